@@ -1,0 +1,42 @@
+# One target per chore. Everything runs in .venv, which the first target that needs it makes.
+PYTHON ?= python3
+BIN := .venv/bin
+DATASET ?=
+OUT ?= runs
+STAMP := .venv/.installed
+# Two test processes on two cores: one thread each.
+PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+
+.PHONY: help setup demo test test-fast check format clean
+
+help:              ## list the targets
+	@grep -hE '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1	/' | expand -t 14
+
+setup: $(STAMP)    ## make the environment
+
+$(STAMP): pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+demo: $(STAMP)     ## run the whole path: make demo, or make demo DATASET=neural-lithography
+	$(BIN)/python examples/demo.py --out $(OUT) $(if $(DATASET),--dataset $(DATASET))
+
+test: $(STAMP)     ## pass all tests; the report is runs/tests/report.xml
+	$(PYTEST) --durations 15 --junitxml $(OUT)/tests/report.xml
+	@echo "test report: $(OUT)/tests/report.xml"
+
+test-fast: $(STAMP) ## pass the tests that take seconds
+	$(PYTEST) -m "not slow"
+
+check: $(STAMP)    ## style and types
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(STAMP)   ## bring the code into the common style
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:             ## remove the environment and the caches, keep results
+	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache *.egg-info

@@ -1,0 +1,82 @@
+"""The shape of the project as laws: imports go one way, and importing is cheap."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+ALLOWED = {
+    "litho_data": {"litho_data"},
+    "litho_models": {"litho_data", "litho_models"},
+    "litho_design": {"litho_data", "litho_models", "litho_design"},
+}
+# What design may use of the models: only what loads and calls a frozen one.
+FROZEN_ONLY = {"load_frozen", "freeze", "simulator", "zoo"}
+HEAVY = ("torch", "cv2", "xarray", "zarr", "matplotlib", "pandas", "skimage", "SurfaceTopography")
+
+
+def _sources(package: str) -> list[Path]:
+    files = sorted((ROOT / package).rglob("*.py"))
+    assert files, f"{package} has no source files: the test would pass on nothing"
+    return files
+
+
+def _imports(file: Path) -> set[str]:
+    """Dotted names of everything that a file imports, at any level of nesting."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{file} has a relative import"
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+@pytest.mark.parametrize("package", sorted(ALLOWED))
+def test_imports_go_left_to_right(package: str) -> None:
+    ours = set(ALLOWED)
+    for file in _sources(package):
+        reached = {name.split(".")[0] for name in _imports(file)} & ours
+        assert reached <= ALLOWED[package], f"{file.relative_to(ROOT)} imports {reached - ALLOWED[package]}"
+
+
+def test_data_does_not_import_torch() -> None:
+    for file in _sources("litho_data"):
+        assert not {n for n in _imports(file) if n.split(".")[0] == "torch"}, f"{file.name} imports torch"
+
+
+def test_design_uses_only_frozen_models() -> None:
+    for file in _sources("litho_design"):
+        for name in _imports(file):
+            parts = name.split(".")
+            if parts[0] == "litho_models":
+                assert parts[1] in FROZEN_ONLY, f"{file.relative_to(ROOT)} imports {name}"
+
+
+def test_virtual_fab_knows_no_model() -> None:
+    for file in _sources("litho_data/virtual_fab"):
+        assert not {n for n in _imports(file) if n.startswith("litho_models")}, file.name
+
+
+@pytest.mark.parametrize("package", sorted(ALLOWED))
+def test_importing_a_package_loads_nothing_heavy(package: str) -> None:
+    code = f"import sys, {package}; print(*[m for m in {HEAVY!r} if m in sys.modules])"
+    loaded = _python(code).split()
+    assert not loaded, f"import {package} loads {loaded}"
+
+
+def test_importing_litho_data_takes_less_than_half_a_second() -> None:
+    # The best of three, because another process may hold the core; the promise is about our own work.
+    code = "import time; t = time.perf_counter(); import litho_data; print(time.perf_counter() - t)"
+    assert min(float(_python(code)) for _ in range(3)) < 0.5
+
+
+def _python(code: str) -> str:
+    """What a fresh interpreter prints."""
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
