@@ -1,0 +1,1 @@
+"""Raw AFM files and layouts in, a dataset with provenance out."""

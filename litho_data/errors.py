@@ -1,0 +1,20 @@
+"""The one exception that users are meant to read."""
+
+from __future__ import annotations
+
+
+class InputError(ValueError):
+    """Bad input: the message is one line that says what, got, wanted and the next step.
+
+    The command lines print it without a traceback and exit with code 2; everything else that is
+    raised is a defect of this project.
+    """
+
+    def __init__(self, what: str, *, got: object = None, wanted: object = None, hint: str = ""):
+        parts = [what]
+        if got is not None:
+            parts.append(f"got {got}")
+        if wanted is not None:
+            parts.append(f"wanted {wanted}")
+        message = ", ".join(parts)
+        super().__init__(" ".join(f"{message}; {hint}".split()) if hint else " ".join(message.split()))

@@ -1,0 +1,31 @@
+"""Layouts: random ones by the paper's equation, calibration patterns, and statistics of sets."""
+
+from litho_data.layouts.layout_set import PATTERNS, write_layout_set
+from litho_data.layouts.patterns import (
+    checkerboard,
+    flat,
+    isolated_features,
+    line_space_sweep,
+    relative_doses,
+    siemens_star,
+    step_ladder,
+)
+from litho_data.layouts.random_layout import random_layout
+from litho_data.layouts.statistics import Departure, LayoutStatistics, departure, layout_statistics
+
+__all__ = [
+    "PATTERNS",
+    "Departure",
+    "LayoutStatistics",
+    "checkerboard",
+    "departure",
+    "flat",
+    "isolated_features",
+    "layout_statistics",
+    "line_space_sweep",
+    "random_layout",
+    "relative_doses",
+    "siemens_star",
+    "step_ladder",
+    "write_layout_set",
+]

@@ -1,0 +1,190 @@
+"""Sets of layouts for the printer: random ones and calibration patterns, with card, table and report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from litho_data.commands import progress
+from litho_data.errors import InputError
+from litho_data.files import atomic_folder
+from litho_data.layouts.card_text import CARD_NAME, TABLE_NAME, CardText, write_layout, write_table
+from litho_data.layouts.patterns import (
+    checkerboard,
+    flat,
+    isolated_features,
+    line_space_sweep,
+    relative_doses,
+    siemens_star,
+    step_ladder,
+)
+from litho_data.layouts.random_layout import random_layout
+from litho_data.layouts.statistics import LayoutStatistics, layout_statistics
+from litho_data.layouts.statistics_report import statistics_page
+from litho_data.outputs import require_replaceable_folder
+
+
+@dataclass(frozen=True)
+class NamedLayout:
+    """One layout with its id, relative dose, and what its scan is for."""
+
+    id: str
+    level: np.ndarray
+    dose: float = 1.0
+    use: str = "dataset"
+
+
+@dataclass(frozen=True)
+class SetSettings:
+    """What a set is made of: see `write_layout_set`."""
+
+    count: int
+    shape: tuple[int, int]
+    levels: int
+    cutoff_per_um: float
+    passband: str
+    pitch_um: float
+    seed: int
+
+    @property
+    def highest(self) -> int:
+        """The highest level."""
+        return self.levels - 1
+
+
+def write_layout_set(
+    out: str | Path,
+    *,
+    pattern: str = "random",
+    count: int = 12,
+    size_px: int | tuple[int, int] = 512,
+    levels: int = 13,
+    cutoff_per_um: float = 0.25,
+    passband: str = "square",
+    pitch_um: float = 0.1,
+    level_height_um: float = 0.1,
+    seed: int = 0,
+) -> Path:
+    """Write a set of layouts into ``out``; returns the path of its card.
+
+    The folder holds `card.toml`, `scans.csv`, ``layouts/*.tif``, `layouts.json` and a report with the
+    set's statistics. The card names the folder ``scans/`` in which the measured scans are expected.
+
+    Args:
+        pattern: a key of `PATTERNS`.
+        count: number of random layouts, or of doses of a dose matrix.
+        size_px: side of a layout, or (ny, nx), pixels.
+        levels: number of levels.
+        cutoff_per_um: cut-off of random layouts, cycles/µm.
+        passband: ``square`` or ``round``.
+        pitch_um: pixel pitch, µm.
+        level_height_um: nominal height of a level, µm.
+        seed: decides every random draw.
+
+    Raises:
+        InputError: an unknown pattern, one that does not fit the size, lengths that are not positive, or a
+            folder with something else in it, such as scans.
+    """
+    if pattern not in PATTERNS:
+        raise InputError("pattern", got=repr(pattern), wanted=", ".join(PATTERNS))
+    if not 2 <= levels <= 256:
+        raise InputError("levels of a layout", got=levels, wanted="2 to 256")
+    shape = (size_px, size_px) if isinstance(size_px, int) else size_px
+    settings = SetSettings(count, shape, levels, cutoff_per_um, passband, pitch_um, seed)
+    require_replaceable_folder(
+        out, CARD_NAME, TABLE_NAME, "layouts", LayoutStatistics.FILE_NAME, "levels.csv", "report.html"
+    )
+    with atomic_folder(out) as folder:
+        paths: list[Path] = []
+        rows: list[tuple[object, ...]] = []
+        make, meaning = PATTERNS[pattern]
+        for layout in progress(make(settings), "writing layouts"):
+            paths.append(write_layout(folder, layout.id, layout.level))
+            rows.append((layout.id, len(rows), f"{layout.dose:.10g}", layout.use))
+        write_table(folder, ("id", "order", "dose", "use"), rows)
+        CardText(
+            name=f"{pattern}-layouts",
+            title=f"Layouts: {meaning}",
+            pitch_um=pitch_um,
+            level_height_um=level_height_um,
+            levels=levels,
+            scan_size_um=(shape[0] * pitch_um, shape[1] * pitch_um),
+        ).write(folder)
+        statistics = layout_statistics(paths, levels=levels, pitch_um=pitch_um)
+        statistics.write(folder)
+        statistics_page(statistics, paths).write(folder)
+    return Path(out) / CARD_NAME
+
+
+def _random(settings: SetSettings) -> Iterator[NamedLayout]:
+    digits = len(str(settings.count))
+    for index in range(settings.count):
+        level = random_layout(
+            settings.shape,
+            levels=settings.levels,
+            cutoff_per_um=settings.cutoff_per_um,
+            pitch_um=settings.pitch_um,
+            seed=np.random.SeedSequence(settings.seed, spawn_key=(index,)),
+            passband=settings.passband,
+        )
+        yield NamedLayout(f"R{index + 1:0{digits}}", level)
+
+
+def _flat(settings: SetSettings) -> Iterator[NamedLayout]:
+    yield NamedLayout("flat", flat(settings.shape, level=settings.highest // 2), use="flat")
+
+
+def _steps(settings: SetSettings) -> Iterator[NamedLayout]:
+    yield NamedLayout("steps", step_ladder(settings.shape, highest=settings.highest), use="steps")
+
+
+def _checkerboard(settings: SetSettings) -> Iterator[NamedLayout]:
+    cell_px = max(1, min(settings.shape) // 16)
+    yield NamedLayout("checkerboard", checkerboard(settings.shape, cell_px=cell_px, high=settings.highest))
+
+
+def _lines(settings: SetSettings) -> Iterator[NamedLayout]:
+    for along in ("x", "y"):
+        level = line_space_sweep(settings.shape, high=settings.highest, along=along)
+        yield NamedLayout(f"lines-{along}", level)
+
+
+def _star(settings: SetSettings) -> Iterator[NamedLayout]:
+    yield NamedLayout("star", siemens_star(settings.shape, spokes=18, high=settings.highest))
+
+
+def _pillars(settings: SetSettings) -> Iterator[NamedLayout]:
+    yield NamedLayout("pillars", _features(settings, settings.highest, 0))
+
+
+def _pits(settings: SetSettings) -> Iterator[NamedLayout]:
+    yield NamedLayout("pits", _features(settings, 0, settings.highest))
+
+
+def _features(settings: SetSettings, feature: int, ground: int) -> np.ndarray:
+    widest_px = min(settings.shape) // 4 // 3
+    widths_px = np.unique(np.geomspace(1, max(1, widest_px), 16).round().astype(int))
+    return isolated_features(settings.shape, widths_px=widths_px.tolist(), feature=feature, ground=ground)
+
+
+def _dose_matrix(settings: SetSettings) -> Iterator[NamedLayout]:
+    ladder = step_ladder(settings.shape, highest=settings.highest)
+    digits = len(str(settings.count))
+    for index, dose in enumerate(relative_doses(settings.count)):
+        yield NamedLayout(f"dose{index + 1:0{digits}}", ladder, dose=float(dose))
+
+
+PATTERNS: dict[str, tuple[Callable[[SetSettings], Iterator[NamedLayout]], str]] = {
+    "random": (_random, "the paper's random layouts"),
+    "flat": (_flat, "one level everywhere"),
+    "step-ladder": (_steps, "stairs over all levels"),
+    "checkerboard": (_checkerboard, "squares of 1/16 of the side"),
+    "line-space": (_lines, "lines and spaces that widen by a pixel each, along x and along y"),
+    "siemens-star": (_star, "18 wedges around the centre"),
+    "pillars": (_pillars, "isolated squares from one pixel up, full height on bare ground"),
+    "pits": (_pits, "isolated square holes from one pixel up in full height"),
+    "dose-matrix": (_dose_matrix, "one step ladder per dose, 0.7 to 1.3 of the recipe's"),
+}

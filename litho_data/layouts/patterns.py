@@ -1,0 +1,107 @@
+"""Calibration patterns: what a laboratory prints to learn one thing at a time.
+
+All functions return uint8 levels of shape (ny, nx); lengths are rounded to whole pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from litho_data.errors import InputError
+
+
+def flat(shape: tuple[int, int], *, level: int) -> np.ndarray:
+    """One level everywhere: roughness, vignetting, flatness."""
+    return np.full(shape, level, np.uint8)
+
+
+def step_ladder(shape: tuple[int, int], *, highest: int, lowest: int = 0) -> np.ndarray:
+    """Stairs along x from ``lowest`` to ``highest``, all steps of one width: height against level."""
+    if not 0 <= lowest < highest:
+        raise InputError("levels of a step ladder", got=(lowest, highest), wanted="0 <= lowest < highest")
+    steps = highest - lowest + 1
+    if shape[1] < steps:
+        raise InputError("width of a step ladder", got=f"{shape[1]} px", wanted=f"at least {steps} px")
+    stairs = lowest + np.arange(shape[1]) * steps // shape[1]
+    return _rows(stairs, shape)
+
+
+def checkerboard(shape: tuple[int, int], *, cell_px: int, high: int, low: int = 0) -> np.ndarray:
+    """Squares of ``cell_px``, the top left one high: lateral scales and shear, corners."""
+    _positive(cell_px, "cell_px of a checkerboard")
+    y, x = np.indices(shape) // cell_px
+    return np.where((y + x) % 2 == 0, high, low).astype(np.uint8)
+
+
+def line_space_sweep(
+    shape: tuple[int, int], *, high: int, low: int = 0, narrowest_px: int = 1, along: str = "y"
+) -> np.ndarray:
+    """Lines and spaces of equal width, each pair one pixel wider: resolution against pitch.
+
+    Args:
+        narrowest_px: width of the first line.
+        along: axis of the lines: ``y`` (they follow one another along x) or ``x``.
+    """
+    _positive(narrowest_px, "narrowest_px of a line/space sweep")
+    if along not in ("x", "y"):
+        raise InputError("direction of the lines", got=repr(along), wanted="x or y")
+    length = shape[1] if along == "y" else shape[0]
+    profile = np.full(length, low)
+    start, width = 0, narrowest_px
+    while start < length:
+        profile[start : start + width] = high
+        start, width = start + 2 * width, width + 1
+    return _rows(profile, shape) if along == "y" else _rows(profile, shape[::-1]).T.copy()
+
+
+def siemens_star(shape: tuple[int, int], *, spokes: int, high: int, low: int = 0) -> np.ndarray:
+    """``spokes`` wedges around the centre, as wide as the gaps: resolution against direction."""
+    _positive(spokes, "spokes of a Siemens star")
+    y, x = np.indices(shape)
+    # Half a wedge of turn keeps the axes of the grid inside wedges and gaps, not on their edges.
+    angle = np.arctan2(y - (shape[0] - 1) / 2, x - (shape[1] - 1) / 2) * spokes / np.pi + 0.5
+    inside = np.hypot(y - (shape[0] - 1) / 2, x - (shape[1] - 1) / 2) <= 0.48 * min(shape)
+    return np.where(inside & (np.floor(angle).astype(int) % 2 == 0), high, low).astype(np.uint8)
+
+
+def isolated_features(
+    shape: tuple[int, int], *, widths_px: Sequence[int], feature: int, ground: int
+) -> np.ndarray:
+    """Squares of growing width far apart on even ground: spot, shrinkage and collapse of single features.
+
+    ``feature`` above ``ground`` makes pillars, below it pits. Every cell of the square array holds one
+    width, in reading order; the free ground between two features is at least twice the larger width.
+    """
+    side = int(np.ceil(len(widths_px) ** 0.5))
+    cell = (shape[0] // side, shape[1] // side)
+    if not widths_px or min(widths_px) < 1 or 3 * max(widths_px) > min(cell):
+        raise InputError(
+            "widths_px of isolated features",
+            got=list(widths_px),
+            wanted=f"1 to {min(cell) // 3} px in a {shape[0]} x {shape[1]} px layout",
+        )
+    layout = np.full(shape, ground, np.uint8)
+    for index, width in enumerate(widths_px):
+        row, column = divmod(index, side)
+        top = row * cell[0] + (cell[0] - width) // 2
+        left = column * cell[1] + (cell[1] - width) // 2
+        layout[top : top + width, left : left + width] = feature
+    return layout
+
+
+def relative_doses(count: int, *, spread: float = 0.3) -> np.ndarray:
+    """Doses of a dose matrix, evenly from 1 − ``spread`` to 1 + ``spread``, shape (count,)."""
+    if count < 2 or not 0 < spread < 1:
+        raise InputError("dose matrix", got=(count, spread), wanted="at least 2 doses and a spread in (0, 1)")
+    return np.linspace(1 - spread, 1 + spread, count)
+
+
+def _rows(profile: np.ndarray, shape: tuple[int, int]) -> np.ndarray:
+    return np.broadcast_to(profile.astype(np.uint8), shape).copy()
+
+
+def _positive(value: int, what: str) -> None:
+    if value < 1:
+        raise InputError(what, got=value, wanted="at least 1")

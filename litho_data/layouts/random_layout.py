@@ -1,0 +1,81 @@
+"""Random layouts by the paper's equation: arXiv:2309.17343, supplement, "Generate randomized … layout"."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from litho_data.errors import InputError
+
+PASSBANDS = ("square", "round")
+
+
+def random_layout(
+    shape: tuple[int, int],
+    *,
+    levels: int = 13,
+    cutoff_per_um: float = 0.25,
+    pitch_um: float = 0.1,
+    seed: int | np.random.SeedSequence | np.random.Generator = 0,
+    passband: str = "square",
+) -> np.ndarray:
+    """One random layout, ``M = Q(norm(Re(F⁻¹(F(R)·LPF))))`` with ``R ~ U(0, 1)``.
+
+    ``norm`` maps the smallest value to 0 and the largest to 1, and ``Q`` rounds half up to the
+    nearest of ``levels`` values. The result is periodic in both directions. The paper leaves the
+    low-pass filter open: the measured layouts show a sharp square pass band of ±0.25 cycles/µm
+    (prints 1–4) and ±0.5 cycles/µm (prints 6 and 7), cut from a larger, periodic field.
+
+    Args:
+        shape: (ny, nx), pixels.
+        levels: number of levels L; the result holds integers 0…L−1.
+        cutoff_per_um: highest spatial frequency that passes, cycles per µm.
+        pitch_um: pixel pitch, µm.
+        seed: anything that `numpy.random.default_rng` takes.
+        passband: ``square`` limits each axis, ``round`` the length of the frequency vector.
+
+    Returns:
+        uint8, shape (ny, nx).
+
+    Raises:
+        InputError: fewer than 2 or more than 256 levels, or a cut-off that leaves nothing to vary.
+    """
+    if not 2 <= levels <= 256:
+        raise InputError("levels of a layout", got=levels, wanted="2 to 256")
+    field = low_pass(
+        np.random.default_rng(seed).random(shape),
+        cutoff_per_um=cutoff_per_um,
+        pitch_um=pitch_um,
+        passband=passband,
+    )
+    lowest, highest = field.min(), field.max()
+    # Rounding of the transform leaves about 1e-17 where nothing but the mean passes.
+    if highest - lowest < 1e-12:
+        raise InputError(
+            "cutoff_per_um of a random layout",
+            got=cutoff_per_um,
+            wanted=f"at least {1 / (max(shape) * pitch_um):.4g} cycles/µm for {shape[0]} x {shape[1]} pixels",
+        )
+    return quantise((field - lowest) / (highest - lowest), levels)
+
+
+def low_pass(field: np.ndarray, *, cutoff_per_um: float, pitch_um: float, passband: str) -> np.ndarray:
+    """Keep the spatial frequencies up to ``cutoff_per_um`` (inclusive), periodic boundaries."""
+    if passband not in PASSBANDS:
+        raise InputError("passband", got=repr(passband), wanted=" or ".join(PASSBANDS))
+    if not cutoff_per_um > 0 or not pitch_um > 0:
+        raise InputError(
+            "cutoff_per_um and pitch_um", got=(cutoff_per_um, pitch_um), wanted="positive numbers"
+        )
+    frequency_y = np.fft.fftfreq(field.shape[0], pitch_um)[:, None]
+    frequency_x = np.fft.rfftfreq(field.shape[1], pitch_um)[None, :]
+    if passband == "square":
+        distance = np.maximum(np.abs(frequency_y), frequency_x)
+    else:
+        distance = np.hypot(frequency_y, frequency_x)
+    # A real field times an even filter stays real, so the half-plane transform loses nothing.
+    return np.fft.irfft2(np.fft.rfft2(field) * (distance <= cutoff_per_um), s=field.shape)
+
+
+def quantise(unit_field: np.ndarray, levels: int) -> np.ndarray:
+    """Values in [0, 1] to the nearest of ``levels`` integers, halves rounded up, uint8."""
+    return np.floor(unit_field * (levels - 1) + 0.5).astype(np.uint8)

@@ -1,0 +1,57 @@
+"""The human report of a set of layouts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from litho_data.layouts.statistics import LayoutStatistics
+from litho_data.report import Page, new_figure
+
+_SHOWN = 4
+
+
+def statistics_page(statistics: LayoutStatistics, files: Sequence[Path]) -> Page:
+    """Pictures of the first layouts, level and jump shares, spectrum and autocorrelation."""
+    import pandas as pd
+
+    from litho_data.readers import read_layout
+
+    page = Page(
+        f"{statistics.count} layouts", f"{statistics.levels} levels, pitch {statistics.pitch_um:g} µm"
+    )
+    pictures = new_figure(11, 3)
+    shown = files[:_SHOWN]
+    for place, file in enumerate(shown, start=1):
+        axes = pictures.add_subplot(1, len(shown), place)
+        axes.imshow(read_layout(file), vmin=0, vmax=statistics.levels - 1, cmap="viridis")
+        axes.set_title(file.stem)
+        axes.set_axis_off()
+    page.figure(pictures, "The first layouts, level by colour.")
+
+    graphs = new_figure(11, 6)
+    levels = np.arange(statistics.levels)
+    axes = graphs.add_subplot(2, 2, 1, xlabel="level", ylabel="share of pixels")
+    axes.bar(levels, statistics.level_share)
+    axes = graphs.add_subplot(
+        2, 2, 2, xlabel="jump between neighbours, levels", ylabel="share of pairs", yscale="log"
+    )
+    axes.bar(levels, statistics.jump_share)
+    axes = graphs.add_subplot(
+        2, 2, 3, xlabel="spatial frequency, cycles/µm", ylabel="share of power", yscale="log"
+    )
+    axes.step(statistics.frequency_per_um, statistics.power_share, where="mid")
+    axes = graphs.add_subplot(2, 2, 4, xlabel="lag, µm", ylabel="autocorrelation")
+    axes.plot(statistics.lag_um, statistics.autocorrelation_x, label="along x")
+    axes.plot(statistics.lag_um, statistics.autocorrelation_y, label="along y")
+    axes.legend()
+    page.figure(graphs, "Pooled statistics of the set.")
+    shares = {
+        "level or jump": levels,
+        "share of pixels": statistics.level_share,
+        "share of pairs": statistics.jump_share,
+    }
+    page.table(pd.DataFrame(shares), "Level and jump shares.", "levels.csv", digits=4)
+    return page

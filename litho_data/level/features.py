@@ -1,0 +1,121 @@
+"""Features that levelling must not follow: marking them, and levelling and marking in turn."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+from scipy import ndimage
+
+from litho_data.errors import InputError
+from litho_data.level.polynomial import evaluate, fit_terms, polynomial_terms
+from litho_data.level.robust import noise_sigma, robust_surface
+from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
+
+Side = Literal["above", "below", "both"]
+_MAX_ROUNDS = 50
+# With less than this share of the pixels left, the background is a guess.
+_LEAST_BACKGROUND = 0.02
+
+
+class MaskedLevelling(NamedTuple):
+    """What ``mask_and_relevel`` found: the levelled map and the features that it left out."""
+
+    levelled: Levelled
+    mask: np.ndarray
+
+
+def mark_features(
+    height: np.ndarray,
+    *,
+    threshold: float = 3.0,
+    side: Side = "both",
+    grow_px: int = 0,
+    mask: np.ndarray | None = None,
+    masking: Masking = "exclude",
+) -> np.ndarray:
+    """Mark the pixels that lie off the main surface by more than ``threshold`` noise sigmas.
+
+    Main surface and noise are the median and 1.4826 · MAD of the selected pixels, so the features
+    must be the minority of them. Measured pixels that were not selected are marked as well: the
+    result is everything that later steps should exclude.
+
+    Args:
+        height: (ny, nx), any unit, already level.
+        grow_px: the marked area is widened by this many pixels, against edges that blur.
+
+    Returns:
+        bool (ny, nx).
+
+    Raises:
+        InputError: a threshold that is not positive, an unknown side, a negative ``grow_px``.
+    """
+    z = as_height(height)
+    _check(threshold, side, grow_px)
+    chosen = select(z, mask, masking)
+    values = z if chosen is None else z[chosen]
+    centre = float(np.median(values))
+    usable = np.isfinite(z) if chosen is None else chosen
+    features = _off_surface(z - centre, usable, threshold * noise_sigma(values - centre), side, grow_px)
+    return features | (np.isfinite(z) & ~usable)
+
+
+def mask_and_relevel(
+    height: np.ndarray,
+    *,
+    x_degree: int = 1,
+    y_degree: int = 1,
+    total_degree: int | None = 1,
+    threshold: float = 3.0,
+    side: Side = "both",
+    grow_px: int = 2,
+    mask: np.ndarray | None = None,
+    masking: Masking = "exclude",
+) -> MaskedLevelling:
+    """Level, mark the features, level again without them, until the marks stay the same.
+
+    The first background is robust (Tukey), the following ones are least squares over the unmarked
+    pixels. The background is subtracted with its constant, so that the main surface lies at zero.
+    The mask that comes back marks what ``mark_features`` marks.
+
+    Raises:
+        InputError: parameters outside their range, or features that leave no background.
+    """
+    z = as_height(height)
+    _check(threshold, side, grow_px)
+    terms = polynomial_terms(x_degree, y_degree, total_degree)
+    chosen = select(z, mask, masking)
+    usable = np.isfinite(z) if chosen is None else chosen
+    surface = robust_surface(z, chosen, terms)
+    # The noise is judged once: judged again over what is left, it would shrink round by round.
+    limit = threshold * noise_sigma((z - surface)[usable])
+    seen: set[bytes] = set()
+    for _ in range(_MAX_ROUNDS):
+        features = _off_surface(z - surface, usable, limit, side, grow_px)
+        background = usable & ~features
+        if np.count_nonzero(background) < _LEAST_BACKGROUND * np.count_nonzero(usable):
+            raise InputError("mask-and-relevel finds no main surface", wanted="a higher threshold or a mask")
+        surface = evaluate(fit_terms(z, background.astype(np.float64), terms), z.shape)
+        key = np.packbits(features).tobytes()
+        if key in seen:
+            break
+        seen.add(key)
+    return MaskedLevelling(subtract(z, surface), features | (np.isfinite(z) & ~usable))
+
+
+def _check(threshold: float, side: str, grow_px: int) -> None:
+    if not threshold > 0:
+        raise InputError("feature threshold", got=threshold, wanted="a positive number of noise sigmas")
+    if side not in get_args(Side):
+        raise InputError("side of the features", got=repr(side), wanted=" | ".join(get_args(Side)))
+    if grow_px < 0:
+        raise InputError("grow_px", got=grow_px, wanted="0 or more pixels")
+
+
+def _off_surface(
+    residual: np.ndarray, usable: np.ndarray, limit: float, side: Side, grow_px: int
+) -> np.ndarray:
+    with np.errstate(invalid="ignore"):
+        above, below = residual > limit, residual < -limit
+    marked = usable & (above if side == "above" else below if side == "below" else above | below)
+    return usable & ndimage.binary_dilation(marked, iterations=grow_px) if grow_px else marked

@@ -1,0 +1,140 @@
+"""Levelling that knows the layout: the printed structure's own slope and bow are not removed."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import ndimage
+
+from litho_data.errors import InputError
+from litho_data.level.polynomial import Terms, evaluate, polynomial_terms
+from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
+
+# Below it background and structure cannot be told apart in double precision with noise on top.
+_SINGULAR = 1e-9
+_ROWS_AT_ONCE = 64
+
+
+def level_layout_aware(
+    height: np.ndarray,
+    *,
+    layout_level: np.ndarray,
+    blur_px: float = 3.0,
+    x_degree: int = 1,
+    y_degree: int = 1,
+    total_degree: int | None = 1,
+    mask: np.ndarray | None = None,
+    masking: Masking = "exclude",
+) -> Levelled:
+    """Subtract the background that is left once the layout has explained what it can.
+
+    Least squares of z = sum_pq c_pq x^p y^q + g(blurred level), where g is a free piecewise linear
+    response with one knot per level. A plain fit would assign to the background whatever slope the
+    structure itself has. Only the polynomial without its constant is subtracted, with mean zero
+    over the fitted pixels: the datum belongs to the response.
+
+    Args:
+        height: (ny, nx), any unit.
+        layout_level: (ny, nx) in the scan's frame, level per pixel, NaN outside the layout; see
+            ``layout_in_scan_frame``.
+        blur_px: sigma of the Gaussian that stands for the lateral spread of printing.
+        x_degree, y_degree, total_degree: as in ``level_polynomial``; by default a plane.
+
+    Raises:
+        InputError: a layout of another shape or without overlap, or a layout that looks like the
+            background itself (a ramp, say), so that the two cannot be told apart.
+    """
+    z = as_height(height)
+    if layout_level.shape != z.shape:
+        raise InputError("layout in the scan's frame: shape", got=layout_level.shape, wanted=z.shape)
+    if blur_px < 0:
+        raise InputError("blur_px", got=blur_px, wanted="0 or more pixels")
+    terms = tuple(term for term in polynomial_terms(x_degree, y_degree, total_degree) if term != (0, 0))
+    if not terms:
+        raise InputError("layout-aware background", got="degree 0", wanted="degree 1 or more")
+    blurred = _blur(np.asarray(layout_level, dtype=np.float64), blur_px)
+    chosen = select(z, mask, masking)
+    fitted = np.isfinite(blurred) if chosen is None else chosen & np.isfinite(blurred)
+    if not fitted.any():
+        raise InputError("the layout covers no measured pixel", wanted="a layout in the scan's frame")
+    surface = evaluate(_joint_fit(z, blurred, fitted, terms), z.shape)
+    return subtract(z, surface - surface[fitted].mean())
+
+
+def layout_in_scan_frame(
+    layout_level: np.ndarray,
+    scan_to_layout: np.ndarray,
+    scan_shape: tuple[int, int],
+    scan_pitch_um: tuple[float, float],
+    layout_pitch_um: float,
+) -> np.ndarray:
+    """The level of the layout pixel under each scan pixel; NaN outside the layout.
+
+    Args:
+        layout_level: (ny, nx) levels.
+        scan_to_layout: 3 x 3, maps (x_um, y_um, 1) of the scan's frame to the layout's.
+
+    Returns:
+        float64 of ``scan_shape``. Nearest pixel: levels are labels and must not be mixed.
+    """
+    y_um = (np.arange(scan_shape[0]) + 0.5) * scan_pitch_um[0]
+    x_um = (np.arange(scan_shape[1]) + 0.5) * scan_pitch_um[1]
+    grid_y, grid_x = np.meshgrid(y_um, x_um, indexing="ij")
+    mapped = np.tensordot(scan_to_layout, np.stack([grid_x, grid_y, np.ones_like(grid_x)]), axes=1)
+    column = np.floor(mapped[0] / mapped[2] / layout_pitch_um).astype(int)
+    row = np.floor(mapped[1] / mapped[2] / layout_pitch_um).astype(int)
+    inside = (row >= 0) & (row < layout_level.shape[0]) & (column >= 0) & (column < layout_level.shape[1])
+    levels = np.full(scan_shape, np.nan)
+    levels[inside] = layout_level[row[inside], column[inside]]
+    return levels
+
+
+def _blur(level: np.ndarray, sigma_px: float) -> np.ndarray:
+    """Gaussian blur over the known pixels only; unknown ones stay unknown."""
+    if sigma_px == 0:
+        return level
+    known = np.isfinite(level)
+    weight = ndimage.gaussian_filter(known.astype(np.float64), sigma_px)
+    spread = ndimage.gaussian_filter(np.where(known, level, 0.0), sigma_px)
+    return np.where(known, spread / np.where(weight > 0, weight, 1.0), np.nan)
+
+
+def _joint_fit(z: np.ndarray, blurred: np.ndarray, fitted: np.ndarray, terms: Terms) -> np.ndarray:
+    """Coefficients of the background, in the Legendre basis of ``evaluate``."""
+    normal, right = _normal_equations(z, blurred, fitted, terms)
+    used = np.diag(normal) > 0
+    normal, right = normal[np.ix_(used, used)], right[used]
+    scale = 1 / np.sqrt(np.diag(normal))
+    values, directions = np.linalg.eigh(normal * np.outer(scale, scale))
+    if values[0] < _SINGULAR * values[-1]:
+        raise InputError(
+            "the layout varies like the background itself",
+            got=f"condition {values[-1] / max(values[0], np.finfo(float).tiny):.1g}",
+            wanted="a lower degree or a layout with independent structure",
+        )
+    solution = scale * (directions @ ((directions.T @ (scale * right)) / values))
+    coefficients = np.zeros((max(q for _, q in terms) + 1, max(p for p, _ in terms) + 1))
+    for (p, q), value in zip(terms, solution, strict=False):
+        coefficients[q, p] = value
+    return coefficients
+
+
+def _normal_equations(
+    z: np.ndarray, blurred: np.ndarray, fitted: np.ndarray, terms: Terms
+) -> tuple[np.ndarray, np.ndarray]:
+    """Summed over strips of rows, so that the design matrix never exists as a whole."""
+    x, y = (np.linspace(-1.0, 1.0, n) for n in (z.shape[1], z.shape[0]))
+    basis_x = np.polynomial.legendre.legvander(x, max(p for p, _ in terms))
+    basis_y = np.polynomial.legendre.legvander(y, max(q for _, q in terms))
+    top = max(int(np.ceil(np.nanmax(blurred))), 0)
+    size = len(terms) + top + 1
+    normal, right = np.zeros((size, size)), np.zeros(size)
+    for start in range(0, z.shape[0], _ROWS_AT_ONCE):
+        strip = slice(start, start + _ROWS_AT_ONCE)
+        inside = fitted[strip]
+        columns = [np.multiply.outer(basis_y[strip, q], basis_x[:, p])[inside] for p, q in terms]
+        level = blurred[strip][inside]
+        columns += [np.clip(1 - np.abs(level - knot), 0.0, None) for knot in range(top + 1)]
+        design = np.stack(columns)
+        normal += design @ design.T
+        right += design @ z[strip][inside]
+    return normal, right

@@ -1,0 +1,92 @@
+"""Planes: Gwyddion's Plane Level and Three Point Level."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from litho_data.errors import InputError
+from litho_data.level.polynomial import Terms, fit_terms
+from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
+
+PLANE: Terms = ((0, 0), (1, 0), (0, 1))
+
+
+def level_plane(
+    height: np.ndarray, *, mask: np.ndarray | None = None, masking: Masking = "exclude"
+) -> Levelled:
+    """Subtract the tilt of the least-squares plane; the height at the pivot (nx/2, ny/2) stays.
+
+    Gwyddion's definition: the fitted constant is discarded and -(bx nx + by ny) / 2 taken in its
+    place, so that the mean of the result is the mean of the input plus (bx + by) / 2, slopes in
+    height per pixel.
+
+    Raises:
+        InputError: the selected pixels do not determine a plane. (Gwyddion then removes nothing.)
+    """
+    z = as_height(height)
+    chosen = select(z, mask, masking)
+    weights = None if chosen is None else chosen.astype(np.float64)
+    return subtract(z, tilt(slopes_per_px(fit_terms(z, weights, PLANE), z.shape), z.shape))
+
+
+def level_three_point(
+    height: np.ndarray,
+    *,
+    points_px: Sequence[tuple[float, float]],
+    radius_px: float = 0.0,
+    set_zero: bool = False,
+    mask: np.ndarray | None = None,
+    masking: Masking = "exclude",
+) -> Levelled:
+    """Subtract the plane through three points, each the mean over a disc.
+
+    Args:
+        points_px: three (y, x) positions in pixel indices.
+        radius_px: radius of the disc; 0 takes the one pixel.
+        set_zero: put the three points to zero; otherwise the height at the pivot (nx/2, ny/2)
+            stays, as in ``level_plane``.
+
+    Raises:
+        InputError: not three points, a disc without a selected pixel, or points on one line.
+    """
+    z = as_height(height)
+    chosen = select(z, mask, masking)
+    if len(points_px) != 3:
+        raise InputError(
+            "three-point levelling", got=f"{len(points_px)} points", wanted="3 points (y, x) in pixels"
+        )
+    heights = [_disc_mean(z, chosen, point, radius_px) for point in points_px]
+    design = np.array([[1.0, x, y] for y, x in points_px])
+    if abs(np.linalg.det(design)) < 1e-9 * z.size:
+        raise InputError(
+            "three-point levelling", got=f"points {list(points_px)}", wanted="points not on one line"
+        )
+    constant, slope_x, slope_y = np.linalg.solve(design, heights)
+    removed = tilt((slope_x, slope_y), z.shape)
+    return subtract(z, removed - removed[0, 0] + constant if set_zero else removed)
+
+
+def slopes_per_px(coefficients: np.ndarray, shape: tuple[int, ...]) -> tuple[float, float]:
+    """(along x, along y) slope in height per pixel of ``fit_terms``'s linear terms."""
+    return 2 * coefficients[0, 1] / (shape[1] - 1), 2 * coefficients[1, 0] / (shape[0] - 1)
+
+
+def tilt(slopes: tuple[float, float], shape: tuple[int, ...]) -> np.ndarray:
+    """The plane with these slopes (x, y) per pixel that is zero at column nx/2, row ny/2."""
+    ny, nx = shape
+    return np.add.outer(slopes[1] * (np.arange(ny) - ny / 2), slopes[0] * (np.arange(nx) - nx / 2))
+
+
+def _disc_mean(z: np.ndarray, chosen: np.ndarray | None, point: tuple[float, float], radius: float) -> float:
+    y, x = (np.arange(n) - centre for n, centre in zip(z.shape, point, strict=True))
+    distance2 = np.add.outer(y**2, x**2)
+    disc = distance2 <= max(radius**2, distance2.min())
+    if not (0 <= point[0] <= z.shape[0] - 1 and 0 <= point[1] <= z.shape[1] - 1):
+        raise InputError("three-point levelling: point (y, x)", got=point, wanted=f"a pixel of {z.shape}")
+    if chosen is not None:
+        disc &= chosen
+    if not disc.any():
+        raise InputError("three-point levelling", got=f"no selected pixel within {radius} px of {point}")
+    return float(z[disc].mean())

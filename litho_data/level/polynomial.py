@@ -1,0 +1,142 @@
+"""Polynomial background, with the definition of Gwyddion's Polynomial Background."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.polynomial import legendre
+
+from litho_data.errors import InputError
+from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
+
+MAX_DEGREE = 11
+Terms = tuple[tuple[int, int], ...]
+
+# Below it the smallest direction of the normal matrix is rounding noise.
+_SINGULAR = 1e-12
+_WELL_CONDITIONED = 1e3
+
+
+def level_polynomial(
+    height: np.ndarray,
+    *,
+    x_degree: int = 3,
+    y_degree: int = 3,
+    total_degree: int | None = None,
+    mask: np.ndarray | None = None,
+    masking: Masking = "exclude",
+) -> Levelled:
+    """Subtract the least-squares polynomial, its constant included.
+
+    The mean of the fitted pixels becomes zero. Without ``total_degree`` the terms are x^p y^q with
+    p <= x_degree and q <= y_degree (Gwyddion's independent degrees, column and row degree); with
+    it, p + q <= total_degree and the other two degrees do not count (limited total degree).
+
+    Args:
+        height: (ny, nx), any unit.
+        mask: bool (ny, nx).
+
+    Raises:
+        InputError: a degree outside 0..11, or selected pixels that do not determine all terms.
+    """
+    z = as_height(height)
+    terms = polynomial_terms(x_degree, y_degree, total_degree)
+    chosen = select(z, mask, masking)
+    weights = None if chosen is None else chosen.astype(np.float64)
+    return subtract(z, evaluate(fit_terms(z, weights, terms), z.shape))
+
+
+def polynomial_terms(x_degree: int, y_degree: int, total_degree: int | None = None) -> Terms:
+    """The exponents (p, q) of x^p y^q; raises InputError for a degree outside 0..11."""
+    degrees = (x_degree, y_degree) if total_degree is None else (total_degree, total_degree)
+    if not all(0 <= degree <= MAX_DEGREE for degree in degrees):
+        raise InputError("degree of the background", got=degrees, wanted=f"0 to {MAX_DEGREE}")
+    return tuple(
+        (p, q)
+        for q in range(degrees[1] + 1)
+        for p in range(degrees[0] + 1)
+        if total_degree is None or p + q <= total_degree
+    )
+
+
+def fit_terms(z: np.ndarray, weights: np.ndarray | None, terms: Terms) -> np.ndarray:
+    """Weighted least-squares coefficients c[q, p] of P_q(y) P_p(x), P the Legendre polynomials.
+
+    x = 2 j / (nx - 1) - 1 and y alike. Any set of terms that contains all lower ones spans the
+    same polynomials in the Legendre basis as in powers, at a far better condition. The moments
+    are separable, so that the cost is that of a few thin matrix products.
+
+    Args:
+        z: (ny, nx); NaN only where the weight is zero.
+        weights: (ny, nx), not negative; None for one everywhere.
+
+    Raises:
+        InputError: the weighted pixels do not determine all terms.
+    """
+    powers_x, powers_y = [p for p, _ in terms], [q for _, q in terms]
+    basis_x = _basis(z.shape[1], max(powers_x))
+    basis_y = _basis(z.shape[0], max(powers_y))
+    factors = _eigen_factors(_normal_matrix(weights, basis_x, basis_y, powers_x, powers_y))
+    coefficients = np.zeros((basis_y.shape[1], basis_x.shape[1]))
+    if weights is None:
+        coefficients[powers_y, powers_x] = _solve(factors, (basis_y.T @ (z @ basis_x))[powers_y, powers_x])
+        return coefficients
+    known = weights * z
+    if not np.isfinite(known.sum()):
+        known[~(weights > 0)] = 0.0
+    coefficients[powers_y, powers_x] = _solve(factors, (basis_y.T @ (known @ basis_x))[powers_y, powers_x])
+    if factors[0][-1] > _WELL_CONDITIONED * factors[0][0]:
+        # A second round removes the rounding that a badly conditioned mask put into the first.
+        known -= weights * (basis_y @ (coefficients @ basis_x.T))
+        coefficients[powers_y, powers_x] += _solve(
+            factors, (basis_y.T @ (known @ basis_x))[powers_y, powers_x]
+        )
+    return coefficients
+
+
+def evaluate(coefficients: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """The surface of ``fit_terms``'s coefficients on (ny, nx) pixels."""
+    basis_y = _basis(shape[0], coefficients.shape[0] - 1)
+    basis_x = _basis(shape[1], coefficients.shape[1] - 1)
+    return basis_y @ (coefficients @ basis_x.T)
+
+
+def _basis(n: int, degree: int) -> np.ndarray:
+    return legendre.legvander(np.linspace(-1.0, 1.0, n), degree)
+
+
+def _normal_matrix(
+    weights: np.ndarray | None,
+    basis_x: np.ndarray,
+    basis_y: np.ndarray,
+    powers_x: list[int],
+    powers_y: list[int],
+) -> np.ndarray:
+    if weights is None:
+        gram_x, gram_y = basis_x.T @ basis_x, basis_y.T @ basis_y
+        return gram_x[np.ix_(powers_x, powers_x)] * gram_y[np.ix_(powers_y, powers_y)]
+    pairs_x, pairs_y = _pairs(basis_x), _pairs(basis_y)
+    moments = pairs_y.T @ (weights @ pairs_x)
+    moments = moments.reshape(basis_y.shape[1], basis_y.shape[1], basis_x.shape[1], basis_x.shape[1])
+    p, q = np.array(powers_x), np.array(powers_y)
+    return moments[q[:, None], q[None, :], p[:, None], p[None, :]]
+
+
+def _pairs(basis: np.ndarray) -> np.ndarray:
+    """(n, d^2): products of any two columns."""
+    return (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
+
+
+def _eigen_factors(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    scales, directions = np.linalg.eigh(normal)
+    if scales[0] <= _SINGULAR * scales[-1]:
+        raise InputError(
+            "the selected pixels do not determine the background",
+            got=f"{len(normal)} terms, condition {scales[-1] / max(scales[0], np.finfo(float).tiny):.1g}",
+            wanted="a lower degree or more pixels",
+        )
+    return scales, directions
+
+
+def _solve(factors: tuple[np.ndarray, np.ndarray], right: np.ndarray) -> np.ndarray:
+    scales, directions = factors
+    return directions @ ((directions.T @ right) / scales)

@@ -1,0 +1,93 @@
+"""Levelling recipes: a list of steps, written in TOML or Python, kept with the data."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from litho_data.errors import InputError
+from litho_data.level.recipe_steps import AnyStep, State
+from litho_data.level.selection import Levelled, as_height
+from litho_data.results import first_error
+from litho_data.scan import Scan
+
+
+class Recipe(BaseModel):
+    """Levelling steps in the order in which they are applied; an unknown key is an error.
+
+    In TOML each step is a table ``[[step]]`` with its operation as ``op``; in Python the steps are
+    the models of ``litho_data.level.recipe_steps``.
+    """
+
+    SCHEMA: ClassVar[str] = "litho-data/recipe/1"
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str = ""
+    step: tuple[AnyStep, ...] = ()
+
+    @classmethod
+    def from_toml(cls, path: str | Path) -> Self:
+        """Read a recipe.
+
+        Raises:
+            InputError: no such file, no TOML, an unknown operation or key, a value out of range.
+        """
+        try:
+            content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            raise InputError(f"cannot read recipe {path}", got=str(error), wanted="a TOML file") from error
+        return cls.from_dict(content, source=str(path))
+
+    @classmethod
+    def from_dict(cls, content: dict[str, Any], *, source: str = "") -> Self:
+        """A recipe from plain tables: those of TOML, or ``canonical()``; raises InputError."""
+        tables = dict(content)
+        if tables.pop("schema", cls.SCHEMA) != cls.SCHEMA:
+            raise InputError(f"recipe {source}: schema", got=repr(content["schema"]), wanted=repr(cls.SCHEMA))
+        try:
+            return cls.model_validate(tables)
+        except ValidationError as error:
+            raise InputError(f"recipe {source}".rstrip(), got=first_error(error)) from error
+
+    def canonical(self) -> dict[str, Any]:
+        """Everything that decides the result, defaults written out; ``from_dict`` reads it back."""
+        return {"schema": self.SCHEMA, "step": [step.model_dump(mode="json") for step in self.step]}
+
+    def apply(
+        self,
+        scan: Scan | np.ndarray,
+        *,
+        pitch_um: tuple[float, float] | None = None,
+        mask: np.ndarray | None = None,
+        layout_level: np.ndarray | None = None,
+    ) -> Levelled:
+        """Level a scan; ``height + removed`` is what came in, both NaN where nothing was measured.
+
+        Args:
+            scan: a ``Scan``, whose pitch and mask are used, or heights (ny, nx) in µm.
+            pitch_um: (y, x), only for plain heights.
+            mask: bool (ny, nx), takes the place of the scan's mask.
+            layout_level: (ny, nx) levels in the scan's frame, NaN outside the layout; needed by
+                ``layout-aware`` steps only.
+
+        Raises:
+            InputError: a step that lacks what it needs, or data that it cannot be applied to.
+        """
+        if isinstance(scan, Scan):
+            heights, pitch_um = scan.height_um, scan.pitch_um
+            mask = scan.mask if mask is None else mask
+        else:
+            heights = scan
+        state = State(as_height(heights), mask, pitch_um, layout_level)
+        start = state.height_um
+        for number, step in enumerate(self.step, start=1):
+            try:
+                state = step.run(state)
+            except InputError as error:
+                raise InputError(f"recipe step {number} ({step.op}): {error}") from error
+        return Levelled(state.height_um, start - state.height_um)

@@ -1,0 +1,189 @@
+"""Row alignment, with the definitions of Gwyddion's Align Rows."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import numpy as np
+
+from litho_data.errors import InputError
+from litho_data.level.row_statistics import (
+    MEDIAN_TRIM,
+    fewest_for_row,
+    row_counts,
+    row_facet_tilt,
+    row_modus,
+    row_trimmed_mean,
+)
+from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
+
+RowMethod = Literal[
+    "median",
+    "median-of-differences",
+    "trimmed-mean",
+    "trimmed-mean-of-differences",
+    "polynomial",
+    "matching",
+    "modus",
+    "facet-tilt",
+]
+Direction = Literal["horizontal", "vertical"]
+MAX_ROW_DEGREE = 5
+_FACET_SHARPNESS = 1 / 200
+_METRE_PER_UM = 1e-6
+
+
+def align_rows(
+    height_um: np.ndarray,
+    *,
+    method: RowMethod = "median",
+    direction: Direction = "horizontal",
+    degree: int = 1,
+    trim: float = 0.05,
+    pitch_um: tuple[float, float] | None = None,
+    mask: np.ndarray | None = None,
+    masking: Masking = "exclude",
+) -> Levelled:
+    """Take from each scan line what it does not share with the others.
+
+    Args:
+        height_um: (ny, nx), µm. Only ``"matching"`` depends on the unit: its weights compare a
+            squared height with a height, in metres as Gwyddion does.
+        method: ``median``, ``trimmed-mean`` and ``modus`` make that statistic of all rows equal;
+            the two ``-of-differences`` and ``matching`` sum up steps between neighbouring rows and
+            so keep large features; ``polynomial`` fits each row by itself; ``facet-tilt`` removes
+            the prevailing slope of each row.
+        direction: ``"horizontal"`` lines are rows, ``"vertical"`` lines are columns.
+        degree: of the polynomial, 0 to 5.
+        trim: fraction cut at each end by the trimmed means, 0 to 0.5; 0.5 is the median.
+        pitch_um: (y, x), needed by ``facet-tilt`` only.
+
+    Raises:
+        InputError: an unknown method or direction, a degree or trim outside its range, a missing pitch.
+    """
+    z = as_height(height_um)
+    _check(method, direction, degree, trim, pitch_um)
+    chosen = select(z, mask, masking)
+    if direction == "vertical":
+        columns = None if chosen is None else np.ascontiguousarray(chosen.T)
+        pitch = None if pitch_um is None else (pitch_um[1], pitch_um[0])
+        removed = _removed(np.ascontiguousarray(z.T), columns, method, degree, trim, pitch).T
+    else:
+        removed = _removed(z, chosen, method, degree, trim, pitch_um)
+    return subtract(z, removed)
+
+
+def _check(
+    method: str, direction: str, degree: int, trim: float, pitch_um: tuple[float, float] | None
+) -> None:
+    if method not in get_args(RowMethod):
+        raise InputError("row alignment method", got=repr(method), wanted=" | ".join(get_args(RowMethod)))
+    if direction not in get_args(Direction):
+        raise InputError(
+            "row alignment direction", got=repr(direction), wanted=" | ".join(get_args(Direction))
+        )
+    if not 0 <= degree <= MAX_ROW_DEGREE:
+        raise InputError("row alignment degree", got=degree, wanted=f"0 to {MAX_ROW_DEGREE}")
+    if not 0 <= trim <= MEDIAN_TRIM:
+        raise InputError("row alignment trim", got=trim, wanted=f"0 to {MEDIAN_TRIM}")
+    if method == "facet-tilt" and pitch_um is None:
+        raise InputError("facet-tilt of rows needs the pixel pitch", wanted="pitch_um")
+
+
+def _removed(
+    z: np.ndarray,
+    chosen: np.ndarray | None,
+    method: RowMethod,
+    degree: int,
+    trim: float,
+    pitch_um: tuple[float, float] | None,
+) -> np.ndarray:
+    if method == "polynomial" and degree > 0:
+        return _row_polynomials(z, chosen, degree)
+    if method == "facet-tilt":
+        assert pitch_um is not None
+        slopes = row_facet_tilt(z, chosen, pitch_um[1], _FACET_SHARPNESS)
+        return np.multiply.outer(slopes, _centred(z.shape[1]))
+    match method:
+        case "median":
+            shifts = _level_shifts(z, chosen, MEDIAN_TRIM)
+        case "trimmed-mean":
+            shifts = _level_shifts(z, chosen, trim)
+        case "polynomial":
+            shifts = _level_shifts(z, chosen, 0.0)
+        case "modus":
+            shifts = _modus_shifts(z, chosen)
+        case "median-of-differences":
+            shifts = _difference_shifts(z, chosen, MEDIAN_TRIM)
+        case "trimmed-mean-of-differences":
+            shifts = _difference_shifts(z, chosen, trim)
+        case _:
+            shifts = _matching_shifts(z, chosen)
+    return np.broadcast_to(shifts[:, None], z.shape)
+
+
+def _level_shifts(z: np.ndarray, chosen: np.ndarray | None, trim: float) -> np.ndarray:
+    shifts = row_trimmed_mean(z, chosen, trim)
+    if chosen is not None:
+        too_few = row_counts(z, chosen) < fewest_for_row(z.shape[1])
+        shifts[too_few] = _overall_median(z, chosen)
+    return shifts - shifts.mean()
+
+
+def _modus_shifts(z: np.ndarray, chosen: np.ndarray | None) -> np.ndarray:
+    shifts = row_modus(z, chosen)
+    if chosen is not None:
+        shifts[row_counts(z, chosen) == 0] = _overall_median(z, chosen)
+    return shifts - shifts.mean()
+
+
+def _overall_median(z: np.ndarray, chosen: np.ndarray) -> float:
+    values = z[chosen]
+    return float(np.partition(values, values.size // 2)[values.size // 2])
+
+
+def _difference_shifts(z: np.ndarray, chosen: np.ndarray | None, trim: float) -> np.ndarray:
+    steps = np.diff(z, axis=0)
+    both = None if chosen is None else chosen[1:] & chosen[:-1]
+    step = row_trimmed_mean(steps, both, trim)
+    if both is not None:
+        step[row_counts(steps, both) < fewest_for_row(z.shape[1])] = 0.0
+    shifts = np.concatenate([[0.0], np.cumsum(step)])
+    # Steps alone cannot tell drift from slope: the straight part stays in the data.
+    row = _centred(len(shifts))
+    return shifts - shifts.mean() - row * (row @ shifts) / (row @ row)
+
+
+def _matching_shifts(z: np.ndarray, chosen: np.ndarray | None) -> np.ndarray:
+    steps_m = np.nan_to_num(np.diff(z, axis=0) * _METRE_PER_UM, nan=0.0)
+    usable = np.ones(steps_m.shape, dtype=bool) if chosen is None else chosen[1:] & chosen[:-1]
+    bends_m = np.diff(steps_m, axis=1)
+    scale_m = (np.abs(bends_m) * usable[:, :-1]).sum(axis=1) / bends_m.shape[1]
+    weights = np.exp(-(bends_m**2) / (2 * np.where(scale_m > 0, scale_m, 1.0))[:, None])
+    weights[~usable[:, :-1]] = 0.0
+    pixel_weights = np.zeros_like(steps_m)
+    pixel_weights[:, :-1] += weights
+    pixel_weights[:, 1:] += weights
+    pixel_weights[~usable] = 0.0
+    total = 2 * weights.sum(axis=1)
+    step_m = (pixel_weights * steps_m).sum(axis=1) / np.where(total > 0, total, 1.0)
+    shifts = np.concatenate([[0.0], np.cumsum(step_m)]) / _METRE_PER_UM
+    return shifts - shifts.mean()
+
+
+def _row_polynomials(z: np.ndarray, chosen: np.ndarray | None, degree: int) -> np.ndarray:
+    """The fit of each row less the mean of all measured pixels, mask or not, as Gwyddion adds it back."""
+    overall = float(np.nanmean(z))
+    basis = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, z.shape[1]), degree)
+    if chosen is None:
+        directions, _ = np.linalg.qr(basis)
+        return (z @ directions) @ directions.T - overall
+    fitted = np.zeros_like(z)
+    for i in np.flatnonzero(row_counts(z, chosen) > degree):
+        coefficients, *_ = np.linalg.lstsq(basis[chosen[i]], z[i, chosen[i]], rcond=None)
+        fitted[i] = basis @ coefficients
+    return fitted - overall
+
+
+def _centred(n: int) -> np.ndarray:
+    return np.arange(n) - (n - 1) / 2

@@ -1,0 +1,136 @@
+"""Scars: short strokes along the fast axis where the feedback lost the surface."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+import numpy as np
+from scipy import ndimage, sparse
+from scipy.sparse import linalg
+
+from litho_data.errors import InputError
+from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
+
+ScarSign = Literal["both", "positive", "negative"]
+
+
+def mark_scars(
+    height: np.ndarray,
+    *,
+    high: float = 0.666,
+    low: float = 0.25,
+    min_length_px: int = 16,
+    max_width_px: int = 4,
+    sign: ScarSign = "both",
+    mask: np.ndarray | None = None,
+    masking: Masking = "exclude",
+) -> np.ndarray:
+    """Mark strokes along the rows that stand out from the rows above and below them.
+
+    A stroke of up to ``max_width_px`` rows stands out by the difference between its lowest pixel
+    and the higher of the two pixels that bound it above and below (the mirror image for negative
+    ones), in units of rms = sqrt(sum of squared differences between rows / number of pixels).
+    Runs along a row count where they reach ``high`` somewhere, stay above ``low`` and are at least
+    ``min_length_px`` long.
+
+    Returns:
+        bool (ny, nx); only selected pixels are marked.
+
+    Raises:
+        InputError: thresholds or sizes outside their range, or an unknown sign.
+    """
+    z = as_height(height)
+    if not 0 < low <= high or min_length_px < 1 or max_width_px < 1:
+        raise InputError(
+            "scar parameters",
+            got=f"low {low}, high {high}, min_length_px {min_length_px}, max_width_px {max_width_px}",
+            wanted="0 < low <= high and sizes of at least 1 px",
+        )
+    if sign not in get_args(ScarSign):
+        raise InputError("sign of the scars", got=repr(sign), wanted=" | ".join(get_args(ScarSign)))
+    chosen = select(z, mask, masking)
+    steps = np.diff(z, axis=0)
+    rms = np.sqrt(float(np.nansum(steps**2)) / z.size)
+    scars = np.zeros(z.shape, dtype=bool)
+    if rms == 0.0:
+        return scars
+    for direction in (1, -1):
+        if sign in ("both", "positive" if direction > 0 else "negative"):
+            prominence = _prominence(direction * z, max_width_px) / rms
+            scars |= _long_runs(prominence, low, high, min_length_px)
+    return scars if chosen is None else scars & chosen
+
+
+def remove_scars(height: np.ndarray, *, scars: np.ndarray) -> Levelled:
+    """Replace the marked pixels by the harmonic surface through their surroundings.
+
+    Solves Laplace's equation inside the marks; the border of the image counts as insulated. All
+    other pixels stay bit for bit, and ``removed`` is zero there.
+
+    Raises:
+        InputError: marks of another shape, or a marked area without any measured neighbour.
+    """
+    z = as_height(height)
+    if scars.shape != z.shape or scars.dtype != np.bool_:
+        raise InputError("scar mask", got=f"{scars.dtype} {scars.shape}", wanted=f"bool {z.shape}")
+    removed = np.zeros_like(z)
+    unknown = scars & np.isfinite(z)
+    if unknown.any():
+        removed[unknown] = z[unknown] - _harmonic(z, unknown)
+    return subtract(z, removed)
+
+
+def _prominence(z: np.ndarray, max_width_px: int) -> np.ndarray:
+    """By how much each pixel belongs to a ridge at most ``max_width_px`` rows wide."""
+    ny = z.shape[0]
+    prominence = np.zeros_like(z)
+    for width in range(1, min(max_width_px, ny - 2) + 1):
+        count = ny - width - 1
+        ridge = np.min([z[1 + k : 1 + k + count] for k in range(width)], axis=0)
+        gain = ridge - np.maximum(z[:count], z[width + 1 :])
+        for k in range(width):
+            part = prominence[1 + k : 1 + k + count]
+            np.fmax(part, gain, out=part)
+    return prominence
+
+
+def _long_runs(prominence: np.ndarray, low: float, high: float, min_length_px: int) -> np.ndarray:
+    along_row = np.array([[0, 0, 0], [1, 1, 1], [0, 0, 0]])
+    labels, count = ndimage.label(prominence >= low, structure=along_row)
+    lengths = np.bincount(labels.ravel(), minlength=count + 1)
+    reaches = np.zeros(count + 1, dtype=bool)
+    reaches[labels[prominence >= high]] = True
+    kept = reaches & (lengths >= min_length_px)
+    kept[0] = False
+    return kept[labels]
+
+
+def _harmonic(z: np.ndarray, unknown: np.ndarray) -> np.ndarray:
+    """Values of the unknown pixels, in the order of ``z[unknown]``."""
+    n = int(np.count_nonzero(unknown))
+    index = np.full(z.shape, -1)
+    index[unknown] = np.arange(n)
+    known = np.isfinite(z) & ~unknown
+    coupling, right, anchors = np.zeros(n), np.zeros(n), np.zeros(n)
+    pairs = []
+    for here, there in _neighbours():
+        for a, b in ((here, there), (there, here)):
+            inside, border = unknown[a] & unknown[b], unknown[a] & known[b]
+            pairs.append((index[a][inside], index[b][inside]))
+            np.add.at(coupling, index[a][inside], 1.0)
+            np.add.at(anchors, index[a][border], 1.0)
+            np.add.at(right, index[a][border], z[b][border])
+    labels, count = ndimage.label(unknown)
+    anchored = np.bincount(labels[unknown], weights=anchors, minlength=count + 1)[1:]
+    if (anchored == 0).any():
+        raise InputError(
+            "a marked area has no measured neighbour", wanted="marks that leave something around them"
+        )
+    rows, columns = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
+    links = sparse.csc_matrix((-np.ones(len(rows)), (rows, columns)), shape=(n, n))
+    return linalg.spsolve(links + sparse.diags(coupling + anchors, format="csc"), right)
+
+
+def _neighbours() -> tuple[tuple[tuple[slice, slice], tuple[slice, slice]], ...]:
+    every, first, last = slice(None), slice(None, -1), slice(1, None)
+    return (((first, every), (last, every)), ((every, first), (every, last)))

@@ -1,0 +1,65 @@
+"""What all levelling operations share: which pixels are used, and what is returned."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from litho_data.errors import InputError
+
+Masking = Literal["ignore", "exclude", "include"]
+MASKINGS: tuple[Masking, ...] = ("ignore", "exclude", "include")
+
+
+class Levelled(NamedTuple):
+    """A levelled map and what was taken away; ``height + removed`` is the map that came in.
+
+    Both are float64 (ny, nx) in the unit of the input. NaNs of the input stay NaN in ``height``;
+    ``removed`` is a number everywhere, and may be a read-only view where it is constant along an axis.
+    """
+
+    height: np.ndarray
+    removed: np.ndarray
+
+
+def as_height(height: np.ndarray) -> np.ndarray:
+    """The map as contiguous float64 (ny, nx).
+
+    Raises:
+        InputError: not two-dimensional or below 2 x 2 pixels.
+    """
+    z = np.ascontiguousarray(height, dtype=np.float64)
+    if z.ndim != 2 or min(z.shape) < 2:
+        raise InputError("shape of the height map", got=z.shape, wanted="(ny, nx), at least 2 x 2")
+    return z
+
+
+def select(z: np.ndarray, mask: np.ndarray | None, masking: Masking) -> np.ndarray | None:
+    """Pixels that an operation may use, bool (ny, nx); None where it may use all of them.
+
+    Pixels that were not measured (NaN) are never used.
+
+    Raises:
+        InputError: a mask that is not boolean or has another shape, an unknown masking, or a
+            selection without any pixel.
+    """
+    if masking not in MASKINGS:
+        raise InputError("masking", got=repr(masking), wanted=" | ".join(MASKINGS))
+    chosen = None
+    if mask is not None and masking != "ignore":
+        if mask.dtype != np.bool_ or mask.shape != z.shape:
+            raise InputError("mask", got=f"{mask.dtype} {mask.shape}", wanted=f"bool {z.shape}")
+        chosen = ~mask if masking == "exclude" else mask
+    if not math.isfinite(float(z.sum())):
+        measured = np.isfinite(z)
+        chosen = measured if chosen is None else chosen & measured
+    if chosen is not None and not chosen.any():
+        raise InputError("no pixel is left to level with", wanted="a mask that leaves measured pixels")
+    return chosen
+
+
+def subtract(z: np.ndarray, removed: np.ndarray) -> Levelled:
+    """The map less the surface."""
+    return Levelled(z - removed, removed)

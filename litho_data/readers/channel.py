@@ -1,0 +1,73 @@
+"""What every reader hands over: the channels of a file, described before they are loaded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from litho_data.errors import InputError
+from litho_data.scan import Axis
+from litho_data.units import is_length
+
+# 2 GiB as float64: beyond it a damaged header is far likelier than a scan.
+_MAX_PIXELS = 2**28
+
+Loaded = tuple[np.ndarray, np.ndarray | None]
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One two-dimensional map in a file.
+
+    Args:
+        name: unique within the file.
+        shape: (ny, nx) in pixels.
+        unit: of the values, as the file states it; None where it does not.
+        size_um: (y, x) extent from edge to edge; None where the file does not state it.
+        load: returns the values, (ny, nx) in ``unit``, row 0 on top, and the file's mask or None.
+        full_scale: the largest value of an integer image; None for real numbers.
+        fast_axis: None where the file does not state it.
+        header: what the file states, word by word.
+    """
+
+    name: str
+    shape: tuple[int, int]
+    unit: str | None
+    size_um: tuple[float, float] | None
+    load: Callable[[], Loaded]
+    full_scale: float | None = None
+    fast_axis: Axis | None = None
+    header: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if min(self.shape) < 2 or self.shape[0] * self.shape[1] > _MAX_PIXELS:
+            raise InputError(
+                f"channel {self.name!r}: size in pixels",
+                got=f"{self.shape[0]} x {self.shape[1]}",
+                wanted=f"2 x 2 up to {_MAX_PIXELS} pixels",
+                hint="the file may be damaged",
+            )
+
+    @property
+    def is_height(self) -> bool:
+        """A length, or a value whose unit only the caller can know."""
+        return self.unit is None or is_length(self.unit)
+
+    def describe(self) -> str:
+        """Name, size and unit in a few words, for messages."""
+        unit = "no unit" if self.unit is None else self.unit
+        return f"{self.name!r} ({self.shape[0]} x {self.shape[1]}, {unit})"
+
+
+def with_unique_names(channels: list[Channel]) -> list[Channel]:
+    """Number the channels that share a name, such as trace and retrace, so that each can be chosen."""
+    from dataclasses import replace
+
+    seen: dict[str, int] = {}
+    unique = []
+    for channel in channels:
+        count = seen[channel.name] = seen.get(channel.name, 0) + 1
+        unique.append(channel if count == 1 else replace(channel, name=f"{channel.name} #{count}"))
+    return unique

@@ -1,0 +1,154 @@
+"""Reading one scan: format, channel, unit and size are settled here, once, for every format."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from litho_data.errors import InputError
+from litho_data.readers import gsf, gwy, npy, text_matrix, tiff, vendor
+from litho_data.readers.channel import Channel
+from litho_data.readers.detect import detect_format, require_file
+from litho_data.scan import Axis, Scan
+from litho_data.units import um_per
+
+_READERS = {
+    "text-matrix": text_matrix.read_channels,
+    "tiff": tiff.read_channels,
+    "npy": npy.read_channels,
+    "gsf": gsf.read_channels,
+    "gwy": gwy.read_channels,
+    "vendor": vendor.read_channels,
+}
+FORMATS = ("auto", *_READERS)
+
+# Sizes that files state are rounded to a few digits when they are written.
+_SIZE_TOLERANCE = 1e-4
+
+
+def read_scan(
+    path: str | Path,
+    *,
+    format: str = "auto",
+    unit: str | None = None,
+    size_um: tuple[float, float] | None = None,
+    channel: str | None = None,
+    fast_axis: Axis | None = None,
+    full_scale_um: float | None = None,
+) -> Scan:
+    """Read one height map.
+
+    Args:
+        path: the instrument's file.
+        format: one of ``FORMATS``; ``"auto"`` judges the content.
+        unit: of the heights, needed where the file states none.
+        size_um: (y, x) extent from edge to edge, µm, for files that state none; without it the
+            pitch stays unknown (None).
+        channel: which channel; needed where a file has several height channels.
+        fast_axis: ``"x"`` or ``"y"`` where it is known and the file does not state it.
+        full_scale_um: height of the largest integer value, for images that hold integers:
+            height = value / largest value · full_scale_um. Takes the place of ``unit``.
+
+    Raises:
+        InputError: unreadable, no or several height channels, a missing or contradicting unit or
+            size, nothing finite in the map.
+    """
+    file = require_file(path)
+    kind = _settle_format(file, format)
+    chosen = _choose(file, _READERS[kind](file), channel)
+    values, mask = chosen.load()
+    stated_unit, factor = _settle_unit(file, chosen, unit, full_scale_um)
+    return Scan(
+        height_um=_to_um(np.asarray(values, dtype=np.float64), factor),
+        pitch_um=_settle_pitch(file, chosen, size_um),
+        name=file.stem,
+        channel=chosen.name,
+        unit=stated_unit,
+        fast_axis=_settle_fast_axis(file, chosen, fast_axis),
+        mask=mask,
+        header=chosen.header,
+        source=str(file),
+        format=kind,
+    )
+
+
+def list_channels(path: str | Path, *, format: str = "auto") -> list[Channel]:
+    """All channels of a file, heights and others, without choosing one.
+
+    Raises:
+        InputError: unreadable or of unknown format.
+    """
+    file = require_file(path)
+    return _READERS[_settle_format(file, format)](file)
+
+
+def _settle_format(file: Path, format: str) -> str:
+    if format not in FORMATS:
+        raise InputError("scan format", got=repr(format), wanted=" | ".join(FORMATS))
+    kind = detect_format(file) if format == "auto" else format
+    if kind not in _READERS:
+        raise InputError(f"{file}: format", got=f"a picture ({kind})", wanted="a file with heights")
+    return kind
+
+
+def _choose(file: Path, channels: list[Channel], name: str | None) -> Channel:
+    listed = ", ".join(channel.describe() for channel in channels) or "none"
+    if name is not None:
+        for channel in channels:
+            if channel.name == name:
+                if not channel.is_height:
+                    raise InputError(f"{file}: channel {name!r} is no height", got=f"unit {channel.unit!r}")
+                return channel
+        raise InputError(f"{file}: channel", got=repr(name), wanted=f"one of {listed}")
+    heights = [channel for channel in channels if channel.is_height]
+    if len(heights) == 1:
+        return heights[0]
+    problem = "several height channels" if heights else "no height channel"
+    hint = "choose one by its name with channel" if heights else ""
+    raise InputError(f"{file} has {problem}", got=listed, wanted="one", hint=hint)
+
+
+def _settle_unit(
+    file: Path, channel: Channel, unit: str | None, full_scale_um: float | None
+) -> tuple[str, float]:
+    """The unit of the file and the factor from its values to µm."""
+    if full_scale_um is not None:
+        if channel.full_scale is None or channel.unit is not None or unit is not None:
+            raise InputError(f"{file}: full scale", got=full_scale_um, wanted="an integer image and no unit")
+        if not (np.isfinite(full_scale_um) and full_scale_um > 0):
+            raise InputError(f"{file}: full scale in µm", got=full_scale_um, wanted="a positive number")
+        return f"{full_scale_um:g} µm / {channel.full_scale:g}", full_scale_um / channel.full_scale
+    if unit is None and channel.unit is None:
+        raise InputError(f"{file} does not state the unit of its heights", wanted="unit, for example 'm'")
+    if unit is not None and channel.unit is not None and um_per(unit) != um_per(channel.unit):
+        raise InputError(f"{file}: unit", got=repr(unit), wanted=f"{channel.unit!r} as in the file, or none")
+    stated = channel.unit if channel.unit is not None else str(unit)
+    return stated, um_per(stated)
+
+
+def _to_um(values: np.ndarray, factor: float) -> np.ndarray:
+    """Scaled to µm; a factor below one is applied as a division, so that 100 nm is 0.1 µm exactly."""
+    inverse = round(1 / factor)
+    return values / inverse if factor < 1 and np.isclose(inverse * factor, 1, rtol=1e-12) else values * factor
+
+
+def _settle_pitch(
+    file: Path, channel: Channel, size_um: tuple[float, float] | None
+) -> tuple[float, float] | None:
+    stated = channel.size_um
+    if size_um is not None:
+        if len(size_um) != 2 or not all(np.isfinite(size) and size > 0 for size in size_um):
+            raise InputError(f"{file}: size_um", got=size_um, wanted="two positive numbers (y, x) in µm")
+        if stated is not None and not np.allclose(size_um, stated, rtol=_SIZE_TOLERANCE, atol=0):
+            raise InputError(f"{file}: size_um", got=size_um, wanted=f"{stated} as in the file, or none")
+    size = stated if stated is not None else size_um
+    return None if size is None else (size[0] / channel.shape[0], size[1] / channel.shape[1])
+
+
+def _settle_fast_axis(file: Path, channel: Channel, fast_axis: Axis | None) -> Axis | None:
+    if fast_axis not in (None, "x", "y"):
+        raise InputError(f"{file}: fast axis", got=repr(fast_axis), wanted="'x' or 'y'")
+    if fast_axis is not None and channel.fast_axis is not None and fast_axis != channel.fast_axis:
+        raise InputError(f"{file}: fast axis", got=fast_axis, wanted=f"{channel.fast_axis} as in the file")
+    return channel.fast_axis or fast_axis

@@ -1,0 +1,156 @@
+"""Text matrices: one line per row, numbers apart by tabs, blanks, commas or semicolons."""
+
+from __future__ import annotations
+
+import io
+import re
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+
+from litho_data.errors import InputError
+from litho_data.readers.channel import Channel
+from litho_data.units import is_length, um_per
+
+_TEXT_BYTES = bytes(range(0x20, 0x7F)) + b"\t\n\r\x0c"
+_EMPTY_CELL = re.compile(rb"[,;][ \t]*[,;]")
+_EXPONENT = re.compile(r"[eE][+-]?\d+$")
+_LENGTH = re.compile(r"^\s*([-+\d.eE]+)\s*(\S+)\s*$")
+_COMMENT = b"#"
+
+
+def read_channels(path: Path) -> list[Channel]:
+    """The one channel of a text matrix; unit and size only if comment lines of Gwyddion state them.
+
+    Comment lines start with ``#``. A decimal comma is accepted where the cells are not separated
+    by commas. ``nan`` marks a pixel that was not measured.
+
+    Raises:
+        InputError: binary or empty file, something that is no number, rows of different lengths,
+            or a last number that was cut off; the message names the line.
+    """
+    raw = path.read_bytes().removeprefix(b"\xef\xbb\xbf")
+    comments, body, first_line = _split_comments(raw)
+    header = _header(comments)
+    values = _parse(path, body, first_line)
+    return [
+        Channel(
+            name=header.get("Channel", "height"),
+            shape=(values.shape[0], values.shape[1]),
+            unit=header.get("Value units"),
+            size_um=_size_um(header),
+            load=lambda: (values, None),
+            header=header,
+        )
+    ]
+
+
+def _split_comments(raw: bytes) -> tuple[list[bytes], bytes, int]:
+    """Comment lines on top, the rest, and the number of the first line of the rest."""
+    comments = []
+    start = 0
+    while raw.startswith(_COMMENT, start):
+        end = raw.find(b"\n", start)
+        end = len(raw) if end < 0 else end + 1
+        comments.append(raw[start:end])
+        start = end
+    return comments, raw[start:], len(comments) + 1
+
+
+def _header(comments: list[bytes]) -> dict[str, str]:
+    header = {}
+    for index, line in enumerate(comments):
+        text = line.decode("utf-8", errors="replace").strip("# \t\r\n")
+        key, colon, value = text.partition(":")
+        header[key.strip() if colon else f"comment {index + 1}"] = value.strip() if colon else text
+    return header
+
+
+def _size_um(header: dict[str, str]) -> tuple[float, float] | None:
+    sizes = []
+    for key in ("Height", "Width"):
+        match = _LENGTH.match(header.get(key, ""))
+        if match is None or not is_length(match[2]):
+            return None
+        try:
+            sizes.append(float(match[1]) * um_per(match[2]))
+        except ValueError:
+            return None
+    return sizes[0], sizes[1]
+
+
+def _parse(path: Path, body: bytes, first_line: int) -> np.ndarray:
+    if strange := body.translate(None, _TEXT_BYTES):
+        position = body.index(strange[:1])
+        line = first_line + body.count(b"\n", 0, position)
+        raise InputError(f"{path} line {line}", got=f"byte 0x{strange[0]:02x}", wanted="a text of numbers")
+    if not body.strip():
+        raise InputError(f"{path} holds no numbers", wanted="one line per row of the height map")
+    if empty := _EMPTY_CELL.search(body):
+        line = first_line + body.count(b"\n", 0, empty.start())
+        raise InputError(
+            f"{path} line {line}", got="an empty cell", wanted="a number, or nan where not measured"
+        )
+    cells = _separate_by_blanks(body)
+    _refuse_cut_number(path, cells, first_line)
+    try:
+        values = np.loadtxt(io.BytesIO(cells), dtype=np.float64, comments=None, ndmin=2)
+    except ValueError:
+        _complain(path, cells, first_line)
+    return values
+
+
+def _separate_by_blanks(body: bytes) -> bytes:
+    """Turn separators into blanks and a decimal comma into a point."""
+    first = body.lstrip().split(b"\n", 1)[0].strip()
+    apart_by_other = any(mark in first for mark in (b";", b"\t", b" "))
+    decimal_comma = b"," in first and b"." not in first and apart_by_other and not re.search(rb",\s", first)
+    return body.translate(bytes.maketrans(b",;\x0c", b".  " if decimal_comma else b"   "))
+
+
+def _refuse_cut_number(path: Path, cells: bytes, first_line: int) -> None:
+    """A copy that stopped inside the last number (5.4e-007 -> 5.4) would otherwise read as 5.4 m."""
+    if cells.endswith((b"\n", b"\r")):
+        return
+    last_row = cells[cells.rfind(b"\n") + 1 :].decode("ascii").split()
+    if len(last_row) < 2:
+        return
+    before, last = _EXPONENT.search(last_row[-2]), _EXPONENT.search(last_row[-1])
+    if before is not None and (last is None or len(last[0]) < len(before[0])):
+        line = first_line + cells.count(b"\n")
+        raise InputError(
+            f"{path} line {line} ends inside a number",
+            got=repr(last_row[-1]),
+            wanted=f"a number spelt like {last_row[-2]!r}",
+            hint="the file may be truncated",
+        )
+
+
+def _complain(path: Path, cells: bytes, first_line: int) -> NoReturn:
+    """Find the first line that is to blame; only reached when the fast parser refused the text."""
+    width, width_line = 0, 0
+    for line, row in enumerate(cells.decode("ascii").splitlines(), start=first_line):
+        tokens = row.split()
+        for token in tokens:
+            if not _is_number(token):
+                raise InputError(f"{path} line {line}", got=repr(token[:24]), wanted="a number")
+        if tokens and width and len(tokens) != width:
+            raise InputError(
+                f"{path} line {line}",
+                got=f"{len(tokens)} values",
+                wanted=f"{width} values as in line {width_line}",
+                hint="the file may be truncated",
+            )
+        if tokens and not width:
+            width, width_line = len(tokens), line
+    raise InputError(f"{path} is no matrix of numbers", wanted="one line per row, cells apart by tabs")
+
+
+def _is_number(token: str) -> bool:
+    try:
+        float(token)
+    except ValueError:
+        return False
+    # Python alone takes 1_000 for a number.
+    return "_" not in token

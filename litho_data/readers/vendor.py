@@ -1,0 +1,112 @@
+"""Instrument makers' formats (IBW, SPM, JPK, X3P, SUR, …) through SurfaceTopography."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager, closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from litho_data.errors import InputError
+from litho_data.readers.channel import Channel, Loaded, with_unique_names
+from litho_data.readers.foreign import foreign_parser
+from litho_data.readers.vendor_headers import fast_axis, vendor_header
+from litho_data.units import is_length, um_per
+
+# Left out: formats with readers of our own, plain text, and two that have no signature and would
+# take any bytes of a fitting length for a map.
+_NOT_OURS = {"npy", "npz", "gwy", "asc", "xyz", "hgt", "nms"}
+_HEAD_BYTES = 512
+# Deflate, the strongest compression in use, packs at most 1032 bytes into one.
+_MOST_PIXELS_PER_BYTE = 1032
+
+
+def read_channels(path: Path) -> list[Channel]:
+    """The two-dimensional channels of an instrument's file, in the order of the file.
+
+    Raises:
+        InputError: no reader recognises the file, it is damaged, or it holds no map.
+    """
+    kind = _recognise(path)
+    header = vendor_header(path, kind)
+    with foreign_parser(path, kind), _open(path, kind) as reader:
+        channels = [_channel(path, kind, info, header) for info in reader.channels if info.dim == 2]
+    size = path.stat().st_size
+    for channel in channels:
+        if channel.shape[0] * channel.shape[1] > _MOST_PIXELS_PER_BYTE * size:
+            got = f"{size} bytes for {channel.shape[0]} x {channel.shape[1]} pixels"
+            raise InputError(f"{path} ({kind})", got=got, wanted="more", hint="the file may be damaged")
+    if not channels:
+        raise InputError(f"{path} ({kind}) holds no two-dimensional channel")
+    return with_unique_names(channels)
+
+
+def _recognise(path: Path) -> str:
+    """SurfaceTopography's name of the format: the first whose reader opens the file."""
+    from SurfaceTopography.IO import readers
+    from SurfaceTopography.IO.Reader import MagicMatch
+
+    with path.open("rb") as stream:
+        head = stream.read(_HEAD_BYTES)
+    refusals = []
+    for kind, can_read in ((reader.format(), reader.can_read) for reader in readers):
+        if kind in _NOT_OURS or can_read(head) == MagicMatch.NO:
+            continue
+        try:
+            with foreign_parser(path, kind), _open(path, kind):
+                return kind
+        except InputError as error:
+            refusals.append(error)
+    if len(refusals) == 1:
+        raise refusals[0]
+    raise InputError(f"{path}: format", got=f"unknown content {head[:8]!r}", wanted="a known AFM format")
+
+
+def _open(path: Path, kind: str) -> AbstractContextManager[Any]:
+    from SurfaceTopography.IO import open_topography
+
+    return closing(open_topography(str(path), format=kind))
+
+
+def _channel(path: Path, kind: str, info: Any, header: dict[str, str]) -> Channel:
+    nx, ny = info.nb_grid_pts
+    sizes = info.physical_sizes
+    unit = info.unit if info.is_height_channel else info.data_unit or "not a length"
+    lateral_unit = info.lateral_unit
+    return Channel(
+        name=str(info.name),
+        shape=(int(ny), int(nx)),
+        unit=unit,
+        size_um=_size_um(sizes, lateral_unit),
+        load=lambda: _load(path, kind, info.index, sizes is None),
+        fast_axis=fast_axis(header),
+        header=header or dict(_flatten(info.info.get("raw_metadata", info.info))),
+    )
+
+
+def _size_um(sizes: Any, unit: str | None) -> tuple[float, float] | None:
+    if sizes is None or unit is None or not is_length(unit):
+        return None
+    size = float(sizes[1]) * um_per(unit), float(sizes[0]) * um_per(unit)
+    return size if all(np.isfinite(size)) and min(size) > 0 else None
+
+
+def _load(path: Path, kind: str, index: int, without_size: bool) -> Loaded:
+    """Heights with row 0 on top: SurfaceTopography indexes [x, y] with y downwards."""
+    # A size is demanded even where the file has none; heights do not depend on it.
+    arguments = {"physical_sizes": (1.0, 1.0)} if without_size else {}
+    with foreign_parser(path, kind), _open(path, kind) as reader:
+        heights = reader.topography(channel_index=index, **arguments).heights()
+        values = np.ma.filled(np.ma.asarray(heights, dtype=np.float64), np.nan)
+    return np.ascontiguousarray(values.T), None
+
+
+def _flatten(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
+    for key, value in content.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            yield from _flatten(value, f"{name}/")
+        else:
+            yield name, str(value)

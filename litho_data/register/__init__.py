@@ -1,0 +1,19 @@
+"""Registration of AFM scans onto the layouts they were printed from."""
+
+from litho_data.register.geometry import apply_transform
+from litho_data.register.quality import RegistrationQuality, Thresholds
+from litho_data.register.resample import resample_to_layout
+from litho_data.register.scan import Registration, centred_placement, register_scan
+from litho_data.register.topography import predicted_topography, smooth_measured
+
+__all__ = [
+    "Registration",
+    "RegistrationQuality",
+    "Thresholds",
+    "apply_transform",
+    "centred_placement",
+    "predicted_topography",
+    "register_scan",
+    "resample_to_layout",
+    "smooth_measured",
+]

@@ -1,0 +1,129 @@
+"""From nothing to within a few pixels: orientation, polarity and a robust affine, with fallbacks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from litho_data.register.features import Correspondence, match_blocks, match_features
+from litho_data.register.geometry import (
+    ORIENTATIONS,
+    apply_transform,
+    centre,
+    linear_part,
+    nearest_orientation,
+    orient,
+    orientation_matrix,
+    overlap_of,
+)
+from litho_data.register.orientation import TIE, Hypothesis, search_orientation
+from litho_data.register.topography import predicted_topography
+
+CLEAR_MARGIN = 0.1
+# Correlation above which a hypothesis is believed without features to support it.
+CONVINCING = 0.7
+MIN_INLIERS = 30
+MIN_COVERAGE = 0.5
+MIN_BLOCK_AGREEMENT = 0.5
+SEARCH_BLUR_PX = 2.0
+
+
+@dataclass(frozen=True)
+class CoarseFit:
+    """Where the scan lies, to a few pixels.
+
+    ``layout_to_oriented`` maps layout indices to indices of ``orient(scan, orientation) * polarity``.
+    ``method`` is what found it: ``orb``, ``sift``, ``blocks``, or ``correlation`` when no points were usable.
+    """
+
+    orientation: str
+    polarity: int
+    layout_to_oriented: np.ndarray
+    method: str
+    points: Correspondence | None
+
+
+def find_coarse(
+    scan: np.ndarray, layout_level: np.ndarray, *, search: bool, features: bool, seed: int
+) -> CoarseFit | None:
+    """The best coarse fit, or None if scan or layout shows no structure.
+
+    Args:
+        scan: (ny, nx) heights at the layout's pitch without bow, NaN where not measured.
+        layout_level: (ny, nx) integer levels.
+        search: whether all eight orientations and both polarities are open, or only the identity.
+        features: whether keypoints may be matched; on a layout that repeats itself they match everywhere.
+        seed: of the robust estimators.
+    """
+    allowed = (tuple(ORIENTATIONS), (1, -1)) if search else (("identity",), (1,))
+    hypotheses = search_orientation(scan, predicted_topography(layout_level, SEARCH_BLUR_PX), *allowed)
+    if not hypotheses:
+        return None
+    best = _upright_if_tied(hypotheses)
+    for method, orientation, polarity in _attempts(best, hypotheses) if features else ():
+        fit = _fit_features(method, scan, layout_level, orientation, polarity, seed)
+        if fit is not None and fit.orientation in allowed[0]:
+            return fit
+    return _fit_without_features(scan, layout_level, best, seed)
+
+
+def _upright_if_tied(hypotheses: list[Hypothesis]) -> Hypothesis:
+    """The best hypothesis, or the upright one where a symmetric layout makes it just as good."""
+    best = hypotheses[0]
+    for hypothesis in hypotheses:
+        upright = (hypothesis.orientation, hypothesis.polarity) == ("identity", 1)
+        if upright and hypothesis.ncc > max(CONVINCING, best.ncc - TIE):
+            return hypothesis
+    return best
+
+
+def _attempts(best: Hypothesis, hypotheses: list[Hypothesis]) -> list[tuple[str, str, int]]:
+    """(method, orientation, polarity) to try in turn.
+
+    ORB and SIFT see through rotations, so that only the four combinations of mirror image and polarity
+    differ; they are all tried where correlation leaves the orientation open.
+    """
+    own = (best.orientation, best.polarity)
+    rivals = [h.ncc for h in hypotheses if (h.orientation, h.polarity) != own]
+    if best is not hypotheses[0] or best.ncc - max(rivals, default=-1.0) >= CLEAR_MARGIN:
+        return [("orb", *own), ("sift", *own)]
+    families: dict[tuple[int, int], tuple[str, int]] = {}
+    for hypothesis in hypotheses:
+        handedness = round(np.linalg.det(orientation_matrix(hypothesis.orientation, (1, 1))))
+        families.setdefault((handedness, hypothesis.polarity), (hypothesis.orientation, hypothesis.polarity))
+    return [*(("orb", *family) for family in families.values()), ("sift", *own)]
+
+
+def _fit_features(
+    method: str, scan: np.ndarray, layout_level: np.ndarray, orientation: str, polarity: int, seed: int
+) -> CoarseFit | None:
+    """A fit from matched keypoints, or None if its inliers are too few or too clustered."""
+    points = match_features(method, polarity * orient(scan, orientation), layout_level, seed)
+    if points is None or points.inlier.sum() < MIN_INLIERS:
+        return None
+    shape = (scan.shape[0], scan.shape[1])
+    layout_shape = (layout_level.shape[0], layout_level.shape[1])
+    from_family = np.linalg.inv(orientation_matrix(orientation, shape))
+    to_layout = np.linalg.inv(linear_part(from_family @ points.layout_to_scan, centre(layout_shape)))
+    # The keypoints may have found a quarter turn that the correlation had missed.
+    found = nearest_orientation(to_layout)
+    turn = orientation_matrix(found, shape) @ from_family
+    warp = turn @ points.layout_to_scan
+    points = replace(points, scan_points=apply_transform(turn, points.scan_points), layout_to_scan=warp)
+    overlap = overlap_of(warp, layout_shape, orient(np.isfinite(scan), found))
+    if points.coverage(overlap) < MIN_COVERAGE:
+        return None
+    return CoarseFit(found, polarity, warp, method, points)
+
+
+def _fit_without_features(
+    scan: np.ndarray, layout_level: np.ndarray, hypothesis: Hypothesis, seed: int
+) -> CoarseFit:
+    orientation, polarity = hypothesis.orientation, hypothesis.polarity
+    points = match_blocks(
+        polarity * orient(scan, orientation), layout_level, hypothesis.layout_to_oriented, seed
+    )
+    if points is not None and points.inlier.mean() >= MIN_BLOCK_AGREEMENT:
+        return CoarseFit(orientation, polarity, points.layout_to_scan, "blocks", points)
+    return CoarseFit(orientation, polarity, hypothesis.layout_to_oriented, "correlation", None)

@@ -1,0 +1,151 @@
+"""How well a registration is known: held-out blocks, bootstrap, correlation, information."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from litho_data.register.geometry import corners
+from litho_data.register.refine import BORDER_PX, Refinement, corner_motion_px, solve_gram
+from litho_data.register.topography import pearson, smooth_measured
+
+WINDOW_CELLS = 4
+WINDOW_SEARCH_PX = 6
+MIN_MEASURED = 0.9
+BOOTSTRAP_SAMPLES = 200
+
+
+@dataclass(frozen=True)
+class BlockShifts:
+    """What single blocks of the field say about the warp; all (n, 2) as (x, y), layout pixels.
+
+    ``shift_px`` is how far a block's content lies from where the warp puts it, ``held_out_px`` the same
+    against a warp that was fitted without the block.
+    """
+
+    middle_px: np.ndarray
+    shift_px: np.ndarray
+    held_out_px: np.ndarray
+
+    def held_out_error_percentiles_px(self, *percents: float) -> list[float]:
+        """Percentiles of the target registration error, NaN without blocks."""
+        lengths = np.hypot(*self.held_out_px.T)
+        return [float(np.percentile(lengths, p)) if len(lengths) else float("nan") for p in percents]
+
+    def curve_px(self, axis: int) -> float:
+        """Peak to valley of the mean shift along an axis (0 = x, 1 = y) as a function of that coordinate.
+
+        A straight scanner and a sufficient model leave only noise; a curve means that the scanner's axis is
+        not linear, which no rung of the ladder can follow.
+        """
+        places = np.unique(self.middle_px[:, axis])
+        if len(places) < 3:
+            return float("nan")
+        return float(
+            np.ptp([self.shift_px[self.middle_px[:, axis] == place, axis].mean() for place in places])
+        )
+
+
+def match_blocks_of_field(
+    refinement: Refinement, registered: np.ndarray, measured: np.ndarray, topography: np.ndarray
+) -> BlockShifts:
+    """The shift of every block, and against a warp refitted to the pixels outside it.
+
+    Args:
+        registered: (ny, nx) smoothed scan on the layout's pixels without background, gaps filled.
+        measured: (ny, nx) where it was measured.
+        topography: (ny, nx) blur-matched topography.
+
+    Blocks are half-overlapping windows of four cells, away from the layout's border, with structure and
+    at most a tenth of gaps. A block's shift is the peak of its normalised cross-correlation (parabola
+    through the neighbours).
+    """
+    import cv2
+
+    gram, shape = refinement.gram, (topography.shape[0], topography.shape[1])
+    size = min(WINDOW_CELLS, gram.shape[0] // 2, gram.shape[1] // 2)
+    total, scale = gram.sum(axis=(0, 1)), np.array(shape) / gram.shape[:2]
+    image, template = registered.astype(np.float32), topography.astype(np.float32)
+    middles, shifts, held_out = [], [], []
+    step = max(1, size // 2)
+    for i in range(0, gram.shape[0] - size + 1, step) if size else ():
+        for j in range(0, gram.shape[1] - size + 1, step):
+            top, left = np.maximum(np.rint(scale * (i, j)).astype(int), BORDER_PX)
+            bottom, right = np.minimum(
+                np.rint(scale * (i + size, j + size)).astype(int), np.array(shape) - BORDER_PX
+            )
+            block = template[top:bottom, left:right]
+            if measured[top:bottom, left:right].mean() < MIN_MEASURED or block.std() < 0.1 * template.std():
+                continue
+            window = image[
+                top - WINDOW_SEARCH_PX : bottom + WINDOW_SEARCH_PX,
+                left - WINDOW_SEARCH_PX : right + WINDOW_SEARCH_PX,
+            ]
+            shift = _peak(cv2.matchTemplate(window, block, cv2.TM_CCOEFF_NORMED)) - WINDOW_SEARCH_PX
+            others = total - gram[i : i + size, j : j + size].sum(axis=(0, 1))
+            middle = np.array([(left + right - 1) / 2, (top + bottom - 1) / 2])
+            # The scan shows at x what the topography has at x - shift; the refit explains x + motion.
+            motion = corner_motion_px(solve_gram(others), shape, middle[None])[0]
+            middles.append(middle)
+            shifts.append(shift)
+            held_out.append(shift + motion)
+    return BlockShifts(*(np.reshape(values, (-1, 2)) for values in (middles, shifts, held_out)))
+
+
+def bootstrap_corner_sd_px(refinement: Refinement, shape: tuple[int, int], seed: int) -> float:
+    """Largest standard deviation of a corner when the field's blocks are drawn with replacement, px."""
+    blocks = refinement.blocks()
+    blocks = blocks.reshape(-1, *blocks.shape[2:])
+    if len(blocks) < 4:
+        return float("nan")
+    even = np.full(len(blocks), 1 / len(blocks))
+    counts = np.random.default_rng(seed).multinomial(len(blocks), even, BOOTSTRAP_SAMPLES)
+    samples = np.einsum("sb,bij->sij", counts.astype(float), blocks)
+    motion = corner_motion_px(solve_gram(samples), shape, corners(shape))
+    return float(np.sqrt(motion.var(axis=0).sum(axis=-1)).max())
+
+
+def height_correlation(height: np.ndarray, layout_level: np.ndarray) -> float:
+    """Pearson correlation of heights, smoothed with sigma = 1 px, with the layout as it is.
+
+    Over valid pixels at least 8 px from the border of the layout; heights (ny, nx) with NaN.
+    """
+    chosen = _interior(height)
+    if chosen.sum() < 16:
+        return float("nan")
+    return pearson(smooth_measured(height, 1.0)[chosen], layout_level[chosen].astype(np.float64))
+
+
+def mutual_information_bit(height: np.ndarray, layout_level: np.ndarray) -> float:
+    """Mutual information of height (64 equally filled classes) and level over the same pixels, bit."""
+    chosen = _interior(height)
+    if chosen.sum() < 16:
+        return float("nan")
+    values = height[chosen]
+    classes = np.searchsorted(np.quantile(values, np.arange(1, 64) / 64), values)
+    levels = np.unique(layout_level[chosen], return_inverse=True)[1]
+    counts = np.bincount(levels * 64 + classes, minlength=64 * (levels.max() + 1))
+    joint = counts.reshape(-1, 64) / len(values)
+    product = joint.sum(axis=1, keepdims=True) * joint.sum(axis=0, keepdims=True)
+    present = joint > 0
+    return float((joint[present] * np.log2(joint[present] / product[present])).sum())
+
+
+def _interior(height: np.ndarray) -> np.ndarray:
+    chosen = np.zeros(height.shape, bool)
+    inner = (slice(BORDER_PX, -BORDER_PX),) * 2
+    chosen[inner] = np.isfinite(height[inner])
+    return chosen
+
+
+def _peak(score: np.ndarray) -> np.ndarray:
+    """Sub-pixel position (x, y) of the maximum; a maximum on the rim stays where it is."""
+    row, column = (int(k) for k in np.unravel_index(np.argmax(score), score.shape))
+    position = np.array([column, row], dtype=np.float64)
+    for axis, line, k in ((0, score[row], column), (1, score[:, column], row)):
+        if 0 < k < len(line) - 1:
+            before, at, after = (float(value) for value in line[k - 1 : k + 2])
+            curvature = before - 2 * at + after
+            position[axis] += (before - after) / (2 * curvature) if curvature < 0 else 0.0
+    return position

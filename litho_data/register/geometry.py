@@ -1,0 +1,103 @@
+"""Frames, units and orientations: how pixel indices, micrometres and turned images relate.
+
+Points are rows ``(x, y)``; matrices are 3×3 and act on ``(x, y, 1)``. An *index* frame counts
+pixel centres 0, 1, 2 …; the micrometre frame of the same image has those centres at
+``(i + 0.5) * pitch_um``.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+# name: (transpose, then flip rows, then flip columns); the operation that turns the scan onto the layout.
+ORIENTATIONS: dict[str, tuple[bool, bool, bool]] = {
+    "identity": (False, False, False),
+    "rotate-90": (True, True, False),
+    "rotate-180": (False, True, True),
+    "rotate-270": (True, False, True),
+    "flip-x": (False, False, True),
+    "flip-y": (False, True, False),
+    "transpose": (True, False, False),
+    "anti-transpose": (True, True, True),
+}
+
+
+def index_to_um(pitch_um: tuple[float, float]) -> np.ndarray:
+    """The matrix that takes pixel indices (x, y) to µm for a (y, x) pitch."""
+    pitch_y, pitch_x = pitch_um
+    return np.array([[pitch_x, 0.0, pitch_x / 2], [0.0, pitch_y, pitch_y / 2], [0.0, 0.0, 1.0]])
+
+
+def orient(image: np.ndarray, orientation: str) -> np.ndarray:
+    """The image turned by one of the eight operations of ``ORIENTATIONS`` (a view)."""
+    transpose, flip_y, flip_x = ORIENTATIONS[orientation]
+    turned = image.T if transpose else image
+    turned = turned[::-1] if flip_y else turned
+    return turned[:, ::-1] if flip_x else turned
+
+
+def orientation_matrix(orientation: str, shape: tuple[int, int]) -> np.ndarray:
+    """Takes an index of an image of this (y, x) shape to its index in ``orient(image, orientation)``."""
+    transpose, flip_y, flip_x = ORIENTATIONS[orientation]
+    ny, nx = shape[::-1] if transpose else shape
+    matrix = np.eye(3)
+    if transpose:
+        matrix = matrix[[1, 0, 2]]
+    if flip_y:
+        matrix = np.array([[1.0, 0, 0], [0, -1, ny - 1], [0, 0, 1]]) @ matrix
+    if flip_x:
+        matrix = np.array([[-1.0, 0, nx - 1], [0, 1, 0], [0, 0, 1]]) @ matrix
+    return matrix
+
+
+def nearest_orientation(linear: np.ndarray) -> str:
+    """The orientation whose linear part is closest (Frobenius norm) to a 2×2 matrix."""
+    unit = linear / np.sqrt(abs(np.linalg.det(linear)))
+
+    def distance(name: str) -> float:
+        return float(np.linalg.norm(unit - orientation_matrix(name, (1, 1))[:2, :2]))
+
+    return min(ORIENTATIONS, key=distance)
+
+
+def apply_transform(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Maps (n, 2) points (x, y) by a 3×3 matrix."""
+    homogeneous = points @ matrix[:, :2].T + matrix[:, 2]
+    return homogeneous[:, :2] / homogeneous[:, 2:]
+
+
+def warped_grid(matrix: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """(rows, columns) that a 3×3 index matrix assigns to every pixel of an image."""
+    y = np.arange(shape[0], dtype=np.float64)[:, None]
+    x = np.arange(shape[1], dtype=np.float64)[None, :]
+    mapped_x, mapped_y, weight = (row[0] * x + row[1] * y + row[2] for row in matrix)
+    return mapped_y / weight, mapped_x / weight
+
+
+def overlap_of(layout_to_scan: np.ndarray, layout_shape: tuple[int, int], measured: np.ndarray) -> np.ndarray:
+    """Which layout pixels have their centre inside the measured part of the scan, bool (ny, nx)."""
+    rows, columns = warped_grid(layout_to_scan, layout_shape)
+    ny, nx = measured.shape
+    inside = (rows >= 0) & (rows <= ny - 1) & (columns >= 0) & (columns <= nx - 1)
+    if measured.all():
+        return inside
+    nearest = (np.clip(np.rint(k), 0, n - 1).astype(int) for k, n in ((rows, ny), (columns, nx)))
+    return inside & measured[tuple(nearest)]
+
+
+def linear_part(matrix: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """The 2×2 Jacobian of the map at a point (x, y): its local scale, rotation and shear."""
+    mapped = apply_transform(matrix, point[None])[0]
+    weight = matrix[2, :2] @ point + matrix[2, 2]
+    return (matrix[:2, :2] - np.outer(mapped, matrix[2, :2])) / weight
+
+
+def corners(shape: tuple[int, int]) -> np.ndarray:
+    """Index coordinates (x, y) of the four corner pixels, shape (4, 2)."""
+    ny, nx = shape
+    return np.array([[0.0, 0], [nx - 1, 0], [0, ny - 1], [nx - 1, ny - 1]])
+
+
+def centre(shape: tuple[int, int]) -> np.ndarray:
+    """Index coordinates (x, y) of the middle of an image, shape (2,)."""
+    return np.array([(shape[1] - 1) / 2, (shape[0] - 1) / 2])

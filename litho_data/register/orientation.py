@@ -1,0 +1,162 @@
+"""Which way up, which sign, roughly where: masked normalised cross-correlation over all shifts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from litho_data.register.geometry import ORIENTATIONS, orient
+
+SEARCH_SIZE_PX = 128
+MIN_OVERLAP = 0.4
+TIE = 0.02
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One orientation and polarity of the scan with its best shift.
+
+    ``layout_to_oriented`` maps layout indices to indices of the oriented scan; ``ncc`` is the correlation
+    at that shift, already multiplied by the polarity.
+    """
+
+    orientation: str
+    polarity: int
+    ncc: float
+    layout_to_oriented: np.ndarray
+
+
+def search_orientation(
+    scan: np.ndarray,
+    topography: np.ndarray,
+    orientations: tuple[str, ...] = tuple(ORIENTATIONS),
+    polarities: tuple[int, ...] = (1, -1),
+) -> list[Hypothesis]:
+    """All hypotheses, best first, by masked correlation of low-resolution copies.
+
+    Args:
+        scan: (ny, nx) heights at the layout's pitch, NaN where not measured.
+        topography: (ny, nx) predicted topography.
+
+    Returns:
+        Empty if the scan or the layout shows no structure at all.
+
+    The correlation is that of D. Padfield, Masked object registration in the Fourier domain,
+    IEEE Trans. Image Process. 21 (2012), doi:10.1109/TIP.2011.2181402, eq. 11.
+    """
+    factor = max(1, round(max(*scan.shape, *topography.shape) / SEARCH_SIZE_PX))
+    small_scan, small_topography = reduce_image(scan, factor), reduce_image(topography, factor)
+    found = []
+    for orientation in orientations:
+        moving = orient(small_scan, orientation)
+        correlation, overlap = masked_correlation(small_topography, moving)
+        if np.isnan(correlation).all():
+            continue
+        # Only breaks ties: on a repeating layout the shift with the larger overlap is the better guess.
+        handicap = TIE * (1 - overlap / overlap.max())
+        # A block of `factor` pixels has its centre (factor - 1) / 2 behind its first pixel; turning a scan
+        # whose size is no multiple of the factor moves the cut-off rest to the other side.
+        cut_y, cut_x = _cut_off(orientation, (scan.shape[0], scan.shape[1]), factor)
+        for polarity in polarities:
+            row, column = np.unravel_index(np.nanargmax(polarity * correlation - handicap), correlation.shape)
+            # Shifts run from -(fixed size - 1) to moving size - 1, the negative ones wrapped to the end.
+            shift_y = int(row) - (correlation.shape[0] if row >= moving.shape[0] else 0)
+            shift_x = int(column) - (correlation.shape[1] if column >= moving.shape[1] else 0)
+            matrix = np.array(
+                [[1.0, 0, factor * shift_x + cut_x], [0, 1, factor * shift_y + cut_y], [0, 0, 1]]
+            )
+            found.append(
+                Hypothesis(orientation, polarity, float(polarity * correlation[row, column]), matrix)
+            )
+    return sorted(found, key=lambda hypothesis: -hypothesis.ncc)
+
+
+def rival_alignment(registered: np.ndarray, topography: np.ndarray) -> float:
+    """Correlation of the best rival shift, as a share of that of the registration itself.
+
+    A rival is a local maximum of the correlation over shifts, a sixteenth of the field or more away. With
+    the topography in place of the scan it tells how well the layout repeats itself.
+    """
+    from scipy.ndimage import maximum_filter
+
+    factor = max(1, round(max(topography.shape) / (2 * SEARCH_SIZE_PX)))
+    correlation, _ = masked_correlation(reduce_image(topography, factor), reduce_image(registered, factor))
+    own = correlation[0, 0]
+    if not np.isfinite(own) or own <= 0:
+        return float("nan")
+    known = np.where(np.isfinite(correlation), correlation, -1.0)
+    peaks = known >= maximum_filter(known, size=3, mode="wrap")
+    distance = np.hypot(*np.meshgrid(*(_wrapped(n) for n in known.shape), indexing="ij"))
+    rivals = known[peaks & (distance >= max(topography.shape) / factor / 16)]
+    return float(max(rivals.max(initial=0.0), 0.0) / own)
+
+
+def rival_orientation(registered: np.ndarray, topography: np.ndarray) -> float:
+    """Largest correlation of the registered scan when turned, mirrored or inverted, over all shifts."""
+    factor = max(1, round(max(topography.shape) / SEARCH_SIZE_PX))
+    small, scan = reduce_image(topography, factor), reduce_image(registered, factor)
+    rivals = []
+    for orientation in ORIENTATIONS:
+        correlation, _ = masked_correlation(small, orient(scan, orientation))
+        if not np.isnan(correlation).all():
+            rivals.append(-np.nanmin(correlation))
+            if orientation != "identity":
+                rivals.append(np.nanmax(correlation))
+    return float(max(rivals, default=float("nan")))
+
+
+def reduce_image(image: np.ndarray, factor: int) -> np.ndarray:
+    """Means over blocks of ``factor`` × ``factor`` pixels (the rest cut off); NaN where half is missing."""
+    ny, nx = image.shape[0] // factor, image.shape[1] // factor
+    blocks = image[: ny * factor, : nx * factor].reshape(ny, factor, nx, factor)
+    measured = np.isfinite(blocks)
+    count = measured.sum(axis=(1, 3))
+    total = np.where(measured, blocks, 0.0).sum(axis=(1, 3))
+    return np.divide(total, count, out=np.full((ny, nx), np.nan), where=2 * count > factor**2)
+
+
+def masked_correlation(fixed: np.ndarray, moving: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pearson correlation of ``fixed[y, x]`` with ``moving[y + sy, x + sx]`` where they overlap.
+
+    Returns:
+        Correlation and number of overlapping pixels, indexed by the shift modulo their shape; the
+        correlation is NaN where less than ``MIN_OVERLAP`` of the smaller image takes part or one side
+        is constant.
+    """
+    from scipy.fft import irfft2, next_fast_len, rfft2
+
+    shape = [next_fast_len(a + b - 1, real=True) for a, b in zip(fixed.shape, moving.shape, strict=True)]
+    transforms = []
+    for image in (fixed, moving):
+        measured = np.isfinite(image)
+        mean = image[measured].mean() if measured.any() else 0.0
+        values = np.where(measured, image - mean, 0.0)
+        values /= max(float(np.sqrt((values**2).mean())), 1e-300)
+        transforms.append([rfft2(part, shape) for part in (measured.astype(float), values, values**2)])
+    (m1, f1, f1f1), (m2, f2, f2f2) = transforms
+
+    def correlate(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return irfft2(np.conj(a) * b, shape)
+
+    overlap = np.maximum(np.rint(correlate(m1, m2)), 1.0)
+    mean1, mean2 = correlate(f1, m2), correlate(m1, f2)
+    covariance = correlate(f1, f2) - mean1 * mean2 / overlap
+    variance1 = correlate(f1f1, m2) - mean1**2 / overlap
+    variance2 = correlate(m1, f2f2) - mean2**2 / overlap
+    least = MIN_OVERLAP * min(np.isfinite(fixed).sum(), np.isfinite(moving).sum())
+    # Rounding leaves 1e-12 of the energy; a side flatter than 1e-6 of it carries no structure.
+    usable = (overlap >= least) & (variance1 > 1e-6 * overlap) & (variance2 > 1e-6 * overlap)
+    product = np.sqrt(np.where(usable, variance1 * variance2, 1.0))
+    return np.where(usable, np.clip(covariance / product, -1, 1), np.nan), overlap
+
+
+def _cut_off(orientation: str, shape: tuple[int, int], factor: int) -> tuple[int, int]:
+    transpose, flip_y, flip_x = ORIENTATIONS[orientation]
+    ny, nx = shape[::-1] if transpose else shape
+    return (ny % factor if flip_y else 0), (nx % factor if flip_x else 0)
+
+
+def _wrapped(size: int) -> np.ndarray:
+    index = np.arange(size)
+    return np.minimum(index, size - index)

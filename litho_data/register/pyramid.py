@@ -1,0 +1,118 @@
+"""Refinement from coarse to fine, with the blur of the print matched on the way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from litho_data.register.geometry import apply_transform, corners, linear_part, warped_grid
+from litho_data.register.refine import LADDER, Model, Refinement, refine
+from litho_data.register.topography import fill_gaps, pearson, predicted_topography, smooth_measured
+
+SCAN_BLUR_PX = 1.0
+BLURS_PX = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0)
+LEVELS = (4, 2)
+SMALLEST_LEVEL_PX = 48
+
+
+@dataclass(frozen=True)
+class FineFit:
+    """The refinement with the two images it compared: smoothed scan and blur-matched topography."""
+
+    refinement: Refinement
+    scan: np.ndarray
+    topography: np.ndarray
+    blur_px: float
+
+
+def refine_pyramid(scan: np.ndarray, layout_level: np.ndarray, start: np.ndarray, model: Model) -> FineFit:
+    """Refines a coarse warp at a quarter, half and full resolution.
+
+    Args:
+        scan: (ny, nx) oriented heights without bow at the layout's pitch, NaN where not measured.
+        layout_level: (ny, nx) integer levels.
+        start: 3×3 index matrix, layout to scan.
+        model: rung of the ladder; the reduced levels use at most an affine.
+
+    If the last level does not converge the coarse warp stays, marked as not converged.
+    """
+    low_model: Model = "affine" if model == "homography" else model
+    coarse = project_to_model(start, low_model, (layout_level.shape[0], layout_level.shape[1]))
+    matrix = coarse
+    for factor in LEVELS:
+        if min(*layout_level.shape, *scan.shape) < factor * SMALLEST_LEVEL_PX:
+            continue
+        # The extra blur widens the basin of convergence to the few pixels a coarse fit may be off.
+        small_scan = _smooth(scan, factor)[::factor, ::factor]
+        small_topography = predicted_topography(layout_level, 1.5 * factor)[::factor, ::factor]
+        scale = np.diag([1.0 / factor, 1.0 / factor, 1.0])
+        found = refine(
+            small_scan,
+            small_topography,
+            scale @ matrix @ np.linalg.inv(scale),
+            low_model,
+            tolerance_px=0.02,
+        )
+        if found.converged:
+            matrix = np.linalg.inv(scale) @ found.layout_to_scan @ scale
+    smooth_scan = _smooth(scan, SCAN_BLUR_PX)
+    blur_px = match_blur(smooth_scan, layout_level, matrix)
+    topography = predicted_topography(layout_level, blur_px)
+    refinement = refine(smooth_scan, topography, matrix, model)
+    if not refinement.converged:
+        refinement = refine(smooth_scan, topography, coarse, model, max_iterations=0)
+    return FineFit(refinement, smooth_scan, topography, blur_px)
+
+
+def match_blur(smooth_scan: np.ndarray, layout_level: np.ndarray, layout_to_scan: np.ndarray) -> float:
+    """The Gaussian sigma, layout pixels, whose topography correlates best with an aligned scan."""
+    from scipy.ndimage import map_coordinates
+
+    grid = warped_grid(layout_to_scan, (layout_level.shape[0], layout_level.shape[1]))
+    # Every other pixel is enough to rank blurs of half a pixel and more.
+    rows, columns = grid[0][::2, ::2], grid[1][::2, ::2]
+    warped = map_coordinates(fill_gaps(smooth_scan), (rows, columns), order=1, cval=np.nan)
+    valid = np.isfinite(warped)
+    if valid.sum() < 16:
+        return SCAN_BLUR_PX
+    scores: list[float] = []
+    for blur_px in BLURS_PX:
+        predicted = predicted_topography(layout_level, blur_px)[::2, ::2]
+        scores.append(pearson(warped[valid], predicted[valid]))
+        if len(scores) > 1 and scores[-1] < scores[-2]:
+            break
+    return BLURS_PX[int(np.argmax(scores))]
+
+
+def project_to_model(matrix: np.ndarray, model: Model, shape: tuple[int, int]) -> np.ndarray:
+    """The warp of a lower rung that moves the corners of the field most like a given warp."""
+    if LADDER[model] >= LADDER["affine"]:
+        if model == "homography":
+            return matrix
+        middle = np.array([[(shape[1] - 1) / 2, (shape[0] - 1) / 2]])
+        linear = linear_part(matrix, middle[0])
+        return _about(linear, middle[0], apply_transform(matrix, middle)[0])
+    points = corners(shape)
+    moved = apply_transform(matrix, points)
+    source, target = (p[:, 0] + 1j * p[:, 1] for p in (points - points.mean(0), moved - moved.mean(0)))
+    turn = np.vdot(source, target) / np.vdot(source, source)
+    if model == "translation":
+        turn = np.complex128(1.0)
+    elif model == "euclidean":
+        turn = turn / abs(turn)
+    linear = np.array([[turn.real, -turn.imag], [turn.imag, turn.real]])
+    return _about(linear, points.mean(0), moved.mean(0))
+
+
+def _about(linear: np.ndarray, point: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """The affine with a given linear part that takes one point to its image."""
+    matrix = np.eye(3)
+    matrix[:2, :2] = linear
+    matrix[:2, 2] = image - linear @ point
+    return matrix
+
+
+def _smooth(scan: np.ndarray, sigma_px: float) -> np.ndarray:
+    """Smoothed where measured: what a gap would take from its surroundings is no evidence of its own."""
+    return np.where(np.isfinite(scan), smooth_measured(scan, sigma_px), np.nan)

@@ -1,0 +1,120 @@
+"""What is recorded about one registration, and when it counts as passed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+
+@dataclass(frozen=True)
+class RegistrationQuality:
+    """Figures of one registration; NaN where a figure could not be had.
+
+    Lengths in px are layout pixels; the nm figures are the same lengths times the pitch.
+    """
+
+    passed: bool
+    reason: str  # why it failed; empty when passed
+    warning: str  # what to know although it passed
+    model: str
+    method: str  # orb | sift | blocks | correlation: what found the coarse fit
+    dihedral: str  # the operation that turns the scan onto the layout
+    polarity: int  # -1: the scan shows the layout's negative
+    converged: bool
+    keypoints: int
+    matches: int
+    inlier_ratio: float
+    reprojection_px: float
+    reprojection_nm: float
+    coverage: float
+    overlap: float
+    ncc_before: float
+    ncc_after: float
+    mutual_information_before_bit: float
+    mutual_information_after_bit: float
+    ecc: float
+    blur_um: float
+    tre_windows: int
+    tre_median_px: float
+    tre_p95_px: float
+    tre_median_nm: float
+    tre_p95_nm: float
+    curve_x_px: float
+    curve_y_px: float
+    corner_sd_px: float
+    corner_sd_nm: float
+    singular_max: float
+    singular_min: float
+    rotation_deg: float
+    layout_repeats: float
+    second_alignment: float
+    second_orientation: float
+    noise_variance_factor: float
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """Limits of a passed registration; docs/registration.md gives the reason for each."""
+
+    min_overlap: float = 0.5
+    min_ecc: float = 0.7
+    max_tre_median_px: float = 1.0
+    max_corner_sd_px: float = 1.5
+    singular_range: tuple[float, float] = (0.90, 1.10)
+    singular_warning_range: tuple[float, float] = (0.95, 1.05)
+    max_layout_repeats: float = 0.9
+    max_second_alignment: float = 0.9
+    min_orientation_margin: float = 0.1
+
+
+def judge(figures: dict[str, Any], thresholds: Thresholds) -> tuple[bool, str, str]:
+    """(passed, reason, warning) for the figures of one registration; every failure is named."""
+    low, high = thresholds.singular_range
+    smallest, largest = figures["singular_min"], figures["singular_max"]
+    margin = figures["ecc"] - figures["second_orientation"]
+    upright = figures["dihedral"] == "identity" and figures["polarity"] == 1
+    tied = margin < thresholds.min_orientation_margin
+    by_points = figures["method"] in ("orb", "sift")
+
+    fits = figures["ecc"] >= thresholds.min_ecc
+    failures = []
+    if not fits:
+        failures.append(f"correlation {figures['ecc']:.2f}, at least {thresholds.min_ecc} wanted")
+    if figures["layout_repeats"] > thresholds.max_layout_repeats:
+        share = figures["layout_repeats"]
+        failures.append(f"ambiguous: the layout repeats itself, correlation {share:.2f} with its own shift")
+    elif fits and figures["second_alignment"] > thresholds.max_second_alignment:
+        share = figures["second_alignment"]
+        failures.append(f"ambiguous: another shift correlates {share:.2f} times as well")
+    if fits and tied and not upright:
+        failures.append(f"ambiguous: another orientation or polarity correlates within {margin:.2f}")
+    # Written as "not >=", so that a figure that could not be computed fails.
+    if not figures["overlap"] >= thresholds.min_overlap:
+        failures.append(f"overlap {figures['overlap']:.2f}, at least {thresholds.min_overlap} wanted")
+    if not low <= smallest <= largest <= high:
+        failures.append(f"scale {smallest:.3f} to {largest:.3f}, {low} to {high} wanted; is the pitch right?")
+    if figures["tre_median_px"] > thresholds.max_tre_median_px:
+        failures.append(f"target registration error {figures['tre_median_px']:.2f} px")
+    if not figures["corner_sd_px"] <= thresholds.max_corner_sd_px:
+        failures.append(f"corners known to {figures['corner_sd_px']:.2f} px only")
+
+    warnings = []
+    low, high = thresholds.singular_warning_range
+    if not low <= smallest <= largest <= high:
+        warnings.append(f"scale {smallest:.3f} to {largest:.3f}; is the pitch right?")
+    if fits and tied and upright:
+        warnings.append("layout looks alike in another orientation; upright assumed")
+    if figures["polarity"] == -1:
+        warnings.append("inverted contrast")
+    if not by_points:
+        warnings.append(f"coarse fit by {figures['method']}, no feature matches")
+    if not figures["converged"]:
+        warnings.append("refinement did not converge")
+    return not failures, "; ".join(failures), "; ".join(warnings)
+
+
+def unregistered_quality(reason: str) -> RegistrationQuality:
+    """The record of a scan for which nothing could be fitted: every figure is missing."""
+    empty = {"int": 0, "float": float("nan"), "str": "none", "bool": False}
+    figures = {field.name: empty[str(field.type)] for field in fields(RegistrationQuality)}
+    return RegistrationQuality(**{**figures, "reason": reason, "warning": ""})  # type: ignore[arg-type]

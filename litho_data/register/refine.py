@@ -1,0 +1,197 @@
+"""Sub-pixel refinement on the heights themselves: enhanced correlation, any rung of the ladder.
+
+The correlation between the scan and the predicted topography is maximised over a warp, a gain and a
+quadratic background at once, by Gauss-Newton steps in the inverse compositional form.
+G. D. Evangelidis, E. Z. Psarakis, IEEE TPAMI 30 (2008), doi:10.1109/TPAMI.2008.113;
+S. Baker, I. Matthews, IJCV 56 (2004), doi:10.1023/B:VISI.0000011205.11775.fd.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+
+from litho_data.register.geometry import apply_transform, corners, warped_grid
+from litho_data.register.topography import fill_gaps, quadratic_basis
+
+Model = Literal["translation", "euclidean", "similarity", "affine", "homography"]
+# Every rung owns the first so many generators below: the ladder is nested by construction.
+LADDER: dict[Model, int] = {"translation": 2, "euclidean": 3, "similarity": 4, "affine": 6, "homography": 8}
+_GENERATORS = np.zeros((8, 3, 3))
+_GENERATORS[0, 0, 2] = _GENERATORS[1, 1, 2] = 1.0
+_GENERATORS[2, 0, 1], _GENERATORS[2, 1, 0] = -1.0, 1.0
+_GENERATORS[3, 0, 0] = _GENERATORS[3, 1, 1] = 1.0
+_GENERATORS[4, 0, 0], _GENERATORS[4, 1, 1] = 1.0, -1.0
+_GENERATORS[5, 0, 1] = _GENERATORS[5, 1, 0] = 1.0
+_GENERATORS[6, 2, 0] = _GENERATORS[7, 2, 1] = 1.0
+NUISANCES = 7  # gain of the topography, then the six quadratic terms
+_BACKGROUND_AND_SCAN = [1, 2, 3, 4, 5, 6, -1]
+CELL_PX = 32
+# What surrounds the print is unknown (bare, or its neighbour) and blurs across the layout's border.
+BORDER_PX = 8
+TOLERANCE_PX = 1e-3
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """A converged warp with what is needed to ask how well it is known.
+
+    ``layout_to_scan`` is the 3×3 index matrix; ``gram`` (cells_y, cells_x, k, k) holds, per cell of
+    ``CELL_PX`` pixels, the inner products of the regressors (gain, background, warp) and, last, the scan:
+    every sub-sample of the field can be refitted from it without touching a pixel.
+    """
+
+    model: Model
+    layout_to_scan: np.ndarray
+    gram: np.ndarray
+    converged: bool
+
+    def blocks(self) -> np.ndarray:
+        """``gram`` summed over blocks of two by two cells, (blocks_y, blocks_x, k, k).
+
+        The topography repeats its errors over a feature or two; a block is the smallest independent piece.
+        """
+        starts = [np.linspace(0, n, max(1, n // 2) + 1).astype(int)[:-1] for n in self.gram.shape[:2]]
+        return np.add.reduceat(np.add.reduceat(self.gram, starts[0], axis=0), starts[1], axis=1)
+
+    @property
+    def background(self) -> np.ndarray:
+        """Coefficients (6,) of the quadratic surface fitted along with the warp."""
+        return solve_gram(self.gram.sum(axis=(0, 1)))[1:NUISANCES]
+
+    @property
+    def correlation(self) -> float:
+        """Partial correlation of scan and topography given the background; 0 if the gain is not positive."""
+        total = self.gram.sum(axis=(0, 1))
+        background = total[np.ix_(_BACKGROUND_AND_SCAN, _BACKGROUND_AND_SCAN)]
+        coefficients = solve_gram(total)
+        energy = float(residual_energy(background, solve_gram(background)))
+        if energy <= 0 or coefficients[0] <= 0:
+            return 0.0
+        return max(0.0, 1 - float(residual_energy(total, coefficients)) / energy) ** 0.5
+
+
+def refine(
+    scan: np.ndarray,
+    topography: np.ndarray,
+    start: np.ndarray,
+    model: Model,
+    *,
+    max_iterations: int = 30,
+    tolerance_px: float = TOLERANCE_PX,
+) -> Refinement:
+    """The warp of this model that maximises the correlation, from a start within the structures' width.
+
+    Args:
+        scan: (ny, nx) smoothed heights, NaN where not measured.
+        topography: (ny, nx) predicted topography.
+        start: 3×3 index matrix, layout to scan; it must already belong to ``model``.
+        max_iterations: Gauss-Newton steps at most; 0 only evaluates the start.
+        tolerance_px: a step that would move no corner by more ends the iteration.
+    """
+    from scipy.linalg import expm
+    from scipy.ndimage import map_coordinates, spline_filter
+
+    shape = (topography.shape[0], topography.shape[1])
+    normalise = _normalisation(shape)
+    denormalise = np.linalg.inv(normalise)
+    regressors = _regressors(topography, LADDER[model])
+    border = min(BORDER_PX, min(shape) // 16)
+    interior = np.pad(np.ones([n - 2 * border for n in shape], bool), border)
+    measured = np.isfinite(scan)
+    complete = bool(measured.all())
+    spline = spline_filter(fill_gaps(scan), 3, output=np.float32, mode="mirror")
+    matrix, converged, step_px = np.array(start, dtype=np.float64), False, np.inf
+    for iteration in range(max_iterations + 1):
+        rows, columns = warped_grid(matrix, shape)
+        inside = interior & (rows > 0) & (rows < scan.shape[0] - 1)
+        inside &= (columns > 0) & (columns < scan.shape[1] - 1)
+        if not complete:
+            inside &= map_coordinates(measured.astype(np.float32), (rows, columns), order=1) > 0.999
+        warped = map_coordinates(spline, (rows, columns), order=3, mode="mirror", prefilter=False)
+        gram = _cell_grams(regressors, warped, inside)
+        coefficients = solve_gram(gram.sum(axis=(0, 1)))
+        if coefficients[0] <= 0:
+            break
+        warp = coefficients[NUISANCES:] / coefficients[0]
+        increment = denormalise @ expm(np.einsum("k,kij->ij", warp, _GENERATORS[: len(warp)])) @ normalise
+        previous_px = step_px
+        step_px = float(np.abs(apply_transform(increment, corners(shape)) - corners(shape)).max())
+        converged = step_px < tolerance_px
+        diverges = not step_px < 0.5 * max(shape) or (iteration > 5 and step_px > 2 * previous_px)
+        if converged or diverges or iteration == max_iterations:
+            break
+        matrix = matrix @ np.linalg.inv(increment)
+        matrix /= matrix[2, 2]
+    return Refinement(model, matrix, gram, converged)
+
+
+def solve_gram(gram: np.ndarray) -> np.ndarray:
+    """Least-squares coefficients of the regressors for the scan, for (…, k, k) inner products."""
+    normal, right = gram[..., :-1, :-1], gram[..., :-1, -1]
+    scale = np.sqrt(np.maximum(np.einsum("...ii->...i", normal), 1e-300))
+    # A ridge of the regressors' float32 precision keeps directions that the layout cannot fix at rest.
+    scaled = normal / (scale[..., :, None] * scale[..., None, :]) + 1e-7 * np.eye(normal.shape[-1])
+    return np.linalg.solve(scaled, (right / scale)[..., None])[..., 0] / scale
+
+
+def residual_energy(gram: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+    """Sum of squared residuals of given coefficients over the pixels behind inner products (…, k, k)."""
+    extended = np.concatenate([coefficients, -np.ones((*coefficients.shape[:-1], 1))], axis=-1)
+    return np.einsum("...i,...ij,...j->...", extended, gram, extended)
+
+
+def corner_motion_px(coefficients: np.ndarray, shape: tuple[int, int], points: np.ndarray) -> np.ndarray:
+    """Displacement (…, n, 2) in layout pixels that fitted coefficients (…, k) ask for at points (n, 2)."""
+    normalise = _normalisation(shape)
+    warp = coefficients[..., NUISANCES:] / coefficients[..., :1]
+    unit = apply_transform(normalise, points)
+    flow = _flow(unit[:, 0], unit[:, 1], warp.shape[-1])
+    return np.einsum("...k,kdn->...nd", warp, flow) / normalise[0, 0]
+
+
+def _normalisation(shape: tuple[int, int]) -> np.ndarray:
+    """Index coordinates to coordinates of order one about the middle, the same scale along both axes."""
+    scale = 2.0 / (max(shape) - 1)
+    ny, nx = shape
+    return np.array([[scale, 0, -scale * (nx - 1) / 2], [0, scale, -scale * (ny - 1) / 2], [0, 0, 1]])
+
+
+def _flow(x: np.ndarray, y: np.ndarray, count: int) -> np.ndarray:
+    """Velocity (count, 2, …) of each generator at normalised points."""
+    points = np.stack([x, y, np.ones_like(x)])
+    moved = np.einsum("kij,j...->ki...", _GENERATORS[:count], points)
+    return moved[:, :2] - moved[:, 2:] * points[:2]
+
+
+def _regressors(topography: np.ndarray, count: int) -> np.ndarray:
+    """(7 + count, ny, nx): topography, quadratic background, change of the topography per generator."""
+    shape = (topography.shape[0], topography.shape[1])
+    scale = _normalisation(shape)[0, 0]
+    gradient_y, gradient_x = np.gradient(topography.astype(np.float32))
+    y = ((np.arange(shape[0]) - (shape[0] - 1) / 2) * scale).astype(np.float32)[:, None]
+    x = ((np.arange(shape[1]) - (shape[1] - 1) / 2) * scale).astype(np.float32)[None, :]
+    flow = _flow(x + 0 * y, y + 0 * x, count).astype(np.float32)
+    change = (flow[:, 0] * gradient_x + flow[:, 1] * gradient_y) / np.float32(scale)
+    centred = topography.astype(np.float32) - topography.mean()
+    return np.concatenate([centred[None], quadratic_basis(shape).astype(np.float32), change])
+
+
+def _cell_grams(regressors: np.ndarray, warped: np.ndarray, inside: np.ndarray) -> np.ndarray:
+    ny, nx = warped.shape
+    stack = np.concatenate([regressors, warped[None]]) * inside.astype(np.float32)
+    rows, columns = _cell_edges(ny), _cell_edges(nx)
+    gram = np.empty((len(rows) - 1, len(columns) - 1, len(stack), len(stack)))
+    for i, (top, bottom) in enumerate(pairwise(rows)):
+        for j, (left, right) in enumerate(pairwise(columns)):
+            # float64 sums: the result must not depend on how BLAS orders them.
+            cell = stack[:, top:bottom, left:right].reshape(len(stack), -1).astype(np.float64)
+            gram[i, j] = cell @ cell.T
+    return gram
+
+
+def _cell_edges(size: int) -> np.ndarray:
+    return np.linspace(0, size, max(1, round(size / CELL_PX)) + 1).astype(int)

@@ -1,0 +1,92 @@
+"""The one resampling between a scan and the dataset: float heights, gaps respected."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from litho_data.errors import InputError
+from litho_data.register.geometry import index_to_um, warped_grid
+from litho_data.register.topography import fill_gaps
+
+SPLINE_ORDER = 3
+
+
+def resample_to_layout(
+    height_um: np.ndarray,
+    scan_to_layout: np.ndarray,
+    layout_shape: tuple[int, int],
+    *,
+    scan_pitch_um: tuple[float, float],
+    layout_pitch_um: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Heights of a scan at the pixel centres of the layout, in one cubic-spline interpolation.
+
+    Args:
+        height_um: (ny, nx) in the scan's own frame, NaN where not measured.
+        scan_to_layout: 3×3, maps (x_um, y_um, 1) of the scan to the layout.
+        layout_shape: (ny, nx) of the result.
+        scan_pitch_um: (y, x) pitch of the scan.
+        layout_pitch_um: pitch of the layout.
+
+    Returns:
+        ``height_um`` float32 (NaN where not valid) and ``valid`` bool, both of ``layout_shape``. A pixel is
+        valid if it falls between the scan's pixel centres and no gap lies within two pixels of it, the
+        reach of the spline's kernel.
+
+    Raises:
+        InputError: a transform that is not an invertible 3×3 matrix, or a scan without a measured pixel.
+
+    A scan sampled more finely than the layout is first averaged over the layout's pixel (Gaussian of
+    the missing width), since plain interpolation would alias its noise.
+    """
+    from scipy.ndimage import binary_dilation, map_coordinates
+
+    matrix = np.asarray(scan_to_layout, dtype=np.float64)
+    if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-12:
+        raise InputError("scan_to_layout", got=matrix.tolist(), wanted="an invertible 3x3 matrix")
+    height = np.asarray(height_um, dtype=np.float64)
+    measured = np.isfinite(height)
+    if not measured.any():
+        raise InputError("scan", got="no measured pixel", wanted="finite heights")
+
+    to_scan = np.linalg.inv(index_to_um(scan_pitch_um)) @ np.linalg.inv(matrix)
+    to_scan = to_scan @ index_to_um((layout_pitch_um, layout_pitch_um))
+    rows, columns = warped_grid(to_scan, layout_shape)
+
+    filled = _average_over_layout_pixel(fill_gaps(height), scan_pitch_um, layout_pitch_um)
+    values = map_coordinates(filled, (rows, columns), order=SPLINE_ORDER, mode="mirror")
+    valid = (rows >= 0) & (rows <= height.shape[0] - 1) & (columns >= 0) & (columns <= height.shape[1] - 1)
+    if not measured.all():
+        near_gap = binary_dilation(~measured, np.ones((3, 3), bool)).astype(np.float32)
+        valid &= map_coordinates(near_gap, (rows, columns), order=1, mode="nearest") == 0
+    return np.where(valid, values, np.nan).astype(np.float32), valid
+
+
+def noise_variance_factor(scan_pitch_um: tuple[float, float], layout_pitch_um: float) -> float:
+    """What the resampling leaves of the variance of white pixel noise, averaged over sub-pixel positions.
+
+    The squared weights that one output pixel gives to the scan's pixels along an axis, summed, averaged
+    over phases; the product of both axes.
+    """
+    from scipy.ndimage import map_coordinates
+
+    impulse = np.zeros((513, 1))
+    impulse[256] = 1.0
+    places = 256 + np.arange(-128, 129)[None, :] + (np.arange(64)[:, None] + 0.5) / 64
+    factor = 1.0
+    for pitch_um in scan_pitch_um:
+        response = _average_over_layout_pixel(impulse, (pitch_um, layout_pitch_um), layout_pitch_um)[:, 0]
+        weights = map_coordinates(response, [places], order=SPLINE_ORDER)
+        factor *= float((weights**2).sum(axis=1).mean())
+    return factor
+
+
+def _average_over_layout_pixel(
+    height: np.ndarray, scan_pitch_um: tuple[float, float], layout_pitch_um: float
+) -> np.ndarray:
+    from scipy.ndimage import gaussian_filter
+
+    ratios = [layout_pitch_um / pitch for pitch in scan_pitch_um]
+    # A box of r pixels has variance (r² - 1) / 12; below 10 % of difference the pitches count as equal.
+    sigma_px = [np.sqrt((ratio**2 - 1) / 12) if ratio > 1.1 else 0.0 for ratio in ratios]
+    return gaussian_filter(height, sigma_px, mode="nearest") if any(sigma_px) else height

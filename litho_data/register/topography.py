@@ -1,0 +1,93 @@
+"""Images that can be compared: the topography a layout predicts, and a scan freed of gaps and bow."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def predicted_topography(layout_level: np.ndarray, blur_px: float) -> np.ndarray:
+    """The layout as the printer would render it to first order: levels blurred by a Gaussian.
+
+    Args:
+        layout_level: (ny, nx) integer levels.
+        blur_px: Gaussian sigma of the process, layout pixels.
+
+    Returns:
+        (ny, nx) float32 in levels; gain and offset to heights stay open.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    return gaussian_filter(layout_level.astype(np.float32), blur_px, mode="nearest", truncate=3.0)
+
+
+def smooth_measured(height: np.ndarray, sigma_px: float) -> np.ndarray:
+    """Gaussian smoothing by normalised convolution: gaps neither pull the mean nor spread.
+
+    Args:
+        height: (ny, nx), NaN where not measured.
+        sigma_px: Gaussian sigma, pixels.
+
+    Returns:
+        (ny, nx) float64; gaps are filled from their surroundings, NaN only where no measured pixel
+        lies within 4 sigma.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    measured = np.isfinite(height)
+    if measured.all():
+        return gaussian_filter(height.astype(np.float64), sigma_px)
+    weight = gaussian_filter(measured.astype(np.float64), sigma_px)
+    total = gaussian_filter(np.where(measured, height, 0.0).astype(np.float64), sigma_px)
+    # 1e-9 keeps pixels that see only a few far measured ones apart from those that see rounding.
+    return np.divide(total, weight, out=np.full(height.shape, np.nan), where=weight > 1e-9)
+
+
+def fill_gaps(height: np.ndarray) -> np.ndarray:
+    """The same heights with every NaN replaced: continued straight for three pixels, then held.
+
+    A gap's first pixels are the point reflection of the measured side about the nearest measured pixel, so
+    that slopes run on and an interpolating spline does not ring at the rim.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    missing = ~np.isfinite(height)
+    if not missing.any():
+        return height
+    distance, (rows, columns) = distance_transform_edt(missing, return_indices=True)
+    held = height[rows, columns]
+    y, x = np.nonzero(missing & (distance <= 3))
+    mirror_y = np.clip(2 * rows[y, x] - y, 0, height.shape[0] - 1)
+    mirror_x = np.clip(2 * columns[y, x] - x, 0, height.shape[1] - 1)
+    continued = 2 * held[y, x] - height[mirror_y, mirror_x]
+    held[y, x] = np.where(np.isfinite(continued), continued, held[y, x])
+    return held
+
+
+def remove_bow(height: np.ndarray) -> np.ndarray:
+    """The heights minus their least-squares quadratic surface; only ever used on a copy for comparison."""
+    basis = quadratic_basis((height.shape[0], height.shape[1]))
+    measured = np.isfinite(height)
+    # A third of the rows and columns fixes six coefficients as well as all of them do.
+    sparse = np.zeros_like(measured)
+    sparse[::3, ::3] = measured[::3, ::3]
+    chosen = sparse if sparse.sum() >= 60 else measured
+    coefficients, *_ = np.linalg.lstsq(basis[:, chosen].T, height[chosen], rcond=None)
+    return height - np.einsum("k,kyx->yx", coefficients, basis)
+
+
+def quadratic_basis(shape: tuple[int, int]) -> np.ndarray:
+    """1, x, y, x², xy, y² over an image in coordinates from -1 to 1, shape (6, ny, nx)."""
+    y = np.linspace(-1, 1, shape[0])[:, None]
+    x = np.linspace(-1, 1, shape[1])[None, :]
+    one = np.ones(shape)
+    return np.stack([one, one * x, one * y, one * x * x, x * y, one * y * y])
+
+
+def pearson(a: np.ndarray, b: np.ndarray) -> float:
+    """Pearson correlation of two equally long vectors, 0 if one is constant.
+
+    Plain sums instead of a matrix product: the same digits whatever the number of BLAS threads.
+    """
+    a, b = (values - values.mean(dtype=np.float64) for values in (a, b))
+    energy = float((a * a).sum()) * float((b * b).sum())
+    return float((a * b).sum()) / energy**0.5 if energy > 0 else 0.0

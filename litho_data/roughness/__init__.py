@@ -1,0 +1,41 @@
+"""Roughness and noise of scans: amplitudes, spectra, correlation, step heights, and what levelling hides."""
+
+from litho_data.roughness.amplitude import AmplitudeParameters, amplitude_parameters
+from litho_data.roughness.correlation import (
+    autocorrelation,
+    correlation_length_um,
+    effective_samples,
+    sq_uncertainty_nm,
+)
+from litho_data.roughness.levelling_bias import (
+    exponential_correlation,
+    gaussian_correlation,
+    retained_variance,
+    retained_variance_by_rows,
+)
+from litho_data.roughness.noise import NoiseSplit, PrintRoughness, print_roughness, split_noise
+from litho_data.roughness.spectrum import Spectrum, psd_along, psd_radial
+from litho_data.roughness.step_height import StepHeight, groove_depth, stair_steps
+
+__all__ = [
+    "AmplitudeParameters",
+    "NoiseSplit",
+    "PrintRoughness",
+    "Spectrum",
+    "StepHeight",
+    "amplitude_parameters",
+    "autocorrelation",
+    "correlation_length_um",
+    "effective_samples",
+    "exponential_correlation",
+    "gaussian_correlation",
+    "groove_depth",
+    "print_roughness",
+    "psd_along",
+    "psd_radial",
+    "retained_variance",
+    "retained_variance_by_rows",
+    "split_noise",
+    "sq_uncertainty_nm",
+    "stair_steps",
+]

@@ -1,0 +1,112 @@
+"""Line noise apart from pixel noise, and the print's roughness apart from the microscope's."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from litho_data.errors import InputError
+from litho_data.results import Record
+from litho_data.roughness.amplitude import amplitude_parameters
+from litho_data.roughness.correlation import sq_uncertainty_nm
+
+Axis = Literal["x", "y"]
+
+# Median absolute deviation of a Gaussian: 0.6745 sd.
+_MAD_TO_SD = 1 / 0.6744897501960817
+
+
+class NoiseSplit(Record):
+    """Noise of one scan by second and first differences; topography adds, so all are upper bounds.
+
+    Args:
+        pixel_nm: uncorrelated noise from second differences along the fast axis.
+        pixel_slow_nm: the same along the slow axis; larger by the line noise.
+        line_nm: sd of one offset per line, from steps between the medians of neighbouring lines.
+        column_nm: the same for columns, where no such noise is expected: the control.
+    """
+
+    pixel_nm: float
+    pixel_slow_nm: float
+    line_nm: float
+    column_nm: float
+
+
+class PrintRoughness(Record):
+    """Sq of a flat print without microscope and substrate, with its standard uncertainty."""
+
+    print_nm: float
+    print_uncertainty_nm: float
+    flat_nm: float
+    flat_uncertainty_nm: float
+    substrate_nm: float
+    substrate_uncertainty_nm: float
+
+
+def split_noise(height_um: np.ndarray, *, fast_axis: Axis = "x") -> NoiseSplit:
+    """Separate the offsets of scan lines from noise of single pixels.
+
+    Second differences ``z₋ − 2z₀ + z₊`` of white noise have 6 times its variance. The difference of
+    two line medians has variance ``2 (line² + π/2 · pixel²/n)`` with n pixels in a line; the sd of both
+    is taken from the median absolute deviation, which single scars and edges do not move.
+
+    Args:
+        height_um: finite heights, µm, shape (ny, nx).
+        fast_axis: axis along which the tip moved.
+
+    Raises:
+        InputError: NaN in the surface, or fewer than 8 pixels along an axis.
+    """
+    if fast_axis not in ("x", "y"):
+        raise InputError("fast_axis", got=repr(fast_axis), wanted="x or y")
+    if not np.isfinite(height_um).all() or min(height_um.shape) < 8:
+        raise InputError(
+            "surface", got=f"{height_um.shape} px", wanted="finite heights, at least 8 px each way"
+        )
+    lines = 1e3 * (height_um if fast_axis == "x" else height_um.T).astype(np.float64)
+    pixel_nm = _robust_sd(np.diff(lines, 2, axis=1)) / 6**0.5
+    return NoiseSplit(
+        pixel_nm=pixel_nm,
+        pixel_slow_nm=_robust_sd(np.diff(lines, 2, axis=0)) / 6**0.5,
+        line_nm=_line_sd(lines, pixel_nm),
+        column_nm=_line_sd(lines.T, pixel_nm),
+    )
+
+
+def print_roughness(flat_um: np.ndarray, substrate_um: np.ndarray) -> PrintRoughness:
+    """Roughness of a print from a flat print and a bare substrate, by quadrature.
+
+    ``print² = flat² − substrate²``: microscope and substrate are taken to add independently. Both
+    surfaces have to be levelled alike.
+
+    Raises:
+        InputError: a substrate rougher than the print.
+    """
+    flat_nm, substrate_nm = (amplitude_parameters(surface).sq_nm for surface in (flat_um, substrate_um))
+    if substrate_nm >= flat_nm:
+        raise InputError(
+            "roughness of the substrate",
+            got=f"{substrate_nm:.3g} nm",
+            wanted=f"less than the print's {flat_nm:.3g} nm",
+        )
+    print_nm = float(np.sqrt(flat_nm**2 - substrate_nm**2))
+    flat_u_nm, substrate_u_nm = sq_uncertainty_nm(flat_um), sq_uncertainty_nm(substrate_um)
+    return PrintRoughness(
+        print_nm=print_nm,
+        print_uncertainty_nm=float(np.hypot(flat_nm * flat_u_nm, substrate_nm * substrate_u_nm) / print_nm),
+        flat_nm=flat_nm,
+        flat_uncertainty_nm=flat_u_nm,
+        substrate_nm=substrate_nm,
+        substrate_uncertainty_nm=substrate_u_nm,
+    )
+
+
+def _line_sd(lines: np.ndarray, pixel_nm: float) -> float:
+    """Sd of the offsets of lines, freed of what pixel noise does to a median."""
+    step_variance = _robust_sd(np.diff(np.median(lines, axis=1))) ** 2
+    return float(np.sqrt(max(0.0, step_variance / 2 - np.pi / 2 * pixel_nm**2 / lines.shape[1])))
+
+
+def _robust_sd(values: np.ndarray) -> float:
+    return float(_MAD_TO_SD * np.median(np.abs(values - np.median(values))))

@@ -1,0 +1,98 @@
+"""Power spectral densities whose integral is the variance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from litho_data.errors import InputError
+
+Axis = Literal["x", "y"]
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """A spectrum on positive frequencies.
+
+    Args:
+        frequency_per_um: cycles/µm, ascending.
+        density: nm²·µm for a spectrum along one axis (its integral over frequency is Sq², one-sided),
+            nm²·µm² for a radial mean of the two-dimensional density (``∫ 2πf·density df`` is Sq²).
+    """
+
+    frequency_per_um: np.ndarray
+    density: np.ndarray
+
+
+def psd_along(height_um: np.ndarray, pitch_um: float, axis: Axis, *, window: bool = True) -> Spectrum:
+    """One-sided power spectral density along one axis, averaged over the lines.
+
+    Each line loses its mean and slope, is weighted by a Hann window (divided out in power), and its
+    spectrum is scaled so that ``Σ density·Δf`` is the mean square of the lines.
+
+    Args:
+        height_um: finite heights, µm, shape (ny, nx).
+        pitch_um: pitch along the axis, µm.
+        axis: ``x`` along rows, ``y`` along columns.
+        window: False keeps the lines as they are, for periodic or noise-like surfaces.
+
+    Raises:
+        InputError: NaN in the surface, lines shorter than 8 pixels, or another axis.
+    """
+    lines = _lines(height_um, axis)
+    size = lines.shape[1]
+    weight = np.hanning(size + 2)[1:-1] if window else np.ones(size)
+    if window:
+        lines = lines - _straight_line(lines)
+    power = np.abs(np.fft.rfft(lines * weight, axis=1)) ** 2
+    density = power.mean(axis=0) * pitch_um / np.sum(weight**2)
+    # Frequencies other than 0 and Nyquist stand for their negative twins as well.
+    density[1 : None if size % 2 else -1] *= 2
+    return Spectrum(np.fft.rfftfreq(size, pitch_um)[1:], density[1:])
+
+
+def psd_radial(height_um: np.ndarray, pitch_um: float, *, window: bool = True) -> Spectrum:
+    """Radial mean of the two-dimensional power spectral density, square pixels.
+
+    Args:
+        height_um: finite heights, µm, shape (ny, nx).
+        pitch_um: pitch of both axes, µm.
+        window: False for periodic surfaces.
+
+    Raises:
+        InputError: NaN in the surface, or fewer than 8 pixels along an axis.
+    """
+    _lines(height_um, "x"), _lines(height_um, "y")
+    height_nm = 1e3 * height_um.astype(np.float64)
+    ny, nx = height_nm.shape
+    weight = np.outer(np.hanning(ny + 2)[1:-1], np.hanning(nx + 2)[1:-1]) if window else np.ones((ny, nx))
+    height_nm = height_nm - (height_nm * weight).sum() / weight.sum()
+    density = np.abs(np.fft.fft2(height_nm * weight)) ** 2 * pitch_um**2 / np.sum(weight**2)
+    frequency = np.hypot(np.fft.fftfreq(ny, pitch_um)[:, None], np.fft.fftfreq(nx, pitch_um)[None, :])
+    width = 1 / (min(ny, nx) * pitch_um)
+    bins = np.rint(frequency / width).astype(int).ravel()
+    rings = min(ny, nx) // 2 + 1
+    inside = bins < rings
+    pixels = np.bincount(bins[inside], minlength=rings)
+    total = np.bincount(bins[inside], weights=density.ravel()[inside], minlength=rings)
+    return Spectrum(np.arange(1, rings) * width, total[1:] / pixels[1:])
+
+
+def _lines(height_um: np.ndarray, axis: Axis) -> np.ndarray:
+    if axis not in ("x", "y"):
+        raise InputError("axis", got=repr(axis), wanted="x or y")
+    lines = 1e3 * (height_um if axis == "x" else height_um.T).astype(np.float64)
+    if not np.isfinite(lines).all():
+        raise InputError(
+            "surface", got="NaN", wanted="finite heights for a spectrum", hint="crop to valid pixels"
+        )
+    if lines.shape[1] < 8:
+        raise InputError("lines of a spectrum", got=f"{lines.shape[1]} px", wanted="at least 8 px")
+    return lines - lines.mean(axis=1, keepdims=True)
+
+
+def _straight_line(lines: np.ndarray) -> np.ndarray:
+    position = np.arange(lines.shape[1]) - (lines.shape[1] - 1) / 2
+    return np.outer(lines @ position / (position @ position), position)

@@ -1,0 +1,140 @@
+"""Step heights by the windows of ISO 5436-1: stay off the edges, share one slope, repeat line by line."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from litho_data.errors import InputError
+from litho_data.results import Record
+
+Axis = Literal["x", "y"]
+
+
+class StepHeight(Record):
+    """One step.
+
+    Args:
+        height_nm: mean over the lines.
+        line_sd_nm: sd over the lines.
+        uncertainty_nm: standard uncertainty of the mean, from the sd and the number of independent
+            lines; calibration of the z scale is not in it.
+        lines: lines that were fitted.
+    """
+
+    height_nm: float
+    line_sd_nm: float
+    uncertainty_nm: float
+    lines: int
+
+
+def groove_depth(
+    height_um: np.ndarray, pitch_um: float, *, left_um: float, right_um: float, axis: Axis = "x"
+) -> StepHeight:
+    """Height of a ridge (positive) or groove (negative) of type A1 over its surroundings.
+
+    On every line ``z = a·x + b + h·δ`` is fitted with δ = 1 on the middle third of the feature and
+    δ = 0 on two reference arms. With W the width of the feature, the arms lie W/3 to W off its edges,
+    so that the profile spans three widths.
+
+    Args:
+        height_um: heights, µm, shape (ny, nx); NaN is left out.
+        left_um: first edge along the axis, µm from the field's border.
+        right_um: second edge, µm.
+        axis: direction of the profiles.
+
+    Raises:
+        InputError: edges in the wrong order, or arms outside the field.
+    """
+    width_um = right_um - left_um
+    lines, position_um = _profiles(height_um, pitch_um, axis)
+    extent_um = lines.shape[1] * pitch_um
+    if width_um <= 0 or left_um - width_um < -1e-9 or right_um + width_um > extent_um + 1e-9:
+        raise InputError(
+            "edges of a groove",
+            got=f"{left_um:g} and {right_um:g} µm",
+            wanted=f"left < right with one width to spare on both sides of {extent_um:g} µm",
+        )
+    third_um = width_um / 3
+    feature = (position_um >= left_um + third_um) & (position_um <= right_um - third_um)
+    before = (position_um >= left_um - width_um) & (position_um <= left_um - third_um)
+    after = (position_um >= right_um + third_um) & (position_um <= right_um + width_um)
+    return _fit_steps(lines, position_um, [before | after, feature])[0]
+
+
+def stair_steps(
+    height_um: np.ndarray, pitch_um: float, *, edges_um: Sequence[float], axis: Axis = "x"
+) -> list[StepHeight]:
+    """Heights of the steps of a staircase, one per edge, positive upwards.
+
+    On every line one height per tread and one common slope are fitted to the middle thirds of the
+    treads; a step is the difference of two neighbouring treads.
+
+    Args:
+        edges_um: positions of the edges along the axis, ascending, µm.
+
+    Raises:
+        InputError: edges that are not ascending inside the field, or treads under 3 pixels.
+    """
+    lines, position_um = _profiles(height_um, pitch_um, axis)
+    limits_um = np.array([0.0, *edges_um, lines.shape[1] * pitch_um])
+    widths_um = np.diff(limits_um)
+    if len(edges_um) == 0 or widths_um.min() < 3 * pitch_um:
+        raise InputError(
+            "edges of a staircase",
+            got=list(edges_um),
+            wanted="ascending, inside the field, 3 pixels apart or more",
+        )
+    treads = [
+        (position_um >= start + width / 3) & (position_um <= start + 2 * width / 3)
+        for start, width in zip(limits_um[:-1], widths_um, strict=True)
+    ]
+    return _fit_steps(lines, position_um, treads)
+
+
+def _profiles(height_um: np.ndarray, pitch_um: float, axis: Axis) -> tuple[np.ndarray, np.ndarray]:
+    if axis not in ("x", "y"):
+        raise InputError("axis", got=repr(axis), wanted="x or y")
+    lines = 1e3 * (height_um if axis == "x" else height_um.T).astype(np.float64)
+    return lines, (np.arange(lines.shape[1]) + 0.5) * pitch_um
+
+
+def _fit_steps(lines: np.ndarray, position_um: np.ndarray, treads: list[np.ndarray]) -> list[StepHeight]:
+    """Differences of neighbouring treads, line by line, with one slope per line."""
+    used = np.any(treads, axis=0)
+    design = np.stack([position_um - position_um.mean(), *(tread.astype(float) for tread in treads)], axis=1)[
+        used
+    ]
+    heights = []
+    for line in lines[:, used]:
+        finite = np.isfinite(line)
+        if np.linalg.matrix_rank(design[finite]) < design.shape[1]:
+            continue
+        weights, *_ = np.linalg.lstsq(design[finite], line[finite], rcond=None)
+        heights.append(np.diff(weights[1:]))
+    if len(heights) < 2:
+        raise InputError("lines of a step height", got=f"{len(heights)} complete", wanted="at least 2")
+    return [_summary(step) for step in np.array(heights).T]
+
+
+def _summary(step_nm: np.ndarray) -> StepHeight:
+    sd_nm = float(step_nm.std(ddof=1))
+    # Neighbouring lines of a print share its roughness, so they do not count as independent.
+    independent = _independent_lines(step_nm) if sd_nm > 0 else float(step_nm.size)
+    return StepHeight(
+        height_nm=float(step_nm.mean()),
+        line_sd_nm=sd_nm,
+        uncertainty_nm=sd_nm / float(np.sqrt(independent)),
+        lines=int(step_nm.size),
+    )
+
+
+def _independent_lines(values: np.ndarray) -> float:
+    """n / (1 + 2 Σ ρ) with the sum up to the first negative ρ (initial positive sequence)."""
+    deviation = values - values.mean()
+    correlation = np.correlate(deviation, deviation, "full")[values.size - 1 :] / (deviation @ deviation)
+    negative = np.flatnonzero(correlation < 0)
+    until = int(negative[0]) if negative.size else correlation.size
+    return float(values.size / max(1.0, 1 + 2 * correlation[1:until].sum()))

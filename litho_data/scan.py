@@ -1,0 +1,90 @@
+"""One height map as an instrument recorded it, with everything the file says about it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from litho_data.errors import InputError
+from litho_data.grid import PixelGrid
+
+Axis = Literal["x", "y"]
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """A height map in the scan's own frame.
+
+    Args:
+        height_um: (ny, nx) float64, µm, row 0 on top; NaN where nothing was measured.
+        pitch_um: (along y, along x) sampling, µm; None where neither the file nor the caller says.
+        name: what the scan is called, by default the stem of its file.
+        channel: name of the channel that was read.
+        unit: unit of the heights in the file, before conversion to µm.
+        fast_axis: the axis along which the tip moved fast; None where unknown.
+        mask: (ny, nx) bool, the mask kept in the file; None where there is none.
+        header: what the file says beside the heights, word by word.
+        source: path of the file.
+        format: name of the reader that read it.
+
+    Raises:
+        InputError: not a map of at least 2 x 2 pixels, no finite height at all, a mask of another
+            shape, or a pitch that is not positive.
+    """
+
+    height_um: np.ndarray
+    pitch_um: tuple[float, float] | None
+    name: str = ""
+    channel: str = ""
+    unit: str = "µm"
+    fast_axis: Axis | None = None
+    mask: np.ndarray | None = None
+    header: dict[str, str] = field(default_factory=dict)
+    source: str = ""
+    format: str = ""
+
+    def __post_init__(self) -> None:
+        what = f"scan {self.source or self.name}".strip()
+        height = np.array(self.height_um, dtype=np.float64, order="C")
+        if height.ndim != 2 or min(height.shape) < 2:
+            raise InputError(f"{what}: shape", got=height.shape, wanted="at least 2 x 2 pixels")
+        height[~np.isfinite(height)] = np.nan
+        if np.isnan(height).all():
+            raise InputError(f"{what}: no finite height", wanted="at least one measured pixel")
+        height.flags.writeable = False
+        object.__setattr__(self, "height_um", height)
+        if self.mask is not None:
+            mask = np.array(self.mask, dtype=bool)
+            if mask.shape != height.shape:
+                raise InputError(f"{what}: shape of the mask", got=mask.shape, wanted=height.shape)
+            mask.flags.writeable = False
+            object.__setattr__(self, "mask", mask)
+        if self.pitch_um is not None:
+            grid = PixelGrid((height.shape[0], height.shape[1]), self.pitch_um)
+            object.__setattr__(self, "pitch_um", (float(grid.pitch_um[0]), float(grid.pitch_um[1])))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(ny, nx) in pixels."""
+        return self.height_um.shape[0], self.height_um.shape[1]
+
+    def require_pitch(self) -> tuple[float, float]:
+        """The pitch (y, x) in µm, for every operation that needs lateral lengths.
+
+        Raises:
+            InputError: the pitch is unknown.
+        """
+        if self.pitch_um is None:
+            raise InputError(
+                f"scan {self.source or self.name} carries no pixel pitch",
+                wanted="a pitch in µm",
+                hint="give the field size, for example size_um = [54.0, 54.0]",
+            )
+        return self.pitch_um
+
+    @property
+    def grid(self) -> PixelGrid:
+        """The sampling geometry; raises InputError where the pitch is unknown."""
+        return PixelGrid(self.shape, self.require_pitch())

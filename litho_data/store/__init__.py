@@ -1,0 +1,5 @@
+"""The dataset store: its schema, and reading it."""
+
+from litho_data.store.read import PrintedScan, Store, open_store
+
+__all__ = ["PrintedScan", "Store", "open_store"]

@@ -1,0 +1,121 @@
+"""Typed, checked access to Zarr groups and arrays; damaged bytes become one clear error."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from zipfile import BadZipFile
+
+import numpy as np
+
+from litho_data.errors import InputError
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import zarr
+
+
+def open_root(path: str | Path) -> zarr.Group:
+    """The root group of a store, read-only, without trusting consolidated metadata.
+
+    Raises:
+        InputError: not there, or not a Zarr v3 group.
+    """
+    import zarr
+    from zarr.storage import ZipStore
+
+    location = Path(path)
+    if not location.exists():
+        raise InputError(
+            "dataset store", got=f"{location}, which does not exist", wanted="a .zarr folder or .zarr.zip"
+        )
+    try:
+        source = ZipStore(location, mode="r") if location.is_file() else location
+        return zarr.open_group(source, mode="r", zarr_format=3, use_consolidated=False)
+    except (OSError, ValueError, BadZipFile) as error:
+        raise InputError(
+            f"cannot open {location} as a dataset store", got=str(error), wanted="a Zarr v3 group"
+        ) from error
+
+
+def group_of(parent: zarr.Group, name: str) -> zarr.Group:
+    """The child group of that name.
+
+    Raises:
+        InputError: there is none.
+    """
+    import zarr
+
+    child = _child(parent, name)
+    if not isinstance(child, zarr.Group):
+        raise InputError(
+            f"group {name} of {parent.store_path}", got="none", wanted="a store made by litho-data"
+        )
+    return child
+
+
+def array_of(parent: zarr.Group, name: str) -> zarr.Array:
+    """The child array of that name.
+
+    Raises:
+        InputError: there is none.
+    """
+    import zarr
+
+    child = _child(parent, name)
+    if not isinstance(child, zarr.Array):
+        raise InputError(
+            f"array {name} of {parent.store_path}", got="none", wanted="a store made by litho-data"
+        )
+    return child
+
+
+def has_child(parent: zarr.Group, name: str) -> bool:
+    """Whether there is a child of that name.
+
+    Raises:
+        InputError: there is one, with damaged metadata.
+    """
+    return _child(parent, name) is not None
+
+
+def values_of(parent: zarr.Group, name: str) -> np.ndarray:
+    """All values of a child array.
+
+    Raises:
+        InputError: no such array, or a stored chunk that does not decode.
+    """
+    return decoded(array_of(parent, name), ..., f"{name} of {parent.store_path}")
+
+
+def decoded(array: zarr.Array, selection: Any, what: str) -> np.ndarray:
+    """A selection of an array.
+
+    Raises:
+        InputError: a stored chunk that does not decode; the message says what it belongs to.
+    """
+    try:
+        return np.asarray(array[selection])
+    except Exception as error:  # each codec raises its own type for damaged bytes
+        raise InputError(
+            f"{what} does not decode", got=str(error), hint="the stored chunk is damaged"
+        ) from error
+
+
+def read_table(group: zarr.Group, first: str) -> pd.DataFrame:
+    """The one-dimensional arrays of a group as a table, the column ``first`` in front."""
+    import pandas as pd
+
+    names = sorted((name for name, _ in group.arrays()), key=lambda name: (name != first, name))
+    return pd.DataFrame({name: _plain(values_of(group, name)) for name in names})
+
+
+def _child(parent: zarr.Group, name: str) -> Any:
+    try:
+        return parent.get(name)
+    except Exception as error:  # zarr lets the errors of its metadata parsers through
+        raise InputError(f"metadata of {name} in {parent.store_path} is damaged", got=str(error)) from error
+
+
+def _plain(values: np.ndarray) -> np.ndarray:
+    return np.array([str(value) for value in values], dtype=object) if values.dtype.kind in "OTU" else values

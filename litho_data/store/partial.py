@@ -1,0 +1,160 @@
+"""A store under construction: finished scans are kept, so that a build that was killed can go on.
+
+It lies beside the store as ``.<name>.partial`` and becomes the store in one rename. A scan counts as finished
+when its record is there, which is written last; it is taken over only if its files, parameters and code
+are the same and its arrays still have the recorded hashes.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
+from zipfile import BadZipFile
+
+import numpy as np
+
+from litho_data.errors import InputError
+from litho_data.files import atomic_file, writable
+from litho_data.store.access import group_of, open_root, values_of
+from litho_data.store.schema import SAMPLE_VARIABLES, SCAN_VARIABLES, STORE_SCHEMA, VARIABLES
+from litho_data.store.write import write_scan_group
+
+if TYPE_CHECKING:
+    import zarr
+
+
+@dataclass(frozen=True)
+class Piece:
+    """One finished scan: its arrays by name, and a record of plain data with ``id``, ``key``, ``steps``, …"""
+
+    record: Mapping[str, Any]
+    arrays: Mapping[str, np.ndarray]
+
+
+@contextmanager
+def partial_store(out: Path) -> Iterator[PartialStore]:
+    """The construction site of the store ``out``; only one process at a time may use it.
+
+    Raises:
+        InputError: ``out`` exists and is not a dataset store, cannot be written, or is being built already.
+    """
+    _require_replaceable(out)
+    partial = PartialStore(out)
+    with writable(out):
+        partial.folder.mkdir(parents=True, exist_ok=True)
+    with open(partial.folder / "lock", "w") as lock:
+        _lock(lock, out)
+        yield partial
+
+
+class PartialStore:
+    """Pieces on disk and the group that they grow into."""
+
+    def __init__(self, out: Path):
+        self.out = out
+        self.folder = out.parent / f".{out.name}.partial"
+        self.store = self.folder / "store"
+        self._pieces = self.folder / "pieces"
+
+    def open(self) -> zarr.Group:
+        """The growing root group; everything but finished scans is thrown away first."""
+        import zarr
+
+        self._pieces.mkdir(exist_ok=True)
+        if self.store.exists():
+            for child in self.store.iterdir():
+                if child.name != "scans":
+                    shutil.rmtree(child) if child.is_dir() else child.unlink()
+        return zarr.open_group(self.store, mode="a", zarr_format=3)
+
+    def finished(self, root: zarr.Group, keys: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+        """Records of the scans that need not be computed again.
+
+        Args:
+            root: the growing group.
+            keys: per id that is to be built, a function that returns its key; other ids are removed.
+        """
+        records = {}
+        for path in sorted(self._pieces.glob("*.json")):
+            record = json.loads(path.read_text(encoding="utf-8"))
+            scan_id = record["id"]
+            if scan_id in keys and record["key"] == keys[scan_id]() and self._intact(root, record):
+                records[scan_id] = record
+            else:
+                path.unlink()
+        for path in (self.store / "scans").glob("*"):
+            if path.is_dir() and path.name not in records:
+                shutil.rmtree(path)
+        return records
+
+    def add(self, root: zarr.Group, piece: Piece) -> None:
+        """Keep one finished scan; its record comes last."""
+        scan_id = piece.record["id"]
+        write_scan_group(root, scan_id, piece.arrays, {"use": piece.record["use"]})
+        samples = {v.name: piece.arrays[v.name] for v in SAMPLE_VARIABLES if v.name in piece.arrays}
+        with atomic_file(self._pieces / f"{scan_id}.npz") as temporary, open(temporary, "wb") as stream:
+            np.savez(stream, allow_pickle=False, **samples)
+        with atomic_file(self._pieces / f"{scan_id}.json") as temporary:
+            temporary.write_text(json.dumps(piece.record), encoding="utf-8")
+
+    def samples(self, scan_id: str) -> dict[str, np.ndarray]:
+        """The arrays of one finished scan on the layout grid."""
+        with np.load(self._pieces / f"{scan_id}.npz", allow_pickle=False) as archive:
+            return dict(archive)
+
+    def publish(self) -> None:
+        """Put the finished store in its place; an older store there is replaced."""
+        retired = self.folder / "retired"
+        shutil.rmtree(retired, ignore_errors=True)
+        if self.out.exists():
+            self.out.rename(retired)
+        self.store.rename(self.out)
+        self.discard()
+
+    def discard(self) -> None:
+        """Leave nothing behind."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _intact(self, root: zarr.Group, record: Mapping[str, Any]) -> bool:
+        hashes = {output["name"]: output["sha256"] for step in record["steps"] for output in step["outputs"]}
+        try:
+            arrays = self.samples(record["id"])
+            group = group_of(root, f"scans/{record['id']}")
+            arrays |= {v.name: values_of(group, v.name) for v in SCAN_VARIABLES if v.name in hashes}
+        except (OSError, ValueError, BadZipFile):  # InputError is a ValueError
+            return False
+        return {name: VARIABLES[name].sample_sha256(array) for name, array in arrays.items()} == hashes
+
+
+def _require_replaceable(out: Path) -> None:
+    if not out.exists():
+        return
+    if out.is_dir() and not any(out.iterdir()):
+        return
+    try:
+        schema = open_root(out).attrs.get("schema")
+    except InputError:
+        schema = None
+    if schema != STORE_SCHEMA or not out.is_dir():
+        raise InputError(
+            "output", got=f"{out}, which is there and no store of ours", wanted="a new path or a store"
+        )
+
+
+def _lock(stream: IO[str], out: Path) -> None:
+    """An advisory lock that ends with the process, however it ends; where there is none, go without."""
+    try:
+        import fcntl
+    except ImportError:
+        return
+    try:
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        raise InputError(
+            f"{out} is being built by another process", hint="wait for it, or stop it"
+        ) from error

@@ -1,0 +1,251 @@
+"""Reading a dataset store: checked once at the door, then one scan at a time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from litho_data.errors import InputError
+from litho_data.store.access import array_of, decoded, group_of, has_child, open_root, read_table, values_of
+from litho_data.store.schema import OPTIONAL_COLUMNS, SAMPLE_VARIABLES, dataset_sha256
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import zarr
+
+
+@dataclass(frozen=True)
+class PrintedScan:
+    """One printed field: the layout sent to the printer and the height measured on the layout's grid.
+
+    Args:
+        id: name of the scan; ``print_id``: block of fields it was printed with; ``order``: writing order.
+        mask_level: layout levels, uint8 (ny, nx).
+        height_um: float32 (ny, nx), µm, NaN where not measured.
+        valid: bool (ny, nx), measured and inside the scan.
+        pitch_um: pixel pitch of all three arrays, µm; ``level_height_um``: nominal height of a level, µm.
+        levels: number of levels the layout may use.
+        scan_to_layout: 3 x 3 float64, maps (x_um, y_um, 1) of the scan's own frame to the layout frame.
+        write: the card's ``[write]`` table, None where the card has none.
+        field_x_um, field_y_um: position of the scan in its write field, µm; ``dose``: relative dose;
+            None where the card does not say.
+    """
+
+    id: str
+    print_id: str
+    order: int
+    mask_level: np.ndarray
+    height_um: np.ndarray
+    valid: np.ndarray
+    pitch_um: float
+    level_height_um: float
+    levels: int
+    scan_to_layout: np.ndarray
+    write: Mapping[str, Any] | None = None
+    field_x_um: float | None = None
+    field_y_um: float | None = None
+    dose: float | None = None
+
+    @property
+    def layout_um(self) -> np.ndarray:
+        """Nominal height, float32 (ny, nx), µm."""
+        return self.mask_level.astype(np.float32) * np.float32(self.level_height_um)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(ny, nx) in pixels."""
+        return self.mask_level.shape[0], self.mask_level.shape[1]
+
+
+def open_store(path: str | Path) -> Store:
+    """Open a dataset store, a folder or a ``.zarr.zip`` file, for reading.
+
+    Raises:
+        InputError: not there, not a Zarr v3 group, or arrays and attributes that break the store's contract.
+    """
+    return Store(open_root(path), Path(path))
+
+
+class Store:
+    """A dataset of printed scans; arrays are read when asked for, never all at once."""
+
+    def __init__(self, root: zarr.Group, path: Path):
+        self.path = path
+        self.root = root
+        attributes = _checked_attributes(root, path)
+        self.name: str = attributes["name"]
+        self.pitch_um: float = attributes["pitch_um"]
+        self.level_height_um: float = attributes["level_height_um"]
+        self.levels: int = attributes["levels"]
+        self.write: dict[str, Any] | None = attributes["write"]
+        self._arrays = _checked_arrays(root, path)
+        self.ids: list[str] = [str(value) for value in values_of(root, "scan")]
+        if len(set(self.ids)) != len(self.ids):
+            raise InputError(f"scan ids of {path}", got="duplicates", wanted="unique ids")
+        self._print_ids = [str(value) for value in values_of(root, "print")]
+        self._order = [int(value) for value in values_of(root, "order")]
+        self._columns = {name: values_of(root, name) for name in OPTIONAL_COLUMNS if has_child(root, name)}
+        self.shapes = _true_shapes(root, len(self.ids), self._arrays["mask_level"].shape[1:])
+        self._row = {scan_id: row for row, scan_id in enumerate(self.ids)}
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def __repr__(self) -> str:
+        return f"Store({self.name!r}, {len(self)} scans, pitch_um={self.pitch_um}, path={str(self.path)!r})"
+
+    def scan(self, scan_id: str) -> PrintedScan:
+        """One scan, padding cut off.
+
+        Raises:
+            InputError: no such id, or a stored chunk that does not decode.
+        """
+        row = self._row.get(scan_id)
+        if row is None:
+            raise InputError(
+                f"scan of {self.path}", got=repr(scan_id), wanted=f"one of {', '.join(self.ids[:30])}"
+            )
+        return PrintedScan(
+            id=scan_id,
+            print_id=self._print_ids[row],
+            order=self._order[row],
+            mask_level=self.sample("mask_level", row),
+            height_um=self.sample("height_um", row),
+            valid=self.sample("valid", row),
+            pitch_um=self.pitch_um,
+            level_height_um=self.level_height_um,
+            levels=self.levels,
+            scan_to_layout=self.sample("scan_to_layout", row),
+            write=self.write,
+            field_x_um=self._column("field_x_um", row),
+            field_y_um=self._column("field_y_um", row),
+            dose=self._column("dose", row),
+        )
+
+    def scans(self) -> list[PrintedScan]:
+        """All scans in stored order, in memory."""
+        return [self.scan(scan_id) for scan_id in self.ids]
+
+    def sample(self, name: str, row: int) -> np.ndarray:
+        """One scan's slice of one array in its true shape.
+
+        Raises:
+            InputError: a stored chunk that does not decode.
+        """
+        values = decoded(self._arrays[name], row, f"{name} of scan {self.ids[row]} in {self.path}")
+        if name == "scan_to_layout":
+            return values
+        ny, nx = self.shapes[row]
+        return values[:ny, :nx]
+
+    def scan_frame(self, scan_id: str, name: str) -> np.ndarray:
+        """An array of a scan in its own frame: ``raw_height_um``, ``levelled_height_um``, ``removed_um``, …
+
+        Raises:
+            InputError: no such scan or array, or a stored chunk that does not decode.
+        """
+        return values_of(group_of(self.root, f"scans/{scan_id}"), name)
+
+    def references(self) -> dict[str, str]:
+        """Scans outside the dataset: id and use (flat, substrate, steps); ``scan_frame`` has the heights."""
+        if not has_child(self.root, "scans"):
+            return {}
+        uses = {name: str(group.attrs["use"]) for name, group in group_of(self.root, "scans").groups()}
+        return {name: use for name, use in sorted(uses.items()) if use != "dataset"}
+
+    @cached_property
+    def manifest(self) -> dict[str, Any]:
+        """Card, build record and one row per raw file; empty for a store that was not built from a card."""
+        if not has_child(self.root, "manifest"):
+            return {}
+        group = group_of(self.root, "manifest")
+        return {**dict(group.attrs), "files": read_table(group, "path").to_dict("records")}
+
+    @cached_property
+    def quality(self) -> pd.DataFrame:
+        """One row per scan: registration, levelling and noise figures; only ids where none were stored."""
+        import pandas as pd
+
+        if not has_child(self.root, "quality"):
+            return pd.DataFrame({"scan": self.ids})
+        return read_table(group_of(self.root, "quality"), "scan")
+
+    @cached_property
+    def sha256(self) -> str:
+        """Hash of the dataset, independent of chunking: the stored one, else computed from the arrays."""
+        stored = self.root.attrs.get("dataset_sha256")
+        return str(stored) if stored else self.computed_sha256()
+
+    def computed_sha256(self) -> str:
+        """Hash of the dataset from the arrays as they are now."""
+        facts: dict[str, Any] = {
+            "pitch_um": self.pitch_um,
+            "level_height_um": self.level_height_um,
+            "levels": self.levels,
+        }
+        if self.write:
+            facts["write"] = self.write
+        return dataset_sha256(facts, [self._identity(row) for row in range(len(self))])
+
+    def _identity(self, row: int) -> dict[str, Any]:
+        identity: dict[str, Any] = {
+            "id": self.ids[row],
+            "print": self._print_ids[row],
+            "order": self._order[row],
+        }
+        for name in OPTIONAL_COLUMNS:
+            value = self._column(name, row)
+            if value is not None:
+                identity[name] = value
+        hashes = {v.name: v.sample_sha256(self.sample(v.name, row)) for v in SAMPLE_VARIABLES}
+        return {**identity, "arrays": hashes}
+
+    def _column(self, name: str, row: int) -> float | None:
+        value = float(self._columns[name][row]) if name in self._columns else math.nan
+        return None if math.isnan(value) else value
+
+
+def _checked_attributes(root: zarr.Group, path: Path) -> dict[str, Any]:
+    attributes = dict(root.attrs)
+    checked: dict[str, Any] = {
+        "name": str(attributes.get("name", path.stem)),
+        "write": attributes.get("write"),
+    }
+    for key in ("pitch_um", "level_height_um"):
+        value = attributes.get(key)
+        if not isinstance(value, int | float) or not math.isfinite(value) or value <= 0:
+            raise InputError(f"attribute {key} of {path}", got=repr(value), wanted="a positive number in µm")
+        checked[key] = float(value)
+    levels = attributes.get("levels")
+    if not isinstance(levels, int) or not 2 <= levels <= 256:
+        raise InputError(
+            f"attribute levels of {path}", got=repr(levels), wanted="a whole number from 2 to 256"
+        )
+    return {**checked, "levels": levels}
+
+
+def _checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array]:
+    names = (*(variable.name for variable in SAMPLE_VARIABLES), "scan", "print", "order")
+    arrays = {name: array_of(root, name) for name in names}
+    count, field = arrays["scan"].shape[0], arrays["mask_level"].shape[1:]
+    for variable in SAMPLE_VARIABLES:
+        array = arrays[variable.name]
+        wanted = (count, 3, 3) if variable.name == "scan_to_layout" else (count, *field)
+        if array.shape != wanted or array.dtype != np.dtype(variable.dtype):
+            got, wanted_text = f"{array.dtype} {array.shape}", f"{variable.dtype} {wanted}"
+            raise InputError(f"array {variable.name} of {path}", got=got, wanted=wanted_text)
+    return arrays
+
+
+def _true_shapes(root: zarr.Group, count: int, padded: tuple[int, ...]) -> list[tuple[int, int]]:
+    if not has_child(root, "quality"):
+        return [(padded[0], padded[1])] * count
+    quality = group_of(root, "quality")
+    rows, columns = values_of(quality, "layout_ny"), values_of(quality, "layout_nx")
+    return [(int(ny), int(nx)) for ny, nx in zip(rows, columns, strict=True)]

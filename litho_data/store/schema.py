@@ -1,0 +1,65 @@
+"""The dataset store on one screen: arrays, dimensions, types, units, and the hash of a whole dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from litho_data.provenance import array_sha256, record_sha256
+
+STORE_SCHEMA = "litho-data/store/1"
+
+
+@dataclass(frozen=True)
+class Variable:
+    """One array of the store: name, dimensions, type, unit (UDUNITS spelling), CF long name."""
+
+    name: str
+    dims: tuple[str, ...]
+    dtype: str
+    unit: str
+    long_name: str
+
+    @property
+    def sample_dims(self) -> tuple[str, ...]:
+        """The dimensions of one scan's slice."""
+        return tuple(dim for dim in self.dims if dim != "scan")
+
+    def sample_sha256(self, sample: np.ndarray) -> str:
+        """Hash of one scan's slice in its true shape, so that padding and chunking leave no trace."""
+        return array_sha256(np.asarray(sample, dtype=self.dtype), self.unit, self.sample_dims)
+
+
+SAMPLE_VARIABLES = (
+    Variable("mask_level", ("scan", "y", "x"), "uint8", "1", "layout level sent to the printer"),
+    Variable("height_um", ("scan", "y", "x"), "float32", "um", "levelled, registered height, layout grid"),
+    Variable("valid", ("scan", "y", "x"), "bool", "1", "measured and inside the scan"),
+    Variable("scan_to_layout", ("scan", "row", "column"), "float64", "1",
+             "maps (x_um, y_um, 1) of the scan frame to the layout frame"),
+)  # fmt: skip
+SCAN_VARIABLES = (
+    Variable("raw_height_um", ("y", "x"), "float32", "um", "height as read from the raw file, scan frame"),
+    Variable("levelled_height_um", ("y", "x"), "float32", "um", "height after levelling, scan frame"),
+    Variable("removed_um", ("y", "x"), "float32", "um", "surface that levelling removed, scan frame"),
+    Variable(
+        "layout_in_scan", ("y", "x"), "float32", "1", "layout level under each scan pixel; only where needed"
+    ),
+    Variable("vendor_mask", ("y", "x"), "bool", "1", "mask kept in the raw file; only where there is one"),
+)
+VARIABLES = {variable.name: variable for variable in (*SAMPLE_VARIABLES, *SCAN_VARIABLES)}
+OPTIONAL_COLUMNS = ("field_x_um", "field_y_um", "dose")
+"""Numbers per scan from the card's table; coordinates where the card has them, NaN where a row has not."""
+
+
+def dataset_sha256(facts: Mapping[str, Any], scans: Sequence[Mapping[str, Any]]) -> str:
+    """Hash of what a model can see of a dataset, independent of chunking, padding and metadata texts.
+
+    Args:
+        facts: ``pitch_um``, ``level_height_um``, ``levels`` and, where known, the ``write`` table.
+        scans: per scan in stored order: ``id``, ``print``, ``order``, the optional columns that are not NaN,
+            and ``arrays``, a dict of variable name to :meth:`Variable.sample_sha256`.
+    """
+    return record_sha256({"facts": dict(facts), "scans": [dict(scan) for scan in scans]})

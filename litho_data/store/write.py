@@ -1,0 +1,165 @@
+"""Writing a dataset store: whole scans per chunk, groups of scans per shard, every chunk with a checksum."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from litho_data.store.schema import OPTIONAL_COLUMNS, SAMPLE_VARIABLES, SCAN_VARIABLES, VARIABLES
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import zarr
+
+_SHARD_BYTES = 16 << 20
+_MAX_SCANS_PER_SHARD = 16
+
+
+def write_scan_group(
+    root: zarr.Group, scan_id: str, arrays: Mapping[str, np.ndarray], attributes: dict
+) -> None:
+    """Group ``scans/<id>``: what one scan looked like in its own frame."""
+    group = root.create_group(f"scans/{scan_id}", overwrite=True, attributes=attributes)
+    for variable in SCAN_VARIABLES:
+        if variable.name in arrays:
+            array = arrays[variable.name]
+            _create(group, variable.name, array.shape, chunks=array.shape)[...] = array
+
+
+def write_samples(
+    root: zarr.Group,
+    scans: Sequence[Mapping[str, Any]],
+    load: Callable[[str], Mapping[str, np.ndarray]],
+    pitch_um: float,
+) -> None:
+    """The arrays over all scans, streamed one shard at a time.
+
+    Args:
+        root: an open group.
+        scans: per scan ``id``, ``print``, ``order``, ``shape`` (ny, nx), ``columns`` (optional numbers).
+        load: the sample arrays of an id.
+        pitch_um: pitch of the layout grid, µm.
+    """
+    ny, nx = (max(scan["shape"][axis] for scan in scans) for axis in (0, 1))
+    group_size = int(np.clip(_SHARD_BYTES // (ny * nx * 4), 1, _MAX_SCANS_PER_SHARD))
+    field_shape = {"y": ny, "x": nx, "row": 3, "column": 3}
+    arrays = {}
+    for variable in SAMPLE_VARIABLES:
+        sample = tuple(field_shape[dim] for dim in variable.sample_dims)
+        shape, shards = (len(scans), *sample), (min(group_size, len(scans)), *sample)
+        arrays[variable.name] = _create(root, variable.name, shape, chunks=(1, *sample), shards=shards)
+    for start in range(0, len(scans), group_size):
+        rows = scans[start : start + group_size]
+        for name, block in _padded_blocks(rows, load, ny, nx).items():
+            arrays[name][start : start + len(rows)] = block
+
+    write_strings(root, "scan", [scan["id"] for scan in scans], "scan")
+    write_strings(root, "print", [scan["print"] for scan in scans], "scan")
+    write_numbers(root, "order", np.array([scan["order"] for scan in scans], dtype=np.int64), "scan")
+    for name in OPTIONAL_COLUMNS:
+        if any(name in scan["columns"] for scan in scans):
+            values = [scan["columns"].get(name, np.nan) for scan in scans]
+            write_numbers(root, name, np.array(values), "scan", "1" if name == "dose" else "um")
+    write_numbers(root, "y_um", pixel_centres_um(ny, pitch_um), "y", "um")
+    write_numbers(root, "x_um", pixel_centres_um(nx, pitch_um), "x", "um")
+
+
+def pixel_centres_um(count: int, pitch_um: float) -> np.ndarray:
+    """Coordinates of pixel centres along one axis, µm."""
+    return (np.arange(count) + 0.5) * pitch_um
+
+
+def write_table(
+    root: zarr.Group, name: str, table: pd.DataFrame, dim: str, attributes: dict | None = None
+) -> None:
+    """A table as a group of one-dimensional arrays over ``dim``; text as UTF-8, no missing text."""
+    group = root.create_group(name, attributes=attributes or {})
+    for column in table.columns:
+        values = table[column].to_numpy()
+        if values.dtype.kind in "biuf":
+            write_numbers(group, str(column), values, dim)
+        else:
+            write_strings(group, str(column), [str(value) for value in values], dim)
+
+
+def write_strings(group: zarr.Group, name: str, values: Sequence[str], dim: str) -> None:
+    """A one-dimensional array of UTF-8 texts."""
+    size = (max(len(values), 1),)
+    array = group.create_array(
+        name,
+        shape=(len(values),),
+        chunks=size,
+        dtype="string",
+        compressors=_compressors(),
+        dimension_names=(dim,),
+    )
+    array[...] = np.array(values, dtype=object)
+
+
+def write_numbers(
+    group: zarr.Group, name: str, values: np.ndarray, dim: str, unit: str | None = None
+) -> None:
+    """A one-dimensional array of numbers."""
+    array = group.create_array(
+        name,
+        shape=values.shape,
+        chunks=(max(len(values), 1),),
+        dtype=values.dtype,
+        compressors=_compressors(),
+        dimension_names=(dim,),
+        attributes={"units": unit} if unit else {},
+    )
+    array[...] = values
+
+
+def consolidate(root: zarr.Group) -> None:
+    """Copy all metadata into the root's document, so that xarray opens the store with one read."""
+    import zarr
+
+    with warnings.catch_warnings():
+        # zarr-python says that other readers may not know the copy; they read the single documents.
+        warnings.filterwarnings("ignore", message="Consolidated metadata")
+        zarr.consolidate_metadata(root.store)
+
+
+def _create(group: zarr.Group, name: str, shape: tuple[int, ...], **layout: Any) -> zarr.Array:
+    variable = VARIABLES[name]
+    coordinates = {"coordinates": "print order y_um x_um"} if variable.dims[:2] == ("scan", "y") else {}
+    return group.create_array(
+        name,
+        shape=shape,
+        dtype=variable.dtype,
+        fill_value=np.nan if variable.dtype.startswith("float") else 0,
+        compressors=_compressors(),
+        dimension_names=variable.dims,
+        attributes={"units": variable.unit, "long_name": variable.long_name, **coordinates},
+        **layout,
+    )
+
+
+def _compressors() -> list[Any]:
+    """Zstandard on shuffled bytes, then a checksum over everything, so that no flipped byte goes unseen."""
+    from zarr.codecs import BloscCodec, Crc32cCodec
+
+    return [BloscCodec(cname="zstd", clevel=5, shuffle="shuffle"), Crc32cCodec()]
+
+
+def _padded_blocks(
+    scans: Sequence[Mapping[str, Any]], load: Callable[[str], Mapping[str, np.ndarray]], ny: int, nx: int
+) -> dict[str, np.ndarray]:
+    padding = {"mask_level": 0, "height_um": np.nan, "valid": False}
+    blocks = {
+        name: np.full((len(scans), ny, nx), fill, dtype=VARIABLES[name].dtype)
+        for name, fill in padding.items()
+    }
+    blocks["scan_to_layout"] = np.empty((len(scans), 3, 3))
+    for row, scan in enumerate(scans):
+        arrays = load(scan["id"])
+        rows, columns = scan["shape"]
+        for name in padding:
+            blocks[name][row, :rows, :columns] = arrays[name]
+        blocks["scan_to_layout"][row] = arrays["scan_to_layout"]
+    return blocks

@@ -1,0 +1,130 @@
+"""The microscope: tip, feedback, drift, line offsets, tilt, bow, datum, quantisation."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.ndimage
+
+from litho_data.virtual_fab.geometry import ScanFrame
+from litho_data.virtual_fab.knobs import KnobBoard
+from litho_data.virtual_fab.settings import Noise
+
+_TIP_OVERSAMPLING = 10
+_DRIFT_DECAY_ROWS = 0.15
+
+
+def scan_surface(
+    surface_um: np.ndarray,
+    frame: ScanFrame,
+    noise: Noise,
+    knobs: KnobBoard,
+    scan_index: int,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Height that the microscope reports for a surface given at its pixels, µm.
+
+    Lines are scanned from left to right (fast axis x), the first line on top.
+
+    Args:
+        surface_um: true height at the pixels of the scan, µm.
+        rng: draws of the default noise of this scan.
+    """
+    height = surface_um
+    if strength := knobs["tip-dilation"]:
+        height = _dilate_by_tip(height, frame.pitch_um, strength)
+    if strength := knobs["feedback-lag"]:
+        height = _follow_surface(height, frame.pitch_um, strength)
+    if strength := knobs["z-gain"]:
+        height = height * (1 + strength * knobs.scan_rng("z-gain", scan_index).standard_normal())
+    height = height + 1e-3 * _additive_nm(frame, noise, knobs, scan_index, rng)
+    if strength := knobs["resampling-blur"]:
+        height = scipy.ndimage.gaussian_filter(
+            height, strength / frame.pitch_um, mode="nearest", truncate=5.0
+        )
+    if strength := knobs["scars-and-spikes"]:
+        height = _scar(height, strength, knobs.scan_rng("scars-and-spikes", scan_index))
+    if strength := knobs["min-to-zero-datum"]:
+        height = height - strength * height.min()
+    if strength := knobs["quantisation"]:
+        step_um = 1e-3 * strength
+        height = np.floor(height / step_um) * step_um
+    return height
+
+
+def _dilate_by_tip(height: np.ndarray, pitch_um: float, radius_um: float) -> np.ndarray:
+    """Path of a paraboloid tip: ``max_u h(x − u) − u²/2R``, between pixels as well."""
+    # A paraboloid is a sum of two parabolas, so the maximum can be taken axis by axis.
+    columns_done = _dilate_columns(height, pitch_um, radius_um)
+    return _dilate_columns(columns_done.T, pitch_um, radius_um).T
+
+
+def _dilate_columns(height: np.ndarray, pitch_um: float, radius_um: float) -> np.ndarray:
+    from scipy.interpolate import CubicSpline
+
+    fine_um = pitch_um / _TIP_OVERSAMPLING
+    # The tip touches where its slope u/R equals the surface's.
+    steepest = np.abs(np.diff(height, axis=0)).max() / pitch_um
+    reach = int(np.ceil(1.5 * radius_um * steepest / fine_um)) + 1
+    rows = height.shape[0]
+    at = np.arange(-reach, (rows - 1) * _TIP_OVERSAMPLING + reach + 1) / _TIP_OVERSAMPLING
+    fine = CubicSpline(np.arange(rows), height, axis=0)(np.clip(at, 0, rows - 1))
+    highest = np.full_like(height, -np.inf)
+    for offset in range(-reach, reach + 1):
+        start = reach + offset
+        touched = fine[start : start + (rows - 1) * _TIP_OVERSAMPLING + 1 : _TIP_OVERSAMPLING]
+        np.maximum(highest, touched - (offset * fine_um) ** 2 / (2 * radius_um), out=highest)
+    return highest
+
+
+def _follow_surface(height: np.ndarray, pitch_um: float, lag_um: float) -> np.ndarray:
+    """First-order feedback along the lines that loses the surface more easily on the way down."""
+    falling, rising = (1 - np.exp(-pitch_um / length) for length in (lag_um, lag_um / 3))
+    followed = np.empty_like(height)
+    at = height[:, 0].copy()
+    followed[:, 0] = at
+    for column in range(1, height.shape[1]):
+        error = height[:, column] - at
+        at = at + np.where(error < 0, falling, rising) * error
+        followed[:, column] = at
+    return followed
+
+
+def _additive_nm(
+    frame: ScanFrame, noise: Noise, knobs: KnobBoard, scan_index: int, rng: np.random.Generator
+) -> np.ndarray:
+    """Everything that is added to the height whatever the surface, nm."""
+    y, x = frame.unit_axes
+    lines = noise.line_nm * rng.standard_normal((frame.shape[0], 1))
+    pixels = noise.pixel_nm * rng.standard_normal(frame.shape)
+    total = lines + pixels + noise.datum_nm * rng.standard_normal()
+    if strength := knobs["datum-offset"]:
+        total = total + strength * knobs.scan_rng("datum-offset", scan_index).standard_normal()
+    if strength := knobs["tilt-bow"]:
+        shapes = (x, y, x**2 - 1 / 3, x * y, y**2 - 1 / 3)
+        weights = knobs.scan_rng("tilt-bow", scan_index).standard_normal(len(shapes))
+        surface = sum(
+            weight * shape / np.sqrt(np.mean(shape**2)) for weight, shape in zip(weights, shapes, strict=True)
+        )
+        total = total + strength * surface / len(shapes) ** 0.5
+    if strength := knobs["slow-drift"]:
+        creep = np.exp(-(y + 1) / 2 / _DRIFT_DECAY_ROWS)
+        total = (
+            total
+            + strength * knobs.scan_rng("slow-drift", scan_index).standard_normal() * creep / creep.std()
+        )
+    if strength := knobs["scan-line-stripes"]:
+        stripes = knobs.scan_rng("scan-line-stripes", scan_index).standard_normal((frame.shape[0], 1))
+        total = total + strength * stripes
+    return total
+
+
+def _scar(height: np.ndarray, scars_per_row: float, rng: np.random.Generator) -> np.ndarray:
+    """Scars along the fast axis and single-pixel spikes, of either sign."""
+    scarred = height.copy()
+    ny, nx = height.shape
+    for _ in range(rng.poisson(scars_per_row * ny)):
+        row, start, length = rng.integers(ny), rng.integers(nx), rng.integers(16, 61)
+        scarred[row, start : start + length] += rng.choice([-1, 1]) * rng.uniform(0.05, 0.3)
+    for _ in range(rng.poisson(scars_per_row * ny / 3)):
+        scarred[rng.integers(ny), rng.integers(nx)] += rng.choice([-1, 1]) * rng.uniform(0.05, 0.3)
+    return scarred

@@ -1,0 +1,129 @@
+"""Exposure: hatch lines, slices and two-photon dose; what beam, galvo and field do to it."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.signal
+
+from litho_data.layouts.random_layout import random_layout
+from litho_data.virtual_fab.canvas import (
+    Canvas,
+    apply_transfer,
+    blur,
+    cut_layout,
+    frequencies_per_um,
+    set_layout,
+)
+from litho_data.virtual_fab.knobs import KnobBoard
+from litho_data.virtual_fab.settings import Printer
+
+_SLICE_STEEPNESS = 20.0
+_SLICE_THRESHOLD = 0.5
+
+
+def accumulate_dose(
+    canvas: Canvas,
+    printer: Printer,
+    knobs: KnobBoard,
+    *,
+    relative_dose: float = 1.0,
+    order: float = 0.0,
+    scan_index: int = 0,
+) -> np.ndarray:
+    """Two-photon dose of a written canvas; 1 is the middle of a wide block of the highest level.
+
+    Each row of the canvas is one hatch line. In slice k the laser is on where the level is at
+    least k, and absorption goes with the squared intensity of the spot, so the slices add up to
+    ``level * (squared spot)``.
+
+    Args:
+        canvas: what is written.
+        printer: spot and slicing.
+        knobs: effects on the dose.
+        relative_dose: two-photon dose of this print relative to the recipe's.
+        order: place in the print order, −0.5 (first) to 0.5 (last).
+        scan_index: number of the scan, for draws that are new in every scan.
+    """
+    nominal = canvas.level / (printer.levels - 1)
+    if strength := knobs["unseen-neighbours"]:
+        around = random_layout(
+            nominal.shape,
+            levels=printer.levels,
+            pitch_um=printer.pitch_um,
+            seed=knobs.scan_rng("unseen-neighbours", scan_index),
+        )
+        mixed = (1 - strength) * nominal + strength * (around / (printer.levels - 1))
+        nominal = set_layout(mixed, cut_layout(nominal))
+    if strength := knobs["level-error"]:
+        wrong_level = int(knobs.machine_rng("level-error").integers(3, max(4, printer.levels - 4)))
+        nominal = nominal + (canvas.level == wrong_level) * (strength / printer.full_height_um)
+    line_energy = relative_dose * (1 + knobs["laser-drift"] * order) * _field_response(canvas, knobs)
+    spot = _spot_transfer(canvas, printer, knobs)
+    dose = apply_transfer(nominal * line_energy, spot)
+    if strength := knobs["layer-stacking"]:
+        dose = (1 - strength) * dose + strength * _slice_by_slice(nominal, line_energy, spot, printer)
+    if strength := knobs["long-range-proximity"]:
+        reach_um = knobs.machine_rng("long-range-proximity").uniform(2.0, 5.0)
+        dose = (dose + strength * blur(dose, canvas.pitch_um, reach_um)) / (1 + strength)
+    if strength := knobs["write-order-memory"]:
+        decay_um = knobs.machine_rng("write-order-memory").uniform(1.0, 4.0)
+        dose = dose - strength * _earlier_lines(dose, canvas.pitch_um, decay_um)
+    # Spectral filters undershoot zero by rounding, and no dose is negative.
+    dose = np.maximum(dose, 0.0)
+    if strength := knobs["dose-exponent"]:
+        dose = dose ** (1 + strength)
+    return dose
+
+
+def _field_response(canvas: Canvas, knobs: KnobBoard) -> np.ndarray | float:
+    """Relative dose over the write field."""
+    if not (strength := knobs["vignetting"]):
+        return 1.0
+    y_um, x_um = canvas.field_offset_um()
+    corner_um2 = canvas.write_field_um**2 / 2
+    return np.maximum(1 - strength * (y_um**2 + x_um**2) / corner_um2, 0.0)
+
+
+def _spot_transfer(canvas: Canvas, printer: Printer, knobs: KnobBoard) -> np.ndarray:
+    """Transfer function of the squared spot, with its ellipticity, its ghost and the lag of the galvo."""
+    frequency_y, frequency_x = frequencies_per_um(canvas.level.shape, canvas.pitch_um)
+    # The square of a Gaussian intensity is a Gaussian narrower by √2.
+    sigma_um = printer.spot_sigma_um / 2**0.5
+    transfer = np.exp(-2 * (np.pi * sigma_um) ** 2 * (frequency_y**2 + frequency_x**2))
+    if strength := knobs["elliptical-psf"]:
+        axis = knobs.machine_rng("elliptical-psf").uniform(0, np.pi)
+        along = frequency_x * np.cos(axis) + frequency_y * np.sin(axis)
+        transfer = transfer * np.exp(-2 * (np.pi * strength * along) ** 2)
+    if strength := knobs["galvo-lag"]:
+        transfer = transfer / (1 + 2j * np.pi * frequency_x * strength)
+    if strength := knobs["ghost-spot"]:
+        rng = knobs.machine_rng("ghost-spot")
+        distance_um, direction = rng.uniform(0.8, 2.0), rng.uniform(0, 2 * np.pi)
+        shift = frequency_x * np.cos(direction) + frequency_y * np.sin(direction)
+        transfer = transfer * (1 + strength * np.exp(-2j * np.pi * distance_um * shift))
+    return transfer
+
+
+def _slice_by_slice(
+    nominal: np.ndarray, line_energy: np.ndarray | float, spot: np.ndarray, printer: Printer
+) -> np.ndarray:
+    """Dose that counts if every slice has to pass the threshold on its own."""
+    slices = printer.levels - 1
+    passed = np.zeros_like(nominal)
+    for index in range(slices):
+        exposed = np.clip(nominal * slices - index, 0.0, 1.0) * line_energy
+        dose = apply_transfer(exposed, spot)
+        passed += _soft_step(dose) / slices
+    return passed
+
+
+def _soft_step(dose: np.ndarray) -> np.ndarray:
+    """Logistic step that maps 0 to 0 and 1 to 1 exactly."""
+    low, high = (1 / (1 + np.exp(-_SLICE_STEEPNESS * (edge - _SLICE_THRESHOLD))) for edge in (0.0, 1.0))
+    return (1 / (1 + np.exp(-_SLICE_STEEPNESS * (dose - _SLICE_THRESHOLD))) - low) / (high - low)
+
+
+def _earlier_lines(dose: np.ndarray, pitch_um: float, decay_um: float) -> np.ndarray:
+    """Exponentially fading mean of the lines above, which were written before."""
+    memory = np.exp(-pitch_um / decay_um)
+    return scipy.signal.lfilter([0.0, 1 - memory], [1.0, -memory], dose, axis=0)

@@ -1,0 +1,69 @@
+"""The fab: a printer, a microscope, their knobs and their noise; one field in, one scan out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from litho_data.virtual_fab.afm import scan_surface
+from litho_data.virtual_fab.canvas import cut_layout
+from litho_data.virtual_fab.geometry import ScanFrame, place_scan, sample_surface
+from litho_data.virtual_fab.knobs import KnobBoard
+from litho_data.virtual_fab.printer import Job, print_clean, surface_noise
+from litho_data.virtual_fab.settings import Microscope, Noise, Printer
+
+
+@dataclass(frozen=True)
+class Fab:
+    """A printer and a microscope with their knobs and their noise."""
+
+    printer: Printer
+    microscope: Microscope
+    noise: Noise
+    knobs: KnobBoard
+    seed: int
+
+
+@dataclass(frozen=True)
+class FabScan:
+    """One simulated scan.
+
+    Args:
+        job: what was printed.
+        frame: where the scan lies on the layout.
+        height_um: what the microscope reports, float64 (ny, nx) of the scan.
+        noiseless_um: the same without default noise.
+        clean_um: the print without noise on the layout grid, µm.
+    """
+
+    job: Job
+    frame: ScanFrame
+    height_um: np.ndarray
+    noiseless_um: np.ndarray
+    clean_um: np.ndarray
+
+
+def scan_job(fab: Fab, job: Job) -> FabScan:
+    """Print and scan one field; depends on the fab and the job only, not on other fields."""
+    geometry_seed, roughness_seed, instrument_seed = np.random.SeedSequence(
+        fab.seed, spawn_key=(job.index, 1)
+    ).spawn(3)
+    frame = place_scan(
+        job.level.shape, fab.printer.pitch_um, fab.microscope, np.random.default_rng(geometry_seed)
+    )
+    surface = print_clean(job, fab.printer, fab.knobs)
+    rough = surface_noise(job, fab.printer, fab.noise, fab.knobs, np.random.default_rng(roughness_seed))
+
+    def scan(true_surface: np.ndarray, noise: Noise) -> np.ndarray:
+        sampled = sample_surface(true_surface, frame, fab.knobs, job.index)
+        instrument = np.random.default_rng(instrument_seed)
+        return scan_surface(sampled, frame, noise, fab.knobs, job.index, instrument)
+
+    return FabScan(
+        job=job,
+        frame=frame,
+        height_um=scan(surface + rough, fab.noise),
+        noiseless_um=scan(surface, Noise.off()),
+        clean_um=cut_layout(surface),
+    )

@@ -1,0 +1,98 @@
+"""Where the pixels of a scan lie on the print."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.ndimage
+
+from litho_data.virtual_fab.canvas import GUARD_PX
+from litho_data.virtual_fab.knobs import KnobBoard
+from litho_data.virtual_fab.settings import Microscope
+
+_REFERENCE_PX = 512
+
+
+@dataclass(frozen=True)
+class ScanFrame:
+    """The frame of one scan.
+
+    Args:
+        shape: (ny, nx) of the scan.
+        pitch_um: nominal pixel pitch, µm.
+        scan_to_layout: 3×3, maps (x_um, y_um, 1) of the scan to the layout.
+    """
+
+    shape: tuple[int, int]
+    pitch_um: float
+    scan_to_layout: np.ndarray
+
+    @property
+    def size_um(self) -> tuple[float, float]:
+        """(y, x) nominal extent, µm."""
+        return self.shape[0] * self.pitch_um, self.shape[1] * self.pitch_um
+
+    @property
+    def unit_axes(self) -> tuple[np.ndarray, np.ndarray]:
+        """(y, x) coordinates from −1 to 1 over the scan, broadcastable."""
+        return np.linspace(-1, 1, self.shape[0])[:, None], np.linspace(-1, 1, self.shape[1])[None, :]
+
+
+def place_scan(
+    layout_shape: tuple[int, int], pitch_um: float, microscope: Microscope, rng: np.random.Generator
+) -> ScanFrame:
+    """A scan centred on the layout up to a small random shift, rotation, shear and anisotropic scale."""
+    margins_px = [round(microscope.margin_px * size / _REFERENCE_PX) for size in layout_shape]
+    shape = (layout_shape[0] + 2 * margins_px[0], layout_shape[1] + 2 * margins_px[1])
+    draws = rng.uniform(-1, 1, 6)
+    angle = np.deg2rad(microscope.rotation_deg) * draws[0]
+    scale_x, scale_y = 1 + microscope.scale * draws[1], 1 + microscope.scale * draws[2]
+    rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    linear = rotation @ np.array([[scale_x, microscope.shear * draws[3]], [0.0, scale_y]])
+    scan_centre_um = np.array([shape[1], shape[0]]) * pitch_um / 2
+    layout_centre_um = np.array([layout_shape[1], layout_shape[0]]) * pitch_um / 2
+    transform = np.eye(3)
+    transform[:2, :2] = linear
+    transform[:2, 2] = layout_centre_um + microscope.shift_um * draws[4:6] - linear @ scan_centre_um
+    return ScanFrame(shape, pitch_um, transform)
+
+
+def sample_surface(surface: np.ndarray, frame: ScanFrame, knobs: KnobBoard, scan_index: int) -> np.ndarray:
+    """The surface (on the canvas) at the pixels of the scan, shape ``frame.shape``."""
+    y_um = (np.arange(frame.shape[0]) + 0.5)[:, None] * frame.pitch_um
+    x_um = (np.arange(frame.shape[1]) + 0.5)[None, :] * frame.pitch_um
+    warped = knobs.any("piezo-nonlinearity", "registration-residual")
+    if not warped and (corner := _whole_pixel_corner(frame)) is not None:
+        top, left = corner
+        return surface[top : top + frame.shape[0], left : left + frame.shape[1]].copy()
+    if strength := knobs["piezo-nonlinearity"]:
+        x_um = x_um + strength * x_um * (1 - x_um / frame.size_um[1])
+    (xx, xy, x0), (yx, yy, y0) = frame.scan_to_layout[:2]
+    layout_x_um = xx * x_um + xy * y_um + x0
+    layout_y_um = yx * x_um + yy * y_um + y0
+    if strength := knobs["registration-residual"]:
+        rng = knobs.scan_rng("registration-residual", scan_index)
+        layout_x_um = layout_x_um + strength * _quadratic_distortion(frame, rng)
+        layout_y_um = layout_y_um + strength * _quadratic_distortion(frame, rng)
+    rows = layout_y_um / frame.pitch_um - 0.5 + GUARD_PX
+    columns = layout_x_um / frame.pitch_um - 0.5 + GUARD_PX
+    return scipy.ndimage.map_coordinates(surface, [rows, columns], order=3, mode="nearest")
+
+
+def _whole_pixel_corner(frame: ScanFrame) -> tuple[int, int] | None:
+    """(row, column) on the canvas of the scan's first pixel if the frames differ by whole pixels only."""
+    shift_px = frame.scan_to_layout[:2, 2] / frame.pitch_um
+    whole = np.round(shift_px)
+    if not np.array_equal(frame.scan_to_layout[:2, :2], np.eye(2)) or np.abs(shift_px - whole).max() > 1e-9:
+        return None
+    return int(whole[1]) + GUARD_PX, int(whole[0]) + GUARD_PX
+
+
+def _quadratic_distortion(frame: ScanFrame, rng: np.random.Generator) -> np.ndarray:
+    """Random second-order polynomial without its affine part, unit rms on average."""
+    y, x = frame.unit_axes
+    c = rng.standard_normal(3)
+    # Legendre terms and the product have variances 1/5, 1/5 and 1/9 over the square.
+    terms = (c[0] * (1.5 * x**2 - 0.5) * 5**0.5, c[1] * (1.5 * y**2 - 0.5) * 5**0.5, c[2] * 3 * x * y)
+    return (terms[0] + terms[1] + terms[2]) / 3**0.5

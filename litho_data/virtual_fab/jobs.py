@@ -1,0 +1,153 @@
+"""Which fields a run prints: random layouts in print blocks, and the reference scans of a noise analysis."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+
+from litho_data.card import load_card
+from litho_data.card_files import read_table
+from litho_data.errors import InputError
+from litho_data.layouts.random_layout import random_layout
+from litho_data.readers import read_layout
+from litho_data.virtual_fab.printer import Job, Use
+from litho_data.virtual_fab.settings import Printer
+
+PRINT_PATTERN = r"P(?P<print>\d+)F\d+"
+_STEPS = 5
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Fields to print with random layouts.
+
+    Args:
+        count: number of fields.
+        size_px: (ny, nx) of a layout.
+        fields_per_print: fields of one print block.
+        cutoffs_per_um: cut-offs of the layouts, taken in turn by the prints, cycles/µm.
+        write_field_um: side of a write field that all fields of a print share; None gives each
+            field a write field of its own, centred on it.
+        references: add a bare substrate, a flat print and a five-step print (print 0).
+    """
+
+    count: int = 12
+    size_px: tuple[int, int] = (256, 256)
+    fields_per_print: int = 4
+    cutoffs_per_um: tuple[float, ...] = (0.25, 0.5)
+    write_field_um: float | None = None
+    references: bool = False
+
+    def __post_init__(self) -> None:
+        if self.count < 1 or self.fields_per_print < 1 or not self.cutoffs_per_um:
+            raise InputError(
+                "plan of a virtual-fab run", got=self, wanted="at least one field, print and cut-off"
+            )
+        if min(self.size_px) < 32:
+            raise InputError("size of a layout", got=f"{self.size_px} px", wanted="at least 32 x 32 px")
+
+    def scan_id(self, block: int, field: int) -> str:
+        """Name of a field; padded, so that the sorted names are in print order."""
+        blocks = -(-self.count // self.fields_per_print)
+        return f"P{block + 1:0{len(str(blocks))}}F{field + 1:0{len(str(self.fields_per_print))}}"
+
+    @property
+    def total(self) -> int:
+        """Number of scans, references included."""
+        return self.count + 3 * self.references
+
+
+def random_jobs(plan: Plan, printer: Printer, seed: int) -> Iterator[Job]:
+    """The fields of a plan in print order; each depends on the seed and on its own number only."""
+    for index in range(plan.count):
+        block, field = divmod(index, plan.fields_per_print)
+        yield Job(
+            id=plan.scan_id(block, field),
+            level=random_layout(
+                plan.size_px,
+                levels=printer.levels,
+                cutoff_per_um=plan.cutoffs_per_um[block % len(plan.cutoffs_per_um)],
+                pitch_um=printer.pitch_um,
+                seed=np.random.SeedSequence(seed, spawn_key=(index, 0)),
+            ),
+            index=index,
+            order=index / (plan.count - 1) - 0.5 if plan.count > 1 else 0.0,
+            field_um=_field_position_um(plan, printer, field),
+            write_field_um=plan.write_field_um,
+        )
+    if plan.references:
+        yield from _reference_jobs(plan, printer)
+
+
+def _field_position_um(plan: Plan, printer: Printer, field: int) -> tuple[float, float]:
+    """(y, x) centre of a field in the shared write field: a square block, row by row."""
+    if plan.write_field_um is None:
+        return 0.0, 0.0
+    side = int(np.ceil(plan.fields_per_print**0.5))
+    rows, columns = divmod(field, side)
+    steps_um = [plan.write_field_um / side] * 2
+    if not all(size * printer.pitch_um <= step for size, step in zip(plan.size_px, steps_um, strict=True)):
+        raise InputError(
+            "write field",
+            got=f"{plan.write_field_um:g} µm",
+            wanted=f"room for {side} x {side} fields of {max(plan.size_px) * printer.pitch_um:g} µm",
+        )
+    return (rows - (side - 1) / 2) * steps_um[0], (columns - (side - 1) / 2) * steps_um[1]
+
+
+def _reference_jobs(plan: Plan, printer: Printer) -> Iterator[Job]:
+    """A bare substrate, a flat print of the middle level, and steps of one level each."""
+    middle = (printer.levels - 1) // 2
+    flat = np.full(plan.size_px, middle, np.uint8)
+    stairs = np.arange(plan.size_px[1]) * _STEPS // plan.size_px[1] + 1
+    steps = np.broadcast_to(np.minimum(stairs, printer.levels - 1).astype(np.uint8), plan.size_px)
+    yield Job(id="P0F1", level=np.zeros(plan.size_px, np.uint8), index=plan.count, use="substrate")
+    yield Job(id="P0F2", level=flat, index=plan.count + 1, use="flat")
+    yield Job(id="P0F3", level=np.ascontiguousarray(steps), index=plan.count + 2, use="steps")
+
+
+def jobs_of_card(path: str | Path) -> list[Job]:
+    """The layouts of a dataset card, with order, dose, position and use from its table.
+
+    Raises:
+        InputError: a bad card, no layout files, or layouts of a pitch or level height that the default
+            printer does not write.
+    """
+    card = load_card(path)
+    printer = Printer()
+    geometry = (card.layout.pitch_um, card.layout.level_height_um)
+    if geometry != (printer.pitch_um, printer.level_height_um):
+        raise InputError(
+            f"card {path}: pitch and level height",
+            got=geometry,
+            wanted=(printer.pitch_um, printer.level_height_um),
+        )
+    folder = Path(path).parent
+    table = read_table(folder / card.ids.table) if card.ids.table else {}
+    before, after = card.layout.files.split("{id}", 1)
+    files = sorted(folder.glob(f"{before}*{after}"))
+    if not files:
+        raise InputError(f"layouts of card {path}", got="none", wanted=card.layout.files)
+    ids = [file.relative_to(folder).as_posix().removeprefix(before).removesuffix(after) for file in files]
+    rank = {scan_id: int(table.get(scan_id, {}).get("order", place)) for place, scan_id in enumerate(ids)}
+    spread = max(1, len(ids) - 1)
+    jobs = []
+    for index, scan_id in enumerate(sorted(ids, key=rank.__getitem__)):
+        row = table.get(scan_id, {})
+        jobs.append(
+            Job(
+                id=scan_id,
+                level=read_layout(folder / f"{before}{scan_id}{after}"),
+                index=index,
+                order=index / spread - 0.5 if len(ids) > 1 else 0.0,
+                dose=float(row.get("dose", 1.0)),
+                field_um=(float(row.get("field_y_um", 0.0)), float(row.get("field_x_um", 0.0))),
+                write_field_um=card.write.field_um if card.write else None,
+                use=cast(Use, row.get("use", "dataset")),
+            )
+        )
+    return jobs

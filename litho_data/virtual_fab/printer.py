@@ -1,0 +1,82 @@
+"""One print from layout to dry surface."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from litho_data.virtual_fab.canvas import Canvas, frame_layout, gaussian_transfer
+from litho_data.virtual_fab.exposure import accumulate_dose
+from litho_data.virtual_fab.knobs import KnobBoard
+from litho_data.virtual_fab.random_curves import gaussian_field, line_roughness
+from litho_data.virtual_fab.resist import develop
+from litho_data.virtual_fab.settings import Noise, Printer
+
+Use = Literal["dataset", "flat", "substrate", "steps"]
+
+_SUBSTRATE_GRAIN_UM = 0.3
+
+
+@dataclass(frozen=True)
+class Job:
+    """One field to print and scan.
+
+    Args:
+        id: name of the scan.
+        level: uint8 layout, shape (ny, nx).
+        index: number of the scan in its set; it decides the random draws.
+        order: place in the print order, −0.5 (first) to 0.5 (last).
+        dose: two-photon dose relative to the recipe's.
+        field_um: (y, x) centre of the layout in its write field, µm.
+        write_field_um: side of the write field, µm; None for a field as large as the layout.
+        use: what the scan is for; nothing is printed for ``substrate``.
+    """
+
+    id: str
+    level: np.ndarray
+    index: int = 0
+    order: float = 0.0
+    dose: float = 1.0
+    field_um: tuple[float, float] = (0.0, 0.0)
+    write_field_um: float | None = None
+    use: Use = "dataset"
+
+    def canvas(self, pitch_um: float) -> Canvas:
+        """The framed layout in its write field."""
+        side_um = self.write_field_um or max(self.level.shape) * pitch_um
+        return Canvas(frame_layout(self.level), pitch_um, self.field_um, side_um)
+
+
+def print_clean(job: Job, printer: Printer, knobs: KnobBoard) -> np.ndarray:
+    """Surface of one print without noise, on the canvas, µm; a bare substrate is 0."""
+    canvas = job.canvas(printer.pitch_um)
+    if job.use == "substrate":
+        return np.zeros(canvas.level.shape)
+    dose = accumulate_dose(
+        canvas, printer, knobs, relative_dose=job.dose, order=job.order, scan_index=job.index
+    )
+    height = develop(dose, canvas, printer, knobs)
+    if strength := knobs["hatch-ripple"]:
+        rng = knobs.machine_rng("hatch-ripple")
+        hatch_um = printer.pitch_um * (1 + rng.choice([-1, 1]) * rng.uniform(0.02, 0.04))
+        ripple = np.cos(2 * np.pi * canvas.y_um / hatch_um + rng.uniform(0, 2 * np.pi))
+        height = height + 1e-3 * strength * ripple * (canvas.level > 0)
+    return height
+
+
+def surface_noise(
+    job: Job, printer: Printer, noise: Noise, knobs: KnobBoard, rng: np.random.Generator
+) -> np.ndarray:
+    """Roughness of the surface, on the canvas, µm."""
+    canvas = job.canvas(printer.pitch_um)
+    shape = canvas.level.shape
+    if job.use == "substrate":
+        grain_psd = gaussian_transfer(shape, printer.pitch_um, _SUBSTRATE_GRAIN_UM) ** 2
+        return 1e-3 * noise.substrate_nm * gaussian_field(grain_psd, rng, shape)
+    rough_nm = noise.roughness_nm * line_roughness(shape, printer.pitch_um, rng)
+    if strength := knobs["line-roughness"]:
+        more = line_roughness(shape, printer.pitch_um, knobs.scan_rng("line-roughness", job.index))
+        rough_nm = rough_nm + strength * more
+    return 1e-3 * rough_nm

@@ -1,0 +1,68 @@
+"""Random shapes: Perlin curves, smooth maps, and roughness of a given spectrum."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from litho_data.virtual_fab.canvas import apply_transfer, frequencies_per_um
+
+# The spectrum of the measured prints' fine residual: a band of line-shaped features across the
+# hatch direction, 0.45 µm apart, and a slower part; both long along the hatch lines.
+_BAND_PER_UM = 2.2
+_BAND_WIDTH_PER_UM = 0.5
+_BAND_SHARE = 0.55
+_SLOW_WIDTH_PER_UM = 0.6
+_ALONG_UM = 1.2
+# Nothing that was written with a 0.2 µm spot changes faster than this along the line.
+_SMOOTH_UM = 0.06
+
+
+def line_roughness(shape: tuple[int, int], pitch_um: float, rng: np.random.Generator) -> np.ndarray:
+    """Line-shaped roughness along x with unit variance on average, shape (ny, nx)."""
+    return gaussian_field(line_roughness_psd(shape, pitch_um), rng, shape)
+
+
+def line_roughness_psd(shape: tuple[int, int], pitch_um: float) -> np.ndarray:
+    """Power spectrum of `line_roughness` on the half plane, arbitrary units."""
+    frequency_y, frequency_x = frequencies_per_um(shape, pitch_um)
+    band = np.exp(-((np.abs(frequency_y) - _BAND_PER_UM) ** 2) / (2 * _BAND_WIDTH_PER_UM**2))
+    slow = np.exp(-(frequency_y**2) / (2 * _SLOW_WIDTH_PER_UM**2))
+    across = _BAND_SHARE * band / band.sum() + (1 - _BAND_SHARE) * slow / slow.sum()
+    along = np.exp(-4 * (np.pi * _SMOOTH_UM * frequency_x) ** 2) / (
+        1 + (2 * np.pi * _ALONG_UM * frequency_x) ** 2
+    )
+    return across * along
+
+
+def gaussian_field(psd: np.ndarray, rng: np.random.Generator, shape: tuple[int, int]) -> np.ndarray:
+    """Gaussian random field of a power spectrum given on the half plane; unit variance on average."""
+    # Columns other than 0 and the Nyquist one stand for two frequencies of the full plane.
+    doubled = np.full(psd.shape[1], 2.0)
+    doubled[0] = 1.0
+    if shape[1] % 2 == 0:
+        doubled[-1] = 1.0
+    mean_power = (psd * doubled).sum() / (shape[0] * shape[1])
+    return apply_transfer(rng.standard_normal(shape), np.sqrt(psd / mean_power))
+
+
+def perlin_curve(position_um: np.ndarray, period_um: float, rng: np.random.Generator) -> np.ndarray:
+    """One-dimensional Perlin noise within ±1, same shape as ``position_um``."""
+    slopes = rng.uniform(-1, 1, 1024)
+    cell, inside = np.divmod(position_um / period_um, 1.0)
+    left = cell.astype(int) % slopes.size
+    right = (left + 1) % slopes.size
+    fade = inside**3 * (inside * (6 * inside - 15) + 10)
+    # A unit slope reaches half a cell's height, hence the factor 2.
+    return 2 * ((1 - fade) * slopes[left] * inside + fade * slopes[right] * (inside - 1))
+
+
+def smooth_map(y_um: np.ndarray, x_um: np.ndarray, period_um: float, rng: np.random.Generator) -> np.ndarray:
+    """Random sum of eight plane waves of about one period each, unit variance on average."""
+    waves = 8
+    direction = rng.uniform(0, 2 * np.pi, waves)
+    phase = rng.uniform(0, 2 * np.pi, waves)
+    frequency = rng.uniform(0.7, 1.3, waves) / period_um
+    total = np.zeros(np.broadcast_shapes(y_um.shape, x_um.shape))
+    for angle, start, rate in zip(direction, phase, frequency, strict=True):
+        total += np.cos(2 * np.pi * rate * (x_um * np.cos(angle) + y_um * np.sin(angle)) + start)
+    return total * np.sqrt(2 / waves)

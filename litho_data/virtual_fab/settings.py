@@ -1,0 +1,89 @@
+"""What the plain fab is: printer, microscope and default noise, all with units."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Printer:
+    """A two-photon printer and its resist.
+
+    Args:
+        pitch_um: hatch pitch, which is also the pitch of the layout, µm.
+        level_height_um: slice height, µm.
+        levels: number of levels; the tallest column has ``levels - 1`` slices.
+        spot_sigma_um: sd of the focal *intensity*, µm. Two-photon absorption goes with its square,
+            whose sd is smaller by √2: 0.2 µm.
+        threshold_dose: dose at which conversion rises fastest, share of the full column's dose.
+        threshold_steepness: slope parameter of the logistic conversion curve, per full dose.
+        network_reach_um: sd of the neighbourhood whose conversion decides how much a column shrinks, µm.
+        loose_retention: share of its height that an isolated, loose network keeps; a dense one keeps all.
+        base_um: height of the base layer's surface above the zero of the scans, µm.
+    """
+
+    pitch_um: float = 0.1
+    level_height_um: float = 0.1
+    levels: int = 13
+    spot_sigma_um: float = 0.2 * 2**0.5
+    threshold_dose: float = 0.3
+    threshold_steepness: float = 1.6
+    network_reach_um: float = 2.0
+    loose_retention: float = 0.35
+    base_um: float = 0.14
+
+    @property
+    def full_height_um(self) -> float:
+        """Nominal height of the highest level, µm."""
+        return (self.levels - 1) * self.level_height_um
+
+
+@dataclass(frozen=True)
+class Microscope:
+    """How a scan lies on the print: a margin, and a small affine error drawn for each scan.
+
+    Args:
+        margin_px: pixels that a scan shows beyond the layout on each side, per 512 px of layout.
+        rotation_deg: largest rotation, degrees.
+        scale: largest relative error of each lateral scale.
+        shear: largest shear.
+        shift_um: largest shift along each axis, µm.
+    """
+
+    margin_px: float = 14.0
+    rotation_deg: float = 0.6
+    scale: float = 0.015
+    shear: float = 0.005
+    shift_um: float = 0.3
+
+    @classmethod
+    def aligned(cls) -> Microscope:
+        """Scan pixels fall on layout pixels: no warp, whole-pixel margin."""
+        return cls(rotation_deg=0.0, scale=0.0, shear=0.0, shift_um=0.0)
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Default noise, standard deviations in nm.
+
+    A flat print shows the quadrature sum of all but the datum, a bare substrate that of
+    ``substrate_nm``, ``line_nm`` and ``pixel_nm``.
+
+    Args:
+        roughness_nm: line-shaped roughness of printed surfaces.
+        substrate_nm: roughness of the bare substrate.
+        line_nm: one offset per scan line.
+        pixel_nm: uncorrelated pixel noise.
+        datum_nm: one offset per scan.
+    """
+
+    roughness_nm: float = 15.9
+    substrate_nm: float = 0.8
+    line_nm: float = 0.6
+    pixel_nm: float = 0.75
+    datum_nm: float = 30.0
+
+    @classmethod
+    def off(cls) -> Noise:
+        """No noise at all."""
+        return cls(0.0, 0.0, 0.0, 0.0, 0.0)

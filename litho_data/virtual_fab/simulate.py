@@ -1,0 +1,193 @@
+"""A whole run of the virtual fab: raw files as a laboratory would hand them over, and the truth apart."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from litho_data.commands import progress
+from litho_data.errors import InputError
+from litho_data.files import atomic_folder
+from litho_data.layouts.card_text import CardText, write_layout, write_table
+from litho_data.outputs import require_replaceable_folder
+from litho_data.virtual_fab.fab import Fab, FabScan, scan_job
+from litho_data.virtual_fab.jobs import PRINT_PATTERN, Plan, random_jobs
+from litho_data.virtual_fab.knobs import KnobBoard, KnobSetting
+from litho_data.virtual_fab.printer import Job
+from litho_data.virtual_fab.settings import Microscope, Noise, Printer
+from litho_data.virtual_fab.text_matrix import write_text_matrix
+from litho_data.virtual_fab.truth import KnobTruth, ScanTruth, Truth, noise_floor
+
+T = TypeVar("T")
+
+
+def simulate(
+    out: str | Path,
+    *,
+    count: int = 12,
+    size_px: int | tuple[int, int] = 256,
+    seed: int = 0,
+    knobs: Iterable[KnobSetting | str] = (),
+    noise: Noise | str = "default",
+    microscope: Microscope | str = "default",
+    printer: Printer | None = None,
+    fields_per_print: int = 4,
+    cutoffs_per_um: Sequence[float] = (0.25, 0.5),
+    write_field_um: float | None = None,
+    references: bool = False,
+    jobs: Sequence[Job] | None = None,
+    metadata: str = "full",
+    name: str = "virtual-fab",
+) -> Path:
+    """Print and scan a set of fields; returns the path of the card, ``out/raw/card.toml``.
+
+    ``out/raw`` is what a laboratory hands over: card, table, layouts, scans. ``out/truth`` holds what
+    only a simulation knows: `truth.json` and the clean prints. Scans are made one after the other, so
+    memory does not grow with their number, and none depends on how many there are.
+
+    Args:
+        count: number of scans with random layouts.
+        size_px: size of a layout, pixels (one number, or ny and nx).
+        seed: decides every random draw of the run.
+        knobs: effects beyond plain printing, as settings or ``name=strength[@seed]``.
+        noise: ``default``, ``off``, or own standard deviations.
+        microscope: ``default`` (margin, small affine errors), ``aligned`` (margin only), or own values.
+        fields_per_print: fields that share a print block.
+        cutoffs_per_um: cut-offs of the random layouts, taken in turn by the prints, cycles/µm.
+        write_field_um: side of a write field that a print's fields share, µm; None: each has its own.
+        references: add scans of a bare substrate, a flat print and a five-step print.
+        jobs: own layouts instead of random ones; ``count`` and what follows about layouts is then unused.
+        metadata: ``files-only`` leaves print groups, order, positions and write axis out of the card.
+
+    Raises:
+        InputError: an unknown knob, a strength out of range, an impossible plan, or a folder with
+            something else in it.
+    """
+    if metadata not in ("full", "files-only"):
+        raise InputError("metadata", got=repr(metadata), wanted="full or files-only")
+    if references and metadata != "full":
+        raise InputError(
+            "references", got="metadata files-only", wanted="full: only the table tells them apart"
+        )
+    if references and jobs is not None:
+        raise InputError(
+            "references", got="own layouts", wanted="references among them: their use is in the table"
+        )
+    settings = [KnobSetting.parse(knob) if isinstance(knob, str) else knob for knob in knobs]
+    fab = Fab(
+        printer=printer or Printer(),
+        microscope=_named(
+            microscope, "microscope", {"default": Microscope(), "aligned": Microscope.aligned()}
+        ),
+        noise=_named(noise, "noise", {"default": Noise(), "off": Noise.off()}),
+        knobs=KnobBoard(settings, seed),
+        seed=seed,
+    )
+    shape = (size_px, size_px) if isinstance(size_px, int) else size_px
+    plan = Plan(count, shape, fields_per_print, tuple(cutoffs_per_um), write_field_um, references)
+    if jobs is not None:
+        _check_jobs(jobs, fab.printer)
+    source: Iterator[Job] = iter(jobs) if jobs is not None else random_jobs(plan, fab.printer, seed)
+    total = len(jobs) if jobs is not None else plan.total
+    require_replaceable_folder(out, "raw", "truth")
+    with atomic_folder(out) as folder:
+        raw, hidden = folder / "raw", folder / "truth"
+        for part in (raw / "scans", hidden / "prints"):
+            part.mkdir(parents=True)
+        rows: list[tuple[object, ...]] = []
+        scans: list[ScanTruth] = []
+        size_um = (0.0, 0.0)
+        for job in progress(source, "printing and scanning", total):
+            scan = scan_job(fab, job)
+            write_layout(raw, job.id, job.level)
+            write_text_matrix(raw / "scans" / f"{job.id}.txt", scan.height_um)
+            np.save(hidden / "prints" / f"{job.id}.npy", scan.clean_um.astype(np.float32))
+            size_um = scan.frame.size_um
+            write_field_um = job.write_field_um
+            rows.append((job.id, len(rows), job.field_um[1], job.field_um[0], job.dose, job.use))
+            scans.append(_scan_truth(scan))
+        _write_card(raw, fab, name, size_um, rows, metadata, write_field_um)
+        _truth(fab, scans).write(hidden)
+    return Path(out) / "raw" / "card.toml"
+
+
+def _named(value: T | str, what: str, known: dict[str, T]) -> T:
+    if not isinstance(value, str):
+        return value
+    if value not in known:
+        raise InputError(what, got=repr(value), wanted=" or ".join(known))
+    return known[value]
+
+
+def _check_jobs(jobs: Sequence[Job], printer: Printer) -> None:
+    if not jobs:
+        raise InputError("layouts to print", got="none", wanted="at least one")
+    if len({job.id for job in jobs}) != len(jobs):
+        raise InputError("ids of the layouts to print", got=[job.id for job in jobs], wanted="each once")
+    if len({job.level.shape for job in jobs}) > 1:
+        raise InputError(
+            "layouts to print",
+            got=sorted({job.level.shape for job in jobs}),
+            wanted="one size",
+            hint="split the set",
+        )
+    highest = max(int(job.level.max()) for job in jobs)
+    if highest >= printer.levels:
+        raise InputError("level in a layout", got=highest, wanted=f"0 to {printer.levels - 1}")
+
+
+def _write_card(
+    raw: Path,
+    fab: Fab,
+    name: str,
+    size_um: tuple[float, float],
+    rows: list[tuple[object, ...]],
+    metadata: str,
+    write_field_um: float | None,
+) -> None:
+    full = metadata == "full"
+    in_prints = all(re.fullmatch(PRINT_PATTERN, str(row[0])) for row in rows)
+    if full:
+        write_table(raw, ("id", "order", "field_x_um", "field_y_um", "dose", "use"), rows)
+    CardText(
+        name=name,
+        title="Simulated two-photon prints with simulated AFM scans",
+        pitch_um=fab.printer.pitch_um,
+        level_height_um=fab.printer.level_height_um,
+        levels=fab.printer.levels,
+        scan_size_um=size_um,
+        print_pattern=PRINT_PATTERN if full and in_prints else "",
+        table=full,
+        slow_axis="y" if full else "",
+        write_field_um=write_field_um if full else None,
+    ).write(raw)
+
+
+def _scan_truth(scan: FabScan) -> ScanTruth:
+    return ScanTruth(
+        id=scan.job.id,
+        use=scan.job.use,
+        dose=scan.job.dose,
+        order=scan.job.order,
+        field_um=scan.job.field_um,
+        scan_shape=scan.frame.shape,
+        scan_to_layout=[[float(value) for value in row] for row in scan.frame.scan_to_layout],
+        **noise_floor(scan.height_um - scan.noiseless_um),
+    )
+
+
+def _truth(fab: Fab, scans: list[ScanTruth]) -> Truth:
+    return Truth(
+        schema=Truth.SCHEMA,
+        seed=fab.seed,
+        printer=asdict(fab.printer),
+        microscope=asdict(fab.microscope),
+        noise=asdict(fab.noise),
+        knobs=[KnobTruth.of(setting, fab.seed) for setting in fab.knobs.settings],
+        scans=scans,
+    )

@@ -1,0 +1,131 @@
+"""How large an effect is in the data, and which strength makes it a given size."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from litho_data.errors import InputError
+from litho_data.virtual_fab.fab import Fab, scan_job
+from litho_data.virtual_fab.jobs import Plan, random_jobs
+from litho_data.virtual_fab.knobs import KNOBS, KnobBoard, KnobSetting
+from litho_data.virtual_fab.printer import Job
+from litho_data.virtual_fab.settings import Microscope, Noise, Printer
+
+Policy = Literal["none", "offset", "full"]
+
+_RELATIVE_PRECISION = 0.01
+_MAX_STEPS = 40
+
+
+@dataclass(frozen=True)
+class KnobStrength:
+    """A strength and the rms it has. ``rms_nm`` stays below the wish where the knob's range ends first."""
+
+    setting: KnobSetting
+    rms_nm: float
+
+
+def strength_for_rms(
+    name: str,
+    rms_nm: float,
+    *,
+    jobs: Sequence[Job] | None = None,
+    policy: Policy = "full",
+    seed: int = 0,
+    printer: Printer | None = None,
+) -> KnobStrength:
+    """The strength at which a knob changes the noise-free scans by ``rms_nm``.
+
+    The rms is that of `knob_rms_nm`; it grows with the strength, so the strength is found by
+    interval search within the knob's range.
+
+    Args:
+        name: knob.
+        rms_nm: wanted rms, nm.
+        jobs: fields to measure it on; by default four of 256 × 256 px, two of each cut-off.
+        policy: what each scan is freed from before the rms is taken.
+        seed: seed of the knob.
+
+    Raises:
+        InputError: an unknown knob or policy, an rms that is not positive, or a knob that leaves no
+            trace under the policy.
+    """
+    if not rms_nm > 0:
+        raise InputError("rms_nm", got=rms_nm, wanted="a positive number")
+    fields = tuple(jobs) if jobs is not None else default_fields(printer or Printer(), seed)
+
+    def measured(strength: float) -> float:
+        return knob_rms_nm(KnobSetting(name, strength, seed), fields, policy=policy, printer=printer)
+
+    if name not in KNOBS:
+        KnobSetting.parse(f"{name}=0")
+    highest = KNOBS[name].limit
+    at_limit = measured(highest)
+    # Float32-sized remainders of what the policy removes are no trace.
+    if at_limit < 1e-3:
+        raise InputError(
+            f"knob {name}", got=f"no trace under policy {policy}", wanted="another knob or policy"
+        )
+    if at_limit <= rms_nm:
+        return KnobStrength(KnobSetting(name, highest, seed), at_limit)
+    low, high = 0.0, highest
+    # Most effects grow about linearly, some with the square: the first guess assumes the former.
+    strength = highest * rms_nm / at_limit
+    for _ in range(_MAX_STEPS):
+        found = measured(strength)
+        if abs(found - rms_nm) <= _RELATIVE_PRECISION * rms_nm:
+            break
+        low, high = (strength, high) if found < rms_nm else (low, strength)
+        guess = strength * rms_nm / found if found > 0 else 0.0
+        strength = guess if low < guess < high else (low + high) / 2
+    return KnobStrength(KnobSetting(name, strength, seed), found)
+
+
+def knob_rms_nm(
+    setting: KnobSetting, jobs: Sequence[Job], *, policy: Policy = "full", printer: Printer | None = None
+) -> float:
+    """Rms over the scans of (noise-free scan with the knob) − (without), free of nuisances, nm.
+
+    Scans are aligned with the layout, so a warp counts by the heights that it moves. Policy ``full``
+    removes the least-squares fit of {1, P, x, y, x², xy, y²} from each scan, P the scan without the
+    knob; ``offset`` the mean; ``none`` nothing.
+    """
+    if policy not in get_args(Policy):
+        raise InputError("policy", got=repr(policy), wanted=", ".join(get_args(Policy)))
+    mean_squares = []
+    for job in jobs:
+        without = _noise_free(job, (), printer)
+        change = _noise_free(job, (setting,), printer) - without
+        mean_squares.append(np.mean(free_of_nuisances(change, without, policy) ** 2))
+    return float(1e3 * np.sqrt(np.mean(mean_squares)))
+
+
+def free_of_nuisances(change: np.ndarray, prediction: np.ndarray, policy: Policy) -> np.ndarray:
+    """``change`` minus its least-squares fit by the terms of the policy, same shape."""
+    if policy == "none":
+        return change
+    ones = np.ones(change.size)
+    terms = [ones]
+    if policy == "full":
+        y, x = (
+            axis.ravel()
+            for axis in np.meshgrid(*(np.linspace(-1, 1, n) for n in change.shape), indexing="ij")
+        )
+        terms = [ones, prediction.ravel() - prediction.mean(), y, x, y * y, x * y, x * x]
+    basis = np.stack(terms, axis=1)
+    weights, *_ = np.linalg.lstsq(basis, change.ravel(), rcond=None)
+    return change - (basis @ weights).reshape(change.shape)
+
+
+def default_fields(printer: Printer, seed: int) -> tuple[Job, ...]:
+    """Four fields of 256 × 256 px: first, two middle ones and last of a print order, two of each cut-off."""
+    return tuple(random_jobs(Plan(count=4, size_px=(256, 256), fields_per_print=2), printer, seed))
+
+
+def _noise_free(job: Job, knobs: Sequence[KnobSetting], printer: Printer | None) -> np.ndarray:
+    fab = Fab(printer or Printer(), Microscope.aligned(), Noise.off(), KnobBoard(knobs, 0), 0)
+    return scan_job(fab, job).noiseless_um

@@ -1,0 +1,91 @@
+"""What a simulated run hides from `build`: knobs, warps, clean prints and the noise floor."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+
+from litho_data.results import Record, Result
+from litho_data.virtual_fab.knobs import KNOBS, KnobSetting
+
+
+class KnobTruth(Record):
+    """One knob that was off its null."""
+
+    name: str
+    effect: str
+    stage: str
+    role: str
+    strength: float
+    unit: str
+    seed: int
+
+    @classmethod
+    def of(cls, setting: KnobSetting, run_seed: int) -> KnobTruth:
+        """The knob of a setting, with the seed that counted."""
+        knob = KNOBS[setting.name]
+        return cls(
+            name=knob.name,
+            effect=knob.effect,
+            stage=knob.stage,
+            role=knob.role,
+            strength=setting.strength,
+            unit=knob.unit,
+            seed=run_seed if setting.seed is None else setting.seed,
+        )
+
+
+class ScanTruth(Record):
+    """One scan: its place, its datum, and the error that perfect models of print and microscope make."""
+
+    id: str
+    use: str
+    dose: float
+    order: float
+    field_um: tuple[float, float]
+    scan_shape: tuple[int, int]
+    scan_to_layout: list[list[float]]
+    datum_nm: float
+    floor_mae_nm: float
+    floor_rmse_nm: float
+    floor_full_mae_nm: float
+    floor_full_rmse_nm: float
+
+
+class Truth(Result):
+    """`truth.json`; the clean print of each scan lies beside it as ``prints/<id>.npy`` (µm, layout grid)."""
+
+    SCHEMA: ClassVar[str] = "litho-data/virtual-fab/1"
+    FILE_NAME: ClassVar[str] = "truth.json"
+
+    seed: int
+    printer: dict[str, float]
+    microscope: dict[str, float]
+    noise: dict[str, float]
+    knobs: list[KnobTruth]
+    scans: list[ScanTruth]
+
+
+def noise_floor(noise_um: np.ndarray) -> dict[str, float]:
+    """Size of one scan's noise, free of its offset and, for ``floor_full``, of tilt and bow as well, nm."""
+    centred_nm = 1e3 * (noise_um - noise_um.mean())
+    bent_nm = centred_nm - quadratic_surface(centred_nm)
+    return {
+        "datum_nm": float(1e3 * noise_um.mean()),
+        "floor_mae_nm": float(np.abs(centred_nm - np.median(centred_nm)).mean()),
+        "floor_rmse_nm": float(centred_nm.std()),
+        "floor_full_mae_nm": float(np.abs(bent_nm).mean()),
+        "floor_full_rmse_nm": float(bent_nm.std()),
+    }
+
+
+def quadratic_surface(field: np.ndarray) -> np.ndarray:
+    """Least-squares surface of {1, x, y, x², xy, y²}, same shape as ``field``."""
+    # Legendre products are nearly orthogonal on the grid, which keeps the normal equations harmless.
+    y, x = (np.polynomial.legendre.legvander(np.linspace(-1, 1, size), 2) for size in field.shape)
+    pairs = [(0, 0), (0, 1), (1, 0), (0, 2), (1, 1), (2, 0)]
+    gram = np.array([[(y[:, a] @ y[:, c]) * (x[:, b] @ x[:, d]) for c, d in pairs] for a, b in pairs])
+    moments = np.array([y[:, a] @ field @ x[:, b] for a, b in pairs])
+    weights = np.linalg.solve(gram, moments)
+    return sum(weight * np.outer(y[:, a], x[:, b]) for weight, (a, b) in zip(weights, pairs, strict=True))

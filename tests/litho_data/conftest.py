@@ -1,0 +1,25 @@
+"""One small built store for all tests of the store; tests that change it work on a copy."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from campaigns import write_campaign
+
+from litho_data.build import build
+
+
+@pytest.fixture(scope="session")
+def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with ``card.toml``, three scans, and ``prints.zarr`` built from them; not to be changed."""
+    folder = tmp_path_factory.mktemp("campaign")
+    build(write_campaign(folder), folder / "prints.zarr")
+    return folder
+
+
+@pytest.fixture
+def own_campaign(campaign: Path, tmp_path: Path) -> Path:
+    """A copy of ``campaign`` that a test may damage."""
+    return Path(shutil.copytree(campaign, tmp_path / "campaign"))

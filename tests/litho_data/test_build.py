@@ -1,0 +1,298 @@
+"""A build keeps what is good, names what is not, repeats itself, and never leaves half a store."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+from campaigns import LEVEL_HEIGHT_UM, MARGIN_PX, NOISE_UM, height_of, layout_of, write_campaign, write_scan
+
+from litho_data.build import build
+from litho_data.errors import InputError
+from litho_data.jobs import attempt, field_jobs
+from litho_data.listing import list_fields
+from litho_data.make_store import BuildResult, report_folder
+from litho_data.operations import load_recipe
+from litho_data.records import read_steps
+from litho_data.replay import replay
+from litho_data.store import open_store
+from litho_data.store.access import values_of
+from litho_data.store.partial import Piece, partial_store
+from litho_data.verify import verify
+
+
+def test_heights_come_back_on_the_layout(campaign: Path) -> None:
+    store = open_store(campaign / "prints.zarr")
+    assert store.ids == ["P11", "P12", "P21"]
+    assert (store.pitch_um, store.level_height_um, store.levels) == (0.1, LEVEL_HEIGHT_UM, 13)
+    for index, scan in enumerate(store.scans()):
+        layout = layout_of(index)
+        np.testing.assert_array_equal(scan.mask_level, layout)
+        truth = height_of(layout, index)[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX]
+        assert scan.valid.all()
+        # The scan lies on the layout's grid, shifted by whole pixels. Resampling keeps 0.76 of the noise
+        # variance, so noise differs by less than twice its sd; 0.02 px of registration add about 2 nm.
+        assert np.std(scan.height_um - truth) < 2 * NOISE_UM
+        assert scan.print_id == scan.id[1]
+        assert scan.order == index
+        assert scan.layout_um[5, 7] == pytest.approx(layout[5, 7] * LEVEL_HEIGHT_UM)
+        corner = scan.scan_to_layout @ [MARGIN_PX * 0.1, MARGIN_PX * 0.1, 1]
+        # Held-out registration error of these scans is below 0.05 px = 0.005 µm, tripled for the corner.
+        np.testing.assert_allclose(corner, [0, 0, 1], atol=0.015)
+
+
+def test_raw_heights_are_kept_as_read(campaign: Path) -> None:
+    store = open_store(campaign / "prints.zarr")
+    text = np.loadtxt(campaign / "scans" / "P12.txt") * 1e6
+    # float32 keeps 24 bits.
+    np.testing.assert_allclose(store.scan_frame("P12", "raw_height_um"), text, rtol=2**-24)
+    np.testing.assert_array_equal(store.scan_frame("P12", "removed_um"), 0)
+
+
+def test_building_again_with_other_workers_gives_the_same(own_campaign: Path) -> None:
+    first = open_store(own_campaign / "prints.zarr")
+    hashes = first.sha256, first.root.attrs["manifest_sha256"]
+    result = build(own_campaign / "card.toml", own_campaign / "prints.zarr", workers=2)
+    again = open_store(own_campaign / "prints.zarr")
+    assert result.reused == 0
+    assert (again.sha256, again.root.attrs["manifest_sha256"]) == hashes
+    assert again.computed_sha256() == again.sha256
+    assert not list(own_campaign.glob(".*"))
+
+
+@pytest.mark.slow
+def test_a_dask_cluster_gives_the_same(campaign: Path, tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    cluster = distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None)
+    with cluster:
+        result = build(campaign / "card.toml", tmp_path / "prints.zarr", dask=cluster.scheduler_address)
+    assert result.dataset.sha256 == open_store(campaign / "prints.zarr").sha256
+
+
+def test_no_scheduler_is_bad_input(campaign: Path, tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    with pytest.raises(InputError, match="Dask scheduler"):
+        build(campaign / "card.toml", tmp_path / "prints.zarr", dask="nonsense://")
+    assert not list(tmp_path.iterdir())
+
+
+def test_bad_scans_are_skipped_with_their_reason(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    card = write_campaign(tmp_path, count=3)
+    good = (tmp_path / "scans" / "P11.txt").read_text()
+    bad = {
+        "P31": good[: len(good) // 2],  # a text that ends within a row
+        "P32": "\n".join(["nan\t" * 127 + "nan"] * 128),
+        "P33": "\n".join(good.splitlines()[:125]),  # readable, but rows are missing
+        "P34": "\x00\x01 no heights",
+        "P35": good,  # its layout has too many levels
+    }
+    for scan_id, text in bad.items():
+        shutil.copy(tmp_path / "layouts" / "P11.tif", tmp_path / "layouts" / f"{scan_id}.tif")
+        (tmp_path / "scans" / f"{scan_id}.txt").write_text(text)
+    tifffile.imwrite(tmp_path / "layouts" / "P35.tif", layout_of(0) + 4)
+    write_scan(tmp_path / "scans" / "P36.txt", height_of(layout_of(6), 6))  # without layout
+
+    result = build(card, tmp_path / "prints.zarr")
+    skipped = {one.id: one.reason for one in result.skipped}
+    assert result.n_scans == 3
+    assert set(skipped) == set(bad)
+    assert "finite" in skipped["P32"]
+    assert "rows or columns are missing" in skipped["P33"]
+    assert "highest level" in skipped["P35"]
+    assert [one.id for one in result.unpaired] == ["P36"]
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("skipped ")]
+    assert sorted(line.split()[1].rstrip(":") for line in lines) == sorted(bad)
+    store = open_store(tmp_path / "prints.zarr")
+    assert store.ids == ["P11", "P12", "P21"]
+    status = {row["path"]: (row["status"], bool(row["reason"])) for row in store.manifest["files"]}
+    assert status["scans/P31.txt"] == ("skipped", True)
+    assert status["scans/P36.txt"] == ("unpaired", True)
+    assert status["scans/P11.txt"] == ("ok", False)
+    assert BuildResult.read(report_folder(tmp_path / "prints.zarr")) == result
+
+    with pytest.raises(InputError, match="5 scans cannot be used"):
+        build(card, tmp_path / "strict.zarr", strict=True)
+    assert not [path for path in tmp_path.iterdir() if "strict" in path.name]
+
+
+def test_the_manifest_does_not_depend_on_where_the_raw_files_lie(
+    campaign: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    hashes = set()
+    for name in ("here", "there"):
+        folder = tmp_path / name
+        for part in ("layouts", "scans"):
+            shutil.copytree(campaign / part, folder / part)
+        shutil.copy(campaign / "card.toml", folder)
+        (folder / "scans" / "P21.txt").write_text("1\t2\n3")
+        build(folder / "card.toml", folder / "prints.zarr")
+        store = open_store(folder / "prints.zarr")
+        hashes.add(store.root.attrs["manifest_sha256"])
+        assert "reason: P21: scans/P21.txt line 2" in [
+            f"reason: {row['scan']}: {row['reason'][:20]}" for row in store.manifest["files"]
+        ]
+    assert len(hashes) == 1
+    assert str(tmp_path) not in capsys.readouterr().err
+
+
+def test_isolated_gaps_are_not_valid(tmp_path: Path) -> None:
+    card = write_campaign(tmp_path, count=1)
+    height = height_of(layout_of(0), 0)
+    row, column = 40, 60
+    height[row + MARGIN_PX, column + MARGIN_PX] = np.nan
+    write_scan(tmp_path / "scans" / "P11.txt", height)
+    build(card, tmp_path / "prints.zarr")
+    scan = open_store(tmp_path / "prints.zarr").scan("P11")
+    assert not scan.valid[row, column]
+    # The gap and the pixels whose interpolation reaches it: at most 6 x 6, never the rest of the field.
+    assert 0 < (~scan.valid).sum() <= 36
+    np.testing.assert_array_equal(np.isnan(scan.height_um), ~scan.valid)
+
+
+def test_no_good_scan_leaves_nothing(tmp_path: Path) -> None:
+    card = write_campaign(tmp_path, count=1)
+    (tmp_path / "scans" / "P11.txt").write_text("1\t2\n3")
+    before = {path.name for path in tmp_path.iterdir()}
+    with pytest.raises(InputError, match=r"no scan can be used.*P11"):
+        build(card, tmp_path / "prints.zarr")
+    assert {path.name for path in tmp_path.iterdir()} == before
+
+
+def test_smaller_layouts_are_padded_and_cut_again(tmp_path: Path) -> None:
+    card = write_campaign(tmp_path, count=1, shape=(144, 144))
+    small = layout_of(5, (144, 128))
+    tifffile.imwrite(tmp_path / "layouts" / "P12.tif", small)
+    # Both files state one size; a wider margin of the smaller field keeps the scan's shape.
+    margin = MARGIN_PX + 8
+    height = np.pad(height_of(small, 5)[:, MARGIN_PX:-MARGIN_PX], ((0, 0), (margin, margin)), mode="edge")
+    write_scan(tmp_path / "scans" / "P12.txt", height)
+    build(card, tmp_path / "prints.zarr")
+    store = open_store(tmp_path / "prints.zarr")
+    np.testing.assert_array_equal(store.scan("P12").mask_level, small)
+    assert store.scan("P12").height_um.shape == (144, 128)
+    assert not values_of(store.root, "valid")[1, :, 128:].any()
+    assert np.isnan(values_of(store.root, "height_um")[1, :, 128:]).all()
+    assert verify(tmp_path / "prints.zarr").findings == ()
+
+
+def test_references_are_kept_apart_from_the_dataset(tmp_path: Path) -> None:
+    card = write_campaign(tmp_path, count=1, more='table = "scans.csv"')
+    (tmp_path / "scans.csv").write_text("id,use\nP11,dataset\nbare,substrate\n", encoding="utf-8")
+    write_scan(tmp_path / "scans" / "bare.txt", 0.001 * np.random.default_rng(0).standard_normal((128, 128)))
+    result = build(card, tmp_path / "prints.zarr")
+    store = open_store(tmp_path / "prints.zarr")
+    assert (result.n_scans, result.n_references) == (1, 1)
+    assert store.ids == ["P11"]
+    assert store.references() == {"bare": "substrate"}
+    # White noise of 1 nm over 128² pixels: its standard deviation is known to 1 / sqrt(2 · 128²) = 0.6 %.
+    assert store.scan_frame("bare", "levelled_height_um").std() == pytest.approx(0.001, rel=0.03)
+    assert verify(tmp_path / "prints.zarr").findings == ()
+
+
+def test_a_levelling_recipe_is_applied_and_recorded(tmp_path: Path) -> None:
+    recipe = '[[step]]\nop = "plane"\n'
+    (tmp_path / "recipe.toml").write_text(recipe, encoding="utf-8")
+    card = write_campaign(tmp_path, count=1, more='[process]\nlevel = "recipe.toml"')
+    height = height_of(layout_of(0), 0)
+    tilt_um = 0.3 * (np.arange(128) / 128 - 0.5)
+    write_scan(tmp_path / "scans" / "P11.txt", height + tilt_um)
+    build(card, tmp_path / "prints.zarr")
+    store = open_store(tmp_path / "prints.zarr")
+    removed = store.scan_frame("P11", "removed_um").astype(float)
+    raw, levelled = (
+        store.scan_frame("P11", f"{name}_height_um").astype(float) for name in ("raw", "levelled")
+    )
+    np.testing.assert_allclose(levelled + removed, raw, atol=1e-6)  # three float32 roundings of ~1 µm
+    slope = np.polyfit(np.arange(128), levelled.mean(axis=0), 1)[0]
+    assert abs(slope) < 1e-8  # least squares leaves no slope, up to float32 rounding
+    assert store.quality["removed_sd_nm"][0] > 50
+    assert store.manifest["recipe"]["step"][0]["op"] == "plane"
+
+
+def test_layout_aware_levelling_knows_where_the_layout_lies(tmp_path: Path) -> None:
+    recipe = '[[step]]\nop = "layout-aware"\nblur_px = 1.0\n'
+    (tmp_path / "recipe.toml").write_text(recipe, encoding="utf-8")
+    card = write_campaign(tmp_path, count=1, more='[process]\nlevel = "recipe.toml"')
+    height = height_of(layout_of(0), 0)
+    tilt_um = 0.3 * (np.arange(128) / 128 - 0.5)
+    write_scan(tmp_path / "scans" / "P11.txt", height + tilt_um)
+    build(card, tmp_path / "prints.zarr")
+    removed = open_store(tmp_path / "prints.zarr").scan_frame("P11", "removed_um").astype(float)
+    # The margin has no layout and the response is piecewise linear: 5 % of the tilt is left to them.
+    np.testing.assert_allclose(np.polyfit(np.arange(128), removed.mean(axis=0), 1)[0] * 128, 0.3, rtol=0.05)
+    steps = [step.op for _, step in read_steps(open_store(tmp_path / "prints.zarr"))["P11"]]
+    assert steps == ["read-layout", "read-scan", "locate", "level", "register", "resample"]
+    assert replay(tmp_path / "prints.zarr")["same_hash"].all()
+
+
+def test_a_killed_build_is_finished_by_the_next(campaign: Path, tmp_path: Path) -> None:
+    out = tmp_path / "prints.zarr"
+    pieces = tmp_path / ".prints.zarr.partial" / "pieces"
+    code = f"from litho_data.build import build; build({str(campaign / 'card.toml')!r}, {str(out)!r})"
+    process = subprocess.Popen([sys.executable, "-c", code])
+    deadline = time.monotonic() + 60
+    while not list(pieces.glob("*.json")) and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.002)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert not out.exists()
+    finished = len(list(pieces.glob("*.json")))
+    assert finished >= 1
+    result = build(campaign / "card.toml", out)
+    assert result.reused == finished
+    assert result.dataset.sha256 == open_store(campaign / "prints.zarr").sha256
+    assert verify(out).findings == ()
+    assert not pieces.parent.exists()
+
+
+def test_a_damaged_or_outdated_piece_is_made_again(campaign: Path, own_campaign: Path) -> None:
+    out = own_campaign / "again.zarr"
+    jobs = field_jobs(list_fields(own_campaign / "card.toml"), load_recipe(None))
+    with partial_store(out) as partial:
+        root = partial.open()
+        for job in jobs:
+            piece = attempt(job)
+            assert isinstance(piece, Piece)
+            partial.add(root, piece)
+        damaged = partial.folder / "pieces" / "P11.npz"
+        content = bytearray(damaged.read_bytes())
+        content[len(content) // 2] ^= 1
+        damaged.write_bytes(content)
+    text = (own_campaign / "scans" / "P12.txt").read_text()
+    (own_campaign / "scans" / "P12.txt").write_text(text.replace("\t", " ", 1))
+    result = build(own_campaign / "card.toml", out)
+    assert result.reused == 1
+    assert result.dataset.sha256 == open_store(campaign / "prints.zarr").sha256
+
+
+def test_a_changed_card_is_another_piece(campaign: Path) -> None:
+    listing = list_fields(campaign / "card.toml")
+    job = field_jobs(listing, load_recipe(None))[0]
+    levels = listing.card.layout.model_copy(update={"levels": 14})
+    changed = [
+        replace(job, card=listing.card.model_copy(update={"layout": levels})),
+        replace(job, seed=1),
+        replace(job, recipe={"schema": "litho-data/recipe/1", "step": [{"op": "plane"}]}),
+        replace(job, field=replace(job.field, order=5)),
+    ]
+    assert len({one.key() for one in (job, *changed)}) == 5
+    assert replace(job).key() == job.key()
+
+
+def test_another_build_or_a_foreign_folder_is_left_alone(campaign: Path, tmp_path: Path) -> None:
+    with partial_store(tmp_path / "busy.zarr"), pytest.raises(InputError, match="another process"):
+        build(campaign / "card.toml", tmp_path / "busy.zarr")
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "chapter.txt").write_text("years of work")
+    with pytest.raises(InputError, match="no store of ours"):
+        build(campaign / "card.toml", tmp_path / "thesis")
+    assert (tmp_path / "thesis" / "chapter.txt").read_text() == "years of work"

@@ -1,0 +1,61 @@
+"""The measured prints: all 24 build, the same with one and two workers, in bounded memory."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from litho_data.build import build
+from litho_data.fetch import find_card
+from litho_data.store import open_store
+from litho_data.store.schema import SAMPLE_VARIABLES
+from litho_data.verify import verify
+
+_BUILD = """
+import json, resource, sys
+from litho_data.build import build
+if __name__ == "__main__":
+    result = build(sys.argv[1], sys.argv[2], workers=int(sys.argv[3]))
+    whose = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    peaks = [resource.getrusage(one).ru_maxrss / 1024 for one in whose]
+    print(json.dumps([result.dataset.sha256, result.n_scans, result.seconds, *peaks]))
+"""
+
+
+def _built(out: Path, workers: int) -> tuple[str, int, float, float]:
+    """Hash, scans, seconds, MiB: the peak of the process plus, per worker, that of the largest worker."""
+    script = out.with_suffix(".py")
+    script.write_text(_BUILD, encoding="utf-8")
+    command = [sys.executable, str(script), str(find_card("neural-lithography")), str(out), str(workers)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    sha256, scans, seconds, own, child = json.loads(done.stdout.splitlines()[-1])
+    return sha256, scans, seconds, own + (workers * child if workers > 1 else 0)
+
+
+@pytest.mark.slow
+@pytest.mark.measured
+def test_all_measured_scans_build_in_bounded_memory(measured_prints: Path, tmp_path: Path) -> None:
+    sha256, scans, seconds, peak_mib = _built(tmp_path / "prints.zarr", workers=2)
+    print(f"{scans} scans, 2 workers: {seconds:.1f} s, peak at most {peak_mib:.0f} MiB")
+    assert scans == 24
+    assert peak_mib < 1536
+    store = open_store(tmp_path / "prints.zarr")
+    assert store.sha256 == sha256
+    assert store.quality["passed"].all()
+    assert verify(tmp_path / "prints.zarr").findings == ()
+
+    # Two scans alone, in one process: other company, other order, the same arrays.
+    for name in ("afm_ug/FOV42.txt", "afm_ug/FOV72.txt", "mask_ug/FOV42.tif", "mask_ug/FOV72.tif"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        shutil.copy(measured_prints / name, tmp_path / name)
+    build(find_card("neural-lithography"), tmp_path / "two.zarr", data_dir=tmp_path, workers=1)
+    two = open_store(tmp_path / "two.zarr")
+    for scan_id in two.ids:
+        for variable in SAMPLE_VARIABLES:
+            arrays = [getattr(one.scan(scan_id), variable.name) for one in (store, two)]
+            assert variable.sample_sha256(arrays[0]) == variable.sample_sha256(arrays[1]), variable.name

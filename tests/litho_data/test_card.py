@@ -1,0 +1,90 @@
+"""A card is read strictly: every wrong key or value is named together with what was expected."""
+
+from __future__ import annotations
+
+import copy
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import pytest
+from campaigns import card_text
+
+from litho_data.card import check_card, load_card
+from litho_data.errors import InputError
+from litho_data.fetch import known_cards
+
+GOOD: dict[str, Any] = tomllib.loads(card_text())
+
+
+def changed(key: str, value: object) -> dict[str, Any]:
+    """The good card with one key set, or removed where the value is None."""
+    card = copy.deepcopy(GOOD)
+    *tables, last = key.split(".")
+    table = card
+    for name in tables:
+        table = table.setdefault(name, {})
+    if value is None:
+        del table[last]
+    else:
+        table[last] = value
+    return card
+
+
+def test_defaults_are_those_of_the_contract() -> None:
+    card = check_card(GOOD, "card")
+    assert card.process.registration == "affine"
+    assert card.process.level is None
+    assert card.write is None
+    assert card.scan.size_um == (12.8, 12.8)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "expected"),
+    [
+        ("scan.colour", "red", r"unknown key scan\.colour.*'red'.*one of files, format, unit"),
+        ("colour", 1, r"unknown key colour.*one of name"),
+        ("write.speed", 1, r"unknown key write\.speed.*slow_axis"),
+        ("scan.unit", None, r"scan: unit is missing.*text-matrix.*unit = 'm'"),
+        ("scan.unit", "furlong", r"scan\.unit = 'furlong'.*m, mm, µm"),
+        ("scan.unit", "A", r"scan\.unit = 'A'"),
+        ("scan.size_um", None, r"size_um is missing"),
+        ("scan.size_um", [54.0, -1.0], r"scan\.size_um\.1 = -1\.0.*positive"),
+        ("layout.pitch_um", 0.0, r"layout\.pitch_um = 0\.0.*positive"),
+        ("layout.pitch_um", -0.1, r"layout\.pitch_um = -0\.1.*positive"),
+        ("layout.pitch_um", float("inf"), r"layout\.pitch_um = inf.*positive"),
+        ("layout.pitch_um", True, r"layout\.pitch_um"),
+        ("layout.pitch_um", None, r"layout\.pitch_um.*nothing"),
+        ("layout.levels", 1, r"layout\.levels.*greater than or equal to 2"),
+        ("layout.files", "layouts/a.tif", r"layout\.files.*\{id\}"),
+        ("layout.files", "../raw/{id}.tif", r"layout\.files.*inside the data folder"),
+        ("scan.files", "/raw/{id}.txt", r"scan\.files.*inside the data folder"),
+        ("scan.files", "..\\raw\\{id}.txt", r"scan\.files.*inside the data folder"),
+        ("scan.format", "bmp", r"scan\.format.*text-matrix"),
+        ("scan.full_scale_file", "max.txt", r"either unit or full_scale_file"),
+        ("ids.print", "P(", r"ids\.print.*regular expression"),
+        ("ids.print", "P.*", r"ids\.print.*named print"),
+        ("ids.table", "../table.csv", r"ids\.table.*inside"),
+        ("process.registration", "rigid", r"process\.registration.*affine"),
+        ("source", {"url": "file:///x", "registry": "a"}, r"source\.url"),
+        ("name", "../x", r"name"),
+    ],
+)
+def test_a_wrong_card_is_named(key: str, value: object, expected: str) -> None:
+    with pytest.raises(InputError, match=expected):
+        check_card(changed(key, value), "card")
+
+
+def test_no_card_and_no_toml(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot read"):
+        load_card(tmp_path / "absent.toml")
+    (tmp_path / "bad.toml").write_text("name = ", encoding="utf-8")
+    with pytest.raises(InputError, match=r"cannot read .*bad\.toml"):
+        load_card(tmp_path / "bad.toml")
+
+
+def test_the_cards_of_the_project_are_good() -> None:
+    cards = known_cards()
+    assert "neural-lithography" in cards
+    for name, path in cards.items():
+        assert load_card(path).name == name

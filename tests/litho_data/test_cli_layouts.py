@@ -1,0 +1,96 @@
+"""The commands `masks` and `simulate`: they only parse, so a few calls pin what they pass on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from litho_data.cli_layouts import masks, simulate
+from litho_data.commands import new_app
+from litho_data.errors import InputError
+from litho_data.virtual_fab import KNOBS, Truth
+from litho_data.virtual_fab.presets import PRESETS
+
+
+@pytest.fixture(scope="module")
+def app():
+    app = new_app("layouts")
+    app.command()(masks)
+    app.command()(simulate)
+    return app
+
+
+def run(app, *arguments: str):
+    return CliRunner().invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)
+
+
+def test_layouts_are_made_and_printed(app, tmp_path):
+    assert (
+        run(
+            app, "masks", "--out", tmp_path / "m", "--pattern", "dose-matrix", "--count", 3, "--size", 64
+        ).exit_code
+        == 0
+    )
+    card = tmp_path / "m" / "card.toml"
+    found = run(app, "simulate", "--out", tmp_path / "s", "--layouts", card, "--knob", "z-gain=0.02@4")
+    assert found.exit_code == 0
+    truth = Truth.read(tmp_path / "s" / "truth")
+    assert [scan.dose for scan in truth.scans] == pytest.approx([0.7, 1.0, 1.3])
+    assert [(knob.name, knob.strength, knob.seed) for knob in truth.knobs] == [("z-gain", 0.02, 4)]
+
+
+def test_presets_are_overruled_by_what_is_stated(app, tmp_path):
+    run(
+        app,
+        "simulate",
+        "--out",
+        tmp_path / "s",
+        "--preset",
+        "demo",
+        "--count",
+        1,
+        "--size",
+        64,
+        "--noise",
+        "off",
+    )
+    truth = Truth.read(tmp_path / "s" / "truth")
+    assert len(truth.scans) == 1
+    assert truth.scans[0].floor_rmse_nm == 0
+    assert {f"{knob.name}={knob.strength:g}" for knob in truth.knobs} == set(PRESETS["demo"].knobs)
+
+
+def test_lists_need_no_output_folder(app):
+    assert all(name in run(app, "simulate", "--list-knobs").stdout for name in KNOBS)
+    assert "siemens-star" in run(app, "masks", "--list-patterns").stdout
+
+
+def test_bad_input_is_one_clear_error(app, tmp_path):
+    with pytest.raises(InputError, match="vignetting"):
+        run(app, "simulate", "--out", tmp_path / "s", "--knob", "vignet=1")
+    with pytest.raises(InputError, match="preset"):
+        run(app, "simulate", "--out", tmp_path / "s", "--preset", "gigantic")
+    with pytest.raises(InputError, match="level_height_um = nan"):
+        run(app, "masks", "--out", tmp_path / "m", "--count", 1, "--size", 64, "--level-height-um", "nan")
+    with pytest.raises(InputError, match="seed of knob z-gain"):
+        run(app, "simulate", "--out", tmp_path / "s", "--knob", "z-gain=0.1@-1")
+    with pytest.raises(InputError, match="write field"):
+        run(app, "simulate", "--out", tmp_path / "s", "--count", 1, "--write-field-um", "nan")
+    assert not list(tmp_path.iterdir())
+
+
+def test_options_that_a_card_settles_are_not_swallowed(app, tmp_path):
+    run(app, "masks", "--out", tmp_path / "m", "--count", 1, "--size", 64)
+    card = ("--layouts", tmp_path / "m" / "card.toml")
+    for option in (("--count", 3), ("--size", 64), ("--write-field-um", 100)):
+        with pytest.raises(InputError, match="beside --layouts"):
+            run(app, "simulate", "--out", tmp_path / "s", *card, *option)
+    with pytest.raises(InputError, match="references"):
+        run(app, "simulate", "--out", tmp_path / "s", *card, "--references")
+
+
+def test_every_knob_is_in_the_documentation():
+    page = (Path(__file__).parents[2] / "docs" / "virtual_fab.md").read_text(encoding="utf-8")
+    assert all(f"`{name}`" in page for name in KNOBS)

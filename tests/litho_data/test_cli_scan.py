@@ -1,0 +1,160 @@
+"""`level` and `inspect` on files: what they write, what they print, how they fail."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import afm_files
+import numpy as np
+import pytest
+from afm_files import HEIGHT_UM, SIZE_UM
+from typer.testing import CliRunner
+
+from litho_data.cli_scan import ScanFormat, inspect, level
+from litho_data.commands import new_app, run_app
+from litho_data.errors import InputError
+from litho_data.files import file_sha256
+from litho_data.level import Recipe
+from litho_data.level_scan import LevelRecord, level_scan
+from litho_data.provenance import array_sha256
+from litho_data.readers import FORMATS, read_scan
+from litho_data.scan import Scan
+from litho_data.scan_files import write_heights
+from litho_data.scan_picture import terminal_preview, write_picture
+
+RECIPE = '[[step]]\nop = "plane"\n[[step]]\nop = "fix-zero"\n'
+
+
+@pytest.fixture
+def app():
+    application = new_app("scans")
+    application.command()(level)
+    application.command()(inspect)
+    return application
+
+
+@pytest.fixture
+def scan_file(tmp_path: Path) -> Path:
+    path = tmp_path / "scan.txt"
+    np.savetxt(path, HEIGHT_UM * 1e-6)
+    (tmp_path / "recipe.toml").write_text(RECIPE)
+    return path
+
+
+def run(app, *arguments: object) -> str:
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+@pytest.mark.parametrize("suffix", [".gsf", ".npy"])
+def test_level_writes_heights_removed_surface_and_record(app, scan_file: Path, suffix: str) -> None:
+    out = scan_file.with_name(f"levelled{suffix}")
+    recipe_file = scan_file.with_name("recipe.toml")
+    size = ("--size-um", *SIZE_UM)
+    run(app, "level", scan_file, "--unit", "m", *size, "--recipe", recipe_file, "--out", out)
+    expected = Recipe.from_toml(recipe_file).apply(read_scan(scan_file, unit="m", size_um=SIZE_UM))
+    record = LevelRecord.read(f"{out}.json")
+    arguments = {"unit": "µm", "size_um": SIZE_UM} if suffix == ".npy" else {}
+    levelled = read_scan(out, **arguments)
+    removed = read_scan(out.with_name(record.removed), **arguments)
+    # GSF rounds to float32.
+    rtol = 2**-23 if suffix == ".gsf" else 0.0
+    np.testing.assert_allclose(levelled.height_um, expected.height, rtol=rtol, atol=1e-12 * bool(rtol))
+    np.testing.assert_allclose(removed.height_um, expected.removed, rtol=rtol, atol=1e-12 * bool(rtol))
+    assert levelled.pitch_um == pytest.approx((SIZE_UM[0] / 5, SIZE_UM[1] / 8), rel=1e-12)
+    assert record.source_sha256 == file_sha256(scan_file)
+    assert record.levelled_sha256 == array_sha256(expected.height, "µm", ("y", "x"))
+    assert Recipe.from_dict(record.recipe).canonical() == Recipe.from_toml(recipe_file).canonical()
+
+
+def test_the_command_offers_what_the_reader_reads() -> None:
+    assert tuple(ScanFormat) == FORMATS
+
+
+def test_gsf_keeps_missing_pixels(tmp_path: Path) -> None:
+    holed = HEIGHT_UM.copy()
+    holed[2, 3] = np.nan
+    write_heights(tmp_path / "a.gsf", holed, pitch_um=None, title="two\nlines", header={"Note": "kept"})
+    scan = read_scan(tmp_path / "a.gsf")
+    np.testing.assert_array_equal(np.isnan(scan.height_um), np.isnan(holed))
+    assert (scan.pitch_um, scan.channel, scan.header["Note"]) == (None, "two lines", "kept")
+
+
+def test_inspect_lists_channels_and_writes_a_picture(app, tmp_path: Path) -> None:
+    path = tmp_path / "scan.gwy"
+    channels = {"Topography": (HEIGHT_UM * 1e-6, "m"), "Phase": (HEIGHT_UM, "deg")}
+    afm_files.write_gwy(path, channels, HEIGHT_UM > 0.03)
+    output = run(app, "inspect", path, "--header", "--picture", tmp_path / "scan.png")
+    for word in (
+        "Topography",
+        "Phase",
+        "5 × 8",
+        "deg",
+        "0.5 × 0.2",
+        "Scan rate = 1.5 Hz",
+        "heights 0.001 to 0.5",
+    ):
+        assert word in output
+    import cv2
+
+    picture = cv2.imread(str(tmp_path / "scan.png"))
+    assert picture is not None
+    assert picture.std() > 10
+
+
+def test_inspect_without_a_unit_lists_and_says_why_there_is_no_picture(app, scan_file: Path) -> None:
+    output = run(app, "inspect", scan_file)
+    assert "5 × 8" in output
+    assert "does not state the unit" in output
+
+
+def test_pictures_show_row_0_on_top(tmp_path: Path) -> None:
+    height = np.zeros((40, 60))
+    height[:20, :30] = 1.0
+    scan = Scan(height_um=height, pitch_um=(0.1, 0.1), name="corner")
+    lines = terminal_preview(scan).split("\n")
+    colours = [[span.style.color.triplet for span in line.spans] for line in lines if line.plain]
+    assert len(colours[0]) == 60
+    assert colours[0][0] != colours[0][-1] == colours[-1][0] == colours[-1][-1]
+    import cv2
+
+    picture = cv2.imread(str(write_picture(scan, tmp_path / "a.png")))
+    rows, columns = picture.shape[:2]
+    # Viridis ends in yellow, strong in red and weak in blue (channels are blue, green, red).
+    top_left, bottom_right = picture[rows // 4, columns // 4], picture[3 * rows // 4, columns // 2]
+    assert top_left[2] > 200 > 100 > top_left[0]
+    assert bottom_right[2] < 100
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["level", "{scan}", "--recipe", "{recipe}", "--out", "o.gsf"], "does not state the unit"),
+        (["level", "{scan}", "--unit", "m", "--recipe", "none.toml", "--out", "o.gsf"], "cannot read recipe"),
+        (["level", "{scan}", "--unit", "m", "--recipe", "{recipe}", "--out", "o.xyz"], "file type"),
+        (["inspect", "none.txt"], "no such file"),
+        (["inspect", "{recipe}"], "unknown content"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(
+    app, scan_file: Path, arguments: list[str], message: str, monkeypatch, capsys
+) -> None:
+    names = {"scan": scan_file, "recipe": scan_file.with_name("recipe.toml")}
+    monkeypatch.chdir(scan_file.parent)
+    before = sorted(scan_file.parent.iterdir())
+    monkeypatch.setattr("sys.argv", ["litho-data", *(argument.format(**names) for argument in arguments)])
+    with pytest.raises(SystemExit) as stopped:
+        run_app(app, "litho-data")
+    assert stopped.value.code == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert len(error.splitlines()) == 1
+    assert sorted(scan_file.parent.iterdir()) == before
+
+
+def test_a_step_that_fails_writes_nothing(tmp_path: Path) -> None:
+    scan = Scan(height_um=HEIGHT_UM, pitch_um=None, source="scan")
+    with pytest.raises(InputError, match="pixel pitch"):
+        level_scan(scan, Recipe.from_dict({"step": [{"op": "facet"}]}), tmp_path / "a.gsf")
+    assert not list(tmp_path.iterdir())

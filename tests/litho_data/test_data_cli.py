@@ -1,0 +1,51 @@
+"""The command line: one clear line and code 2 for bad input, 1 for a store that has changed, 0 else."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+from campaigns import card_text
+from typer.testing import CliRunner
+
+from litho_data.cli import app
+
+run = CliRunner()
+
+
+def test_bad_input_is_one_line_and_code_2(tmp_path: Path) -> None:
+    card = tmp_path / "card.toml"
+    card.write_text(card_text(unit='"furlong"'), encoding="utf-8")
+    code = "from litho_data.cli import main; main()"
+    command = [sys.executable, "-c", code, "build", str(card), "--out", str(tmp_path / "out.zarr")]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert "scan.unit = 'furlong'" in done.stderr
+    assert list(tmp_path.iterdir()) == [card]
+
+
+def test_the_commands_on_a_store(own_campaign: Path) -> None:
+    store = str(own_campaign / "prints.zarr")
+    verified = run.invoke(app, ["verify", store])
+    assert verified.exit_code == 0, verified.output
+    assert "unchanged: 21 arrays, 15 steps, 6 raw files" in verified.output
+    assert "from scans/P11.txt" in run.invoke(app, ["history", store, "P11"]).output
+    replayed = run.invoke(app, ["replay", store, "P11", "--array", "height_um"])
+    assert "largest difference 0, over 1 arrays" in replayed.output
+    exported = run.invoke(app, ["export", store, "--format", "zip"])
+    assert exported.exit_code == 0, exported.output
+    assert (own_campaign / "prints.zarr.zip").is_file()
+    (own_campaign / "scans" / "P11.txt").write_text("1 2\n3 4\n")
+    changed = run.invoke(app, ["verify", store])
+    assert changed.exit_code == 1
+    assert "CHANGED raw file scans/P11.txt" in changed.output
+
+
+def test_help_names_every_command() -> None:
+    text = run.invoke(app, ["--help"]).output
+    scans, stores = ["masks", "simulate", "level", "inspect"], ["verify", "history", "replay", "export"]
+    commands = ["fetch", *scans, "build", *stores, "import-pairs"]
+    assert [name for name in commands if f" {name} " not in text] == []

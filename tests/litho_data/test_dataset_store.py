@@ -1,0 +1,113 @@
+"""The store's contract at the door, and hashes that see values and nothing else."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import zarr
+
+from litho_data.errors import InputError
+from litho_data.provenance import array_sha256, record_sha256
+from litho_data.store import open_store
+from litho_data.store.access import array_of, values_of
+
+
+def test_array_hash_sees_values_type_shape_unit_and_names() -> None:
+    array = np.arange(6, dtype=np.float32).reshape(2, 3)
+    known = array_sha256(array, "um", ("y", "x"))
+    assert known == array_sha256(np.asfortranarray(array), "um", ("y", "x"))
+    assert known == array_sha256(array.astype(">f4"), "um", ("y", "x"))
+    others = [
+        array_sha256(array.astype(np.float64), "um", ("y", "x")),
+        array_sha256(array.reshape(3, 2), "um", ("y", "x")),
+        array_sha256(array, "nm", ("y", "x")),
+        array_sha256(array, "um", ("x", "y")),
+        array_sha256(np.nextafter(array, np.inf), "um", ("y", "x")),
+    ]
+    assert len({known, *others}) == 6
+
+
+def test_array_hash_knows_one_nan_only() -> None:
+    quiet = np.array([np.nan, 1.0], dtype=np.float32)
+    other = quiet.copy()
+    other.view(np.uint32)[0] = 0xFFC01234  # negative, with a payload
+    assert np.isnan(other[0])
+    assert array_sha256(quiet, "um", ("x",)) == array_sha256(other, "um", ("x",))
+
+
+def test_record_hash_does_not_see_the_order_of_keys() -> None:
+    assert record_sha256({"a": 1, "b": [2.5, None]}) == record_sha256({"b": [2.5, None], "a": 1})
+    assert record_sha256({"a": 1}) != record_sha256({"a": 2})
+
+
+def test_dataset_hash_does_not_see_chunks_or_codecs(own_campaign: Path) -> None:
+    path = own_campaign / "prints.zarr"
+    known = open_store(path).sha256
+    root = zarr.open_group(path, mode="a", use_consolidated=False)
+    for name, chunks in (("height_um", (3, 50, 17)), ("mask_level", (2, 64, 64)), ("valid", (1, 112, 112))):
+        old = array_of(root, name)
+        values, attributes, dims = old[...], dict(old.attrs), old.metadata.dimension_names
+        new = root.create_array(name, shape=old.shape, chunks=chunks, dtype=old.dtype, overwrite=True,
+                                compressors=None, attributes=attributes, dimension_names=dims)  # fmt: skip
+        new[...] = values
+    assert open_store(path).computed_sha256() == known
+    array_of(root, "height_um")[1, 5, 5] += 1e-4
+    assert open_store(path).computed_sha256() != known
+
+
+def test_opens_with_xarray_without_a_warning(campaign: Path, recwarn: pytest.WarningsRecorder) -> None:
+    import xarray
+
+    dataset = xarray.open_zarr(campaign / "prints.zarr")
+    assert not [one for one in recwarn if "onsolidated" in str(one.message)]
+    assert set(dataset.coords) >= {"scan", "print", "order", "y_um", "x_um"}
+    assert dataset["height_um"].dims == ("scan", "y", "x")
+    assert dataset["height_um"].attrs["units"] == "um"
+    assert dataset["y_um"].values[:2] == pytest.approx([0.05, 0.15])
+    assert [str(value) for value in dataset["print"].values] == ["1", "1", "2"]
+    quality = xarray.open_zarr(campaign / "prints.zarr", group="quality")
+    assert float(quality["ncc_after"].min()) > 0.9
+
+
+def test_one_chunk_is_one_scan(campaign: Path) -> None:
+    array = array_of(open_store(campaign / "prints.zarr").root, "height_um")
+    assert array.chunks == (1, 112, 112)
+    assert array.shards == (3, 112, 112)
+
+
+def test_broken_contracts_are_named(own_campaign: Path, tmp_path: Path) -> None:
+    path = own_campaign / "prints.zarr"
+    with pytest.raises(InputError, match="one of P11, P12, P21"):
+        open_store(path).scan("P99")
+    with pytest.raises(InputError, match="does not exist"):
+        open_store(tmp_path / "absent.zarr")
+    (tmp_path / "note.txt").write_text("no zip")
+    with pytest.raises(InputError, match="cannot open"):
+        open_store(tmp_path / "note.txt")
+    root = zarr.open_group(path, mode="a", use_consolidated=False)
+    for key, value in (("pitch_um", 0), ("pitch_um", "0.1"), ("level_height_um", None), ("levels", 13.5)):
+        good = root.attrs[key]
+        root.attrs[key] = value
+        with pytest.raises(InputError, match=f"attribute {key}"):
+            open_store(path)
+        root.attrs[key] = good
+    shutil.rmtree(path / "valid")
+    with pytest.raises(InputError, match="array valid"):
+        open_store(path)
+
+
+def test_a_store_without_quality_and_provenance_can_be_read(own_campaign: Path) -> None:
+    path = own_campaign / "prints.zarr"
+    known = open_store(path).sha256
+    for name in ("quality", "provenance", "manifest", "scans"):
+        shutil.rmtree(path / name)
+    root = zarr.open_group(path, mode="a", use_consolidated=False)
+    del root.attrs["dataset_sha256"]
+    store = open_store(path)
+    assert store.sha256 == known
+    assert list(store.quality["scan"]) == store.ids
+    assert store.manifest == {}
+    assert values_of(store.root, "valid").all()

@@ -1,0 +1,315 @@
+"""Laws of levelling: closed forms, idempotence, transposition, units, masks, missing pixels."""
+
+from __future__ import annotations
+
+from typing import get_args
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from litho_data.errors import InputError
+from litho_data.level import (
+    align_rows,
+    fix_zero,
+    level_facet,
+    level_plane,
+    level_polynomial,
+    level_robust,
+    level_rotate,
+    level_three_point,
+    mask_and_relevel,
+    zero_max,
+    zero_mean,
+)
+from litho_data.level.rows import RowMethod
+
+PITCH_UM = (0.1, 0.07)
+SHAPES = st.tuples(st.integers(8, 24), st.integers(8, 24))
+SLOPES = st.floats(-0.1, 0.1, allow_subnormal=False)
+SEEDS = st.integers(0, 2**32 - 1)
+ROW_METHODS = get_args(RowMethod)
+# Cumulative and least-squares steps over a few hundred pixels keep this share of the range.
+ROUNDING = 1e-11
+
+WHOLE_SURFACE = {
+    "plane": lambda z, **kw: level_plane(z, **kw),
+    "facet": lambda z, **kw: level_facet(z, pitch_um=PITCH_UM, **kw),
+    "polynomial": lambda z, **kw: level_polynomial(z, x_degree=2, y_degree=3, **kw),
+    "total": lambda z, **kw: level_polynomial(z, total_degree=3, **kw),
+    "robust": lambda z, **kw: level_robust(z, **kw),
+    "mask-and-relevel": lambda z, **kw: mask_and_relevel(z, **kw).levelled,
+    "fix-zero": fix_zero,
+    "zero-mean": zero_mean,
+    "zero-max": zero_max,
+}
+ROWS = {
+    f"rows-{name}": (lambda z, name=name, **kw: align_rows(z, method=name, pitch_um=PITCH_UM, **kw))
+    for name in ROW_METHODS
+}
+ALL = WHOLE_SURFACE | ROWS
+
+
+def ramp(shape: tuple[int, int], constant: float, slope_x: float, slope_y: float) -> np.ndarray:
+    return constant + slope_x * np.arange(shape[1])[None, :] + slope_y * np.arange(shape[0])[:, None]
+
+
+def rough(shape: tuple[int, int], seed: int) -> np.ndarray:
+    """A smooth surface with noise, about 1 µm high."""
+    rng = np.random.default_rng(seed)
+    y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij")
+    a = rng.normal(size=6)
+    smooth = a[0] + a[1] * x + a[2] * y + a[3] * x * y + a[4] * x**2 + a[5] * np.sin(3 * y)
+    return 0.2 * smooth + 0.01 * rng.normal(size=shape)
+
+
+@settings(deadline=None, max_examples=30)
+@given(shape=SHAPES, constant=SLOPES, slope_x=SLOPES, slope_y=SLOPES)
+def test_a_plane_is_removed_in_closed_form(
+    shape: tuple[int, int], constant: float, slope_x: float, slope_y: float
+) -> None:
+    z = ramp(shape, constant, slope_x, slope_y)
+    atol = ROUNDING * max(np.abs(z).max(), 1e-30)
+    # The pivot (nx/2, ny/2) lies half a pixel off the middle pixel, so the mean moves by (bx + by) / 2.
+    pivot = constant + slope_x * shape[1] / 2 + slope_y * shape[0] / 2
+    for levelled in (level_plane(z), level_three_point(z, points_px=[(0, 0), (0, 7), (7, 0)])):
+        np.testing.assert_allclose(levelled.height, pivot, rtol=0, atol=atol)
+        assert levelled.height.mean() == pytest.approx(z.mean() + 0.5 * (slope_x + slope_y), abs=atol)
+    for levelled in (level_polynomial(z, total_degree=1), level_polynomial(z), level_robust(z)):
+        np.testing.assert_allclose(levelled.height, 0.0, rtol=0, atol=atol)
+    zeroed = level_three_point(z, points_px=[(0, 0), (0, 7), (7, 0)], set_zero=True)
+    np.testing.assert_allclose(zeroed.height, 0.0, rtol=0, atol=10 * atol)
+
+
+@pytest.mark.parametrize(("slope_x", "slope_y"), [(0.02, -0.03), (0.0, 0.1), (0.0, 0.0)])
+def test_the_facet_of_a_plane_is_the_plane(slope_x: float, slope_y: float) -> None:
+    z = ramp((20, 30), 0.3, slope_x * PITCH_UM[1], slope_y * PITCH_UM[0])
+    # Iteration stops once a step is below sqrt(1e-9) in slope, over 30 pixels of 0.1 µm.
+    assert np.ptp(level_facet(z, pitch_um=PITCH_UM).height) < 1e-4 * 3
+
+
+def test_facets_see_terraces_and_not_their_steps() -> None:
+    terraces = 0.1 * np.repeat(np.arange(6), 10)[None, :] + np.zeros((40, 1))
+    tilted = terraces + ramp(terraces.shape, 0.0, 0.02 * PITCH_UM[1], -0.05 * PITCH_UM[0])
+    once = level_facet(tilted, pitch_um=PITCH_UM)
+    # Slopes are found to sqrt(1e-9); the least-squares plane would take the staircase for a slope.
+    atol = np.sqrt(1e-9) * (60 * PITCH_UM[1] + 40 * PITCH_UM[0])
+    np.testing.assert_allclose(once.height - once.height[0, 0], terraces, rtol=0, atol=atol)
+    np.testing.assert_allclose(
+        level_facet(once.height, pitch_um=PITCH_UM).height, once.height, rtol=0, atol=atol
+    )
+    assert np.ptp(level_plane(tilted).height - terraces) > 0.1
+
+
+@settings(deadline=None, max_examples=25)
+@given(seed=SEEDS, degrees=st.tuples(st.integers(0, 5), st.integers(0, 5)))
+def test_a_polynomial_is_removed_whatever_its_coefficients(seed: int, degrees: tuple[int, int]) -> None:
+    rng = np.random.default_rng(seed)
+    y, x = np.linspace(-1, 1, 21)[:, None], np.linspace(-1, 1, 34)[None, :]
+    z = np.polynomial.polynomial.polyval2d(
+        *np.broadcast_arrays(x, y), rng.normal(size=(degrees[0] + 1, degrees[1] + 1))
+    )
+    mask = rng.random(z.shape) < 0.3
+    for masking in ("ignore", "exclude", "include"):
+        levelled = level_polynomial(z, x_degree=degrees[0], y_degree=degrees[1], mask=mask, masking=masking)
+        # The fit through 30 % of the pixels has a condition of up to 1e4 on top of rounding.
+        np.testing.assert_allclose(levelled.height, 0.0, rtol=0, atol=1e-10 * max(1, np.abs(z).max()))
+
+
+TWICE = [
+    (name, masking)
+    for name in ALL
+    for masking in ("ignore", "exclude", "include")
+    # Facets converge on facetted surfaces only; under a mask the weights of matching do not add up to one.
+    if "facet" not in name and (name != "rows-matching" or masking == "ignore")
+]
+
+
+@pytest.mark.parametrize(("name", "masking"), TWICE)
+def test_levelling_twice_is_levelling_once(name: str, masking: str) -> None:
+    # Wide enough that any two rows share more than the fewest pixels that count.
+    z = rough((24, 96), 1)
+    mask = np.random.default_rng(2).random(z.shape) < 0.5
+    once = ALL[name](z, mask=mask, masking=masking).height
+    difference = ALL[name](once, mask=mask, masking=masking).height - once
+    if name == "rows-polynomial":
+        # The mean that it adds back ignores the mask, so the datum moves each time.
+        difference -= difference.mean()
+    # The robust fits stop at 1e-7 noise sigmas of 0.1 µm; marks at a threshold may flip on rounding.
+    atol = {"robust": 1e-7, "mask-and-relevel": 1e-2}.get(name, ROUNDING)
+    np.testing.assert_allclose(difference, 0.0, rtol=0, atol=atol)
+
+
+@pytest.mark.parametrize("name", list(ALL))
+def test_the_removed_surface_is_what_is_missing(name: str) -> None:
+    z = rough((20, 28), 3)
+    mask = z > np.quantile(z, 0.8)
+    levelled = ALL[name](z, mask=mask)
+    np.testing.assert_array_equal(levelled.height, z - levelled.removed)
+    assert np.isfinite(levelled.removed).all()
+
+
+@pytest.mark.parametrize("name", [name for name in WHOLE_SURFACE if name != "facet"])
+def test_rows_and_columns_are_treated_alike(name: str) -> None:
+    z = rough((18, 26), 4)
+    mask = z > np.quantile(z, 0.7)
+    swap = {"polynomial": lambda z, **kw: level_polynomial(z, x_degree=3, y_degree=2, **kw)}
+    turned = swap.get(name, WHOLE_SURFACE[name])(z.T, mask=mask.T)
+    np.testing.assert_allclose(turned.height.T, WHOLE_SURFACE[name](z, mask=mask).height, rtol=0, atol=1e-8)
+
+
+def test_facets_of_the_transpose() -> None:
+    z = rough((18, 26), 4)
+    straight = level_facet(z, pitch_um=PITCH_UM).height
+    turned = level_facet(z.T, pitch_um=PITCH_UM[::-1]).height
+    np.testing.assert_allclose(turned.T, straight, rtol=0, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("method", ROW_METHODS)
+def test_vertical_is_the_transpose(method: str) -> None:
+    z = rough((18, 26), 5)
+    mask = z > np.quantile(z, 0.6)
+    kwargs = {"method": method, "mask": mask}
+    vertical = align_rows(z, direction="vertical", pitch_um=PITCH_UM, **kwargs)
+    kwargs["mask"] = mask.T
+    horizontal = align_rows(z.T, pitch_um=PITCH_UM[::-1], **kwargs)
+    np.testing.assert_array_equal(vertical.height, horizontal.height.T)
+
+
+@settings(deadline=None, max_examples=10)
+@given(seed=SEEDS, scale=st.floats(1e-3, 1e3), offset=st.floats(-10, 10))
+@pytest.mark.parametrize(
+    "name", [name for name in ALL if name not in ("rows-matching", "facet", "rows-facet-tilt")]
+)
+def test_units_and_datum_pass_through(name: str, seed: int, scale: float, offset: float) -> None:
+    """level(a z + b) = a level(z) + what the operation does to a constant."""
+    z = rough((16, 20), seed)
+    # Rows without any pixel would follow Gwyddion's rule for them, which depends on the datum.
+    mask = np.random.default_rng(seed).random(z.shape) < 0.25
+    operate = ALL[name]
+    expected = scale * operate(z, mask=mask).height
+    scaled = operate(scale * z + offset, mask=mask).height
+    keeps_datum = name == "plane" or name in ROWS
+    atol = 1e-6 * scale if name in ("robust", "mask-and-relevel") else 1e-9 * (scale + abs(offset))
+    np.testing.assert_allclose(scaled, expected + (offset if keeps_datum else 0.0), rtol=0, atol=atol)
+
+
+@pytest.mark.parametrize("name", ["plane", "polynomial", "total"])
+def test_adding_a_plane_changes_at_most_a_constant(name: str) -> None:
+    z = rough((20, 30), 6)
+    tilted = WHOLE_SURFACE[name](z + ramp(z.shape, 0.5, 0.01, -0.02)).height
+    difference = tilted - WHOLE_SURFACE[name](z).height
+    assert np.ptp(difference) < ROUNDING
+    if name != "plane":
+        assert np.abs(difference).max() < ROUNDING
+
+
+@pytest.mark.parametrize("name", list(ALL))
+@pytest.mark.parametrize("masking", ["exclude", "include"])
+def test_masked_pixels_do_not_matter(name: str, masking: str) -> None:
+    """Anything may stand in the pixels that are left out; only polynomials per row put them into a mean."""
+    z = rough((20, 30), 7)
+    rng = np.random.default_rng(8)
+    left_out = rng.random(z.shape) < 0.2
+    mask = left_out if masking == "exclude" else ~left_out
+    spoiled = np.where(left_out, 50.0 * rng.normal(size=z.shape), z)
+    before = ALL[name](z, mask=mask, masking=masking).removed
+    after = ALL[name](spoiled, mask=mask, masking=masking).removed
+    difference = after - before
+    if name == "rows-polynomial":
+        difference -= difference.mean()
+    if name == "rows-matching":
+        # Its weights are scaled by the bends beside a masked pixel too, as in Gwyddion.
+        assert np.abs(difference).max() < 1e-3
+    else:
+        np.testing.assert_allclose(difference, 0.0, rtol=0, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("name", list(ALL))
+def test_missing_pixels_are_left_out_and_stay_missing(name: str) -> None:
+    z = rough((20, 30), 9)
+    missing = np.random.default_rng(10).random(z.shape) < 0.05
+    holed = np.where(missing, np.nan, z)
+    levelled = ALL[name](holed)
+    np.testing.assert_array_equal(np.isnan(levelled.height), missing)
+    assert np.isfinite(levelled.removed).all()
+    masked = ALL[name](z, mask=missing)
+    difference = levelled.removed - masked.removed
+    if name == "rows-polynomial":
+        difference -= difference.mean()  # the mean that it adds back is that of all measured pixels
+    if name != "rows-matching":
+        np.testing.assert_allclose(difference, 0.0, rtol=0, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("method", [name for name in ROW_METHODS if name not in ("facet-tilt", "modus")])
+def test_row_offsets_are_recovered(method: str) -> None:
+    """Offsets of single rows go, whatever each method keeps of the surface."""
+    rng = np.random.default_rng(11)
+    offsets = rng.normal(size=40)
+    offsets -= np.polynomial.Polynomial.fit(np.arange(40), offsets, 1)(np.arange(40))
+    levelled = align_rows(np.repeat(offsets[:, None], 50, axis=1), method=method)
+    np.testing.assert_allclose(levelled.height, 0.0, rtol=0, atol=1e-12)
+
+
+def test_differences_keep_the_slow_slope_and_means_remove_it() -> None:
+    z = ramp((40, 50), 0.0, 0.0, 0.01)
+    kept = align_rows(z, method="median-of-differences").height
+    np.testing.assert_allclose(kept, z, rtol=0, atol=1e-12)
+    assert np.ptp(align_rows(z, method="median").height) < 1e-12
+
+
+def test_rows_without_selected_pixels_take_the_overall_median() -> None:
+    z = rough((20, 30), 12)
+    mask = np.zeros(z.shape, dtype=bool)
+    mask[3] = True
+    shifts = align_rows(z, method="median", mask=mask).removed[:, 0]
+    values = np.sort(z[~mask])
+    expected = np.array([np.sort(row)[15] for row in z])
+    expected[3] = values[values.size // 2]
+    np.testing.assert_allclose(shifts, expected - expected.mean(), rtol=0, atol=1e-15)
+
+
+def test_median_is_exact_where_float32_cannot_tell_values_apart() -> None:
+    rng = np.random.default_rng(13)
+    z = 1.0 + 1e-12 * rng.integers(0, 50, size=(30, 41))
+    medians = np.sort(z, axis=1)[:, 20]
+    removed = align_rows(z, method="median").removed[:, 0]
+    np.testing.assert_array_equal(removed, medians - medians.mean())
+
+
+def test_rotation_brings_a_plane_to_a_constant_and_keeps_shape() -> None:
+    z = ramp((30, 40), 0.2, 0.02 * PITCH_UM[1], -0.01 * PITCH_UM[0])
+    rotated = level_rotate(z, pitch_um=PITCH_UM)
+    np.testing.assert_allclose(rotated.height, rotated.height[0, 0], rtol=0, atol=1e-12)
+    flat = np.zeros((30, 40))
+    np.testing.assert_array_equal(level_rotate(flat, pitch_um=PITCH_UM).height, flat)
+
+
+@pytest.mark.parametrize(
+    ("operate", "message"),
+    [
+        (lambda z: level_plane(z, mask=np.ones(z.shape, bool)), "no pixel is left"),
+        (lambda z: level_plane(z, mask=np.ones(z.shape)), "mask, got float64"),
+        (lambda z: level_plane(z, mask=np.ones((2, 2), bool)), "wanted bool"),
+        (lambda z: level_plane(z, masking="use"), "masking"),
+        (lambda z: level_plane(z, mask=np.arange(z.size).reshape(z.shape) >= z.shape[1]), "do not determine"),
+        (lambda z: level_polynomial(z, x_degree=12), "degree"),
+        (lambda z: level_polynomial(np.full(z.shape, np.nan)), "no pixel is left"),
+        (
+            lambda z: level_facet(z, pitch_um=PITCH_UM, mask=np.indices(z.shape).sum(0) % 2 == 0),
+            "facet levelling",
+        ),
+        (lambda z: align_rows(z, method="mode"), "row alignment method"),
+        (lambda z: align_rows(z, degree=6), "degree"),
+        (lambda z: align_rows(z, trim=0.6), "trim"),
+        (lambda z: align_rows(z, method="facet-tilt"), "pitch"),
+        (lambda z: level_three_point(z, points_px=[(0, 0), (1, 1), (2, 2)]), "not on one line"),
+        (lambda z: level_three_point(z, points_px=[(0, 0), (1, 1), (99, 2)]), "wanted a pixel"),
+        (lambda z: level_rotate(100 * z, pitch_um=PITCH_UM), "overhang"),
+        (lambda z: level_plane(z[0]), "shape"),
+    ],
+)
+def test_what_cannot_be_levelled_is_refused(operate, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        operate(rough((12, 14), 14))

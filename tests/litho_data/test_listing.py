@@ -1,0 +1,106 @@
+"""Files are paired by id; what does not pair is listed, what tries to leave the folder is refused."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from campaigns import card_text
+
+from litho_data.errors import InputError
+from litho_data.listing import list_fields
+
+
+def folder_with(tmp_path: Path, files: list[str], **card: str) -> Path:
+    tmp_path.mkdir(parents=True, exist_ok=True)
+    for name in files:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    (tmp_path / "card.toml").write_text(card_text(**card), encoding="utf-8")
+    return tmp_path / "card.toml"
+
+
+PAIRS = ["layouts/P11.tif", "layouts/P12.tif", "scans/P11.txt", "scans/P12.txt"]
+
+
+def test_ids_are_those_with_both_files(tmp_path: Path) -> None:
+    files = [*PAIRS, "layouts/P13.tif", "scans/P14.txt", "layouts/.P15.tif", "scans/deeper/P16.txt"]
+    listing = list_fields(folder_with(tmp_path, files))
+    assert [(one.id, one.print_id, one.order) for one in listing.fields] == [("P11", "1", 0), ("P12", "1", 1)]
+    reasons = {one.id: one.reason for one in listing.left_aside}
+    assert reasons == {"P13": "no file scans/P13.txt", "P14": "no file layouts/P14.tif"}
+    assert all(one.unpaired for one in listing.left_aside)
+    assert "the writing order is that of the sorted ids" in listing.assumptions
+
+
+def test_an_id_of_another_form_is_refused_with_a_reason(tmp_path: Path) -> None:
+    listing = list_fields(folder_with(tmp_path, [*PAIRS, "layouts/Q1.tif", "scans/Q1.txt"]))
+    (refused,) = listing.left_aside
+    assert not refused.unpaired
+    assert "does not match" in refused.reason
+
+
+def test_the_table_gives_order_position_dose_and_use(tmp_path: Path) -> None:
+    card = folder_with(tmp_path, [*PAIRS, "scans/bare.txt"], more='table = "scans.csv"')
+    table = "id,order,field_x_um,dose,use\nP11,7,-20.5,1.1,\nP12,3,,,dataset\nbare,9,,,substrate\n"
+    (tmp_path / "scans.csv").write_text(table, encoding="utf-8")
+    listing = list_fields(card)
+    by_id = {one.id: one for one in listing.fields}
+    assert by_id["P11"].order == 7
+    assert by_id["P11"].columns == {"field_x_um": -20.5, "dose": 1.1}
+    assert by_id["P12"].columns == {}
+    assert by_id["bare"].use == "substrate"
+    assert by_id["bare"].layout is None
+
+
+@pytest.mark.parametrize(
+    ("table", "expected"),
+    [
+        ("id,order\n../P11,1\n", r"line 2: id, got '\.\./P11'.*without path"),
+        ("id,order\nP11,1\nP11,2\n", "each id once"),
+        ("id,order\nP11,first\n", "whole number"),
+        ("id,dose\nP11,high\n", "dose.*a number"),
+        ("id,dose\nP11,nan\n", "dose.*a number"),
+        ("id,use\nP11,training\n", "dataset | flat"),
+        ("id,speed\nP11,3\n", "columns of"),
+        ("order\n1\n", "columns of"),
+        ("id,dose\nP11,1,2\n", "more cells"),
+    ],
+)
+def test_a_wrong_table_is_named(tmp_path: Path, table: str, expected: str) -> None:
+    card = folder_with(tmp_path, PAIRS, more='table = "scans.csv"')
+    (tmp_path / "scans.csv").write_text(table, encoding="utf-8")
+    with pytest.raises(InputError, match=expected):
+        list_fields(card)
+
+
+def test_full_scales_are_metres_by_id_or_file_name(tmp_path: Path) -> None:
+    card = folder_with(tmp_path, PAIRS)
+    text = card.read_text(encoding="utf-8").replace('unit = "m"', 'full_scale_file = "max.json"')
+    card.write_text(text, encoding="utf-8")
+    (tmp_path / "max.json").write_text(json.dumps({"P11": 1e-6, "P12.txt": 2e-6}), encoding="utf-8")
+    assert [one.full_scale_um for one in list_fields(card).fields] == pytest.approx([1.0, 2.0])
+    (tmp_path / "max.json").write_text(json.dumps({"P11": 1e-6}), encoding="utf-8")
+    assert "no full scale" in list_fields(card).left_aside[0].reason
+    (tmp_path / "max.json").write_text(json.dumps({"P11": -1}), encoding="utf-8")
+    with pytest.raises(InputError, match=r"P11.*positive"):
+        list_fields(card)
+
+
+def test_the_data_folder_is_searched(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    card = folder_with(tmp_path / "cards", [])
+    folder_with(tmp_path / "data" / "test-prints", PAIRS)
+    monkeypatch.setenv("LITHO_DATA_DIR", str(tmp_path / "data"))
+    assert list_fields(card).data_dir == (tmp_path / "data" / "test-prints").resolve()
+    monkeypatch.delenv("LITHO_DATA_DIR")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    with pytest.raises(InputError, match="files of card"):
+        list_fields(card)
+    assert len(list_fields(card, data_dir=tmp_path / "data" / "test-prints").fields) == 2
+
+
+def test_no_pair_at_all(tmp_path: Path) -> None:
+    card = folder_with(tmp_path, ["layouts/P11.tif", "scans/P12.txt"])
+    with pytest.raises(InputError, match=r"no field to build.*P11: no file scans/P11\.txt"):
+        list_fields(card)

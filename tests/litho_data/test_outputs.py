@@ -1,0 +1,65 @@
+"""Whatever a command writes as a whole, it never takes the place of something else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from litho_data.errors import InputError
+from litho_data.files import atomic_file, atomic_folder
+from litho_data.layouts import write_layout_set
+from litho_data.pairs_export import export_pairs
+from litho_data.release import export_ro_crate
+from litho_data.virtual_fab import simulate
+
+Writer = Callable[[Path, Path], object]
+WRITERS: dict[str, Writer] = {
+    "masks": lambda campaign, out: write_layout_set(out, count=1, size_px=64),
+    "simulate": lambda campaign, out: simulate(out, count=1, size_px=64),
+    "pairs": lambda campaign, out: export_pairs(campaign / "prints.zarr", out),
+    "ro-crate": lambda campaign, out: export_ro_crate(campaign / "prints.zarr", out),
+}
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_only_an_older_result_is_replaced(name: str, campaign: Path, tmp_path: Path) -> None:
+    write, out = WRITERS[name], tmp_path / "out"
+    out.mkdir()
+    write(campaign, out)
+    names = {path.name for path in out.iterdir()}
+    write(campaign, out)
+    assert {path.name for path in out.iterdir()} == names
+
+    # Measured scans beside their layouts, notes beside a release: one stranger protects the folder.
+    (out / "scans").mkdir()
+    (out / "scans" / "P11.txt").write_text("weeks of measuring")
+    with pytest.raises(InputError, match="which holds scans"):
+        write(campaign, out)
+    assert (out / "scans" / "P11.txt").read_text() == "weeks of measuring"
+
+    file = tmp_path / "thesis.pdf"
+    file.write_text("years of work")
+    with pytest.raises(InputError, match="which is a file"):
+        write(campaign, file)
+    assert file.read_text() == "years of work"
+
+
+def test_the_current_folder_is_not_pulled_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="current folder"):
+        write_layout_set(Path("."), count=1, size_px=64)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_place_that_cannot_be_written_is_bad_input(campaign: Path, tmp_path: Path) -> None:
+    below_a_file = tmp_path / "file" / "out"
+    (tmp_path / "file").write_text("no folder")
+    with pytest.raises(InputError, match="cannot write"), atomic_file(below_a_file):
+        pass
+    with pytest.raises(InputError, match="cannot write"), atomic_folder(below_a_file):
+        pass
+    with pytest.raises(InputError, match="cannot write"), atomic_file(tmp_path):
+        pass
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]

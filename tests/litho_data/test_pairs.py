@@ -1,0 +1,96 @@
+"""The authors' pair format: what it can hold comes back, to half a grey value."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+
+from litho_data.build import build
+from litho_data.errors import InputError
+from litho_data.pairs import import_pairs
+from litho_data.pairs_export import export_pairs
+from litho_data.store import open_store
+from litho_data.verify import verify
+
+
+def test_a_store_survives_the_format_to_half_a_grey_value(campaign: Path, tmp_path: Path) -> None:
+    notes = export_pairs(campaign / "prints.zarr", tmp_path / "pairs")
+    result = import_pairs(tmp_path / "pairs", tmp_path / "back.zarr")
+    assert result.n_scans == 3
+    raised = {note.split(":")[0]: float(note.split()[3]) / 1e3 for note in notes}
+    back = open_store(tmp_path / "back.zarr")
+    for scan in open_store(campaign / "prints.zarr").scans():
+        other = back.scan(scan.id)
+        np.testing.assert_array_equal(other.mask_level, scan.mask_level)
+        # Half of one of 255 steps, and half a digit of the note's rounding to 0.1 nm.
+        half_step_um = (np.nanmax(scan.height_um) + raised.get(scan.id, 0)) / 255 / 2
+        difference = other.height_um - scan.height_um - raised.get(scan.id, 0)
+        assert np.abs(difference).max() <= half_step_um + 0.5e-4 + 1e-6
+        assert np.abs(difference.mean()) < 0.1 * half_step_um + 0.5e-4  # rounded, not cut off
+    assert verify(tmp_path / "back.zarr").findings == ()
+
+
+def test_gaps_are_filled_with_a_note(own_campaign: Path, tmp_path: Path) -> None:
+    scan = own_campaign / "scans" / "P12.txt"
+    rows = [line.split() for line in scan.read_text().splitlines()]
+    rows[60][60] = "nan"
+    scan.write_text("\n".join("\t".join(row) for row in rows))
+    build(own_campaign / "card.toml", own_campaign / "prints.zarr")
+    gaps = int(np.isnan(open_store(own_campaign / "prints.zarr").scan("P12").height_um).sum())
+    notes = export_pairs(own_campaign / "prints.zarr", tmp_path / "pairs")
+    assert [note.split(",")[0] for note in notes if "became" in note] == [
+        f"P12: {gaps} pixels without measurement became 0"
+    ]
+
+
+def test_files_are_those_of_the_authors(campaign: Path, tmp_path: Path) -> None:
+    export_pairs(campaign / "prints.zarr", tmp_path / "pairs")
+    names = {f"{scan}{quadrant}.tif" for scan in ("P11", "P12", "P21") for quadrant in "1234"}
+    assert {path.name for path in (tmp_path / "pairs" / "afm").iterdir()} == names
+    assert set(json.loads((tmp_path / "pairs" / "src_max_dict.txt").read_text())) == names
+    layout = open_store(campaign / "prints.zarr").scan("P11").mask_level
+    for quadrant, part in zip(
+        "1234", (np.s_[:56, :56], np.s_[:56, 56:], np.s_[56:, :56], np.s_[56:, 56:]), strict=True
+    ):
+        with tifffile.TiffFile(tmp_path / "pairs" / "mask" / f"P11{quadrant}.tif") as file:
+            assert file.pages[0].compression.name == "LZW"
+            image = file.pages[0].asarray()
+        assert image.dtype == np.uint8
+        np.testing.assert_array_equal(image, np.repeat(layout[part][..., None], 3, axis=2))
+
+
+def test_single_quadrants_stay_fields_of_their_own_and_orphans_are_listed(
+    campaign: Path, tmp_path: Path
+) -> None:
+    pairs = tmp_path / "pairs"
+    export_pairs(campaign / "prints.zarr", pairs)
+    (pairs / "afm" / "P213.tif").unlink()
+    result = import_pairs(pairs, tmp_path / "back.zarr")
+    assert open_store(tmp_path / "back.zarr").ids == ["P11", "P12", "P211", "P212", "P214"]
+    assert [(one.id, one.reason) for one in result.unpaired] == [("mask/P213.tif", "no heights of this name")]
+
+
+def test_what_is_no_pair_folder(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"cannot read .*src_max_dict\.txt"):
+        import_pairs(tmp_path, tmp_path / "out.zarr")
+    (tmp_path / "src_max_dict.txt").write_text("{}")
+    with pytest.raises(InputError, match="pairs in"):
+        import_pairs(tmp_path, tmp_path / "out.zarr")
+
+
+@pytest.mark.measured
+@pytest.mark.slow
+def test_the_authors_pairs_become_whole_fields(measured_prints: Path, tmp_path: Path) -> None:
+    result = import_pairs(measured_prints, tmp_path / "authors.zarr", workers=1)
+    store = open_store(tmp_path / "authors.zarr")
+    assert (result.n_scans, result.skipped) == (24, [])
+    assert set(store.scan(store.ids[0]).print_id) == {"1"}
+    for scan_id in ("FOV11", "FOV72"):
+        # The quadrants of mask/ are bit-exact parts of the whole layouts in mask_ug/.
+        np.testing.assert_array_equal(
+            store.scan(scan_id).mask_level, tifffile.imread(measured_prints / f"mask_ug/{scan_id}.tif")
+        )

@@ -1,0 +1,120 @@
+"""Text matrices: the spellings that occur, and every kind of damage, named with its line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import array_shapes, arrays
+
+from litho_data.errors import InputError
+from litho_data.readers import read_scan
+
+ROWS = "1e-007\t2e-007\t3e-007\r\n4e-007\t5e-007\t6e-007\r\n"
+EXPECTED_UM = np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
+
+
+def read(folder: Path, content: str | bytes, **arguments: object):
+    path = folder / "scan.txt"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return read_scan(path, format="text-matrix", **({"unit": "m"} | arguments))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        ROWS,
+        ROWS.replace("\r\n", "\n"),
+        ROWS.replace("\t", " "),
+        ROWS.replace("\t", ","),
+        ROWS.replace("\t", ", "),
+        ROWS.replace("\t", ";"),
+        ROWS.replace("\r\n", "\t\r\n"),
+        ROWS.replace("\t", ",").replace("\r\n", ",\r\n"),
+        ROWS.rstrip(),
+        "\ufeff" + ROWS,
+        "# Channel: Topography\n# free text\n" + ROWS,
+        "\n" + ROWS + "\n\n",
+        ROWS.replace("e-007", "E-07"),
+        ROWS.replace("1e", "1,0e").replace("4e", "4,0e"),
+        ROWS.replace("\t", ";").replace("1e", "1,0e").replace("4e", "4,0e"),
+    ],
+)
+def test_spellings(tmp_path: Path, content: str) -> None:
+    scan = read(tmp_path, content)
+    # Decimal to binary and the factor 1e6 round once each.
+    np.testing.assert_allclose(scan.height_um, EXPECTED_UM, rtol=4e-16)
+    assert scan.pitch_um is None
+
+
+def test_gwyddion_comments_state_size_and_unit(tmp_path: Path) -> None:
+    comments = "# Channel: Topography\n# Width: 3.00 µm\n# Height: 1000 nm\n# Value units: nm\n"
+    scan = read(tmp_path, comments + ROWS.replace("e-007", ""), unit=None)
+    assert scan.channel == "Topography"
+    assert scan.pitch_um == (0.5, 1.0)
+    np.testing.assert_allclose(scan.height_um, EXPECTED_UM / 100, rtol=4e-16)
+    assert scan.header["Width"] == "3.00 µm"
+
+
+def test_isolated_nan_is_not_measured(tmp_path: Path) -> None:
+    scan = read(tmp_path, ROWS.replace("5e-007", "nan").replace("2e-007", "-inf"))
+    np.testing.assert_array_equal(np.isnan(scan.height_um), [[False, True, False], [False, True, False]])
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (
+            ROWS + "7e-007\t8e-007\r\n",
+            "line 3, got 2 values, wanted 3 values as in line 1; the file may be truncated",
+        ),
+        ("# one\n# two\n" + ROWS + "7e-007\r\n", "line 5, got 1 values"),
+        (ROWS.replace("5e-007", "five"), "line 2, got 'five', wanted a number"),
+        (ROWS.replace("5e-007", ""), "line 2, got 2 values"),
+        (ROWS.replace("\t", ",").replace("5e-007", ""), "line 2, got an empty cell"),
+        (ROWS.rstrip()[:-3], "line 2 ends inside a number, got '6e-'|line 2, got '6e-'"),
+        (ROWS.rstrip()[:-5], "line 2 ends inside a number, got '6'"),
+        (ROWS.rstrip()[:-1], "line 2 ends inside a number, got '6e-00'"),
+        (ROWS.encode() + b"\0\1\2", "line 3, got byte 0x00"),
+        ("# only a comment\n", "holds no numbers"),
+        (" \r\n\r\n", "holds no numbers"),
+        ("nan nan\nnan nan\n", "no finite height"),
+        ("1e-7\n2e-7\n", "size in pixels"),
+        ("1e-7 2e-7\n", "size in pixels"),
+        ("0x10 1\n2 3\n", "line 1, got '0x10'"),
+        ("1_0 1\n2 3\n", "line 1, got '1_0'"),
+    ],
+)
+def test_damage_is_named(tmp_path: Path, content: str | bytes, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read(tmp_path, content)
+
+
+@pytest.mark.measured
+def test_a_measured_scan_cut_at_any_byte(tmp_path: Path, measured_prints: Path) -> None:
+    raw = (measured_prints / "afm_ug" / "FOV11.txt").read_bytes()
+    rng = np.random.default_rng(0)
+    for cut in rng.integers(len(raw) // 2, len(raw) - 16, size=12):
+        # A cut between two lines leaves a smaller but well-formed matrix, which no reader can know.
+        if raw[cut - 1 : cut] not in (b"\n", b"\r"):
+            with pytest.raises(InputError, match="line"):
+                read(tmp_path, raw[:cut])
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    values=arrays(
+        np.float64,
+        array_shapes(min_dims=2, max_dims=2, min_side=2, max_side=7),
+        elements=st.floats(-1e3, 1e3, allow_subnormal=False),
+    ),
+    separator=st.sampled_from(["\t", " ", ", ", ";"]),
+)
+def test_round_trip(tmp_path_factory: pytest.TempPathFactory, values: np.ndarray, separator: str) -> None:
+    lines = [separator.join(repr(float(value)) for value in row) for row in values]
+    scan = read(tmp_path_factory.mktemp("text"), "\n".join(lines) + "\n", unit="um")
+    # repr writes the shortest text that reads back to the same double.
+    np.testing.assert_array_equal(scan.height_um, values)

@@ -1,0 +1,55 @@
+"""A released store is the same store."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from litho_data.errors import InputError
+from litho_data.files import file_sha256
+from litho_data.release import export_ro_crate, export_zip
+from litho_data.store import open_store
+from litho_data.verify import verify
+
+
+def test_one_file_reads_as_the_folder_does(campaign: Path, tmp_path: Path) -> None:
+    packed = export_zip(campaign / "prints.zarr", tmp_path / "prints.zarr.zip")
+    store = open_store(packed)
+    assert store.computed_sha256() == open_store(campaign / "prints.zarr").sha256
+    result = verify(packed, data_dir=campaign)
+    assert (result.findings, result.n_raw_files) == ((), 6)
+    again = export_zip(campaign / "prints.zarr", tmp_path / "again.zarr.zip")
+    assert file_sha256(again) == file_sha256(packed)
+    with pytest.raises(InputError, match="packed already"):
+        export_zip(packed, tmp_path / "twice.zarr.zip")
+
+
+def test_a_flipped_byte_of_the_file_is_found(campaign: Path, tmp_path: Path) -> None:
+    packed = export_zip(campaign / "prints.zarr", tmp_path / "prints.zarr.zip")
+    content = bytearray(packed.read_bytes())
+    content[len(content) // 2] ^= 1
+    packed.write_bytes(content)
+    assert verify(packed, data_dir=campaign).findings
+
+
+def test_the_crate_describes_its_files(campaign: Path, tmp_path: Path) -> None:
+    crate = export_ro_crate(campaign / "prints.zarr", tmp_path / "crate")
+    graph = json.loads((crate / "ro-crate-metadata.json").read_text())["@graph"]
+    entities = {entity["@id"]: entity for entity in graph}
+    assert len(entities) == len(graph)
+    root = entities["./"]
+    assert entities["ro-crate-metadata.json"]["about"] == {"@id": "./"}
+    parts = [part["@id"] for part in root["hasPart"]]
+    assert sorted(path.name for path in crate.iterdir()) == sorted([*parts, "ro-crate-metadata.json"])
+    for name in parts:
+        assert entities[name]["sha256"] == file_sha256(crate / name)
+        assert entities[name]["contentSize"] == str((crate / name).stat().st_size)
+    action = entities["#build"]
+    assert len(action["object"]) == 6
+    for one in action["object"]:
+        raw = entities[one["@id"]]
+        assert raw["identifier"] == f"sha256:{file_sha256(campaign / raw['name'])}"
+    # RO-Crate 1.1 asks every root dataset for these.
+    assert {"name", "description", "datePublished"} <= set(root)

@@ -1,0 +1,265 @@
+"""Roughness against closed forms and surfaces of known spectrum."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from litho_data.errors import InputError
+from litho_data.roughness import (
+    amplitude_parameters,
+    autocorrelation,
+    correlation_length_um,
+    effective_samples,
+    exponential_correlation,
+    gaussian_correlation,
+    groove_depth,
+    print_roughness,
+    psd_along,
+    psd_radial,
+    retained_variance,
+    retained_variance_by_rows,
+    split_noise,
+    sq_uncertainty_nm,
+    stair_steps,
+)
+
+PITCH_UM = 0.1
+
+
+def gaussian_surface(shape: tuple[int, int], length_um: float, seed: int) -> np.ndarray:
+    """Periodic Gaussian surface with autocorrelation exp(−r²/T²), 10 nm rms on average, µm."""
+    frequency = np.hypot(
+        np.fft.fftfreq(shape[0], PITCH_UM)[:, None], np.fft.rfftfreq(shape[1], PITCH_UM)[None]
+    )
+    # The transform of exp(−r²/T²) goes as exp(−π²T²f²); an amplitude filter is its root.
+    transfer = np.exp(-((np.pi * length_um * frequency) ** 2) / 2)
+    field = np.fft.irfft2(
+        np.fft.rfft2(np.random.default_rng(seed).standard_normal(shape)) * transfer, s=shape
+    )
+    full = np.exp(
+        -((np.pi * length_um) ** 2)
+        * (np.fft.fftfreq(shape[0], PITCH_UM)[:, None] ** 2 + np.fft.fftfreq(shape[1], PITCH_UM)[None] ** 2)
+    )
+    return 0.010 * field / np.sqrt(full.mean())
+
+
+class TestAmplitudes:
+    def test_sine_has_its_closed_form_values(self):
+        x = np.arange(400) / 400 * 2 * np.pi * 5
+        found = amplitude_parameters(0.05 * np.sin(x)[None, :].repeat(3, 0))
+        # 80 pixels per period: sums of sin² and sin⁴ are exact, the sampled mean|sin| is 2/80·cot(π/80).
+        assert found.sq_nm == pytest.approx(50 / 2**0.5, rel=1e-12)
+        assert found.sa_nm == pytest.approx(50 * 2 / 80 / np.tan(np.pi / 80), rel=1e-12)
+        assert found.ssk == pytest.approx(0, abs=1e-12)
+        assert found.sku == pytest.approx(1.5, rel=1e-12)
+        assert found.sz_nm == pytest.approx(100, rel=1e-12)
+
+    def test_two_heights_have_the_skewness_of_a_coin(self):
+        height = np.zeros(1000)
+        height[:100] = 0.01
+        found = amplitude_parameters(height)
+        # Bernoulli with p = 0.1: skewness (1 − 2p)/√(p(1 − p)), kurtosis 3 + (1 − 6p(1 − p))/(p(1 − p)).
+        assert found.ssk == pytest.approx(0.8 / 0.3, rel=1e-9)
+        assert found.sku == pytest.approx(3 + (1 - 0.54) / 0.09, rel=1e-9)
+
+    def test_offset_changes_nothing_and_missing_pixels_are_left_out(self):
+        height = np.random.default_rng(0).standard_normal((40, 50)) * 0.01
+        holes = np.where(np.random.default_rng(1).random(height.shape) < 0.2, np.nan, height)
+        assert amplitude_parameters(height + 3).sq_nm == pytest.approx(amplitude_parameters(height).sq_nm)
+        assert amplitude_parameters(holes) == amplitude_parameters(height, np.isfinite(holes))
+
+    def test_flat_surface_has_no_shape(self):
+        found = amplitude_parameters(np.full((8, 8), 0.3))
+        assert (found.sq_nm, found.ssk, found.sku) == (0, 0, 0)
+
+    def test_nothing_valid_is_an_error(self):
+        with pytest.raises(InputError, match="no valid pixel"):
+            amplitude_parameters(np.full((4, 4), np.nan))
+
+
+class TestSpectra:
+    def test_parseval_without_window(self):
+        height = np.random.default_rng(2).standard_normal((30, 101)) * 0.01
+        for axis, lines in (("x", height), ("y", height.T)):
+            spectrum = psd_along(height, PITCH_UM, axis, window=False)
+            step = spectrum.frequency_per_um[1] - spectrum.frequency_per_um[0]
+            assert spectrum.density.sum() * step == pytest.approx(1e6 * lines.var(axis=1).mean(), rel=1e-12)
+
+    def test_sine_sits_in_its_bin(self):
+        x_um = (np.arange(500) + 0.5) * PITCH_UM
+        height = 0.02 * np.sin(2 * np.pi * 1.2 * x_um)[None, :].repeat(4, 0)
+        spectrum = psd_along(height, PITCH_UM, "x", window=False)
+        peak = np.argmax(spectrum.density)
+        assert spectrum.frequency_per_um[peak] == pytest.approx(1.2)
+        # All power, amplitude²/2, in one bin of width 1/50 per µm.
+        assert spectrum.density[peak] / 50 == pytest.approx(20**2 / 2, rel=1e-9)
+
+    def test_white_noise_is_level_also_through_the_window(self):
+        height = np.random.default_rng(3).standard_normal((400, 256)) * 0.002
+        spectrum = psd_along(height, PITCH_UM, "x")
+        # One-sided density of white noise: 2 σ² pitch = 0.8 nm²µm; 400 lines average to 5 % per bin,
+        # 100 bins together to 1 %.
+        assert spectrum.density[10:110].mean() == pytest.approx(2 * 4 * PITCH_UM, rel=0.03)
+
+    @pytest.mark.parametrize(("window", "tolerance"), [(False, 0.08), (True, 0.16)])
+    def test_radial_spectrum_of_a_known_surface(self, window, tolerance):
+        surfaces = [gaussian_surface((256, 256), 1.0, seed) for seed in range(10)]
+        spectra = [psd_radial(surface, PITCH_UM, window=window) for surface in surfaces]
+        frequency = spectra[0].frequency_per_um
+        # Closed form for autocorrelation exp(−r²/T²), T = 1 µm: σ² π T² exp(−(πTf)²).
+        expected = 100 * np.pi * np.exp(-((np.pi * frequency) ** 2))
+        band = (frequency > 0.1) & (frequency < 0.5)
+        ratio = np.mean([spectrum.density for spectrum in spectra], axis=0)[band] / expected[band]
+        # About 1,300/2 independent bins in the band for ten surfaces (4 %), a quarter of that windowed.
+        assert ratio.mean() == pytest.approx(1, abs=tolerance)
+
+    def test_nan_is_an_error(self):
+        with pytest.raises(InputError, match="NaN"):
+            psd_along(np.full((9, 9), np.nan), PITCH_UM, "x")
+
+
+class TestCorrelation:
+    def test_length_of_a_known_surface(self):
+        lengths = [
+            correlation_length_um(gaussian_surface((512, 512), 0.8, seed), PITCH_UM, "x") for seed in range(3)
+        ]
+        # About 51.2²/(π·0.64/2) = 2600 independent spots: a per cent or two of scatter.
+        assert np.mean(lengths) == pytest.approx(0.8, rel=0.04)
+
+    def test_axes_are_told_apart(self):
+        stretched = gaussian_surface((256, 512), 0.8, 1)[:, ::2]
+        along_x = correlation_length_um(stretched, PITCH_UM, "x")
+        along_y = correlation_length_um(stretched, PITCH_UM, "y")
+        assert along_y / along_x == pytest.approx(2, rel=0.15)
+
+    def test_cosine_is_its_own_autocorrelation(self):
+        x = np.arange(400)
+        correlation = autocorrelation(np.cos(2 * np.pi * x / 40)[None, :].repeat(8, 0))
+        centre = correlation.shape[1] // 2
+        # Whole numbers of pairs only every half period; there it is exact: −1 at half a period.
+        assert correlation[0, centre + 20] == pytest.approx(-1, abs=1e-9)
+        assert correlation[0, centre + 40] == pytest.approx(1, abs=1e-9)
+
+    def test_white_noise_counts_every_pixel(self):
+        noise = np.random.default_rng(4).standard_normal((128, 128))
+        # ρ² of the remaining lags is about 1/pairs each; a quarter of the field holds 64·65/… ≈ 0.3 of them.
+        assert effective_samples(noise) > 0.6 * noise.size
+
+    def test_uncertainty_of_sq_matches_its_scatter(self):
+        surfaces = [gaussian_surface((128, 128), 0.8, seed) for seed in range(60)]
+        scatter = np.std([amplitude_parameters(s).sq_nm for s in surfaces])
+        stated = np.mean([sq_uncertainty_nm(s) for s in surfaces])
+        # An sd from 60 draws is known to 1/√120 = 9 %; the estimate of Σρ² adds about as much.
+        assert stated == pytest.approx(scatter, rel=0.35)
+
+
+class TestStepHeight:
+    def test_groove_on_a_tilt_is_exact(self):
+        x_um = (np.arange(300) + 0.5) * PITCH_UM
+        groove = np.where((x_um > 10) & (x_um < 20), -0.25, 0.0) + 0.01 * x_um + 0.3
+        found = groove_depth(groove[None, :].repeat(5, 0), PITCH_UM, left_um=10, right_um=20)
+        assert found.height_nm == pytest.approx(-250, abs=1e-9)
+        assert found.line_sd_nm == pytest.approx(0, abs=1e-9)
+
+    def test_rounded_edges_do_not_count(self):
+        x_um = (np.arange(300) + 0.5) * PITCH_UM
+        smooth = 0.1 * (np.tanh((x_um - 10) / 0.3) - np.tanh((x_um - 20) / 0.3)) / 2
+        found = groove_depth(smooth[None, :].repeat(3, 0), PITCH_UM, left_um=10, right_um=20)
+        # A third of 10 µm is 11 lengths of the tanh: e^−22 of the step is left.
+        assert found.height_nm == pytest.approx(100, abs=1e-6)
+
+    def test_stairs_along_y_with_missing_pixels(self):
+        y_um = (np.arange(250) + 0.5) * PITCH_UM
+        stairs = 0.1 * np.floor(y_um / 5)
+        height = stairs[:, None].repeat(40, 1)
+        height[10:14, 3] = np.nan
+        steps = stair_steps(height, PITCH_UM, edges_um=[5, 10, 15, 20], axis="y")
+        assert [step.height_nm for step in steps] == pytest.approx([100] * 4, abs=1e-9)
+
+    def test_uncertainty_covers_the_error(self):
+        rng = np.random.default_rng(5)
+        x_um = (np.arange(300) + 0.5) * PITCH_UM
+        errors = []
+        for _ in range(200):
+            noisy = np.where((x_um > 10) & (x_um < 20), 0.1, 0) + rng.standard_normal((30, 300)) * 0.005
+            found = groove_depth(noisy, PITCH_UM, left_um=10, right_um=20)
+            errors.append((found.height_nm - 100) / found.uncertainty_nm)
+        # Normal errors would give 1; uncertainties from 30 lines are t-like: 1.0…1.2.
+        assert 0.85 < np.std(errors) < 1.3
+
+    def test_bad_edges_are_an_error(self):
+        with pytest.raises(InputError, match="one width to spare"):
+            groove_depth(np.zeros((4, 100)), PITCH_UM, left_um=1, right_um=6)
+        with pytest.raises(InputError, match="ascending"):
+            stair_steps(np.zeros((4, 100)), PITCH_UM, edges_um=[5, 4])
+
+
+class TestNoise:
+    def test_lines_and_pixels_are_told_apart(self):
+        rng = np.random.default_rng(6)
+        height = 1e-3 * (3 * rng.standard_normal((512, 512)) + 7 * rng.standard_normal((512, 1)))
+        found = split_noise(height)
+        # sd of a MAD over 511 independent steps: 1.17/√(2·511)·… ≈ 5 %; pixels are 500 times more.
+        assert found.pixel_nm == pytest.approx(3, rel=0.02)
+        assert found.line_nm == pytest.approx(7, rel=0.15)
+        assert found.column_nm < 0.5
+        assert found.pixel_slow_nm == pytest.approx(np.hypot(3, 7), rel=0.1)
+
+    def test_fast_axis_along_y_is_the_transpose(self):
+        height = np.random.default_rng(7).standard_normal((64, 80))
+        assert split_noise(height.T, fast_axis="y") == split_noise(height)
+
+    def test_print_roughness_is_the_quadrature_difference(self):
+        flat = gaussian_surface((128, 128), 0.3, 8)
+        substrate = 0.1 * gaussian_surface((128, 128), 0.2, 9)
+        found = print_roughness(flat, substrate)
+        assert found.print_nm**2 + found.substrate_nm**2 == pytest.approx(found.flat_nm**2)
+        with pytest.raises(InputError, match="roughness of the substrate"):
+            print_roughness(substrate, flat)
+
+
+class TestLevellingBias:
+    def test_white_noise_loses_its_degrees_of_freedom(self):
+        def white(y_um, x_um):
+            return ((y_um == 0) & (x_um == 0)).astype(float)
+
+        # 6 terms of a second-order polynomial out of 32 × 40 pixels.
+        assert retained_variance((32, 40), PITCH_UM, white, degree=2) == pytest.approx(
+            1 - 6 / 1280, rel=1e-12
+        )
+        # Independent degrees 1 × 2: 2 · 3 terms.
+        assert retained_variance((32, 40), PITCH_UM, white, degree=(1, 2)) == pytest.approx(
+            1 - 6 / 1280, rel=1e-12
+        )
+        assert retained_variance_by_rows(40, PITCH_UM, white, degree=1) == pytest.approx(
+            1 - 2 / 40, rel=1e-12
+        )
+
+    def test_row_mean_of_an_exponential_profile_has_a_closed_form(self):
+        # Variance of the mean over L of exp(−|x|/T): 2T/L − 2(T/L)²(1 − e^(−L/T)), the continuous limit.
+        ratio = 0.05
+        closed = 1 - 2 * ratio + 2 * ratio**2 * (1 - np.exp(-1 / ratio))
+        found = retained_variance_by_rows(1000, 0.01, exponential_correlation(0.5), degree=0)
+        # Sampling at T/50 differs from the integral by about (pitch/T)²/6.
+        assert found == pytest.approx(closed, rel=2e-4)
+
+    @pytest.mark.parametrize("degree", [0, 1, 2])
+    def test_monte_carlo_agrees(self, degree):
+        shape, length_um = (64, 64), 0.6
+        y, x = (axis.ravel() for axis in np.meshgrid(*(np.linspace(-1, 1, n) for n in shape), indexing="ij"))
+        basis = np.stack([x**p * y**q for p in range(degree + 1) for q in range(degree + 1 - p)], axis=1)
+        q, _ = np.linalg.qr(basis)
+        kept = []
+        for seed in range(200):
+            # Cut from a larger periodic surface, so that opposite edges are independent.
+            surface = gaussian_surface((128, 128), length_um, seed)[:64, :64].ravel() / 0.010
+            kept.append(np.mean((surface - q @ (q.T @ surface)) ** 2))
+        expected = retained_variance(shape, PITCH_UM, gaussian_correlation(length_um), degree=degree)
+        # 6.4²/(π·0.36/2) = 72 spots per surface: relative sd √(2/72/200) = 1.2 %.
+        assert np.mean(kept) == pytest.approx(expected, rel=0.04)
+
+    def test_rows_lose_more_than_the_field(self):
+        correlation = gaussian_correlation(0.8)
+        by_rows = retained_variance_by_rows(128, PITCH_UM, correlation, degree=1)
+        assert by_rows < retained_variance((128, 128), PITCH_UM, correlation, degree=1)

@@ -1,0 +1,255 @@
+"""Laws that every knob of the virtual fab obeys, and a few signatures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from litho_data.errors import InputError
+from litho_data.virtual_fab import (
+    KNOBS,
+    Fab,
+    Job,
+    KnobSetting,
+    Microscope,
+    Noise,
+    Printer,
+    knob_rms_nm,
+    scan_job,
+    strength_for_rms,
+)
+from litho_data.virtual_fab.afm import scan_surface
+from litho_data.virtual_fab.geometry import place_scan
+from litho_data.virtual_fab.jobs import Plan, random_jobs
+from litho_data.virtual_fab.knobs import KnobBoard
+
+# The effects catalogue has 34 entries; this is the list that a truth file may name besides `off-catalogue`.
+CATALOGUE = {
+    "elliptical-psf",
+    "long-range-proximity",
+    "dose-exponent",
+    "write-order-memory",
+    "galvo-lag",
+    "vignetting",
+    "field-curvature",
+    "laser-drift",
+    "hatch-ripple",
+    "layer-stacking",
+    "interface-offset",
+    "diffusion-blur",
+    "threshold-softness",
+    "height-saturation",
+    "vertical-shrinkage",
+    "dose-dependent-shrinkage",
+    "lateral-shrinkage",
+    "feature-collapse",
+    "trench-residue",
+    "slope-thinning",
+    "datum-offset",
+    "min-to-zero-datum",
+    "z-gain",
+    "tilt-bow",
+    "scan-line-stripes",
+    "slow-drift",
+    "tip-dilation",
+    "feedback-lag",
+    "registration-residual",
+    "piezo-nonlinearity",
+    "resampling-blur",
+    "quantisation",
+    "line-roughness",
+    "scars-and-spikes",
+}
+
+
+@pytest.fixture(scope="module")
+def jobs() -> tuple[Job, ...]:
+    return tuple(random_jobs(Plan(count=2, size_px=(96, 96), fields_per_print=1), Printer(), 1))
+
+
+def scan(job: Job, *knobs: KnobSetting, noise: Noise | None = None):
+    return scan_job(Fab(Printer(), Microscope.aligned(), noise or Noise.off(), KnobBoard(knobs, 4), 4), job)
+
+
+def test_every_effect_of_the_catalogue_has_a_knob_and_no_other_name_is_used():
+    assert {knob.effect for knob in KNOBS.values()} == CATALOGUE | {"off-catalogue"}
+
+
+@pytest.mark.parametrize("name", KNOBS)
+def test_strength_zero_changes_no_bit(name, jobs):
+    plain, off = scan(jobs[0], noise=Noise()), scan(jobs[0], KnobSetting(name, 0.0, 3), noise=Noise())
+    assert np.array_equal(plain.height_um, off.height_um)
+    assert np.array_equal(plain.clean_um, off.clean_um)
+
+
+@pytest.mark.parametrize("name", KNOBS)
+def test_more_strength_changes_more(name, jobs):
+    knob = KNOBS[name]
+    noise = Noise(0, 0, 0, 0, 0)
+    plain = [scan(job, noise=noise).height_um for job in jobs]
+    changes = []
+    for share in (0.2, 0.5, 1.0):
+        setting = KnobSetting(name, share * knob.limit, 5)
+        scans = [scan(job, setting, noise=noise).height_um for job in jobs]
+        changes.append(np.sqrt(np.mean([(z - p) ** 2 for z, p in zip(scans, plain, strict=True)])))
+    assert 0 < changes[0] < changes[1] < changes[2]
+    assert np.isfinite(changes[2])
+
+
+@pytest.mark.parametrize("name", [name for name, knob in KNOBS.items() if knob.stage == "measurement"])
+def test_measurement_never_touches_the_print(name, jobs):
+    turned = scan(jobs[0], KnobSetting(name, KNOBS[name].limit, 5))
+    assert np.array_equal(turned.clean_um, scan(jobs[0]).clean_um)
+
+
+def test_knobs_leave_each_others_draws_alone(jobs):
+    tilt, stripes = KnobSetting("tilt-bow", 20.0), KnobSetting("scan-line-stripes", 5.0)
+    alone = [scan(jobs[0], one).height_um - scan(jobs[0]).height_um for one in (tilt, stripes)]
+    for both in ((tilt, stripes), (stripes, tilt)):
+        together = scan(jobs[0], *both).height_um - scan(jobs[0]).height_um
+        # Sums of a few µm in double precision.
+        np.testing.assert_allclose(together, alone[0] + alone[1], atol=1e-14)
+
+
+def test_noise_is_the_same_with_and_without_a_process_knob(jobs):
+    plain = scan(jobs[0], noise=Noise())
+    bent = scan(jobs[0], KnobSetting("vignetting", 0.3), noise=Noise())
+    np.testing.assert_allclose(
+        bent.height_um - bent.noiseless_um, plain.height_um - plain.noiseless_um, atol=1e-14
+    )
+
+
+def test_own_seed_redraws_that_knob_only(jobs):
+    first, again, other = (
+        scan(jobs[0], KnobSetting("ghost-spot", 0.3, seed)).height_um for seed in (1, 1, 2)
+    )
+    assert np.array_equal(first, again)
+    assert not np.allclose(first, other)
+
+
+class TestSettings:
+    def test_text_form(self):
+        assert KnobSetting.parse("vignetting=0.1") == KnobSetting("vignetting", 0.1)
+        assert KnobSetting.parse("vignetting=0.1@7") == KnobSetting("vignetting", 0.1, 7)
+
+    @pytest.mark.parametrize(
+        "text",
+        [
+            "vignetting",
+            "vignetting=",
+            "vignetting=x",
+            "vignetting=0.1@x",
+            "vignetting=-1",
+            "vignetting=nan",
+            "nosuch=1",
+        ],
+    )
+    def test_bad_text_is_an_error(self, text):
+        with pytest.raises(InputError):
+            KnobSetting.parse(text)
+
+    def test_a_knob_counts_once(self):
+        with pytest.raises(InputError, match="at most once"):
+            KnobBoard([KnobSetting("vignetting", 0.1), KnobSetting("vignetting", 0.2)], 0)
+
+
+class TestStrengthForRms:
+    @pytest.mark.parametrize("name", ["vignetting", "slope-thinning", "elliptical-psf", "scan-line-stripes"])
+    def test_it_hits_the_target(self, name, jobs):
+        found = strength_for_rms(name, 5.0, jobs=jobs)
+        assert knob_rms_nm(found.setting, jobs) == pytest.approx(5.0, rel=0.0101)
+        assert found.rms_nm == pytest.approx(5.0, rel=0.0101)
+
+    def test_it_stops_at_the_limit_and_says_so(self, jobs):
+        found = strength_for_rms("long-range-proximity", 500.0, jobs=jobs)
+        assert found.setting.strength == KNOBS["long-range-proximity"].limit
+        assert found.rms_nm < 500
+
+    def test_knobs_within_the_nuisance_span_are_refused_under_full(self, jobs):
+        for name in ("tilt-bow", "z-gain", "vertical-shrinkage", "datum-offset"):
+            with pytest.raises(InputError, match="no trace"):
+                strength_for_rms(name, 5.0, jobs=jobs)
+        assert strength_for_rms("tilt-bow", 5.0, jobs=jobs, policy="offset").rms_nm == pytest.approx(
+            5, rel=0.0101
+        )
+
+    def test_bad_wishes_are_errors(self, jobs):
+        for name, rms_nm, policy in (
+            ("nosuch", 5.0, "full"),
+            ("vignetting", 0.0, "full"),
+            ("vignetting", 5.0, "rows"),
+        ):
+            with pytest.raises(InputError):
+                strength_for_rms(name, rms_nm, jobs=jobs, policy=policy)
+
+
+class TestSignatures:
+    def test_tip_widens_tops_and_only_adds(self, jobs):
+        plain, dilated = scan(jobs[0]).height_um, scan(jobs[0], KnobSetting("tip-dilation", 0.5)).height_um
+        assert (dilated - plain).min() > -1e-9
+        # Tops are touched by the apex: where the surface has its maximum nothing changes.
+        top = np.unravel_index(plain[10:-10, 10:-10].argmax(), plain[10:-10, 10:-10].shape)
+        # The top lies between pixels: up to slope²·R/2 of one curvature length, under 0.1 nm here.
+        assert (dilated - plain)[10:-10, 10:-10][top] < 1e-4
+
+    def test_tip_on_a_slope_and_on_a_dome_have_closed_forms(self):
+        frame = place_scan((96, 96), 0.1, Microscope.aligned(), np.random.default_rng(0))
+        y_um, x_um = (np.indices(frame.shape) - 50) * 0.1
+        radius_um = 0.4
+        board = KnobBoard([KnobSetting("tip-dilation", radius_um)], 0)
+        # A paraboloid on a slope s rides R s²/2 above it; on a dome of radius A it draws one of radius A + R.
+        cases = (
+            (0.1 * x_um - 0.2 * y_um, 0.1 * x_um - 0.2 * y_um + radius_um * (0.1**2 + 0.2**2) / 2),
+            (-(x_um**2 + y_um**2) / 8, -(x_um**2 + y_um**2) / (2 * (4 + radius_um))),
+        )
+        for surface, expected in cases:
+            found = scan_surface(surface, frame, Noise.off(), board, 0, np.random.default_rng(0))
+            # Contact is searched on a grid of 0.01 µm per axis: (0.005 µm)²/2R short at most, twice.
+            np.testing.assert_allclose(found[20:-20, 20:-20], expected[20:-20, 20:-20], atol=7e-5)
+
+    def test_feedback_lag_trails_along_the_fast_axis_only(self):
+        level = np.zeros((96, 96), np.uint8)
+        level[:, 32:64] = 10
+        step = KnobSetting("feedback-lag", 0.4)
+        changed = scan(Job("a", level), step).height_um - scan(Job("a", level)).height_um
+        assert changed[:, 68:75].min() > 0.02
+        assert changed[:, 33:37].max() < -0.01
+        across = scan(Job("a", level.T.copy()), step).height_um - scan(Job("a", level.T.copy())).height_um
+        # Rows are level there, so a feedback along the rows has nothing to lag behind.
+        assert np.abs(across).max() < 1e-9
+
+    def test_memory_shades_what_is_written_later(self):
+        level = np.full((96, 96), 2, np.uint8)
+        level[40:50] = 12
+        changed = scan(Job("a", level), KnobSetting("write-order-memory", 0.3, 1)).clean_um
+        plain = scan(Job("a", level)).clean_um
+        loss = (plain - changed).mean(axis=1)
+        assert loss[60] > 1.5 * loss[30]
+
+    def test_stripes_are_constant_along_the_fast_axis(self, jobs):
+        change = scan(jobs[0], KnobSetting("scan-line-stripes", 9.0)).height_um - scan(jobs[0]).height_um
+        assert np.ptp(change, axis=1).max() < 1e-12
+        # 100 draws know their sd to 7 %.
+        assert 1e3 * change[:, 0].std() == pytest.approx(9.0, rel=0.25)
+
+    def test_quantisation_truncates_to_its_step(self, jobs):
+        height_nm = 1e3 * scan(jobs[0], KnobSetting("quantisation", 4.0)).height_um
+        np.testing.assert_allclose(height_nm / 4, np.round(height_nm / 4), atol=1e-9)
+        lost_nm = 1e3 * scan(jobs[0]).height_um - height_nm
+        # Truncation loses half a step on average, between 0 and one step.
+        assert lost_nm.min() > -1e-9
+        assert lost_nm.mean() == pytest.approx(2.0, rel=0.05)
+
+    def test_vignetting_darkens_the_corners_of_the_write_field(self):
+        level = np.full((96, 96), 6, np.uint8)
+        centred = scan(Job("a", level), KnobSetting("vignetting", 0.4)).clean_um
+        assert centred[48, 48] > centred[0, 48] > centred[0, 0]
+        aside = Job("a", level, field_um=(0.0, 30.0), write_field_um=100.0)
+        shaded = scan(aside, KnobSetting("vignetting", 0.4)).clean_um
+        assert shaded[48, 0] > shaded[48, -1]
+
+    def test_neighbours_are_seen_at_the_edge_only(self, jobs):
+        change = np.abs(
+            scan(jobs[0], KnobSetting("unseen-neighbours", 1.0)).clean_um - scan(jobs[0]).clean_um
+        )
+        assert change[:3].mean() > 10 * change[40:56, 40:56].mean()
