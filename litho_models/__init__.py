@@ -1,0 +1,19 @@
+"""Models of the printer, trained on a dataset, corrected by its residual, and frozen for design."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from litho_models.freeze import FrozenSimulator, load_frozen, save_frozen
+
+__all__ = ["FrozenSimulator", "load_frozen", "save_frozen"]
+
+
+def __getattr__(name: str) -> Any:
+    """Load torch only when a model is asked for."""
+    if name in __all__:
+        from litho_models import freeze
+
+        return getattr(freeze, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

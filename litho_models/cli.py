@@ -1,0 +1,155 @@
+"""``litho-models``: every command parses arguments and calls one public function."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+from litho_data.commands import new_app, run_app
+from litho_models.cli_loop import close_loop
+
+app = new_app("Train, judge and correct models of the printer. Lengths in µm, height errors in nm.")
+app.command("close-loop")(close_loop)
+
+StorePath = Annotated[Path, typer.Argument(help="dataset store made by `litho-data build`")]
+Out = Annotated[Path, typer.Option(help="folder of the result")]
+PolicyOption = Annotated[
+    Literal["none", "offset", "offset-gain", "full", "full+rows"],
+    typer.Option(help="nuisances that a scan may be freed of in mae_datum_free"),
+]
+RecipeOption = Annotated[
+    Literal["fast", "paper"],
+    typer.Option(help="fast: one-cycle with nuisances fitted jointly; paper: 4,000 epochs of Adam"),
+]
+VariantOption = Annotated[
+    Literal["default", "paper", "authors"],
+    typer.Option(help="ours, as printed in the paper, or as in the authors' code"),
+]
+Steps = Annotated[int | None, typer.Option(min=1, help="optimiser steps; the recipe's by default")]
+Seed = Annotated[int, typer.Option(min=0, help="seed of weights, crops and splits")]
+
+
+@app.command()
+def train(
+    store: StorePath,
+    model: Annotated[
+        str, typer.Option(help="identity, affine, affine-mtf, blur-table, linear, physics or pbl")
+    ],
+    out: Out,
+    recipe: RecipeOption = "fast",
+    variant: VariantOption = "default",
+    steps: Steps = None,
+    seed: Seed = 0,
+    use_lock_box: Annotated[
+        bool,
+        typer.Option("--use-lock-box", help="train on the locked scans too; nothing is left to judge by"),
+    ] = False,
+) -> None:
+    """Train a model on all scans but the locked ones; the same command continues a killed run."""
+    from litho_models.runs import train as train_model
+
+    settings = {"seed": seed, **_given(steps=steps)}
+    run = train_model(
+        store, model, out, recipe=recipe, variant=variant, settings=settings, use_lock_box=use_lock_box
+    )
+    typer.echo(f"{model} trained on {len(run.training_ids)} scans in {run.seconds:.0f} s: {out}")
+
+
+@app.command()
+def evaluate(
+    model: Annotated[Path, typer.Argument(help="folder of a frozen model")],
+    store: StorePath,
+    out: Out,
+    policy: PolicyOption = "offset",
+    extrapolate: Annotated[
+        bool, typer.Option("--extrapolate", help="accept layouts beyond the calibrated range")
+    ] = False,
+) -> None:
+    """Score one frozen model on all scans of a store."""
+    from litho_models.evaluate import evaluate as evaluate_model
+
+    result = evaluate_model(model, store, out, policy=policy, extrapolate=extrapolate)
+    scores = result.scores
+    typer.echo(
+        f"{scores.model}: mae_datum_free {scores.mae_datum_free_nm:.2f} nm, "
+        f"mae_abs {scores.mae_abs_nm:.2f} nm; "
+        f"report {out / 'report.html'}"
+    )
+
+
+@app.command()
+def benchmark(
+    store: StorePath,
+    out: Out,
+    split: Annotated[
+        Literal["grouped", "paper", "leave-one-print-out"], typer.Option(help="what is held out")
+    ] = "grouped",
+    models: Annotated[str, typer.Option(help="names, separated by commas")] = ",".join(
+        ("identity", "affine", "affine-mtf", "blur-table", "linear", "physics", "pbl")
+    ),
+    recipe: RecipeOption = "fast",
+    variant: VariantOption = "default",
+    steps: Steps = None,
+    folds: Annotated[int, typer.Option(min=2, help="folds of the grouped split")] = 5,
+    policy: PolicyOption = "offset",
+    open_lock_box: Annotated[
+        bool, typer.Option("--open-lock-box", help="also score the locked scans; once per release")
+    ] = False,
+    seed: Seed = 0,
+) -> None:
+    """Train every model per fold and score it on scans it never saw; resumable."""
+    from litho_models.benchmark import benchmark as run_benchmark
+    from litho_models.score_tables import headline_table
+
+    settings = {"recipe": recipe, "variant": variant, **_given(steps=steps)}
+    result = run_benchmark(
+        store,
+        out,
+        split=split,
+        models=[name.strip() for name in models.split(",") if name.strip()],
+        settings=settings,
+        folds=folds,
+        policy=policy,
+        open_lock_box=open_lock_box,
+        seed=seed,
+    )
+    typer.echo(headline_table(result.scores).round(2).to_string(index=False))
+    typer.echo(f"report {out / 'report.html'}")
+
+
+@app.command()
+def compare(
+    first: Annotated[Path, typer.Argument(help="benchmark.json or evaluation.json")],
+    second: Annotated[Path, typer.Argument(help="another one, of the same protocol")],
+) -> None:
+    """Difference of two results, paired by scan; refuses different data, splits or nuisances."""
+    from litho_models.compare import compare as compare_results
+
+    typer.echo(compare_results(first, second).round(3).to_string(index=False))
+
+
+@app.command()
+def freeze(
+    run: Annotated[Path, typer.Argument(help="folder of `train` or `close-loop`, or a frozen model")],
+    out: Out,
+    declare_process: Annotated[
+        list[str] | None,
+        typer.Option(help="an undetermined effect that you declare part of the printer; repeatable"),
+    ] = None,
+) -> None:
+    """Write the process model only: weights, card and a page for people."""
+    from litho_models.runs import freeze as freeze_run
+
+    card = freeze_run(run, out, declare_process or [])
+    typer.echo(f"{card.name}: {card.parameters} parameters, frozen in {out}")
+
+
+def main() -> None:
+    """Entry point of ``litho-models``."""
+    run_app(app, "litho-models")
+
+
+def _given(**options: Any) -> dict[str, Any]:
+    return {name: value for name, value in options.items() if value is not None}

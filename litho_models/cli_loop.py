@@ -1,0 +1,65 @@
+"""`litho-models close-loop`: from residual to cause to a better model."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def close_loop(
+    store: Annotated[Path, typer.Argument(help="dataset store made by litho-data build")],
+    out: Annotated[
+        Path, typer.Option("--out", help="folder for result, report, tables and the corrected model")
+    ],
+    base: Annotated[
+        str, typer.Option("--base", help="model to correct: its name, or the folder of a frozen model")
+    ] = "physics",
+    prior: Annotated[
+        str | None,
+        typer.Option(
+            "--prior",
+            help="effects known from earlier looks at these data: a file with one name per line, or a,b,c",
+        ),
+    ] = None,
+    inject: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--inject",
+            help="plant NAME=AMOUNT (its own unit) in copies of the data, report the power to find it",
+        ),
+    ] = None,
+    open_lock_box: Annotated[
+        bool, typer.Option("--open-lock-box", help="also score the locked scans; do this once")
+    ] = False,
+    folds: Annotated[int, typer.Option("--folds", min=2, help="outer folds, by scan")] = 6,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="folds, locked scans, bootstrap")] = 0,
+) -> None:
+    """Find what a model lacks on measured prints, add it, and report the error on held-out scans (nm)."""
+    from litho_models.loop import LoopConfig, close_loop_on_store, parse_priors
+
+    config = LoopConfig(
+        folds=folds,
+        seed=seed,
+        open_lock_box=open_lock_box,
+        prior_hypotheses=parse_priors(prior),
+        inject=tuple(inject or ()),
+    )
+    result = close_loop_on_store(
+        store,
+        out,
+        base=base,
+        config=config,
+        report=lambda message: print(message, file=sys.stderr, flush=True),
+    )
+    print(f"verdict: {result.verdict}")
+    print(
+        f"datum-free error, held out: {result.before.mae_datum_free_nm:.2f} -> "
+        f"{result.after.mae_datum_free_nm:.2f} nm"
+    )
+    for effect in result.effects:
+        alike = f" (or {', '.join(effect.confusable_with)})" if effect.confusable_with else ""
+        print(f"  {effect.name}{alike}: {effect.verdict}, {effect.before_nm:.2f} -> {effect.after_nm:.2f} nm")
+    print(f"report: {out / 'report.html'}")

@@ -1,0 +1,21 @@
+"""The catalogue of effects: named, differentiable, off at their null value."""
+
+from litho_models.effects.effect import Effect, FieldContext, Parameter
+from litho_models.effects.registry import (
+    CATALOGUE,
+    UNTESTABLE,
+    get_effect,
+    in_forward_order,
+    screened_effects,
+)
+
+__all__ = [
+    "CATALOGUE",
+    "UNTESTABLE",
+    "Effect",
+    "FieldContext",
+    "Parameter",
+    "get_effect",
+    "in_forward_order",
+    "screened_effects",
+]

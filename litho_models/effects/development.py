@@ -1,0 +1,153 @@
+"""Development: shrinkage, residue and loss after the resist is set."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from litho_models.effects.effect import Effect, FieldContext, Parameter, Values
+from litho_models.effects.filters import add_blur, add_warp, gradient
+
+_SLOPE_SOURCE = "empirical: loss proportional to the squared slope, one coefficient per axis"
+
+
+def vertical_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """(1 - k) H: the whole print loses height."""
+    return (1 - values["fraction"]) * height
+
+
+def dose_dependent_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """H (1 - k (1 - u)), u the relative nominal height nearby: thin surroundings shrink more."""
+    length = values["length_um"]
+    relative = context.layout_um / context.full_height_um
+    dose = add_blur(relative, length**2, context.pitch_um, 3 * float(length.detach()), "replicate")
+    return height * (1 - values["fraction"] * (1 - dose))
+
+
+def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """H(x + s (H / full) (x - xc)): tops pull in towards the centre of the field, bases stay put."""
+    y, x = context.centred_um()
+    pull = values["fraction"] * height[0, 0] / context.full_height_um
+    return add_warp(height, pull * y, pull * x, context.pitch_um)
+
+
+def feature_collapse(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """H - c softplus((H / w - a) / t) t: narrow tall features lose height; w is the local width."""
+    sharpness = 0.25
+    width_um = 1.0
+    standing = torch.sigmoid((context.layout_um / context.full_height_um - 0.5) / 0.05)
+    variance = torch.as_tensor(width_um**2, dtype=height.dtype, device=height.device)
+    share = add_blur(standing, variance, context.pitch_um, 3 * width_um, "replicate")
+    aspect = height / (width_um * torch.clamp(share, min=0.05))
+    excess = functional.softplus((aspect - values["aspect_ratio"]) / sharpness) * sharpness
+    return height - values["loss_um"] * excess
+
+
+def trench_residue(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """H + ρ (close_w(H) - H): resist stays in pits narrower than w; tops are unchanged."""
+    half = max(1, math.floor(float(values["width_um"].detach()) / context.pitch_um / 2 + 0.5))
+    size = 2 * half + 1
+    dilated = functional.max_pool2d(functional.pad(height, (half,) * 4, mode="replicate"), size, stride=1)
+    closed = -functional.max_pool2d(functional.pad(-dilated, (half,) * 4, mode="replicate"), size, stride=1)
+    return height + values["fraction"] * (closed - height)
+
+
+def slope_thinning(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """H - cx (dH/dx)² - cy (dH/dy)²: height missing on slopes, by axis."""
+    along_y, along_x = gradient(height, context.pitch_um)
+    return height - values["along_x_um"] * along_x**2 - values["along_y_um"] * along_y**2
+
+
+EFFECTS = (
+    Effect(
+        name="vertical-shrinkage",
+        title="the whole print losing height on development",
+        stage="development",
+        role="process",
+        acts_on="height",
+        parameters={"fraction": Parameter("1", -0.2, 0.5, 0.05)},
+        apply=vertical_shrinkage,
+        trials=({"fraction": 0.05},),
+        source="Meisel 2006, cited in the paper",
+        separating="a step standard for the microscope, then a printed staircase",
+    ),
+    Effect(
+        name="dose-dependent-shrinkage",
+        title="thin surroundings shrinking more than thick ones",
+        stage="development",
+        role="process",
+        acts_on="height",
+        parameters={
+            "fraction": Parameter("1", 0.0, 0.5, 0.1),
+            "length_um": Parameter("µm", 0.3, 6.0, 1.0, kind="shape"),
+        },
+        apply=dose_dependent_shrinkage,
+        trials=tuple({"fraction": 0.1, "length_um": length} for length in (0.5, 1.5, 4.0)),
+        source="Lang 2022, arXiv:2205.14891: shrinkage falls with dose",
+        separating="print the same height inside low and high surroundings; a power sweep",
+    ),
+    Effect(
+        name="lateral-shrinkage",
+        title="tops shrinking towards the centre of the field",
+        stage="development",
+        role="process",
+        acts_on="height",
+        parameters={"fraction": Parameter("1", 0.0, 0.1, 0.005)},
+        apply=lateral_shrinkage,
+        trials=({"fraction": 0.005},),
+        source="print bound to the substrate at its base, free at its top",
+        separating="print the layout in fields of two sizes",
+    ),
+    Effect(
+        name="feature-collapse",
+        title="narrow tall features losing height",
+        stage="development",
+        role="process",
+        acts_on="height",
+        parameters={
+            "loss_um": Parameter("µm", 0.0, 1.0, 0.05),
+            "aspect_ratio": Parameter("1", 0.4, 4.0, 0.8, kind="shape"),
+        },
+        apply=feature_collapse,
+        trials=tuple({"loss_um": 0.05, "aspect_ratio": ratio} for ratio in (0.8, 1.5, 2.5)),
+        source="capillary force while drying, above a critical aspect ratio",
+        separating="pillars of one height and five widths, dried in air and supercritically",
+    ),
+    Effect(
+        name="trench-residue",
+        title="resist left in narrow trenches",
+        stage="development",
+        role="process",
+        acts_on="height",
+        parameters={
+            "fraction": Parameter("1", 0.0, 0.9, 0.1),
+            "width_um": Parameter("µm", 0.2, 3.0, 0.6, kind="choice"),
+        },
+        apply=trench_residue,
+        trials=tuple({"fraction": 0.1, "width_um": width} for width in (0.4, 0.8, 1.4)),
+        source="closing of the surface by a square of width w",
+        separating="trenches of five widths, developed for two times",
+    ),
+    Effect(
+        name="slope-thinning",
+        title="height missing on slopes",
+        stage="development",
+        role="undetermined",
+        acts_on="height",
+        parameters={
+            "along_x_um": Parameter("µm", 0.0, 1.0, 0.1),
+            "along_y_um": Parameter("µm", 0.0, 1.0, 0.1),
+        },
+        apply=slope_thinning,
+        trials=(
+            {"along_x_um": 0.1},
+            {"along_y_um": 0.1},
+            {"along_x_um": 0.1, "along_y_um": 0.1},
+        ),
+        source=_SLOPE_SOURCE,
+        separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees, with two tips",
+    ),
+)

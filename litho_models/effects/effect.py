@@ -1,0 +1,185 @@
+"""What an effect is: a small differentiable change of the layout or of the height, off at its null."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from litho_data.errors import InputError
+
+Stage = Literal["exposure", "resist", "development", "measurement"]
+Role = Literal["process", "measurement", "nuisance", "undetermined"]
+ActsOn = Literal["layout", "height"]
+Kind = Literal["amplitude", "shape", "choice"]
+
+Values = Mapping[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of an effect.
+
+    Args:
+        unit: ``1`` for dimensionless.
+        lower, upper: physical range; an estimate outside it contradicts the effect.
+        typical: a value of ordinary size, where screening looks and fitting starts.
+        kind: ``amplitude`` switches the effect off at ``null``; ``shape`` (a length, a position) is
+            without meaning while the amplitudes are null; ``choice`` is a shape that takes few
+            values (a direction) and is never fitted.
+        null: the amplitude's value at which the effect is the identity.
+    """
+
+    unit: str
+    lower: float
+    upper: float
+    typical: float
+    kind: Kind = "amplitude"
+    null: float = 0.0
+
+    @property
+    def off(self) -> float:
+        """The value this parameter has while its effect is off."""
+        return self.null if self.kind == "amplitude" else self.typical
+
+
+@dataclass(frozen=True)
+class FieldContext:
+    """What an effect may know about a field besides the array it acts on.
+
+    Args:
+        layout_um: nominal height (1, 1, y, x), µm.
+        pitch_um: lateral sampling, µm.
+        full_height_um: nominal height of the highest level, µm; scales the pointwise effects.
+        field_centre_um: (y, x) of this field's centre in the write field, µm.
+        field_radius_um: distance from the centre of the write field to its edge, µm.
+        slow_axis: the axis along which the written lines follow each other.
+        order: position in the writing order, scaled to -0.5 ... 0.5 over the dataset.
+        scan_shape: (rows, columns) of the whole scan where this field is a part of it.
+        origin_px: (row, column) of this field's first pixel in the whole scan.
+        scan_line: index of the scan line under each pixel (y, x), None for the rows of the array.
+        seed: decides the draws of random effects where one is planted.
+    """
+
+    layout_um: Tensor
+    pitch_um: float
+    full_height_um: float
+    field_centre_um: tuple[float, float] = (0.0, 0.0)
+    field_radius_um: float | None = None
+    slow_axis: Literal["y", "x"] = "y"
+    order: float = 0.0
+    scan_shape: tuple[int, int] | None = None
+    origin_px: tuple[int, int] = (0, 0)
+    scan_line: Tensor | None = None
+    seed: int = 0
+
+    def centred_um(self) -> tuple[Tensor, Tensor]:
+        """(y, x) of each pixel from the centre of the write field: shapes (y, 1) and (1, x), µm."""
+        y, x = (
+            (torch.arange(n, dtype=self.layout_um.dtype, device=self.layout_um.device) - (n - 1) / 2)
+            * self.pitch_um
+            + centre
+            for n, centre in zip(self.layout_um.shape[-2:], self.field_centre_um, strict=True)
+        )
+        return y[:, None], x[None, :]
+
+    def whole_shape(self) -> tuple[int, int]:
+        """(rows, columns) of the whole scan."""
+        return self.scan_shape or (self.layout_um.shape[-2], self.layout_um.shape[-1])
+
+    def scan_position(self) -> tuple[Tensor, Tensor]:
+        """(y, x) of each pixel from -1 to 1 over the whole scan: shapes (y, 1) and (1, x)."""
+        y, x = (
+            2
+            * (torch.arange(n, dtype=self.layout_um.dtype, device=self.layout_um.device) + start)
+            / max(whole - 1, 1)
+            - 1
+            for n, start, whole in zip(
+                self.layout_um.shape[-2:], self.origin_px, self.whole_shape(), strict=True
+            )
+        )
+        return y[:, None], x[None, :]
+
+    def radius_um(self) -> float:
+        """Half the write field; without a write field in the card, half the longer side of this one."""
+        if self.field_radius_um is not None:
+            return self.field_radius_um
+        return max(self.layout_um.shape[-2:]) * self.pitch_um / 2
+
+    def line(self) -> Tensor:
+        """Scan line of each pixel from 0, shape (y, x)."""
+        if self.scan_line is not None:
+            return self.scan_line
+        ny, nx = self.layout_um.shape[-2:]
+        return torch.arange(ny, device=self.layout_um.device)[:, None].expand(ny, nx)
+
+
+Apply = Callable[[Tensor, Values, FieldContext], Tensor]
+
+
+@dataclass(frozen=True)
+class Effect:
+    """One entry of the catalogue.
+
+    Args:
+        name: the identifier used in code, JSON and on the command line.
+        title: what it is, in words for a process engineer.
+        stage, role: where it happens; whether it may enter the exported process model.
+        acts_on: ``layout`` (before the base model, µm) or ``height`` (after it, µm).
+        parameters: name to ``Parameter``; at least one amplitude.
+        apply: pure function (field, values, context) -> field, shapes (b, 1, y, x), µm.
+        trials: parameter sets (those not named are off) at which screening takes the secant
+            direction; one per separate direction or length scale.
+        source: where the formula comes from.
+        separating: the experiment that tells it apart from what looks alike.
+        needs: facts about the print without which it cannot be tested.
+        per_scan: its parameters belong to one scan and have no value shared by all.
+    """
+
+    name: str
+    title: str
+    stage: Stage
+    role: Role
+    acts_on: ActsOn
+    parameters: Mapping[str, Parameter]
+    apply: Apply
+    source: str
+    separating: str = ""
+    trials: tuple[Mapping[str, float], ...] = ()
+    needs: tuple[Literal["order", "levels"], ...] = ()
+    per_scan: bool = False
+    amplitudes: tuple[str, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        amplitudes = tuple(name for name, p in self.parameters.items() if p.kind == "amplitude")
+        if not amplitudes:
+            raise InputError(f"effect {self.name}", got="no amplitude", wanted="at least one")
+        object.__setattr__(self, "amplitudes", amplitudes)
+
+    def off_values(self) -> dict[str, float]:
+        """Parameters at which the effect is the identity."""
+        return {name: parameter.off for name, parameter in self.parameters.items()}
+
+    def with_values(self, values: Mapping[str, float]) -> dict[str, float]:
+        """The off values with some replaced.
+
+        Raises:
+            InputError: a name this effect does not have.
+        """
+        unknown = set(values) - set(self.parameters)
+        if unknown:
+            raise InputError(
+                f"parameter of {self.name}", got=", ".join(sorted(unknown)), wanted=", ".join(self.parameters)
+            )
+        return {**self.off_values(), **values}
+
+    def __call__(self, array: Tensor, values: Mapping[str, float | Tensor], context: FieldContext) -> Tensor:
+        """Apply the effect; numbers become tensors on the array's device."""
+        tensors = {
+            name: torch.as_tensor(value, dtype=array.dtype, device=array.device)
+            for name, value in values.items()
+        }
+        return self.apply(array, tensors, context)

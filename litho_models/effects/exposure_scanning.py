@@ -1,0 +1,77 @@
+"""Exposure and resist: what the order and the motion of writing leave behind."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from litho_models.effects.effect import Effect, FieldContext, Parameter, Values
+from litho_models.effects.filters import add_filtered, trailing_response
+
+_TAIL_LENGTHS = 6
+
+
+def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """The beam follows the command late: one-sided exponential of length l = v τ along the written lines."""
+    length = values["length_um"]
+    forward = float(values["direction"]) > 0
+
+    def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
+        along = fx if context.slow_axis == "y" else fy
+        return trailing_response(along if forward else -along, length, context.pitch_um) - 1
+
+    reach = _TAIL_LENGTHS * float(length.detach()) + context.pitch_um
+    return add_filtered(layout, transfer_minus_one, context.pitch_um, reach, "zero")
+
+
+def write_order_memory(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """D = M - e K_l * M, K_l one-sided along the slow axis: the lines before starve the resist."""
+    strength, length = values["strength"], values["length_um"]
+    onwards = float(values["direction"]) > 0
+
+    def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
+        along = fy if context.slow_axis == "y" else fx
+        return -strength * trailing_response(along if onwards else -along, length, context.pitch_um)
+
+    reach = _TAIL_LENGTHS * float(length.detach())
+    return add_filtered(layout, transfer_minus_one, context.pitch_um, reach, "zero")
+
+
+EFFECTS = (
+    Effect(
+        name="galvo-lag",
+        title="beam lagging behind the scan command along the written lines",
+        stage="exposure",
+        role="process",
+        acts_on="layout",
+        parameters={
+            "length_um": Parameter("µm", 0.0, 0.8, 0.2),
+            "direction": Parameter("1", -1.0, 1.0, 1.0, kind="choice"),
+        },
+        apply=galvo_lag,
+        trials=tuple(
+            {"length_um": length, "direction": sign} for length in (0.15, 0.4) for sign in (1.0, -1.0)
+        ),
+        source="first-order lag of the deflection, l = speed x time constant",
+        separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
+    ),
+    Effect(
+        name="write-order-memory",
+        title="resist remembering what was written just before",
+        stage="resist",
+        role="process",
+        acts_on="layout",
+        parameters={
+            "strength": Parameter("1", -0.3, 0.3, 0.05),
+            "length_um": Parameter("µm", 0.4, 20.0, 3.0, kind="shape"),
+            "direction": Parameter("1", -1.0, 1.0, 1.0, kind="choice"),
+        },
+        apply=write_order_memory,
+        trials=tuple(
+            {"strength": 0.05, "length_um": length, "direction": sign}
+            for length in (1.0, 3.0, 9.0)
+            for sign in (1.0, -1.0)
+        ),
+        source="oxygen and radical depletion along the slow writing axis, y unless the card says x",
+        separating="print the same layout with the writing order reversed",
+    ),
+)

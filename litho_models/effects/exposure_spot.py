@@ -1,0 +1,94 @@
+"""Exposure: the shape and the background of the writing spot."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from litho_models.effects.effect import Effect, FieldContext, Parameter, Values
+from litho_models.effects.filters import add_filtered
+
+# Below this difference of variances the spot is sharpened along one axis as much as it is widened
+# along the other; above it only widened, so that the filter never amplifies without bound.
+_SHARPENING_UM2 = 0.02
+_SPOT_REACH_UM = 1.5
+
+
+def elliptical_psf(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """T = exp(-2 π² f' C f), C the change of the spot's second moments with (Cxx - Cyy, 2 Cxy) given."""
+    stretch, shear = values["stretch_um2"], values["shear_um2"]
+    isotropic = torch.sqrt(stretch**2 + shear**2 + _SHARPENING_UM2**2) - _SHARPENING_UM2
+
+    def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
+        moment = isotropic * (fx * fx + fy * fy) + stretch * (fx * fx - fy * fy) + 2 * shear * fx * fy
+        return torch.expm1(-(math.pi**2) * moment)
+
+    return add_filtered(layout, transfer_minus_one, context.pitch_um, _SPOT_REACH_UM, "zero")
+
+
+def long_range_proximity(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """D = (M + η G_b * M) / (1 + η): the dose of the neighbourhood within b leaks in."""
+    weight, length = values["weight"], values["length_um"]
+
+    def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
+        blur_minus_one = torch.expm1(-2 * math.pi**2 * length**2 * (fy * fy + fx * fx))
+        return weight / (1 + weight) * blur_minus_one
+
+    return add_filtered(layout, transfer_minus_one, context.pitch_um, 3 * float(length.detach()), "zero")
+
+
+def dose_exponent(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """D = M_ref (M / M_ref)^p, with a foot of 1 % so that the slope at M = 0 stays finite."""
+    foot = 0.01
+    exponent, full = values["exponent"], context.full_height_um
+    relative = torch.clamp(layout / full, min=0) + foot
+    top, bottom = (1 + foot) ** exponent, foot**exponent
+    return layout + full * ((relative**exponent - bottom) / (top - bottom) - (relative - foot))
+
+
+EFFECTS = (
+    Effect(
+        name="elliptical-psf",
+        title="writing spot wider along one direction",
+        stage="exposure",
+        role="process",
+        acts_on="layout",
+        parameters={
+            "stretch_um2": Parameter("µm²", -0.12, 0.12, 0.02),
+            "shear_um2": Parameter("µm²", -0.12, 0.12, 0.02),
+        },
+        apply=elliptical_psf,
+        trials=({"stretch_um2": 0.02}, {"shear_um2": 0.02}),
+        source="Gaussian spot of the paper, with a full second-moment matrix",
+        separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
+    ),
+    Effect(
+        name="long-range-proximity",
+        title="dose leaking in from the neighbourhood",
+        stage="exposure",
+        role="process",
+        acts_on="layout",
+        parameters={
+            "weight": Parameter("1", -0.3, 0.5, 0.1),
+            "length_um": Parameter("µm", 0.6, 10.0, 2.0, kind="shape"),
+        },
+        apply=long_range_proximity,
+        trials=tuple({"weight": 0.1, "length_um": length} for length in (1.0, 2.0, 4.0, 8.0)),
+        source="proximity sum of two Gaussians, as in electron-beam writing; weights signed",
+        separating="print one feature alone and inside dense surroundings of three sizes",
+    ),
+    Effect(
+        name="dose-exponent",
+        title="height not proportional to dose",
+        stage="exposure",
+        role="process",
+        acts_on="layout",
+        parameters={"exponent": Parameter("1", 0.4, 2.0, 1.15, null=1.0)},
+        apply=dose_exponent,
+        trials=({"exponent": 1.15},),
+        source="Schwarzschild exponent of the dose",
+        separating="a wide staircase of all levels and a power sweep",
+    ),
+)

@@ -1,0 +1,113 @@
+"""Linear filters, gradients and warps that the effects share; each is exactly zero at zero strength."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+Edge = Literal["zero", "replicate"]
+
+
+def add_filtered(
+    field: Tensor,
+    transfer_minus_one: Callable[[Tensor, Tensor], Tensor],
+    pitch_um: float,
+    reach_um: float,
+    edge: Edge,
+) -> Tensor:
+    """Field plus the field filtered with (T - 1), so that T = 1 gives the field bit for bit.
+
+    Args:
+        field: (b, 1, y, x).
+        transfer_minus_one: (fy, fx) in cycles/µm, shapes (y, 1) and (1, x/2 + 1) -> T(f) - 1.
+        pitch_um: sampling, µm.
+        reach_um: half the support of the kernel; the field is padded by it.
+        edge: what lies outside: ``zero`` (nothing is written there) or ``replicate``.
+    """
+    ny, nx = field.shape[-2:]
+    pad = min(round(reach_um / pitch_um) + 1, ny - 1, nx - 1)
+    size_y, size_x = _fast_length(ny + 2 * pad), _fast_length(nx + 2 * pad)
+    padding = (pad, size_x - nx - pad, pad, size_y - ny - pad)
+    if edge == "zero":
+        padded = functional.pad(field, padding)
+    else:
+        padded = functional.pad(field, padding, mode="replicate")
+    fy = torch.fft.fftfreq(size_y, pitch_um, dtype=field.dtype, device=field.device)[:, None]
+    fx = torch.fft.rfftfreq(size_x, pitch_um, dtype=field.dtype, device=field.device)[None, :]
+    spectrum = torch.fft.rfft2(padded) * transfer_minus_one(fy, fx)
+    change = torch.fft.irfft2(spectrum, s=(size_y, size_x))
+    return field + change[..., pad : pad + ny, pad : pad + nx]
+
+
+def add_blur(field: Tensor, variance_um2: Tensor, pitch_um: float, reach_um: float, edge: Edge) -> Tensor:
+    """Isotropic Gaussian blur of the given variance, µm²: T = exp(-2 π² s² f²)."""
+    return add_filtered(
+        field,
+        lambda fy, fx: torch.expm1(-2 * math.pi**2 * variance_um2 * (fy * fy + fx * fx)),
+        pitch_um,
+        reach_um,
+        edge,
+    )
+
+
+def trailing_response(frequency: Tensor, length_um: Tensor, pitch_um: float) -> Tensor:
+    """Transfer of y_i = y_{i-1} + (x_i - y_{i-1}) / (1 + l/dx): a one-sided exponential tail of length l.
+
+    Analytic in l, with T = 1 at l = 0 (the continuous form is 1 / (1 + i 2π f l)).
+    """
+    difference = 1 - torch.exp(-2j * math.pi * frequency * pitch_um)
+    return 1 / (1 + length_um / pitch_um * difference)
+
+
+def gradient(field: Tensor, pitch_um: float) -> tuple[Tensor, Tensor]:
+    """Central differences (d/dy, d/dx) with replicated edges, per µm."""
+    padded = functional.pad(field, (1, 1, 1, 1), mode="replicate")
+    along_y = (padded[..., 2:, 1:-1] - padded[..., :-2, 1:-1]) / (2 * pitch_um)
+    along_x = (padded[..., 1:-1, 2:] - padded[..., 1:-1, :-2]) / (2 * pitch_um)
+    return along_y, along_x
+
+
+def add_warp(field: Tensor, shift_y_um: Tensor, shift_x_um: Tensor, pitch_um: float) -> Tensor:
+    """Field looked up at (y + shift_y, x + shift_x), cubic; a zero shift gives the field bit for bit.
+
+    Args:
+        field: (1, 1, y, x).
+        shift_y_um, shift_x_um: maps (y, x) or numbers, µm.
+    """
+    ny, nx = field.shape[-2:]
+    y, x = torch.meshgrid(
+        torch.arange(ny, dtype=field.dtype, device=field.device),
+        torch.arange(nx, dtype=field.dtype, device=field.device),
+        indexing="ij",
+    )
+    return (
+        field
+        + _look_up(field, y + shift_y_um / pitch_um, x + shift_x_um / pitch_um)
+        - _look_up(field, y + 0 * shift_y_um, x + 0 * shift_x_um)
+    )
+
+
+def _look_up(field: Tensor, y_px: Tensor, x_px: Tensor) -> Tensor:
+    ny, nx = field.shape[-2:]
+    y_px, x_px = torch.broadcast_tensors(y_px, x_px)
+    grid = torch.stack([2 * x_px / max(nx - 1, 1) - 1, 2 * y_px / max(ny - 1, 1) - 1], dim=-1)
+    grid = grid.reshape(-1, ny, nx, 2).expand(field.shape[0], ny, nx, 2)
+    return functional.grid_sample(field, grid, mode="bicubic", padding_mode="border", align_corners=True)
+
+
+def _fast_length(n: int) -> int:
+    """The next length whose only prime factors are 2, 3 and 5."""
+    candidate = n
+    while True:
+        rest = candidate
+        for prime in (2, 3, 5):
+            while rest % prime == 0:
+                rest //= prime
+        if rest == 1:
+            return candidate
+        candidate += 1

@@ -1,0 +1,125 @@
+"""Measurement: tip, feedback and lateral scanner; and the registration."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from litho_models.effects.effect import Effect, FieldContext, Parameter, Values
+from litho_models.effects.filters import add_blur, add_filtered, add_warp, gradient, trailing_response
+
+_TAIL_LENGTHS = 6
+
+
+def tip_dilation(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """H + R |grad H|² / 2: dilation by a paraboloid u² / 2R, first order in R (Hopf-Lax)."""
+    along_y, along_x = gradient(height, context.pitch_um)
+    return height + values["radius_um"] / 2 * (along_y**2 + along_x**2)
+
+
+def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """The probe follows late: one-sided exponential of length l along the fast axis."""
+    length = values["length_um"]
+    forward = float(values["direction"]) > 0
+
+    def transfer_minus_one(_: Tensor, fx: Tensor) -> Tensor:
+        return trailing_response(fx if forward else -fx, length, context.pitch_um) - 1
+
+    reach = _TAIL_LENGTHS * float(length.detach()) + context.pitch_um
+    return add_filtered(height, transfer_minus_one, context.pitch_um, reach, "replicate")
+
+
+def registration_residual(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """H(x + u), u a shift and a linear distortion left by the registration of one scan."""
+    y, x = context.scan_position()
+    shift_y, shift_x = (
+        values[f"shift_{axis}_um"] + values[f"{axis}_by_y_um"] * y + values[f"{axis}_by_x_um"] * x
+        for axis in ("y", "x")
+    )
+    return add_warp(height, shift_y, shift_x, context.pitch_um)
+
+
+def piezo_nonlinearity(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """H(x + c x (1 - x/L)): the scanner's x axis runs fast in the middle of a line."""
+    y, x = context.scan_position()
+    length = context.whole_shape()[1] * context.pitch_um
+    from_left = (x + 1) / 2 * length
+    return add_warp(
+        height, 0 * y, values["strength"] * from_left * (1 - from_left / length), context.pitch_um
+    )
+
+
+def resampling_blur(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """H blurred by the interpolation of the registration: Gaussian of a fraction of a pixel."""
+    return add_blur(height, values["variance_um2"], context.pitch_um, 1.0, "replicate")
+
+
+EFFECTS = (
+    Effect(
+        name="tip-dilation",
+        title="tip of finite radius widening tops",
+        stage="measurement",
+        role="measurement",
+        acts_on="height",
+        parameters={"radius_um": Parameter("µm", 0.0, 0.5, 0.05)},
+        apply=tip_dilation,
+        trials=({"radius_um": 0.05},),
+        source="dilation by a paraboloid, expanded for radii small against the curvature of the print",
+        separating="scan again with a new tip; scan a tip characteriser",
+    ),
+    Effect(
+        name="feedback-lag",
+        title="probe lagging behind the surface along the fast axis",
+        stage="measurement",
+        role="measurement",
+        acts_on="height",
+        parameters={
+            "length_um": Parameter("µm", 0.0, 0.8, 0.2),
+            "direction": Parameter("1", -1.0, 1.0, 1.0, kind="choice"),
+        },
+        apply=feedback_lag,
+        trials=tuple(
+            {"length_um": length, "direction": sign} for length in (0.15, 0.4) for sign in (1.0, -1.0)
+        ),
+        source="first-order feedback loop, linear part",
+        separating="compare trace and retrace; scan at 0 and 90 degrees",
+    ),
+    Effect(
+        name="registration-residual",
+        title="shift and distortion left by the registration",
+        stage="measurement",
+        role="measurement",
+        acts_on="height",
+        parameters={
+            name: Parameter("µm", -0.5, 0.5, 0.05)
+            for name in ("shift_y_um", "y_by_y_um", "y_by_x_um", "shift_x_um", "x_by_y_um", "x_by_x_um")
+        },
+        apply=registration_residual,
+        source="affine error of the lateral map from scan to layout",
+        separating="alignment marks in every field",
+        per_scan=True,
+    ),
+    Effect(
+        name="piezo-nonlinearity",
+        title="scanner running unevenly along a line",
+        stage="measurement",
+        role="measurement",
+        acts_on="height",
+        parameters={"strength": Parameter("1", -0.05, 0.05, 0.005)},
+        apply=piezo_nonlinearity,
+        trials=({"strength": 0.005},),
+        source="hysteresis of a piezo scanner, quadratic along the line",
+        separating="scan a calibration grating; scan at 0 and 180 degrees",
+    ),
+    Effect(
+        name="resampling-blur",
+        title="interpolation in the registration",
+        stage="measurement",
+        role="measurement",
+        acts_on="height",
+        parameters={"variance_um2": Parameter("µm²", 0.0, 0.0036, 0.0016)},
+        apply=resampling_blur,
+        trials=({"variance_um2": 0.0016},),
+        source="width of the interpolation kernel, 0.03 to 0.06 µm at 0.1 µm per pixel",
+        separating="register with two interpolation kernels; scan with half the pixel size",
+    ),
+)

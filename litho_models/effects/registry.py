@@ -1,0 +1,99 @@
+"""All effects by name, in the order in which light, resist, developer and microscope act."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from litho_data.errors import InputError
+from litho_models.effects import (
+    development,
+    exposure_field,
+    exposure_scanning,
+    exposure_spot,
+    measurement_height,
+    measurement_lateral,
+    resist,
+)
+from litho_models.effects.effect import Effect
+
+_FORWARD_ORDER = (
+    "dose-exponent",
+    "elliptical-psf",
+    "galvo-lag",
+    "vignetting",
+    "laser-drift",
+    "long-range-proximity",
+    "write-order-memory",
+    "threshold-softness",
+    "diffusion-blur",
+    "height-saturation",
+    "interface-offset",
+    "field-curvature",
+    "vertical-shrinkage",
+    "dose-dependent-shrinkage",
+    "lateral-shrinkage",
+    "feature-collapse",
+    "trench-residue",
+    "slope-thinning",
+    "tip-dilation",
+    "feedback-lag",
+    "registration-residual",
+    "piezo-nonlinearity",
+    "resampling-blur",
+    "z-gain",
+    "datum-offset",
+    "tilt-bow",
+    "scan-line-stripes",
+    "slow-drift",
+)
+
+_FAMILIES = (
+    exposure_spot,
+    exposure_scanning,
+    exposure_field,
+    resist,
+    development,
+    measurement_height,
+    measurement_lateral,
+)
+
+# Named in the catalogue, but a residual map on the layout's grid cannot carry their signature.
+UNTESTABLE = {
+    "hatch-ripple": "the hatching pitch equals the pixel: it aliases; rescan at 25 nm/px",
+    "layer-stacking": "needs the printer's slice table, which the card does not hold",
+    "min-to-zero-datum": "an order statistic per scan; what it leaves is carried by datum-offset",
+    "quantisation": "heights are floating point here; see the histogram of the raw file",
+    "line-roughness": "random from print to print: part of the noise, not of the mean",
+    "scars-and-spikes": "a mask, not a term: masked pixels are counted in the dataset",
+}
+
+
+def _collect() -> dict[str, Effect]:
+    found = {effect.name: effect for family in _FAMILIES for effect in family.EFFECTS}
+    if set(found) != set(_FORWARD_ORDER):
+        raise ImportError(f"families and forward order differ in {set(found) ^ set(_FORWARD_ORDER)}")
+    return {name: found[name] for name in _FORWARD_ORDER}
+
+
+CATALOGUE: dict[str, Effect] = _collect()
+
+
+def get_effect(name: str) -> Effect:
+    """The effect of that name.
+
+    Raises:
+        InputError: no such effect.
+    """
+    if name not in CATALOGUE:
+        raise InputError("effect", got=repr(name), wanted=f"one of {', '.join(CATALOGUE)}")
+    return CATALOGUE[name]
+
+
+def in_forward_order(names: Sequence[str]) -> list[str]:
+    """The names sorted as the effects act, from exposure to microscope."""
+    return [name for name in CATALOGUE if name in set(names)]
+
+
+def screened_effects() -> list[Effect]:
+    """Effects with parameters common to all scans, tested by the score test."""
+    return [effect for effect in CATALOGUE.values() if not effect.per_scan]

@@ -1,0 +1,123 @@
+"""One frozen model on a dataset: ``evaluation.json`` and a report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import numpy as np
+import torch
+from pydantic import Field
+
+from litho_data.commands import progress
+from litho_data.errors import InputError
+from litho_data.results import Record, Result
+from litho_data.store import PrintedScan, open_store
+from litho_models.evaluation_report import write_evaluation_report
+from litho_models.freeze import DatasetName, FrozenSimulator, load_frozen
+from litho_models.nuisance import Policy
+from litho_models.run_info import RunInfo, run_info
+from litho_models.scores import (
+    ModelScores,
+    NoiseFloor,
+    NuisanceProtocol,
+    noise_floor,
+    protocol_for,
+    score_model,
+)
+from litho_models.splits import ids_sha256
+
+
+class SplitRecord(Record):
+    """Which scans were scored, and how that set came about."""
+
+    kind: str
+    folds: int = 0
+    seed: int = 0
+    scored_ids: list[str]
+    scored_ids_sha256: str
+    lock_box: list[str] = Field(default_factory=list)
+    lock_box_opened: bool = False
+
+
+class ModelRecord(Record):
+    """The frozen model that was scored."""
+
+    name: str
+    sha256: str
+    extrapolated: bool
+
+
+class Evaluation(Result):
+    """``evaluation.json``."""
+
+    SCHEMA: ClassVar[str] = "litho-models/evaluation/1"
+    FILE_NAME: ClassVar[str] = "evaluation.json"
+
+    schema_: Literal["litho-models/evaluation/1"] = Field("litho-models/evaluation/1", alias="schema")
+    run: RunInfo
+    dataset: DatasetName
+    model: ModelRecord
+    split: SplitRecord
+    nuisance: NuisanceProtocol
+    noise_floor: NoiseFloor
+    trained_on_scored_scans: list[str]
+    scores: ModelScores
+
+
+def evaluate(
+    model: str | Path,
+    store: str | Path,
+    out: str | Path,
+    *,
+    policy: Policy = "offset",
+    scan_ids: Sequence[str] | None = None,
+    extrapolate: bool = False,
+    device: str = "cpu",
+) -> Evaluation:
+    """Score a frozen model on the scans of a store and write the result and its report.
+
+    Args:
+        model: folder of a frozen model.
+        store: dataset store.
+        out: folder for ``evaluation.json``, ``report.html`` and the CSV tables.
+        policy: nuisances that a scan may be freed of.
+        scan_ids: only these scans; all if None.
+        extrapolate: accept layouts beyond the model's calibrated range.
+
+    Raises:
+        InputError: a model or store that cannot be read, or geometries that differ.
+    """
+    dataset = open_store(store)
+    frozen = load_frozen(model, device=device, extrapolate=extrapolate)
+    frozen.check_geometry(dataset.pitch_um, dataset.level_height_um)
+    ids = list(scan_ids) if scan_ids is not None else dataset.ids
+    if not ids:
+        raise InputError(f"scans of {store}", got="none", wanted="at least one to score")
+    scans = [dataset.scan(scan_id) for scan_id in ids]
+    predictions = [predict_frozen(frozen, scan) for scan in progress(scans, "predicting")]
+    protocol = protocol_for(policy)
+    trained_on = set(frozen.card["training"].get("scan_ids", [])) & set(ids)
+    result = Evaluation(
+        schema="litho-models/evaluation/1",
+        run=run_info([protocol.seed], len(scans)),
+        dataset=DatasetName(name=dataset.name, sha256=dataset.sha256),
+        model=ModelRecord(name=frozen.name, sha256=frozen.sha256, extrapolated=extrapolate),
+        split=SplitRecord(kind="given", scored_ids=ids, scored_ids_sha256=ids_sha256(ids)),
+        nuisance=protocol,
+        noise_floor=noise_floor(dataset.name),
+        trained_on_scored_scans=sorted(trained_on),
+        scores=score_model(frozen.name, scans, predictions, protocol),
+    )
+    result.write(out)
+    write_evaluation_report(result, scans, predictions, out)
+    return result
+
+
+def predict_frozen(model: FrozenSimulator, scan: PrintedScan) -> np.ndarray:
+    """Height that a frozen model expects for a scan, float32 (ny, nx) µm."""
+    device = next((p.device for p in model.parameters()), torch.device("cpu"))
+    with torch.no_grad():
+        layout = torch.from_numpy(scan.layout_um)[None, None].to(device)
+        return model(layout, pitch_um=scan.pitch_um, level_height_um=scan.level_height_um)[0, 0].cpu().numpy()

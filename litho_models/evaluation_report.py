@@ -1,0 +1,58 @@
+"""``report.html`` of one evaluated model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from litho_data.report import Page
+from litho_data.store import PrintedScan
+from litho_models import figures, score_tables
+
+if TYPE_CHECKING:
+    from litho_models.evaluate import Evaluation
+
+
+def write_evaluation_report(
+    result: Evaluation, scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray], out: str | Path
+) -> Path:
+    """Render the result into ``out``; returns the page."""
+    scores = result.scores
+    page = Page(
+        f"{result.model.name} on {result.dataset.name}",
+        f"{len(scores.scans)} scans, datum-free MAE {scores.mae_datum_free_nm:.2f} nm.",
+    )
+    page.tiles(
+        [
+            (f"{scores.mae_datum_free_nm:.2f} nm", "MAE, datum-free"),
+            (f"{scores.mae_abs_nm:.2f} nm", "MAE, no fit at test time"),
+            (f"{scores.bias_nm:.1f} nm", "bias"),
+        ]
+    )
+    if result.trained_on_scored_scans:
+        count = len(result.trained_on_scored_scans)
+        page.note(f"{count} of the scored scans were used in training: this is not a held-out error.")
+    if result.model.extrapolated:
+        page.note("Layouts beyond the calibrated range were accepted (extrapolate).")
+    page.paragraph(score_tables.protocol_text(result.nuisance))
+    page.table(score_tables.headline_table([scores]), "Error over scans.", "headline.csv")
+    page.table(score_tables.policy_table([scores]), "MAE under every nuisance policy, nm.", "policies.csv")
+    worst = max(range(len(scans)), key=lambda i: scores.scans[i].mae_datum_free_nm)
+    shown = {scores.model: predictions_um[worst]}
+    page.heading("The worst scan")
+    page.figure(figures.residual_maps(scans[worst], shown, result.nuisance), "Measured height and error.")
+    page.figure(figures.line_profiles(scans[worst], shown, result.nuisance), "Middle row.")
+    page.heading("By level and frequency")
+    page.figure(figures.level_bias([scores]), "Error by printed level.")
+    page.figure(figures.transfer([scores]), "Transfer and coherence.")
+    page.heading("Tables")
+    page.table(score_tables.scan_table([scores]), "By scan.", "scans.csv")
+    page.table(score_tables.level_table([scores]), "By level.", "levels.csv")
+    page.heading("Things worth knowing about these numbers")
+    for note in score_tables.caveats([scores]):
+        page.paragraph(note)
+    page.code(result.run.command)
+    return page.write(out)

@@ -1,0 +1,100 @@
+"""Gaussian blur that is differentiable in its width: separable, normalised, cut at four sigma.
+
+Each axis is one product with a banded matrix. For fields up to a few thousand pixels this is faster
+than a Fourier transform, its cost does not depend on sigma, and no period or padding rule leaks in.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from litho_data.errors import InputError
+
+SUPPORT_SIGMAS = 4.0
+# A narrower Gaussian has no weight left on the next pixel (exp(-50)); it also keeps 1/sigma finite.
+_SMALLEST_SIGMA_PX = 0.1
+
+Edge = Literal["replicate", "zero"]
+
+
+def gaussian_blur(
+    field: Tensor,
+    sigma_um: float | Tensor | tuple[float | Tensor, float | Tensor],
+    pitch_um: float,
+    *,
+    edge: Edge = "replicate",
+) -> Tensor:
+    """Blur ``field`` (..., y, x) to the same size with a Gaussian of standard deviation ``sigma_um``.
+
+    g(d) ∝ exp(-d²/2σ²), normalised over its support of at least 4σ on each side.
+
+    Args:
+        field: floating-point tensor (..., y, x).
+        sigma_um: standard deviation, µm; a pair (along y, along x) blurs anisotropically. Tensors
+            carry gradients.
+        pitch_um: sampling of the field, µm.
+        edge: ``replicate`` continues the outermost pixels, ``zero`` adds nothing outside.
+
+    Raises:
+        InputError: a pitch that is not positive.
+    """
+    if not pitch_um > 0:
+        raise InputError("pitch_um", got=pitch_um, wanted="a positive number")
+    along_y, along_x = sigma_um if isinstance(sigma_um, tuple) else (sigma_um, sigma_um)
+    sigmas = [
+        torch.as_tensor(sigma, dtype=field.dtype, device=field.device) / pitch_um
+        for sigma in (along_y, along_x)
+    ]
+    radii = [kernel_radius_px(float(sigma.detach())) for sigma in sigmas]
+    padded = pad_field(field, radii[0], radii[1], edge)
+    return blur_interior(padded, (sigmas[0], sigmas[1]), (radii[0], radii[1]))
+
+
+def blur_interior(
+    field: Tensor, sigma_px: Tensor | tuple[Tensor, Tensor], radius_px: int | tuple[int, int]
+) -> Tensor:
+    """Blur and keep only the pixels whose whole support lies inside: (..., y - 2r, x - 2r)."""
+    sigmas = sigma_px if isinstance(sigma_px, tuple) else (sigma_px, sigma_px)
+    radii = radius_px if isinstance(radius_px, tuple) else (radius_px, radius_px)
+    # Heights need full precision: bfloat16 resolves only some nanometres at 1 µm.
+    with torch.autocast(device_type=field.device.type, enabled=False):
+        field = field.float() if field.dtype in (torch.bfloat16, torch.float16) else field
+        rows = _band(field.shape[-2], radii[0], sigmas[0].to(field.dtype))
+        columns = _band(field.shape[-1], radii[1], sigmas[1].to(field.dtype))
+        return rows @ field @ columns.T
+
+
+def kernel_radius_px(sigma_px: float, support: float = SUPPORT_SIGMAS) -> int:
+    """Whole pixels on each side that hold ``support`` standard deviations; 1 at least."""
+    return max(1, math.ceil(support * sigma_px))
+
+
+def pad_field(field: Tensor, rows_px: int, columns_px: int, edge: Edge = "replicate") -> Tensor:
+    """Add a border to a (batch, channel, y, x) or (..., y, x) tensor."""
+    border = (columns_px, columns_px, rows_px, rows_px)
+    flat = field.reshape(-1, 1, *field.shape[-2:])
+    if edge == "replicate":
+        padded = functional.pad(flat, border, mode="replicate")
+    else:
+        padded = functional.pad(flat, border)
+    return padded.reshape(*field.shape[:-2], *padded.shape[-2:])
+
+
+def _band(size: int, radius: int, sigma_px: Tensor) -> Tensor:
+    """Matrix (size - 2 radius, size) whose row i holds the kernel centred on column i + radius."""
+    if size <= 2 * radius:
+        raise InputError(
+            "field to blur", got=f"{size} px", wanted=f"more than {2 * radius} px (twice the support)"
+        )
+    sigma = sigma_px.clamp(min=_SMALLEST_SIGMA_PX)
+    output = torch.arange(size - 2 * radius, device=sigma.device)
+    distance = torch.arange(size, device=sigma.device)[None, :] - output[:, None] - radius
+    weight = torch.exp(-0.5 * (distance / sigma) ** 2)
+    taps = torch.arange(-radius, radius + 1, device=sigma.device)
+    total = torch.exp(-0.5 * (taps / sigma) ** 2).sum()
+    return torch.where(distance.abs() <= radius, weight, torch.zeros_like(weight)) / total

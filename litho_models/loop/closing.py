@@ -1,0 +1,261 @@
+"""Close the loop: from the residual of a model on measured prints to named causes and a better model."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+from pydantic import Field as Setting
+from torch import nn
+
+from litho_data.errors import InputError
+from litho_data.store.read import PrintedScan
+from litho_models.effects import CATALOGUE, UNTESTABLE, get_effect
+from litho_models.effects.chain import EffectChain
+from litho_models.loop.fields import Field, prepare_fields
+from litho_models.loop.fitting import is_stiff, predict, set_vector
+from litho_models.loop.flexible import FoldedBase, Trainer, carry_over, same_for_all, train_folds
+from litho_models.loop.injecting import Planted, parse_injection, plant
+from litho_models.loop.measurement import MeasurementTest, measurement_tests
+from litho_models.loop.scoring import DATUM_FREE, Score, Terms, names_to_terms, score
+from litho_models.loop.search import Search, State, fit_state, search_effects
+from litho_models.loop.structure import CovariateTest, covariate_tests, is_structured
+from litho_models.metrics import NM_PER_UM
+from litho_models.models import build_model
+from litho_models.splits import grouped_folds, lock_box, lock_box_size
+
+
+class LoopConfig(BaseModel):
+    """Settings of one run; the defaults are the reference."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    folds: int = Setting(6, ge=2, description="outer folds by scan")
+    seed: int = Setting(0, ge=0, description="folds, locked scans, calibration blocks, bootstrap")
+    open_lock_box: bool = False
+    prior_hypotheses: tuple[str, ...] = ()
+    inject: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Closed:
+    """Everything that the report and ``close_loop.json`` are made from.
+
+    Attributes:
+        development, locked: prepared scans; ``fold_of``: fold of each development scan.
+        base, final: fitted states before and after; ``search``: how it got there.
+        first_tests, last_tests: measurement tests before and after the process effects.
+        accepted: measurement effects in force at the end.
+        floor_nm: lower bound of the noise, nm (root mean square, mean absolute).
+        structure: covariate tests on what is left.
+        locked_scores: (before, after) as pairs (no fit, datum free), if opened.
+        untestable: effect to reason; ``planted``: power of the screening, if asked for.
+    """
+
+    development: list[Field]
+    locked: list[Field]
+    fold_of: np.ndarray
+    base: State
+    final: State
+    search: Search
+    first_tests: list[MeasurementTest]
+    last_tests: list[MeasurementTest]
+    accepted: list[str]
+    floor_nm: tuple[float, float]
+    structure: list[CovariateTest]
+    locked_scores: tuple[tuple[Score, Score], tuple[Score, Score]] | None
+    untestable: dict[str, str]
+    planted: list[Planted]
+    config: LoopConfig
+
+    @property
+    def structured(self) -> list[CovariateTest]:
+        return is_structured(self.structure)
+
+    @property
+    def terms(self) -> Terms:
+        """Per-scan terms of the final error: the datum and the accepted measurement effects."""
+        return DATUM_FREE | names_to_terms(self.accepted)
+
+    def errors(self, state: State, terms: Terms) -> Score:
+        """Held-out errors of a state over the development scans."""
+        return score(self.development, state.predictions, terms, self.config.seed)
+
+
+def close_loop(
+    scans: Sequence[PrintedScan],
+    base: nn.Module,
+    config: LoopConfig | None = None,
+    *,
+    trainer: Trainer | None = None,
+    report: Callable[[str], None] = lambda message: None,
+) -> Closed:
+    """Find what the base model lacks on these scans, add it, and measure the error on held-out scans.
+
+    Args:
+        scans: measured prints, all of one pitch and one level height.
+        base: simulator; one with few parameters is refitted, another is taken as it is.
+        config: settings.
+        trainer: makes a fresh base model from scans, for a base with many parameters: it is then
+            trained once per fold, and effects are looked for on a Physics model first.
+        report: told what happens, a sentence at a time.
+
+    Raises:
+        InputError: fewer than two usable scans, or an unknown effect among the prior hypotheses.
+    """
+    config = config or LoopConfig.model_validate({})
+    for name in config.prior_hypotheses:
+        get_effect(name)
+    for text in config.inject:
+        parse_injection(text)
+    fields = [field for field in prepare_fields(scans) if len(field.sample) >= 64]
+    if len(fields) < 2:
+        raise InputError("scans to close the loop on", got=f"{len(fields)} usable", wanted="at least 2")
+    development, locked = _split(fields, config.seed)
+    fold_of = _folds(development, config)
+    first = development[0]
+    stiff = is_stiff(base)
+    chain = EffectChain(
+        copy.deepcopy(base) if stiff else _stiff_guide(first.scan),
+        {},
+        full_height_um=first.context.full_height_um,
+        pitch_um=first.context.pitch_um,
+    )
+    report(f"fitting the base model on {len(development)} scans")
+    start = fit_state(chain, development, fold_of)
+    untestable = dict(UNTESTABLE) | _untestable(development)
+    floor = noise_lower_bound_nm(development, start.predictions)
+    report("testing what single scans add")
+    first_tests = measurement_tests(
+        development, start.predictions, fold_of, floor_nm2=floor[0] ** 2, seed=config.seed
+    )
+    terms = DATUM_FREE | names_to_terms([t.effect.name for t in first_tests if t.confirmation.passed])
+    search = search_effects(
+        start,
+        development,
+        fold_of,
+        terms,
+        exclude=untestable,
+        floor_nm2=floor[0] ** 2,
+        seed=config.seed,
+        report=report,
+    )
+    guide = search.state
+    if not stiff:
+        report("training the base model" if trainer else "predicting with the base model as it is")
+        folded = train_folds(development, fold_of, trainer) if trainer else same_for_all(base, development)
+        start, search = carry_over(
+            search,
+            folded,
+            development,
+            fold_of,
+            terms,
+            floor_nm2=floor[0] ** 2,
+            seed=config.seed,
+            report=report,
+        )
+    final = search.state
+    last_tests = measurement_tests(
+        development, final.predictions, fold_of, floor_nm2=floor[0] ** 2, seed=config.seed
+    )
+    accepted = [test.effect.name for test in last_tests if test.confirmation.passed]
+    planted = []
+    for text in config.inject:
+        report(f"planting {text}")
+        planted += plant(text, guide, development, fold_of, terms, config.seed)
+    report("testing what is left for structure")
+    residuals = [f.height - f.at_sample(p) for f, p in zip(development, final.predictions, strict=True)]
+    return Closed(
+        development=development,
+        locked=locked,
+        fold_of=fold_of,
+        base=start,
+        final=final,
+        search=search,
+        first_tests=first_tests,
+        last_tests=last_tests,
+        accepted=accepted,
+        floor_nm=noise_lower_bound_nm(development, final.predictions),
+        structure=covariate_tests(development, final.predictions, residuals),
+        locked_scores=_locked_scores(locked, start, final, accepted, config)
+        if config.open_lock_box
+        else None,
+        untestable=untestable,
+        planted=planted,
+        config=config,
+    )
+
+
+def noise_lower_bound_nm(fields: Sequence[Field], predictions: Sequence[np.ndarray]) -> tuple[float, float]:
+    """Pixel noise from second differences along x, (rms, mean absolute) in nm: blind to correlated noise.
+
+    For white noise of variance s², x[i-1] - 2 x[i] + x[i+1] has variance 6 s². The median over pixels
+    keeps edges of the print out; a Gaussian shape is assumed for the conversion.
+    """
+    variances = []
+    for field, prediction in zip(fields, predictions, strict=True):
+        residual = np.where(field.usable, field.scan.height_um - prediction, np.nan)
+        second = residual[:, 2:] - 2 * residual[:, 1:-1] + residual[:, :-2]
+        spread = float(np.nanmedian(np.abs(second))) / 0.6745
+        variances.append(spread**2 / 6)
+    rms = float(np.sqrt(np.mean(variances))) * NM_PER_UM
+    return rms, rms * float(np.sqrt(2 / np.pi))
+
+
+def _stiff_guide(scan: PrintedScan) -> nn.Module:
+    return build_model(
+        "physics", pitch_um=scan.pitch_um, level_height_um=scan.level_height_um, levels=scan.levels
+    )
+
+
+def _split(fields: list[Field], seed: int) -> tuple[list[Field], list[Field]]:
+    ids, prints = [f.id for f in fields], [f.scan.print_id for f in fields]
+    chosen = set(lock_box(ids, prints, lock_box_size(len(ids)), seed))
+    return [f for f in fields if f.id not in chosen], [f for f in fields if f.id in chosen]
+
+
+def _folds(fields: Sequence[Field], config: LoopConfig) -> np.ndarray:
+    ids = [field.id for field in fields]
+    folds = grouped_folds(ids, min(config.folds, len(ids)), config.seed)
+    fold = {scan_id: number for number, members in enumerate(folds) for scan_id in members}
+    return np.array([fold[scan_id] for scan_id in ids])
+
+
+def _untestable(fields: Sequence[Field]) -> dict[str, str]:
+    reasons = {}
+    one_level = all(field.scan.mask_level.min() == field.scan.mask_level.max() for field in fields)
+    for effect in CATALOGUE.values():
+        if effect.per_scan:
+            continue
+        if one_level:
+            reasons[effect.name] = "every layout has one level only: nothing in the print varies with it"
+        elif "order" in effect.needs and len({field.context.order for field in fields}) < 3:
+            reasons[effect.name] = "the writing order of the scans is not known"
+    return reasons
+
+
+def _locked_scores(
+    locked: Sequence[Field], start: State, final: State, accepted: Sequence[str], config: LoopConfig
+) -> tuple[tuple[Score, Score], tuple[Score, Score]] | None:
+    if not locked:
+        return None
+    before, after = ([predict(s.fits.chain, s.fits.common, f) for f in locked] for s in (start, final))
+    terms = DATUM_FREE | names_to_terms(accepted)
+    return (
+        (score(locked, before, frozenset(), config.seed), score(locked, before, DATUM_FREE, config.seed)),
+        (score(locked, after, frozenset(), config.seed), score(locked, after, terms, config.seed)),
+    )
+
+
+def corrected_chain(closed: Closed) -> EffectChain:
+    """The final model at the parameters fitted on all development scans, a copy."""
+    chain = copy.deepcopy(closed.final.fits.chain)
+    set_vector(chain, closed.final.fits.common)
+    if isinstance(chain.base, FoldedBase):
+        effects, common = chain.values(), chain.base.common
+        geometry = {"full_height_um": chain.full_height_um, "pitch_um": chain.pitch_um}
+        return EffectChain(common, effects, **geometry)
+    return chain

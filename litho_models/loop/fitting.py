@@ -1,0 +1,250 @@
+"""Joint fit of the base model's few parameters and of the effects, once for all scans and per fold.
+
+Separable least squares: datum, tilt, bow and warp of each scan are projected out, so that they
+cannot pull the process parameters. Derivatives are one-sided differences; a model with many
+parameters (a network) is kept as it is and only the effects are fitted.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import nn
+
+from litho_models.effects import get_effect
+from litho_models.effects.chain import EffectChain
+from litho_models.loop.fields import Field
+from litho_models.loop.linear import COMMON_WEIGHT, gram, nuisance_columns, orthonormal, solve_damped
+
+STIFF_PARAMETERS = 16
+_RELATIVE_STEP = 5e-3
+_STEPS = 12
+# The way to the neighbourhood of the optimum is walked on every third scan.
+_START_EVERY = 3
+# Base parameters are lengths in µm or logits of order 1. Beyond 4 a logit has no slope left, and a
+# fit that has run there (on scans that a fold holds out, say) could not come back.
+_LONGEST_STEP, _LARGEST_VALUE = 1.0, 4.0
+_FOLD_STEPS = 6
+_FOLD_GAIN = 1e-4
+# Keeps combinations of parameters without influence where the common fit put them.
+_FOLD_DAMPING = 1e-6
+_RELATIVE_GAIN = 5e-4
+_DAMPING_TRIES = 4
+
+
+@dataclass(frozen=True)
+class Linearisation:
+    """One scan at given parameters: residual (n,), derivatives (n, p) and per-scan basis (n, k), µm."""
+
+    residual: np.ndarray
+    jacobian: np.ndarray
+    basis: np.ndarray
+
+    def normal(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """Normal matrix, right-hand side and weighted sum of squares."""
+        full = gram(np.column_stack([self.jacobian, self.residual]), self.basis, COMMON_WEIGHT)
+        return full[:-1, :-1], full[:-1, -1], float(full[-1, -1])
+
+
+@dataclass(frozen=True)
+class FoldFits:
+    """Parameters for all development scans and for each fold, and where each scan is held out.
+
+    Attributes:
+        chain: the model; its parameters are set by ``set_vector``.
+        common: (p,) fitted on all development scans.
+        per_fold: (folds, p), each fitted without its own scans.
+        covariance: (p, p), cluster-robust over scans.
+        linear: linearisation of each development scan at ``common``.
+    """
+
+    chain: EffectChain
+    common: np.ndarray
+    per_fold: np.ndarray
+    covariance: np.ndarray
+    linear: list[Linearisation]
+
+
+def is_stiff(base: nn.Module) -> bool:
+    """Few enough trainable numbers to be fitted jointly with the effects."""
+    return 0 < sum(p.numel() for p in base.parameters() if p.requires_grad) <= STIFF_PARAMETERS
+
+
+def fit_folds(chain: EffectChain, fields: Sequence[Field], fold_of: np.ndarray) -> FoldFits:
+    """Fit on all scans, then without each fold in turn.
+
+    The fold fits start at the common fit and are iterated to their own stationary point, first with
+    its derivatives, then with their own, so that the start leaves next to no trace of the held-out
+    scans.
+
+    Args:
+        chain: base and effects at their starting values; copied, not changed.
+        fields: development scans; ``fold_of``: (len(fields),) fold that holds each out.
+    """
+    chain = copy.deepcopy(chain)
+    if len(fields) > 2 * _START_EVERY:
+        _fit_common(chain, fields[::_START_EVERY])
+    common, linear = _fit_common(chain, fields)
+    per_fold = np.stack(
+        [
+            _fit_without(chain, common, linear, fields, np.flatnonzero(fold_of != fold))
+            for fold in range(int(fold_of.max()) + 1)
+        ]
+    )
+    return FoldFits(chain, common, per_fold, _robust_covariance(linear), linear)
+
+
+def predict(chain: EffectChain, vector: np.ndarray, field: Field) -> np.ndarray:
+    """Predicted height (y, x) float32, µm."""
+    set_vector(chain, vector)
+    select = getattr(chain.base, "select", None)
+    if select is not None:
+        select(field.id)
+    with torch.no_grad():
+        return chain(field.layout, field.context)[0, 0].numpy()
+
+
+def get_vector(chain: EffectChain) -> np.ndarray:
+    """All fitted numbers: the base's (if stiff), then the effects'."""
+    return np.concatenate([p.detach().numpy().reshape(-1) for p in _fitted(chain)] or [np.empty(0)]).astype(
+        np.float64
+    )
+
+
+def set_vector(chain: EffectChain, vector: np.ndarray) -> None:
+    """Set what ``get_vector`` returns."""
+    at = 0
+    for parameter in _fitted(chain):
+        values = vector[at : at + parameter.numel()]
+        parameter.data.copy_(torch.as_tensor(values, dtype=parameter.dtype).reshape(parameter.shape))
+        at += parameter.numel()
+
+
+def effect_slots(chain: EffectChain) -> dict[tuple[str, str], int]:
+    """Where each effect parameter sits in the vector."""
+    start = len(get_vector(chain)) - len(chain.fitted)
+    return {slot: start + i for i, slot in enumerate(chain.fitted)}
+
+
+def linearise(chain: EffectChain, vector: np.ndarray, field: Field) -> Linearisation:
+    """Residual and derivatives of one scan at the sampled pixels."""
+    prediction = predict(chain, vector, field)
+    here = field.at_sample(prediction)
+    columns = []
+    for i, step in enumerate(_steps(chain, vector)):
+        moved = vector.copy()
+        moved[i] += step
+        columns.append((field.at_sample(predict(chain, moved, field)) - here) / step)
+    jacobian = np.stack(columns, axis=1) if columns else np.empty((len(here), 0))
+    basis = orthonormal(nuisance_columns(field, prediction, gain=False))
+    return Linearisation(field.height - here, jacobian, basis)
+
+
+def _fit_common(chain: EffectChain, fields: Sequence[Field]) -> tuple[np.ndarray, list[Linearisation]]:
+    vector, damping = get_vector(chain), 1e-3
+    linear = [linearise(chain, vector, field) for field in fields]
+    if not len(vector):
+        return vector, linear
+    after = np.inf
+    for _ in range(_STEPS):
+        parts = [part.normal() for part in linear]
+        normal, right = np.sum([p[0] for p in parts], axis=0), np.sum([p[1] for p in parts], axis=0)
+        before = sum(p[2] for p in parts)
+        for _ in range(_DAMPING_TRIES):
+            trial = _bounded(chain, vector, solve_damped(normal, right, damping))
+            after = sum(
+                _sum_of_squares(part, field, predict(chain, trial, field))
+                for part, field in zip(linear, fields, strict=True)
+            )
+            if after < before:
+                break
+            damping *= 10
+        if after >= before:
+            break
+        vector, damping = trial, damping / 10
+        linear = [linearise(chain, vector, field) for field in fields]
+        if before - after < _RELATIVE_GAIN * before:
+            break
+    set_vector(chain, vector)
+    return vector, linear
+
+
+def _fit_without(
+    chain: EffectChain,
+    common: np.ndarray,
+    linear: Sequence[Linearisation],
+    fields: Sequence[Field],
+    training: np.ndarray,
+) -> np.ndarray:
+    """Fit on some of the scans; cheap steps with the common derivatives, full ones where those fail."""
+    if not len(common):
+        return common
+    parts = [linear[i].normal() for i in training]
+    normal, right = np.sum([p[0] for p in parts], axis=0), np.sum([p[1] for p in parts], axis=0)
+    start = best = sum(p[2] for p in parts)
+    vector = common
+    for _ in range(_FOLD_STEPS):
+        moved = _bounded(chain, vector, solve_damped(normal, right, _FOLD_DAMPING))
+        right, total = np.zeros(len(vector)), 0.0
+        for i in training:
+            residual = fields[i].height - fields[i].at_sample(predict(chain, moved, fields[i]))
+            _, own, squares = Linearisation(residual, linear[i].jacobian, linear[i].basis).normal()
+            right += own
+            total += squares
+        gained, vector = best - total, moved
+        if abs(gained) <= _FOLD_GAIN * total:
+            return vector
+        if total > start:
+            break
+        best = total
+    set_vector(chain, common)
+    return _fit_common(chain, [fields[i] for i in training])[0]
+
+
+def _sum_of_squares(part: Linearisation, field: Field, prediction: np.ndarray) -> float:
+    residual = (field.height - field.at_sample(prediction))[:, None]
+    return float(gram(residual, part.basis, COMMON_WEIGHT)[0, 0])
+
+
+def _robust_covariance(linear: Sequence[Linearisation]) -> np.ndarray:
+    if not linear[0].jacobian.shape[1]:
+        return np.empty((0, 0))
+    parts = [part.normal() for part in linear]
+    normal = np.sum([p[0] for p in parts], axis=0)
+    inverse = np.linalg.pinv(normal, rcond=1e-10, hermitian=True)
+    scores = np.stack([p[1] for p in parts])
+    count = len(parts)
+    return inverse @ (scores.T @ scores) @ inverse * count / max(count - 1, 1)
+
+
+def _bounded(chain: EffectChain, vector: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """The vector after a step that is cut to the longest allowed, effects within their range."""
+    bounded = vector + np.clip(step, -_LONGEST_STEP, _LONGEST_STEP)
+    bounded = np.clip(bounded, -_LARGEST_VALUE, _LARGEST_VALUE)
+    free = vector + step
+    for (name, parameter), slot in effect_slots(chain).items():
+        limits = get_effect(name).parameters[parameter]
+        bounded[slot] = np.clip(free[slot], limits.lower, limits.upper)
+    return bounded
+
+
+def _steps(chain: EffectChain, vector: np.ndarray) -> np.ndarray:
+    """Difference steps, pointing away from the nearer bound of an effect's range."""
+    steps = _RELATIVE_STEP * np.maximum(np.abs(vector), 0.2)
+    for (name, parameter), slot in effect_slots(chain).items():
+        limits = get_effect(name).parameters[parameter]
+        size = 0.05 * abs(limits.typical - limits.null if limits.kind == "amplitude" else limits.typical)
+        steps[slot] = size if vector[slot] + size <= limits.upper else -size
+    return steps
+
+
+def _fitted(chain: EffectChain) -> list[nn.Parameter]:
+    base = [p for p in chain.base.parameters() if p.requires_grad] if is_stiff(chain.base) else []
+    effects = [
+        chain.get_parameter(f"{name.replace('-', '_')}__{parameter}") for name, parameter in chain.fitted
+    ]
+    return base + effects

@@ -1,0 +1,64 @@
+"""Linear algebra of the loop: projections on per-scan terms, Gram matrices, damped normal equations."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from litho_models.loop.fields import Field
+
+# Weight left to the per-scan terms in a fit: enough to fix what only they carry (the common datum),
+# too little to let one scan's datum or bow pull the parameters of the process.
+COMMON_WEIGHT = 1e-3
+# Squared size below which a combination of unit columns is round-off.
+_SMALLEST_EIGENVALUE = 1e-10
+_WEAKEST_INFLUENCE = 1e-8
+
+
+def nuisance_columns(field: Field, prediction: np.ndarray, *, gain: bool, warp: bool = True) -> np.ndarray:
+    """Per-scan terms at the sampled pixels: (n, k) of 1, x, y, x², xy, y², prediction, warp.
+
+    Args:
+        field: the scan.
+        prediction: predicted height map (y, x), µm.
+        gain: include the prediction itself.
+        warp: include dH/dy and dH/dx, alone and times y and x: the registration's affine error.
+    """
+    y, x = field.position
+    columns = [np.ones_like(y), x, y, x * x, x * y, y * y]
+    if gain:
+        columns.append(field.at_sample(prediction))
+    if warp:
+        for slope in np.gradient(prediction):
+            sampled = field.at_sample(slope)
+            columns += [sampled, sampled * y, sampled * x]
+    return np.stack(columns, axis=1)
+
+
+def orthonormal(columns: np.ndarray) -> np.ndarray:
+    """Orthonormal basis (n, k') of the span of the columns; columns without content are dropped."""
+    if not columns.shape[1]:
+        return columns
+    scaled = columns / np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny)
+    sizes, directions = np.linalg.eigh(scaled.T @ scaled)
+    kept = sizes > _SMALLEST_EIGENVALUE * max(sizes.max(), np.finfo(float).tiny)
+    return scaled @ (directions[:, kept] / np.sqrt(sizes[kept]))
+
+
+def gram(columns: np.ndarray, basis: np.ndarray, weight_in_basis: float = 0.0) -> np.ndarray:
+    """Inner products (m, m) of the columns (n, m), the part inside the basis weighted down."""
+    return columns.T @ columns - (1 - weight_in_basis) * gram_inside(columns, basis)
+
+
+def gram_inside(columns: np.ndarray, basis: np.ndarray) -> np.ndarray:
+    """Inner products (m, m) of the columns' parts inside an orthonormal basis (n, k)."""
+    inside = basis.T @ columns
+    return inside.T @ inside
+
+
+def solve_damped(normal: np.ndarray, right: np.ndarray, damping: float) -> np.ndarray:
+    """Solve (A + damping diag A) x = b, robust against parameters without influence."""
+    diagonal = np.diag(normal).copy()
+    floor = max(_WEAKEST_INFLUENCE * diagonal.max(), np.finfo(float).tiny)
+    scale = np.sqrt(np.maximum(diagonal, floor))
+    scaled = normal / np.outer(scale, scale) + damping * np.eye(len(normal))
+    return np.linalg.lstsq(scaled, right / scale, rcond=1e-9)[0] / scale

@@ -1,0 +1,195 @@
+"""Nested tests of what single scans add: datum, gain, bow, registration, line offsets.
+
+A term is accepted for what *varies* between scans: the part common to all scans, estimated on the
+other folds, is given to the comparison model too, because it may belong to the process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from litho_models.effects import Effect, get_effect
+from litho_models.loop.confirming import BINOMIAL_P, Confirmation, confirm_variance, one_sided_flip_p
+from litho_models.loop.fields import Field
+from litho_models.loop.scoring import TERMS_OF, Score, Terms, score, term_maps
+from litho_models.metrics import NM_PER_UM, bootstrap_interval, paired_difference
+from litho_models.nuisance import least_squares
+
+# Terms whose mean over scans could be a property of the process.
+_SHARED = {"gain", "bow"}
+
+
+@dataclass(frozen=True)
+class MeasurementTest:
+    """One nested step: per-scan terms without and with those of ``effect``.
+
+    ``spread``: parameter name to (standard deviation over scans, unit); ``evidence`` is a sentence.
+    """
+
+    effect: Effect
+    before: Score
+    after: Score
+    confirmation: Confirmation
+    p_screen: float
+    spread: dict[str, tuple[float, tuple[float, float], str]]
+    evidence: str
+
+
+def measurement_tests(
+    fields: Sequence[Field],
+    predictions: Sequence[np.ndarray],
+    fold_of: np.ndarray,
+    *,
+    floor_nm2: float,
+    seed: int,
+) -> list[MeasurementTest]:
+    """Test each per-scan effect given those accepted before it; line offsets against the columns."""
+    accepted: Terms = frozenset()
+    tests = []
+    for name, term in TERMS_OF.items():
+        if term == "rows":
+            test = _test_lines(fields, predictions, accepted, floor_nm2, seed)
+        else:
+            test = _test_term(name, term, fields, predictions, fold_of, accepted, floor_nm2, seed)
+        tests.append(test)
+        # The datum is free in every later comparison, whatever this test says.
+        if test.confirmation.passed or name == "datum-offset":
+            accepted |= {term}
+    return tests
+
+
+def scan_parameters(fields: Sequence[Field], predictions: Sequence[np.ndarray], terms: Terms) -> np.ndarray:
+    """Smooth per-scan coefficients (scans, k) at the sampled pixels, in the order of ``term_maps``, µm."""
+    return np.stack([_coefficients(f, p, terms) for f, p in zip(fields, predictions, strict=True)])
+
+
+def _test_term(
+    name: str,
+    term: str,
+    fields: Sequence[Field],
+    predictions: Sequence[np.ndarray],
+    fold_of: np.ndarray,
+    accepted: Terms,
+    floor_nm2: float,
+    seed: int,
+) -> MeasurementTest:
+    effect, terms = get_effect(name), accepted | {term}
+    coefficients = scan_parameters(fields, predictions, terms)
+    own = _own_terms(terms, accepted)
+    reference = list(predictions)
+    if term in _SHARED:
+        for i, prediction in enumerate(predictions):
+            shared = coefficients[fold_of != fold_of[i]].mean(axis=0)[own]
+            reference[i] = prediction + np.tensordot(shared, term_maps(prediction, terms)[own], axes=1)
+    before = score(fields, reference, accepted, seed)
+    after = score(fields, predictions, terms, seed)
+    spread = {}
+    for parameter, column in zip(effect.parameters, own, strict=True):
+        values = coefficients[:, column]
+        interval = _spread_interval(values, seed)
+        spread[parameter] = (
+            float(values.std(ddof=min(1, len(values) - 1))),
+            interval,
+            effect.parameters[parameter].unit,
+        )
+    return MeasurementTest(
+        effect=effect,
+        before=before,
+        after=after,
+        confirmation=_confirm(before, after, floor_nm2, seed),
+        p_screen=paired_difference(before.mse_nm2.tolist(), after.mse_nm2.tolist(), seed=seed).p,
+        spread=spread,
+        evidence=_sentence(before, after),
+    )
+
+
+def _test_lines(
+    fields: Sequence[Field], predictions: Sequence[np.ndarray], accepted: Terms, floor_nm2: float, seed: int
+) -> MeasurementTest:
+    effect, terms = get_effect("scan-line-stripes"), accepted | {"rows"}
+    before = score(fields, predictions, accepted, seed, stripes=True)
+    after = score(fields, predictions, terms, seed)
+    turned = [_turned(field) for field in fields]
+    turned_predictions = [p.T for p in predictions]
+    control_before = score(turned, turned_predictions, accepted, seed, stripes=True)
+    control_after = score(turned, turned_predictions, terms, seed)
+    rows, columns = before.mse_nm2 - after.mse_nm2, control_before.mse_nm2 - control_after.mse_nm2
+    confirmation = _confirm(before, after, floor_nm2, seed)
+    excess_p = one_sided_flip_p(rows - columns)
+    if excess_p > BINOMIAL_P:
+        excess = f"rows gain no more than columns (p = {excess_p:.3f})"
+        reason = "; ".join(part for part in (confirmation.reason, excess) if part)
+        confirmation = replace(confirmation, passed=False, reason=reason)
+    variance = np.maximum(rows, 0) / NM_PER_UM**2
+    low, high = bootstrap_interval(variance.tolist(), seed=seed)
+    return MeasurementTest(
+        effect=effect,
+        before=before,
+        after=after,
+        confirmation=confirmation,
+        p_screen=excess_p,
+        spread={
+            "sd_um": (float(np.sqrt(variance.mean())), (float(np.sqrt(low)), float(np.sqrt(high))), "µm")
+        },
+        evidence=(
+            f"line offsets, estimated on half of the columns, remove {rows.mean():.1f} nm² on the other "
+            "half; "
+            f"offsets of the columns, treated alike, {columns.mean():.1f} nm²"
+        ),
+    )
+
+
+def _confirm(before: Score, after: Score, floor_nm2: float, seed: int) -> Confirmation:
+    return confirm_variance(
+        before.residual_um,
+        after.residual_um,
+        (before.mse_nm2, before.mae_nm),
+        (after.mse_nm2, after.mae_nm),
+        floor_nm2=floor_nm2,
+        seed=seed,
+    )
+
+
+def _coefficients(field: Field, prediction: np.ndarray, terms: Terms) -> np.ndarray:
+    maps = term_maps(prediction, terms)
+    design = np.stack([field.at_sample(m) for m in maps])
+    return least_squares(design, field.height - field.at_sample(prediction))
+
+
+def _own_terms(terms: Terms, accepted: Terms) -> list[int]:
+    """Columns of ``term_maps(…, terms)`` that ``accepted`` does not have."""
+    sizes = {"offset": 1, "gain": 1, "bow": 5, "warp": 6}
+    own, at = [], 0
+    for name, size in sizes.items():
+        if name in terms or (name == "offset" and terms):
+            if name not in accepted and name in terms:
+                own += list(range(at, at + size))
+            at += size
+    return own
+
+
+def _spread_interval(values: np.ndarray, seed: int) -> tuple[float, float]:
+    """Bootstrap interval over scans of the standard deviation between scans."""
+    if len(values) < 2:
+        return (0.0, 0.0)
+    draws = np.random.default_rng(seed).integers(0, len(values), size=(2000, len(values)))
+    low, high = np.quantile(values[draws].std(axis=1, ddof=1), [0.025, 0.975])
+    return float(low), float(high)
+
+
+def _sentence(before: Score, after: Score) -> str:
+    return (
+        f"RMSE on pixels not fitted {before.rmse_nm:.2f} -> {after.rmse_nm:.2f} nm "
+        f"with {after.degrees_of_freedom:.0f} instead of {before.degrees_of_freedom:.0f} terms per scan"
+    )
+
+
+def _turned(field: Field) -> Field:
+    """The scan with rows and columns exchanged, its columns taken as scan lines."""
+    ny, nx = field.usable.shape
+    scan = replace(field.scan, height_um=field.scan.height_um.T)
+    line = np.broadcast_to(np.arange(nx)[:, None], (nx, ny))
+    return replace(field, scan=scan, usable=field.usable.T, line=line)

@@ -1,0 +1,293 @@
+"""From what the loop found to ``close_loop.json``: verdicts, estimates with intervals, shares."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from litho_models.effects import CATALOGUE, Effect
+from litho_models.loop.closing import Closed
+from litho_models.loop.confirming import FEWEST_SCANS
+from litho_models.loop.fitting import effect_slots
+from litho_models.loop.measurement import MeasurementTest
+from litho_models.loop.result import (
+    AddedEffect,
+    Candidate,
+    CandidateVerdict,
+    CloseLoop,
+    Dataset,
+    Errors,
+    NoiseFloor,
+    Nuisance,
+    ParameterEstimate,
+    Residual,
+    Shares,
+    Split,
+    Verdict,
+)
+from litho_models.loop.scoring import DATUM_FREE, Score
+from litho_models.loop.screening import FAMILY_P, SMALLEST_RETAINED, Screened
+from litho_models.loop.search import Added, separating_experiment
+from litho_models.nuisance import BLOCK_PX
+from litho_models.run_info import run_info
+
+# Their parameters lie in the span of what every scan may add: nested tests, error without other fits.
+_SPAN_EFFECTS = {"datum-offset", "z-gain", "tilt-bow"}
+_NO_TERMS: frozenset[str] = frozenset()
+
+
+def summarise(closed: Closed, *, dataset: tuple[str, str], base_name: str, dropped: list[str]) -> CloseLoop:
+    """The result record of one run.
+
+    Args:
+        closed: what the loop found.
+        dataset: name and SHA-256 of the store; ``base_name``: the base model.
+        dropped: scans left out, with reason.
+    """
+    locked = closed.locked_scores
+    effects = _added(closed)
+    tested = [e for e in effects if e.name not in _span_names()]
+    structured = closed.structured
+    verdict: Verdict = "traced" if tested else "unexplained" if structured else "nothing-missing"
+    floor_rms, floor_mae = closed.floor_nm
+    return CloseLoop(
+        schema=CloseLoop.SCHEMA,
+        run=run_info([closed.config.seed], len(closed.development) + len(closed.locked), dropped),
+        dataset=Dataset(name=dataset[0], sha256=dataset[1]),
+        base_model=base_name,
+        split=Split(folds=int(closed.fold_of.max()) + 1, lock_box=[f.id for f in closed.locked]),
+        nuisance=Nuisance(block_px=BLOCK_PX, seed=closed.config.seed),
+        prior_hypotheses=list(closed.config.prior_hypotheses),
+        noise_floor=NoiseFloor(
+            mae_nm=floor_mae,
+            rmse_nm=floor_rms,
+            kind="lower-bound",
+            source="second differences along x of the held-out residual: blind to correlated roughness",
+        ),
+        before=_errors(
+            closed.errors(closed.base, _NO_TERMS), closed.errors(closed.base, DATUM_FREE), closed.config.seed
+        ),
+        after=_errors(
+            closed.errors(closed.final, _NO_TERMS),
+            closed.errors(closed.final, closed.terms),
+            closed.config.seed,
+        ),
+        locked_before=_errors(*locked[0], closed.config.seed) if locked else None,
+        locked_after=_errors(*locked[1], closed.config.seed) if locked else None,
+        effects=effects,
+        candidates=_candidates(closed, {e.name for e in effects}),
+        shares=_shares(closed),
+        residual=Residual(
+            state="unexplained" if structured else "undecided",
+            signature="; ".join(
+                f"follows {t.name} (p = {t.p:.4f}, {100 * t.share:.1f} % of the squared error)"
+                for t in sorted(structured, key=lambda t: -t.share)
+            ),
+        ),
+        verdict=verdict,
+    )
+
+
+def _span_names() -> set[str]:
+    return {name for name, effect in CATALOGUE.items() if effect.per_scan}
+
+
+def _errors(without_fit: Score, datum_free: Score, seed: int) -> Errors:
+    return Errors(
+        mae_abs_nm=without_fit.mean_mae_nm,
+        mae_datum_free_nm=datum_free.mean_mae_nm,
+        mae_datum_free_ci95_nm=datum_free.interval_nm(seed),
+        rmse_datum_free_nm=datum_free.rmse_nm,
+    )
+
+
+def _added(closed: Closed) -> list[AddedEffect]:
+    """Measurement terms seen from the start, then the process effects, then terms seen only after them."""
+    first = {t.effect.name: t for t in closed.first_tests if t.confirmation.passed}
+    last = {t.effect.name: t for t in closed.last_tests if t.confirmation.passed}
+    early = [_added_measurement(closed, first[name]) for name in first if name in last]
+    late = [_added_measurement(closed, last[name]) for name in last if name not in first]
+    return early + [_added_process(closed, entry) for entry in closed.search.added] + late
+
+
+def _added_measurement(closed: Closed, test: MeasurementTest) -> AddedEffect:
+    effect = test.effect
+    return AddedEffect(
+        name=effect.name,
+        stage=effect.stage,
+        role=effect.role,
+        verdict="explained",
+        prior_hypothesis=effect.name in closed.config.prior_hypotheses,
+        parameters={
+            name if name.startswith("sd") else f"{name}_sd_between_scans": ParameterEstimate(
+                value=value, unit=unit, ci95=interval
+            )
+            for name, (value, interval, unit) in test.spread.items()
+        },
+        metric="mae_abs" if effect.name in _SPAN_EFFECTS else "mae_datum_free",
+        before_nm=test.before.mean_mae_nm,
+        after_nm=test.after.mean_mae_nm,
+        gain_ci95_nm=test.confirmation.gain_ci95_nm,
+        p_screen=test.p_screen,
+        p_confirm=test.confirmation.p,
+        scans_improved=test.confirmation.improved,
+        confusable_with=[],
+        separating_experiment=effect.separating,
+    )
+
+
+def _added_process(closed: Closed, entry: Added) -> AddedEffect:
+    effect = entry.effect
+    return AddedEffect(
+        name=effect.name,
+        stage=effect.stage,
+        role=effect.role,
+        verdict="confusable" if entry.confusable_with else "explained",
+        prior_hypothesis=effect.name in closed.config.prior_hypotheses,
+        parameters=parameter_estimates(closed, effect),
+        metric="mae_datum_free",
+        before_nm=entry.before.mean_mae_nm,
+        after_nm=entry.after.mean_mae_nm,
+        gain_ci95_nm=entry.confirmation.gain_ci95_nm,
+        p_screen=entry.p_screen,
+        p_confirm=entry.confirmation.p,
+        scans_improved=entry.confirmation.improved,
+        confusable_with=entry.confusable_with,
+        separating_experiment=separating_experiment([effect.name, *entry.confusable_with]),
+    )
+
+
+def parameter_estimates(closed: Closed, effect: Effect) -> dict[str, ParameterEstimate]:
+    """Final values on all development scans, intervals from the spread over scans; choices have none."""
+    from scipy.stats import t
+
+    fits = closed.final.fits
+    slots = effect_slots(fits.chain)
+    reach = float(t.ppf(0.975, max(len(closed.development) - 1, 1)))
+    choices = fits.chain.values()[effect.name]
+    estimates = {}
+    for name, parameter in effect.parameters.items():
+        if (effect.name, name) not in slots:
+            estimates[name] = ParameterEstimate(value=choices[name], unit=parameter.unit, ci95=None)
+            continue
+        slot = slots[effect.name, name]
+        value, half = float(fits.common[slot]), reach * math.sqrt(max(fits.covariance[slot, slot], 0.0))
+        estimates[name] = ParameterEstimate(
+            value=value, unit=parameter.unit, ci95=(value - half, value + half)
+        )
+    return estimates
+
+
+def _candidates(closed: Closed, added: set[str]) -> list[Candidate]:
+    rows = []
+    tests = {t.effect.name: t for t in closed.first_tests} | {t.effect.name: t for t in closed.last_tests}
+    sets = {name: entry for entry in closed.search.added for name in entry.confusable_with}
+    for name in [*CATALOGUE, *(n for n in closed.untestable if n not in CATALOGUE)]:
+        if name in tests:
+            rows.append(_measurement_candidate(closed, tests[name], name in added))
+        elif name in closed.untestable:
+            rows.append(
+                Candidate(
+                    name=name,
+                    verdict="not-testable",
+                    reason=closed.untestable[name],
+                    p_screen=None,
+                    gain_nm=None,
+                )
+            )
+        else:
+            rows.append(_process_candidate(closed, name, added, sets))
+    return rows
+
+
+def _measurement_candidate(closed: Closed, test: MeasurementTest, added: bool) -> Candidate:
+    too_few = len(closed.development) < FEWEST_SCANS
+    reason = test.evidence if added else f"{test.evidence}; {test.confirmation.reason}"
+    return Candidate(
+        name=test.effect.name,
+        verdict="explained" if added else "not-testable" if too_few else "below-noise",
+        reason=reason,
+        p_screen=test.p_screen,
+        gain_nm=test.confirmation.gain_nm,
+    )
+
+
+def _process_candidate(closed: Closed, name: str, added: set[str], sets: dict[str, Added]) -> Candidate:
+    search = closed.search
+    entry = next((a for a in search.added if a.effect.name == name), None)
+    screened = search.last.get(name) or search.first.get(name)
+    first = search.first.get(name)
+    p = first.p if first else None
+    gain = predicted_gain_nm(closed, screened) if screened else None
+    verdict: CandidateVerdict
+    if entry is not None:
+        verdict = "confusable" if entry.confusable_with else "explained"
+        better, count = entry.confirmation.improved
+        reason = f"confirmed on {better} of {count} held-out scans"
+        gain = entry.confirmation.gain_nm
+    elif name in search.absorbed:
+        verdict, reason = "absorbed", search.absorbed[name]
+    elif name in sets:
+        verdict = "confusable"
+        reason = f"cannot be told from {sets[name].effect.name}, which was added"
+    elif screened is None:
+        verdict, reason = "not-testable", "not screened"
+    elif len(closed.development) < FEWEST_SCANS:
+        verdict = "not-testable"
+        reason = f"{len(closed.development)} scans to select and confirm on, at least {FEWEST_SCANS} needed"
+    elif screened.retained < SMALLEST_RETAINED:
+        verdict = "not-testable"
+        reason = "on these layouts it changes nothing that the base model or the per-scan terms do not"
+    elif wrong := next((s for s in (screened, first) if s and s.p <= FAMILY_P and not s.in_range), None):
+        verdict, reason = "contradicted", f"best value leaves the physical range: {_values(wrong)}"
+    else:
+        verdict, reason = "below-noise", _why_not(closed, name, screened)
+    return Candidate(name=name, verdict=verdict, reason=reason, p_screen=p, gain_nm=gain)
+
+
+def _why_not(closed: Closed, name: str, screened: Screened) -> str:
+    search = closed.search
+    first = search.first[name]
+    if name in search.dropped:
+        return search.dropped[name]
+    detectable = f"smallest detectable about {screened.detectable}"
+    if name in search.failures and screened.p <= FAMILY_P:
+        return f"stands out, but is not confirmed: {search.failures[name]}"
+    if screened.p <= FAMILY_P:
+        return "stands out, but others gained more and none further was confirmed"
+    if first.p <= FAMILY_P and search.added:
+        return f"stood out at first, gone once {search.added[0].effect.name} was added; {detectable}"
+    return f"no evidence (z = {screened.z:.1f}); {detectable}"
+
+
+def predicted_gain_nm(closed: Closed, screened: Screened) -> float:
+    """Gain in RMSE that the score test predicts for held-out scans, nm."""
+    mse = float(closed.errors(closed.final, closed.terms).mse_nm2.mean())
+    return math.sqrt(mse) - math.sqrt(max(mse - screened.mean_gain_nm2, 0.0))
+
+
+def _values(screened: Screened) -> str:
+    parameters = screened.effect.parameters
+    return ", ".join(
+        f"{name} {value:.3g} {parameters[name].unit}".removesuffix(" 1")
+        for name, value in screened.values.items()
+        if name in screened.effect.amplitudes
+    )
+
+
+def _shares(closed: Closed) -> Shares:
+    """Parts of the base model's squared error without any fit; they sum to 1."""
+    total = float(closed.errors(closed.base, _NO_TERMS).mse_nm2.mean())
+    freed = min(total, float(closed.errors(closed.base, closed.terms).mse_nm2.mean()))
+    left = min(freed, float(closed.errors(closed.final, closed.terms).mse_nm2.mean()))
+    floor = min(left, closed.floor_nm[0] ** 2)
+    parts = np.array([total - freed, freed - left, left - floor, floor]) / max(total, np.finfo(float).tiny)
+    return Shares(
+        nuisance=float(parts[0]),
+        effects=float(parts[1]),
+        traced=0.0,
+        masked_defects=0.0,
+        unexplained_structured=float(parts[2]),
+        noise_floor=float(parts[3]),
+    )

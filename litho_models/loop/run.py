@@ -1,0 +1,132 @@
+"""One run of the loop on a store: result, report, tables and the corrected model in one folder."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from litho_data.errors import InputError
+from litho_data.files import atomic_folder
+from litho_data.outputs import require_replaceable_folder
+from litho_data.store import Store, open_store
+from litho_models.effects import get_effect
+from litho_models.freeze import save_frozen
+from litho_models.loop.closing import Closed, LoopConfig, close_loop, corrected_chain
+from litho_models.loop.exporting import exported_effects, write_measurement_model
+from litho_models.loop.fitting import is_stiff
+from litho_models.loop.flexible import Trainer
+from litho_models.loop.outcome import summarise
+from litho_models.loop.reporting import write_report
+from litho_models.loop.result import CloseLoop
+from litho_models.models import MODELS, build_model
+from litho_models.simulator import Simulator
+
+MODEL_FOLDER, MEASUREMENT_FILE = "model", "measurement_model.json"
+
+
+def close_loop_on_store(
+    store: str | Path,
+    out: str | Path,
+    *,
+    base: str = "physics",
+    config: LoopConfig | None = None,
+    report: Callable[[str], None] = lambda message: None,
+) -> CloseLoop:
+    """Close the loop on a dataset store and write everything to ``out``, which appears when complete.
+
+    Args:
+        store: a store made by ``litho-data build``.
+        base: name of a model, or the folder of a frozen one.
+        config: settings; ``report`` is told what happens, a sentence at a time.
+
+    Raises:
+        InputError: no store, no such base, a base of another pitch, or too few usable scans.
+    """
+    require_replaceable_folder(
+        out, CloseLoop.FILE_NAME, "report.html", "*.csv", MODEL_FOLDER, MEASUREMENT_FILE
+    )
+    opened = open_store(store)
+    simulator, name = _base_model(base, opened)
+    scans = opened.scans()
+    usable = [scan for scan in scans if np.count_nonzero(scan.valid & np.isfinite(scan.height_um)) >= 1024]
+    kept = {scan.id for scan in usable}
+    dropped = [f"{scan.id}: fewer than 1024 measured pixels" for scan in scans if scan.id not in kept]
+    trainer = _trainer(base, config) if base in MODELS and not is_stiff(simulator) else None
+    closed = close_loop(usable, simulator, config, trainer=trainer, report=report)
+    result = summarise(closed, dataset=(opened.name, opened.sha256), base_name=name, dropped=dropped)
+    with atomic_folder(out) as folder:
+        result.write(folder)
+        write_report(closed, result, folder)
+        _save_process_model(closed, result, folder / MODEL_FOLDER)
+        write_measurement_model(closed, result, folder / MEASUREMENT_FILE)
+    return result
+
+
+def parse_priors(text: str | None) -> tuple[str, ...]:
+    """Effect names from a comma-separated list or from a file with one name per line (# starts a comment).
+
+    Raises:
+        InputError: a name that is not in the catalogue.
+    """
+    if not text:
+        return ()
+    if Path(text).is_file():
+        lines = Path(text).read_text(encoding="utf-8").splitlines()
+        names: Sequence[str] = [line.split("#")[0].strip() for line in lines]
+    else:
+        names = [part.strip() for part in text.split(",")]
+    return tuple(get_effect(name).name for name in names if name)
+
+
+def _trainer(base: str, config: LoopConfig | None) -> Trainer:
+    from litho_models.training import TrainingConfig, fit
+
+    settings = TrainingConfig.of_recipe("fast", base, seed=config.seed if config else 0)
+    return lambda scans: fit(base, scans, settings)
+
+
+def _base_model(base: str, store: Store) -> tuple[Simulator, str]:
+    if base in MODELS:
+        model = build_model(
+            base, pitch_um=store.pitch_um, level_height_um=store.level_height_um, levels=store.levels
+        )
+        return model, base
+    folder = Path(base)
+    if not folder.is_dir():
+        raise InputError("base model", got=repr(base), wanted=f"a model folder or one of {', '.join(MODELS)}")
+    from litho_models.freeze import ModelCard, load_simulator
+
+    card = ModelCard.read(folder)
+    if abs(card.pitch_um - store.pitch_um) > 1e-9:
+        raise InputError(f"pitch of {base}", got=f"{card.pitch_um:g} µm", wanted=f"{store.pitch_um:g} µm")
+    return load_simulator(folder, card), card.name
+
+
+def _save_process_model(closed: Closed, result: CloseLoop, folder: Path) -> None:
+    chain = corrected_chain(closed)
+    groups = exported_effects(chain, result)
+    assert isinstance(chain.base, Simulator)
+    save_frozen(
+        chain.base,
+        folder,
+        name=f"{result.base_model}, loop closed",
+        process_effects=groups["process"],
+        measurement_effects=groups["measurement"],
+        undetermined_effects=groups["undetermined"],
+        dataset=result.dataset.model_dump(),
+        command=result.run.command,
+        split=result.split.model_dump(),
+        nuisance=result.nuisance.model_dump(),
+        noise_floor=result.noise_floor.model_dump(),
+        confusable_sets=[[e.name, *e.confusable_with] for e in result.effects if e.confusable_with],
+        unexplained_fraction=result.shares.unexplained_structured,
+        metrics=[
+            {"name": f"mae_{kind}", "value": value, "split": "grouped", "policy": policy}
+            for kind, value, policy in (
+                ("abs", result.after.mae_abs_nm, "none"),
+                ("datum_free", result.after.mae_datum_free_nm, "offset and accepted measurement effects"),
+            )
+        ],
+    )

@@ -1,0 +1,141 @@
+"""Held-out error of predictions, freed of chosen per-scan terms that were fitted on other pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from litho_models.loop.fields import Field
+from litho_models.metrics import NM_PER_UM, bootstrap_interval
+from litho_models.nuisance import (
+    Half,
+    calibration_blocks,
+    calibration_stripes,
+    least_squares,
+    nuisance_basis,
+    shrunk_line_offsets,
+)
+
+# Per-scan terms by the measurement effect that they stand for, in the order in which they are tested.
+TERMS_OF = {
+    "datum-offset": "offset",
+    "z-gain": "gain",
+    "tilt-bow": "bow",
+    "registration-residual": "warp",
+    "scan-line-stripes": "rows",
+}
+
+Terms = frozenset[str]
+DATUM_FREE: Terms = frozenset({"offset"})
+
+
+@dataclass(frozen=True)
+class Score:
+    """Errors of one set of predictions, one entry per scan, nm, and the residual maps, µm."""
+
+    mae_nm: np.ndarray
+    mse_nm2: np.ndarray
+    degrees_of_freedom: float
+    residual_um: list[np.ndarray]
+
+    @property
+    def mean_mae_nm(self) -> float:
+        return float(self.mae_nm.mean())
+
+    @property
+    def rmse_nm(self) -> float:
+        return float(np.sqrt(self.mse_nm2.mean()))
+
+    def interval_nm(self, seed: int = 0) -> tuple[float, float]:
+        """Bootstrap interval over scans of the mean absolute error."""
+        low, high = bootstrap_interval(self.mae_nm.tolist(), seed=seed)
+        return low, high
+
+
+def score(
+    fields: Sequence[Field],
+    predictions: Sequence[np.ndarray],
+    terms: Terms,
+    seed: int,
+    *,
+    stripes: bool | None = None,
+) -> Score:
+    """Score predictions (y, x) µm; ``stripes`` forces alternate column stripes as the two halves."""
+    maps, freedom = [], []
+    for field, prediction in zip(fields, predictions, strict=True):
+        residual, dof = cross_fit(
+            field, prediction, terms, seed, stripes="rows" in terms if stripes is None else stripes
+        )
+        maps.append(residual)
+        freedom.append(dof)
+    values = [m[np.isfinite(m)] * NM_PER_UM for m in maps]
+    return Score(
+        mae_nm=np.array([np.abs(v).mean() for v in values]),
+        mse_nm2=np.array([(v**2).mean() for v in values]),
+        degrees_of_freedom=float(np.mean(freedom)),
+        residual_um=maps,
+    )
+
+
+def cross_fit(
+    field: Field, prediction: np.ndarray, terms: Terms, seed: int, *, stripes: bool
+) -> tuple[np.ndarray, float]:
+    """Residual (y, x) µm, NaN where not scored, with the terms fitted on the other half; and their number."""
+    difference = np.where(field.usable, field.scan.height_um - prediction, 0.0).astype(np.float64)
+    residual = np.full(difference.shape, np.nan)
+    basis = term_maps(prediction, terms)
+    if not terms:
+        residual[field.usable] = difference[field.usable]
+        return residual, 0.0
+    freedom = []
+    for half in _halves(difference.shape, seed, stripes):
+        calibrate, scored = half.calibrate & field.usable, half.score & field.usable
+        nuisance = np.tensordot(least_squares(basis[:, calibrate], difference[calibrate]), basis, axes=1)
+        dof = float(len(basis))
+        if "rows" in terms:
+            offsets, weight, _ = shrunk_line_offsets(difference - nuisance, calibrate, field.line)
+            nuisance = nuisance + offsets[field.line]
+            dof += float(weight.sum())
+        residual[scored] = (difference - nuisance)[scored]
+        freedom.append(dof)
+    return residual, float(np.mean(freedom))
+
+
+@lru_cache(maxsize=8)
+def _halves(shape: tuple[int, int], seed: int, stripes: bool) -> tuple[Half, Half]:
+    return (calibration_stripes if stripes else calibration_blocks)(shape, seed=seed)
+
+
+def term_maps(prediction: np.ndarray, terms: Terms) -> np.ndarray:
+    """The smooth per-scan terms as maps (k, y, x)."""
+    offset, gain, *bow = nuisance_basis(prediction, "full")
+    chosen = [offset] if terms else []
+    if "gain" in terms:
+        chosen.append(gain)
+    if "bow" in terms:
+        chosen += bow
+    if "warp" in terms:
+        x, y = bow[0], bow[1]
+        for slope in np.gradient(prediction.astype(np.float64)):
+            chosen += [slope, slope * y, slope * x]
+    return np.stack(chosen) if chosen else np.empty((0, *prediction.shape))
+
+
+def names_to_terms(effects: Sequence[str]) -> Terms:
+    """Per-scan terms that the accepted measurement effects stand for."""
+    return frozenset(TERMS_OF[name] for name in effects if name in TERMS_OF)
+
+
+def scan_parameter_names(terms: Terms) -> list[str]:
+    """Names of the smooth per-scan terms, in the order of ``term_maps``; coordinates run from -1 to 1."""
+    names = ["offset (nm)"] if terms else []
+    if "gain" in terms:
+        names.append("gain")
+    if "bow" in terms:
+        names += [f"{power} (nm)" for power in ("x", "y", "x²", "xy", "y²")]
+    if "warp" in terms:
+        names += [f"shift {axis}{by} (px)" for axis in ("y", "x") for by in ("", " by y", " by x")]
+    return names

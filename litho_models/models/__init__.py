@@ -1,0 +1,38 @@
+"""All models by name."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from litho_data.errors import InputError
+from litho_models.models.affine import Affine
+from litho_models.models.affine_mtf import AffineMtf
+from litho_models.models.blur_table import BlurTable
+from litho_models.models.identity import Identity
+from litho_models.models.linear import Linear
+from litho_models.models.pbl import Pbl
+from litho_models.models.physics import Physics
+from litho_models.simulator import Simulator, Variant
+
+__all__ = ["MODELS", "build_model", "model_class"]
+
+MODELS: dict[str, type[Simulator]] = {
+    model.name: model for model in (Identity, Affine, AffineMtf, BlurTable, Linear, Physics, Pbl)
+}
+
+
+def model_class(name: str) -> type[Simulator]:
+    """The class of a model name.
+
+    Raises:
+        InputError: unknown name.
+    """
+    if name not in MODELS:
+        raise InputError("model", got=repr(name), wanted=", ".join(MODELS))
+    return MODELS[name]
+
+
+def build_model(name: str, variant: Variant = "default", **fields: Any) -> Simulator:
+    """An untrained model; ``fields`` are config fields (geometry, hyper-parameters)."""
+    model = model_class(name)
+    return model(model.Config.of_variant(variant, **fields))

@@ -1,0 +1,180 @@
+"""PBL: physics-based learning, the paper's simulator with networks at its unknown places.
+
+arXiv:2309.17343, equation of the chained sub-models and the appendix "More details on the PBL
+model": optical blur of fixed width, pointwise network (exposure threshold), diffusion blur of
+learned width, pointwise network (shrinkage), areawise network (what is left).
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+from typing import Any, ClassVar, cast
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+from torch.nn import functional
+
+from litho_models.gaussian import Edge, blur_interior, kernel_radius_px, pad_field
+from litho_models.lookup import PointwiseNet
+from litho_models.simulator import Simulator, SimulatorConfig, crop_border
+
+
+class PblConfig(SimulatorConfig):
+    sigma_optical_um: float = Field(0.2, gt=0, description="optical spot, standard deviation, µm")
+    sigma_diffusion_max_um: float = Field(2.5, gt=0, description="η, upper bound of the diffusion, µm")
+    # Wider than the areawise network sees (0.5 µm): what it starts with is what it alone can learn.
+    sigma_diffusion_init_um: float = Field(1.5, gt=0, description="diffusion before training, µm")
+    pointwise_channels: tuple[int, ...] = (128, 64)
+    areawise_channels: tuple[int, ...] = (64, 64, 32, 32)
+    leaky_slope: float = Field(0.02, ge=0)
+    # Start as the optically blurred layout and learn what differs; the paper's networks start at random.
+    starts_as_blur: bool = True
+    kernel_cap_px: int | None = Field(None, description="largest kernel radius; None keeps four sigma")
+    blur_modulus: bool = Field(False, description="absolute value after the diffusion blur")
+    edge: Edge = "replicate"
+    knots: int = Field(1025, ge=0, description="points of a pointwise network; 0 evaluates it per pixel")
+
+    VARIANT_FIELDS: ClassVar[dict[str, dict[str, Any]]] = {
+        "paper": {"starts_as_blur": False, "edge": "zero"},
+        "authors": {
+            "starts_as_blur": False,
+            "edge": "zero",
+            "leaky_slope": 0.2,
+            "sigma_diffusion_init_um": 2.5 / (1 + math.exp(-2.5)),
+            "kernel_cap_px": 50,
+            "blur_modulus": True,
+        },
+    }
+
+
+class Pbl(Simulator):
+    """H = g_mismatch(Ĥ · g_shrink(Ĥ * h_diffusion)) with Ĥ = g_thresh(M * h_optical), heights in µm.
+
+    With ``starts_as_blur`` the three networks learn a difference: g_thresh(I) = I + net(I),
+    g_shrink = 1 + net, g_mismatch(H) = H + net(H), last layers zero at the start.
+    """
+
+    name = "pbl"
+    Config = PblConfig
+    config: PblConfig
+    is_small = False
+
+    def __init__(self, config: PblConfig):
+        super().__init__(config)
+        slope = config.leaky_slope
+        self.thresh = PointwiseNet(config.pointwise_channels, slope, config.knots)
+        self.shrink = PointwiseNet(config.pointwise_channels, slope, config.knots)
+        self.mismatch = AreawiseNet(config.areawise_channels, slope)
+        ratio = config.sigma_diffusion_init_um / config.sigma_diffusion_max_um
+        self.tau = nn.Parameter(torch.tensor(math.log(ratio / (1 - ratio))))
+        if config.starts_as_blur:
+            for part in (self.thresh, self.shrink, self.mismatch):
+                part.start_at_zero()
+
+    @property
+    def sigma_diffusion_um(self) -> Tensor:
+        """η / (1 + exp(-τ)), µm."""
+        return self.config.sigma_diffusion_max_um * torch.sigmoid(self.tau)
+
+    @property
+    def reach_px(self) -> int:
+        return sum(self._radii_px()) + self.mismatch.reach_px
+
+    def interior(self, layout_um: Tensor) -> Tensor:
+        optical, diffusion = self._radii_px()
+        initial = self._threshold(self._blur(layout_um, self._sigma_optical(layout_um), optical))
+        dose = self._blur(initial, self.sigma_diffusion_um, diffusion)
+        return self._develop(crop_border(initial, diffusion), dose)
+
+    def forward(self, layout_um: Tensor) -> Tensor:
+        """Height of the whole field, (batch, 1, y, x) µm."""
+        if self.config.edge == "replicate":
+            return super().forward(layout_um)
+        optical, diffusion = self._radii_px()
+        padded = pad_field(layout_um, optical, optical, "zero")
+        initial = self._threshold(self._blur(padded, self._sigma_optical(layout_um), optical))
+        padded = pad_field(initial, diffusion, diffusion, "zero")
+        return self._develop(initial, self._blur(padded, self.sigma_diffusion_um, diffusion), padding=1)
+
+    def _sigma_optical(self, layout_um: Tensor) -> Tensor:
+        return torch.tensor(self.config.sigma_optical_um, device=layout_um.device)
+
+    def _radii_px(self) -> tuple[int, int]:
+        diffusion = float(self.sigma_diffusion_um.detach())
+        radii = [
+            kernel_radius_px(sigma / self.pitch_um) for sigma in (self.config.sigma_optical_um, diffusion)
+        ]
+        cap = self.config.kernel_cap_px
+        optical, diffused = radii if cap is None else [min(radius, cap) for radius in radii]
+        return optical, diffused
+
+    def _blur(self, field: Tensor, sigma_um: Tensor, radius_px: int) -> Tensor:
+        return blur_interior(field, sigma_um / self.pitch_um, radius_px)
+
+    def _threshold(self, aerial: Tensor) -> Tensor:
+        full = self.config.full_height_um
+        change = self.thresh(aerial, 0.0, full) if self.config.knots else self.thresh.exact(aerial)
+        return aerial + change if self.config.starts_as_blur else change
+
+    def _develop(self, initial: Tensor, dose: Tensor, padding: int = 0) -> Tensor:
+        dose = dose.abs() if self.config.blur_modulus else dose
+        remaining = self._shrink_by_table(dose) if self.config.knots else self.shrink.exact(dose)
+        product = initial * (1 + remaining) if self.config.starts_as_blur else initial * remaining
+        height = self.mismatch(product, padding)
+        if not self.config.starts_as_blur:
+            return height
+        return height + (product if padding else crop_border(product, self.mismatch.reach_px))
+
+    def _shrink_by_table(self, dose: Tensor) -> Tensor:
+        # A blur averages, so the dose cannot leave the range of what was blurred; the range of the
+        # threshold network is that of its own knots and does not depend on the image.
+        full = self.config.full_height_um
+        knots = torch.linspace(0.0, full, self.config.knots, device=dose.device, dtype=dose.dtype)
+        reachable = self.thresh.at_knots(0.0, full).detach()
+        reachable = reachable + knots if self.config.starts_as_blur else reachable
+        lowest, highest = float(reachable.min()), float(reachable.max())
+        if self.config.edge == "zero":
+            lowest, highest = min(lowest, 0.0), max(highest, 0.0)
+        if self.config.blur_modulus:
+            lowest, highest = 0.0, max(abs(lowest), abs(highest))
+        if highest - lowest < torch.finfo(dose.dtype).eps * full:
+            return self.shrink.exact(dose)
+        return self.shrink(dose, lowest, highest)
+
+
+class AreawiseNet(nn.Module):
+    """Stack of 3 x 3 convolutions, 1 -> channels -> 1, leaky ReLU after each but the last."""
+
+    def __init__(self, channels: tuple[int, ...], leaky_slope: float):
+        super().__init__()
+        widths = (1, *channels, 1)
+        convolutions = [nn.Conv2d(inputs, outputs, 3) for inputs, outputs in pairwise(widths)]
+        self.hidden = nn.ModuleList(convolutions[:-1])
+        self.last = convolutions[-1]
+        self.leaky_slope = leaky_slope
+        for convolution in convolutions:
+            weight = convolution.weight
+            weight.data = weight.data.contiguous(memory_format=torch.channels_last)
+
+    @property
+    def reach_px(self) -> int:
+        return len(self.hidden) + 1
+
+    def forward(self, height_um: Tensor, padding: int = 0) -> Tensor:
+        """Interior of (b, 1, y, x) without padding; the same size with a zero padding of 1 per layer."""
+        features = height_um.contiguous(memory_format=torch.channels_last)
+        for layer in cast(list[nn.Conv2d], list(self.hidden)):
+            features = functional.conv2d(features, layer.weight, layer.bias, padding=padding)
+            features = functional.leaky_relu(features, self.leaky_slope)
+        # The sum over channels is the height: full precision also where the stack runs in bfloat16.
+        with torch.autocast(device_type=height_um.device.type, enabled=False):
+            return functional.conv2d(
+                features.to(self.last.weight.dtype), self.last.weight, self.last.bias, padding=padding
+            )
+
+    def start_at_zero(self) -> None:
+        """Make the network the zero function, keeping its hidden layers random."""
+        nn.init.zeros_(self.last.weight)
+        nn.init.zeros_(cast(Tensor, self.last.bias))

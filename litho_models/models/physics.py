@@ -1,0 +1,127 @@
+"""Physics: the parameterised simulator of the paper, five values with a meaning each.
+
+Optical blur, normalised tanh projection (Zhou et al. 2014), diffusion blur, dose-dependent
+shrinkage, height bias; arXiv:2309.17343, appendix "Parameterized physics model".
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, ClassVar, Literal
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+from torch.nn import functional
+
+from litho_models.gaussian import Edge, blur_interior, gaussian_blur, kernel_radius_px
+from litho_models.simulator import Simulator, SimulatorConfig, crop_border
+
+Shrinkage = Literal["fixed-reference", "image-range", "image-maximum"]
+
+
+class PhysicsConfig(SimulatorConfig):
+    sigma_optical_um: float = Field(0.2, gt=0, description="optical spot, standard deviation, µm")
+    sigma_diffusion_max_um: float = Field(2.5, gt=0, description="upper bound of the diffusion, µm")
+    # The start matters: from a steep threshold in mid-range a fit ends where the projection is a line.
+    sigma_diffusion_init_um: float = Field(1.5, gt=0, description="diffusion before fitting, µm")
+    alpha_init: float = Field(1.0, gt=0, description="steepness of the projection")
+    eta_init: float = Field(0.1, gt=0, lt=1, description="threshold of the projection")
+    kappa_min_init: float = Field(0.5, gt=0, lt=1, description="remaining height at the lowest dose")
+    bias_init_um: float = Field(0.0, description="height bias, µm")
+    shrinkage: Shrinkage = "fixed-reference"
+    edge: Edge = "replicate"
+
+    VARIANT_FIELDS: ClassVar[dict[str, dict[str, Any]]] = {
+        "paper": {"shrinkage": "image-range"},
+        "authors": {
+            "shrinkage": "image-maximum",
+            "edge": "zero",
+            "sigma_diffusion_init_um": 2.5 / (1 + math.exp(-2.5)),
+            "eta_init": 1 / (1 + math.exp(-0.5)),
+            "kappa_min_init": 1 / (1 + math.exp(-0.5)),
+        },
+    }
+
+
+class Physics(Simulator):
+    """H = H₀ · Ĥ · S + b with Ĥ = projection(G_optical * M / H₀) and S from G_diffusion * Ĥ.
+
+    H₀ is the nominal full height. S = κ + (1 - κ) · u, u the diffused dose on 0 ... 1: against the
+    fixed reference 0 ... 1 (``default``), the range of the image (``paper``) or its maximum
+    (``authors``). The last two depend on the crop.
+    """
+
+    name = "physics"
+    Config = PhysicsConfig
+    config: PhysicsConfig
+
+    def __init__(self, config: PhysicsConfig):
+        super().__init__(config)
+        self.raw_alpha = nn.Parameter(torch.tensor(math.log(math.expm1(config.alpha_init))))
+        self.raw_eta = nn.Parameter(_logit(config.eta_init))
+        self.raw_kappa_min = nn.Parameter(_logit(config.kappa_min_init))
+        self.tau = nn.Parameter(_logit(config.sigma_diffusion_init_um / config.sigma_diffusion_max_um))
+        self.bias_um = nn.Parameter(torch.tensor(config.bias_init_um))
+
+    @property
+    def values(self) -> dict[str, Tensor]:
+        """The five physical values: alpha, eta, kappa_min, sigma_diffusion_um, bias_um."""
+        return {
+            "alpha": functional.softplus(self.raw_alpha),
+            "eta": torch.sigmoid(self.raw_eta),
+            "kappa_min": torch.sigmoid(self.raw_kappa_min),
+            "sigma_diffusion_um": self.config.sigma_diffusion_max_um * torch.sigmoid(self.tau),
+            "bias_um": self.bias_um,
+        }
+
+    @property
+    def reach_px(self) -> int | None:
+        if self.config.shrinkage != "fixed-reference":
+            return None
+        return sum(self._radii_px())
+
+    def interior(self, layout_um: Tensor) -> Tensor:
+        optical, diffusion = self._radii_px()
+        sigma_optical = torch.tensor(self.config.sigma_optical_um / self.pitch_um, device=layout_um.device)
+        aerial = blur_interior(layout_um / self.config.full_height_um, sigma_optical, optical)
+        initial = self._project(aerial)
+        dose = blur_interior(initial, self.values["sigma_diffusion_um"] / self.pitch_um, diffusion)
+        return self._develop(crop_border(initial, diffusion), dose)
+
+    def forward(self, layout_um: Tensor) -> Tensor:
+        """Height of the whole field, (batch, 1, y, x) µm."""
+        if self.reach_px is not None and self.config.edge == "replicate":
+            return super().forward(layout_um)
+        config = self.config
+        relative = layout_um / config.full_height_um
+        aerial = gaussian_blur(relative, config.sigma_optical_um, self.pitch_um, edge=config.edge)
+        initial = self._project(aerial)
+        dose = gaussian_blur(initial, self.values["sigma_diffusion_um"], self.pitch_um, edge=config.edge)
+        return self._develop(initial, dose)
+
+    def _radii_px(self) -> tuple[int, int]:
+        diffusion = float(self.values["sigma_diffusion_um"].detach())
+        return (
+            kernel_radius_px(self.config.sigma_optical_um / self.pitch_um),
+            kernel_radius_px(diffusion / self.pitch_um),
+        )
+
+    def _project(self, aerial: Tensor) -> Tensor:
+        alpha, eta = self.values["alpha"], self.values["eta"]
+        low = torch.tanh(alpha * eta)
+        return (low + torch.tanh(alpha * (aerial - eta))) / (low + torch.tanh(alpha * (1 - eta)))
+
+    def _develop(self, initial: Tensor, dose: Tensor) -> Tensor:
+        if self.config.shrinkage == "image-range":
+            lowest, highest = dose.amin((-2, -1), keepdim=True), dose.amax((-2, -1), keepdim=True)
+            dose = (dose - lowest) / (highest - lowest).clamp(min=torch.finfo(dose.dtype).eps)
+        elif self.config.shrinkage == "image-maximum":
+            dose = dose / dose.amax((-2, -1), keepdim=True).clamp(min=torch.finfo(dose.dtype).eps)
+        kappa_min = self.values["kappa_min"]
+        remaining = kappa_min + (1 - kappa_min) * dose
+        return self.config.full_height_um * initial * remaining + self.values["bias_um"]
+
+
+def _logit(probability: float) -> Tensor:
+    return torch.tensor(math.log(probability / (1 - probability)))

@@ -1,0 +1,36 @@
+"""What every result says about the run that made it."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from litho_data.provenance import code_record
+from litho_data.results import Record
+
+
+class RunInfo(Record):
+    """Command line, code and scans behind a result."""
+
+    command: str
+    commit: str
+    versions: dict[str, str]
+    seeds: list[int]
+    n_scans: int
+    dropped: list[str]
+
+
+def run_info(seeds: Sequence[int], n_scans: int, dropped: Sequence[str] = ()) -> RunInfo:
+    """The current run; ``dropped`` lists scans left out, with the reason."""
+    code = code_record()
+    program = Path(sys.argv[0]).name if sys.argv and sys.argv[0] else "python"
+    return RunInfo(
+        command=shlex.join([program, *sys.argv[1:]]),
+        commit=code["commit"] or "",
+        versions=code["versions"],
+        seeds=list(seeds),
+        n_scans=n_scans,
+        dropped=list(dropped),
+    )

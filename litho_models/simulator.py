@@ -1,0 +1,102 @@
+"""The contract of every model of the printer: layout in, printed height out."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar, Literal, Self, get_args
+
+from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor, nn
+
+from litho_data.errors import InputError
+from litho_models.gaussian import pad_field
+
+Variant = Literal["default", "paper", "authors"]
+VARIANTS: tuple[str, ...] = get_args(Variant)
+
+
+class SimulatorConfig(BaseModel):
+    """Geometry that the model is made for, and its variant; subclasses add their hyper-parameters.
+
+    ``VARIANT_FIELDS`` says which fields a variant sets; the resulting config is explicit, so that a
+    saved model does not depend on what a variant means later.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    VARIANT_FIELDS: ClassVar[dict[str, dict[str, Any]]] = {}
+
+    variant: Variant = "default"
+    pitch_um: float = Field(0.1, gt=0, description="lateral sampling, µm")
+    level_height_um: float = Field(0.1, gt=0, description="nominal height of one level, µm")
+    levels: int = Field(13, ge=2, description="number of layout levels, 0 included")
+
+    @classmethod
+    def of_variant(cls, variant: Variant = "default", **fields: Any) -> Self:
+        """The config of a named variant; ``fields`` (geometry or hyper-parameters) override it.
+
+        Raises:
+            InputError: unknown variant.
+        """
+        if variant not in VARIANTS:
+            raise InputError("variant", got=repr(variant), wanted=", ".join(VARIANTS))
+        return cls(**{"variant": variant, **cls.VARIANT_FIELDS.get(variant, {}), **fields})
+
+    @property
+    def full_height_um(self) -> float:
+        """Nominal height of the highest level, µm."""
+        return (self.levels - 1) * self.level_height_um
+
+
+class Simulator(nn.Module, ABC):
+    """A process model: ``model(layout_um) -> height_um``, both (batch, 1, y, x) float32 in µm.
+
+    A subclass states ``interior``; what it returns may depend on the layout within ``reach_px`` of a
+    pixel and on nothing else, so that a crop with that margin predicts what the whole field does.
+    """
+
+    name: ClassVar[str]
+    Config: ClassVar[type[SimulatorConfig]] = SimulatorConfig
+    # Few parameters with a meaning each: fitted by Gauss-Newton; otherwise by stochastic gradient.
+    is_small: ClassVar[bool] = True
+    # The height is a linear function of the parameters: one Jacobian serves the whole fit.
+    is_linear: ClassVar[bool] = False
+
+    def __init__(self, config: SimulatorConfig):
+        super().__init__()
+        self.config = config
+
+    @property
+    @abstractmethod
+    def reach_px(self) -> int | None:
+        """Receptive radius in pixels; None where a pixel depends on the whole image."""
+
+    @abstractmethod
+    def interior(self, layout_um: Tensor) -> Tensor:
+        """Height of the pixels farther than ``reach_px`` from the edge: (b, 1, y - 2r, x - 2r), µm."""
+
+    def forward(self, layout_um: Tensor) -> Tensor:
+        """Height of the whole field; beyond its edge the outermost pixels are continued."""
+        reach = self.reach_px or 0
+        return self.interior(pad_field(layout_um, reach, reach))
+
+    @property
+    def pitch_um(self) -> float:
+        """Lateral sampling that the model is made for, µm."""
+        return self.config.pitch_um
+
+    @property
+    def reach_um(self) -> float | None:
+        """Receptive radius in µm; None where a pixel depends on the whole image."""
+        return None if self.reach_px is None else round(self.reach_px * self.pitch_um, 9)
+
+    @property
+    def parameter_count(self) -> int:
+        """Number of trained values."""
+        return sum(parameter.numel() for parameter in self.parameters())
+
+
+def crop_border(field: Tensor, border_px: int) -> Tensor:
+    """Cut ``border_px`` from all four sides of (..., y, x)."""
+    if border_px == 0:
+        return field
+    return field[..., border_px:-border_px, border_px:-border_px]

@@ -1,0 +1,138 @@
+"""Fit any model to printed scans: the one entry that commands, benchmark and loop call."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from litho_data.errors import InputError
+from litho_data.provenance import array_sha256
+from litho_data.store import PrintedScan
+from litho_models.models import build_model
+from litho_models.simulator import Simulator
+from litho_models.splits import inner_validation
+from litho_models.tiles import predict_scan
+from litho_models.training.checkpoint import CheckpointFolder, RoundRecord
+from litho_models.training.config import TrainingConfig
+from litho_models.training.gauss_newton import fit_gauss_newton
+from litho_models.training.network import train_network
+
+# Closed form and close to the data: from it a network gets its first nuisances.
+STIFF_MODEL = "linear"
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A fitted model and how it came about; ``history`` is empty for models without rounds."""
+
+    model: Simulator
+    training_ids: list[str]
+    validation_ids: list[str]
+    history: list[RoundRecord]
+    seconds: float
+
+
+def fit(model_name: str, scans: Sequence[PrintedScan], config: TrainingConfig) -> Simulator:
+    """Fit a model to scans and return it, in eval mode.
+
+    Args:
+        model_name: one of ``litho_models.models.MODELS``.
+        scans: scans to learn from, all of one pitch, level height and number of levels.
+        config: recipe, variant, seed, nuisances.
+
+    Raises:
+        InputError: unknown model, no scans, or scans that do not belong together.
+    """
+    return fit_with_record(model_name, scans, config).model
+
+
+def fit_with_record(
+    model_name: str,
+    scans: Sequence[PrintedScan],
+    config: TrainingConfig,
+    *,
+    checkpoint: Path | None = None,
+    model_fields: dict[str, Any] | None = None,
+) -> Fitted:
+    """As ``fit``, with the history; ``checkpoint`` is a folder from which a killed run continues.
+
+    ``model_fields`` override hyper-parameters of the model's variant.
+    """
+    geometry = common_geometry(scans)
+    started = time.monotonic()
+    torch.manual_seed(config.seed)
+    model = build_model(model_name, config.variant, **geometry, **(model_fields or {}))
+    ids = [scan.id for scan in scans]
+    history: list[RoundRecord] = []
+    validation_ids: list[str] = []
+    if model.is_small:
+        fit_gauss_newton(model, scans, config.nuisance, config.free_gain)
+    else:
+        validation_ids = inner_validation(ids, config.validation_scans, config.seed)
+        training = [scan for scan in scans if scan.id not in validation_ids]
+        validation = [scan for scan in scans if scan.id in validation_ids]
+        folder = None
+        if checkpoint is not None:
+            folder = CheckpointFolder(checkpoint, run_key(model, scans, config))
+        stiff = build_model(STIFF_MODEL, **geometry)
+        if config.nuisance != "none":
+            fit_gauss_newton(stiff, training, config.nuisance, config.free_gain)
+        first = [predict_scan(stiff, scan) for scan in training]
+        history = train_network(model, training, validation, config, first, folder)
+    return Fitted(
+        model=model.eval(),
+        training_ids=[scan_id for scan_id in ids if scan_id not in validation_ids],
+        validation_ids=validation_ids,
+        history=history,
+        seconds=time.monotonic() - started,
+    )
+
+
+def run_key(
+    model: Simulator, scans: Sequence[PrintedScan], config: TrainingConfig, held_out_ids: Sequence[str] = ()
+) -> str:
+    """Hash of all that decides a fit: model, hyper-parameters, settings, the scans, and what it predicts."""
+    record = {
+        "held_out_ids": list(held_out_ids),
+        "model": model.name,
+        "model_config": model.config.model_dump(mode="json"),
+        "training": config.model_dump(mode="json"),
+        "scans": scans_sha256(scans),
+    }
+    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
+
+
+def scans_sha256(scans: Sequence[PrintedScan]) -> dict[str, list[str]]:
+    """Per scan id the hashes of its layout, height and valid pixels."""
+    return {
+        scan.id: [
+            array_sha256(scan.mask_level, "level", ("y", "x")),
+            array_sha256(scan.height_um, "µm", ("y", "x")),
+            array_sha256(scan.valid, "1", ("y", "x")),
+        ]
+        for scan in scans
+    }
+
+
+def common_geometry(scans: Sequence[PrintedScan]) -> dict[str, Any]:
+    """Pitch, level height and number of levels that all scans share.
+
+    Raises:
+        InputError: no scans, or scans that differ.
+    """
+    if not scans:
+        raise InputError("training scans", got="none", wanted="at least one")
+    found = sorted({(scan.pitch_um, scan.level_height_um, scan.levels) for scan in scans})
+    if len(found) > 1:
+        raise InputError(
+            "pitch_um, level_height_um, levels of the scans", got=found, wanted="the same for all"
+        )
+    pitch, level_height, levels = found[0]
+    return {"pitch_um": pitch, "level_height_um": level_height, "levels": levels}

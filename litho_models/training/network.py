@@ -1,0 +1,177 @@
+"""Models with many parameters: stochastic gradient on random crops, in rounds.
+
+Between rounds the per-scan nuisances are estimated anew from whole-scan predictions, the inner
+validation scans are scored and a checkpoint is written; inside a round the targets are fixed. All
+that is random is a function of seed and step, so a killed run continues to the same result.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from litho_data.commands import progress
+from litho_data.store import PrintedScan
+from litho_models.metrics import score_scan
+from litho_models.simulator import Simulator
+from litho_models.tiles import predict_scan
+from litho_models.training.checkpoint import CheckpointFolder, RoundRecord, TrainingState
+from litho_models.training.config import TrainingConfig
+from litho_models.training.crops import Window, plan_batch, stack
+from litho_models.training.nuisances import estimate_nuisances
+
+if TYPE_CHECKING:
+    from lightning.fabric import Fabric
+
+WARM_UP_FRACTION = 0.1
+FIRST_RATE, LAST_RATE = 0.1, 1e-3
+
+
+def train_network(
+    model: Simulator,
+    training: Sequence[PrintedScan],
+    validation: Sequence[PrintedScan],
+    config: TrainingConfig,
+    first_predictions_um: Sequence[np.ndarray],
+    checkpoints: CheckpointFolder | None = None,
+) -> list[RoundRecord]:
+    """Train ``model`` in place; it ends with the weights of the best round on ``validation``.
+
+    Without validation scans the last round counts. ``first_predictions_um`` are the heights of a
+    stiff model on the training scans, from which the first nuisances are estimated.
+    """
+    fabric = _fabric(config)
+    optimiser = _optimiser(model, config)
+    module, optimiser = fabric.setup(model, optimiser)
+    module.mark_forward_method("interior")
+    state = TrainingState(model, optimiser)
+    if checkpoints is not None:
+        checkpoints.load(state)
+    bounds = np.linspace(0, config.steps, config.rounds + 1).astype(int)
+    bounds = bounds[np.diff(bounds, prepend=-1) > 0]
+    for first, last in pairwise(bounds.tolist()):
+        if last <= state.step:
+            continue
+        started = time.monotonic()
+        predictions = [predict_scan(model, scan) for scan in training] if first else first_predictions_um
+        nuisances = estimate_nuisances(training, predictions, config.nuisance, config.free_gain)
+        targets = _Targets(training, nuisances)
+        losses = []
+        for step in progress(range(first, last), f"training {model.name} to step {config.steps}"):
+            losses.append(_step(fabric, module, optimiser, targets, config, step))
+        state.record(
+            RoundRecord(
+                step=last,
+                training_mae_nm=1000 * float(np.mean(losses)),
+                validation_mae_datum_free_nm=_validation_error(model, validation),
+                seconds=time.monotonic() - started,
+            )
+        )
+        if checkpoints is not None and fabric.is_global_zero:
+            checkpoints.save(state)
+        fabric.barrier()
+    state.restore_best()
+    return state.history
+
+
+class _Targets:
+    """Layouts and nuisance-free heights of the training scans; what is not measured has no weight."""
+
+    def __init__(self, scans: Sequence[PrintedScan], nuisances_um: Sequence[np.ndarray]):
+        self.shapes = [scan.shape for scan in scans]
+        self.layouts_um = [scan.layout_um for scan in scans]
+        usable = [scan.valid & np.isfinite(scan.height_um) for scan in scans]
+        self.weights = [mask.astype(np.float32) for mask in usable]
+        self.heights_um = [
+            np.where(mask, scan.height_um - nuisance, 0).astype(np.float32)
+            for scan, nuisance, mask in zip(scans, nuisances_um, usable, strict=True)
+        ]
+
+
+def _step(
+    fabric: Fabric,
+    module: Simulator,
+    optimiser: torch.optim.Optimizer,
+    targets: _Targets,
+    config: TrainingConfig,
+    step: int,
+) -> float:
+    for group in optimiser.param_groups:
+        group["lr"] = learning_rate(config, step)
+    windows = plan_batch(targets.shapes, config, step)[fabric.global_rank :: fabric.world_size]
+    prediction = _predict_windows(fabric, module, targets, windows, config)
+    height = fabric.to_device(stack(targets.heights_um, windows))
+    weight = fabric.to_device(stack(targets.weights, windows))
+    # The count of pixels is fixed, so that the mean over processes is the loss of one process.
+    loss = (weight * _error(prediction, height, config)).mean()
+    optimiser.zero_grad(set_to_none=True)
+    fabric.backward(loss)
+    optimiser.step()
+    absolute = (weight * (prediction - height).abs()).mean().detach()
+    return float(cast(Tensor, fabric.all_reduce(absolute)))
+
+
+def _predict_windows(
+    fabric: Fabric, module: Simulator, targets: _Targets, windows: list[Window], config: TrainingConfig
+) -> Tensor:
+    if config.crops == "quadrants" or module.reach_px is None:
+        return module(fabric.to_device(stack(targets.layouts_um, windows)))
+    return module.interior(fabric.to_device(stack(targets.layouts_um, windows, module.reach_px)))
+
+
+def _error(prediction: Tensor, height: Tensor, config: TrainingConfig) -> Tensor:
+    if config.loss == "l1":
+        return (prediction - height).abs()
+    return functional.smooth_l1_loss(prediction, height, reduction="none", beta=config.smooth_l1_beta_um)
+
+
+def learning_rate(config: TrainingConfig, step: int) -> float:
+    """Rate of one step: constant, or up along a cosine for a tenth of the steps and down for the rest."""
+    if config.schedule == "constant":
+        return config.learning_rate
+    done = (step + 0.5) / config.steps
+    if done < WARM_UP_FRACTION:
+        start, stop, along = FIRST_RATE, 1.0, done / WARM_UP_FRACTION
+    else:
+        start, stop, along = 1.0, LAST_RATE, (done - WARM_UP_FRACTION) / (1 - WARM_UP_FRACTION)
+    return config.learning_rate * (stop + (start - stop) * (1 + math.cos(math.pi * along)) / 2)
+
+
+def _validation_error(model: Simulator, scans: Sequence[PrintedScan]) -> float | None:
+    if not scans:
+        return None
+    scores = [score_scan(scan.id, scan.height_um, predict_scan(model, scan), scan.valid) for scan in scans]
+    return float(np.mean([score.mae_datum_free_nm for score in scores]))
+
+
+def _optimiser(model: Simulator, config: TrainingConfig) -> torch.optim.Optimizer:
+    if config.optimiser == "adam":
+        return torch.optim.Adam(model.parameters(), lr=config.learning_rate)
+    return torch.optim.AdamW(model.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
+
+
+def _fabric(config: TrainingConfig) -> Fabric:
+    """Device and precision; under ``torchrun`` one process per local rank."""
+    from lightning.fabric import Fabric
+
+    world = int(os.environ.get("WORLD_SIZE", "1"))
+    devices = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+    fabric = Fabric(
+        accelerator="auto",
+        devices=devices,
+        num_nodes=max(1, world // devices),
+        strategy="ddp" if world > 1 else "auto",
+        precision=config.precision,
+    )
+    if world > 1:
+        fabric.launch()
+    return fabric

@@ -1,0 +1,176 @@
+"""Benchmark, evaluation and comparison: held out is held out, cached is cached, protocols must match."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+from prints import make_scans, write_store
+
+from litho_data.errors import InputError
+from litho_models.benchmark import Benchmark, benchmark
+from litho_models.compare import compare
+from litho_models.evaluate import Evaluation, evaluate
+from litho_models.folds import plan_folds
+from litho_models.runs import TrainingRun, freeze, train
+
+MODELS = ("identity", "affine", "linear")
+SETTINGS = {"nuisance": "offset"}
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    return write_store(tmp_path_factory.mktemp("data") / "made.zarr", make_scans(8, size_px=128))
+
+
+@pytest.fixture(scope="module")
+def result(store, tmp_path_factory):
+    out = tmp_path_factory.mktemp("benchmark")
+    return benchmark(store, out, models=MODELS, folds=3, settings=SETTINGS, open_lock_box=True), out
+
+
+def test_no_scan_is_scored_by_a_fit_that_saw_it(result):
+    record, _ = result
+    for fit in record.fits:
+        assert not set(fit.held_out_ids) & {*fit.training_ids, *fit.validation_ids}
+
+
+def test_every_development_scan_is_scored_once_and_locked_scans_only_in_the_opened_box(result):
+    record, _ = result
+    locked = record.split.lock_box
+    assert len(locked) == 1
+    for scores in record.scores:
+        ids = [row.scan for row in scores.scans]
+        assert sorted(ids) == sorted(record.split.scored_ids)
+        assert not set(ids) & set(locked)
+    assert [row.scan for row in record.locked_scores[0].scans] == locked
+    assert all(not set(fit.training_ids) & set(locked) for fit in record.fits)
+
+
+def test_a_better_model_scores_better_and_the_truth_bounds_it(result):
+    record, _ = result
+    error = {scores.model: scores.mae_datum_free_nm for scores in record.scores}
+    assert error["identity"] > error["affine"] > error["linear"]
+    # White noise of 4 nm has a mean absolute value of 3.19 nm; the features add about 1 nm.
+    assert 3.0 < error["linear"] < 4.2
+    absolute = {scores.model: scores.mae_abs_nm for scores in record.scores}
+    assert absolute["linear"] > 20  # the datum of ±30 nm per scan
+
+
+def test_the_result_is_complete_on_disk(result):
+    record, out = result
+    assert Benchmark.read(out) == record
+    assert (out / "report.html").stat().st_size > 50_000
+    table = pd.read_csv(out / "benchmark.csv")
+    assert sorted(table["model"]) == sorted(MODELS)
+    assert {"pairs.csv", "scans.csv", "levels.csv", "policies.csv", "fits.csv"} <= {
+        p.name for p in out.iterdir()
+    }
+    best = [pair for pair in record.paired if {pair.first, pair.second} == {"affine", "linear"}]
+    assert best[0].mean_nm > 0
+    assert best[0].first_better == 0
+
+
+def test_an_unchanged_benchmark_fits_nothing_again(result, store, monkeypatch):
+    record, out = result
+
+    def refuse(*_args, **_kwargs):
+        raise AssertionError("fitted again")
+
+    monkeypatch.setattr("litho_models.benchmark.fit_with_record", refuse)
+    again = benchmark(store, out, models=MODELS, folds=3, settings=SETTINGS, open_lock_box=True)
+    assert again.scores == record.scores
+
+
+def test_quadrants_of_the_paper_split_are_disjoint_and_leaky():
+    scans = make_scans(4, size_px=64)
+    (fold,) = plan_folds(scans, [], "paper")
+    held_out, training = ({part.id for part in parts} for parts in (fold.held_out, fold.training))
+    assert len(held_out) == 4
+    assert len(training) == 12
+    assert not held_out & training
+    assert {part_id.split("/")[0] for part_id in held_out} & {part_id.split("/")[0] for part_id in training}
+    assert all(part.shape == (32, 32) for part in fold.held_out)
+
+
+def test_whole_prints_are_held_out_by_print():
+    scans = make_scans(6, size_px=32)
+    plan = plan_folds(scans, [], "leave-one-print-out")
+    assert [len({scan.print_id for scan in fold.held_out}) for fold in plan] == [1, 1, 1]
+    assert all(not {s.print_id for s in fold.held_out} & {s.print_id for s in fold.training} for fold in plan)
+
+
+def test_train_evaluate_and_freeze_agree_bit_for_bit(store, tmp_path):
+    run = train(store, "affine", tmp_path / "run", settings=SETTINGS)
+    assert TrainingRun.read(tmp_path / "run") == run
+    assert not set(run.lock_box) & set(run.training_ids)
+    freeze(tmp_path / "run", tmp_path / "model")
+    first = evaluate(tmp_path / "model", store, tmp_path / "a")
+    second = evaluate(tmp_path / "model", store, tmp_path / "b")
+    assert first.scores == second.scores
+    assert first.trained_on_scored_scans == sorted(run.training_ids)
+    assert Evaluation.read(tmp_path / "a") == first
+    assert "not a held-out error" in (tmp_path / "a" / "report.html").read_text()
+    table = compare(tmp_path / "a", tmp_path / "b")
+    assert table["difference_nm"].tolist() == [0.0]
+
+
+def test_comparing_different_protocols_is_refused(store, tmp_path):
+    train(store, "identity", tmp_path / "run")
+    evaluate(tmp_path / "run" / "model", store, tmp_path / "offset")
+    evaluate(tmp_path / "run" / "model", store, tmp_path / "full", policy="full")
+    with pytest.raises(InputError, match="nuisance differs"):
+        compare(tmp_path / "offset", tmp_path / "full")
+    with pytest.raises(InputError):
+        compare(tmp_path / "offset", tmp_path / "nothing")
+
+
+def test_a_model_of_another_geometry_is_refused(store, tmp_path):
+    train(store, "identity", tmp_path / "run")
+    other = write_store(tmp_path / "other.zarr", make_scans(3, size_px=64), pitch_um=0.2)
+    with pytest.raises(InputError, match="pitch_um"):
+        evaluate(tmp_path / "run" / "model", other, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_line_offsets_are_attributed_to_their_frame():
+    from litho_models.scores import protocol_for, score_model
+
+    scans = make_scans(1, size_px=256, noise_um=0.005)
+    angle = np.deg2rad(1.0)
+    turned = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
+    stripes = np.random.default_rng(0).normal(0, 0.01, 256)[:, None].astype(np.float32)
+    from dataclasses import replace
+
+    from prints import printed_height_um
+
+    scan = replace(scans[0], height_um=scans[0].height_um + stripes, scan_to_layout=turned)
+    truth = printed_height_um(scan.layout_um).astype(np.float32)
+    scores = score_model("truth", [scan], [truth], protocol_for("offset"))
+    # Stripes of 10 nm along the layout's rows; along scan lines turned by 1° they average out over
+    # 57 px, of which 256 px hold 4.5: a half to a third is left.
+    assert scores.row_offset_sd_nm == pytest.approx(10, abs=1.5)
+    assert scores.scan_line_offset_sd_nm < 0.7 * scores.row_offset_sd_nm
+
+
+def test_the_commands(store, tmp_path):
+    from typer.testing import CliRunner
+
+    from litho_models.cli import app
+
+    runner = CliRunner()
+    run, model, out = (str(tmp_path / name) for name in ("run", "model", "out"))
+    for arguments in (
+        ["train", str(store), "--model", "affine", "--out", run],
+        ["freeze", run, "--out", model],
+        ["evaluate", model, str(store), "--out", out],
+        ["compare", out, out],
+    ):
+        outcome = runner.invoke(app, arguments)
+        assert outcome.exit_code == 0, outcome.output
+    content = json.loads((tmp_path / "out" / "evaluation.json").read_text())
+    assert content["schema"] == "litho-models/evaluation/1"
+    refused = runner.invoke(app, ["train", str(store), "--model", "resnet", "--out", run])
+    assert isinstance(refused.exception, InputError)

@@ -1,0 +1,62 @@
+"""Effects around a base model: the order of stages, and what design may see."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from litho_models.effects import CATALOGUE
+from litho_models.effects.chain import EffectChain
+from litho_models.freeze import load_frozen, save_frozen
+from litho_models.models import build_model
+
+LAYOUT = (torch.rand(1, 1, 40, 40, generator=torch.Generator().manual_seed(0)) * 12).floor() / 10
+MEASUREMENT = [e for e in CATALOGUE.values() if e.role == "measurement"]
+
+
+def chain_of(effects: dict[str, dict[str, float]]) -> EffectChain:
+    base = build_model("physics", sigma_diffusion_init_um=0.3)
+    return EffectChain(base, effects, full_height_um=1.2, pitch_um=0.1)
+
+
+def test_without_effects_the_chain_is_the_base_bit_for_bit() -> None:
+    chain = chain_of({})
+    assert torch.equal(chain(LAYOUT), chain.base(LAYOUT))
+
+
+def test_effects_act_in_the_order_of_the_catalogue_whatever_the_order_given() -> None:
+    effects = {"height-saturation": {"rate_per_um": 0.3}, "vignetting": {"strength": 0.2}}
+    turned = dict(reversed(effects.items()))
+    assert torch.equal(chain_of(effects)(LAYOUT), chain_of(turned)(LAYOUT))
+    chain = chain_of(effects)
+    by_hand = CATALOGUE["vignetting"](LAYOUT, {"strength": 0.2}, _context())
+    by_hand = CATALOGUE["height-saturation"](chain.base(by_hand), {"rate_per_um": 0.3}, _context())
+    assert torch.equal(chain(LAYOUT), by_hand)
+
+
+@pytest.mark.parametrize("effect", MEASUREMENT, ids=[e.name for e in MEASUREMENT])
+def test_no_measurement_effect_changes_the_process_model(effect, tmp_path) -> None:
+    process = {"vignetting": {"strength": 0.1}}
+    typical = {name: p.typical for name, p in effect.parameters.items()}
+    on, off = chain_of({**process, effect.name: typical}), chain_of(process)
+    assert not torch.equal(on(LAYOUT), off(LAYOUT))
+    assert torch.equal(on.process_model()(LAYOUT), off.process_model()(LAYOUT))
+
+
+def test_undetermined_effects_enter_the_process_model_only_on_request() -> None:
+    chain = chain_of({"slope-thinning": {"along_x_um": 0.3}})
+    assert torch.equal(chain.process_model()(LAYOUT), chain.base(LAYOUT))
+    assert torch.equal(chain.process_model(undetermined=True)(LAYOUT), chain(LAYOUT))
+
+
+def test_a_corrected_model_freezes_and_loads_to_the_same_heights(tmp_path) -> None:
+    chain = chain_of({"galvo-lag": {"length_um": 0.2, "direction": -1.0}})
+    save_frozen(chain.base, tmp_path / "model", process_effects=chain.values())
+    loaded = load_frozen(tmp_path / "model")
+    assert torch.equal(loaded(LAYOUT), chain(LAYOUT).detach())
+
+
+def _context():
+    from litho_models.effects import FieldContext
+
+    return FieldContext(LAYOUT, 0.1, 1.2)

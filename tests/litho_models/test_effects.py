@@ -1,0 +1,254 @@
+"""One contract for every effect of the catalogue, then the closed forms of single effects."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from litho_data.errors import InputError
+from litho_models.effects import CATALOGUE, FieldContext, get_effect, in_forward_order, screened_effects
+from litho_models.effects.effect import Effect, Parameter
+
+PITCH_UM = 0.1
+EFFECTS = list(CATALOGUE.values())
+PER_EFFECT = pytest.mark.parametrize("effect", EFFECTS, ids=[effect.name for effect in EFFECTS])
+
+
+def field(seed: int = 0) -> tuple[torch.Tensor, FieldContext]:
+    """A smooth random height with flat parts, (1, 1, 36, 44) float64 µm, and its context."""
+    generator = torch.Generator().manual_seed(seed)
+    coarse = torch.randint(0, 13, (1, 1, 9, 11), generator=generator).double() * 0.1
+    layout = torch.nn.functional.interpolate(coarse, size=(36, 44), mode="nearest")
+    height = torch.nn.functional.avg_pool2d(torch.nn.functional.pad(layout, (2,) * 4, mode="replicate"), 5, 1)
+    return height, FieldContext(layout, PITCH_UM, 1.2, order=0.3, seed=5)
+
+
+def input_of(effect: Effect) -> tuple[torch.Tensor, FieldContext]:
+    height, context = field()
+    return (context.layout_um if effect.acts_on == "layout" else height), context
+
+
+def test_the_catalogue_is_not_empty_and_holds_all_stages_and_roles() -> None:
+    assert len(EFFECTS) >= 20
+    assert {effect.stage for effect in EFFECTS} == {"exposure", "resist", "development", "measurement"}
+    assert {effect.role for effect in EFFECTS} == {"process", "measurement", "nuisance", "undetermined"}
+
+
+@PER_EFFECT
+def test_off_is_the_identity(effect: Effect) -> None:
+    array, context = input_of(effect)
+    changed = effect(array, effect.off_values(), context)
+    # Some effects rescale and scale back in float64: 1e-7 is nine orders above the rounding.
+    assert torch.allclose(changed, array, rtol=0, atol=1e-7)
+
+
+@PER_EFFECT
+def test_typical_amplitude_changes_the_field_and_keeps_its_shape(effect: Effect) -> None:
+    array, context = input_of(effect)
+    for name in effect.amplitudes:
+        values = effect.with_values({name: effect.parameters[name].typical})
+        changed = effect(array, values, context)
+        assert changed.shape == array.shape
+        assert torch.isfinite(changed).all()
+        assert (changed - array).abs().max() > 1e-5
+
+
+@PER_EFFECT
+def test_gradient_equals_finite_difference(effect: Effect) -> None:
+    array, context = input_of(effect)
+    weights = torch.randn(array.shape, generator=torch.Generator().manual_seed(1), dtype=array.dtype)
+    typical = {name: p.typical for name, p in effect.parameters.items()}
+    for name, parameter in effect.parameters.items():
+        if parameter.kind == "choice":
+            continue
+        for at in (parameter.typical, parameter.off):
+            value = torch.tensor(at, dtype=array.dtype, requires_grad=True)
+            (gradient,) = torch.autograd.grad(
+                (weights * effect(array, {**typical, name: value}, context)).sum(), value
+            )
+            # At its null an amplitude may be at a bound or a kink: one-sided, towards typical values.
+            step = 1e-6 * (parameter.typical - parameter.null if at == parameter.off else parameter.typical)
+            step = step or 1e-6 * parameter.typical
+            up, here, down = (
+                float((weights * effect(array, {**typical, name: at + k * step}, context)).sum())
+                for k in (1, 0, -1)
+            )
+            difference = (up - here) / step if at == parameter.off else (up - down) / (2 * step)
+            # Truncation of one-sided differences ~ step; rounding ~ 1e-16 * 1584 px / step.
+            assert float(gradient) == pytest.approx(difference, rel=1e-3, abs=1e-3)
+
+
+@PER_EFFECT
+def test_gradient_to_the_field_is_finite_when_off_and_on(effect: Effect) -> None:
+    array, context = input_of(effect)
+    for values in (effect.off_values(), {name: p.typical for name, p in effect.parameters.items()}):
+        leaf = array.clone().requires_grad_()
+        (gradient,) = torch.autograd.grad(effect(leaf, values, context).sum(), leaf)
+        assert torch.isfinite(gradient).all()
+
+
+@PER_EFFECT
+def test_parameters_have_units_and_bounds_that_hold_their_values(effect: Effect) -> None:
+    assert effect.source
+    for parameter in effect.parameters.values():
+        assert parameter.unit
+        assert parameter.lower < parameter.upper
+        assert parameter.lower <= parameter.typical <= parameter.upper
+        if parameter.kind == "amplitude":
+            assert parameter.lower <= parameter.null <= parameter.upper
+            assert parameter.typical != parameter.null
+    assert (effect.stage == "measurement") == (effect.role == "measurement")
+    if not effect.per_scan:
+        assert effect.trials
+    for trial in effect.trials:
+        assert effect.with_values(trial) != effect.off_values()
+
+
+def test_screened_effects_and_forward_order() -> None:
+    assert {effect.name for effect in screened_effects()} < set(CATALOGUE)
+    assert in_forward_order(["tilt-bow", "vignetting"]) == ["vignetting", "tilt-bow"]
+
+
+def test_unknown_names_are_refused() -> None:
+    with pytest.raises(InputError, match="vignetting"):
+        get_effect("vigneting")
+    with pytest.raises(InputError, match="strength"):
+        get_effect("vignetting").with_values({"amount": 1.0})
+
+
+def test_an_effect_without_amplitude_is_refused() -> None:
+    with pytest.raises(InputError, match="amplitude"):
+        Effect(
+            "still", "", "resist", "process", "height", {"w": Parameter("1", 0, 1, 0.5, kind="shape")},
+            lambda array, values, context: array, "test",
+        )  # fmt: skip
+
+
+def cosine(frequency_per_um: float, axis: str, size: int = 240) -> tuple[torch.Tensor, FieldContext]:
+    position = (torch.arange(size, dtype=torch.float64) + 0.5) * PITCH_UM
+    wave = torch.cos(2 * math.pi * frequency_per_um * position)
+    plane = wave[None, :].expand(size, size) if axis == "x" else wave[:, None].expand(size, size)
+    plane = plane[None, None].clone()
+    return plane, FieldContext(plane, PITCH_UM, 1.2)
+
+
+def amplitude_ratio(changed: torch.Tensor, original: torch.Tensor, edge_px: int = 60) -> float:
+    inner = (..., slice(edge_px, -edge_px), slice(edge_px, -edge_px))
+    return float(changed[inner].std() / original[inner].std())
+
+
+@pytest.mark.parametrize("frequency", [0.25, 0.5])
+def test_diffusion_blur_has_the_gaussian_transfer(frequency: float) -> None:
+    wave, context = cosine(frequency, "x")
+    changed = get_effect("diffusion-blur")(wave, {"variance_um2": 0.09}, context)
+    expected = math.exp(-2 * math.pi**2 * 0.09 * frequency**2)
+    # The edge is 6 µm = 20 sigma away: only rounding is left.
+    assert amplitude_ratio(changed, wave) == pytest.approx(expected, rel=1e-9)
+
+
+def test_elliptical_psf_widens_one_axis_and_narrows_the_other() -> None:
+    effect = get_effect("elliptical-psf")
+    stretch, frequency = 0.01, 0.5
+    isotropic = math.hypot(stretch, 0.02) - 0.02
+    for axis, sign in (("x", 1), ("y", -1)):
+        wave, context = cosine(frequency, axis)
+        changed = effect(wave, effect.with_values({"stretch_um2": stretch}), context)
+        expected = math.exp(-(math.pi**2) * (isotropic + sign * stretch) * frequency**2)
+        # The sharpened axis rings slightly from the cut at the edge of the layout.
+        assert amplitude_ratio(changed, wave) == pytest.approx(expected, rel=1e-5)
+
+
+def test_long_range_proximity_keeps_a_flat_dose_and_damps_a_fast_wave() -> None:
+    effect = get_effect("long-range-proximity")
+    wave, context = cosine(0.5, "y")
+    changed = effect(wave, {"weight": 0.25, "length_um": 2.0}, context)
+    blur = math.exp(-2 * math.pi**2 * 4 * 0.25)
+    expected = (1 + 0.25 * blur) / 1.25
+    # The edge, 3 sigma from the window, leaks 0.2 * erfc(3 / sqrt 2) / 2 of the background at most.
+    assert amplitude_ratio(changed, wave) == pytest.approx(expected, rel=3e-4)
+    flat, context = torch.ones(1, 1, 240, 240, dtype=torch.float64), context
+    inner = effect(flat, {"weight": 0.25, "length_um": 2.0}, context)[..., 60:-60, 60:-60]
+    assert torch.allclose(inner, torch.ones_like(inner), rtol=0, atol=0.2 * 4 * 0.00135)
+
+
+def test_galvo_lag_is_a_causal_exponential_of_unit_area() -> None:
+    effect = get_effect("galvo-lag")
+    point = torch.zeros(1, 1, 9, 200, dtype=torch.float64)
+    point[..., 4, 100] = 1
+    context = FieldContext(point, PITCH_UM, 1.2)
+    response = effect(point, {"length_um": 0.3, "direction": 1.0}, context)[0, 0, 4]
+    lags = torch.arange(200) - 100
+    ratio = 0.3 / (0.3 + PITCH_UM)
+    expected = torch.where(lags >= 0, (1 - ratio) * ratio ** lags.clamp(min=0).double(), 0.0)
+    # The padded period is 6 lengths longer than the field: the tail that wraps is below ratio^100.
+    assert torch.allclose(response, expected, rtol=0, atol=1e-9)
+    mirrored = effect(point, {"length_um": 0.3, "direction": -1.0}, context)[0, 0, 4]
+    assert torch.allclose(mirrored[:101].flip(0)[:99], response[100:199], rtol=0, atol=1e-9)
+    assert float(mirrored[101:].abs().max()) < 1e-9
+
+
+def test_slow_axis_turns_galvo_lag_and_memory() -> None:
+    _, context = field()
+    turned = FieldContext(context.layout_um.transpose(-1, -2), PITCH_UM, 1.2, slow_axis="x")
+    for name in ("galvo-lag", "write-order-memory"):
+        effect = get_effect(name)
+        values = {key: p.typical for key, p in effect.parameters.items()}
+        straight = effect(context.layout_um, values, context)
+        across = effect(turned.layout_um, values, turned)
+        assert torch.allclose(across.transpose(-1, -2), straight, rtol=0, atol=1e-12)
+
+
+def test_vignetting_reaches_its_strength_at_the_edge_of_the_write_field() -> None:
+    layout = torch.ones(1, 1, 101, 101, dtype=torch.float64)
+    context = FieldContext(layout, PITCH_UM, 1.2, field_radius_um=5.0)
+    dose = get_effect("vignetting")(layout, {"strength": 0.1}, context)[0, 0]
+    assert float(dose[50, 50]) == pytest.approx(1.0)
+    assert float(dose[50, 100]) == pytest.approx(0.9)  # 5.0 µm from the centre
+    assert float(dose[0, 0]) == pytest.approx(0.8)
+
+
+def test_threshold_softness_is_the_normalised_tanh_projection() -> None:
+    height = torch.linspace(0, 1.2, 50, dtype=torch.float64).reshape(1, 1, 1, 50)
+    context = FieldContext(height, PITCH_UM, 1.2)
+    alpha, eta = 4.0, 0.35
+    changed = get_effect("threshold-softness")(
+        height, {"steepness_squared": alpha**2, "centre": eta}, context
+    )
+    top = math.tanh(alpha * eta) + torch.tanh(alpha * (height / 1.2 - eta))
+    expected = 1.2 * top / (math.tanh(alpha * eta) + math.tanh(alpha * (1 - eta)))
+    # The reference point of the difference is alpha = 1e-3 instead of 0: 1e-6 of the height.
+    assert torch.allclose(changed, expected, rtol=0, atol=3e-6)
+
+
+def test_slope_thinning_and_tip_dilation_on_a_ramp() -> None:
+    ramp = 0.5 * (torch.arange(40, dtype=torch.float64) * PITCH_UM).expand(1, 1, 30, 40)
+    context = FieldContext(ramp, PITCH_UM, 1.2)
+    thinned = get_effect("slope-thinning")(ramp, {"along_x_um": 0.2, "along_y_um": 0.7}, context)
+    dilated = get_effect("tip-dilation")(ramp, {"radius_um": 0.2}, context)
+    inner = (..., slice(1, -1), slice(1, -1))
+    assert torch.allclose((thinned - ramp)[inner], torch.tensor(-0.2 * 0.25, dtype=torch.float64))
+    # A paraboloid of radius R on a plane of slope s rests R s² / 2 higher.
+    assert torch.allclose((dilated - ramp)[inner], torch.tensor(0.2 * 0.25 / 2, dtype=torch.float64))
+
+
+def test_trench_residue_fills_narrow_pits_only() -> None:
+    height = torch.ones(1, 1, 60, 60, dtype=torch.float64)
+    height[..., 10:50, 10:13] = 0
+    height[..., 10:50, 30:45] = 0
+    context = FieldContext(height, PITCH_UM, 1.2)
+    changed = get_effect("trench-residue")(height, {"fraction": 0.25, "width_um": 0.6}, context)
+    assert float(changed[0, 0, 30, 11]) == pytest.approx(0.25)
+    assert float(changed[0, 0, 30, 37]) == 0.0
+    assert torch.equal(changed[height == 1], height[height == 1])
+
+
+def test_stripes_follow_the_scan_lines_with_the_stated_spread() -> None:
+    flat = torch.zeros(1, 1, 2000, 4, dtype=torch.float64)
+    striped = get_effect("scan-line-stripes")(
+        flat, {"sd_um": 0.008}, FieldContext(flat, PITCH_UM, 1.2, seed=3)
+    )
+    assert float(striped.std(dim=-1).max()) == 0.0
+    # Relative error of a standard deviation from n draws: 1 / sqrt(2 n) = 1.6 %; four of them.
+    assert float(striped[..., 0].std()) == pytest.approx(0.008, rel=0.065)

@@ -1,0 +1,174 @@
+"""Frozen models: reproduce themselves, refuse what they were not made for, and run nothing on loading."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import subprocess
+import sys
+
+import pytest
+import torch
+from safetensors.torch import save_file
+
+from litho_data.errors import InputError
+from litho_models import load_frozen, save_frozen
+from litho_models.freeze import CARD_FILE, README_FILE, WEIGHTS_FILE, ModelCard
+from litho_models.models import build_model
+from litho_models.runs import freeze
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return save_frozen(build_model("physics"), tmp_path / "model")
+
+
+def edit_card(folder, **changes):
+    card = json.loads((folder / CARD_FILE).read_text())
+    (folder / CARD_FILE).write_text(json.dumps({**card, **changes}))
+
+
+def test_the_folder_holds_weights_a_card_and_a_page(folder):
+    assert {path.name for path in folder.iterdir()} == {WEIGHTS_FILE, CARD_FILE, README_FILE}
+    card = json.loads((folder / CARD_FILE).read_text())
+    assert card["schema"] == "litho-models/frozen/1"
+    assert card["calibrated_range_um"] == [0.0, pytest.approx(1.2)]
+    page = (folder / README_FILE).read_text()
+    assert page.startswith("---\nlicense:")
+    assert "pipeline_tag: image-to-image" in page
+
+
+def test_saving_and_loading_again_gives_the_same_weights_and_identity(folder, tmp_path):
+    frozen = load_frozen(folder)
+    again = save_frozen(frozen.simulator, tmp_path / "again")
+    assert (folder / WEIGHTS_FILE).read_bytes() == (again / WEIGHTS_FILE).read_bytes()
+    assert load_frozen(again).sha256 == frozen.sha256
+
+
+def test_it_stays_frozen(folder):
+    frozen = load_frozen(folder).train()
+    assert not frozen.training
+    layout = torch.full((1, 1, 64, 64), 0.5, requires_grad=True)
+    frozen(layout).sum().backward()
+    assert layout.grad is not None
+    assert all(parameter.grad is None for parameter in frozen.parameters())
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda m: m(torch.zeros(1, 1, 64, 64), pitch_um=0.2), "pitch_um"),
+        (lambda m: m(torch.zeros(1, 1, 64, 64), level_height_um=0.2), "level_height_um"),
+        (lambda m: m(torch.full((1, 1, 64, 64), 1.3)), "calibrated range"),
+        (lambda m: m(torch.full((1, 1, 64, 64), -0.1)), "calibrated range"),
+        (lambda m: m(torch.full((1, 1, 64, 64), float("nan"))), "calibrated range"),
+        (lambda m: m(torch.zeros(64, 64)), "shape"),
+    ],
+)
+def test_it_refuses_in_one_line_what_it_was_not_made_for(folder, call, said):
+    with pytest.raises(InputError, match=said) as caught:
+        call(load_frozen(folder))
+    assert "\n" not in str(caught.value)
+
+
+def test_extrapolation_has_to_be_asked_for(folder):
+    high = torch.full((1, 1, 64, 64), 1.3)
+    assert torch.isfinite(load_frozen(folder, extrapolate=True)(high)).all()
+
+
+def truncate(folder):
+    data = (folder / WEIGHTS_FILE).read_bytes()
+    (folder / WEIGHTS_FILE).write_bytes(data[: len(data) // 2])
+
+
+def rehash(folder):
+    from litho_data.files import file_sha256
+
+    edit_card(folder, weights_sha256=file_sha256(folder / WEIGHTS_FILE))
+
+
+def truncate_and_rehash(folder):
+    truncate(folder)
+    rehash(folder)
+
+
+def foreign_weights(folder):
+    save_file({"weight": torch.zeros(3)}, folder / WEIGHTS_FILE)
+    rehash(folder)
+
+
+def pickled_weights(folder):
+    (folder / WEIGHTS_FILE).write_bytes(pickle.dumps(_Bomb()))
+    rehash(folder)
+
+
+class _Bomb:
+    def __reduce__(self):
+        return (exec, ("raise SystemExit('code ran on loading')",))
+
+
+DAMAGE = {
+    "no weights": lambda f: (f / WEIGHTS_FILE).unlink(),
+    "no card": lambda f: (f / CARD_FILE).unlink(),
+    "truncated weights": truncate,
+    "truncated weights, hash adjusted": truncate_and_rehash,
+    "weights of another model": foreign_weights,
+    "a pickle in place of the weights": pickled_weights,
+    "card is not JSON": lambda f: (f / CARD_FILE).write_text("{"),
+    "card is a list": lambda f: (f / CARD_FILE).write_text("[]"),
+    "another schema": lambda f: edit_card(f, schema="litho-models/frozen/99"),
+    "unknown field": lambda f: edit_card(f, run_this="os.system"),
+    "unknown model": lambda f: edit_card(f, model="os.system"),
+    "unknown hyper-parameter": lambda f: edit_card(f, hyper_parameters={"depth": 3}),
+    "geometry of another card": lambda f: edit_card(f, pitch_um=0.2),
+}
+
+
+@pytest.mark.parametrize("damage", list(DAMAGE))
+def test_damaged_or_foreign_files_are_refused_in_one_line(folder, damage):
+    DAMAGE[damage](folder)
+    with pytest.raises(InputError) as caught:
+        load_frozen(folder)
+    assert "\n" not in str(caught.value)
+
+
+def test_weights_that_are_not_finite_are_not_saved(tmp_path):
+    model = build_model("affine")
+    with torch.no_grad():
+        model.gain.fill_(float("nan"))
+    with pytest.raises(InputError, match="non-finite"):
+        save_frozen(model, tmp_path / "model")
+    assert not (tmp_path / "model").exists()
+
+
+def test_process_effects_are_part_of_the_model_and_measurement_effects_are_not(tmp_path):
+    base = build_model("physics")
+    layout = torch.rand(1, 1, 64, 64, generator=torch.Generator().manual_seed(0)) * 1.2
+    plain = load_frozen(save_frozen(base, tmp_path / "plain"))
+    effects = {"vertical-shrinkage": {"fraction": 0.1}}
+    process = load_frozen(save_frozen(base, tmp_path / "process", process_effects=effects))
+    measured = load_frozen(save_frozen(base, tmp_path / "measured", measurement_effects=effects))
+    # H becomes (1 - fraction) H.
+    assert torch.allclose(process(layout), 0.9 * plain(layout), atol=1e-6)
+    assert torch.equal(measured(layout), plain(layout))
+
+
+def test_an_undetermined_effect_enters_only_by_declaration_and_the_card_says_so(tmp_path):
+    effects = {"vertical-shrinkage": {"fraction": 0.1}}
+    source = save_frozen(build_model("physics"), tmp_path / "source", undetermined_effects=effects)
+    assert freeze(source, tmp_path / "kept").process_effects == {}
+    declared = freeze(source, tmp_path / "declared", ["vertical-shrinkage"])
+    assert declared.process_effects == effects
+    assert declared.declared_processes == ["vertical-shrinkage"]
+    assert declared.undetermined_effects == {}
+    with pytest.raises(InputError, match="declare-process"):
+        freeze(source, tmp_path / "wrong", ["vignetting"])
+
+
+def test_the_card_is_public_and_validated():
+    assert ModelCard.model_json_schema()["additionalProperties"] is False
+
+
+def test_importing_the_package_does_not_load_torch():
+    code = "import sys, litho_models; assert 'torch' not in sys.modules; litho_models.load_frozen"
+    subprocess.run([sys.executable, "-c", code], check=True)

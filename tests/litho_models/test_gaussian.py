@@ -1,0 +1,89 @@
+"""Gaussian blur: closed forms, derivatives with respect to its width, edges."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter
+
+from litho_data.errors import InputError
+from litho_models.gaussian import gaussian_blur, kernel_radius_px
+
+PITCH = 0.1
+
+
+@pytest.mark.parametrize("edge", ["replicate", "zero"])
+@pytest.mark.parametrize("sigma_um", [0.1, 0.25, 0.9])
+def test_agrees_with_an_independent_implementation(edge, sigma_um):
+    field = np.random.default_rng(0).uniform(0, 1, (90, 110))
+    mode = {"replicate": "nearest", "zero": "constant"}[edge]
+    wanted = gaussian_filter(
+        field, sigma_um / PITCH, mode=mode, truncate=kernel_radius_px(sigma_um / PITCH) / (sigma_um / PITCH)
+    )
+    got = gaussian_blur(torch.from_numpy(field), sigma_um, PITCH, edge=edge)
+    assert np.abs(got.numpy() - wanted).max() < 1e-12
+
+
+def test_attenuates_a_grating_as_the_fourier_transform_of_a_gaussian():
+    sigma_um, period_um = 0.3, 1.6
+    x = torch.arange(400, dtype=torch.float64) * PITCH
+    grating = torch.cos(2 * math.pi * x / period_um).expand(20, 400)
+    blurred = gaussian_blur(grating, sigma_um, PITCH)[10, 100:300]
+    gain = blurred.max() / 1.0
+    # Cutting at four sigma leaves out 6e-5 of the weight.
+    assert float(gain) == pytest.approx(math.exp(-2 * (math.pi * sigma_um / period_um) ** 2), abs=2e-4)
+
+
+def test_widths_add_in_quadrature():
+    field = torch.zeros(1, 1, 121, 121, dtype=torch.float64)
+    field[..., 60, 60] = 1
+    twice = gaussian_blur(gaussian_blur(field, 0.3, PITCH), 0.4, PITCH)
+    once = gaussian_blur(field, 0.5, PITCH)
+    # Both are cut at four sigma, which removes exp(-8) = 3e-4 of the peak of 1/(2π 25) at the rim.
+    assert float((twice - once).abs().max()) < 3e-4 * float(once.max()) * 2
+
+
+def test_anisotropic_blur_has_its_own_width_per_axis():
+    field = torch.zeros(81, 81, dtype=torch.float64)
+    field[40, 40] = 1
+    spot = gaussian_blur(field, (0.2, 0.4), PITCH)
+    offset = (torch.arange(81, dtype=torch.float64) - 40) * PITCH
+    variance_y = float((spot.sum(1) * offset**2).sum())
+    variance_x = float((spot.sum(0) * offset**2).sum())
+    # A cut at four sigma lowers the variance by 0.1 %.
+    assert variance_y == pytest.approx(0.04, rel=2e-3)
+    assert variance_x == pytest.approx(0.16, rel=2e-3)
+
+
+def test_derivative_with_respect_to_the_width_matches_finite_differences():
+    field = torch.rand(1, 1, 64, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    weight = torch.rand(1, 1, 64, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    sigma = torch.tensor(0.33, dtype=torch.float64, requires_grad=True)
+    (gradient,) = torch.autograd.grad((weight * gaussian_blur(field, sigma, PITCH)).sum(), sigma)
+    step = 1e-5
+    high, low = (float((weight * gaussian_blur(field, 0.33 + s, PITCH)).sum()) for s in (step, -step))
+    # Central difference: error of order step² plus rounding 1e-13/1e-5.
+    assert float(gradient) == pytest.approx((high - low) / (2 * step), rel=1e-6)
+
+
+def test_the_width_may_move_through_a_change_of_support_without_a_jump():
+    field = torch.rand(1, 1, 64, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    # Four sigma of 0.25 µm are 10 px exactly: the support grows by a pixel just above.
+    below, above = gaussian_blur(field, 0.2499999, PITCH), gaussian_blur(field, 0.2500001, PITCH)
+    # The added ring weighs exp(-0.5 (11/2.5)²) = 6e-5 of the peak, 1e-5 of the sum.
+    assert float((below - above).abs().max()) < 5e-5
+
+
+def test_uniform_fields_and_zero_width_are_left_alone():
+    field = torch.full((1, 1, 30, 30), 0.7)
+    assert torch.allclose(gaussian_blur(field, 0.4, PITCH), field, atol=1e-6)
+    rough = torch.rand(1, 1, 30, 30)
+    assert torch.equal(gaussian_blur(rough, 0.0, PITCH), rough)
+
+
+def test_bad_pitch_is_refused():
+    with pytest.raises(InputError):
+        gaussian_blur(torch.zeros(8, 8), 0.1, 0.0)

@@ -1,0 +1,241 @@
+"""The whole loop on small prints whose missing effect is known."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+
+import numpy as np
+import pytest
+
+from litho_data.errors import InputError
+from litho_models.loop import LoopConfig, close_loop, parse_priors
+from litho_models.loop.closing import Closed
+from litho_models.loop.exporting import exported_effects
+from litho_models.loop.fields import LARGE_PX, prepare_fields
+from litho_models.loop.fitting import fit_folds, get_vector, predict
+from litho_models.loop.injecting import parse_injection
+from litho_models.loop.measurement import measurement_tests
+from litho_models.loop.outcome import summarise
+from litho_models.loop.result import CloseLoop
+from litho_models.loop.structure import covariate_tests, is_structured
+from litho_models.models import build_model
+from tests.litho_models.loop_scans import printed_scans, true_model
+
+
+def closed_on(scans, **config) -> tuple[Closed, CloseLoop]:
+    start = build_model("physics", sigma_diffusion_init_um=0.4)
+    closed = close_loop(scans, start, LoopConfig.model_validate(config))
+    return closed, summarise(closed, dataset=("made here", "0" * 64), base_name="physics", dropped=[])
+
+
+def verdicts(result: CloseLoop) -> Mapping[str, str]:
+    return {c.name: c.verdict for c in result.candidates}
+
+
+@pytest.fixture(scope="module")
+def null() -> tuple[Closed, CloseLoop]:
+    return closed_on(printed_scans(count=14))
+
+
+@pytest.fixture(scope="module")
+def planted() -> tuple[Closed, CloseLoop]:
+    scans = printed_scans({"vignetting": {"strength": 0.2}}, seed=1)
+    return closed_on(scans, open_lock_box=True, prior_hypotheses=("datum-offset",))
+
+
+def test_nothing_is_found_where_nothing_is_missing(null) -> None:
+    closed, result = null
+    assert result.verdict == "nothing-missing"
+    assert not closed.search.added
+    assert result.residual.state == "undecided"
+    # Roughness of 6 nm is all that is left: E|n| = 0.8 sd, the tilt of single scans adds a little.
+    assert 4.5 < result.after.mae_datum_free_nm < 6.5
+
+
+def test_the_datum_of_the_scans_is_recognised(null) -> None:
+    _, result = null
+    datum = next(e for e in result.effects if e.name == "datum-offset")
+    assert datum.metric == "mae_abs"
+    assert datum.before_nm > datum.after_nm
+    spread = datum.parameters["offset_um_sd_between_scans"]
+    assert spread.ci95[0] < 0.02 < spread.ci95[1]
+
+
+def test_a_missing_effect_is_named_with_its_size(planted) -> None:
+    closed, result = planted
+    assert [a.effect.name for a in closed.search.added] == ["vignetting"]
+    entry = next(e for e in result.effects if e.name == "vignetting")
+    assert entry.verdict == "explained"
+    assert entry.parameters["strength"].value == pytest.approx(0.2, abs=0.02)
+    assert entry.scans_improved == (8, 8)
+    assert result.verdict == "traced"
+    assert result.after.mae_datum_free_nm < 0.8 * result.before.mae_datum_free_nm
+
+
+def test_the_locked_scans_agree(planted) -> None:
+    _, result = planted
+    assert len(result.split.lock_box) == 2
+    assert result.locked_after.mae_datum_free_nm < result.locked_before.mae_datum_free_nm
+
+
+def test_the_result_is_read_back_as_written_and_keeps_to_its_keys(planted, null, tmp_path) -> None:
+    _, result = planted
+    path = result.write(tmp_path)
+    assert CloseLoop.read(tmp_path) == result
+    content = json.loads(path.read_text())
+    assert content["schema"] == "litho-models/close-loop/1"
+    assert sum(content["shares"].values()) == pytest.approx(1)
+    assert next(e for e in content["effects"] if e["name"] == "datum-offset")["prior_hypothesis"]
+    content["surprise"] = 1
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match="surprise"):
+        CloseLoop.read(tmp_path)
+    null[1].write(tmp_path)
+    assert "locked_before" not in json.loads(path.read_text())
+
+
+def test_every_candidate_has_a_verdict_and_a_reason(planted) -> None:
+    _, result = planted
+    names = [c.name for c in result.candidates]
+    assert len(names) == len(set(names)) == 34
+    assert all(c.reason for c in result.candidates)
+    assert verdicts(result)["quantisation"] == "not-testable"
+
+
+def test_only_printer_effects_are_exported(planted) -> None:
+    closed, result = planted
+    groups = exported_effects(closed.final.fits.chain, result)
+    assert list(groups["process"]) == ["vignetting"]
+    assert not groups["undetermined"]
+    alike = result.model_copy(
+        update={
+            "effects": [
+                e.model_copy(update={"confusable_with": ["tip-dilation"]}) if e.name == "vignetting" else e
+                for e in result.effects
+            ]
+        }
+    )
+    assert list(exported_effects(closed.final.fits.chain, alike)["undetermined"]) == ["vignetting"]
+
+
+@pytest.mark.slow
+def test_a_tip_that_narrows_is_contradicted() -> None:
+    # Twice the height that a tip of this radius would add is missing on slopes of both axes.
+    scans = printed_scans({"slope-thinning": {"along_x_um": 0.1, "along_y_um": 0.1}}, count=12, seed=2)
+    _, result = closed_on(scans)
+    assert verdicts(result)["tip-dilation"] == "contradicted"
+    assert "slope-thinning" in {e.name for e in result.effects} | {
+        other for e in result.effects for other in e.confusable_with
+    }
+
+
+def test_line_offsets_are_told_from_columns() -> None:
+    scans = printed_scans(count=10, size_px=160, stripes_um=0.006, seed=3)
+    fields = prepare_fields(scans)
+    predictions = [_truth(f) for f in fields]
+    fold_of = np.arange(10) % 5
+    tests = {t.effect.name: t for t in measurement_tests(fields, predictions, fold_of, floor_nm2=0, seed=0)}
+    stripes = tests["scan-line-stripes"]
+    assert stripes.confirmation.passed
+    # Shrinkage takes s⁴/(s² + noise) of s²: the recovered size lies below the planted one, not far.
+    assert 0.004 < stripes.spread["sd_um"][0] < 0.0065
+    plain = prepare_fields(printed_scans(count=10, size_px=160, seed=4))
+    without = measurement_tests(plain, [_truth(f) for f in plain], fold_of, floor_nm2=0, seed=0)
+    assert not {t.effect.name: t for t in without}["scan-line-stripes"].confirmation.passed
+
+
+def test_too_few_scans_confirm_nothing_and_say_so() -> None:
+    _, result = closed_on(printed_scans({"vignetting": {"strength": 0.3}}, count=2))
+    assert not result.effects
+    assert result.verdict in {"nothing-missing", "unexplained"}
+    found = {c.name: c for c in result.candidates}
+    assert found["vignetting"].verdict == "not-testable"
+    assert "2 scans" in found["vignetting"].reason
+    assert np.isfinite(result.after.mae_datum_free_nm)
+
+
+def test_one_scan_is_refused() -> None:
+    with pytest.raises(InputError, match="at least 2"):
+        closed_on(printed_scans(count=1))
+
+
+def test_constant_layouts_and_missing_order_are_named_as_the_reason() -> None:
+    from dataclasses import replace
+
+    flat = [
+        replace(s, mask_level=np.full_like(s.mask_level, 6), height_um=s.height_um * 0 + 0.5)
+        for s in printed_scans(count=4)
+    ]
+    _, result = closed_on(flat)
+    assert {c.reason for c in result.candidates if c.name == "vignetting"} == {
+        "every layout has one level only: nothing in the print varies with it"
+    }
+    _, result = closed_on(printed_scans(count=4, order=False))
+    drift = next(c for c in result.candidates if c.name == "laser-drift")
+    assert (drift.verdict, drift.reason) == ("not-testable", "the writing order of the scans is not known")
+
+
+def test_scans_of_different_sizes_are_taken_together() -> None:
+    _, result = closed_on(printed_scans(count=4, size_px=[56, 64, 72, 64]))
+    assert result.run.n_scans == 4
+
+
+def test_fold_fits_do_not_depend_on_the_scans_they_hold_out() -> None:
+    fields = prepare_fields(printed_scans(count=4, seed=5))
+    spoiled = list(fields)
+    from dataclasses import replace
+
+    spoiled[0] = replace(fields[0], height=0.95 * fields[0].height + 0.01)
+    chain, fold_of = true_model({}), np.arange(4) % 2
+    clean, changed = (fit_folds(chain, f, fold_of) for f in (fields, spoiled))
+    held_out = fields[0]
+    a, b = (predict(c.chain, c.per_fold[0], held_out) for c in (clean, changed))
+    moved = predict(changed.chain, changed.common, held_out) - predict(clean.chain, clean.common, held_out)
+    # The common fit follows the spoiled scan; the fit without it may differ by how far its iteration
+    # has converged, a few hundredths of that.
+    assert np.abs(moved).max() > 0.005
+    assert np.abs(a - b).max() < 0.05 * np.abs(moved).max()
+    assert len(get_vector(chain)) == 5
+
+
+def test_a_covariate_that_the_model_lacks_is_seen_in_what_is_left() -> None:
+    fields = prepare_fields(printed_scans(count=10, seed=6))
+    predictions = [_truth(f) for f in fields]
+    residuals = [f.height - f.at_sample(p) for f, p in zip(fields, predictions, strict=True)]
+    assert not is_structured(covariate_tests(fields, predictions, residuals))
+    levels = [f.at_sample(f.scan.mask_level.astype(float)) for f in fields]
+    bent = [r + 0.01 * (level == 6) for r, level in zip(residuals, levels, strict=True)]
+    names = {t.name for t in is_structured(covariate_tests(fields, predictions, bent))}
+    assert "level" in names
+
+
+def test_large_scans_are_fitted_on_quadrants_in_turn() -> None:
+    scans = printed_scans(count=4, size_px=LARGE_PX)
+    fields = prepare_fields(scans)
+    corners = {f.window.context.origin_px for f in fields}
+    assert len(corners) == 4
+    for field in fields:
+        y, x = (v.numpy() for v in field.window.context.centred_um())
+        row, column = field.window.context.origin_px
+        full_y, full_x = (v.numpy() for v in field.context.centred_um())
+        # Centres are computed in float32 µm: 2e-6 relative.
+        assert np.allclose(y[:, 0], full_y[row : row + len(y), 0], atol=1e-4)
+        assert np.allclose(x[0], full_x[0, column : column + x.shape[1]], atol=1e-4)
+
+
+def test_priors_and_injections_are_read_and_refused(tmp_path) -> None:
+    listed = tmp_path / "priors.txt"
+    listed.write_text("tilt-bow  # seen before\n\nvignetting\n")
+    assert parse_priors(str(listed)) == parse_priors("tilt-bow, vignetting") == ("tilt-bow", "vignetting")
+    assert parse_injection("vignetting=0.1")[1] == 0.1
+    for text in ("vignetting", "vignetting=much", "nothing=1", "tilt-bow=0.1"):
+        with pytest.raises(InputError):
+            parse_injection(text)
+
+
+def _truth(field) -> np.ndarray:
+    import torch
+
+    with torch.no_grad():
+        return true_model({})(field.layout, field.context)[0, 0].numpy()

@@ -1,0 +1,27 @@
+"""A base model that is taken as trained: what it lacks is added, what it carries is called absorbed."""
+
+from __future__ import annotations
+
+import pytest
+
+from litho_models.loop import LoopConfig, close_loop, corrected_chain
+from litho_models.loop.outcome import summarise
+from tests.litho_models.loop_scans import printed_scans, true_model
+
+EFFECT = {"vignetting": {"strength": 0.2}}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("carries_it", [False, True], ids=["lacks it", "carries it"])
+def test_an_effect_is_added_to_or_absorbed_by_a_trained_model(carries_it: bool) -> None:
+    scans = printed_scans(EFFECT, seed=1)
+    trained = true_model(EFFECT if carries_it else {}).requires_grad_(False)
+    closed = close_loop(scans, trained, LoopConfig(), trainer=lambda training: trained)
+    result = summarise(closed, dataset=("made here", ""), base_name="trained", dropped=[])
+    verdict = {c.name: c.verdict for c in result.candidates}["vignetting"]
+    if carries_it:
+        assert verdict == "absorbed"
+        assert result.verdict == "nothing-missing"
+    else:
+        assert verdict == "explained"
+        assert corrected_chain(closed).values()["vignetting"]["strength"] == pytest.approx(0.2, abs=0.02)

@@ -1,0 +1,105 @@
+"""The statistics of the loop on numbers whose answer is known."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from litho_models.loop.confirming import binomial_p, confirm, confirm_variance, one_sided_flip_p, sign_flips
+from litho_models.loop.linear import gram, orthonormal, solve_damped
+from litho_models.loop.screening import family_wise_p, sign_flip_statistics
+
+
+@pytest.mark.parametrize(("needed", "count"), [(19, 24), (17, 20), (11, 12), (10, 10), (8, 8)])
+def test_scans_needed_for_a_confirmation(needed: int, count: int) -> None:
+    assert binomial_p(needed, count) <= 0.005 < binomial_p(needed - 1, count)
+
+
+def test_seven_scans_can_confirm_nothing() -> None:
+    before, after = np.full(7, 100.0), np.full(7, 50.0)
+    assert not confirm(before, after, before, after).passed
+
+
+def test_a_steady_gain_is_confirmed_and_its_rules_fail_one_by_one() -> None:
+    rng = np.random.default_rng(0)
+    before = 100 + rng.normal(size=12)
+    after = before - 10 - rng.normal(size=12)
+    verdict = confirm(before, after, before, after, amplitudes={"a": np.array([1.0, 1.1, 0.9])})
+    assert verdict.passed
+    assert verdict.improved == (12, 12)
+    assert verdict.p == pytest.approx(2**-12)
+    assert "sign" in confirm(before, after, before, after, amplitudes={"a": np.array([1.0, -1.0])}).reason
+    assert "varies" in confirm(before, after, before, after, amplitudes={"a": np.array([1.0, 4.0])}).reason
+    assert "small" in confirm(before, before - 0.1, before, before).reason
+    assert "interval" in confirm(before, before[::-1], before, before).reason
+
+
+def test_sign_flips_are_exhaustive_for_few_scans_and_hold_the_observed_signs() -> None:
+    signs = sign_flips(5)
+    assert len({tuple(row) for row in signs}) == 32
+    assert (signs[0] == 1).all()
+    assert (sign_flips(20)[0] == 1).all()
+    assert one_sided_flip_p(np.ones(8)) == 1 / 256
+
+
+def test_family_wise_p_is_uniform_without_any_effect() -> None:
+    rng = np.random.default_rng(1)
+    p = []
+    for _ in range(300):
+        z, null_max = sign_flip_statistics(rng.normal(size=(10, 6)))
+        p.append(family_wise_p(float(np.abs(z).max()), null_max))
+    # 300 draws of a uniform p: share below 0.1 is 0.1 +- 0.017; four standard deviations.
+    assert abs(np.mean(np.array(p) <= 0.1) - 0.1) < 0.07
+    assert np.mean(np.array(p) <= 0.05) < 0.05 + 4 * math.sqrt(0.05 * 0.95 / 300)
+
+
+def test_cluster_robust_z_is_the_one_of_the_formula() -> None:
+    scores = np.array([[1.0], [2.0], [4.0], [3.0]])
+    z, _ = sign_flip_statistics(scores)
+    expected = 10 / math.sqrt(4 / 3 * ((scores - 2.5) ** 2).sum())
+    assert z[0] == pytest.approx(expected)
+
+
+def test_variance_component_is_confirmed_although_some_scans_do_not_need_it() -> None:
+    rng = np.random.default_rng(2)
+    offsets = np.concatenate([np.zeros(3), rng.normal(size=9)]) * 0.02
+    maps = [o + 0.005 * rng.normal(size=400) for o in offsets]
+    left = [m - o - 0.001 * rng.normal() for m, o in zip(maps, offsets, strict=True)]
+    before, after = (np.array([1e6 * np.mean(m**2) for m in group]) for group in (maps, left))
+    verdict = confirm_variance(maps, left, (before, before), (after, after))
+    assert verdict.passed
+    nothing = [0.005 * rng.normal(size=400) for _ in offsets]
+    noise = [m - 0.001 * rng.normal() for m in nothing]
+    b, a = (np.array([1e6 * np.mean(m**2) for m in group]) for group in (nothing, noise))
+    assert not confirm_variance(nothing, noise, (b, b), (a, a)).passed
+
+
+def test_orthonormal_basis_spans_the_columns_and_drops_copies() -> None:
+    rng = np.random.default_rng(3)
+    columns = rng.normal(size=(50, 3))
+    basis = orthonormal(np.column_stack([columns, columns[:, 0] * 2]))
+    assert basis.shape == (50, 3)
+    assert np.allclose(basis.T @ basis, np.eye(3), atol=1e-9)
+    assert np.allclose(basis @ (basis.T @ columns), columns, atol=1e-9)
+
+
+def test_gram_frees_columns_of_the_basis() -> None:
+    rng = np.random.default_rng(4)
+    basis = orthonormal(rng.normal(size=(40, 2)))
+    columns = rng.normal(size=(40, 3))
+    free = columns - basis @ (basis.T @ columns)
+    assert np.allclose(gram(columns, basis), free.T @ free)
+    assert np.allclose(gram(columns, basis, weight_in_basis=1.0), columns.T @ columns)
+
+
+def test_damped_solution_is_exact_without_damping_and_indifferent_to_units() -> None:
+    rng = np.random.default_rng(5)
+    a = rng.normal(size=(20, 3))
+    b = rng.normal(size=20)
+    units = np.array([1.0, 30.0, 0.03])
+    plain = solve_damped(a.T @ a, a.T @ b, 0.0)
+    assert np.allclose(plain, np.linalg.lstsq(a, b, rcond=None)[0])
+    damped, scaled = (solve_damped((a * u).T @ (a * u), (a * u).T @ b, 0.1) for u in (1.0, units))
+    assert np.allclose(damped, scaled * units, rtol=1e-6)

@@ -1,0 +1,88 @@
+"""Error figures: closed forms, coverage of the intervals, exact sign-flip p."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from litho_data.errors import InputError
+from litho_models.metrics import bootstrap_interval, paired_difference, regression_line, score_scan
+
+VALID = np.ones((256, 256), bool)
+
+
+def test_constant_error_is_bias_and_vanishes_when_the_datum_is_free():
+    prediction = np.random.default_rng(0).uniform(0, 1, VALID.shape)
+    score = score_scan("a", prediction - 0.052, prediction, VALID)
+    # Measured minus predicted: a print lower than the model says has a negative bias.
+    assert score.bias_nm == pytest.approx(-52)
+    assert score.mae_abs_nm == pytest.approx(52)
+    assert score.mae_datum_free_nm < 1e-9
+
+
+def test_gaussian_noise_has_a_mean_absolute_error_of_0_798_sigma():
+    random = np.random.default_rng(1)
+    noise = random.normal(0, 0.01596, VALID.shape)
+    score = score_scan("a", noise, np.zeros(VALID.shape), VALID, "none")
+    # 65,536 pixels: |n| has a relative standard error of 0.756/256 = 0.3 %; three times that.
+    assert score.mae_datum_free_nm == pytest.approx(15.96 * np.sqrt(2 / np.pi), rel=0.009)
+    assert score.rmse_datum_free_nm == pytest.approx(15.96, rel=0.009)
+    assert score.median_abs_datum_free_nm == pytest.approx(15.96 * 0.67449, rel=0.015)
+    assert score.p95_abs_datum_free_nm == pytest.approx(15.96 * 1.95996, rel=0.015)
+
+
+def test_slope_and_intercept_of_a_known_line():
+    x = np.linspace(0, 1.2, 50)
+    slope, intercept = regression_line(x, 0.7 * x + 0.05)
+    assert (slope, intercept) == (pytest.approx(0.7), pytest.approx(0.05))
+    assert np.isnan(regression_line(np.ones(4), x[:4])[0])
+
+
+def test_interval_over_scans_covers_the_mean_about_as_often_as_promised():
+    random = np.random.default_rng(2)
+    hits = 0
+    for _ in range(200):
+        low, high = bootstrap_interval(random.normal(21, 2, 20).tolist(), draws=500)
+        hits += low <= 21 <= high
+    # The percentile interval of 20 values covers about 93 %; 200 trials have a standard error of 1.8 %.
+    assert 0.87 <= hits / 200 <= 0.985
+
+
+def test_one_scan_has_no_interval():
+    assert all(np.isnan(end) for end in bootstrap_interval([20.0]))
+
+
+def test_sign_flip_p_of_a_uniform_improvement_is_two_in_two_to_the_n():
+    first, second = [20.0] * 6, [21.0] * 6
+    compared = paired_difference(first, second)
+    assert compared.p == pytest.approx(2 / 2**6)
+    assert compared.mean == -1.0
+    assert compared.first_better == 6
+
+
+def test_no_difference_gives_p_of_one():
+    assert paired_difference([1.0, 2.0], [1.0, 2.0]).p == 1.0
+
+
+def test_sampled_and_exact_p_agree():
+    random = np.random.default_rng(3)
+    difference = random.normal(0.6, 1.0, 14)
+    exact = paired_difference(difference.tolist(), [0.0] * 14).p
+    sampled = paired_difference([*difference, 0.0], [0.0] * 15).p
+    # A scan without difference changes nothing but the way p is computed; 9,999 draws: 3 standard errors.
+    assert sampled == pytest.approx(exact, abs=3 * np.sqrt(exact * (1 - exact) / 9999) + 1e-4)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: paired_difference([1.0], [1.0, 2.0]),
+        lambda: paired_difference([], []),
+        lambda: score_scan(
+            "a", np.full((64, 64), np.nan), np.zeros((64, 64)), np.ones((64, 64), bool), "none"
+        ),
+    ],
+)
+def test_bad_input_is_refused(call):
+    with pytest.raises(InputError):
+        call()

@@ -1,0 +1,101 @@
+"""Splits: disjoint, complete, reproducible, and never through a scan."""
+
+from __future__ import annotations
+
+import pytest
+
+from litho_data.errors import InputError
+from litho_models.splits import (
+    Crop,
+    grouped_folds,
+    ids_sha256,
+    inner_validation,
+    leave_one_print_out,
+    lock_box,
+    lock_box_size,
+    paper_draw,
+)
+
+MEASURED_IDS = [f"FOV{print_}{field}" for print_ in (1, 2, 3, 4, 6, 7) for field in (1, 2, 3, 4)]
+PRINTS = [scan_id[3] for scan_id in MEASURED_IDS]
+
+
+def test_folds_hold_each_scan_out_exactly_once():
+    folds = grouped_folds(MEASURED_IDS, 5)
+    assert sorted(scan_id for fold in folds for scan_id in fold) == sorted(MEASURED_IDS)
+    assert max(map(len, folds)) - min(map(len, folds)) <= 1
+
+
+def test_folds_depend_on_the_seed_and_not_on_the_order_of_the_ids():
+    assert grouped_folds(MEASURED_IDS, 5, seed=3) == grouped_folds(MEASURED_IDS[::-1], 5, seed=3)
+    assert grouped_folds(MEASURED_IDS, 5, seed=3) != grouped_folds(MEASURED_IDS, 5, seed=4)
+
+
+def test_lock_box_takes_scans_from_different_prints():
+    locked = lock_box(MEASURED_IDS, PRINTS, lock_box_size(24))
+    assert len(locked) == 4
+    assert len({scan_id[3] for scan_id in locked}) == 4
+
+
+@pytest.mark.parametrize(("scans", "wanted"), [(1, 0), (2, 0), (3, 1), (8, 1), (24, 4)])
+def test_lock_box_is_a_sixth_of_the_scans(scans, wanted):
+    assert lock_box_size(scans) == wanted
+
+
+def test_the_recorded_lock_box_of_the_measured_prints_is_the_one_that_is_computed():
+    import tomllib
+    from pathlib import Path
+
+    record = Path(__file__).parents[2] / "datasets" / "neural-lithography.split.toml"
+    stated = tomllib.loads(record.read_text(encoding="utf-8"))
+    locked = lock_box(MEASURED_IDS, PRINTS, lock_box_size(24))
+    assert stated["lock_box"]["ids"] == locked
+    assert stated["lock_box"]["sha256"] == ids_sha256(locked)
+    development = [scan_id for scan_id in MEASURED_IDS if scan_id not in locked]
+    assert stated["grouped"]["folds"] == grouped_folds(development, 5)
+
+
+def test_leave_one_print_out_holds_out_whole_prints():
+    folds = leave_one_print_out(MEASURED_IDS, PRINTS)
+    assert [len(fold) for fold in folds] == [4] * 6
+    assert all(len({scan_id[3] for scan_id in fold}) == 1 for fold in folds)
+
+
+def test_paper_draw_is_72_against_24_and_leaky():
+    held_out = paper_draw(MEASURED_IDS, 0)
+    assert len(held_out) == 24
+    # 24 of 96 quadrants at random: practically every scan would have to be all in or all out not to leak.
+    split_scans = {crop.scan_id for crop in held_out} & {
+        scan_id for scan_id in MEASURED_IDS if sum(c.scan_id == scan_id for c in held_out) < 4
+    }
+    assert split_scans
+
+
+def test_quadrants_tile_a_scan_of_odd_size():
+    import numpy as np
+
+    seen = np.zeros((7, 9), int)
+    for quadrant in range(4):
+        seen[Crop("a", quadrant).slices((7, 9))] += 1
+    assert (seen == 1).all()
+
+
+def test_inner_validation_is_a_small_part_of_the_training_scans():
+    assert len(inner_validation(MEASURED_IDS, 2)) == 2
+    assert len(inner_validation(MEASURED_IDS[:5], 2)) == 1
+    assert inner_validation(MEASURED_IDS[:3], 2) == []
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda: grouped_folds(["a", "a", "b"], 2),
+        lambda: grouped_folds(["a", "b"], 3),
+        lambda: lock_box(["a", "b"], ["1"], 1),
+        lambda: lock_box(["a", "b"], ["1", "2"], 2),
+        lambda: leave_one_print_out(["a", "b"], ["1", "1"]),
+    ],
+)
+def test_impossible_splits_are_refused(call):
+    with pytest.raises(InputError):
+        call()
