@@ -1,0 +1,1 @@
+"""Diffractive optics designed through a frozen model of the printer."""

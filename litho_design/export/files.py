@@ -1,0 +1,107 @@
+"""Export of a design in one of the formats, and the exact import of what was exported."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from litho_data.errors import InputError
+from litho_data.files import atomic_folder
+from litho_data.outputs import require_replaceable_folder
+from litho_design.design import LEVELS_FILE, Design, read_array
+from litho_design.export.gds import GdsLayers, read_gds_levels, write_gds
+from litho_design.export.image import read_image_levels, write_bmp, write_png16, write_tiff
+from litho_design.export.sidecar import Format, Sidecar, make_sidecar, read_sidecar, sidecar_path
+from litho_design.export.stl import read_stl_levels, write_stl
+
+_SUFFIX: dict[str, str] = {"png16": ".png", "bmp": ".bmp", "tiff": ".tif", "stl": ".stl", "gds": ".gds"}
+
+
+def export_design(
+    folder: str | Path,
+    kind: Format,
+    out: str | Path,
+    *,
+    pedestal_um: float = 1.0,
+    slicing_um: float = 0.1,
+    hatching_um: float = 0.1,
+    gds_layers: GdsLayers = "cumulative",
+) -> Path:
+    """Write the layout of a design for the printer, and ``<file>.json`` beside it.
+
+    The file is read back before the export counts as done.
+
+    Args:
+        folder: design folder.
+        kind: png16, bmp, tiff, stl or gds.
+        out: folder of the export; replaced as a whole.
+        pedestal_um: base under level 0 (part of the STL; told to the operator otherwise).
+        slicing_um, hatching_um: recorded for the job.
+
+    Returns:
+        Path of the exported file.
+
+    Raises:
+        InputError: an incomplete design, or a format that cannot hold it.
+    """
+    if kind not in _SUFFIX:
+        raise InputError("format", got=repr(kind), wanted=", ".join(_SUFFIX))
+    design = Design.read(folder)
+    levels = read_array(folder, LEVELS_FILE)
+    name = f"layout{_SUFFIX[kind]}"
+    require_replaceable_folder(out, "layout*")
+    with atomic_folder(out) as temporary:
+        file = temporary / name
+        step = _write(file, kind, levels, design, pedestal_um, gds_layers)
+        sidecar = make_sidecar(
+            Path(folder), design, file, kind, pedestal_um=pedestal_um, slicing_um=slicing_um,
+            hatching_um=hatching_um, grey_per_level=step, gds_layers=gds_layers if kind == "gds" else None,
+        )  # fmt: skip
+        sidecar.write(temporary).rename(sidecar_path(file))
+        back, _ = import_levels(file)
+        if not np.array_equal(back, levels):
+            raise AssertionError(f"{kind} export does not read back as it was written")
+    return Path(out) / name
+
+
+def import_levels(file: str | Path) -> tuple[np.ndarray, Sidecar]:
+    """The level map of an exported file, uint8 (ny, nx), row 0 on top, and its sidecar.
+
+    Raises:
+        InputError: no sidecar, or a file that was changed.
+    """
+    path = Path(file)
+    sidecar = read_sidecar(path)
+    if sidecar.format == "stl":
+        cell_px = _cell_px(sidecar)
+        shape = (sidecar.shape_px[0] // cell_px, sidecar.shape_px[1] // cell_px)
+        cells = read_stl_levels(
+            path, shape, cell_px * sidecar.pitch_um, sidecar.level_height_um, sidecar.pedestal_um
+        )
+        return cells.repeat(cell_px, 0).repeat(cell_px, 1), sidecar
+    if sidecar.format == "gds":
+        assert sidecar.gds_layers is not None
+        return read_gds_levels(path, sidecar.shape_px, sidecar.pitch_um, sidecar.gds_layers), sidecar
+    assert sidecar.grey_per_level is not None
+    return read_image_levels(path, sidecar.grey_per_level), sidecar
+
+
+def _write(
+    file: Path, kind: Format, levels: np.ndarray, design: Design, pedestal_um: float, gds_layers: GdsLayers
+) -> int | None:
+    layout = design.layout
+    if kind == "stl":
+        cell_px = 1 if layout.symmetry == "radial" else layout.cell_px
+        cells = levels[::cell_px, ::cell_px]
+        write_stl(file, cells, cell_px * layout.pitch_um, layout.level_height_um, pedestal_um)
+        return None
+    if kind == "gds":
+        write_gds(file, levels, layout.pitch_um, gds_layers)
+        return None
+    return {"png16": write_png16, "bmp": write_bmp, "tiff": write_tiff}[kind](file, levels, layout)
+
+
+def _cell_px(sidecar: Sidecar) -> int:
+    layout = sidecar.settings["layout"]
+    return 1 if layout["symmetry"] == "radial" else round(layout["cell_um"] / layout["pitch_um"])

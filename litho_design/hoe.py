@@ -1,0 +1,165 @@
+"""Design a holographic element through a frozen model of the printer."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from litho_data.errors import InputError
+from litho_design.design import HEIGHT_FILE, IMAGE_FILE, TARGET_FILE, Design, DesignTask
+from litho_design.hologram import HologramBench, image_error
+from litho_design.initialise import gerchberg_saxton, printed_phase
+from litho_design.metrics import HologramScore, si_psnr_db
+from litho_design.parametrise import CellMap, LayoutSettings, Parametrisation, nearest_levels
+from litho_design.printer import Printer
+from litho_design.report_design import write_hologram_report
+from litho_design.robust import draws, risk
+from litho_design.settings import HoeSettings
+from litho_design.targets import TargetRecord
+from litho_design.task import run_design
+
+_REFERENCE_ITERATIONS = 40
+_WINDOW_DRAWS = 16
+
+
+def design_hoe(
+    settings: HoeSettings,
+    printer: Printer,
+    target: np.ndarray,
+    target_record: TargetRecord,
+    out: str | Path,
+    *,
+    command: str = "",
+    announce: bool = True,
+) -> Design:
+    """Optimise the layout of a hologram so that its print shows the wanted image.
+
+    Args:
+        settings: geometry, optics, search and loss (see ``hoe_preset``).
+        printer: frozen model, or nominal heights.
+        target: wanted image (size_px, size_px) in [0, 1].
+        out: folder of the design; an interrupted run in it is continued.
+
+    Returns:
+        The record written to ``out/design.json``.
+
+    Raises:
+        InputError: a target of another size, or a folder that holds another design.
+    """
+    _check_target(target, settings.layout)
+    task = HoeTask(settings, printer, target, target_record)
+    return run_design(task, settings, settings, out, command=command, announce=announce)
+
+
+class HoeTask:
+    """The hologram as a task for ``run_design``."""
+
+    name: DesignTask = "hoe"
+
+    def __init__(self, settings: HoeSettings, printer: Printer, target: np.ndarray, record: TargetRecord):
+        device = printer.device
+        if settings.search.start == "fresnel":
+            raise InputError("start", got="'fresnel'", wanted="'random', 'gs' or 'wgs' for a hologram")
+        self.settings, self.printer, self.target_record = settings, printer, record
+        self.cells = CellMap(settings.layout).to(device)
+        self.bench = HologramBench(settings.layout, settings.optics).to(device)
+        self.target = torch.from_numpy(target).to(device)
+        self.draws = [
+            (draw, HologramBench(settings.layout, draw.optics).to(device))
+            for draw in draws(settings.window, settings.optics, settings.window.samples)
+        ]
+
+    def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
+        """RMSE of the printed hologram's image + weight * (1 - efficiency), of levels on the pixels.
+
+        With process-window samples: the risk of that loss over them.
+        """
+        height = self.printer(level)[0, 0]
+        if not self.draws:
+            return self._loss(height, self.bench)
+        layout = self.settings.layout
+        losses = torch.stack([self._loss(draw.apply(height, layout), bench)[0] for draw, bench in self.draws])
+        parts = {"mean": float(losses.detach().mean()), "worst": float(losses.detach().max())}
+        return risk(losses, self.settings.window), parts
+
+    @torch.no_grad()
+    def window_scores(self, height_um: Tensor, count: int) -> list[dict[str, float]]:
+        """Loss, SI-PSNR and signal efficiency of a print (size, size) over ``count`` draws of the window."""
+        scores = []
+        for draw in draws(self.settings.window, self.settings.optics, count):
+            bench = HologramBench(self.settings.layout, draw.optics).to(height_um.device)
+            changed = draw.apply(height_um, self.settings.layout)
+            share = bench(changed)
+            loss, _ = self._loss(changed, bench)
+            scores.append(
+                {
+                    "loss": float(loss),
+                    "si_psnr_db": si_psnr_db(share.double(), self.target.double()),
+                    "eff_signal": float(share[self.target > 0.5].sum()),
+                }
+            )
+        return scores
+
+    def _loss(self, height_um: Tensor, bench: HologramBench) -> tuple[Tensor, dict[str, float]]:
+        share = bench(height_um)
+        rmse, efficiency = image_error(share, self.target, self.settings.loss.scale)
+        total = rmse + self.settings.loss.efficiency_weight * (1 - efficiency)
+        return total, {"rmse": float(rmse.detach()), "efficiency": float(efficiency.detach())}
+
+    def start(self, parameters: Parametrisation, level_heights_um: list[float]) -> None:
+        """Random, or Gerchberg-Saxton projected on the phases that the levels really print."""
+        search = self.settings.search
+        if search.start == "random":
+            parameters.start_random(search.seed)
+            return
+        level_phase = printed_phase(level_heights_um, self.settings.optics).to(self.target)
+        phase, _ = gerchberg_saxton(
+            self.bench.propagator,
+            self.target,
+            self.cells,
+            iterations=search.start_iterations,
+            weighted=search.start == "wgs",
+            seed=search.seed,
+            level_phase=level_phase,
+        )
+        parameters.start_from(nearest_levels(phase, level_phase).float())
+
+    def score(self, height_um: Tensor) -> HologramScore:
+        """All figures of the image behind a print (size, size), µm."""
+        return self.bench.score(height_um, self.target, self.settings.camera)
+
+    @torch.no_grad()
+    def arrays(self, height_um: Tensor) -> dict[str, np.ndarray]:
+        """Image (share of incident power per pixel) and target."""
+        return {IMAGE_FILE: self.bench(height_um).cpu().numpy(), TARGET_FILE: self.target.cpu().numpy()}
+
+    @torch.no_grad()
+    def reference_efficiency(self) -> float:
+        """Signal efficiency of a continuous-phase Gerchberg-Saxton element with the same cells."""
+        phase, _ = gerchberg_saxton(
+            self.bench.propagator,
+            self.target,
+            self.cells,
+            iterations=_REFERENCE_ITERATIONS,
+            weighted=False,
+            seed=self.settings.search.seed,
+        )
+        share = self.bench(self.cells(phase) * (self.settings.optics.wave_height_um / (2 * math.pi)))
+        return float(share[self.target > 0.5].sum())
+
+    def report(self, folder: Path, design: Design, history: list[dict[str, float]]) -> None:
+        """Write report.html."""
+        height = torch.from_numpy(np.load(folder / HEIGHT_FILE)).to(self.target.device)
+        write_hologram_report(folder, design, history, self.window_scores(height, _WINDOW_DRAWS))
+
+
+def _check_target(target: np.ndarray, layout: LayoutSettings) -> None:
+    wanted = (layout.size_px, layout.size_px)
+    if target.shape != wanted:
+        raise InputError("target", got=f"{target.shape} px", wanted=f"{wanted} px, the size of the element")
+    if not np.isfinite(target).all() or target.min() < 0 or target.max() > 1 or target.max() == 0:
+        raise InputError("target", got="values outside [0, 1] or no light", wanted="an image in [0, 1]")

@@ -1,0 +1,187 @@
+"""Design a multi-level diffractive lens through a frozen model of the printer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from litho_data.errors import InputError
+from litho_design.design import IMAGE_FILE, Design, DesignTask
+from litho_design.initialise import fresnel_lens_phase, printed_phase
+from litho_design.lens_bench import (
+    LensBench,
+    RadialLensBench,
+    centre_to_background,
+    object_stack,
+    reconstruct,
+    record,
+    sensor_psf,
+)
+from litho_design.lens_metrics import ImagingScore, LensScore, imaging_score, lens_score
+from litho_design.parametrise import CellMap, Parametrisation, nearest_levels
+from litho_design.printer import Printer
+from litho_design.report_lens import write_lens_report
+from litho_design.settings import LensSettings
+from litho_design.targets import TargetRecord
+from litho_design.task import run_design
+
+# The same noise in every iteration: the search compares layouts, not noise; the score draws its own.
+_DESIGN_NOISE_SEED = 0
+
+
+def design_lens(
+    settings: LensSettings, printer: Printer, out: str | Path, *, command: str = "", announce: bool = True
+) -> Design:
+    """Optimise the layout of a lens so that its print focuses, or images after reconstruction.
+
+    Args:
+        settings: geometry, optics, task and search (see ``lens_preset``).
+        printer: frozen model, or nominal heights.
+        out: folder of the design; an interrupted run in it is continued.
+
+    Raises:
+        InputError: a radial search of a layout without rings or with a square aperture.
+    """
+    task = LensTask(settings, printer)
+    return run_design(task, settings, settings, out, command=command, announce=announce)
+
+
+class LensTask:
+    """The lens as a task for ``run_design``."""
+
+    target_record: TargetRecord | None = None
+
+    def __init__(self, settings: LensSettings, printer: Printer):
+        _check(settings)
+        self.settings, self.printer = settings, printer
+        self.name: DesignTask = "lens-direct" if settings.task == "direct" else "lens-computational"
+        device = printer.device
+        self.cells = CellMap(settings.layout).to(device)
+        self.bench = LensBench(settings.layout, settings.optics, settings.view).to(device)
+        self.rings = (
+            RadialLensBench(settings.layout, settings.optics, settings.view).to(device)
+            if settings.view.path == "radial"
+            else None
+        )
+        self.strip = _strip_rings(self.cells, printer.guard_px) if self.rings is not None else None
+        self.objects = object_stack(settings.imaging.objects, settings.imaging.object_px).to(device)
+
+    def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
+        """-log(centre-to-background ratio), or the mean absolute error after Richardson-Lucy."""
+        psf = self._search_psf(level)
+        layout = self.settings.layout
+        centre_px = round(self.settings.view.centre_um / layout.pitch_um)
+        ratio = centre_to_background(psf, centre_px, layout.size_px)
+        parts = {"cbr": float(ratio.detach()), "window": float(psf.detach().sum())}
+        if self.settings.task == "direct":
+            return -ratio.log(), parts
+        imaging = self.settings.imaging
+        kernel = sensor_psf(psf, imaging.pixel_px)
+        seen = record(self.objects, kernel, imaging.read_noise, _DESIGN_NOISE_SEED)
+        error = (reconstruct(seen, kernel, imaging.iterations) - self.objects).abs().mean()
+        return error, parts
+
+    def start(self, parameters: Parametrisation, level_heights_um: list[float]) -> None:
+        """Random, or the wrapped phase of a perfect lens at the levels that print nearest to it."""
+        search = self.settings.search
+        if search.start == "random":
+            parameters.start_random(search.seed)
+            return
+        layout = self.settings.layout
+        phase = fresnel_lens_phase(CellMap(layout), layout.pitch_um, self.settings.optics)
+        level_phase = printed_phase(level_heights_um, self.settings.optics)
+        levels = _best_offset(phase, level_phase).float().to(self.printer.device)
+        generator = torch.Generator().manual_seed(search.seed)
+        jitter = torch.randn(levels.shape, generator=generator).to(levels) * search.start_jitter_levels
+        parameters.start_from((levels + jitter).clamp(0, layout.levels - 1))
+
+    def score(self, height_um: Tensor) -> LensScore | ImagingLensScore:
+        """Score of a print, expected PSF and printed PSF being the same."""
+        return score_lens(self.settings, self.bench, height_um, height_um)
+
+    @torch.no_grad()
+    def arrays(self, height_um: Tensor) -> dict[str, np.ndarray]:
+        """The PSF."""
+        return {IMAGE_FILE: self.bench(height_um).cpu().numpy()}
+
+    def reference_efficiency(self) -> float:
+        """Focusing efficiency of a perfect lens of this aperture."""
+        return lens_score(self.bench, self.bench.ideal_height_um()).focusing_efficiency
+
+    def report(self, folder: Path, design: Design, history: list[dict[str, float]]) -> None:
+        """Write report.html."""
+        write_lens_report(folder, design, history, self.bench)
+
+    def _search_psf(self, level: Tensor) -> Tensor:
+        if self.rings is None:
+            return self.bench(self.printer(level)[0, 0])
+        return self.rings(self._printed_rings(level))
+
+    def _printed_rings(self, level: Tensor) -> Tensor:
+        """Height of each ring inside the aperture, from a print of a strip along a radius.
+
+        The strip continues the rings beyond the aperture, as the layout's corners do.
+        """
+        assert self.strip is not None
+        rings = self.cells.average(level[0, 0])
+        printed = self.printer.print_patch(rings[self.strip][None, None])[0, 0]
+        guard = self.printer.guard_px
+        inside = self.settings.layout.size_px // 2
+        return printed[guard : guard + 2, guard : guard + inside].mean(0)
+
+
+def _strip_rings(cells: CellMap, guard_px: int) -> Tensor:
+    """Ring under each pixel of the strip: two central rows, rings 0 to the aperture, guard all round."""
+    assert cells.radial
+    along = torch.arange(-guard_px, cells.size_px // 2 + guard_px, dtype=torch.float64) + 0.5
+    across = torch.arange(-guard_px - 1, guard_px + 1, dtype=torch.float64) + 0.5
+    ring = (torch.hypot(across[:, None], along[None, :]) / cells.cell_px).floor().long()
+    return ring.clamp(max=cells.cells[0] - 1).to(cells.ring.device)
+
+
+class ImagingLensScore(LensScore, ImagingScore):
+    """PSF and imaging figures of a computational lens."""
+
+
+@torch.no_grad()
+def score_lens(
+    settings: LensSettings, bench: LensBench, height_um: Tensor, design_height_um: Tensor
+) -> LensScore | ImagingLensScore:
+    """Figures of a printed lens whose design expected ``design_height_um``."""
+    score = lens_score(bench, height_um)
+    if settings.task == "direct":
+        return score
+    imaging = imaging_score(bench(height_um), bench(design_height_um), settings.imaging)
+    return ImagingLensScore(**score.model_dump(), **imaging.model_dump())
+
+
+def _best_offset(phase: Tensor, level_phase: Tensor) -> Tensor:
+    """Nearest levels after the constant phase shift that wastes the least light.
+
+    A print whose stroke is below one wave leaves a gap on the circle; turning the wanted phase
+    moves the gap, and the sum of the cosines of what is left is the amplitude at the focus.
+    """
+    best, best_value = nearest_levels(phase, level_phase), -torch.inf
+    for turn in torch.arange(0, 1, 1 / 24) * (2 * torch.pi):
+        levels = nearest_levels(phase + turn, level_phase)
+        value = float(torch.polar(torch.ones_like(phase), level_phase[levels] - phase).mean().abs())
+        if value > best_value:
+            best, best_value = levels, value
+    return best
+
+
+def _check(settings: LensSettings) -> None:
+    if settings.search.start in ("gs", "wgs"):
+        raise InputError("start", got=repr(settings.search.start), wanted="'random' or 'fresnel' for a lens")
+    radial = settings.view.path == "radial"
+    if radial and (settings.layout.symmetry != "radial" or settings.view.aperture != "circle"):
+        raise InputError(
+            "search path 'radial'",
+            got=f"symmetry {settings.layout.symmetry!r}, aperture {settings.view.aperture!r}",
+            wanted="a ring layout behind a circular aperture",
+        )
+    if radial and settings.layout.size_px % 2:
+        raise InputError("size_px for the radial path", got=settings.layout.size_px, wanted="an even number")

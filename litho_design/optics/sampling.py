@@ -1,0 +1,79 @@
+"""Where grids sit and which propagator may be used on them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from litho_data.errors import InputError
+from litho_data.grid import PixelGrid
+
+# Replicas of the spectrum sit at 1/pitch; two decay lengths of the evanescent wave there leave 4e-6.
+_DECAY_LENGTHS = 2.0
+
+
+def centred_grid(
+    shape: tuple[int, int], pitch_um: float, centre_um: tuple[float, float] = (0.0, 0.0)
+) -> PixelGrid:
+    """A grid of square pixels whose middle lies at ``centre_um`` (y, x), for even and odd sizes alike."""
+    grid = PixelGrid.square(shape, pitch_um)
+    height, width = grid.size_um
+    return replace(grid, origin_um=(centre_um[0] - height / 2, centre_um[1] - width / 2))
+
+
+def sampling_limit_um(source: PixelGrid, target: PixelGrid, wavelength_um: float) -> float:
+    """Smallest distance, µm, at which the sampled Rayleigh-Sommerfeld kernel is not aliased.
+
+    Far from the axis the kernel oscillates with x / (wavelength r) cycles/µm, which must stay below
+    the Nyquist frequency of the source; close to it the evanescent replicas must have decayed.
+    """
+    limit = 0.0
+    for axis in range(2):
+        pitch = source.pitch_um[axis]
+        reach = _largest_separation_um(source, target, axis)
+        if 2 * pitch > wavelength_um:
+            limit = max(limit, reach * math.sqrt((2 * pitch / wavelength_um) ** 2 - 1))
+        if pitch < wavelength_um:
+            limit = max(limit, _DECAY_LENGTHS / math.sqrt(pitch**-2 - wavelength_um**-2) / 2)
+    return limit
+
+
+def check_distance(distance_um: float, source: PixelGrid, target: PixelGrid, wavelength_um: float) -> None:
+    """Refuse a distance at which the Rayleigh-Sommerfeld kernel would be aliased.
+
+    Raises:
+        InputError: ``distance_um`` is not positive, or below ``sampling_limit_um``.
+    """
+    limit = sampling_limit_um(source, target, wavelength_um)
+    if not math.isfinite(distance_um) or distance_um <= 0 or distance_um < limit:
+        raise InputError(
+            "propagation distance",
+            got=f"{distance_um} µm",
+            wanted=f"at least {limit:.4g} µm for a pitch of {source.pitch_um[1]:g} µm",
+            hint="use the angular spectrum method or a finer pitch",
+        )
+
+
+def fast_length(length: int) -> int:
+    """The next size for which the FFT is fast (factors 2, 3 and 5 only)."""
+    size = length
+    while True:
+        rest = size
+        for factor in (2, 3, 5):
+            while rest % factor == 0:
+                rest //= factor
+        if rest == 1:
+            return size
+        size += 1
+
+
+def first_centre_um(grid: PixelGrid, axis: int) -> float:
+    """Coordinate of the first pixel centre along ``axis`` (0 = y, 1 = x), µm."""
+    return grid.origin_um[axis] + grid.pitch_um[axis] / 2
+
+
+def _largest_separation_um(source: PixelGrid, target: PixelGrid, axis: int) -> float:
+    start = first_centre_um(target, axis) - first_centre_um(source, axis)
+    source_span = (source.shape[axis] - 1) * source.pitch_um[axis]
+    target_span = (target.shape[axis] - 1) * target.pitch_um[axis]
+    return max(abs(start - source_span), abs(start + target_span))

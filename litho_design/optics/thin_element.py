@@ -1,0 +1,57 @@
+"""From a height map to the wave behind it."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from pydantic import PositiveFloat
+from torch import Tensor
+
+from litho_data.grid import PixelGrid
+from litho_data.results import Record
+
+
+class Optics(Record):
+    """What the light sees: wavelength, index step and the distance to the output plane, µm."""
+
+    wavelength_um: PositiveFloat = 0.6328
+    index_step: PositiveFloat = 0.548
+    distance_um: PositiveFloat = 300.0
+
+    @property
+    def wave_height_um(self) -> float:
+        """Height that delays the wave by one period, µm."""
+        return self.wavelength_um / self.index_step
+
+
+def element_field(
+    height_um: Tensor, grid: PixelGrid, optics: Optics, aperture: Tensor | None = None
+) -> Tensor:
+    """The wave just behind a thin phase element lit by a plane wave of unit power.
+
+    u = exp(j 2 pi index_step height / wavelength) on the aperture and 0 elsewhere, scaled so that
+    sum |u|^2 dy dx = 1: intensities summed over any window times its pixel area are shares of the
+    incident power.
+
+    Args:
+        height_um: real (..., ny, nx), µm.
+        grid: geometry of ``height_um``.
+        aperture: optional real mask (ny, nx) in [0, 1].
+
+    Returns:
+        complex (..., ny, nx), 1/µm.
+    """
+    phase = height_um * (2 * math.pi / optics.wave_height_um)
+    area = math.prod(grid.pitch_um)
+    if aperture is None:
+        amplitude = torch.full_like(phase, 1 / math.sqrt(math.prod(grid.shape) * area))
+    else:
+        power = float(aperture.double().square().sum()) * area
+        amplitude = (aperture / math.sqrt(power)).to(phase).expand_as(phase)
+    return torch.polar(amplitude, phase)
+
+
+def intensity_share(field: Tensor, grid: PixelGrid) -> Tensor:
+    """|U|^2 times the pixel area: the share of the incident power that falls on each pixel."""
+    return (field.real.square() + field.imag.square()) * math.prod(grid.pitch_um)

@@ -1,0 +1,192 @@
+"""The printer as the designer meets it: layout levels in, printed height of the element out."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, Literal
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from litho_data.errors import InputError
+from litho_data.results import Record
+from litho_design.parametrise import LayoutSettings
+
+_GUARD_UM = 6.4
+
+
+class PrinterRecord(Record):
+    """Which printer a design or a score was made with."""
+
+    name: str
+    sha256: str
+    source: str
+    guard_um: float
+    extrapolated: bool = False
+
+
+class Printer(nn.Module):
+    """A frozen lithography model, or no model at all, applied to one element.
+
+    The element stands alone on the substrate, but models continue their input beyond its edge; so
+    the layout is surrounded by a guard ring of level 0 before printing and cropped afterwards.
+
+    Args:
+        simulator: a frozen model called as ``simulator(layout_um, pitch_um=...)``, or None for a
+            print equal to the nominal height.
+        layout: geometry and levels of the element.
+    """
+
+    device_marker: Tensor
+
+    def __init__(
+        self,
+        simulator: nn.Module | None,
+        layout: LayoutSettings,
+        *,
+        source: str,
+        name: str = "",
+        extrapolate: bool = False,
+    ):
+        super().__init__()
+        self.simulator = simulator
+        self.register_buffer("device_marker", torch.zeros(()), persistent=False)
+        self.layout = layout
+        self.source = source
+        self.extrapolate = extrapolate
+        self._reduced = False
+        self.name = name or ("none" if simulator is None else str(simulator.name))
+        self.guard_px = 0 if simulator is None else math.ceil(_guard_um(simulator) / layout.pitch_um)
+        if simulator is not None:
+            simulator.eval().requires_grad_(False)
+
+    @property
+    def card(self) -> Mapping[str, Any]:
+        """The card of the model; empty where there is none."""
+        return getattr(self.simulator, "card", {})
+
+    @property
+    def device(self) -> torch.device:
+        """Where the model lives, also where there is no model."""
+        return self.device_marker.device
+
+    def forward(self, level: Tensor) -> Tensor:
+        """Printed height, µm (b, 1, size, size), of real ``level`` (b, 1, size, size)."""
+        height_um = level * self.layout.level_height_um
+        if self.simulator is None:
+            return height_um
+        guard = self.guard_px
+        padded = F.pad(height_um, (guard, guard, guard, guard))
+        printed = self._simulate(padded)
+        return printed[..., guard : printed.shape[-2] - guard, guard : printed.shape[-1] - guard]
+
+    def print_patch(self, level: Tensor) -> Tensor:
+        """Printed height, µm, of a patch cut out of a layout, (b, 1, y, x) as given.
+
+        Pixels nearer to the patch's edge than the guard see a continued patch and must not be used.
+        """
+        height_um = level * self.layout.level_height_um
+        if self.simulator is None:
+            return height_um
+        return self._simulate(height_um)
+
+    @contextmanager
+    def at_precision(self, precision: Literal["float32", "bfloat16"]) -> Iterator[None]:
+        """Run the networks of the model in ``precision`` inside the block."""
+        self._reduced = precision == "bfloat16"
+        try:
+            yield
+        finally:
+            self._reduced = False
+
+    def record(self) -> PrinterRecord:
+        """Name, weights hash and guard ring, for the results."""
+        return PrinterRecord(
+            name=self.name,
+            sha256=self.weights_sha256(),
+            source=self.source,
+            guard_um=self.guard_px * self.layout.pitch_um,
+            extrapolated=self.extrapolate,
+        )
+
+    def weights_sha256(self) -> str:
+        """Hash of every parameter and buffer as it is now; equal before and after a design run."""
+        digest = hashlib.sha256()
+        state = {} if self.simulator is None else self.simulator.state_dict()
+        for name in sorted(state):
+            value = state[name].detach().cpu().contiguous()
+            digest.update(f"{name}:{value.dtype}:{tuple(value.shape)};".encode())
+            digest.update(value.reshape(-1).view(torch.uint8).numpy().tobytes())
+        return digest.hexdigest()
+
+    @torch.no_grad()
+    def level_heights_um(self) -> list[float]:
+        """Printed height of a wide uniform field of each level, µm: the level table of the advisor."""
+        size = 2 * self.guard_px + 16
+        heights = []
+        for level in range(self.layout.levels):
+            nominal = torch.full((1, 1, size, size), level * self.layout.level_height_um, device=self.device)
+            printed = (
+                nominal if self.simulator is None else self.simulator(nominal, pitch_um=self.layout.pitch_um)
+            )
+            heights.append(
+                float(printed[..., size // 2 - 4 : size // 2 + 4, size // 2 - 4 : size // 2 + 4].mean())
+            )
+        return heights
+
+    def _simulate(self, height_um: Tensor) -> Tensor:
+        assert self.simulator is not None
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self._reduced):
+            return self.simulator(height_um, pitch_um=self.layout.pitch_um).to(height_um.dtype)
+
+
+def load_printer(
+    source: str,
+    layout: LayoutSettings,
+    *,
+    name: str = "",
+    device: str | torch.device = "cpu",
+    extrapolate: bool = False,
+) -> Printer:
+    """The printer for ``source``: a folder of a frozen model, or ``none`` for nominal heights.
+
+    ``name`` is what results call it; the model's own name by default.
+
+    Raises:
+        InputError: no frozen model there, another pitch, or levels the model was not calibrated for.
+    """
+    if source == "none":
+        return Printer(None, layout, source=source, name=name).to(device)
+    from litho_models import load_frozen
+
+    simulator = load_frozen(source, device=device, extrapolate=extrapolate)
+    _check_calibration(simulator.card, layout, extrapolate)
+    return Printer(simulator, layout, source=str(source), name=name, extrapolate=extrapolate).to(device)
+
+
+def _check_calibration(card: Mapping[str, Any], layout: LayoutSettings, extrapolate: bool) -> None:
+    for name, asked in (("pitch_um", layout.pitch_um), ("level_height_um", layout.level_height_um)):
+        calibrated = card[name]
+        if abs(calibrated - asked) > 1e-9 and not (extrapolate and name == "level_height_um"):
+            raise InputError(
+                f"{name} of the layout",
+                got=f"{asked:g} µm",
+                wanted=f"{calibrated:g} µm, as the model was trained",
+            )
+    highest, asked = card["calibrated_range_um"][1], (layout.levels - 1) * layout.level_height_um
+    if asked > highest + 1e-6 and not extrapolate:
+        raise InputError(
+            "highest level of the layout",
+            got=f"{layout.levels} levels of {layout.level_height_um:g} µm ({asked:g} µm)",
+            wanted=f"at most {highest:g} µm, what the model was calibrated for",
+            hint="use fewer levels, or --extrapolate to accept a guess",
+        )
+
+
+def _guard_um(simulator: nn.Module) -> float:
+    reach = getattr(simulator, "reach_um", None)
+    return _GUARD_UM if reach is None else float(reach)

@@ -1,0 +1,53 @@
+"""The report of one score."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from litho_data.report import Page
+from litho_design.figures import image_grid
+
+if TYPE_CHECKING:
+    from litho_design.score import ScoreResult
+
+
+def write_score_report(
+    folder: Path, result: ScoreResult, pictures: dict[str, np.ndarray], side_um: float
+) -> Path:
+    """Write ``report.html`` and ``scores.csv``."""
+    import pandas as pd
+
+    page = Page(
+        "Score of a printable layout",
+        f"Designed through “{result.designed_with.name}”, printed by {len(result.scores)} judge(s).",
+    )
+    if not any(score.independent for score in result.scores):
+        page.note(
+            "No judge is independent of the design: these figures repeat the design model's own opinion."
+        )
+    rows = [{"printed by": f"{result.designed_with.name} (design)", "independent": "no", **result.designed}]
+    rows += [
+        {"printed by": score.judge.name, "independent": "yes" if score.independent else "no", **score.figures}
+        for score in result.scores
+    ]
+    page.table(pd.DataFrame(rows), "Figures by judge", "scores.csv", digits=3)
+    page.figure(
+        image_grid([list(pictures.values())], [list(pictures)], [""], side_um),
+        "Behind each print: the image at matched scale, or the square root of the PSF.",
+    )
+    heights = pd.DataFrame(
+        [
+            {
+                "printed by": score.judge.name,
+                "mean difference to the designed print, nm": 1000 * score.mean_height_difference_um,
+                "rms difference, nm": 1000 * score.rms_height_difference_um,
+            }
+            for score in result.scores
+            if score.mean_height_difference_um is not None and score.rms_height_difference_um is not None
+        ]
+    )
+    page.table(heights, "Heights against the print that the design expected", "heights.csv", digits=1)
+    return page.write(folder)

@@ -1,0 +1,217 @@
+"""One way to run every design task: start, search, polish, score, write."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from litho_data.errors import InputError
+from litho_data.results import Record, software_versions
+from litho_design.budget import Budget, measure_budget, peak_memory_gib
+from litho_design.design import (
+    HEIGHT_FILE,
+    LEVELS_FILE,
+    Design,
+    DesignTask,
+    RunRecord,
+    make_stroke,
+    write_arrays,
+    write_level_image,
+)
+from litho_design.fingerprint import record_sha256
+from litho_design.gauge import out_of_distribution, printability
+from litho_design.optics import Optics
+from litho_design.optimise import (
+    SearchSettings,
+    SearchState,
+    make_parametrisation,
+    remove_checkpoint,
+    search_layout,
+)
+from litho_design.parametrise import LayoutSettings, Parametrisation
+from litho_design.polish import polish_levels
+from litho_design.printer import Printer
+from litho_design.targets import TargetRecord
+
+
+class DesignSettings(Protocol):
+    """What the settings of every task hold."""
+
+    @property
+    def variant(self) -> Any: ...
+    @property
+    def layout(self) -> LayoutSettings: ...
+    @property
+    def optics(self) -> Optics: ...
+    @property
+    def search(self) -> SearchSettings: ...
+
+
+class Task(Protocol):
+    """A hologram or a lens, ready to be optimised through one printer."""
+
+    @property
+    def name(self) -> DesignTask: ...
+    @property
+    def printer(self) -> Printer: ...
+    @property
+    def target_record(self) -> TargetRecord | None: ...
+
+    def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
+        """Loss and its parts, of levels on the pixels (1, 1, size, size)."""
+
+    def start(self, parameters: Parametrisation, level_heights_um: list[float]) -> None:
+        """Set the start of the search."""
+
+    def score(self, height_um: Tensor) -> Record:
+        """Score of a printed height map (size, size), µm."""
+
+    def arrays(self, height_um: Tensor) -> dict[str, np.ndarray]:
+        """What is kept beside levels and heights, by file name."""
+
+    def reference_efficiency(self) -> float | None:
+        """What an ideal element would reach, where that is defined."""
+
+    def report(self, folder: Path, design: Design, history: list[dict[str, float]]) -> None:
+        """Write report.html; the arrays are already in ``folder``."""
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    levels: Tensor
+    state: SearchState
+    start_loss: float
+    polished_loss: float
+    budget: Budget
+    seconds: float
+
+
+def run_design(
+    task: Task,
+    settings: DesignSettings,
+    settings_record: Record,
+    out: str | Path,
+    *,
+    command: str = "",
+    announce: bool = True,
+) -> Design:
+    """Optimise, polish and score one layout, and write the folder ``out``.
+
+    The folder may hold an interrupted run of the same task (it goes on and ends as if it had never
+    stopped) or a finished one (it is returned as it is). The weights of the printer's model are
+    hashed before and after.
+
+    Args:
+        announce: print the expected time and memory to stderr before starting.
+
+    Raises:
+        InputError: ``out`` holds another design.
+    """
+    folder = Path(out)
+    hash_before = task.printer.weights_sha256()
+    parts: list[Record | str] = [settings_record, hash_before, task.name]
+    fingerprint = record_sha256(*parts, *([task.target_record] if task.target_record else []))
+    finished = _finished(folder, fingerprint)
+    if finished is not None:
+        return finished
+    folder.mkdir(parents=True, exist_ok=True)
+    heights = task.printer.level_heights_um()
+    with task.printer.at_precision(settings.search.precision):
+        outcome = _optimise(task, settings, folder, fingerprint, heights, announce)
+    cells = make_parametrisation(settings.layout, settings.search).to(outcome.levels.device).cells
+    layout_level = cells(outcome.levels)
+    with torch.no_grad():
+        height = task.printer(layout_level[None, None].float())[0, 0]
+    layout_array = layout_level.cpu().numpy().astype(np.uint8)
+    arrays = {LEVELS_FILE: layout_array, HEIGHT_FILE: height.cpu().numpy(), **task.arrays(height)}
+    files = write_arrays(folder, arrays) | write_level_image(folder, layout_array)
+    adaptation = task.target_record.adaptation if task.target_record else ""
+    design = Design(
+        task=task.name,
+        variant=settings.variant,
+        fingerprint=fingerprint,
+        run=RunRecord(
+            command=command,
+            versions=software_versions(),
+            device=str(height.device),
+            threads=torch.get_num_threads(),
+            seconds=outcome.seconds,
+            seconds_per_iteration=outcome.budget.seconds_per_iteration,
+            peak_memory_gib=peak_memory_gib(height.device),
+        ),
+        settings=settings_record.model_dump(mode="json"),
+        layout=settings.layout,
+        optics=settings.optics,
+        target=task.target_record,
+        printer=task.printer.record(),
+        printer_unchanged=task.printer.weights_sha256() == hash_before,
+        stroke=make_stroke(heights, settings.optics, settings.layout),
+        printability=printability(layout_array, settings.layout),
+        out_of_distribution=out_of_distribution(layout_array, settings.layout, task.printer.card),
+        notes=[f"target {adaptation}"] if adaptation else [],
+        iterations=outcome.state.iteration,
+        start_loss=outcome.start_loss,
+        sample_loss=outcome.state.history[-1]["sample_loss"],
+        argmax_loss=outcome.state.best_loss,
+        polished_loss=outcome.polished_loss,
+        reference_efficiency=task.reference_efficiency(),
+        predicted=task.score(height).model_dump(),
+        files=files,
+    )
+    task.report(folder, design, outcome.state.history)
+    design.write(folder)
+    remove_checkpoint(folder)
+    return design
+
+
+def _finished(folder: Path, fingerprint: str) -> Design | None:
+    if not (folder / Design.FILE_NAME).exists():
+        return None
+    design = Design.read(folder)
+    if design.fingerprint != fingerprint:
+        raise InputError(
+            f"folder {folder}",
+            got="a design with other settings",
+            wanted="an empty folder",
+            hint="choose another --out",
+        )
+    return design
+
+
+def _optimise(
+    task: Task,
+    settings: DesignSettings,
+    folder: Path,
+    fingerprint: str,
+    heights: list[float],
+    announce: bool,
+) -> _Outcome:
+    started = time.monotonic()
+    search = settings.search
+    parameters = make_parametrisation(settings.layout, search).to(task.printer.device)
+    task.start(parameters, heights)
+    with torch.no_grad():
+        start_loss = float(task.objective(parameters.cells(parameters.best_levels())[None, None].float())[0])
+    budget = measure_budget(parameters, task.objective, search)
+    if announce:
+        print(budget.sentence(search), file=sys.stderr)
+    state = search_layout(parameters, task.objective, search, folder=folder, fingerprint=fingerprint)
+    levels, polished = state.best_levels, state.best_loss
+    assert levels is not None
+    if search.polish_rounds:
+        levels, losses = polish_levels(
+            levels,
+            parameters.cells,
+            task.objective,
+            level_count=settings.layout.levels,
+            rounds=search.polish_rounds,
+        )
+        polished = losses[-1]
+    return _Outcome(levels, state, start_loss, polished, budget, time.monotonic() - started)

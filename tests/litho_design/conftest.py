@@ -1,0 +1,68 @@
+"""A small closed-form printer and settings that design in a second."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+from litho_design.optics import Optics
+from litho_design.parametrise import LayoutSettings
+from litho_design.printer import Printer
+from litho_design.settings import HoeSettings, hoe_preset
+
+
+class BlurPrinter(nn.Module):
+    """gain * (layout * Gaussian) + offset, as a frozen model would be called."""
+
+    def __init__(self, sigma_um=0.2, gain=0.62, offset_um=0.164, pitch_um=0.1, name="blur"):
+        super().__init__()
+        self.name = name
+        self.gain = nn.Parameter(torch.tensor(gain))
+        self.offset_um = nn.Parameter(torch.tensor(offset_um))
+        half = math.ceil(4 * sigma_um / pitch_um)
+        self.reach_um = half * pitch_um
+        x = torch.arange(-half, half + 1) * pitch_um
+        kernel = torch.exp(-(x**2) / (2 * sigma_um**2))
+        self.register_buffer("kernel", kernel / kernel.sum())
+
+    def forward(self, layout_um, pitch_um=0.1):
+        half = len(self.kernel) // 2
+        padded = F.pad(layout_um, (half,) * 4, mode="replicate")
+        rows = F.conv2d(padded, self.kernel.view(1, 1, 1, -1))
+        return self.gain * F.conv2d(rows, self.kernel.view(1, 1, -1, 1)) + self.offset_um
+
+
+@pytest.fixture
+def make_printer():
+    def make(layout: LayoutSettings, **arguments) -> Printer:
+        return Printer(BlurPrinter(**arguments), layout, source="closed form")
+
+    return make
+
+
+@pytest.fixture
+def small_settings() -> HoeSettings:
+    """A hologram of 12.8 µm at 30 µm, 30 iterations."""
+    default = hoe_preset("default")
+    return default.model_copy(
+        update={
+            "layout": LayoutSettings(size_px=128),
+            "optics": Optics(distance_um=30.0),
+            "search": default.search.model_copy(
+                update={"iterations": 30, "checkpoint_every": 10, "polish_rounds": 3}
+            ),
+        }
+    )
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Bit-exact repeats need a fixed number of threads."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)

@@ -1,0 +1,58 @@
+"""The comparison: its statistics, its matrix, and what it refuses."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from litho_data.errors import InputError
+from litho_design.compare import HEADLINE, GapResult, compare, interval95, paired_differences, summarise
+from litho_design.hoe import design_hoe
+from litho_design.printer import Printer
+from litho_design.targets import make_target
+
+
+def ring_designer(settings, printer, place):
+    return design_hoe(settings, printer, *make_target("ring", 128), place, announce=False)
+
+
+def test_interval_is_students():
+    values = np.array([1.0, 2.0, 4.0])
+    # mean 7/3, sd 1.5275, t(0.975, 2) = 4.3027, half width 4.3027 * 1.5275 / sqrt(3) = 3.7946
+    low, high = interval95(values)
+    assert (low, high) == pytest.approx((7 / 3 - 3.7946, 7 / 3 + 3.7946), abs=1e-3)
+    assert interval95(values[:1]) is None
+
+
+def test_matrix_gap_and_resume(tmp_path, small_settings, make_printer):
+    search = small_settings.search.model_copy(update={"iterations": 25, "polish_rounds": 0})
+    settings = small_settings.model_copy(update={"search": search})
+    arms = {"none": Printer(None, settings.layout, source="none"), "blur": make_printer(settings.layout)}
+    judges = {"fab": make_printer(settings.layout, sigma_um=0.22, gain=0.6)}
+    result = compare(settings, ring_designer, arms, judges, tmp_path, seeds=(0, 1))
+    assert {(e.arm, e.seed, e.judge) for e in result.entries} == {
+        (arm, seed, judge) for arm in arms for seed in (0, 1) for judge in ("none", "blur", "fab")
+    }
+    for entry in result.entries:
+        if entry.self_judged:
+            assert entry.judged == pytest.approx(entry.designed, rel=1e-5)
+            assert entry.rms_height_gap_um == pytest.approx(0, abs=1e-7)
+    figures = {(s.arm, s.judge): s.judged_mean for s in result.summary if s.figure == "si_psnr_db"}
+    # A design that knows the blur must survive it better than one that does not.
+    assert figures["blur", "fab"] > figures["none", "fab"] + 1
+    paired = {(p.judge, p.figure): p for p in result.paired}
+    assert paired["fab", "si_psnr_db"].mean == pytest.approx(figures["blur", "fab"] - figures["none", "fab"])
+    assert summarise(result.entries) == result.summary
+    assert paired_differences(result.entries, HEADLINE["hoe"]) == result.paired
+    assert GapResult.read(tmp_path) == result
+    written = (tmp_path / "designs" / "blur" / "seed1" / "design.json").stat().st_mtime_ns
+    compare(settings, ring_designer, arms, judges, tmp_path, seeds=(0, 1))
+    assert (tmp_path / "designs" / "blur" / "seed1" / "design.json").stat().st_mtime_ns == written
+
+
+def test_a_judge_may_not_carry_the_name_of_an_arm(tmp_path, small_settings, make_printer):
+    printer = make_printer(small_settings.layout)
+    with pytest.raises(InputError, match="twice"):
+        compare(small_settings, ring_designer, {"a": printer}, {"a": printer}, tmp_path, seeds=(0,))
+    with pytest.raises(InputError, match="at least one"):
+        compare(small_settings, ring_designer, {"a": printer}, {}, tmp_path, seeds=())

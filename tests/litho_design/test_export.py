@@ -1,0 +1,155 @@
+"""Every format comes back level for level, at its size, the right way up."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from litho_data.errors import InputError
+from litho_design.design import Design
+from litho_design.export import export_design, import_levels, sidecar_path
+from litho_design.export.gds import rectangles
+from litho_design.export.image import read_published_bmp
+from litho_design.export.stl import read_stl_triangles, write_stl
+from litho_design.gauge import out_of_distribution, printability
+from litho_design.hoe import design_hoe
+from litho_design.parametrise import LayoutSettings
+from litho_design.targets import make_target
+
+FORMATS = ["png16", "bmp", "tiff", "stl", "gds"]
+# An "F" has no symmetry: any flip or rotation shows.
+LETTER = np.array([[1, 1, 1, 1], [1, 0, 0, 0], [1, 1, 1, 0], [1, 0, 0, 0], [1, 0, 0, 0]], np.uint8)
+
+
+@pytest.fixture(scope="module")
+def design(tmp_path_factory):
+    from litho_design.optics import Optics
+    from litho_design.printer import Printer
+    from litho_design.settings import hoe_preset
+
+    default = hoe_preset("default")
+    layout = LayoutSettings(size_px=64)
+    search = default.search.model_copy(update={"iterations": 3, "polish_rounds": 0})
+    settings = default.model_copy(
+        update={"layout": layout, "optics": Optics(distance_um=20.0), "search": search}
+    )
+    folder = tmp_path_factory.mktemp("design")
+    printer = Printer(None, layout, source="none")
+    design_hoe(settings, printer, *make_target("ring", 64), folder, announce=False)
+    return folder
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_round_trip_is_exact_and_has_its_size(tmp_path, design, kind):
+    if kind == "gds":
+        pytest.importorskip("gdstk")
+    file = export_design(design, kind, tmp_path / kind)
+    levels, sidecar = import_levels(file)
+    assert np.array_equal(levels, np.load(design / "layout_level.npy"))
+    assert sidecar.size_um == pytest.approx((6.4, 6.4), abs=1e-9)
+    assert sidecar.nominal_height_um[-1] == pytest.approx(1.2)
+    assert sidecar.layout_sha256 == Design.read(design).files["layout_level.npy"]
+    raw = json.loads(sidecar_path(file).read_text())
+    assert {"wavelength_um", "settings", "printability", "predicted_height_um", "polarity"} <= raw.keys()
+
+
+@pytest.mark.parametrize("kind", ["png16", "bmp"])
+def test_a_changed_or_lonely_file_is_refused(tmp_path, design, kind):
+    file = export_design(design, kind, tmp_path / kind)
+    with open(file, "ab") as stream:
+        stream.write(b"x")
+    with pytest.raises(InputError, match="other bytes"):
+        import_levels(file)
+    sidecar_path(file).unlink()
+    with pytest.raises(InputError, match="cannot read"):
+        import_levels(file)
+
+
+def test_grey_is_linear_in_height(tmp_path, design):
+    file = export_design(design, "bmp", tmp_path / "bmp")
+    grey = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    levels = np.load(design / "layout_level.npy")
+    assert np.array_equal(grey, levels * 21)  # 255 // 12
+    table = np.loadtxt(file.with_suffix(".csv"), delimiter=",", skiprows=1)
+    assert table[12] == pytest.approx((252, 1.2))
+
+
+def test_stl_is_closed_upright_and_has_the_volume_of_its_columns(tmp_path):
+    levels = np.kron(LETTER * 3, np.ones((2, 2), np.uint8)) + np.arange(8, dtype=np.uint8) % 3
+    write_stl(tmp_path / "f.stl", levels, 0.4, 0.1, 1.0)
+    triangles = read_stl_triangles(tmp_path / "f.stl").astype(np.float64)
+    # Divergence theorem: the signed volume is that of the columns, float32 corners to 1e-6.
+    volume = np.einsum("ij,ij->i", triangles[:, 0], np.cross(triangles[:, 1], triangles[:, 2])).sum() / 6
+    assert volume == pytest.approx((1.0 + 0.1 * levels).sum() * 0.16, rel=1e-6)
+    # Closed: every directed edge is met as often in the other direction.
+    keys = np.rint(triangles * 1e4).astype(np.int64)
+    starts = keys.reshape(-1, 3)
+    ends = keys[:, [1, 2, 0]].reshape(-1, 3)
+    forward, backward = (np.hstack(pair) for pair in ((starts, ends), (ends, starts)))
+    assert np.array_equal(*(np.unique(edges, axis=0, return_counts=True)[1] for edges in (forward, backward)))
+    assert np.array_equal(*(np.unique(edges, axis=0) for edges in (forward, backward)))
+    # Row 0 is at the top: the bar of the F lies at high y.
+    high = triangles[triangles[:, :, 2].min(1) > 1.25]
+    assert high[..., 1].max() == pytest.approx(4.0)
+    with pytest.raises(InputError, match="pedestal"):
+        write_stl(tmp_path / "g.stl", levels, 0.4, 0.1, 0.0)
+
+
+@pytest.mark.parametrize("layers", ["cumulative", "exclusive"])
+def test_gds_layers_have_the_area_of_their_levels(tmp_path, design, layers):
+    gdstk = pytest.importorskip("gdstk")
+    file = export_design(design, "gds", tmp_path / "gds", gds_layers=layers)
+    levels = np.load(design / "layout_level.npy")
+    cell = gdstk.read_gds(file).cells[0]
+    area = {}
+    for polygon in cell.polygons:
+        area[polygon.layer] = area.get(polygon.layer, 0) + polygon.area()
+        assert len(polygon.points) == 4
+    for layer, covered in area.items():
+        mask = levels >= layer if layers == "cumulative" else levels == layer
+        assert covered == pytest.approx(mask.sum() * 0.01, rel=1e-9)
+    assert np.array_equal(import_levels(file)[0], levels)
+
+
+def test_rectangles_cover_once():
+    cover = np.zeros(LETTER.shape, int)
+    for top, bottom, left, right in rectangles(LETTER > 0):
+        cover[top:bottom, left:right] += 1
+    assert np.array_equal(cover, LETTER)
+
+
+def test_published_bmp_is_read_with_its_offset(tmp_path):
+    cv2.imwrite(str(tmp_path / "mask.bmp"), LETTER * 7 + 10)
+    assert np.array_equal(read_published_bmp(tmp_path / "mask.bmp"), LETTER * 7)
+    cv2.imwrite(str(tmp_path / "other.bmp"), LETTER)
+    with pytest.raises(InputError, match="published mask"):
+        read_published_bmp(tmp_path / "other.bmp")
+
+
+def test_printability_of_known_stripes():
+    row = np.repeat([0, 5, 0, 12, 0], [4, 3, 2, 1, 6])
+    levels = np.tile(row, (16, 1)).astype(np.uint8)
+    figures = printability(levels, LayoutSettings(size_px=16))
+    assert figures.smallest_feature_um == pytest.approx(0.1)
+    assert figures.single_pixel_feature_share == pytest.approx(1 / 3)  # inner runs of 3, 2 and 1 pixels
+    assert figures.steepest_step_um == pytest.approx(1.2)
+    assert figures.large_jump_share == pytest.approx(2 * 16 / (2 * 16 * 15))
+    assert figures.used_levels == 3
+
+
+def test_distance_to_the_training_levels():
+    layout = LayoutSettings(size_px=16, levels=4)
+    levels = np.repeat(np.arange(4, dtype=np.uint8), 64).reshape(16, 16)
+    same = out_of_distribution(levels, layout, {"training_level_share": [1, 1, 1, 1]})
+    assert same is not None
+    assert same.level_distance == pytest.approx(0)
+    assert not same.flagged
+    middle = out_of_distribution(levels, layout, {"training_level_share": [0, 0.5, 0.5, 0]})
+    assert middle is not None
+    # Half of the pixels sit on levels that training never showed.
+    assert middle.level_distance == pytest.approx(0.5)
+    assert middle.extreme_level_share == pytest.approx(0.5)
+    assert out_of_distribution(levels, layout, {}) is None

@@ -1,0 +1,118 @@
+"""Designing through a frozen model on disk, and the command line around it."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from litho_data.errors import InputError
+from litho_design.cli import app, main
+from litho_design.design import Design
+from litho_design.parametrise import LayoutSettings
+from litho_design.printer import load_printer
+from litho_models import save_frozen
+from litho_models.models import model_class
+
+SMALL = ("--size-px", "128", "--distance-um", "30", "--iterations", "20")
+
+
+@pytest.fixture
+def affine_folder(tmp_path):
+    simulator_class = model_class("affine")
+    simulator = simulator_class(simulator_class.Config())
+    with torch.no_grad():
+        for parameter, value in zip(simulator.parameters(), (0.62, 0.164), strict=True):
+            parameter.fill_(value)
+    return save_frozen(simulator, tmp_path / "affine")
+
+
+@pytest.mark.parametrize("name", ["identity", "affine"])
+def test_simple_models_print_their_closed_form(tmp_path, name):
+    simulator_class = model_class(name)
+    simulator = simulator_class(simulator_class.Config())
+    with torch.no_grad():
+        for parameter, value in zip(simulator.parameters(), (0.62, 0.164), strict=False):
+            parameter.fill_(value)
+    printer = load_printer(str(save_frozen(simulator, tmp_path / name)), LayoutSettings(size_px=32))
+    level = torch.randint(0, 13, (1, 1, 32, 32)).float()
+    expected = level * 0.1 if name == "identity" else 0.62 * (level * 0.1) + 0.164
+    assert torch.allclose(printer(level), expected, atol=1e-7)
+    assert printer.level_heights_um() == pytest.approx(expected.new_tensor(
+        [0.1 * n if name == "identity" else 0.062 * n + 0.164 for n in range(13)]
+    ).tolist(), abs=1e-6)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"pitch_um": 0.2, "cell_um": 0.4}, "pitch_um of the layout"),
+        ({"levels": 16}, "calibrated"),
+        ({"level_height_um": 0.08}, "level_height_um"),
+    ],
+)
+def test_layouts_that_the_model_does_not_know_are_refused(affine_folder, change, message):
+    with pytest.raises(InputError, match=message):
+        load_printer(str(affine_folder), LayoutSettings(size_px=64, **change))
+
+
+def test_more_levels_are_a_stated_guess(affine_folder):
+    layout = LayoutSettings(size_px=16, levels=16)
+    printer = load_printer(str(affine_folder), layout, extrapolate=True)
+    assert printer.record().extrapolated
+    assert float(printer(torch.full((1, 1, 16, 16), 15.0)).mean()) == pytest.approx(0.62 * 1.5 + 0.164)
+
+
+def test_commands_design_score_and_compare(tmp_path, affine_folder):
+    from typer.testing import CliRunner
+
+    def call(*arguments):
+        result = CliRunner().invoke(app, [str(a) for a in arguments], catch_exceptions=False)
+        assert result.exit_code == 0
+        return result.output
+
+    design = tmp_path / "design"
+    output = call("hoe", "--model", affine_folder, "--target", "ring", "--out", design, *SMALL)
+    assert "judged by its own model" in output
+    record = Design.read(design)
+    assert record.printer.name == "affine"
+    assert record.printer_unchanged
+    levels = np.load(design / "layout_level.npy")
+    assert levels.shape == (128, 128)
+    assert (design / "report.html").stat().st_size > 50_000
+    call("score", design, "--judge", "none", "--judge", f"twin={affine_folder}", "--out", tmp_path / "score")
+    scores = json.loads((tmp_path / "score" / "score.json").read_text())["scores"]
+    assert [(s["judge"]["name"], s["independent"]) for s in scores] == [("none", True), ("twin", False)]
+    models = f"none,affine={affine_folder}"
+    call("compare", "--models", models, "--target", "ring", "--seeds", "1", "--out", tmp_path / "gap", *SMALL)
+    gap = json.loads((tmp_path / "gap" / "gap.json").read_text())
+    assert gap["schema"] == "litho-design/gap/1"
+    assert {entry["arm"] for entry in gap["entries"]} == {"none", "affine"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("hoe", "--model", "nowhere", "--out", "out"), "nowhere"),
+        (("hoe", "--model", "none", "--target", "note.txt", "--out", "out"), "an image"),
+        (("hoe", "--model", "none", "--size-px", "1022", "--out", "out"), "cell_um"),
+        (("hoe", "--model", "none", "--levels", "1", "--out", "out"), "levels"),
+        (("hoe", "--model", "none", "--distance-um", "0.01", "--out", "out"), "propagation distance"),
+        (("score", "nowhere", "--judge", "none", "--out", "out"), "nowhere"),
+        (("compare", "--models", "none,none", "--out", "out"), "twice"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(tmp_path, monkeypatch, capsys, arguments, words):
+    (tmp_path / "note.txt").write_text("words")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["litho-design", *arguments])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 2
+    complaint = capsys.readouterr().err.strip()
+    assert len(complaint.splitlines()) == 1
+    assert words in complaint
+    assert not (tmp_path / "out").exists()

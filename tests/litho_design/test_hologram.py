@@ -1,0 +1,158 @@
+"""From levels to a scored image: gradients, normalisation, and scores against independent code."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from litho_design.hologram import HologramBench, image_error
+from litho_design.initialise import fresnel_lens_phase, gerchberg_saxton
+from litho_design.metrics import CameraView, hologram_score, si_psnr_db, ssim, through_aperture
+from litho_design.optics import Optics, RSPropagator, centred_grid, element_field, intensity_share
+from litho_design.parametrise import CellMap, LayoutSettings
+from litho_design.targets import draw_target
+
+WAVELENGTH_UM = 0.6328
+
+
+def test_gradient_from_mask_through_print_and_field_to_loss(make_printer):
+    layout = LayoutSettings(size_px=16)
+    printer = make_printer(layout).double()
+    bench = HologramBench(layout, Optics(distance_um=5.0), dtype=torch.complex128)
+    target = torch.from_numpy(draw_target("ring", 16)).double()
+
+    def loss(level):
+        rmse, efficiency = image_error(bench(printer(level)[0, 0]), target, "paper")
+        return rmse + 0.1 * (1 - efficiency)
+
+    level = (torch.rand(1, 1, 16, 16, dtype=torch.float64) * 12).requires_grad_()
+    assert torch.autograd.gradcheck(loss, (level,), atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", ["paper", "least-squares"])
+def test_the_efficiency_term_is_alive(scale):
+    # The published loss divides the efficiency twice; here half the light must be worth half.
+    target = torch.zeros(8, 8).double()
+    target[2:4, 2:4] = 1
+    share = torch.rand(8, 8).double() / 64
+    share[2:4, 2:4] = 0.1
+    rmse, efficiency = image_error(share, target, scale)
+    dimmer_rmse, dimmer = image_error(share / 2, target, scale)
+    assert float(efficiency) == pytest.approx(0.4, rel=1e-12)
+    assert float(dimmer) == pytest.approx(0.2, rel=1e-12)
+    assert float(dimmer_rmse) == pytest.approx(float(rmse), rel=1e-12)
+
+
+def test_incident_power_is_one_with_and_without_an_aperture():
+    grid = centred_grid((40, 40), 0.2)
+    height = torch.rand(40, 40).double()
+    disc = torch.from_numpy(np.hypot(grid.y_um[:, None], grid.x_um[None, :]) < 3).double()
+    for aperture in (None, disc):
+        field = element_field(height, grid, Optics(), aperture)
+        assert float(intensity_share(field, grid).sum()) == pytest.approx(1, rel=1e-12)
+
+
+def test_scores_of_a_perfect_image():
+    layout = LayoutSettings(size_px=64)
+    target = torch.from_numpy(draw_target("ring", 64)).double()
+    grid = centred_grid((64, 64), layout.pitch_um)
+    field = (target / (target.sum() * 0.01)).sqrt().to(torch.complex128)
+    score = hologram_score(field, field, target, grid, Optics(), CameraView(numerical_aperture=0.95))
+    assert score.eff_window == pytest.approx(1, rel=1e-12)
+    assert score.ssim == pytest.approx(1, abs=1e-6)
+    assert score.rmse_paper < 0.1  # I_avg weights by T: exact only for a binary target
+    assert score.si_psnr_db > 100
+    assert score.uniformity > 0.3
+
+
+def test_fully_developed_speckle_has_unit_contrast():
+    target = torch.ones(256, 256).double()
+    target[:, :128] = 0
+    speckle = torch.randn(256, 256, dtype=torch.complex128, generator=torch.Generator().manual_seed(0))
+    grid = centred_grid((256, 256), 0.1)
+    score = hologram_score(speckle, speckle, target, grid, Optics(), CameraView())
+    # 32768 independent samples of an exponential distribution: sd of the contrast about 0.006.
+    assert score.speckle_contrast == pytest.approx(1, abs=0.03)
+
+
+def test_si_psnr_ignores_scale():
+    generator = torch.Generator().manual_seed(0)
+    image, target = (torch.rand(32, 32, generator=generator).double() for _ in range(2))
+    assert si_psnr_db(image, target) == pytest.approx(si_psnr_db(37.5 * image, target), abs=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["noise", "smooth", "constant", "edges", "dark"])
+def test_ssim_equals_scikit_image(kind):
+    from skimage.metrics import structural_similarity
+
+    rng = np.random.default_rng(1)
+    image = {
+        "noise": rng.random((48, 48)),
+        "smooth": np.sin(np.linspace(0, 3, 48))[:, None] * np.ones((48, 48)) * 0.5 + 0.5,
+        "constant": np.full((48, 48), 0.4),
+        "edges": (np.indices((48, 48)).sum(0) // 9 % 2).astype(float),
+        "dark": np.zeros((48, 48)),
+    }[kind]
+    other = np.clip(image + 0.1 * rng.standard_normal(image.shape), 0, 1)
+    for second in (image, other):
+        reference = structural_similarity(
+            image, second, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0
+        )
+        assert ssim(torch.from_numpy(image), torch.from_numpy(second)) == pytest.approx(reference, abs=1e-4)
+    assert ssim(torch.from_numpy(image), torch.from_numpy(image)) == pytest.approx(1, abs=1e-4)
+
+
+def test_an_aperture_passes_what_is_inside_it_and_nothing_else():
+    grid = centred_grid((200, 200), 0.1)
+    x = torch.from_numpy(grid.x_um)
+    for angle_sine, passed in ((0.2, 1.0), (0.45, 0.0)):
+        # A cosine that fits the mirrored window: whole half periods.
+        half_periods = round(2 * 20.0 * angle_sine / WAVELENGTH_UM)
+        wave = (
+            torch.cos(math.pi * half_periods * (x - x[0] + 0.05) / 20.0).expand(200, 200).to(torch.complex128)
+        )
+        out = through_aperture(wave, grid, WAVELENGTH_UM, 0.3)
+        assert float(out.abs().square().sum() / wave.abs().square().sum()) == pytest.approx(passed, abs=1e-9)
+
+
+def test_gerchberg_saxton_error_never_rises():
+    layout = LayoutSettings(size_px=96)
+    grid = centred_grid((96, 96), 0.1)
+    propagate = RSPropagator(grid, grid, 25.0, WAVELENGTH_UM, dtype=torch.complex128)
+    target = torch.from_numpy(draw_target("ring", 96)).double()
+    arguments = {"iterations": 30, "weighted": False, "seed": 1}
+    _, errors = gerchberg_saxton(propagate, target, CellMap(layout), **arguments)
+    assert all(after <= before * (1 + 1e-12) for before, after in itertools.pairwise(errors))
+    assert errors[-1] < 0.85 * errors[0]
+
+
+def test_weighting_makes_the_image_more_even():
+    layout = LayoutSettings(size_px=96)
+    bench = HologramBench(layout, Optics(distance_um=25.0))
+    target = torch.from_numpy(draw_target("spots", 96))
+    cells = CellMap(layout)
+    spread = {}
+    for weighted in (False, True):
+        phase, _ = gerchberg_saxton(bench.propagator, target, cells, iterations=30, weighted=weighted, seed=0)
+        lit = bench(cells(phase) * Optics().wave_height_um / (2 * math.pi))[target > 0.5]
+        spread[weighted] = float(lit.std() / lit.mean())
+    assert spread[True] < spread[False]
+
+
+def test_fresnel_start_focuses_to_the_diffraction_limit():
+    layout = LayoutSettings(size_px=200, cell_um=0.1)
+    optics = Optics(distance_um=100.0)
+    cells = CellMap(layout)
+    phase = cells(fresnel_lens_phase(cells, layout.pitch_um, optics))
+    grid = centred_grid((200, 200), 0.1)
+    line = centred_grid((1, 41), 0.1)
+    propagate = RSPropagator(grid, line, 100.0, WAVELENGTH_UM)
+    height = phase * optics.wave_height_um / (2 * math.pi)
+    intensity = propagate(element_field(height, grid, optics)).abs().square()[0]
+    assert int(intensity.argmax()) == 20
+    # Square aperture of area A: peak A / (wavelength f)^2 per incident power; paraxial to 1.5 % at a/f = 0.1.
+    assert float(intensity[20]) == pytest.approx(400 / (WAVELENGTH_UM * 100) ** 2, rel=0.02)

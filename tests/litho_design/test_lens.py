@@ -1,0 +1,155 @@
+"""Lenses: the ring path against the plane path, figures against theory, a whole design."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from litho_data.errors import InputError
+from litho_design.judging import Judging
+from litho_design.lens import LensTask, design_lens
+from litho_design.lens_bench import LensBench, LensView, RadialLensBench, centre_to_background
+from litho_design.lens_metrics import half_maximum_width_um, lens_score
+from litho_design.optics import Optics, blaze_efficiency
+from litho_design.parametrise import LayoutSettings
+from litho_design.printer import Printer
+from litho_design.score import score_design
+from litho_design.settings import lens_preset
+
+LAYOUT = LayoutSettings(size_px=300, cell_um=0.1, symmetry="radial")
+OPTICS = Optics(distance_um=100.0)
+
+
+@pytest.fixture
+def settings():
+    default = lens_preset("default", "direct")
+    search = default.search.model_copy(update={"iterations": 20, "polish_rounds": 2})
+    view = default.view.model_copy(update={"window_px": 128})
+    imaging = default.imaging.model_copy(update={"object_px": 48, "iterations": 10})
+    return default.model_copy(
+        update={"layout": LAYOUT, "optics": OPTICS, "search": search, "view": view, "imaging": imaging}
+    )
+
+
+@pytest.mark.parametrize("aperture", ["circle", "square"])
+def test_perfect_lens_reaches_the_diffraction_limit(aperture):
+    # 30 µm at f = 200: NA 0.075, where the paraxial formulas hold to 0.5 %.
+    bench = LensBench(LAYOUT, Optics(distance_um=200.0), LensView(aperture=aperture, window_px=254))
+    score = lens_score(bench, bench.ideal_height_um())
+    assert score.strehl == pytest.approx(1, abs=1e-12)
+    assert score.mtf_volume_ratio == pytest.approx(1, abs=1e-12)
+    assert score.cbr == pytest.approx(score.cbr_ceiling)
+    psf = bench(bench.ideal_height_um())
+    area = math.pi * 15**2 if aperture == "circle" else 30**2
+    assert float(psf.max()) / LAYOUT.pitch_um**2 == pytest.approx(area / (0.6328 * 200) ** 2, rel=0.02)
+    if aperture == "circle":
+        # Airy: full width at half maximum 1.029 lambda f / D.
+        assert score.fwhm_um == pytest.approx(1.029 * 0.6328 * 200 / 30, rel=0.01)
+    else:
+        # A square's section is sinc^2 with half width 0.443 lambda f / D.
+        row = psf[127] / psf.max()
+        half = 0.443 * 0.6328 * 200 / 30
+        position = int((half + 0.05) / 0.1)
+        assert float(row[126 + position]) > 0.5 > float(row[128 + position])
+
+
+def test_airy_power_inside_the_focusing_radius():
+    bench = LensBench(LAYOUT, OPTICS, LensView(window_px=254))
+    score = lens_score(bench, bench.ideal_height_um())
+    # Encircled energy 1 - J0^2(v) - J1^2(v) at v = pi D r / (lambda f), r = 3 FWHM = 3.08 lambda f / D.
+    from scipy.special import j0, j1
+
+    v = math.pi * 30 * score.focusing_radius_um / (0.6328 * 100)
+    assert score.focusing_efficiency == pytest.approx(1 - j0(v) ** 2 - j1(v) ** 2, abs=0.01)
+
+
+@pytest.mark.parametrize(("levels", "step_um"), [(13, 0.1), (8, 0.1443), (2, 0.57735)])
+def test_staircase_lens_loses_what_the_blaze_formula_says(levels, step_um):
+    layout = LAYOUT.model_copy(update={"size_px": 600, "levels": levels, "level_height_um": step_um})
+    base = lens_preset("default", "direct")
+    task = LensTask(
+        base.model_copy(
+            update={
+                "layout": layout,
+                "optics": OPTICS,
+                "search": base.search.model_copy(update={"start_jitter_levels": 0.0}),
+            }
+        ),
+        Printer(None, layout, source="none"),
+    )
+    from litho_design.optimise import make_parametrisation
+
+    parameters = make_parametrisation(layout, task.settings.search)
+    task.start(parameters, task.printer.level_heights_um())
+    height = task.printer(task.cells(parameters.best_levels())[None, None].float())[0, 0]
+    strehl = lens_score(task.bench, height).strehl
+    # One wave is 11.5 steps of 0.1 µm; a lens of seven zones scatters a per cent or two beside the rule.
+    steps = {13: 12, 8: 8, 2: 2}[levels]
+    assert strehl == pytest.approx(blaze_efficiency(steps, 1.0), abs=0.03)
+
+
+def test_ring_path_sees_what_the_plane_path_sees(make_printer):
+    view = LensView(window_px=128, path="radial")
+    bench, rings = LensBench(LAYOUT, OPTICS, view), RadialLensBench(LAYOUT, OPTICS, view)
+    base = lens_preset("default", "direct")
+    task = LensTask(
+        base.model_copy(update={"layout": LAYOUT, "optics": OPTICS, "view": view}), make_printer(LAYOUT)
+    )
+    generator = torch.Generator().manual_seed(0)
+    smooth = torch.nn.functional.interpolate(
+        torch.rand(1, 1, 10, generator=generator) * 12, size=task.cells.cells[0], mode="linear"
+    )[0, 0]
+    level = task.cells(smooth)[None, None]
+    plane = bench(task.printer(level)[0, 0])
+    strip = rings(task._printed_rings(level))
+    # What differs: the disc's edge is a staircase of pixels (1e-3), the layout ends where its circle
+    # touches the sides, and rings are flat across 0.1 µm where this rough print is not.
+    assert float((plane - strip).abs().sum() / plane.sum()) < 0.04
+
+
+def test_light_thrown_out_of_the_window_counts_as_background():
+    psf = torch.zeros(64, 64)
+    psf[27:37, 27:37] = 0.004
+    bright = centre_to_background(psf, 10, 300)
+    assert float(bright) == pytest.approx(0.004 / (0.6 / (300**2 - 100)), rel=1e-5)
+    assert float(centre_to_background(psf / 2, 10, 300)) < 0.5 * float(bright)
+
+
+def test_width_of_a_gaussian():
+    x = torch.arange(-40, 40).double() * 0.1
+    psf = torch.exp(-(x[:, None] ** 2 + x[None, :] ** 2) / (2 * 0.8**2))
+    assert half_maximum_width_um(psf, 0.1) == pytest.approx(2.3548 * 0.8, abs=0.02)
+
+
+@pytest.mark.parametrize("task", ["direct", "computational"])
+def test_lens_design_improves_and_is_judged_with_both_psfs(tmp_path, settings, make_printer, task):
+    settings = settings.model_copy(update={"task": task})
+    printer = make_printer(LAYOUT)
+    design = design_lens(settings, printer, tmp_path / "design", announce=False)
+    assert design.polished_loss <= design.start_loss
+    assert design.printer_unchanged
+    other = make_printer(LAYOUT, sigma_um=0.3, gain=0.5, name="other")
+    own, foreign = score_design(tmp_path / "design", [printer, other], tmp_path / "score").scores
+    assert own.figures == pytest.approx(design.predicted, rel=1e-5)
+    assert foreign.independent
+    assert foreign.figures["strehl"] < own.figures["strehl"]
+    if task == "computational":
+        # One PSF on both sides in design; after another print only calibration knows the right one.
+        assert own.figures["mae_design"] == pytest.approx(own.figures["mae_calibrated"], rel=1e-6)
+        assert foreign.figures["mae_design"] != foreign.figures["mae_calibrated"]
+    assert Judging(tmp_path / "design").target is None
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"layout": LAYOUT.model_copy(update={"symmetry": "none"})}, "ring layout"),
+        ({"layout": LAYOUT.model_copy(update={"size_px": 301})}, "even number"),
+    ],
+)
+def test_ring_path_needs_rings(settings, make_printer, change, message):
+    changed = settings.model_copy(update=change)
+    with pytest.raises(InputError, match=message):
+        LensTask(changed, make_printer(changed.layout))

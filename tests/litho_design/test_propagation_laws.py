@@ -1,0 +1,196 @@
+"""Propagators against the laws that any linear wave propagation obeys, and against a reference."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from litho_data.errors import InputError
+from litho_data.grid import PixelGrid
+from litho_design.optics import (
+    ASMPropagator,
+    RSPropagator,
+    centred_grid,
+    element_field,
+    intensity_share,
+    sampling_limit_um,
+)
+from litho_design.optics.thin_element import Optics
+
+WAVELENGTH_UM = 0.6328
+
+
+def random_field(shape, dtype=torch.complex128, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(shape, dtype=dtype, generator=generator)
+
+
+def direct_sum(field, source, target, distance):
+    y = target.y_um[:, None, None, None] - source.y_um[None, None, :, None]
+    x = target.x_um[None, :, None, None] - source.x_um[None, None, None, :]
+    r = np.sqrt(x**2 + y**2 + distance**2)
+    k = 2 * np.pi / WAVELENGTH_UM
+    kernel = distance / (2 * np.pi * r**2) * (1 / r - 1j * k) * np.exp(1j * k * r)
+    return np.einsum("abcd,cd->ab", kernel, field.numpy()) * source.pitch_um[0] * source.pitch_um[1]
+
+
+GRIDS = {
+    "same": centred_grid((32, 32), 0.1),
+    "offset": centred_grid((30, 41), 0.1, (1.234, -7.7)),
+    "coarse": centred_grid((17, 9), 0.2, (0.3, 0.01)),
+    "fine": centred_grid((31, 32), 0.05, (-0.4, 2.0)),
+    "rational": centred_grid((20, 33), 0.15, (5.0, 0.0)),
+    "mixed": PixelGrid((13, 21), (0.25, 0.04), (-3.0, 1.0)),
+    "incommensurate": centred_grid((32, 32), 0.1 * math.sqrt(2), (0.05, -1.0)),
+}
+
+
+@pytest.mark.parametrize("name", GRIDS)
+def test_fft_equals_the_direct_sum_on_any_output_grid(name):
+    source, target = centred_grid((32, 32), 0.1, (0.02, -0.5)), GRIDS[name]
+    field = random_field((32, 32))
+    expected = direct_sum(field, source, target, 30.0)
+    scale = np.abs(expected).max()
+    for dtype, tolerance in ((torch.complex128, 1e-10), (torch.complex64, 1e-5)):
+        out = RSPropagator(source, target, 30.0, WAVELENGTH_UM, dtype=dtype)(field.to(dtype))
+        assert np.abs(out.numpy() - expected).max() < tolerance * scale
+
+
+@pytest.mark.parametrize("name", GRIDS)
+def test_adjoint_and_gradient(name):
+    source, target = centred_grid((32, 32), 0.1), GRIDS[name]
+    propagate = RSPropagator(source, target, 30.0, WAVELENGTH_UM, dtype=torch.complex128)
+    u = random_field((32, 32)).requires_grad_()
+    v = random_field(target.shape, seed=1)
+    forward = (propagate(u).conj() * v).sum()
+    backward = (u.conj() * propagate.adjoint(v)).sum()
+    # Both are the same sum of products; only rounding differs.
+    assert (forward - backward).abs().item() < 1e-10 * forward.abs().item()
+    forward.real.backward()
+    assert torch.allclose(u.grad, propagate.adjoint(v), rtol=1e-10, atol=1e-12)
+
+
+def test_asm_adjoint():
+    source, target = centred_grid((32, 30), 0.4), centred_grid((25, 40), 0.4, (1.0, -2.0))
+    propagate = ASMPropagator(source, target, 12.0, WAVELENGTH_UM, dtype=torch.complex128)
+    u, v = random_field((32, 30)), random_field((25, 40), seed=1)
+    forward = complex((propagate(u).conj() * v).sum())
+    assert abs(forward - complex((u.conj() * propagate.adjoint(v)).sum())) < 1e-10
+
+
+def test_agrees_with_torchoptics():
+    torchoptics = pytest.importorskip("torchoptics")
+    source, target = centred_grid((48, 48), 0.2), centred_grid((40, 56), 0.2, (3.0, -4.0))
+    field = random_field((48, 48))
+    ours = RSPropagator(source, target, 60.0, WAVELENGTH_UM, dtype=torch.complex128)(field)
+    reference = torchoptics.Field(field, wavelength=WAVELENGTH_UM, z=0.0, spacing=0.2).propagate(
+        (40, 56), 60.0, spacing=0.2, offset=(3.0, -4.0), propagation_method="DIM"
+    )
+    assert (ours - reference.data).abs().max() < 1e-5 * ours.abs().max()
+
+
+def test_asm_and_rs_agree_where_both_hold():
+    source = centred_grid((256, 256), 0.1)
+    spot = torch.exp(-((torch.from_numpy(np.hypot(source.y_um[:, None], source.x_um[None, :])) / 2) ** 2))
+    target = centred_grid((200, 300), 0.1, (2.0, 1.55))
+    arguments = (source, target, 10.0, WAVELENGTH_UM)
+    rs = RSPropagator(*arguments, dtype=torch.complex128)(spot.to(torch.complex128))
+    asm = ASMPropagator(*arguments, dtype=torch.complex128)(spot.to(torch.complex128))
+    # The beam is band-limited to well inside the band; both are then exact.
+    assert (rs - asm).abs().max() < 1e-5 * rs.abs().max()
+
+
+def gaussian(grid, waist=3.0):
+    r = np.hypot(grid.y_um[:, None], grid.x_um[None, :])
+    return torch.from_numpy(np.exp(-((r / waist) ** 2))).to(torch.complex128)
+
+
+def test_asm_semigroup_and_reversal():
+    grid = centred_grid((256, 256), 0.35)
+
+    def asm(z):
+        return ASMPropagator(grid, grid, z, WAVELENGTH_UM, dtype=torch.complex128)
+
+    u = gaussian(grid)
+    once = asm(50.0)(u)
+    assert (asm(30.0)(asm(20.0)(u)) - once).abs().max() < 1e-5
+    assert (asm(-50.0)(once) - u).abs().max() < 1e-5
+    assert (asm(0.0)(u) - u).abs().max() < 1e-12
+
+
+def test_energy_is_kept_by_asm_and_never_exceeded_by_rs():
+    grid = centred_grid((256, 256), 0.35)  # pitch above wavelength / 2: no evanescent waves
+    u = gaussian(grid)
+    power = float(u.abs().square().sum())
+    out = ASMPropagator(grid, grid, 50.0, WAVELENGTH_UM, dtype=torch.complex128)(u)
+    assert float(out.abs().square().sum()) == pytest.approx(power, rel=1e-6)
+    element = centred_grid((64, 64), 0.1)
+    rough = torch.exp(2j * np.pi * torch.rand((64, 64), generator=torch.Generator().manual_seed(3)).double())
+    shares = []
+    for size in (64, 128, 256, 512):
+        window = centred_grid((size, size), 0.1)
+        seen = RSPropagator(element, window, 20.0, WAVELENGTH_UM, dtype=torch.complex128)(rough)
+        shares.append(float(seen.abs().square().sum()) / 64**2)
+    assert shares == sorted(shares)
+    assert shares[-1] <= 1 + 1e-6
+
+
+@pytest.mark.parametrize("size", [64, 65])
+def test_a_centred_lens_focuses_on_the_axis_for_even_and_odd_sizes(size):
+    grid = centred_grid((size, size), 0.2)
+    r2 = torch.from_numpy(grid.y_um[:, None] ** 2 + grid.x_um[None, :] ** 2)
+    lens = torch.exp(-2j * math.pi / WAVELENGTH_UM * (r2 + 60.0**2).sqrt())
+    window = centred_grid((size + 7, size + 7), 0.1)
+    field = RSPropagator(grid, window, 60.0, WAVELENGTH_UM, dtype=torch.complex128)(lens)
+    intensity = field.abs().square()
+    for axis, coordinate in ((0, window.x_um), (1, window.y_um)):
+        centroid = float((intensity.sum(axis) * torch.from_numpy(coordinate)).sum() / intensity.sum())
+        assert abs(centroid) / 0.1 < 1e-3
+    assert torch.allclose(field, field.T)
+    assert torch.allclose(field, field.flip(0))
+
+
+def test_transposed_and_flipped_fields_give_transposed_and_flipped_waves():
+    grid = centred_grid((40, 40), 0.1)
+    propagate = RSPropagator(grid, grid, 25.0, WAVELENGTH_UM, dtype=torch.complex128)
+    u = random_field((40, 40))
+    for operation in (lambda a: a.T, lambda a: a.flip(0), lambda a: a.flip(1)):
+        assert (propagate(operation(u)) - operation(propagate(u))).abs().max() < 1e-12
+
+
+def test_transfer_is_cached_on_the_device_but_not_saved():
+    grid = centred_grid((16, 16), 0.1)
+    propagate = RSPropagator(grid, grid, 10.0, WAVELENGTH_UM)
+    assert dict(propagate.named_buffers())["transfer"].dtype == torch.complex64
+    assert propagate.state_dict() == {}
+
+
+def test_distance_below_the_sampling_limit_is_refused():
+    coarse = centred_grid((256, 256), 0.4)
+    limit = sampling_limit_um(coarse, coarse, WAVELENGTH_UM)
+    # Largest separation 255 pixels; Nyquist wants x / (wavelength r) <= 1 / (2 pitch).
+    assert limit == pytest.approx(255 * 0.4 * math.sqrt((0.8 / WAVELENGTH_UM) ** 2 - 1))
+    with pytest.raises(InputError, match="angular spectrum"):
+        RSPropagator(coarse, coarse, 0.99 * limit, WAVELENGTH_UM)
+    with pytest.raises(InputError, match="at least"):
+        RSPropagator(coarse, coarse, -5.0, WAVELENGTH_UM)
+
+
+def test_draft_pitch_is_close_inside_the_window():
+    # 0.2 µm pixels that average 2 x 2 heights, for a layout of 0.4 µm cells: the heights are the
+    # same, only the source sampling differs; angles inside the window stay below 19 degrees.
+    cells = torch.randint(0, 13, (64, 64), generator=torch.Generator().manual_seed(0)) * 0.1
+    optics = Optics()
+    images = []
+    for pitch, repeat in ((0.1, 4), (0.2, 2)):
+        height = cells.repeat_interleave(repeat, 0).repeat_interleave(repeat, 1).double()
+        grid = centred_grid(tuple(height.shape), pitch)
+        window = centred_grid((64, 64), 0.4)
+        propagate = RSPropagator(grid, window, 75.0, WAVELENGTH_UM, dtype=torch.complex128)
+        images.append(intensity_share(propagate(element_field(height, grid, optics)), window))
+    difference = (images[0] - images[1]).abs().sum() / images[0].sum()
+    # The midpoint rule on a 0.2 µm pixel dims a wave of 19 degrees by (pi 0.2 0.33 / 0.6328)^2 / 6 = 1.8 %.
+    assert difference < 0.02

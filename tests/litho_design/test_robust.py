@@ -1,0 +1,60 @@
+"""The process window: its draws, its risk, and what a robust search gains."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from litho_design.design import HEIGHT_FILE
+from litho_design.hoe import HoeTask, design_hoe
+from litho_design.optics import Optics
+from litho_design.parametrise import LayoutSettings
+from litho_design.robust import Draw, ProcessWindow, draws, risk
+from litho_design.targets import make_target
+
+
+def test_draws_have_their_spread_and_repeat():
+    window = ProcessWindow(gain_sd=0.05, defocus_sd_um=4.0, wavelength_sd_um=0.001)
+    many = draws(window, Optics(), 4000)
+    assert draws(window, Optics(), 3) == many[:3]
+    # Standard error of a standard deviation over 4000 draws is 1.1 %.
+    assert np.std([draw.gain for draw in many]) == pytest.approx(0.05, rel=0.05)
+    assert np.std([draw.optics.distance_um for draw in many]) == pytest.approx(4.0, rel=0.05)
+    assert np.std([draw.optics.wavelength_um for draw in many]) == pytest.approx(0.001, rel=0.05)
+
+
+def test_risk_formulas():
+    losses = torch.tensor([1.0, 2.0, 3.0, 6.0])
+    assert float(risk(losses, ProcessWindow(risk="cvar", tail=0.5))) == pytest.approx(4.5)
+    # mean 3, population variance (4 + 1 + 0 + 9) / 4 = 3.5
+    assert float(risk(losses, ProcessWindow(risk="mean-sd", weight=2))) == pytest.approx(3 + 2 * 3.5**0.5)
+
+
+def test_extra_blur_keeps_the_mean_and_damps_a_wave_by_its_gaussian():
+    layout = LayoutSettings(size_px=128)
+    x = (torch.arange(128) + 0.5) * 0.1
+    wave = torch.cos(2 * torch.pi * x / 1.6).double().expand(128, 128)
+    blurred = Draw(1.0, 0.0, 0.2, Optics()).apply(wave, layout)
+    # exp(-2 pi^2 sigma^2 f^2) with sigma 0.2, f = 1 / 1.6; the kernel is cut at four sigma.
+    expected = np.exp(-2 * np.pi**2 * 0.2**2 / 1.6**2)
+    middle = slice(32, 96)
+    assert torch.allclose(blurred[middle, middle], expected * wave[middle, middle], atol=1e-3)
+
+
+def test_a_robust_search_lowers_the_risk_it_minimises(tmp_path, small_settings, make_printer):
+    spread = ProcessWindow(gain_sd=0.08, blur_sd_um=0.05, defocus_sd_um=2.0, samples=6, risk="mean-sd")
+    search = small_settings.search.model_copy(update={"iterations": 60})
+    nominal = small_settings.model_copy(update={"search": search})
+    robust = nominal.model_copy(update={"window": spread})
+    target = make_target("ring", 128)
+    risks = {}
+    # Other draws than those of the search: what it gained must hold for prints it has not seen.
+    unseen = robust.model_copy(update={"window": spread.model_copy(update={"seed": 1})})
+    judge = HoeTask(unseen, make_printer(robust.layout), *target)
+    for name, settings in (("nominal", nominal), ("robust", robust)):
+        design_hoe(settings, make_printer(settings.layout), *target, tmp_path / name, announce=False)
+        height = torch.from_numpy(np.load(tmp_path / name / HEIGHT_FILE))
+        losses = torch.tensor([score["loss"] for score in judge.window_scores(height, 24)])
+        risks[name] = float(risk(losses, spread))
+    assert risks["robust"] < risks["nominal"]

@@ -1,0 +1,50 @@
+"""Targets: drawings by code and pictures from files."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from litho_data.errors import InputError
+from litho_design.targets import draw_target, make_target
+
+
+@pytest.mark.parametrize("name", ["text", "ring", "chart", "spots"])
+def test_drawings_look_the_same_at_every_size(name):
+    fine, coarse = draw_target(name, 256), draw_target(name, 128)
+    assert fine.min() >= 0
+    assert fine.max() == 1
+    assert 0.01 < fine.mean() < 0.3
+    # Averaging 2 x 2 must give the coarse drawing; edges may differ by the oversampling of 4.
+    assert np.abs(fine.reshape(128, 2, 128, 2).mean((1, 3)) - coarse).mean() < 0.02
+
+
+def test_ring_area():
+    # pi (0.28^2 - 0.2^2) of the unit square; the 4-fold oversampled edge is exact to 1e-3.
+    assert draw_target("ring", 256).mean() == pytest.approx(np.pi * (0.28**2 - 0.2**2), abs=1e-3)
+
+
+def test_another_size_and_shape_are_adapted_and_said(tmp_path):
+    picture = np.zeros((60, 100), np.uint8)
+    picture[10:30, 20:60] = 200
+    cv2.imwrite(str(tmp_path / "wide.png"), picture)
+    image, record = make_target(str(tmp_path / "wide.png"), 200)
+    assert image.shape == (200, 200)
+    assert "60 x 100" in record.adaptation
+    assert "from 100 to 200" in record.adaptation
+    # Letterboxed by 20 rows, then doubled: the block's centre goes from (19.5, 39.5) to (79.5, 79.5).
+    rows, columns = np.indices(image.shape)
+    assert (image * rows).sum() / image.sum() == pytest.approx(79.5, abs=0.01)
+    assert (image * columns).sum() / image.sum() == pytest.approx(79.5, abs=0.01)
+    assert image.max() == 1
+
+
+def test_what_is_no_image_or_has_no_light_is_refused(tmp_path):
+    (tmp_path / "note.txt").write_text("not an image")
+    cv2.imwrite(str(tmp_path / "black.png"), np.zeros((8, 8), np.uint8))
+    for name, message in (("note.txt", "an image"), ("black.png", "bright pixels")):
+        with pytest.raises(InputError, match=message):
+            make_target(str(tmp_path / name), 64)
+    with pytest.raises(InputError, match="text, ring, chart, spots"):
+        make_target("no such thing", 64)
