@@ -1,0 +1,213 @@
+"""The whole path in one run: prints and scans → dataset → models → closed loop → design → score.
+
+Without a dataset the prints come from the virtual fab, where effects are hidden that no model declares;
+with ``--dataset neural-lithography`` they are the measured prints. Every step is one of the project's own
+commands, printed as it runs. A step whose result exists is skipped: a killed demo goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shlex
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from litho_data.report import Page
+
+BIN = Path(sys.executable).parent
+CARDS = Path(__file__).parents[1] / "datasets"
+ARMS = ("affine", "physics", "pbl")
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much is trained and designed: enough to see every part, or what is quoted in the docs."""
+
+    training_steps: int
+    folds: int
+    element_px: int
+    distance_um: int
+    iterations: int
+    seeds: int
+
+
+# A quarter of the paper's element at a quarter of its distance keeps the diffraction angles.
+QUICK = Effort(training_steps=100, folds=3, element_px=256, distance_um=75, iterations=60, seeds=1)
+MEASURED = Effort(training_steps=1000, folds=5, element_px=256, distance_um=75, iterations=100, seeds=1)
+
+
+@dataclass(frozen=True)
+class Step:
+    """One command, the file or folder that shows it is done, and its page for people."""
+
+    title: str
+    command: tuple[str, ...]
+    result: Path
+    report: Path | None = None
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--dataset", default="", help="name of a card in datasets/, e.g. neural-lithography")
+    parser.add_argument("--out", type=Path, default=Path("runs"), help="folder for everything that is made")
+    arguments = parser.parse_args()
+
+    name = arguments.dataset or "demo"
+    out = arguments.out / name
+    steps = plan(out, arguments.dataset)
+    seconds = [run(step, f"[{number}/{len(steps)}]") for number, step in enumerate(steps, 1)]
+    page = write_index(out, name, steps, seconds)
+    print(f"\ndone in {sum(seconds) / 60:.1f} min; open {page}")
+
+
+def plan(out: Path, dataset: str) -> list[Step]:
+    """The steps in order; later ones read what earlier ones wrote."""
+    effort = MEASURED if dataset else QUICK
+    store, loop = out / "store.zarr", out / "close-loop"
+    if dataset:
+        card = CARDS / f"{dataset}.toml"
+        source = Step("Find or fetch the measured prints", _data("fetch", dataset), out / ".always")
+        prior = ["--prior", "datum-offset,tilt-bow,scan-line-stripes,registration-residual,slope-thinning"]
+    else:
+        card = out / "fab" / "raw" / "card.toml"
+        source = Step(
+            "Print and scan in the virtual fab",
+            _data("simulate", "--preset", "demo", "--out", card.parents[1]),
+            card,
+        )
+        prior = []
+    training = ["--steps", effort.training_steps]
+    steps = [
+        source,
+        Step("Build the dataset", _data("build", card, "--out", store, "--workers", 2), store),
+        Step(
+            "Compare the models on held-out scans",
+            _models(
+                "benchmark", store, "--models", "identity,affine,blur-table,physics,pbl",
+                "--folds", effort.folds, *training, "--out", out / "benchmark",
+            ),
+            out / "benchmark" / "benchmark.json",
+            out / "benchmark" / "report.html",
+        ),
+        Step(
+            "Close the loop: what does the model lack?",
+            _models("close-loop", store, "--base", "physics", *prior, "--out", loop),
+            loop / "close_loop.json",
+            loop / "report.html",
+        ),
+    ]  # fmt: skip
+    for model in ARMS:
+        trained, frozen = out / "runs" / model, out / "models" / model
+        steps += [
+            Step(
+                f"Train {model}",
+                _models("train", store, "--model", model, *training, "--out", trained),
+                frozen,
+            ),
+            Step(f"Freeze {model}", _models("freeze", trained, "--out", frozen), frozen),
+        ]
+    corrected = out / "models" / "corrected"
+    element = (
+        "--size-px", effort.element_px, "--distance-um", effort.distance_um,
+        "--iterations", effort.iterations,
+    )  # fmt: skip
+    models = ",".join(["none", *(f"{name}={out / 'models' / name}" for name in ARMS)])
+    steps += [
+        Step("Freeze the corrected model", _models("freeze", loop, "--out", corrected), corrected),
+        Step(
+            "Design a hologram through the learned printer",
+            _design("hoe", "--model", out / "models" / "pbl", *element, "--out", out / "hoe"),
+            out / "hoe" / "design.json",
+            out / "hoe" / "report.html",
+        ),
+        Step(
+            "Judge it by a printer that it was not designed with",
+            _design("score", out / "hoe", "--judge", f"corrected={corrected}", "--out", out / "score"),
+            out / "score" / "score.json",
+            out / "score" / "report.html",
+        ),
+        Step(
+            "Designed with × judged with",
+            _design(
+                "compare", "--models", models, "--judge", f"corrected={corrected}", *element,
+                "--seeds", effort.seeds, "--out", out / "compare",
+            ),
+            out / "compare" / "gap.json",
+            out / "compare" / "report.html",
+        ),
+    ]  # fmt: skip
+    return steps
+
+
+def run(step: Step, number: str) -> float:
+    """Run one step unless its result is there; returns the seconds it took and stops the demo if it fails."""
+    print(f"\n{number} {step.title}\n$ {_spell(step.command)}", flush=True)
+    if step.result.exists():
+        print("  already done")
+        return 0.0
+    started = time.monotonic()
+    code = subprocess.run([str(BIN / step.command[0]), *step.command[1:]]).returncode
+    if code:
+        print(f"the demo stops here: the command above ended with exit code {code}", file=sys.stderr)
+        raise SystemExit(code)
+    return time.monotonic() - started
+
+
+def write_index(out: Path, name: str, steps: list[Step], seconds: list[float]) -> Path:
+    """One page that leads to all the reports."""
+    import pandas as pd
+
+    loop = _read(out / "close-loop" / "close_loop.json")
+    page = Page(
+        f"litholoop: {name}", "From raw scans to a design that was optimised through the learned printer."
+    )
+    page.tiles(
+        [
+            (
+                f"{loop['before']['mae_datum_free_nm']:.2f} nm",
+                "error of the base model, held-out scans, datum-free",
+            ),
+            (f"{loop['after']['mae_datum_free_nm']:.2f} nm", "error after the effects that the loop added"),
+            (", ".join(e["name"] for e in loop["effects"]) or "none", "effects found"),
+        ]
+    )
+    page.heading("Reports")
+    page.links([(os.path.relpath(s.report, out), s.title) for s in steps if s.report])
+    page.heading("What was run")
+    table = pd.DataFrame(
+        {"step": [s.title for s in steps], "seconds": seconds, "command": [_spell(s.command) for s in steps]}
+    )
+    page.table(table, "0 s: the result was there from an earlier run.", "steps.csv", digits=1)
+    return page.write(out, "index.html")
+
+
+def _read(path: Path) -> dict[str, Any]:
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def _spell(command: tuple[str, ...]) -> str:
+    return shlex.join(command)
+
+
+def _data(*words: object) -> tuple[str, ...]:
+    return ("litho-data", *map(str, words))
+
+
+def _models(*words: object) -> tuple[str, ...]:
+    return ("litho-models", *map(str, words))
+
+
+def _design(*words: object) -> tuple[str, ...]:
+    return ("litho-design", *map(str, words))
+
+
+if __name__ == "__main__":
+    main()

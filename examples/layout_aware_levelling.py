@@ -1,0 +1,54 @@
+"""How much of a print's own slope and bow goes away with the background, scan by scan.
+
+    python examples/layout_aware_levelling.py STORE.zarr
+
+Compares the background that knows the layout with the plain polynomial, on the raw heights of a
+store, in the scan's own frame. Prints one table, nm.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+import pandas as pd
+
+from litho_data.commands import progress
+from litho_data.level import layout_in_scan_frame, level_layout_aware, level_polynomial
+from litho_data.store import Store, open_store
+
+
+def main() -> None:
+    """Open the store, compare every scan, print."""
+    parser = argparse.ArgumentParser(description="Layout-aware against plain background, per scan.")
+    parser.add_argument("store", help="dataset store built from raw scans")
+    store = open_store(parser.parse_args().store)
+    rows = [compare(store, scan_id) for scan_id in progress(store.ids, "levelling")]
+    table = pd.DataFrame(rows, index=list(store.ids))
+    table.loc["median"] = table.median()
+    table.loc["largest"] = table.iloc[:-1].max()
+    print(table.to_string(float_format=lambda value: f"{value:.1f}"))
+
+
+def compare(store: Store, scan_id: str) -> dict[str, float]:
+    """Range of both planes over the field, and rms difference of both second-degree backgrounds, nm."""
+    print_ = store.scan(scan_id)
+    height_um = store.scan_frame(scan_id, "raw_height_um").astype(np.float64)
+    figures = store.quality.set_index("scan").loc[scan_id]
+    pitch_um = (figures["scan_pitch_y_um"], figures["scan_pitch_x_um"])
+    layout = layout_in_scan_frame(
+        print_.mask_level, print_.scan_to_layout, height_um.shape, pitch_um, print_.pitch_um
+    )
+    plane_aware = level_layout_aware(height_um, layout_level=layout)
+    plane_plain = level_polynomial(height_um, total_degree=1)
+    bow_aware = level_layout_aware(height_um, layout_level=layout, total_degree=2)
+    bow_plain = level_polynomial(height_um, total_degree=2)
+    return {
+        "plane, plain": np.ptp(plane_plain.removed) * 1e3,
+        "plane, layout-aware": np.ptp(plane_aware.removed) * 1e3,
+        "difference of second degree, rms": np.std(bow_aware.removed - bow_plain.removed) * 1e3,
+    }
+
+
+if __name__ == "__main__":
+    main()

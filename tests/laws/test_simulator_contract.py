@@ -1,0 +1,177 @@
+"""The contract of every simulator: one suite over all models and variants."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from litho_models.freeze import load_frozen, save_frozen
+from litho_models.models import MODELS, build_model
+from litho_models.simulator import VARIANTS, Simulator
+from litho_models.tiles import predict_field
+
+CASES = [(name, variant) for name in MODELS for variant in VARIANTS]
+# Narrow blurs keep the fields of this suite small; the law does not depend on them.
+NARROW = {
+    "affine-mtf": {"sigmas_um": (0.1, 0.2, 0.3)},
+    "linear": {"sigmas_um": (0.1, 0.2, 0.3)},
+    "pbl": {"sigma_diffusion_init_um": 0.3},
+    "physics": {"sigma_diffusion_init_um": 0.3},
+}
+
+
+def make(name: str, variant: str = "default", **fields: object) -> Simulator:
+    """A model whose every parameter differs from its start, so that no part is idle."""
+    torch.manual_seed(0)
+    model = build_model(name, variant, **{**NARROW.get(name, {}), **fields})
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(0.03 * torch.randn_like(parameter))
+    return model.eval()
+
+
+def layout(ny: int = 80, nx: int = 96, seed: int = 1) -> torch.Tensor:
+    torch.manual_seed(seed)
+    return torch.randint(0, 13, (1, 1, ny, nx)) * 0.1
+
+
+def test_there_are_models_to_test():
+    assert set(MODELS) >= {"identity", "affine", "affine-mtf", "blur-table", "linear", "physics", "pbl"}
+
+
+@pytest.mark.parametrize(("name", "variant"), CASES)
+def test_height_has_the_shape_of_the_layout_and_is_in_micrometres(name, variant):
+    model = make(name, variant)
+    with torch.no_grad():
+        for shape in ((80, 96), (65, 71)):
+            height = model(layout(*shape))
+            assert height.shape == (1, 1, *shape)
+            assert height.dtype == torch.float32
+            assert torch.isfinite(height).all()
+    if variant == "default":
+        untrained = build_model(name)
+        with torch.no_grad():
+            uniform = untrained(torch.full((1, 1, 160, 160), 0.6))
+        # Untrained default models start near the nominal height: 0.6 µm, not 0.6 nm or 600.
+        assert 0.2 < float(uniform[..., 80, 80]) < 1.0
+
+
+@pytest.mark.parametrize(("name", "variant"), CASES)
+def test_samples_of_a_batch_do_not_touch_each_other(name, variant):
+    model = make(name, variant)
+    a, b = layout(seed=1), layout(seed=2)
+    with torch.no_grad():
+        together = model(torch.cat([a, b]))
+        # Different batch sizes may sum in a different order: a few float32 roundings of 1 µm.
+        assert torch.allclose(together[:1], model(a), atol=2e-6)
+        assert torch.allclose(together[1:], model(b), atol=2e-6)
+
+
+@pytest.mark.parametrize(("name", "variant"), CASES)
+def test_gradient_equals_finite_difference(name, variant):
+    if name == "linear" and variant != "default":
+        pytest.skip("the variants of a baseline are the same model")
+    model = make(name, variant).double()
+    field = (layout(60, 64).double() + 0.05).clamp(0.02, 1.18).requires_grad_()
+    torch.manual_seed(3)
+    direction = torch.randn_like(field)
+    weight = torch.randn_like(field)
+    (gradient,) = torch.autograd.grad((weight * model(field)).sum(), field)
+    step = 1e-6
+    with torch.no_grad():
+        high, low = model(field + step * direction), model(field - step * direction)
+        difference = float((weight * (high - low)).sum() / (2 * step))
+    directional = float((gradient * direction).sum())
+    assert gradient.isfinite().all()
+    # Double precision: rounding 1e-16/1e-6 = 1e-10 per pixel; kinks of leaky ReLU and of the tables
+    # are crossed by a few of 4,000 pixels and change slopes by a few per cent there.
+    assert difference == pytest.approx(directional, rel=2e-3, abs=1e-4)
+
+
+@pytest.mark.parametrize("name", [name for name in MODELS if list(build_model(name).parameters())])
+def test_every_parameter_gets_a_gradient(name):
+    model = make(name)
+    model(layout()).square().sum().backward()
+    for key, parameter in model.named_parameters():
+        assert parameter.grad is not None, key
+        assert parameter.grad.isfinite().all(), key
+        assert parameter.grad.abs().max() > 0, key
+
+
+@pytest.mark.parametrize("name", list(MODELS))
+def test_a_crop_predicts_what_the_whole_field_does_beyond_the_receptive_radius(name):
+    model = make(name)
+    reach = model.reach_px
+    assert reach is not None
+    size = 2 * reach + 40
+    field = layout(size + 24, size + 24)
+    with torch.no_grad():
+        whole = model(field)[..., 10 : 10 + size, 6 : 6 + size]
+        crop = model(field[..., 10 : 10 + size, 6 : 6 + size])
+    inside = slice(reach, size - reach)
+    difference = (whole - crop)[..., inside, inside].abs().max()
+    assert float(difference) < 1e-5
+
+
+@pytest.mark.parametrize("name", [name for name in MODELS if (make(name).reach_px or 0) > 0])
+def test_the_receptive_radius_is_not_overstated(name):
+    model = make(name)
+    reach = model.reach_px
+    size = 2 * reach + 21
+    field = layout(size, size)
+    changed = field.clone()
+    centre = size // 2
+    changed[..., centre, centre] += 0.4
+    with torch.no_grad():
+        response = (model(changed) - model(field)).abs()[0, 0]
+    assert float(response[centre, centre]) > 0
+    beyond = response.clone()
+    beyond[centre - reach : centre + reach + 1, centre - reach : centre + reach + 1] = 0
+    assert float(beyond.max()) < 1e-6
+
+
+@pytest.mark.parametrize("name", list(MODELS))
+def test_tiles_give_the_whole_field(name):
+    model = make(name)
+    field = layout(150, 170)
+    with torch.no_grad():
+        assert torch.allclose(predict_field(model, field, tile_px=64), model(field), atol=1e-5)
+
+
+@pytest.mark.parametrize(("name", "variant"), CASES)
+def test_a_frozen_model_is_the_model(name, variant, tmp_path):
+    model = make(name, variant)
+    save_frozen(model, tmp_path / "model")
+    frozen = load_frozen(tmp_path / "model")
+    field = layout().requires_grad_()
+    height = frozen(field, pitch_um=0.1)
+    with torch.no_grad():
+        assert torch.equal(height, model(layout()))
+    height.sum().backward()
+    assert field.grad.isfinite().all()
+    assert field.grad.abs().sum() > 0
+    assert not any(parameter.requires_grad for parameter in frozen.parameters())
+    assert frozen.name == name
+
+
+@pytest.mark.parametrize(("name", "variant"), [("physics", "paper"), ("physics", "authors")])
+def test_the_published_shrinkage_depends_on_the_crop_and_says_so(name, variant):
+    model = make(name, variant)
+    assert model.reach_px is None
+    field = layout(96, 96)
+    with torch.no_grad():
+        tall = field.clone()
+        tall[..., :8, :8] = 1.2
+        difference = (model(tall) - model(field))[..., 60:, 60:].abs().max()
+    assert float(difference) > 1e-4
+
+
+def test_pointwise_networks_by_knots_equal_those_per_pixel():
+    by_knots = make("pbl")
+    per_pixel = make("pbl", knots=0)
+    per_pixel.load_state_dict(by_knots.state_dict())
+    with torch.no_grad():
+        difference = (by_knots(layout()) - per_pixel(layout())).abs().max()
+    # 1,025 knots over 1.2 µm are 1.2 nm apart; only a kink between two knots is missed, by at most a
+    # quarter of the spacing times the change of slope (below 0.1 here): 0.03 nm.
+    assert float(difference) < 5e-5
