@@ -92,9 +92,7 @@ def _band(size: int, radius: int, sigma_px: Tensor) -> Tensor:
             "field to blur", got=f"{size} px", wanted=f"more than {2 * radius} px (twice the support)"
         )
     sigma = sigma_px.clamp(min=_SMALLEST_SIGMA_PX)
-    output = torch.arange(size - 2 * radius, device=sigma.device)
-    distance = torch.arange(size, device=sigma.device)[None, :] - output[:, None] - radius
-    weight = torch.exp(-0.5 * (distance / sigma) ** 2)
-    taps = torch.arange(-radius, radius + 1, device=sigma.device)
-    total = torch.exp(-0.5 * (taps / sigma) ** 2).sum()
-    return torch.where(distance.abs() <= radius, weight, torch.zeros_like(weight)) / total
+    taps = torch.exp(-0.5 * (torch.arange(-radius, radius + 1, device=sigma.device) / sigma) ** 2)
+    # All rows are windows on one symmetric kernel with zeros on both sides, the last row's first.
+    kernel = functional.pad(taps / taps.sum(), (size - 2 * radius - 1,) * 2)
+    return kernel.unfold(0, size, 1).flip(0)

@@ -155,7 +155,7 @@ def _fit_common(chain: EffectChain, fields: Sequence[Field]) -> tuple[np.ndarray
         normal, right = np.sum([p[0] for p in parts], axis=0), np.sum([p[1] for p in parts], axis=0)
         before = sum(p[2] for p in parts)
         for _ in range(_DAMPING_TRIES):
-            trial = _bounded(chain, vector, solve_damped(normal, right, damping))
+            trial = vector + solve_damped(normal, right, damping, _room(chain, vector))
             after = sum(
                 _sum_of_squares(part, field, predict(chain, trial, field))
                 for part, field in zip(linear, fields, strict=True)
@@ -188,7 +188,7 @@ def _fit_without(
     start = best = sum(p[2] for p in parts)
     vector = common
     for _ in range(_FOLD_STEPS):
-        moved = _bounded(chain, vector, solve_damped(normal, right, _FOLD_DAMPING))
+        moved = vector + solve_damped(normal, right, _FOLD_DAMPING, _room(chain, vector))
         right, total = np.zeros(len(vector)), 0.0
         for i in training:
             residual = fields[i].height - fields[i].at_sample(predict(chain, moved, fields[i]))
@@ -221,15 +221,14 @@ def _robust_covariance(linear: Sequence[Linearisation]) -> np.ndarray:
     return inverse @ (scores.T @ scores) @ inverse * count / max(count - 1, 1)
 
 
-def _bounded(chain: EffectChain, vector: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """The vector after a step that is cut to the longest allowed, effects within their range."""
-    bounded = vector + np.clip(step, -_LONGEST_STEP, _LONGEST_STEP)
-    bounded = np.clip(bounded, -_LARGEST_VALUE, _LARGEST_VALUE)
-    free = vector + step
+def _room(chain: EffectChain, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Smallest and largest step allowed from here: effects within their range, the base not too far."""
+    lowest = np.maximum(-_LONGEST_STEP, -_LARGEST_VALUE - vector)
+    highest = np.minimum(_LONGEST_STEP, _LARGEST_VALUE - vector)
     for (name, parameter), slot in effect_slots(chain).items():
         limits = get_effect(name).parameters[parameter]
-        bounded[slot] = np.clip(free[slot], limits.lower, limits.upper)
-    return bounded
+        lowest[slot], highest[slot] = limits.lower - vector[slot], limits.upper - vector[slot]
+    return np.minimum(lowest, 0), np.maximum(highest, 0)
 
 
 def _steps(chain: EffectChain, vector: np.ndarray) -> np.ndarray:

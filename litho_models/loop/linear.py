@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from litho_models.loop.fields import Field
 
@@ -55,10 +56,32 @@ def gram_inside(columns: np.ndarray, basis: np.ndarray) -> np.ndarray:
     return inside.T @ inside
 
 
-def solve_damped(normal: np.ndarray, right: np.ndarray, damping: float) -> np.ndarray:
-    """Solve (A + damping diag A) x = b, robust against parameters without influence."""
+def solve_damped(
+    normal: np.ndarray,
+    right: np.ndarray,
+    damping: float,
+    bounds: tuple[np.ndarray, np.ndarray] | None = None,
+) -> np.ndarray:
+    """Minimise x·A·x / 2 - b·x + damping x·diag(A)·x / 2 inside a box; robust against idle parameters.
+
+    A step that is cut to its bounds afterwards would leave the other parameters where only the uncut
+    step was best, and a fit whose optimum lies on a bound would creep; inside the box they follow.
+
+    Args:
+        normal, right: A (p, p), positive semi-definite, and b (p,).
+        damping: relative to the diagonal.
+        bounds: lowest and highest x, (p,) each; none by default.
+    """
     diagonal = np.diag(normal).copy()
     floor = max(_WEAKEST_INFLUENCE * diagonal.max(), np.finfo(float).tiny)
     scale = np.sqrt(np.maximum(diagonal, floor))
     scaled = normal / np.outer(scale, scale) + damping * np.eye(len(normal))
-    return np.linalg.lstsq(scaled, right / scale, rcond=1e-9)[0] / scale
+    step = np.linalg.lstsq(scaled, right / scale, rcond=1e-9)[0] / scale
+    if bounds is None or ((step >= bounds[0]) & (step <= bounds[1])).all():
+        return step
+    factor = np.linalg.cholesky(scaled + _SMALLEST_EIGENVALUE * np.eye(len(normal)))
+    target = np.linalg.solve(factor, right / scale)
+    # lsq_linear wants room between the bounds; a parameter without any stays where it is.
+    room = np.maximum(bounds[1] - bounds[0], 1e-12)
+    box = (bounds[0] * scale, (bounds[0] + room) * scale)
+    return lsq_linear(factor.T, target, box, method="bvls").x / scale

@@ -103,3 +103,30 @@ def test_damped_solution_is_exact_without_damping_and_indifferent_to_units() -> 
     assert np.allclose(plain, np.linalg.lstsq(a, b, rcond=None)[0])
     damped, scaled = (solve_damped((a * u).T @ (a * u), (a * u).T @ b, 0.1) for u in (1.0, units))
     assert np.allclose(damped, scaled * units, rtol=1e-6)
+
+
+def test_a_step_in_a_box_is_the_best_one_in_it() -> None:
+    """Karush-Kuhn-Tucker: inside the box no slope is left; on a bound the slope points out of the box."""
+    rng = np.random.default_rng(6)
+    a = rng.normal(size=(20, 4)) @ np.diag([1.0, 30.0, 0.03, 5.0])
+    normal, right = a.T @ a, a.T @ rng.normal(size=20)
+    free = solve_damped(normal, right, 0.0)
+    lowest, highest = np.minimum(0.5 * free, 0), np.maximum(0.5 * free, 0)
+    lowest[3], highest[3] = -1e3, 1e3
+    step = solve_damped(normal, right, 0.0, (lowest, highest))
+    assert ((step >= lowest) & (step <= highest)).all()
+    slope = (normal @ step - right) / np.sqrt(np.diag(normal))
+    # lsq_linear ends at a relative tolerance of 1e-10; the regularisation of the factor is as small.
+    size = 1e-6 * np.abs(right / np.sqrt(np.diag(normal))).max()
+    inside = (step > lowest + 1e-9) & (step < highest - 1e-9)
+    assert inside[3]
+    assert np.allclose(slope[inside], 0, atol=size)
+    assert (slope[step <= lowest + 1e-9] >= -size).all()
+    assert (slope[step >= highest - 1e-9] <= size).all()
+    # Cutting the free step is worse: the others do not follow.
+    cut = np.clip(free, lowest, highest)
+    assert _quadratic(normal, right, step) < _quadratic(normal, right, cut)
+
+
+def _quadratic(normal: np.ndarray, right: np.ndarray, x: np.ndarray) -> float:
+    return float(x @ normal @ x / 2 - right @ x)
