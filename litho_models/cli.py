@@ -35,7 +35,7 @@ Seed = Annotated[int, typer.Option(min=0, help="seed of weights, crops and split
 def train(
     store: StorePath,
     model: Annotated[
-        str, typer.Option(help="identity, affine, affine-mtf, blur-table, linear, physics or pbl")
+        str, typer.Option(help="identity, affine, affine-mtf, blur-table, linear, physics, pbl or fno")
     ],
     out: Out,
     recipe: RecipeOption = "fast",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar, Literal, Self, get_args
+from typing import Any, ClassVar, Literal, NamedTuple, Self, get_args
 
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
@@ -47,6 +47,13 @@ class SimulatorConfig(BaseModel):
         return (self.levels - 1) * self.level_height_um
 
 
+class Tile(NamedTuple):
+    """Square on which a model is trained and evaluated; neighbours share ``overlap_px``, blended."""
+
+    size_px: int
+    overlap_px: int
+
+
 class Simulator(nn.Module, ABC):
     """A process model: ``model(layout_um) -> height_um``, both (batch, 1, y, x) float32 in µm.
 
@@ -70,9 +77,17 @@ class Simulator(nn.Module, ABC):
     def reach_px(self) -> int | None:
         """Receptive radius in pixels; None where a pixel depends on the whole image."""
 
+    @property
+    def tile(self) -> Tile | None:
+        """The tile of a model that answers differently for another image size; None for all others."""
+        return None
+
     @abstractmethod
     def interior(self, layout_um: Tensor) -> Tensor:
-        """Height of the pixels farther than ``reach_px`` from the edge: (b, 1, y - 2r, x - 2r), µm."""
+        """Height of the pixels farther than ``reach_px`` from the edge: (b, 1, y - 2r, x - 2r), µm.
+
+        Without a receptive radius it is the image as a whole, or one tile: the same size.
+        """
 
     def forward(self, layout_um: Tensor) -> Tensor:
         """Height of the whole field; beyond its edge the outermost pixels are continued."""

@@ -8,6 +8,7 @@ from litho_data.errors import InputError
 from litho_models.models.affine import Affine
 from litho_models.models.affine_mtf import AffineMtf
 from litho_models.models.blur_table import BlurTable
+from litho_models.models.fno import Fno
 from litho_models.models.identity import Identity
 from litho_models.models.linear import Linear
 from litho_models.models.pbl import Pbl
@@ -17,7 +18,7 @@ from litho_models.simulator import Simulator, Variant
 __all__ = ["MODELS", "build_model", "model_class"]
 
 MODELS: dict[str, type[Simulator]] = {
-    model.name: model for model in (Identity, Affine, AffineMtf, BlurTable, Linear, Physics, Pbl)
+    model.name: model for model in (Identity, Affine, AffineMtf, BlurTable, Linear, Physics, Pbl, Fno)
 }
 
 

@@ -23,7 +23,7 @@ from litho_data.commands import progress
 from litho_data.store import PrintedScan
 from litho_models.metrics import score_scan
 from litho_models.simulator import Simulator
-from litho_models.tiles import predict_scan
+from litho_models.tiles import blending_window, predict_scan
 from litho_models.training.checkpoint import CheckpointFolder, RoundRecord, TrainingState
 from litho_models.training.config import TrainingConfig
 from litho_models.training.crops import Window, plan_batch, stack
@@ -49,6 +49,8 @@ def train_network(
     Without validation scans the last round counts. ``first_predictions_um`` are the heights of a
     stiff model on the training scans, from which the first nuisances are estimated.
     """
+    if model.tile is not None and config.crops == "random":
+        config = config.model_copy(update={"crop_px": model.tile.size_px})
     fabric = _fabric(config)
     optimiser = _optimiser(model, config)
     module, optimiser = fabric.setup(model, optimiser)
@@ -64,7 +66,7 @@ def train_network(
         started = time.monotonic()
         predictions = [predict_scan(model, scan) for scan in training] if first else first_predictions_um
         nuisances = estimate_nuisances(training, predictions, config.nuisance, config.free_gain)
-        targets = _Targets(training, nuisances)
+        targets = _Targets(training, nuisances, _overhang_px(model, training, config))
         losses = []
         for step in progress(range(first, last), f"training {model.name} to step {config.steps}"):
             losses.append(_step(fabric, module, optimiser, targets, config, step))
@@ -84,17 +86,21 @@ def train_network(
 
 
 class _Targets:
-    """Layouts and nuisance-free heights of the training scans; what is not measured has no weight."""
+    """Layouts and nuisance-free heights of the training scans; what is not measured has no weight.
 
-    def __init__(self, scans: Sequence[PrintedScan], nuisances_um: Sequence[np.ndarray]):
-        self.shapes = [scan.shape for scan in scans]
-        self.layouts_um = [scan.layout_um for scan in scans]
+    Around each scan the outermost pixels of its layout continue for ``overhang_px``, without weight.
+    """
+
+    def __init__(self, scans: Sequence[PrintedScan], nuisances_um: Sequence[np.ndarray], overhang_px: int):
+        self.layouts_um = [np.pad(scan.layout_um, overhang_px, mode="edge") for scan in scans]
+        self.shapes = [layout.shape for layout in self.layouts_um]
         usable = [scan.valid & np.isfinite(scan.height_um) for scan in scans]
-        self.weights = [mask.astype(np.float32) for mask in usable]
-        self.heights_um = [
+        self.weights = [np.pad(mask.astype(np.float32), overhang_px) for mask in usable]
+        heights = [
             np.where(mask, scan.height_um - nuisance, 0).astype(np.float32)
             for scan, nuisance, mask in zip(scans, nuisances_um, usable, strict=True)
         ]
+        self.heights_um = [np.pad(height, overhang_px) for height in heights]
 
 
 def _step(
@@ -111,21 +117,35 @@ def _step(
     prediction = _predict_windows(fabric, module, targets, windows, config)
     height = fabric.to_device(stack(targets.heights_um, windows))
     weight = fabric.to_device(stack(targets.weights, windows))
+    if module.tile is not None and config.crops == "random":
+        # A pixel counts as much as it will in the blended field.
+        window = blending_window(module.tile, weight)
+        weight = weight * (window / window.mean())
     # The count of pixels is fixed, so that the mean over processes is the loss of one process.
     loss = (weight * _error(prediction, height, config)).mean()
     optimiser.zero_grad(set_to_none=True)
     fabric.backward(loss)
     optimiser.step()
-    absolute = (weight * (prediction - height).abs()).mean().detach()
-    return float(cast(Tensor, fabric.all_reduce(absolute)))
+    sums = torch.stack([(weight * (prediction - height).abs()).mean().detach(), weight.mean()])
+    absolute, counted = cast(Tensor, fabric.all_reduce(sums)).tolist()
+    return absolute / counted
 
 
 def _predict_windows(
     fabric: Fabric, module: Simulator, targets: _Targets, windows: list[Window], config: TrainingConfig
 ) -> Tensor:
-    if config.crops == "quadrants" or module.reach_px is None:
-        return module(fabric.to_device(stack(targets.layouts_um, windows)))
-    return module.interior(fabric.to_device(stack(targets.layouts_um, windows, module.reach_px)))
+    whole = config.crops == "quadrants" or (module.reach_px is None and module.tile is None)
+    predict = module if whole else module.interior
+    margin = 0 if whole else module.reach_px or 0
+    return predict(fabric.to_device(stack(targets.layouts_um, windows, margin)))
+
+
+def _overhang_px(model: Simulator, scans: Sequence[PrintedScan], config: TrainingConfig) -> int:
+    """Pixels that tiles may reach beyond a scan: as far as in prediction, and one tile at least."""
+    if model.tile is None or config.crops != "random":
+        return 0
+    shortest = min(length for scan in scans for length in scan.shape)
+    return max(model.tile.overlap_px, -(-(model.tile.size_px - shortest) // 2))
 
 
 def _error(prediction: Tensor, height: Tensor, config: TrainingConfig) -> Tensor:

@@ -1,0 +1,152 @@
+"""FNO: the Fourier neural operator, the paper's learned simulator without physics inside.
+
+arXiv:2309.17343, appendix "Fourier Neural Operator": the two-dimensional operator of Li et al. 2020
+(arXiv:2010.08895) with 12 x 12 modes and width 24. A layer adds a product in Fourier space, which sees
+the whole image, to a local convolution. It is periodic in the image and its modes count periods per
+image, so it answers differently for another image size: ``default`` runs it on tiles of one size.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+from torch.nn import functional
+
+from litho_models.simulator import Simulator, SimulatorConfig, Tile
+from litho_models.tiles import blend_tiles
+
+
+class FnoConfig(SimulatorConfig):
+    layers: int = Field(4, ge=1)
+    modes: tuple[int, int] = Field((12, 12), description="frequencies kept along y (both signs) and x")
+    width: int = Field(24, ge=1, description="channels of the layers")
+    projection_channels: int = Field(128, ge=1, description="hidden channels of the last two layers")
+    # 1 x 1 in the paper: what the kept modes do not resolve can then only be mapped pixel by pixel.
+    local_px: int = Field(3, ge=1, description="side of the local convolution, odd")
+    coordinates: bool = Field(False, description="y and x on 0 ... 1 of the image as further inputs")
+    padding_fraction: float = Field(0.0, ge=0, description="zeros added at bottom and right, share of image")
+    tile_px: int | None = Field(128, ge=8, description="side of a tile; None takes the image as it is")
+    overlap_px: int = Field(64, ge=0, description="blended pixels of neighbouring tiles, at most half a tile")
+    # Start as the layout and learn what differs; the paper's network starts at random.
+    starts_as_layout: bool = True
+
+    VARIANT_FIELDS: ClassVar[dict[str, dict[str, Any]]] = {
+        variant: {
+            "local_px": 1,
+            "coordinates": True,
+            # 9 px of the published quadrants of 256 px.
+            "padding_fraction": 9 / 256,
+            "tile_px": None,
+            "starts_as_layout": False,
+            **fields,
+        }
+        for variant, fields in {"paper": {}, "authors": {"width": 12}}.items()
+    }
+
+
+class Fno(Simulator):
+    """H = Q(L₄ ∘ … ∘ L₁(P(M, y, x))) with L(v) = gelu(local(v) + spectral(v)), no gelu after the last.
+
+    P lifts each pixel to ``width`` channels, Q maps them to a height through one hidden layer. With
+    ``starts_as_layout`` this is what is added to M, zero at the start. Where the config has a tile,
+    ``interior`` is the height of one tile, taken as periodic, and the field is blended from tiles.
+    """
+
+    name = "fno"
+    Config = FnoConfig
+    config: FnoConfig
+    is_small = False
+
+    def __init__(self, config: FnoConfig):
+        super().__init__(config)
+        width, local = config.width, config.local_px
+        self.lift = nn.Conv2d(3 if config.coordinates else 1, width, 1)
+        self.spectral = nn.ModuleList(SpectralConvolution(width, config.modes) for _ in range(config.layers))
+        self.local = nn.ModuleList(
+            nn.Conv2d(width, width, local, padding=local // 2, padding_mode="circular")
+            for _ in range(config.layers)
+        )
+        self.hidden = nn.Conv2d(width, config.projection_channels, 1)
+        self.last = nn.Conv2d(config.projection_channels, 1, 1)
+        if config.starts_as_layout:
+            nn.init.zeros_(self.last.weight)
+            if self.last.bias is not None:
+                nn.init.zeros_(self.last.bias)
+
+    @property
+    def reach_px(self) -> None:
+        return None
+
+    @property
+    def tile(self) -> Tile | None:
+        size = self.config.tile_px
+        return None if size is None else Tile(size, self.config.overlap_px)
+
+    def interior(self, layout_um: Tensor) -> Tensor:
+        """Height of an image taken as a whole, the same size, (batch, 1, y, x) µm."""
+        config = self.config
+        ny, nx = layout_um.shape[-2:]
+        # Heights need full precision where they enter and leave, also under autocast.
+        with torch.autocast(device_type=layout_um.device.type, enabled=False):
+            inputs = torch.cat([layout_um, _coordinates(layout_um)], 1) if config.coordinates else layout_um
+            features = self.lift(inputs)
+        padding = [round(config.padding_fraction * size) for size in (nx, ny)]
+        features = functional.pad(features, (0, padding[0], 0, padding[1]))
+        for number, (spectral, local) in enumerate(zip(self.spectral, self.local, strict=True)):
+            features = spectral(features) + local(features)
+            if number < config.layers - 1:
+                features = functional.gelu(features)
+        features = functional.gelu(self.hidden(features[..., :ny, :nx]))
+        with torch.autocast(device_type=layout_um.device.type, enabled=False):
+            height = self.last(features.to(self.last.weight.dtype))
+        return layout_um + height if config.starts_as_layout else height
+
+    def forward(self, layout_um: Tensor) -> Tensor:
+        """Height of the whole field, (batch, 1, y, x) µm."""
+        if self.tile is None:
+            return self.interior(layout_um)
+        return blend_tiles(self.interior, layout_um, self.tile)
+
+
+class SpectralConvolution(nn.Module):
+    """A matrix over channels for each of the lowest frequencies: v̂'(k) = W(k) v̂(k), all others zero.
+
+    The weights are real, (sign of k_y, in, out, modes y, modes x, real and imaginary part), so that
+    they can be stored and cast like any other parameter.
+    """
+
+    def __init__(self, channels: int, modes: tuple[int, int]):
+        super().__init__()
+        self.weight = nn.Parameter(torch.rand(2, channels, channels, *modes, 2) / channels**2)
+
+    def forward(self, field: Tensor) -> Tensor:
+        """(b, channels, y, x) to the same shape; an image smaller than the modes keeps those it has."""
+        ny, nx = field.shape[-2:]
+        kept_y = min(self.weight.shape[3], ny // 2)
+        kept_x = min(self.weight.shape[4], nx // 2 + 1)
+        with torch.autocast(device_type=field.device.type, enabled=False):
+            field = field.to(self.weight.dtype)
+            weight = torch.view_as_complex(self.weight)[..., :kept_x]
+            # rfft2 and irfft2, with the transform along y for the kept columns only.
+            spectrum = torch.fft.fft(torch.fft.rfft(field, dim=-1)[..., :kept_x], dim=-2)
+            low = _mix(spectrum[..., :kept_y, :], weight[0][..., :kept_y, :])
+            high = _mix(spectrum[..., ny - kept_y :, :], weight[1][..., -kept_y:, :])
+            between = low.new_zeros(*low.shape[:2], ny - 2 * kept_y, kept_x)
+            mixed = torch.cat([low, between, high], dim=-2)
+            return torch.fft.irfft(torch.fft.ifft(mixed, dim=-2), n=nx, dim=-1)
+
+
+def _mix(spectrum: Tensor, weight: Tensor) -> Tensor:
+    return torch.einsum("biyx,ioyx->boyx", spectrum, weight)
+
+
+def _coordinates(layout: Tensor) -> Tensor:
+    """y and x of each pixel on 0 ... 1, (batch, 2, y, x)."""
+    y, x = (
+        torch.linspace(0, 1, size, device=layout.device, dtype=layout.dtype) for size in layout.shape[-2:]
+    )
+    grid = torch.stack(torch.meshgrid(y, x, indexing="ij"))
+    return grid.expand(layout.shape[0], -1, -1, -1)

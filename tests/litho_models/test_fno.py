@@ -1,0 +1,187 @@
+"""FNO: its spectral layer is a Fourier sum, its tiles are periodic, its blending weights sum to one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from prints import make_scans
+
+from litho_data.errors import InputError
+from litho_models.models import build_model
+from litho_models.models.fno import SpectralConvolution
+from litho_models.simulator import Tile
+from litho_models.tiles import blend_tiles, blending_window, predict_scan
+from litho_models.training import TrainingConfig, fit_with_record
+
+SMALL = {"width": 6, "modes": (4, 4), "projection_channels": 16, "tile_px": 32, "overlap_px": 16}
+QUICK = {"steps": 12, "rounds": 3, "batch": 2, "precision": "32-true", "nuisance": "offset"}
+
+
+def trained(**fields):
+    """A small FNO whose every weight differs from its start."""
+    torch.manual_seed(0)
+    model = build_model("fno", **{**SMALL, **fields}).double()
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+    return model.eval()
+
+
+@pytest.mark.parametrize("shape", [(7, 8), (9, 6)])
+def test_the_spectral_layer_is_the_fourier_sum(shape):
+    ny, nx = shape
+    modes_y, modes_x, channels = 3, 2, 2
+    torch.manual_seed(1)
+    layer = SpectralConvolution(channels, (modes_y, modes_x)).double()
+    layer.weight.data.normal_()
+    field = torch.randn(1, channels, ny, nx, dtype=torch.float64)
+    weight = torch.view_as_complex(layer.weight.detach()).numpy()
+    y, x = np.meshgrid(np.arange(ny), np.arange(nx), indexing="ij")
+    wanted = np.zeros((channels, ny, nx))
+    frequencies = [(0, k, k) for k in range(modes_y)] + [(1, modes_y - k, -k) for k in range(1, modes_y + 1)]
+    for sign, row, ky in frequencies:
+        for kx in range(modes_x):
+            wave = np.exp(-2j * np.pi * (ky * y / ny + kx * x / nx))
+            spectrum = (field[0].numpy() * wave).sum(axis=(1, 2))
+            mixed = spectrum @ weight[sign, :, :, row, kx]
+            # A positive k_x stands for its mirror image too; k_x = 0 has none.
+            wanted += (1 if kx == 0 else 2) * (mixed[:, None, None] * wave.conj()).real / (ny * nx)
+    with torch.no_grad():
+        assert np.abs(layer(field)[0].numpy() - wanted).max() < 1e-12
+
+
+def test_a_tile_is_periodic_without_coordinates():
+    model = trained()
+    field = torch.rand(1, 1, 32, 32, dtype=torch.float64)
+    with torch.no_grad():
+        turned = model.interior(field.roll((5, -11), (-2, -1)))
+        straight = model.interior(field).roll((5, -11), (-2, -1))
+    assert float((turned - straight).abs().max()) < 1e-12
+
+
+def test_coordinates_break_the_periodicity():
+    model = trained(coordinates=True)
+    field = torch.rand(1, 1, 32, 32, dtype=torch.float64)
+    with torch.no_grad():
+        change = model.interior(field.roll(9, -1)) - model.interior(field).roll(9, -1)
+    assert float(change.abs().max()) > 1e-3
+
+
+def test_a_field_moved_by_whole_strides_moves_its_print():
+    model = trained()
+    stride = SMALL["tile_px"] - SMALL["overlap_px"]
+    # A wide even border, so that nothing but the pattern moves.
+    field = torch.zeros(1, 1, 160, 160, dtype=torch.float64)
+    field[..., 48:80, 48:80] = torch.rand(32, 32, dtype=torch.float64)
+    with torch.no_grad():
+        moved = model(field.roll((2 * stride, stride), (-2, -1)))
+        straight = model(field).roll((2 * stride, stride), (-2, -1))
+    assert float((moved - straight).abs().max()) < 1e-12
+
+
+@pytest.mark.parametrize("tile", [Tile(32, 16), Tile(32, 10), Tile(31, 15), Tile(16, 0)])
+@pytest.mark.parametrize("shape", [(5, 90), (64, 33)])
+def test_blending_weights_sum_to_one(tile, shape):
+    field = torch.rand(2, 1, *shape, dtype=torch.float64)
+    assert torch.allclose(blend_tiles(lambda tiles: tiles, field, tile), field, atol=1e-14, rtol=0)
+    assert float(blending_window(tile, field).max()) <= 1
+
+
+def test_an_overlap_beyond_half_a_tile_is_refused():
+    with pytest.raises(InputError, match="half a tile"):
+        blend_tiles(lambda tiles: tiles, torch.rand(1, 1, 40, 40), Tile(32, 17))
+
+
+def test_the_variants_are_those_of_paper_and_code():
+    paper, authors, ours = (build_model("fno", variant) for variant in ("paper", "authors", "default"))
+    for model in (paper, authors, ours):
+        assert (model.config.layers, model.config.modes) == (4, (12, 12))
+    assert (paper.config.width, authors.config.width, ours.config.width) == (24, 12, 24)
+    assert paper.config.coordinates
+    assert authors.config.coordinates
+    assert not ours.config.coordinates
+    # 9 px of 256, and the same share of another size.
+    assert round(authors.config.padding_fraction * 256) == 9
+    assert round(authors.config.padding_fraction * 540) == 19
+    # Lift, four layers of two spectral blocks and one 1 x 1 convolution, projection.
+    width = 24
+    spectral = 4 * 2 * width**2 * 12 * 12 * 2
+    local = 4 * (width**2 + width)
+    assert paper.parameter_count == (3 * width + width) + spectral + local + (128 * width + 128) + (128 + 1)
+
+
+@pytest.mark.parametrize("size", [256, 540])
+def test_the_published_variant_takes_other_sizes(size):
+    model = build_model("fno", "paper", width=2)
+    with torch.no_grad():
+        height = model(torch.rand(1, 1, size, size))
+    assert height.shape == (1, 1, size, size)
+    assert height.isfinite().all()
+
+
+@pytest.mark.parametrize(
+    ("recipe", "variant"), [("fast", "default"), ("paper", "default"), ("paper", "paper"), ("fast", "paper")]
+)
+def test_every_recipe_trains_every_variant(recipe, variant):
+    fields = SMALL if variant == "default" else {"width": 4, "modes": (4, 4), "projection_channels": 8}
+    settings = {**QUICK, "variant": variant, "learning_rate": 5e-3}
+    settings |= {"crop_px": 48} if recipe == "paper" else {}
+    config = TrainingConfig.of_recipe(recipe, "fno", **settings)
+    scans = make_scans(4, size_px=96)
+    fitted = fit_with_record("fno", scans, config, model_fields=fields)
+    errors = [entry.training_mae_nm for entry in fitted.history]
+    assert errors[-1] < errors[0]
+    assert np.isfinite(predict_scan(fitted.model, scans[0])).all()
+
+
+def test_training_sees_whole_tiles_and_the_continued_edge(monkeypatch):
+    from litho_models.models.fno import Fno
+
+    shapes = []
+    interior = Fno.interior
+
+    def watched(self, layout_um):
+        if torch.is_grad_enabled():
+            shapes.append(tuple(layout_um.shape[-2:]))
+        return interior(self, layout_um)
+
+    monkeypatch.setattr(Fno, "interior", watched)
+    # Scans narrower than a tile, and a crop size that is not the tile's.
+    for size_px in (28, 64):
+        fit_with_record(
+            "fno", make_scans(3, size_px=size_px), TrainingConfig(**QUICK, crop_px=40), model_fields=SMALL
+        )
+    assert set(shapes) == {(32, 32)}
+
+
+def test_fno_learns_a_blur_beyond_its_start():
+    scans = make_scans(4, size_px=96, noise_um=0.002, datum_um=0.0)
+    config = TrainingConfig(**{**QUICK, "steps": 120, "learning_rate": 5e-3, "validation_scans": 0})
+    fitted = fit_with_record("fno", scans, config, model_fields=SMALL)
+    start = build_model("fno", **SMALL)
+
+    def error(model):
+        return np.mean([np.abs(predict_scan(model, s) - s.height_um).mean() for s in scans])
+
+    # The start is the layout itself; blur and saturation are what there is to learn.
+    assert error(fitted.model) < 0.5 * error(start)
+
+
+def test_what_is_not_measured_does_not_teach():
+    scans = make_scans(3, size_px=64)
+    broken = []
+    for scan in scans:
+        valid = scan.valid.copy()
+        valid[:, :20] = False
+        height = np.where(valid, scan.height_um, np.nan).astype(np.float32)
+        broken.append(replace(scan, height_um=height, valid=valid))
+    also = [replace(scan, height_um=np.where(scan.valid, scan.height_um, 5.0)) for scan in broken]
+    config = TrainingConfig(**QUICK, validation_scans=0)
+    first, second = (fit_with_record("fno", each, config, model_fields=SMALL) for each in (broken, also))
+    assert math.isfinite(first.history[-1].training_mae_nm)
+    for one, other in zip(first.model.parameters(), second.model.parameters(), strict=True):
+        assert torch.equal(one, other)
