@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from litho_data.colour_image import colour_bar_png, coloured_png
 from litho_data.files import atomic_file
-from litho_data.report import Page, new_figure
+from litho_data.report import Page
 from litho_data.store.read import PrintedScan, Store, open_store
 
 if TYPE_CHECKING:
     import pandas as pd
-    from matplotlib.figure import Figure
 
     from litho_data.make_store import BuildResult
 
-_SCANS_PER_FIGURE = 6
 _MAX_SCANS_SHOWN = 48
 _THUMBNAIL_PX = 180
-_GAP_PX = 6
 # Blur of the layout in the residual: about the width of the printer's line; a look, not a model.
 _BLUR_PX = 3.0
+_STAGES = {
+    "layout [level]": "viridis",
+    "raw [nm]": "cividis",
+    "registered [nm]": "cividis",
+    "residual [nm]": "RdBu_r",
+}
 _TABLE = {
     "scan": "scan",
     "model": "model",
@@ -102,14 +107,18 @@ def _pictures(page: Page, store: Store) -> None:
     ids = _shown_ids(store)
     if len(ids) < len(store):
         page.note(f"The {len(ids)} scans that correlate least with their layout, of {len(store)}.")
-    for start in range(0, len(ids), _SCANS_PER_FIGURE):
-        chosen = ids[start : start + _SCANS_PER_FIGURE]
-        caption = (
-            f"{', '.join(chosen)}. Raw: the scan in its own frame. Registered: on the layout's grid, "
-            "white where not measured. Residual: registered height minus the blurred layout, "
-            "with the best gain and offset."
-        )
-        page.figure(_thumbnails(store, chosen), caption)
+    stages = [_stages(store, scan_id) for scan_id in ids]
+    columns, pictures = [], []
+    for (title, colours), images in zip(_STAGES.items(), zip(*stages, strict=True), strict=True):
+        low, high = _range(images, symmetric=colours == "RdBu_r")
+        columns.append((f"{title}, {low:.4g} … {high:.4g}", colour_bar_png(colours)))
+        pictures.append([coloured_png(image, colours, low, high) for image in images])
+    caption = (
+        "Raw: the scan in its own frame. Registered: on the layout's grid, white where not measured. "
+        "Residual: registered height minus the blurred layout, with the best gain and offset. "
+        "One colour scale per column."
+    )
+    page.gallery(columns, list(zip(ids, zip(*pictures, strict=True), strict=True)), caption)
 
 
 def _shown_ids(store: Store) -> list[str]:
@@ -119,44 +128,12 @@ def _shown_ids(store: Store) -> list[str]:
     return [str(scan_id) for scan_id in worst]
 
 
-def _thumbnails(store: Store, ids: list[str]) -> Figure:
-    """One row per scan, one column per stage, one colour scale per column."""
-    scans = [store.scan(scan_id) for scan_id in ids]
-    columns = [
-        ("layout [level]", [_thumbnail(scan.mask_level) for scan in scans], "viridis"),
-        (
-            "raw [nm]",
-            [_thumbnail(store.scan_frame(scan_id, "raw_height_um")) * 1e3 for scan_id in ids],
-            "cividis",
-        ),
-        ("registered [nm]", [_thumbnail(scan.height_um) * 1e3 for scan in scans], "cividis"),
-        ("residual [nm]", [_thumbnail(_residual_nm(scan)) for scan in scans], "RdBu_r"),
-    ]
-    figure = new_figure(8.6, 2.05 * len(ids) + 0.7)
-    for axis, (title, images, colours) in zip(figure.subplots(1, len(columns)), columns, strict=True):
-        # One picture per column: an axis for every thumbnail would take matplotlib longer than the build.
-        stack, middles = _stacked(images)
-        low, high = _range(stack, symmetric=colours == "RdBu_r")
-        shown = axis.imshow(stack, cmap=colours, vmin=low, vmax=high, interpolation="nearest")
-        axis.set_title(title, fontsize=9)
-        axis.set_xticks([])
-        axis.set_yticks(middles, ids if title.startswith("layout") else [""] * len(ids), fontsize=8)
-        axis.tick_params(length=0)
-        axis.set_frame_on(False)
-        figure.colorbar(shown, ax=axis, location="bottom", shrink=0.9, pad=0.01).ax.tick_params(labelsize=7)
-    return figure
-
-
-def _stacked(images: list[np.ndarray]) -> tuple[np.ndarray, list[float]]:
-    """Images below each other with a gap of NaN, and the row of each one's middle."""
-    width = max(image.shape[1] for image in images)
-    height = sum(image.shape[0] + _GAP_PX for image in images) - _GAP_PX
-    stack, middles, top = np.full((height, width), np.nan, dtype=np.float32), [], 0
-    for image in images:
-        stack[top : top + image.shape[0], : image.shape[1]] = image
-        middles.append(top + image.shape[0] / 2)
-        top += image.shape[0] + _GAP_PX
-    return stack, middles
+def _stages(store: Store, scan_id: str) -> list[np.ndarray]:
+    """Thumbnails of a scan, in the order of ``_STAGES``."""
+    scan = store.scan(scan_id)
+    raw = store.scan_frame(scan_id, "raw_height_um")
+    images = [scan.mask_level, raw * 1e3, scan.height_um * 1e3, _residual_nm(scan)]
+    return [_thumbnail(image) for image in images]
 
 
 def _residual_nm(scan: PrintedScan) -> np.ndarray:
@@ -170,8 +147,9 @@ def _residual_nm(scan: PrintedScan) -> np.ndarray:
     return (scan.height_um - (z_mean + gain * (layout - x_mean))) * 1e3
 
 
-def _range(image: np.ndarray, symmetric: bool) -> tuple[float, float]:
-    low, high = (float(value) for value in np.nanpercentile(image, [0.5, 99.5]))
+def _range(images: Sequence[np.ndarray], symmetric: bool) -> tuple[float, float]:
+    values = np.concatenate([image.ravel() for image in images])
+    low, high = (float(value) for value in np.nanpercentile(values, [0.5, 99.5]))
     return (-max(-low, high), max(-low, high)) if symmetric else (low, high)
 
 

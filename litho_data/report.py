@@ -38,6 +38,8 @@ _TEMPLATE = """<!doctype html>
  td.n, th.n { text-align:right; }
  thead th { background:var(--band); position:sticky; top:0; }
  tbody tr:hover { background:var(--band); }
+ .gallery td, .gallery th { border:0; padding:.15rem .3rem; font-weight:normal; }
+ .gallery img { width:100%; min-width:7rem; display:block; } .gallery th img { height:.5rem; }
  figure { margin:1.1rem 0; } figure img { max-width:100%; height:auto; }
  figcaption, .caption { color:var(--soft); font-size:.88rem; }
  pre { background:var(--band); padding:.8rem; overflow-x:auto; font-size:.85rem; }
@@ -53,6 +55,12 @@ _TEMPLATE = """<!doctype html>
 {% elif part.kind == "figure" %}<figure>
 <img alt="{{ part.caption }}" src="data:image/png;base64,{{ part.png }}">
 <figcaption>{{ part.caption }}</figcaption></figure>
+{% elif part.kind == "gallery" %}<figure><div class="scroll"><table class="gallery"><thead><tr><th></th>
+{% for title, png in part.columns %}
+<th>{{ title }}<img alt="" src="data:image/png;base64,{{ png }}"></th>{% endfor %}
+</tr></thead><tbody>{% for label, pngs in part.rows %}<tr><td>{{ label }}</td>{% for png in pngs %}
+<td><img alt="{{ label }}" src="data:image/png;base64,{{ png }}"></td>{% endfor %}</tr>
+{% endfor %}</tbody></table></div><figcaption>{{ part.caption }}</figcaption></figure>
 {% elif part.kind == "table" %}<p class="caption">{{ part.caption }}</p><div class="scroll"><table><thead><tr>
 {% for column in part.columns %}
 <th{% if column.numeric %} class="n"{% endif %}>{{ column.name }}</th>{% endfor %}
@@ -111,8 +119,29 @@ class Page:
         """A matplotlib figure, embedded as PNG."""
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=_FIGURE_DPI, bbox_inches="tight")
-        png = base64.b64encode(buffer.getvalue()).decode()
-        self._parts.append({"kind": "figure", "caption": caption, "png": png})
+        self._parts.append({"kind": "figure", "caption": caption, "png": _base64(buffer.getvalue())})
+
+    def gallery(
+        self,
+        columns: Sequence[tuple[str, bytes]],
+        rows: Sequence[tuple[str, Sequence[bytes]]],
+        caption: str,
+    ) -> None:
+        """Small PNG pictures in rows and columns.
+
+        Args:
+            columns: title and colour bar of each.
+            rows: label and one picture per column.
+            caption: below.
+        """
+        self._parts.append(
+            {
+                "kind": "gallery",
+                "columns": [(title, _base64(png)) for title, png in columns],
+                "rows": [(label, [_base64(png) for png in pngs]) for label, pngs in rows],
+                "caption": caption,
+            }
+        )
 
     def write(self, folder: str | Path, name: str = "report.html") -> Path:
         """Write the page and its CSV tables into ``folder``; returns the path of the page."""
@@ -137,6 +166,10 @@ def new_figure(width_inch: float, height_inch: float) -> Figure:
     figure = Figure(figsize=(width_inch, height_inch), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
+
+
+def _base64(png: bytes) -> str:
+    return base64.b64encode(png).decode()
 
 
 def _cell(value: Any, digits: int) -> str:

@@ -87,7 +87,8 @@ def _parse(path: Path, body: bytes, first_line: int) -> np.ndarray:
         raise InputError(f"{path} line {line}", got=f"byte 0x{strange[0]:02x}", wanted="a text of numbers")
     if not body.strip():
         raise InputError(f"{path} holds no numbers", wanted="one line per row of the height map")
-    if empty := _EMPTY_CELL.search(body):
+    # Looking for a comma first takes a hundredth of the time of the expression.
+    if (b"," in body or b";" in body) and (empty := _EMPTY_CELL.search(body)):
         line = first_line + body.count(b"\n", 0, empty.start())
         raise InputError(
             f"{path} line {line}", got="an empty cell", wanted="a number, or nan where not measured"

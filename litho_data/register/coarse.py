@@ -18,7 +18,6 @@ from litho_data.register.geometry import (
     overlap_of,
 )
 from litho_data.register.orientation import TIE, Hypothesis, search_orientation
-from litho_data.register.topography import predicted_topography
 
 CLEAR_MARGIN = 0.1
 # Correlation above which a hypothesis is believed without features to support it.
@@ -45,19 +44,26 @@ class CoarseFit:
 
 
 def find_coarse(
-    scan: np.ndarray, layout_level: np.ndarray, *, search: bool, features: bool, seed: int
+    scan: np.ndarray,
+    layout_level: np.ndarray,
+    smooth_layout: np.ndarray,
+    *,
+    search: bool,
+    features: bool,
+    seed: int,
 ) -> CoarseFit | None:
     """The best coarse fit, or None if scan or layout shows no structure.
 
     Args:
         scan: (ny, nx) heights at the layout's pitch without bow, NaN where not measured.
         layout_level: (ny, nx) integer levels.
+        smooth_layout: (ny, nx) the topography predicted from it with a blur of ``SEARCH_BLUR_PX``.
         search: whether all eight orientations and both polarities are open, or only the identity.
         features: whether keypoints may be matched; on a layout that repeats itself they match everywhere.
         seed: of the robust estimators.
     """
     allowed = (tuple(ORIENTATIONS), (1, -1)) if search else (("identity",), (1,))
-    hypotheses = search_orientation(scan, predicted_topography(layout_level, SEARCH_BLUR_PX), *allowed)
+    hypotheses = search_orientation(scan, smooth_layout, *allowed)
     if not hypotheses:
         return None
     best = _upright_if_tied(hypotheses)

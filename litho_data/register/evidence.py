@@ -124,7 +124,7 @@ def mutual_information_bit(height: np.ndarray, layout_level: np.ndarray) -> floa
         return float("nan")
     values = height[chosen]
     classes = np.searchsorted(np.quantile(values, np.arange(1, 64) / 64), values)
-    levels = np.unique(layout_level[chosen], return_inverse=True)[1]
+    levels = layout_level[chosen].astype(np.int64)
     counts = np.bincount(levels * 64 + classes, minlength=64 * (levels.max() + 1))
     joint = counts.reshape(-1, 64) / len(values)
     product = joint.sum(axis=1, keepdims=True) * joint.sum(axis=0, keepdims=True)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
@@ -11,6 +13,8 @@ from litho_data.register.geometry import ORIENTATIONS, orient
 SEARCH_SIZE_PX = 128
 MIN_OVERLAP = 0.4
 TIE = 0.02
+
+_Shape = tuple[int, ...]
 
 
 @dataclass(frozen=True)
@@ -48,9 +52,9 @@ def search_orientation(
     factor = max(1, round(max(*scan.shape, *topography.shape) / SEARCH_SIZE_PX))
     small_scan, small_topography = reduce_image(scan, factor), reduce_image(topography, factor)
     found = []
-    for orientation in orientations:
-        moving = orient(small_scan, orientation)
-        correlation, overlap = masked_correlation(small_topography, moving)
+    turned = [orient(small_scan, orientation) for orientation in orientations]
+    correlations = masked_correlations(small_topography, turned)
+    for orientation, moving, (correlation, overlap) in zip(orientations, turned, correlations, strict=True):
         if np.isnan(correlation).all():
             continue
         # Only breaks ties: on a repeating layout the shift with the larger overlap is the better guess.
@@ -81,7 +85,9 @@ def rival_alignment(registered: np.ndarray, topography: np.ndarray) -> float:
     from scipy.ndimage import maximum_filter
 
     factor = max(1, round(max(topography.shape) / (2 * SEARCH_SIZE_PX)))
-    correlation, _ = masked_correlation(reduce_image(topography, factor), reduce_image(registered, factor))
+    fixed = reduce_image(topography, factor)
+    moving = fixed if registered is topography else reduce_image(registered, factor)
+    correlation, _ = next(masked_correlations(fixed, [moving]))
     own = correlation[0, 0]
     if not np.isfinite(own) or own <= 0:
         return float("nan")
@@ -97,8 +103,8 @@ def rival_orientation(registered: np.ndarray, topography: np.ndarray) -> float:
     factor = max(1, round(max(topography.shape) / SEARCH_SIZE_PX))
     small, scan = reduce_image(topography, factor), reduce_image(registered, factor)
     rivals = []
-    for orientation in ORIENTATIONS:
-        correlation, _ = masked_correlation(small, orient(scan, orientation))
+    correlations = masked_correlations(small, [orient(scan, orientation) for orientation in ORIENTATIONS])
+    for orientation, (correlation, _) in zip(ORIENTATIONS, correlations, strict=True):
         if not np.isnan(correlation).all():
             rivals.append(-np.nanmin(correlation))
             if orientation != "identity":
@@ -116,39 +122,62 @@ def reduce_image(image: np.ndarray, factor: int) -> np.ndarray:
     return np.divide(total, count, out=np.full((ny, nx), np.nan), where=2 * count > factor**2)
 
 
-def masked_correlation(fixed: np.ndarray, moving: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pearson correlation of ``fixed[y, x]`` with ``moving[y + sy, x + sx]`` where they overlap.
+def masked_correlations(
+    fixed: np.ndarray, movings: Sequence[np.ndarray]
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Pearson correlation of ``fixed[y, x]`` with ``moving[y + sy, x + sx]`` where they overlap, for each.
 
-    Returns:
+    Yields:
         Correlation and number of overlapping pixels, indexed by the shift modulo their shape; the
         correlation is NaN where less than ``MIN_OVERLAP`` of the smaller image takes part or one side
         is constant.
     """
     from scipy.fft import irfft2, next_fast_len, rfft2
 
-    shape = [next_fast_len(a + b - 1, real=True) for a, b in zip(fixed.shape, moving.shape, strict=True)]
-    transforms = []
-    for image in (fixed, moving):
-        measured = np.isfinite(image)
-        mean = image[measured].mean() if measured.any() else 0.0
-        values = np.where(measured, image - mean, 0.0)
-        values /= max(float(np.sqrt((values**2).mean())), 1e-300)
-        transforms.append([rfft2(part, shape) for part in (measured.astype(float), values, values**2)])
-    (m1, f1, f1f1), (m2, f2, f2f2) = transforms
+    @cache
+    def of_fixed(shape: _Shape) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return rfft2(np.isfinite(fixed).astype(float), shape), *_height_spectra(fixed, shape)
 
-    def correlate(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return irfft2(np.conj(a) * b, shape)
+    def under(measured: np.ndarray, shape: _Shape) -> tuple[np.ndarray, ...]:
+        """Pixels of the fixed image under the moving one's: number, sum, energy about the mean."""
+        mask = rfft2(measured.astype(float), shape)
+        number, total, energy = (irfft2(np.conj(part) * mask, shape) for part in of_fixed(shape))
+        number = np.maximum(np.rint(number), 1.0)
+        return number, total, energy - total**2 / number
 
-    overlap = np.maximum(np.rint(correlate(m1, m2)), 1.0)
-    mean1, mean2 = correlate(f1, m2), correlate(m1, f2)
-    covariance = correlate(f1, f2) - mean1 * mean2 / overlap
-    variance1 = correlate(f1f1, m2) - mean1**2 / overlap
-    variance2 = correlate(m1, f2f2) - mean2**2 / overlap
-    least = MIN_OVERLAP * min(np.isfinite(fixed).sum(), np.isfinite(moving).sum())
-    # Rounding leaves 1e-12 of the energy; a side flatter than 1e-6 of it carries no structure.
-    usable = (overlap >= least) & (variance1 > 1e-6 * overlap) & (variance2 > 1e-6 * overlap)
-    product = np.sqrt(np.where(usable, variance1 * variance2, 1.0))
-    return np.where(usable, np.clip(covariance / product, -1, 1), np.nan), overlap
+    @cache
+    def under_complete(moving_shape: _Shape, shape: _Shape) -> tuple[np.ndarray, ...]:
+        return under(np.ones(moving_shape, bool), shape)
+
+    for moving in movings:
+        ny, nx = (next_fast_len(a + b - 1, real=True) for a, b in zip(fixed.shape, moving.shape, strict=True))
+        shape, measured = (ny, nx), np.isfinite(moving)
+        # Turning a scan that is measured everywhere does not change what it covers.
+        complete = measured.all()
+        overlap, total1, variance1 = (
+            under_complete(moving.shape, shape) if complete else under(measured, shape)
+        )
+        m1, f1, f1f1 = of_fixed(shape)
+        f2, f2f2 = (f1, f1f1) if moving is fixed else _height_spectra(moving, shape)
+        total2 = irfft2(np.conj(m1) * f2, shape)
+        variance2 = irfft2(np.conj(m1) * f2f2, shape) - total2**2 / overlap
+        covariance = irfft2(np.conj(f1) * f2, shape) - total1 * total2 / overlap
+        least = MIN_OVERLAP * min(np.isfinite(fixed).sum(), measured.sum())
+        # Rounding leaves 1e-12 of the energy; a side flatter than 1e-6 of it carries no structure.
+        usable = (overlap >= least) & (variance1 > 1e-6 * overlap) & (variance2 > 1e-6 * overlap)
+        product = np.sqrt(np.where(usable, variance1 * variance2, 1.0))
+        yield np.where(usable, np.clip(covariance / product, -1, 1), np.nan), overlap
+
+
+def _height_spectra(image: np.ndarray, shape: _Shape) -> tuple[np.ndarray, np.ndarray]:
+    """Transforms of an image's heights, scaled to unit energy and 0 where not measured, and their squares."""
+    from scipy.fft import rfft2
+
+    measured = np.isfinite(image)
+    mean = image[measured].mean() if measured.any() else 0.0
+    values = np.where(measured, image - mean, 0.0)
+    values /= max(float(np.sqrt((values**2).mean())), 1e-300)
+    return rfft2(values, shape), rfft2(values**2, shape)
 
 
 def _cut_off(orientation: str, shape: tuple[int, int], factor: int) -> tuple[int, int]:

@@ -39,13 +39,15 @@ TOLERANCE_PX = 1e-3
 class Refinement:
     """A converged warp with what is needed to ask how well it is known.
 
-    ``layout_to_scan`` is the 3×3 index matrix; ``gram`` (cells_y, cells_x, k, k) holds, per cell of
-    ``CELL_PX`` pixels, the inner products of the regressors (gain, background, warp) and, last, the scan:
-    every sub-sample of the field can be refitted from it without touching a pixel.
+    ``layout_to_scan`` is the 3×3 index matrix; ``warped`` (ny, nx) float32 is the scan on the layout's
+    pixels, gaps filled. ``gram`` (cells_y, cells_x, k, k) holds, per cell of ``CELL_PX`` pixels, the inner
+    products of the regressors (gain, background, warp) and, last, the scan: every sub-sample of the field
+    can be refitted from it without touching a pixel.
     """
 
     model: Model
     layout_to_scan: np.ndarray
+    warped: np.ndarray
     gram: np.ndarray
     converged: bool
 
@@ -105,6 +107,7 @@ def refine(
     complete = bool(measured.all())
     spline = spline_filter(fill_gaps(scan), 3, output=np.float32, mode="mirror")
     matrix, converged, step_px = np.array(start, dtype=np.float64), False, np.inf
+    sums = _Sums(regressors)
     for iteration in range(max_iterations + 1):
         rows, columns = warped_grid(matrix, shape)
         inside = interior & (rows > 0) & (rows < scan.shape[0] - 1)
@@ -112,8 +115,7 @@ def refine(
         if not complete:
             inside &= map_coordinates(measured.astype(np.float32), (rows, columns), order=1) > 0.999
         warped = map_coordinates(spline, (rows, columns), order=3, mode="mirror", prefilter=False)
-        gram = _cell_grams(regressors, warped, inside)
-        coefficients = solve_gram(gram.sum(axis=(0, 1)))
+        coefficients = solve_gram(sums.gram(warped, inside))
         if coefficients[0] <= 0:
             break
         warp = coefficients[NUISANCES:] / coefficients[0]
@@ -126,7 +128,7 @@ def refine(
             break
         matrix = matrix @ np.linalg.inv(increment)
         matrix /= matrix[2, 2]
-    return Refinement(model, matrix, gram, converged)
+    return Refinement(model, matrix, warped, _cell_grams(regressors, warped, inside), converged)
 
 
 def solve_gram(gram: np.ndarray) -> np.ndarray:
@@ -149,7 +151,7 @@ def corner_motion_px(coefficients: np.ndarray, shape: tuple[int, int], points: n
     normalise = _normalisation(shape)
     warp = coefficients[..., NUISANCES:] / coefficients[..., :1]
     unit = apply_transform(normalise, points)
-    flow = _flow(unit[:, 0], unit[:, 1], warp.shape[-1])
+    flow = np.array([_flow(generator, *unit.T) for generator in _GENERATORS[: warp.shape[-1]]])
     return np.einsum("...k,kdn->...nd", warp, flow) / normalise[0, 0]
 
 
@@ -160,11 +162,14 @@ def _normalisation(shape: tuple[int, int]) -> np.ndarray:
     return np.array([[scale, 0, -scale * (nx - 1) / 2], [0, scale, -scale * (ny - 1) / 2], [0, 0, 1]])
 
 
-def _flow(x: np.ndarray, y: np.ndarray, count: int) -> np.ndarray:
-    """Velocity (count, 2, …) of each generator at normalised points."""
-    points = np.stack([x, y, np.ones_like(x)])
-    moved = np.einsum("kij,j...->ki...", _GENERATORS[:count], points)
-    return moved[:, :2] - moved[:, 2:] * points[:2]
+def _flow(generator: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Velocity along x and y that a generator gives to normalised points; x and y broadcast."""
+    coordinates = (x, y, np.ones(1, dtype=x.dtype))
+    zero = np.zeros(1, dtype=x.dtype)
+    moved_x, moved_y, weight = (
+        sum((float(row[k]) * coordinates[k] for k in np.flatnonzero(row)), start=zero) for row in generator
+    )
+    return moved_x - weight * x, moved_y - weight * y
 
 
 def _regressors(topography: np.ndarray, count: int) -> np.ndarray:
@@ -174,10 +179,27 @@ def _regressors(topography: np.ndarray, count: int) -> np.ndarray:
     gradient_y, gradient_x = np.gradient(topography.astype(np.float32))
     y = ((np.arange(shape[0]) - (shape[0] - 1) / 2) * scale).astype(np.float32)[:, None]
     x = ((np.arange(shape[1]) - (shape[1] - 1) / 2) * scale).astype(np.float32)[None, :]
-    flow = _flow(x + 0 * y, y + 0 * x, count).astype(np.float32)
-    change = (flow[:, 0] * gradient_x + flow[:, 1] * gradient_y) / np.float32(scale)
+    flow = (_flow(generator, x, y) for generator in _GENERATORS[:count])
+    change = [(along_x * gradient_x + along_y * gradient_y) / np.float32(scale) for along_x, along_y in flow]
     centred = topography.astype(np.float32) - topography.mean()
-    return np.concatenate([centred[None], quadratic_basis(shape).astype(np.float32), change])
+    return np.stack([centred, *quadratic_basis(shape).astype(np.float32), *change])
+
+
+class _Sums:
+    """Inner products over the whole field; those among the regressors are kept while the overlap stays."""
+
+    def __init__(self, regressors: np.ndarray):
+        self._regressors = regressors
+        self._inside = np.zeros(0, bool)
+
+    def gram(self, warped: np.ndarray, inside: np.ndarray) -> np.ndarray:
+        """The products (k, k) of regressors and scan over the pixels inside."""
+        if not np.array_equal(inside, self._inside):
+            self._inside, self._chosen = inside, self._regressors[:, inside].astype(np.float64)
+            self._normal = self._chosen @ self._chosen.T
+        scan = warped[inside].astype(np.float64)
+        right = self._chosen @ scan
+        return np.block([[self._normal, right[:, None]], [right[None, :], scan @ scan]])
 
 
 def _cell_grams(regressors: np.ndarray, warped: np.ndarray, inside: np.ndarray) -> np.ndarray:

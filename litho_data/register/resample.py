@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 from litho_data.errors import InputError
@@ -39,29 +41,45 @@ def resample_to_layout(
     A scan sampled more finely than the layout is first averaged over the layout's pixel (Gaussian of
     the missing width), since plain interpolation would alias its noise.
     """
-    from scipy.ndimage import binary_dilation, map_coordinates
-
-    matrix = np.asarray(scan_to_layout, dtype=np.float64)
-    if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-12:
-        raise InputError("scan_to_layout", got=matrix.tolist(), wanted="an invertible 3x3 matrix")
-    height = np.asarray(height_um, dtype=np.float64)
-    measured = np.isfinite(height)
-    if not measured.any():
-        raise InputError("scan", got="no measured pixel", wanted="finite heights")
-
-    to_scan = np.linalg.inv(index_to_um(scan_pitch_um)) @ np.linalg.inv(matrix)
-    to_scan = to_scan @ index_to_um((layout_pitch_um, layout_pitch_um))
-    rows, columns = warped_grid(to_scan, layout_shape)
-
-    filled = _average_over_layout_pixel(fill_gaps(height), scan_pitch_um, layout_pitch_um)
-    values = map_coordinates(filled, (rows, columns), order=SPLINE_ORDER, mode="mirror")
-    valid = (rows >= 0) & (rows <= height.shape[0] - 1) & (columns >= 0) & (columns <= height.shape[1] - 1)
-    if not measured.all():
-        near_gap = binary_dilation(~measured, np.ones((3, 3), bool)).astype(np.float32)
-        valid &= map_coordinates(near_gap, (rows, columns), order=1, mode="nearest") == 0
-    return np.where(valid, values, np.nan).astype(np.float32), valid
+    resampler = Resampler(height_um, scan_pitch_um=scan_pitch_um, layout_pitch_um=layout_pitch_um)
+    return resampler.at(scan_to_layout, layout_shape)
 
 
+class Resampler:
+    """`resample_to_layout` of one scan to several places; the spline is fitted once."""
+
+    def __init__(self, height_um: np.ndarray, *, scan_pitch_um: tuple[float, float], layout_pitch_um: float):
+        from scipy.ndimage import spline_filter
+
+        height = np.asarray(height_um, dtype=np.float64)
+        self._measured = np.isfinite(height)
+        if not self._measured.any():
+            raise InputError("scan", got="no measured pixel", wanted="finite heights")
+        self._um_to_index = np.linalg.inv(index_to_um(scan_pitch_um))
+        self._layout_to_um = index_to_um((layout_pitch_um, layout_pitch_um))
+        filled = _average_over_layout_pixel(fill_gaps(height), scan_pitch_um, layout_pitch_um)
+        self._spline = spline_filter(filled, SPLINE_ORDER, mode="mirror")
+
+    def at(self, scan_to_layout: np.ndarray, layout_shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+        """Height and validity under a transform, on a layout of this shape."""
+        from scipy.ndimage import binary_dilation, map_coordinates
+
+        matrix = np.asarray(scan_to_layout, dtype=np.float64)
+        if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-12:
+            raise InputError("scan_to_layout", got=matrix.tolist(), wanted="an invertible 3x3 matrix")
+        to_scan = self._um_to_index @ np.linalg.inv(matrix) @ self._layout_to_um
+        rows, columns = warped_grid(to_scan, layout_shape)
+        places = (rows, columns)
+        values = map_coordinates(self._spline, places, order=SPLINE_ORDER, mode="mirror", prefilter=False)
+        ny, nx = self._measured.shape
+        valid = (rows >= 0) & (rows <= ny - 1) & (columns >= 0) & (columns <= nx - 1)
+        if not self._measured.all():
+            near_gap = binary_dilation(~self._measured, np.ones((3, 3), bool)).astype(np.float32)
+            valid &= map_coordinates(near_gap, places, order=1, mode="nearest") == 0
+        return np.where(valid, values, np.nan).astype(np.float32), valid
+
+
+@lru_cache
 def noise_variance_factor(scan_pitch_um: tuple[float, float], layout_pitch_um: float) -> float:
     """What the resampling leaves of the variance of white pixel noise, averaged over sub-pixel positions.
 

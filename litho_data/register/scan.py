@@ -22,15 +22,14 @@ from litho_data.register.geometry import (
     orient,
     orientation_matrix,
     overlap_of,
-    warped_grid,
 )
 from litho_data.register.ladder import climb
 from litho_data.register.orientation import rival_alignment, rival_orientation
 from litho_data.register.pyramid import FineFit, refine_pyramid
 from litho_data.register.quality import RegistrationQuality, Thresholds, judge, unregistered_quality
 from litho_data.register.refine import Model
-from litho_data.register.resample import noise_variance_factor, resample_to_layout
-from litho_data.register.topography import fill_gaps, predicted_topography, quadratic_basis, remove_bow
+from litho_data.register.resample import Resampler, noise_variance_factor, resample_to_layout
+from litho_data.register.topography import predicted_topography, quadratic_basis, remove_bow
 
 MIN_SIZE_PX = 32
 # A picometre: below any instrument, above rounding.
@@ -90,7 +89,9 @@ def register_scan(
     layout_repeats = rival_alignment(smooth_layout, smooth_layout) if has_structure else float("nan")
     features = layout_repeats <= limits.max_layout_repeats
     search = orientation == "search"
-    coarse = find_coarse(scan, layout, search=search, features=features, seed=seed) if has_structure else None
+    coarse = None
+    if has_structure:
+        coarse = find_coarse(scan, layout, smooth_layout, search=search, features=features, seed=seed)
     if coarse is None:
         return Registration(centred, unregistered_quality("no structure in the scan or the layout"))
 
@@ -105,12 +106,8 @@ def register_scan(
     layout_to_scan = frame @ to_scan @ fine.refinement.layout_to_scan @ np.linalg.inv(frame)
     scan_to_layout = _rounded(np.linalg.inv(layout_to_scan))
 
-    before, after = (
-        resample_to_layout(
-            height, place, _shape(layout), scan_pitch_um=scan_pitch_um, layout_pitch_um=layout_pitch_um
-        )[0]
-        for place in (centred, scan_to_layout)
-    )
+    resampler = Resampler(height, scan_pitch_um=scan_pitch_um, layout_pitch_um=layout_pitch_um)
+    before, after = (resampler.at(place, _shape(layout))[0] for place in (centred, scan_to_layout))
     figures = {
         **_figures_of_fit(coarse, fine, layout_pitch_um),
         **_figures_of_warp(layout_to_scan, _shape(layout), layout_pitch_um),
@@ -213,11 +210,9 @@ def _figures_of_warp(
 
 
 def _figures_of_evidence(fine: FineFit, pitch_um: float, seed: int) -> dict[str, Any]:
-    from scipy.ndimage import map_coordinates
-
     warp, shape = fine.refinement.layout_to_scan, _shape(fine.topography)
-    aligned = map_coordinates(fill_gaps(fine.scan), warped_grid(warp, shape), order=3, mode="mirror")
-    aligned -= np.einsum("k,kyx->yx", fine.refinement.background, quadratic_basis(shape))
+    background = np.einsum("k,kyx->yx", fine.refinement.background, quadratic_basis(shape))
+    aligned = fine.refinement.warped - background
     measured = overlap_of(warp, shape, np.isfinite(fine.scan))
     registered = np.where(measured, aligned, np.nan)
     blocks = match_blocks_of_field(fine.refinement, aligned, measured, fine.topography)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 
 
@@ -75,12 +77,15 @@ def remove_bow(height: np.ndarray) -> np.ndarray:
     return height - np.einsum("k,kyx->yx", coefficients, basis)
 
 
+@lru_cache(maxsize=4)
 def quadratic_basis(shape: tuple[int, int]) -> np.ndarray:
-    """1, x, y, x², xy, y² over an image in coordinates from -1 to 1, shape (6, ny, nx)."""
+    """1, x, y, x², xy, y² over an image in coordinates from -1 to 1, read-only (6, ny, nx)."""
     y = np.linspace(-1, 1, shape[0])[:, None]
     x = np.linspace(-1, 1, shape[1])[None, :]
     one = np.ones(shape)
-    return np.stack([one, one * x, one * y, one * x * x, x * y, one * y * y])
+    basis = np.stack([one, one * x, one * y, one * x * x, x * y, one * y * y])
+    basis.setflags(write=False)
+    return basis
 
 
 def pearson(a: np.ndarray, b: np.ndarray) -> float:
