@@ -26,8 +26,10 @@ Extrapolate = Annotated[
 SizePx = Annotated[int | None, typer.Option(help="Side of the element in pixels of 0.1 µm.")]
 Iterations = Annotated[int | None, typer.Option(help="Iterations of the search.")]
 Precision = Annotated[
-    Literal["float32", "bfloat16"],
-    typer.Option(help="Networks of the model during the search; the final score is always float32."),
+    Literal["float32", "mixed", "bfloat16"],
+    typer.Option(
+        help="Networks of the model in the search: float32, float32 with the gradient in bfloat16 (mixed), or bfloat16. Scores are always float32."
+    ),
 ]
 LensTaskOption = Annotated[
     Literal["direct", "computational"], typer.Option(help="Focus light, or image after Richardson-Lucy.")

@@ -39,8 +39,9 @@ class SearchSettings(Record):
     keep: Literal["best", "last"] = "best"
     polish_rounds: int = Field(default=10, ge=0)
     checkpoint_every: int = Field(default=50, ge=1)
-    # Networks of the printer model during the search; the final layout is scored in float32.
-    precision: Literal["float32", "bfloat16"] = "float32"
+    # Of the printer model's networks during the search (see ``Printer.at_precision``); the final layout
+    # is scored in float32.
+    precision: Literal["float32", "mixed", "bfloat16"] = "float32"
     seed: int = 0
 
     def temperature(self, iteration: int) -> float:

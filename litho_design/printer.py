@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, Literal
 
@@ -17,6 +17,8 @@ from litho_data.results import Record
 from litho_design.parametrise import LayoutSettings
 
 _GUARD_UM = 6.4
+
+Precision = Literal["float32", "mixed", "bfloat16"]
 
 
 class PrinterRecord(Record):
@@ -61,6 +63,8 @@ class Printer(nn.Module):
         self._reduced = False
         self.name = name or ("none" if simulator is None else str(simulator.name))
         self.guard_px = 0 if simulator is None else math.ceil(_guard_um(simulator) / layout.pitch_um)
+        # What lies in the guard ring is cut off again: a model that can leave it out need not compute it.
+        self._has_interior = bool(getattr(simulator, "has_interior", False))
         if simulator is not None:
             simulator.eval().requires_grad_(False)
 
@@ -81,7 +85,9 @@ class Printer(nn.Module):
             return height_um
         guard = self.guard_px
         padded = F.pad(height_um, (guard, guard, guard, guard))
-        printed = self._simulate(padded)
+        if self._has_interior:
+            return self._simulate(padded, self.simulator.interior)
+        printed = self._simulate(padded, self.simulator)
         return printed[..., guard : printed.shape[-2] - guard, guard : printed.shape[-1] - guard]
 
     def print_patch(self, level: Tensor) -> Tensor:
@@ -92,16 +98,26 @@ class Printer(nn.Module):
         height_um = level * self.layout.level_height_um
         if self.simulator is None:
             return height_um
-        return self._simulate(height_um)
+        return self._simulate(height_um, self.simulator)
 
     @contextmanager
-    def at_precision(self, precision: Literal["float32", "bfloat16"]) -> Iterator[None]:
-        """Run the networks of the model in ``precision`` inside the block."""
+    def at_precision(self, precision: Precision) -> Iterator[None]:
+        """Run the networks of the model in ``precision`` inside the block.
+
+        ``mixed`` prints in float32 and sends gradients back through the areawise networks in bfloat16;
+        ``bfloat16`` does both so. Other models, and heights, blurs and waves, stay in float32.
+        """
+        networks = [] if self.simulator is None else list(self.simulator.modules())
+        networks = [network for network in networks if hasattr(network, "adjoint_dtype")]
         self._reduced = precision == "bfloat16"
+        for network in networks:
+            network.adjoint_dtype = torch.bfloat16 if precision == "mixed" else None
         try:
             yield
         finally:
             self._reduced = False
+            for network in networks:
+                network.adjoint_dtype = None
 
     def record(self) -> PrinterRecord:
         """Name, weights hash and guard ring, for the results."""
@@ -138,10 +154,9 @@ class Printer(nn.Module):
             )
         return heights
 
-    def _simulate(self, height_um: Tensor) -> Tensor:
-        assert self.simulator is not None
+    def _simulate(self, height_um: Tensor, call: Callable[..., Tensor]) -> Tensor:
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self._reduced):
-            return self.simulator(height_um, pitch_um=self.layout.pitch_um).to(height_um.dtype)
+            return call(height_um, pitch_um=self.layout.pitch_um).to(height_um.dtype)
 
 
 def load_printer(

@@ -23,7 +23,7 @@ from litho_data.results import Record, Result, first_error, software_versions
 from litho_models.model_readme import model_readme
 from litho_models.models import model_class
 from litho_models.simulator import Simulator
-from litho_models.tiles import predict_field
+from litho_models.tiles import predict_field, predict_interior
 
 WEIGHTS_FILE, CARD_FILE, README_FILE = "model.safetensors", "card.json", "README.md"
 # A level's height in float32 may exceed the range by rounding; a level off it differs by 100 nm.
@@ -134,14 +134,35 @@ class FrozenSimulator(nn.Module):
             InputError: another pitch or level height, another shape, or heights beyond the calibrated
                 range without ``extrapolate``.
         """
+        self._check_layout(layout_um, pitch_um, level_height_um)
+        if isinstance(self.simulator, Simulator):
+            return predict_field(self.simulator, layout_um)
+        return self.simulator(layout_um)
+
+    @property
+    def has_interior(self) -> bool:
+        """Whether ``interior`` can be asked for: a finite receptive radius, no effects behind the model."""
+        return isinstance(self.simulator, Simulator) and self.simulator.reach_px is not None
+
+    def interior(self, layout_um: Tensor, pitch_um: float | None = None) -> Tensor:
+        """As ``forward``, of the pixels farther than the receptive radius r from the edge only.
+
+        Nothing beyond the edge is assumed, and nothing is computed there: (b, 1, y - 2r, x - 2r), µm.
+
+        Raises:
+            InputError: as ``forward``, or a model without ``has_interior``.
+        """
+        self._check_layout(layout_um, pitch_um, None)
+        if not isinstance(self.simulator, Simulator):
+            raise InputError(f"interior of a print by {self.name}", wanted="a model without added effects")
+        return predict_interior(self.simulator, layout_um)
+
+    def _check_layout(self, layout_um: Tensor, pitch_um: float | None, level_height_um: float | None) -> None:
         self.check_geometry(pitch_um, level_height_um)
         if layout_um.ndim != 4 or layout_um.shape[1] != 1:
             raise InputError("layout", got=f"shape {tuple(layout_um.shape)}", wanted="(batch, 1, y, x)")
         if not self.extrapolate:
             self._check_range(layout_um)
-        if isinstance(self.simulator, Simulator):
-            return predict_field(self.simulator, layout_um)
-        return self.simulator(layout_um)
 
     def check_geometry(self, pitch_um: float | None, level_height_um: float | None = None) -> None:
         """Refuse another pitch or level height than the model's; None is not checked.

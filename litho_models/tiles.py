@@ -38,12 +38,30 @@ def predict_field(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX) -
     ny, nx = layout_um.shape[-2:]
     if reach is None or max(ny, nx) <= tile_px:
         return model(layout_um)
-    whole = pad_field(layout_um, reach, reach)
+    return predict_interior(model, pad_field(layout_um, reach, reach), tile_px)
+
+
+def predict_interior(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX) -> Tensor:
+    """Height of the pixels farther than the receptive radius r from the edge, (b, 1, y - 2r, x - 2r), µm.
+
+    Gradients flow to the layout; computed in tiles of at most ``tile_px``, which changes nothing.
+
+    Raises:
+        InputError: a model without a receptive radius, or a layout that has no interior.
+    """
+    reach = model.reach_px
+    if reach is None or min(layout_um.shape[-2:]) <= 2 * reach:
+        raise InputError(
+            f"interior of a print by {model.name}",
+            got=f"{tuple(layout_um.shape[-2:])} px and a receptive radius of {reach} px",
+            wanted="a field wider than twice the radius",
+        )
+    ny, nx = (length - 2 * reach for length in layout_um.shape[-2:])
     rows = []
     for y in range(0, ny, tile_px):
         stop = min(y + tile_px, ny)
         tiles = [
-            model.interior(whole[..., y : stop + 2 * reach, x : min(x + tile_px, nx) + 2 * reach])
+            model.interior(layout_um[..., y : stop + 2 * reach, x : min(x + tile_px, nx) + 2 * reach])
             for x in range(0, nx, tile_px)
         ]
         rows.append(torch.cat(tiles, dim=-1))
