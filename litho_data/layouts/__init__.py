@@ -4,6 +4,7 @@ from litho_data.layouts.layout_set import PATTERNS, write_layout_set
 from litho_data.layouts.patterns import (
     checkerboard,
     flat,
+    framed_ladder,
     isolated_features,
     line_space_sweep,
     relative_doses,
@@ -20,6 +21,7 @@ __all__ = [
     "checkerboard",
     "departure",
     "flat",
+    "framed_ladder",
     "isolated_features",
     "layout_statistics",
     "line_space_sweep",

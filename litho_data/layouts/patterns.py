@@ -28,6 +28,32 @@ def step_ladder(shape: tuple[int, int], *, highest: int, lowest: int = 0) -> np.
     return _rows(stairs, shape)
 
 
+def framed_ladder(frame: np.ndarray, *, highest: int, tread_px: int, lowest: int = 0) -> np.ndarray:
+    """Stairs along x inside a pattern that tells where they are: height and roughness against level.
+
+    A ladder alone looks the same wherever it is moved along its steps, so its scan cannot be registered;
+    the frame, a fifth of the side all around, can. The stairs go from ``lowest`` to ``highest`` evenly,
+    over every level where there is room for it.
+
+    Args:
+        frame: layout without repeats, (ny, nx).
+        tread_px: least width of a step, at least 3 of which have to fit.
+    """
+    inset_y, inset_x = (size // 5 for size in frame.shape)
+    width = frame.shape[1] - 2 * inset_x
+    steps = min(highest - lowest + 1, width // max(1, tread_px))
+    if steps < 3:
+        raise InputError(
+            "size of a framed ladder",
+            got=f"{frame.shape[1]} px and {highest - lowest + 1} levels",
+            wanted=f"at least {5 * tread_px} px and 3 levels: three steps of {tread_px} px",
+        )
+    levels = np.rint(np.linspace(lowest, highest, steps)).astype(np.uint8)
+    layout = frame.astype(np.uint8)
+    layout[inset_y:-inset_y, inset_x:-inset_x] = levels[np.arange(width) * steps // width]
+    return layout
+
+
 def checkerboard(shape: tuple[int, int], *, cell_px: int, high: int, low: int = 0) -> np.ndarray:
     """Squares of ``cell_px``, the top left one high: lateral scales and shear, corners."""
     _positive(cell_px, "cell_px of a checkerboard")

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
+from scipy.ndimage import maximum_filter, minimum_filter
 from typer.testing import CliRunner
 
+from litho_data.build import build
 from litho_data.cli_layouts import masks, simulate
 from litho_data.commands import new_app
 from litho_data.errors import InputError
+from litho_data.store import open_store
 from litho_data.virtual_fab import KNOBS, Truth
 from litho_data.virtual_fab.presets import PRESETS
 
@@ -29,7 +33,7 @@ def run(app, *arguments: str):
 def test_layouts_are_made_and_printed(app, tmp_path):
     assert (
         run(
-            app, "masks", "--out", tmp_path / "m", "--pattern", "dose-matrix", "--count", 3, "--size", 64
+            app, "masks", "--out", tmp_path / "m", "--pattern", "dose-matrix", "--count", 3, "--size", 150
         ).exit_code
         == 0
     )
@@ -39,6 +43,35 @@ def test_layouts_are_made_and_printed(app, tmp_path):
     truth = Truth.read(tmp_path / "s" / "truth")
     assert [scan.dose for scan in truth.scans] == pytest.approx([0.7, 1.0, 1.3])
     assert [(knob.name, knob.strength, knob.seed) for knob in truth.knobs] == [("z-gain", 0.02, 4)]
+
+
+@pytest.mark.slow
+def test_a_dose_matrix_becomes_heights_against_dose(app, tmp_path):
+    made = run(app, "masks", "--out", tmp_path / "m", "--pattern", "dose-matrix", "--count", 3, "--size", 192)
+    printed = run(app, "simulate", "--out", tmp_path / "s", "--layouts", tmp_path / "m" / "card.toml")
+    assert made.exit_code == printed.exit_code == 0
+    result = build(tmp_path / "s" / "raw" / "card.toml", tmp_path / "s.zarr", strict=True)
+    assert (result.n_scans, result.n_references) == (3, 0)
+    scans = open_store(tmp_path / "s.zarr").scans()
+    assert [scan.dose for scan in scans] == pytest.approx([0.7, 1.0, 1.3])
+    fill, previous = {}, 0.0
+    for scan in scans:
+        even = maximum_filter(scan.mask_level, 21) == minimum_filter(scan.mask_level, 21)
+        heights_um = {
+            int(level): scan.height_um[even & scan.valid & (scan.mask_level == level)]
+            for level in np.unique(scan.mask_level[even])
+        }
+        # Three treads of 38 px, less 10 px to each edge, are 18 px wide and 96 px long.
+        assert min(values.size for values in heights_um.values()) > 1000
+        assert {0, 6, 12} <= set(heights_um)
+        # Roughness of 15.9 nm, and neighbours within the 2 µm that decide the shrinkage, not misread edges.
+        assert max(values.std() for values in heights_um.values()) < 0.05
+        step_um = float(heights_um[12].mean() - heights_um[0].mean())
+        fill[scan.dose] = step_um
+        assert step_um > previous
+        previous = step_um
+    # Two-photon absorption and a threshold print more than in proportion to the dose, 1.3 / 0.7.
+    assert fill[scans[-1].dose] > 1.3 / 0.7 * fill[scans[0].dose]
 
 
 def test_presets_are_overruled_by_what_is_stated(app, tmp_path):

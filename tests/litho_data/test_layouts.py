@@ -14,6 +14,7 @@ from litho_data.layouts import (
     checkerboard,
     departure,
     flat,
+    framed_ladder,
     isolated_features,
     layout_statistics,
     line_space_sweep,
@@ -93,6 +94,19 @@ class TestPatterns:
         ladder = step_ladder((4, 26), highest=12)
         assert ladder[0].tolist() == np.repeat(np.arange(13), 2).tolist()
         assert np.array_equal(ladder[0], ladder[3])
+
+    def test_a_framed_ladder_has_wide_steps_amid_the_frame(self):
+        frame = random_layout((100, 200), seed=3)
+        layout = framed_ladder(frame, highest=12, tread_px=20)
+        inner = layout[20:-20, 40:-40]
+        # 120 px hold six steps of 20 px: six levels from 0 to 12, evenly.
+        assert inner[0].tolist() == np.repeat([0, 2, 5, 7, 10, 12], 20).tolist()
+        assert (inner == inner[0]).all()
+        outside = np.ones(frame.shape, bool)
+        outside[20:-20, 40:-40] = False
+        np.testing.assert_array_equal(layout[outside], frame[outside])
+        with pytest.raises(InputError, match="at least 350 px"):
+            framed_ladder(frame, highest=12, tread_px=70)
 
     def test_checkerboard_inverts_under_a_shift_by_one_cell(self):
         board = checkerboard((32, 48), cell_px=8, high=12)
@@ -183,8 +197,8 @@ class TestLayoutSets:
     @pytest.mark.parametrize("pattern", PATTERNS)
     def test_every_pattern_fits_its_levels(self, pattern):
         make, _ = PATTERNS[pattern]
-        for layout in make(SetSettings(3, (96, 128), 13, 0.25, "square", 0.1, 0)):
-            assert layout.level.shape == (96, 128)
+        for layout in make(SetSettings(3, (96, 160), 13, 0.25, "square", 0.1, 0)):
+            assert layout.level.shape == (96, 160)
             assert layout.level.dtype == np.uint8
             assert layout.level.max() <= 12
 
@@ -199,7 +213,7 @@ class TestLayoutSets:
         assert LayoutStatistics.read(card_path.parent).count == len(table)
 
     def test_dose_matrix_lists_its_doses(self, tmp_path):
-        card_path = write_layout_set(tmp_path / "set", pattern="dose-matrix", count=5, size_px=96)
+        card_path = write_layout_set(tmp_path / "set", pattern="dose-matrix", count=5, size_px=150)
         table = read_table(card_path.parent / "scans.csv")
         assert [float(row["dose"]) for row in table.values()] == pytest.approx([0.7, 0.85, 1.0, 1.15, 1.3])
 
