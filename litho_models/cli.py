@@ -9,9 +9,11 @@ import typer
 
 from litho_data.commands import new_app, run_app
 from litho_models.cli_loop import close_loop
+from litho_models.cli_noise import noise
 
 app = new_app("Train, judge and correct models of the printer. Lengths in µm, height errors in nm.")
 app.command("close-loop")(close_loop)
+app.command()(noise)
 
 StorePath = Annotated[Path, typer.Argument(help="dataset store made by `litho-data build`")]
 Out = Annotated[Path, typer.Option(help="folder of the result")]

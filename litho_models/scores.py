@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from litho_data.errors import InputError
 from litho_data.results import Record
 from litho_data.store import PrintedScan
 from litho_models.curves import LevelError, TransferCurves, level_errors, transfer_curves
@@ -155,8 +157,23 @@ def interval(values: Sequence[float]) -> Interval:
     return bootstrap_interval(values) if len(values) > 1 else None
 
 
-def noise_floor(dataset_name: str) -> NoiseFloor:
-    """What is known about the floor of a dataset without flat or repeated prints."""
+def noise_floor(dataset_name: str, analysis: str | Path | None = None) -> NoiseFloor:
+    """What is known about the floor of a dataset: from its noise analysis, else from the literature.
+
+    Args:
+        dataset_name: name of the dataset whose errors are reported.
+        analysis: ``noise.json``, or its folder, of this dataset or of scans without one.
+
+    Raises:
+        InputError: no noise analysis there, or one of another dataset.
+    """
+    if analysis is not None:
+        from litho_models.noise.result import NoiseAnalysis
+
+        found = NoiseAnalysis.read(analysis)
+        if found.dataset is not None and found.dataset.name != dataset_name:
+            raise InputError(f"noise analysis {analysis}", got=found.dataset.name, wanted=dataset_name)
+        return found.noise_floor
     if dataset_name == "neural-lithography":
         # 0.798 σ is the mean absolute value of a Gaussian of standard deviation σ.
         return NoiseFloor(

@@ -1,0 +1,180 @@
+"""The dose matrix: height, roughness and lost steps against dose, and the dose to print with.
+
+The paper's search for a laser power (appendix "Mask and optical elements fabrication"), made from scans
+that carry a dose: step ladders, or any layout with areas of one level wider than the printer's blur.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from litho_data.errors import InputError
+from litho_data.results import Record
+from litho_data.store import PrintedScan
+from litho_models.noise.staircase import READABLE_AT
+from litho_models.noise.surface import NM_PER_UM
+
+# Off every change of level by four σ of the optical spot and two of a diffusion of 0.5 µm.
+GUARD_UM = 1.0
+# A step that prints at less than half its nominal height is lost.
+LOST_BELOW = 0.5
+_FEWEST_PIXELS = 50
+
+
+class LevelHeight(Record):
+    """Printed height of one level above the lowest printed one, pooled over the scans of a dose."""
+
+    level: int
+    height_nm: float
+    sigma_nm: float
+    pixels: int
+
+
+class DoseRow(Record):
+    """One dose.
+
+    Args:
+        dose: relative to the nominal one.
+        height_gain: printed over nominal height, slope of a straight line through the levels.
+        full_height_nm: printed height of the highest level above the lowest.
+        roughness_nm: rms deviation within areas of one level.
+        lost_low, lost_high: steps at the low and at the high end that print at under half their height:
+            under-exposure (nothing is left there) and over-exposure (the resist has no more to give).
+        worst_readability: smallest step over σ of its two levels; 3.92 tells single pixels apart.
+    """
+
+    dose: float
+    scans: list[str]
+    levels: list[LevelHeight]
+    height_gain: float
+    full_height_nm: float
+    roughness_nm: float
+    lost_low: int
+    lost_high: int
+    worst_readability: float
+    under_exposed: bool
+    over_exposed: bool
+
+
+class DoseMatrix(Record):
+    """All doses, ascending, the recommended one, and why."""
+
+    rows: list[DoseRow]
+    recommended_dose: float
+    reason: str
+    guard_um: float
+
+
+def dose_matrix(scans: Sequence[PrintedScan], guard_um: float = GUARD_UM) -> DoseMatrix | None:
+    """Judge the doses of the scans that carry one; None with fewer than two doses.
+
+    Recommended is, among the doses that lose no step at either end, the one whose worst step stands
+    out most from the roughness; if all lose some, the one that loses fewest.
+
+    Raises:
+        InputError: doses whose layouts have no area of one level wide enough to measure on.
+    """
+    by_dose: dict[float, list[PrintedScan]] = {}
+    for scan in scans:
+        if scan.dose is not None:
+            by_dose.setdefault(round(scan.dose, 6), []).append(scan)
+    if len(by_dose) < 2:
+        return None
+    rows = [_row(dose, by_dose[dose], guard_um) for dose in sorted(by_dose)]
+    sound = [row for row in rows if not (row.under_exposed or row.over_exposed)]
+    if sound:
+        best = max(sound, key=lambda row: row.worst_readability)
+        readable = (
+            "all levels readable pixel by pixel"
+            if best.worst_readability >= READABLE_AT
+            else (
+                f"its worst step is {best.worst_readability:.2f} σ, under the {READABLE_AT:.2f} σ at which "
+                "single pixels are told apart"
+            )
+        )
+        reason = f"largest worst step over roughness of the {len(sound)} doses that lose no step; {readable}"
+    else:
+        best = min(rows, key=lambda row: (row.lost_low + row.lost_high, -row.worst_readability))
+        reason = f"every dose loses steps; this one loses fewest ({best.lost_low + best.lost_high})"
+    return DoseMatrix(rows=rows, recommended_dose=best.dose, reason=reason, guard_um=guard_um)
+
+
+def _row(dose: float, scans: Sequence[PrintedScan], guard_um: float) -> DoseRow:
+    levels = _level_heights(scans, guard_um)
+    if len(levels) < 3:
+        raise InputError(
+            f"prints at dose {dose:g}",
+            got=f"{len(levels)} levels with areas farther than {guard_um:g} µm from every edge",
+            wanted="at least 3, as in a step ladder",
+        )
+    nominal = np.array([entry.level for entry in levels]) * scans[0].level_height_um * NM_PER_UM
+    height = np.array([entry.height_nm for entry in levels])
+    sigma = np.array([entry.sigma_nm for entry in levels])
+    step = np.diff(height)
+    spread = np.maximum(np.sqrt((sigma[1:] ** 2 + sigma[:-1] ** 2) / 2), 1e-4)
+    lost = step < LOST_BELOW * np.diff(nominal)
+    lost_low, lost_high = _run_length(lost), _run_length(lost[::-1])
+    return DoseRow(
+        dose=dose,
+        scans=[scan.id for scan in scans],
+        levels=levels,
+        height_gain=float(np.polyfit(nominal, height, 1)[0]),
+        full_height_nm=float(height[-1]),
+        roughness_nm=float(np.sqrt(np.average(sigma**2, weights=[entry.pixels for entry in levels]))),
+        lost_low=lost_low,
+        lost_high=lost_high,
+        worst_readability=float((step / spread).min()),
+        under_exposed=lost_low > 0,
+        over_exposed=lost_high > 0 and lost_low < len(lost),
+    )
+
+
+def _level_heights(scans: Sequence[PrintedScan], guard_um: float) -> list[LevelHeight]:
+    """Per level mean and sd of the pixels inside areas of one level; datum and tilt of each scan removed."""
+    found: dict[int, list[np.ndarray]] = {}
+    for scan in scans:
+        inside = _plateaus(scan, guard_um)
+        if not inside.any():
+            continue
+        level = scan.mask_level[inside]
+        y, x = np.nonzero(inside)
+        present = np.unique(level)
+        dummies = (level[:, None] == present[None, :]).astype(np.float64)
+        # One tilt and one height per level; a tilt is separable from a ladder along the other axis and
+        # by the slope within the treads.
+        slopes = np.stack([y / scan.shape[0], x / scan.shape[1]], axis=1) - 0.5
+        height_nm = NM_PER_UM * scan.height_um[inside].astype(np.float64)
+        weights, *_ = np.linalg.lstsq(np.hstack([dummies, slopes]), height_nm, rcond=None)
+        flat = height_nm - slopes @ weights[len(present) :] - weights[0]
+        for value in present:
+            found.setdefault(int(value), []).append(flat[level == value])
+    rows = []
+    for level_number, parts in sorted(found.items()):
+        heights = np.concatenate(parts)
+        if heights.size >= _FEWEST_PIXELS:
+            rows.append((level_number, float(heights.mean()), _pooled_sd(parts), int(heights.size)))
+    ground = rows[0][1] if rows else 0.0
+    return [
+        LevelHeight(level=level, height_nm=mean - ground, sigma_nm=sd, pixels=pixels)
+        for level, mean, sd, pixels in rows
+    ]
+
+
+def _plateaus(scan: PrintedScan, guard_um: float) -> np.ndarray:
+    from scipy.ndimage import maximum_filter, minimum_filter
+
+    size = 2 * round(guard_um / scan.pitch_um) + 1
+    even = maximum_filter(scan.mask_level, size) == minimum_filter(scan.mask_level, size)
+    return even & scan.valid & np.isfinite(scan.height_um)
+
+
+def _pooled_sd(parts: Sequence[np.ndarray]) -> float:
+    squares = sum(float(((part - part.mean()) ** 2).sum()) for part in parts)
+    return float(np.sqrt(squares / max(1, sum(part.size - 1 for part in parts))))
+
+
+def _run_length(flags: np.ndarray) -> int:
+    """Number of leading True values."""
+    return int(np.argmin(flags)) if not flags.all() else len(flags)

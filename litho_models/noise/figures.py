@@ -1,0 +1,172 @@
+"""Figures of the noise report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from litho_data.report import new_figure
+from litho_models.noise.bounds import NoiseBound
+from litho_models.noise.calibration import SpreadAnalysis
+from litho_models.noise.dose import DoseMatrix
+from litho_models.noise.staircase import READABLE_AT, StepPrint
+from litho_models.noise.surface import NM_PER_UM, without_background
+from litho_models.scores import NoiseFloor
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from litho_models.noise.analyse import Reference
+
+_COLOURS = {"lower bound": "#2d8a4e", "upper bound": "#c23b22", "estimate": "#0b6aa2", "control": "#9aa7b5"}
+
+
+def surfaces(references: Sequence[Reference]) -> Figure:
+    """Each reference scan as a map, freed of its mean, and its middle line; all but steps share a scale."""
+    figure = new_figure(3.1 * len(references) + 0.6, 5.2)
+    grid = figure.subplots(2, len(references), squeeze=False, height_ratios=[1.6, 1])
+    rough = [one for one in references if one.use != "steps"]
+    widest = max((np.nanstd(without_background(one.height_um, "offset")) for one in rough), default=0.01)
+    limit_nm = 3 * NM_PER_UM * float(widest)
+    for column, one in enumerate(references):
+        height_nm = NM_PER_UM * without_background(one.height_um, "offset")
+        ny, nx = height_nm.shape
+        extent = (0, nx * one.pitch_um[1], ny * one.pitch_um[0], 0)
+        bound = None if one.use == "steps" else limit_nm
+        axes = grid[0, column]
+        image = axes.imshow(
+            height_nm, extent=extent, cmap="viridis", vmin=None if bound is None else -bound, vmax=bound
+        )
+        axes.set_title(f"{one.use}: {one.id}", fontsize=9)
+        figure.colorbar(image, ax=axes, shrink=0.75, label="nm")
+        profile = grid[1, column]
+        x_um = (np.arange(nx) + 0.5) * one.pitch_um[1]
+        profile.plot(x_um, height_nm[ny // 2], color="#0b6aa2", lw=0.8)
+        if bound is not None:
+            profile.set_ylim(-bound, bound)
+        profile.set_xlabel("x, µm", fontsize=8)
+        profile.grid(alpha=0.3)
+    grid[1, 0].set_ylabel("middle row, nm")
+    return figure
+
+
+def bounds(found: Sequence[NoiseBound], floor: NoiseFloor) -> Figure:
+    """σ of every figure about the noise, coloured by the direction in which it errs."""
+    figure = new_figure(8.5, 0.42 * len(found) + 1.5)
+    axes = figure.subplots()
+    for number, bound in enumerate(found):
+        low, high = bound.ci95_nm or (bound.sigma_nm, bound.sigma_nm)
+        axes.barh(number, bound.sigma_nm, 0.6, color=_COLOURS[bound.direction])
+        axes.plot([low, high], [number, number], color="#1c2430", lw=1.2)
+    labels = [f"{bound.name}\n({bound.of} noise)" for bound in found]
+    axes.set_yticks(range(len(found)), labels, fontsize=7.5)
+    axes.invert_yaxis()
+    if floor.rmse_nm is not None:
+        axes.axvline(floor.rmse_nm, color="#1c2430", ls="--", lw=1)
+    for direction, colour in _COLOURS.items():
+        axes.barh(0, 0, color=colour, label=direction)
+    axes.set_xlabel("σ, nm (line: 95 % interval over scans; dashed: floor)")
+    axes.legend(fontsize=8)
+    axes.grid(axis="x", alpha=0.3)
+    return figure
+
+
+def steps(found: StepPrint) -> Figure:
+    """Step heights with their uncertainty against what can be resolved."""
+    figure = new_figure(6.5, 3.0)
+    axes = figure.subplots()
+    number = np.arange(1, len(found.steps) + 1)
+    heights = np.array([abs(step.height_nm) for step in found.steps])
+    axes.bar(number, heights, 0.6, color="#9aa7b5", yerr=[step.uncertainty_nm for step in found.steps])
+    axes.axhline(
+        found.resolvable_step_nm,
+        color="#c23b22",
+        ls="--",
+        label=f"resolvable by single pixels: {found.resolvable_step_nm:.1f} nm",
+    )
+    if found.resolvable_step_area_nm is not None:
+        axes.axhline(
+            found.resolvable_step_area_nm,
+            color="#2d8a4e",
+            ls=":",
+            label=f"by means over {found.area_um2:g} µm²: {found.resolvable_step_area_nm:.1f} nm",
+        )
+    axes.set_xticks(number)
+    axes.set_xlabel("step")
+    axes.set_ylabel("height, nm")
+    axes.legend(fontsize=8)
+    return figure
+
+
+def dose(found: DoseMatrix) -> Figure:
+    """Height, roughness and readability against dose; shaded where steps are lost."""
+    figure = new_figure(10.5, 3.2)
+    left, middle, right = figure.subplots(1, 3)
+    doses = np.array([row.dose for row in found.rows])
+    for row in found.rows:
+        levels = [entry.level for entry in row.levels]
+        share = (row.dose - doses.min()) / np.ptp(doses)
+        left.plot(
+            levels,
+            [entry.height_nm for entry in row.levels],
+            color=(0.1 + 0.8 * share, 0.3, 0.8 - 0.7 * share),
+            lw=1,
+            label=f"{row.dose:.3g}",
+        )
+    left.set_xlabel("level")
+    left.set_ylabel("printed height above the lowest level, nm")
+    left.legend(fontsize=7, title="dose", title_fontsize=7)
+    middle.plot(doses, [row.roughness_nm for row in found.rows], "o-", color="#c23b22", ms=4)
+    middle.set_ylabel("roughness, nm")
+    right.plot(doses, [row.worst_readability for row in found.rows], "o-", color="#0b6aa2", ms=4)
+    right.axhline(READABLE_AT, color="#9aa7b5", ls="--", lw=1)
+    right.set_ylabel("worst step over σ (dashed: single pixels told apart)")
+    for axes in (middle, right):
+        axes.set_xlabel("relative dose")
+        axes.axvline(found.recommended_dose, color="#2d8a4e", lw=1.2)
+        for row in found.rows:
+            if row.under_exposed or row.over_exposed:
+                width = np.ptp(doses) / max(1, len(doses) - 1) / 2
+                axes.axvspan(row.dose - width, row.dose + width, color="#d99b00", alpha=0.15, lw=0)
+    return figure
+
+
+def spread(found: SpreadAnalysis) -> Figure:
+    """Observed (points) and predicted (line) rms of the residual in ranges of each covariate."""
+    names = list(dict.fromkeys(row.covariate for row in found.bins))
+    figure = new_figure(2.8 * len(names), 2.9)
+    grid = figure.subplots(1, len(names), squeeze=False, sharey=True)[0]
+    for axes, name in zip(grid, names, strict=True):
+        rows = [row for row in found.bins if row.covariate == name]
+        centre = [(row.low + row.high) / 2 for row in rows]
+        axes.plot(centre, [row.rms_nm for row in rows], "o", color="#1c2430", ms=4, label="there")
+        axes.plot(centre, [row.predicted_nm for row in rows], "-", color="#0b6aa2", label="predicted")
+        axes.set_xlabel(name)
+        axes.grid(alpha=0.3)
+    grid[0].set_ylabel("rms of the residual, nm")
+    grid[0].set_ylim(bottom=0)
+    grid[0].legend(fontsize=8)
+    return figure
+
+
+def calibration(found: SpreadAnalysis) -> Figure:
+    """Coverage of the 90 % interval scan by scan, and the PIT histogram."""
+    figure = new_figure(9.5, 3.2)
+    left, right = figure.subplots(1, 2)
+    for number, described in enumerate(found.calibrations):
+        at = described.levels.index(0.9)
+        covered = [100 * row.coverage[at] for row in described.scans]
+        left.plot(range(len(covered)), covered, "o-", ms=3, lw=0.8, color=f"C{number}", label=described.name)
+        edges = np.linspace(0, 1, len(described.pit) + 1)
+        right.stairs(np.array(described.pit) * len(described.pit), edges, color=f"C{number}", lw=1.2)
+    scans = [row.scan for row in found.calibrations[0].scans]
+    left.set_xticks(range(len(scans)), scans, rotation=90, fontsize=6)
+    left.axhline(90, color="#9aa7b5", lw=1)
+    left.set_ylabel("pixels inside the 90 % interval, %")
+    left.legend(fontsize=8)
+    right.axhline(1, color="#9aa7b5", lw=1)
+    right.set_xlabel("Φ(residual / σ)")
+    right.set_ylabel("density (flat where σ is right)")
+    return figure

@@ -1,0 +1,231 @@
+"""Step prints: where the treads are, how high the steps, and how well one is told from the next."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+
+from litho_data.errors import InputError
+from litho_data.results import Record
+from litho_data.roughness import stair_steps
+from litho_models.noise.gaussian_law import half_width, probability_below
+from litho_models.noise.surface import NM_PER_UM
+
+Axis = Literal["x", "y"]
+
+# Two heights are told apart if at most 2.5 % of each lie beyond the middle between them.
+READABLE_AT = 2 * half_width(0.95)
+# A tread narrower than this share of the field is an edge, not a tread.
+_NARROWEST_TREAD = 1 / 25
+_MOST_TREADS = 24
+
+
+class Step(Record):
+    """One step of a staircase, nm.
+
+    Args:
+        readability: height over the σ of single pixels on its two treads.
+        misread: share of the pixels of both treads nearer to the other one, as measured.
+        misread_if_gaussian: the same for Gaussian heights of that σ: Φ(−readability/2).
+    """
+
+    height_nm: float
+    uncertainty_nm: float
+    sigma_nm: float
+    readability: float
+    misread: float
+    misread_if_gaussian: float
+
+
+class StepPrint(Record):
+    """A print of steps.
+
+    Args:
+        tread_sigma_nm: rms deviation within the treads, one plane for all removed.
+        tread_mae_nm: mean absolute deviation from the median of each tread.
+        resolvable_step_nm: smallest step of which single pixels are told apart: 3.92 σ.
+        area_um2, area_sigma_nm, resolvable_step_area_nm: the same for means over squares of that area.
+    """
+
+    id: str
+    axis: Axis
+    edges_um: list[float]
+    tread_means_nm: list[float]
+    steps: list[Step]
+    tread_sigma_nm: float
+    tread_mae_nm: float
+    resolvable_step_nm: float
+    area_um2: float
+    area_sigma_nm: float | None
+    resolvable_step_area_nm: float | None
+
+
+def step_print(
+    scan_id: str,
+    height_um: np.ndarray,
+    pitch_um: tuple[float, float],
+    level_height_um: float,
+    *,
+    guard_um: float = 0.75,
+    area_um: float = 1.0,
+) -> StepPrint:
+    """Find the treads of a staircase along x or y and judge its steps.
+
+    Args:
+        scan_id: name in the result.
+        height_um: (ny, nx), µm; NaN where not measured.
+        pitch_um: (y, x) sampling, µm.
+        level_height_um: nominal step; an edge counts if it parts treads by half of it.
+        guard_um: kept off each edge, at least three σ of the printer's blur.
+        area_um: side of the squares whose means are compared.
+
+    Raises:
+        InputError: no step found.
+    """
+    axis, edges_px = find_edges(height_um, level_height_um)
+    along = height_um if axis == "x" else height_um.T
+    pitch_along, pitch_across = (pitch_um[1], pitch_um[0]) if axis == "x" else (pitch_um[0], pitch_um[1])
+    edges_um = [edge * pitch_along for edge in edges_px]
+    steps = stair_steps(along, pitch_along, edges_um=edges_um)
+    treads = _treads(along.shape, edges_px, round(guard_um / pitch_along))
+    flat = _without_plane(along, treads)
+    means, sigmas, deviations = [], [], []
+    for tread in treads:
+        heights = flat[:, tread][np.isfinite(flat[:, tread])] * NM_PER_UM
+        means.append(float(heights.mean()))
+        sigmas.append(float(heights.std()))
+        deviations.append(np.abs(heights - np.median(heights)))
+    records = []
+    for number, step in enumerate(steps):
+        sigma = float(np.sqrt((sigmas[number] ** 2 + sigmas[number + 1] ** 2) / 2))
+        # float32 heights of 1 µm carry 6e-5 nm.
+        ratio = abs(step.height_nm) / max(sigma, 1e-4)
+        records.append(
+            Step(
+                height_nm=step.height_nm,
+                uncertainty_nm=step.uncertainty_nm,
+                sigma_nm=sigma,
+                readability=ratio,
+                misread=_misread(flat, treads[number], treads[number + 1]),
+                misread_if_gaussian=float(probability_below(-ratio / 2)),
+            )
+        )
+    tread_sigma = float(np.sqrt(np.mean(np.square(sigmas))))
+    block = (max(1, round(area_um / pitch_across)), max(1, round(area_um / pitch_along)))
+    area_sigma = _sigma_of_block_means(flat, treads, block)
+    return StepPrint(
+        id=scan_id,
+        axis=axis,
+        edges_um=edges_um,
+        tread_means_nm=[mean - means[0] for mean in means],
+        steps=records,
+        tread_sigma_nm=tread_sigma,
+        tread_mae_nm=float(np.concatenate(deviations).mean()),
+        resolvable_step_nm=READABLE_AT * tread_sigma,
+        area_um2=area_um**2,
+        area_sigma_nm=area_sigma,
+        resolvable_step_area_nm=None if area_sigma is None else READABLE_AT * area_sigma,
+    )
+
+
+def find_edges(height_um: np.ndarray, level_height_um: float) -> tuple[Axis, list[int]]:
+    """The axis of a staircase and the pixels at which a new tread starts, ascending.
+
+    The profile of medians is cut into constant pieces with the least squared error, each edge paid
+    for: it has to save as much as two treads of the narrowest width do that differ by half a level.
+
+    Raises:
+        InputError: no edge along either axis.
+    """
+    found: dict[Axis, tuple[float, list[int]]] = {}
+    for axis in ("x", "y"):
+        profile = np.nanmedian(height_um, axis=0 if axis == "x" else 1)
+        profile = profile[np.isfinite(profile)]
+        narrowest = max(3, int(len(profile) * _NARROWEST_TREAD))
+        # Two pieces of w pixels that differ by d: joining them costs w d²/2.
+        price = narrowest * (level_height_um / 2) ** 2 / 2
+        edges = _piecewise_constant(profile, price, narrowest)
+        means = [piece.mean() for piece in np.split(profile, edges)]
+        found[axis] = (float(np.ptp(means)), edges)
+    chosen = max(found, key=lambda name: found[name][0])
+    if not found[chosen][1]:
+        raise InputError(
+            "step print",
+            got="no step along x or y",
+            wanted=f"steps of about {level_height_um:g} µm along one axis",
+        )
+    return chosen, found[chosen][1]
+
+
+def _piecewise_constant(profile: np.ndarray, price: float, narrowest: int) -> list[int]:
+    """Least squared error plus ``price`` per edge, by dynamic programming over the last edge."""
+    size = len(profile)
+    sums = np.concatenate([[0.0], np.cumsum(profile)])
+    squares = np.concatenate([[0.0], np.cumsum(profile**2)])
+    best = np.full(size + 1, np.inf)
+    best[0] = -price
+    last = np.zeros(size + 1, int)
+    for stop in range(narrowest, size + 1):
+        starts = np.arange(0, stop - narrowest + 1)
+        total = sums[stop] - sums[starts]
+        error = squares[stop] - squares[starts] - total**2 / (stop - starts)
+        cost = best[starts] + error + price
+        last[stop] = starts[np.argmin(cost)]
+        best[stop] = cost.min()
+    edges: list[int] = []
+    stop = size
+    while last[stop] > 0 and len(edges) < _MOST_TREADS:
+        stop = int(last[stop])
+        edges.append(stop)
+    return edges[::-1]
+
+
+def _treads(shape: tuple[int, ...], edges_px: list[int], guard_px: int) -> list[slice]:
+    """Columns of each tread, off its edges by the guard, but never by more than a third of its width."""
+    limits = [0, *edges_px, shape[1]]
+    treads = []
+    for start, stop in pairwise(limits):
+        inset = min(guard_px, (stop - start) // 3)
+        treads.append(slice(start + inset, stop - inset))
+    return treads
+
+
+def _without_plane(height_um: np.ndarray, treads: list[slice]) -> np.ndarray:
+    """Heights freed of the one tilt that all treads share; NaN off the treads."""
+    ny, nx = height_um.shape
+    y, x = np.meshgrid(np.linspace(-1, 1, ny), np.linspace(-1, 1, nx), indexing="ij")
+    terms = [np.zeros((ny, nx)) for _ in treads]
+    inside = np.zeros((ny, nx), bool)
+    for term, tread in zip(terms, treads, strict=True):
+        term[:, tread] = 1
+        inside[:, tread] = True
+    usable = inside & np.isfinite(height_um)
+    design = np.stack([y[usable], x[usable], *(term[usable] for term in terms)], axis=1)
+    weights, *_ = np.linalg.lstsq(design, height_um[usable].astype(np.float64), rcond=None)
+    return np.where(usable, height_um - weights[0] * y - weights[1] * x, np.nan)
+
+
+def _misread(flat: np.ndarray, first: slice, second: slice) -> float:
+    below, above = (flat[:, tread][np.isfinite(flat[:, tread])] for tread in (first, second))
+    if below.mean() > above.mean():
+        below, above = above, below
+    middle = (below.mean() + above.mean()) / 2
+    return float((np.mean(below > middle) + np.mean(above < middle)) / 2)
+
+
+def _sigma_of_block_means(flat: np.ndarray, treads: list[slice], block: tuple[int, int]) -> float | None:
+    """Pooled sd of the means of blocks (rows, columns) within treads, nm; None with fewer than two."""
+    squares, freedom = 0.0, 0
+    for tread in treads:
+        region = flat[:, tread]
+        rows, columns = region.shape[0] // block[0], max(1, region.shape[1] // block[1])
+        width = min(block[1], region.shape[1])
+        if rows * columns < 2:
+            continue
+        cut = region[: rows * block[0], : columns * width].reshape(rows, block[0], columns, width)
+        means = np.nanmean(cut, axis=(1, 3)) * NM_PER_UM
+        squares += float(((means - means.mean()) ** 2).sum())
+        freedom += means.size - 1
+    return float(np.sqrt(squares / freedom)) if freedom else None

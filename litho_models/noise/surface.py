@@ -1,0 +1,122 @@
+"""How rough one surface is: bare substrate, flat print, or the treads of a staircase."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from litho_data.errors import InputError
+from litho_data.results import Record
+from litho_data.roughness import amplitude_parameters, effective_samples
+from litho_models.noise.gaussian_law import GAUSSIAN_MAE
+
+Background = Literal["offset", "quadratic"]
+BACKGROUNDS: tuple[Background, ...] = ("offset", "quadratic")
+NM_PER_UM = 1000.0
+
+
+class SurfaceNoise(Record):
+    """Deviation of a surface from its background.
+
+    Args:
+        background: what was removed: the mean (``offset``) or a polynomial of second degree.
+        sigma_nm: root mean square (Sq); ``sigma_uncertainty_nm`` its standard uncertainty from the
+            number of independent heights in the field.
+        mae_nm: mean absolute deviation from the median, as measured: no distribution assumed.
+        gaussian_mae_nm: 0.798 σ, what it would be for a Gaussian.
+        independent_heights: pixels over the sum of squared autocorrelation.
+    """
+
+    id: str
+    background: Background
+    sigma_nm: float
+    sigma_uncertainty_nm: float
+    mae_nm: float
+    gaussian_mae_nm: float
+    independent_heights: float
+    pixels: int
+
+
+class PrintNoise(Record):
+    """What the print adds to substrate and microscope: ``print² = flat² − substrate²``, nm.
+
+    ``print_nm`` is None where the flat print is not rougher than the substrate.
+    """
+
+    background: Background
+    flat_nm: float
+    flat_uncertainty_nm: float
+    substrate_nm: float
+    substrate_uncertainty_nm: float
+    print_nm: float | None
+    print_uncertainty_nm: float | None
+
+
+def surface_noise(scan_id: str, height_um: np.ndarray, background: Background) -> SurfaceNoise:
+    """Roughness of one surface about its background.
+
+    Args:
+        scan_id: name in the result.
+        height_um: (ny, nx), µm; NaN where not measured.
+        background: ``offset`` or ``quadratic``.
+
+    Raises:
+        InputError: fewer than 64 measured pixels.
+    """
+    deviation = without_background(height_um, background)
+    finite = np.isfinite(deviation)
+    if finite.sum() < 64:
+        raise InputError(f"surface {scan_id}", got=f"{finite.sum()} measured pixels", wanted="at least 64")
+    sigma = amplitude_parameters(deviation).sq_nm
+    # Unmeasured pixels enter the correlation as the mean: they hold no information.
+    filled = np.where(finite, deviation, deviation[finite].mean())
+    independent = effective_samples(filled) * float(finite.mean()) if sigma > 0 else float(finite.sum())
+    centred = deviation[finite] - np.median(deviation[finite])
+    return SurfaceNoise(
+        id=scan_id,
+        background=background,
+        sigma_nm=sigma,
+        sigma_uncertainty_nm=sigma / float(np.sqrt(2 * max(1.0, independent))),
+        mae_nm=NM_PER_UM * float(np.abs(centred).mean()),
+        gaussian_mae_nm=GAUSSIAN_MAE * sigma,
+        independent_heights=independent,
+        pixels=int(finite.sum()),
+    )
+
+
+def without_background(height_um: np.ndarray, background: Background) -> np.ndarray:
+    """Height minus its least-squares background over the measured pixels, float64 (ny, nx) µm."""
+    height = np.asarray(height_um, np.float64)
+    finite = np.isfinite(height)
+    if background == "offset":
+        return height - height[finite].mean()
+    y, x = np.meshgrid(*(np.linspace(-1, 1, size) for size in height.shape), indexing="ij")
+    terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
+    weights, *_ = np.linalg.lstsq(terms[:, finite].T, height[finite], rcond=None)
+    return height - np.tensordot(weights, terms, axes=1)
+
+
+def print_noise(flat: SurfaceNoise, substrate: SurfaceNoise) -> PrintNoise:
+    """The print alone, by quadrature: microscope and substrate are taken to add independently.
+
+    Raises:
+        InputError: surfaces freed of different backgrounds.
+    """
+    if flat.background != substrate.background:
+        raise InputError("backgrounds", got=(flat.background, substrate.background), wanted="the same")
+    square = flat.sigma_nm**2 - substrate.sigma_nm**2
+    print_nm = float(np.sqrt(square)) if square > 0 else None
+    uncertainty = None
+    if print_nm is not None:
+        of_flat, of_substrate = (s.sigma_nm * s.sigma_uncertainty_nm for s in (flat, substrate))
+        uncertainty = float(np.hypot(of_flat, of_substrate)) / print_nm
+    return PrintNoise(
+        background=flat.background,
+        flat_nm=flat.sigma_nm,
+        flat_uncertainty_nm=flat.sigma_uncertainty_nm,
+        substrate_nm=substrate.sigma_nm,
+        substrate_uncertainty_nm=substrate.sigma_uncertainty_nm,
+        print_nm=print_nm,
+        print_uncertainty_nm=uncertainty,
+    )
