@@ -1,0 +1,123 @@
+"""A campaign: all drawn trials, side by side as separate processes, resumable, none stopping the others."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
+
+from benchmarks.blind_trials.draws import draw_trials
+from benchmarks.blind_trials.records import Draw, Draws, Trial
+from benchmarks.blind_trials.trial import failed, run_trial, trial_folder
+from litho_data.errors import InputError
+
+_ROOT = Path(__file__).parents[2]
+# One thread per trial: trials side by side use the cores better than threads within one.
+_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+
+
+def open_campaign(out: Path, *, count: int, seed: int, n_scans: int, size_px: int) -> Draws:
+    """The draws of a campaign, written to ``out/draws.json`` before anything is run.
+
+    Raises:
+        InputError: ``out`` holds the campaign of other settings, or settings that cannot be drawn.
+    """
+    draws = Draws(
+        schema=Draws.SCHEMA,
+        seed=seed,
+        n_scans=n_scans,
+        size_px=size_px,
+        trials=draw_trials(count, seed),
+    )
+    if not (out / Draws.FILE_NAME).exists():
+        draws.write(out)
+    elif Draws.read(out) != draws:
+        raise InputError(
+            f"campaign in {out}",
+            got="draws of other settings",
+            wanted="the same settings",
+            hint="choose another folder",
+        )
+    return draws
+
+
+def finished(out: Path, draws: Draws) -> list[Trial]:
+    """The trials that have come to an end, failed ones included, in the order drawn."""
+    folders = (trial_folder(out, draw.number) for draw in draws.trials)
+    return [Trial.read(folder) for folder in folders if (folder / Trial.FILE_NAME).exists()]
+
+
+def run_campaign(
+    out: Path, draws: Draws, *, numbers: Sequence[int], workers: int, timeout_s: float, keep_data: bool
+) -> None:
+    """Run the trials of these numbers that are not finished; a line per trial as it ends.
+
+    A trial whose process dies or takes longer than ``timeout_s`` is recorded as failed.
+
+    Raises:
+        InputError: a number that was not drawn, or fewer than one worker.
+    """
+    unknown = set(numbers) - {draw.number for draw in draws.trials}
+    if unknown:
+        raise InputError("trials", got=sorted(unknown), wanted=f"numbers below {len(draws.trials)}")
+    if workers < 1:
+        raise InputError("workers", got=workers, wanted="at least 1")
+    done = {trial.draw.number for trial in finished(out, draws)}
+    todo = [draw for draw in draws.trials if draw.number in set(numbers) - done]
+    if len(todo) < len(set(numbers)):
+        print(f"{len(set(numbers)) - len(todo)} trials are finished already", flush=True)
+    with ThreadPoolExecutor(workers) as pool:
+        running = {pool.submit(_run_apart, out, draw, timeout_s, keep_data): draw for draw in todo}
+        for place, future in enumerate(as_completed(running), 1):
+            trial, seconds = future.result()
+            print(f"[{place}/{len(todo)}] {_line(trial)} ({seconds:.0f} s)", flush=True)
+
+
+def run_one(out: Path, number: int, keep_data: bool) -> None:
+    """Run one trial of an open campaign in this process."""
+    draws = Draws.read(out)
+    draw = next(draw for draw in draws.trials if draw.number == number)
+    run_trial(
+        draw,
+        out,
+        n_scans=draws.n_scans,
+        size_px=draws.size_px,
+        keep_data=keep_data,
+        report=lambda message: print(message, flush=True),
+    )
+
+
+def _run_apart(out: Path, draw: Draw, timeout_s: float, keep_data: bool) -> tuple[Trial, float]:
+    """Run a trial in a process of its own; what it prints goes to a log beside its result."""
+    folder, clock = trial_folder(out, draw.number), time.monotonic()
+    command = [sys.executable, "-m", "benchmarks.blind_trials", "--out", str(out.resolve())]
+    command += ["--run-one", str(draw.number), *(["--keep-data"] if keep_data else [])]
+    log = out / "logs" / f"{draw.number:02d}.txt"
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("w", encoding="utf-8") as stream:
+        try:
+            code = subprocess.run(
+                command,
+                cwd=_ROOT,
+                env=os.environ | _ONE_THREAD,
+                stdout=stream,
+                stderr=subprocess.STDOUT,
+                timeout=timeout_s,
+            ).returncode
+            reason = f"the process ended with exit code {code}"
+        except subprocess.TimeoutExpired:
+            reason = f"not finished after {timeout_s:g} s"
+    if not (folder / Trial.FILE_NAME).exists():
+        failed(draw, [], reason).write(folder)
+    return Trial.read(folder), time.monotonic() - clock
+
+
+def _line(trial: Trial) -> str:
+    planted = " + ".join(f"{one.name} {one.rms_nm:.1f} nm" for one in trial.planted) or trial.draw.kind
+    outcomes = ", ".join(outcome.judgement for outcome in trial.outcomes)
+    reason = f": {trial.failure}" if trial.failure else ""
+    return f"trial {trial.draw.number}: {planted}: {outcomes}{reason}"

@@ -1,0 +1,117 @@
+"""The scoreboard as a page for people, with two figures and the table as CSV."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from benchmarks.blind_trials.document import figures_of
+from benchmarks.blind_trials.records import Scoreboard, Trial
+from benchmarks.blind_trials.scoreboard import COUNTS_FROM_RMS_NM, FLOOR_TOLERANCE, trial_table
+from benchmarks.blind_trials.trial import trial_folder
+from litho_data.report import Page, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+CSV_NAME = "scoreboard.csv"
+_GOOD, _FAIR, _SILENT, _BAD = "#1b7f4b", "#6fbf8f", "#9aa5b1", "#c0392b"
+_LOOKS = {
+    "right": (_GOOD, "o"),
+    "set-contains-it": (_FAIR, "o"),
+    "clean": (_GOOD, "o"),
+    "traced-to-covariate": (_GOOD, "D"),
+    "unexplained": (_FAIR, "D"),
+    "missed": (_SILENT, "s"),
+    "wrong": (_BAD, "X"),
+    "false-positive": (_BAD, "X"),
+    "named-a-cause": (_BAD, "X"),
+    "failed": ("black", "X"),
+}
+
+
+def write_report(scoreboard: Scoreboard, folder: Path) -> Path:
+    """Write ``report.html`` and the CSV table into ``folder``; returns the path of the page."""
+    page = Page(
+        "Blind trials of the closed loop",
+        "The virtual fab hides effects drawn from one seed; the loop sees scans and layouts only; "
+        "a judge who knows the answer compares. All draws are shown, none was repeated.",
+    )
+    if scoreboard.pending:
+        page.note(f"Not run yet: trials {', '.join(map(str, scoreboard.pending))}.")
+    figures = figures_of(scoreboard)
+    page.tiles([(value, what) for what, value in figures])
+    page.code(scoreboard.command)
+    if scoreboard.trials:
+        page.heading("Outcome against size")
+        page.figure(
+            _outcomes(scoreboard.trials),
+            f"One row per planted effect. The dashed line is {COUNTS_FROM_RMS_NM:g} nm: effects to its left "
+            "do not count for the goal. Trials without an effect stand at the left edge.",
+        )
+        page.heading("Error before, after, and of the true models")
+        page.figure(
+            _errors(scoreboard.trials),
+            "Mean absolute error on held-out scans, datum-free: from the base model (open) to the corrected "
+            f"one (filled). Black: the true models on the same pixels; grey band: up to {FLOOR_TOLERANCE:g} "
+            "times that.",
+        )
+        page.heading("All trials")
+        page.table(trial_table(scoreboard), "One row per planted effect.", CSV_NAME)
+        numbers = [trial.draw.number for trial in scoreboard.trials if not trial.failure]
+        page.links(
+            [
+                (str(trial_folder(Path(), n) / "loop" / "report.html"), f"what the loop wrote on trial {n}")
+                for n in numbers
+            ]
+        )
+    return page.write(folder)
+
+
+def _outcomes(trials: list[Trial]) -> Figure:
+    rows = [
+        (f"{label} · {trial.draw.number}", outcome)
+        for trial in trials
+        for label, outcome in zip(_labels(trial), trial.outcomes, strict=True)
+    ]
+    rows.sort(key=lambda row: row[1].rms_nm)
+    figure = new_figure(9, 1.2 + 0.24 * len(rows))
+    axes = figure.add_subplot()
+    for judgement, (colour, marker) in _LOOKS.items():
+        places = [(max(o.rms_nm, 0.5), y) for y, (_, o) in enumerate(rows) if o.judgement == judgement]
+        if places:
+            x, y = zip(*places, strict=True)
+            axes.scatter(x, y, c=colour, marker=marker, s=48, label=judgement, zorder=3)
+    axes.axvline(COUNTS_FROM_RMS_NM, color="0.4", linestyle="--", linewidth=1)
+    axes.set_xscale("log")
+    axes.set_xlabel("rms of the effect, free of nuisances (nm)")
+    axes.set_yticks(range(len(rows)), [label for label, _ in rows], fontsize=8)
+    axes.grid(axis="x", alpha=0.3)
+    axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1), fontsize=8, frameon=False)
+    return figure
+
+
+def _errors(trials: list[Trial]) -> Figure:
+    done = [(trial, trial.errors) for trial in trials if trial.errors]
+    figure = new_figure(9, 1.2 + 0.26 * max(len(done), 1))
+    axes = figure.add_subplot()
+    for y, (_, errors) in enumerate(done):
+        floor, before, after = errors.floor.mae_nm, errors.before.mae_nm, errors.after.mae_nm
+        reached = errors.mae_to_floor <= FLOOR_TOLERANCE
+        colour = _GOOD if reached else _BAD
+        axes.fill_betweenx([y - 0.35, y + 0.35], floor, FLOOR_TOLERANCE * floor, color="0.85", linewidth=0)
+        axes.plot([before, after], [y, y], color=colour, linewidth=1.2)
+        axes.scatter([before], [y], facecolors="white", edgecolors=colour, s=34, zorder=3)
+        axes.scatter([after], [y], color=colour, s=34, zorder=3)
+        axes.plot([floor, floor], [y - 0.35, y + 0.35], color="black", linewidth=1.6, zorder=4)
+    labels = [f"{' + '.join(_labels(trial))} · {trial.draw.number}" for trial, _ in done]
+    axes.set_yticks(range(len(done)), labels, fontsize=8)
+    axes.set_xscale("log")
+    axes.set_xlabel("mean absolute error, held-out, datum-free (nm)")
+    axes.grid(axis="x", which="both", alpha=0.3)
+    axes.invert_yaxis()
+    return figure
+
+
+def _labels(trial: Trial) -> list[str]:
+    return [one.name for one in trial.planted] or [outcome.effect for outcome in trial.outcomes]
