@@ -12,10 +12,11 @@ from pydantic import Field
 from litho_data.errors import InputError
 from litho_data.files import atomic_file, file_sha256
 from litho_data.results import Record, Result
+from litho_design.ensemble import EnsembleRecord
 from litho_design.gauge import OutOfDistribution, Printability
 from litho_design.optics import Optics, stroke_table
 from litho_design.parametrise import LayoutSettings
-from litho_design.printer import PrinterRecord
+from litho_design.printer import PrinterRecord, TilingCheck
 from litho_design.targets import TargetRecord
 
 LEVELS_FILE = "layout_level.npy"
@@ -69,6 +70,8 @@ class Design(Result):
     target: TargetRecord | None = None
     printer: PrinterRecord
     printer_unchanged: bool
+    tiling: TilingCheck | None = None
+    ensemble: EnsembleRecord | None = None
     stroke: Stroke
     printability: Printability
     out_of_distribution: OutOfDistribution | None = None

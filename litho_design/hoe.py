@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +12,14 @@ from torch import Tensor
 
 from litho_data.errors import InputError
 from litho_design.design import HEIGHT_FILE, IMAGE_FILE, TARGET_FILE, Design, DesignTask
+from litho_design.ensemble import penalised
 from litho_design.hologram import HologramBench, image_error
 from litho_design.initialise import gerchberg_saxton, printed_phase
 from litho_design.metrics import HologramScore, si_psnr_db
 from litho_design.parametrise import CellMap, LayoutSettings, Parametrisation, nearest_levels
 from litho_design.printer import Printer
 from litho_design.report_design import write_hologram_report
-from litho_design.robust import draws, risk
+from litho_design.robust import Draw, draws, windowed_loss
 from litho_design.settings import HoeSettings
 from litho_design.targets import TargetRecord
 from litho_design.task import run_design
@@ -33,6 +35,7 @@ def design_hoe(
     target_record: TargetRecord,
     out: str | Path,
     *,
+    ensemble: Sequence[Printer] = (),
     command: str = "",
     announce: bool = True,
 ) -> Design:
@@ -43,6 +46,7 @@ def design_hoe(
         printer: frozen model, or nominal heights.
         target: wanted image (size_px, size_px) in [0, 1].
         out: folder of the design; an interrupted run in it is continued.
+        ensemble: further models: the loss is the mean over all, plus what they disagree by.
 
     Returns:
         The record written to ``out/design.json``.
@@ -51,7 +55,7 @@ def design_hoe(
         InputError: a target of another size, or a folder that holds another design.
     """
     _check_target(target, settings.layout)
-    task = HoeTask(settings, printer, target, target_record)
+    task = HoeTask(settings, printer, target, target_record, ensemble)
     return run_design(task, settings, settings, out, command=command, announce=announce)
 
 
@@ -60,31 +64,40 @@ class HoeTask:
 
     name: DesignTask = "hoe"
 
-    def __init__(self, settings: HoeSettings, printer: Printer, target: np.ndarray, record: TargetRecord):
+    def __init__(
+        self,
+        settings: HoeSettings,
+        printer: Printer,
+        target: np.ndarray,
+        record: TargetRecord,
+        ensemble: Sequence[Printer] = (),
+    ):
         device = printer.device
         if settings.search.start == "fresnel":
             raise InputError("start", got="'fresnel'", wanted="'random', 'gs' or 'wgs' for a hologram")
         self.settings, self.printer, self.target_record = settings, printer, record
+        self.printers = [printer, *ensemble]
         self.cells = CellMap(settings.layout).to(device)
         self.bench = HologramBench(settings.layout, settings.optics).to(device)
         self.target = torch.from_numpy(target).to(device)
-        self.draws = [
+        self.scenes: list[tuple[Draw | None, HologramBench]] = [
             (draw, HologramBench(settings.layout, draw.optics).to(device))
             for draw in draws(settings.window, settings.optics, settings.window.samples)
-        ]
+        ] or [(None, self.bench)]
 
     def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
         """RMSE of the printed hologram's image + weight * (1 - efficiency), of levels on the pixels.
 
-        With process-window samples: the risk of that loss over them.
+        With process-window samples: the risk of that loss over them; with an ensemble: its mean over
+        the models, and their disagreement.
         """
-        height = self.printer(level)[0, 0]
-        if not self.draws:
-            return self._loss(height, self.bench)
-        layout = self.settings.layout
-        losses = torch.stack([self._loss(draw.apply(height, layout), bench)[0] for draw, bench in self.draws])
-        parts = {"mean": float(losses.detach().mean()), "worst": float(losses.detach().max())}
-        return risk(losses, self.settings.window), parts
+        prints = [printer(level)[0, 0] for printer in self.printers]
+        settings = self.settings
+        loss, parts = windowed_loss(
+            prints, self.scenes, self._loss, settings.window, settings.layout.pitch_um
+        )
+        wave_um = settings.optics.wave_height_um
+        return penalised(loss, prints, settings.ensemble.weight, wave_um), parts
 
     @torch.no_grad()
     def window_scores(self, height_um: Tensor, count: int) -> list[dict[str, float]]:
@@ -92,7 +105,7 @@ class HoeTask:
         scores = []
         for draw in draws(self.settings.window, self.settings.optics, count):
             bench = HologramBench(self.settings.layout, draw.optics).to(height_um.device)
-            changed = draw.apply(height_um, self.settings.layout)
+            changed = draw.apply(height_um, self.settings.layout.pitch_um)
             share = bench(changed)
             loss, _ = self._loss(changed, bench)
             scores.append(

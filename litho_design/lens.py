@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,8 @@ import torch
 from torch import Tensor
 
 from litho_data.errors import InputError
-from litho_design.design import IMAGE_FILE, Design, DesignTask
+from litho_design.design import HEIGHT_FILE, IMAGE_FILE, Design, DesignTask
+from litho_design.ensemble import penalised
 from litho_design.initialise import fresnel_lens_phase, printed_phase
 from litho_design.lens_bench import (
     LensBench,
@@ -21,19 +23,28 @@ from litho_design.lens_bench import (
     sensor_psf,
 )
 from litho_design.lens_metrics import ImagingScore, LensScore, imaging_score, lens_score
+from litho_design.optics import Optics
 from litho_design.parametrise import CellMap, Parametrisation, nearest_levels
 from litho_design.printer import Printer
 from litho_design.report_lens import write_lens_report
+from litho_design.robust import Draw, draws, windowed_loss
 from litho_design.settings import LensSettings
 from litho_design.targets import TargetRecord
 from litho_design.task import run_design
 
 # The same noise in every iteration: the search compares layouts, not noise; the score draws its own.
 _DESIGN_NOISE_SEED = 0
+_WINDOW_DRAWS = 16
 
 
 def design_lens(
-    settings: LensSettings, printer: Printer, out: str | Path, *, command: str = "", announce: bool = True
+    settings: LensSettings,
+    printer: Printer,
+    out: str | Path,
+    *,
+    ensemble: Sequence[Printer] = (),
+    command: str = "",
+    announce: bool = True,
 ) -> Design:
     """Optimise the layout of a lens so that its print focuses, or images after reconstruction.
 
@@ -41,11 +52,12 @@ def design_lens(
         settings: geometry, optics, task and search (see ``lens_preset``).
         printer: frozen model, or nominal heights.
         out: folder of the design; an interrupted run in it is continued.
+        ensemble: further models: the loss is the mean over all, plus what they disagree by.
 
     Raises:
         InputError: a radial search of a layout without rings or with a square aperture.
     """
-    task = LensTask(settings, printer)
+    task = LensTask(settings, printer, ensemble)
     return run_design(task, settings, settings, out, command=command, announce=announce)
 
 
@@ -54,24 +66,41 @@ class LensTask:
 
     target_record: TargetRecord | None = None
 
-    def __init__(self, settings: LensSettings, printer: Printer):
+    def __init__(self, settings: LensSettings, printer: Printer, ensemble: Sequence[Printer] = ()):
         _check(settings)
         self.settings, self.printer = settings, printer
+        self.printers = [printer, *ensemble]
         self.name: DesignTask = "lens-direct" if settings.task == "direct" else "lens-computational"
         device = printer.device
         self.cells = CellMap(settings.layout).to(device)
         self.bench = LensBench(settings.layout, settings.optics, settings.view).to(device)
-        self.rings = (
-            RadialLensBench(settings.layout, settings.optics, settings.view).to(device)
-            if settings.view.path == "radial"
-            else None
-        )
-        self.strip = _strip_rings(self.cells, printer.guard_px) if self.rings is not None else None
+        self.radial = settings.view.path == "radial"
+        self.strips = [_strip_rings(self.cells, p.halo_px) for p in self.printers] if self.radial else []
+        self.scenes: list[tuple[Draw | None, LensBench | RadialLensBench]] = [
+            (draw, self._search_bench(draw.optics))
+            for draw in draws(settings.window, settings.optics, settings.window.samples)
+        ] or [(None, self._search_bench(settings.optics))]
         self.objects = object_stack(settings.imaging.objects, settings.imaging.object_px).to(device)
 
     def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """-log(centre-to-background ratio), or the mean absolute error after Richardson-Lucy."""
-        psf = self._search_psf(level)
+        """-log(centre-to-background ratio), or the mean absolute error after Richardson-Lucy.
+
+        With process-window samples: the risk of that loss over them; with an ensemble: its mean over
+        the models, and their disagreement.
+        """
+        prints = (
+            [self.printed_rings(level, index) for index in range(len(self.printers))]
+            if self.radial
+            else [printer(level)[0, 0] for printer in self.printers]
+        )
+        settings = self.settings
+        loss, parts = windowed_loss(
+            prints, self.scenes, self._loss, settings.window, settings.layout.pitch_um
+        )
+        return penalised(loss, prints, settings.ensemble.weight, settings.optics.wave_height_um), parts
+
+    def _loss(self, height_um: Tensor, bench: LensBench | RadialLensBench) -> tuple[Tensor, dict[str, float]]:
+        psf = bench(height_um)
         layout = self.settings.layout
         centre_px = round(self.settings.view.centre_um / layout.pitch_um)
         ratio = centre_to_background(psf, centre_px, layout.size_px)
@@ -113,31 +142,40 @@ class LensTask:
 
     def report(self, folder: Path, design: Design, history: list[dict[str, float]]) -> None:
         """Write report.html."""
-        write_lens_report(folder, design, history, self.bench)
+        height = torch.from_numpy(np.load(folder / HEIGHT_FILE)).to(self.printer.device)
+        write_lens_report(folder, design, history, self.bench, self.window_scores(height, _WINDOW_DRAWS))
 
-    def _search_psf(self, level: Tensor) -> Tensor:
-        if self.rings is None:
-            return self.bench(self.printer(level)[0, 0])
-        return self.rings(self._printed_rings(level))
+    @torch.no_grad()
+    def window_scores(self, height_um: Tensor, count: int) -> list[dict[str, float]]:
+        """Strehl ratio and centre-to-background ratio of a print over draws of the window."""
+        settings, scores = self.settings, []
+        peak = float(self.bench(self.bench.ideal_height_um()).max())
+        centre_px = round(settings.view.centre_um / settings.layout.pitch_um)
+        for draw in draws(settings.window, settings.optics, count):
+            bench = LensBench(settings.layout, draw.optics, settings.view).to(height_um.device)
+            psf = bench(draw.apply(height_um, settings.layout.pitch_um))
+            cbr = centre_to_background(psf, centre_px, settings.layout.size_px)
+            scores.append({"strehl": float(psf.max()) / peak, "cbr": float(cbr)})
+        return scores
 
-    def _printed_rings(self, level: Tensor) -> Tensor:
-        """Height of each ring inside the aperture, from a print of a strip along a radius.
+    def _search_bench(self, optics: Optics) -> LensBench | RadialLensBench:
+        kind = RadialLensBench if self.radial else LensBench
+        return kind(self.settings.layout, optics, self.settings.view).to(self.printer.device)
+
+    def printed_rings(self, level: Tensor, printer: int = 0) -> Tensor:
+        """Height (rings,), µm, inside the aperture, from one printer's print of a strip along a radius.
 
         The strip continues the rings beyond the aperture, as the layout's corners do.
         """
-        assert self.strip is not None
         rings = self.cells.average(level[0, 0])
-        printed = self.printer.print_patch(rings[self.strip][None, None])[0, 0]
-        guard = self.printer.guard_px
-        inside = self.settings.layout.size_px // 2
-        return printed[guard : guard + 2, guard : guard + inside].mean(0)
+        return self.printers[printer].print_patch(rings[self.strips[printer]][None, None])[0, 0].mean(0)
 
 
-def _strip_rings(cells: CellMap, guard_px: int) -> Tensor:
-    """Ring under each pixel of the strip: two central rows, rings 0 to the aperture, guard all round."""
+def _strip_rings(cells: CellMap, halo_px: int) -> Tensor:
+    """Ring under each pixel of the strip: two central rows, rings 0 to the aperture, a halo all round."""
     assert cells.radial
-    along = torch.arange(-guard_px, cells.size_px // 2 + guard_px, dtype=torch.float64) + 0.5
-    across = torch.arange(-guard_px - 1, guard_px + 1, dtype=torch.float64) + 0.5
+    along = torch.arange(-halo_px, cells.size_px // 2 + halo_px, dtype=torch.float64) + 0.5
+    across = torch.arange(-halo_px - 1, halo_px + 1, dtype=torch.float64) + 0.5
     ring = (torch.hypot(across[:, None], along[None, :]) / cells.cell_px).floor().long()
     return ring.clamp(max=cells.cells[0] - 1).to(cells.ring.device)
 

@@ -6,7 +6,7 @@ import hashlib
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 import torch.nn.functional as F
@@ -19,6 +19,18 @@ from litho_design.parametrise import LayoutSettings
 _GUARD_UM = 6.4
 
 Precision = Literal["float32", "mixed", "bfloat16"]
+
+
+class TilingCheck(Record):
+    """How much a print depends on the tile in which it is computed, over some tiles of the layout.
+
+    With a receptive radius this is rounding; without one (a Fourier operator) it is the model's error.
+    """
+
+    tile_px: int
+    tiles: int
+    max_nm: float
+    rms_nm: float
 
 
 class PrinterRecord(Record):
@@ -63,8 +75,11 @@ class Printer(nn.Module):
         self._reduced = False
         self.name = name or ("none" if simulator is None else str(simulator.name))
         self.guard_px = 0 if simulator is None else math.ceil(_guard_um(simulator) / layout.pitch_um)
+        self.halo_px = 0 if simulator is None else _halo_px(simulator, self.guard_px)
         # What lies in the guard ring is cut off again: a model that can leave it out need not compute it.
-        self._has_interior = bool(getattr(simulator, "has_interior", False))
+        self._interior: Callable[..., Tensor] | None = None
+        if getattr(simulator, "has_interior", False):
+            self._interior = cast(Any, simulator).interior
         if simulator is not None:
             simulator.eval().requires_grad_(False)
 
@@ -83,22 +98,44 @@ class Printer(nn.Module):
         height_um = level * self.layout.level_height_um
         if self.simulator is None:
             return height_um
-        guard = self.guard_px
-        padded = F.pad(height_um, (guard, guard, guard, guard))
-        if self._has_interior:
-            return self._simulate(padded, self.simulator.interior)
-        printed = self._simulate(padded, self.simulator)
-        return printed[..., guard : printed.shape[-2] - guard, guard : printed.shape[-1] - guard]
+        return self._inside(F.pad(height_um, (self.guard_px,) * 4), self.guard_px)
 
     def print_patch(self, level: Tensor) -> Tensor:
-        """Printed height, µm, of a patch cut out of a layout, (b, 1, y, x) as given.
-
-        Pixels nearer to the patch's edge than the guard see a continued patch and must not be used.
-        """
+        """Printed height, µm, of a patch cut out of a layout (b, 1, y, x), without its outer ``halo_px``."""
         height_um = level * self.layout.level_height_um
-        if self.simulator is None:
-            return height_um
-        return self._simulate(height_um, self.simulator)
+        return self._inside(height_um, self.halo_px)
+
+    @torch.no_grad()
+    def tiling_check(self, level: Tensor, tile_px: int = 256) -> TilingCheck | None:
+        """Compare the print of the whole element with tiles printed on their own, halo included.
+
+        Args:
+            level: layout (1, 1, size, size).
+            tile_px: side of a tile without its halo; up to four of them along the diagonal are compared.
+
+        Returns:
+            The differences; None for nominal heights and for elements that are not larger than one tile.
+        """
+        size, halo = self.layout.size_px, self.halo_px
+        if self.simulator is None or size <= tile_px:
+            return None
+        whole = self(level)
+        around = F.pad(level, (halo,) * 4)
+        count = min(4, size // tile_px)
+        # Odd starts: a multiple of the model's own tile would compare it with itself.
+        starts = [round((size - tile_px) * (index + 0.5) / count) | 1 for index in range(count)]
+        off = []
+        for start in (min(start, size - tile_px) for start in starts):
+            part = slice(start, start + tile_px)
+            wide = slice(start, start + tile_px + 2 * halo)
+            off.append(self.print_patch(around[..., wide, wide]) - whole[..., part, part])
+        nm = torch.stack(off).double() * 1000
+        return TilingCheck(
+            tile_px=tile_px,
+            tiles=count,
+            max_nm=float(nm.abs().max()),
+            rms_nm=float(nm.square().mean().sqrt()),
+        )
 
     @contextmanager
     def at_precision(self, precision: Precision) -> Iterator[None]:
@@ -107,8 +144,7 @@ class Printer(nn.Module):
         ``mixed`` prints in float32 and sends gradients back through the areawise networks in bfloat16;
         ``bfloat16`` does both so. Other models, and heights, blurs and waves, stay in float32.
         """
-        networks = [] if self.simulator is None else list(self.simulator.modules())
-        networks = [network for network in networks if hasattr(network, "adjoint_dtype")]
+        networks: list[Any] = [network for network in self.modules() if hasattr(network, "adjoint_dtype")]
         self._reduced = precision == "bfloat16"
         for network in networks:
             network.adjoint_dtype = torch.bfloat16 if precision == "mixed" else None
@@ -153,6 +189,16 @@ class Printer(nn.Module):
                 float(printed[..., size // 2 - 4 : size // 2 + 4, size // 2 - 4 : size // 2 + 4].mean())
             )
         return heights
+
+    def _inside(self, height_um: Tensor, border_px: int) -> Tensor:
+        """Print of ``height_um`` without its outer ``border_px``."""
+        if self.simulator is None or border_px == 0:
+            printed = height_um if self.simulator is None else self._simulate(height_um, self.simulator)
+            return printed if border_px == 0 else printed[..., border_px:-border_px, border_px:-border_px]
+        if self._interior is not None:
+            return self._simulate(height_um, self._interior)
+        printed = self._simulate(height_um, self.simulator)
+        return printed[..., border_px:-border_px, border_px:-border_px]
 
     def _simulate(self, height_um: Tensor, call: Callable[..., Tensor]) -> Tensor:
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self._reduced):
@@ -205,3 +251,9 @@ def _check_calibration(card: Mapping[str, Any], layout: LayoutSettings, extrapol
 def _guard_um(simulator: nn.Module) -> float:
     reach = getattr(simulator, "reach_um", None)
     return _GUARD_UM if reach is None else float(reach)
+
+
+def _halo_px(simulator: nn.Module, guard_px: int) -> int:
+    """What a patch needs around it: the guard, or a whole tile where the model runs on tiles."""
+    tile = getattr(getattr(simulator, "simulator", None), "tile", None)
+    return guard_px if tile is None else max(guard_px, tile.size_px)

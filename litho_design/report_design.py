@@ -10,6 +10,8 @@ import numpy as np
 from litho_data.report import Page, new_figure
 from litho_design.design import HEIGHT_FILE, IMAGE_FILE, LEVELS_FILE, TARGET_FILE, Design
 from litho_design.metrics import HologramScore
+from litho_design.report_window import add_yield
+from litho_design.robust import ProcessWindow
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -37,8 +39,6 @@ def write_hologram_report(
     levels, height_um, image, target = (
         np.load(folder / name) for name in (LEVELS_FILE, HEIGHT_FILE, IMAGE_FILE, TARGET_FILE)
     )
-    import pandas as pd
-
     score = HologramScore.model_validate(design.predicted)
     page = Page(
         "Holographic element",
@@ -72,13 +72,8 @@ def write_hologram_report(
         f"{design.iterations} iterations, {design.polished_loss:.4f} after the polish; the last sample had "
         f"{design.sample_loss:.4f} (soft-to-hard gap {design.argmax_loss - design.sample_loss:+.4f})."
     )
-    page.heading("Process window")
-    page.paragraph(
-        f"{len(window)} prints with random gain, blur and defocus as in the settings: the share of them that "
-        "is at least as good as the abscissa."
-    )
-    page.figure(_yield_curves(window, score), "Yield curves; the dashed line is the print as modelled.")
-    page.table(pd.DataFrame(window), "Single draws", "window.csv", digits=3)
+    shown = {name: (getattr(score, name), SCORE_LABELS[name]) for name in ("si_psnr_db", "eff_signal")}
+    add_yield(page, window, ProcessWindow.model_validate(design.settings["window"]), shown)
     page.heading("What the print makes of the levels")
     page.table(
         stroke_frame(design), "Printed height of a uniform field of each level", "levels.csv", digits=3
@@ -150,18 +145,6 @@ def progress_figure(history: list[dict[str, float]], design: Design):
     return figure
 
 
-def _yield_curves(window: list[dict[str, float]], score: HologramScore):
-    figure = new_figure(8, 3)
-    axes = figure.subplots(1, 2, sharey=True)
-    for axis, name in zip(axes, ("si_psnr_db", "eff_signal"), strict=True):
-        values = np.sort([draw[name] for draw in window])
-        axis.step(values, 1 - np.arange(len(values)) / len(values), where="pre")
-        axis.axvline(getattr(score, name), color="0.5", linestyle="--", linewidth=1)
-        axis.set_xlabel(SCORE_LABELS[name])
-    axes[0].set_ylabel("yield")
-    return figure
-
-
 def add_gauge(page: Page, design: Design) -> None:
     """What the layout asks of the printer, and how far it is from the model's training layouts."""
     import pandas as pd
@@ -172,6 +155,18 @@ def add_gauge(page: Page, design: Design) -> None:
         page.note(
             f"Out of distribution: {100 * gauge.level_distance:.0f} % of the pixels would have to change "
             "level to match the layouts that the model was trained on; its prediction is an extrapolation."
+        )
+    tiling, ensemble = design.tiling, design.ensemble
+    if tiling is not None:
+        page.paragraph(
+            f"Whole field against {tiling.tiles} tiles of {tiling.tile_px} px with their halo: the "
+            f"predicted height differs by {tiling.rms_nm:.2g} nm rms, {tiling.max_nm:.2g} nm at most."
+        )
+    if ensemble is not None:
+        names = ", ".join(member.name for member in ensemble.members)
+        page.paragraph(
+            f"Designed together with {names}: here the models are {ensemble.disagreement_nm:.1f} nm "
+            f"({ensemble.disagreement_waves:.3f} waves) apart, rms over the pixels."
         )
     figures = design.printability.model_dump() | (gauge.model_dump() if gauge else {})
     frame = pd.DataFrame({"name": list(figures), "value": [float(value) for value in figures.values()]})

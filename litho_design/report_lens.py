@@ -11,7 +11,10 @@ import torch
 from litho_data.report import Page, new_figure
 from litho_design.design import HEIGHT_FILE, IMAGE_FILE, LEVELS_FILE, Design
 from litho_design.lens_metrics import mtf
+from litho_design.process_window import focus_window
 from litho_design.report_design import add_gauge, progress_figure, stroke_advice, stroke_frame
+from litho_design.report_window import add_focus_window, add_yield
+from litho_design.robust import ProcessWindow
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -43,7 +46,11 @@ LENS_LABELS = {
 
 
 def write_lens_report(
-    folder: Path, design: Design, history: list[dict[str, float]], bench: LensBench
+    folder: Path,
+    design: Design,
+    history: list[dict[str, float]],
+    bench: LensBench,
+    window: list[dict[str, float]],
 ) -> Path:
     """Write ``report.html`` and its CSV tables from the arrays in ``folder``."""
     levels, height, psf = (np.load(folder / name) for name in (LEVELS_FILE, HEIGHT_FILE, IMAGE_FILE))
@@ -79,6 +86,9 @@ def write_lens_report(
     page.figure(
         progress_figure(history, design), "Loss of the sampled layout and of the printable (argmax) layout."
     )
+    shown = {name: (figures[name], LENS_LABELS[name]) for name in ("strehl", "cbr")}
+    add_yield(page, window, ProcessWindow.model_validate(design.settings["window"]), shown)
+    add_focus_window(page, focus_window(bench, torch.from_numpy(height).to(bench.aperture.device)))
     page.heading("What the print makes of the levels")
     page.table(
         stroke_frame(design), "Printed height of a uniform field of each level", "levels.csv", digits=3

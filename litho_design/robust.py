@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor
 
+from litho_data.errors import InputError
 from litho_data.results import Record
 from litho_design.optics import Optics
-from litho_design.parametrise import LayoutSettings
 
 _NARROWEST_BLUR_PX = 0.2
 
@@ -29,6 +31,7 @@ class ProcessWindow(Record):
 
     gain_sd: float = Field(default=0.03, ge=0)
     offset_sd_um: float = Field(default=0.02, ge=0)
+    gain_offset_correlation: float = Field(default=0.0, ge=-1, le=1)
     blur_sd_um: float = Field(default=0.05, ge=0)
     defocus_sd_um: float = Field(default=3.0, ge=0)
     wavelength_sd_um: float = Field(default=0.0, ge=0)
@@ -48,23 +51,28 @@ class Draw:
     blur_um: float
     optics: Optics
 
-    def apply(self, height_um: Tensor, layout: LayoutSettings) -> Tensor:
-        """The height (size, size), µm, as this draw prints it.
+    def apply(self, height_um: Tensor, pitch_um: float) -> Tensor:
+        """The height (size, size), or of rings (n,) from the centre outwards, µm, as this draw prints it.
 
         A uniform offset is a uniform phase and changes no image; it is kept for scores of heights.
+        Rings are blurred along the radius only, which is exact where they are much wider than the blur
+        or far from the centre.
         """
         changed = height_um * self.gain + self.offset_um
-        sigma_px = self.blur_um / layout.pitch_um
-        return changed if sigma_px < _NARROWEST_BLUR_PX else _blur(changed, sigma_px)
+        sigma_px = self.blur_um / pitch_um
+        if sigma_px < _NARROWEST_BLUR_PX:
+            return changed
+        return _blur(changed, sigma_px) if changed.dim() == 2 else _blur_rings(changed, sigma_px)
 
 
 def draws(window: ProcessWindow, optics: Optics, count: int) -> list[Draw]:
     """``count`` draws from ``window.seed``; the first ``k`` of a longer list are those of a shorter one."""
+    shared = window.gain_offset_correlation
     normal = np.random.default_rng(window.seed).standard_normal((count, 5)).tolist()
     return [
         Draw(
             gain=1 + window.gain_sd * gain,
-            offset_um=window.offset_sd_um * offset,
+            offset_um=window.offset_sd_um * (shared * gain + math.sqrt(1 - shared**2) * offset),
             blur_um=abs(window.blur_sd_um * blur),
             optics=optics.model_copy(
                 update={
@@ -77,12 +85,87 @@ def draws(window: ProcessWindow, optics: Optics, count: int) -> list[Draw]:
     ]
 
 
+Loss = Callable[[Tensor, Any], tuple[Tensor, dict[str, float]]]
+
+
+def windowed_loss(
+    prints: Sequence[Tensor],
+    scenes: Sequence[tuple[Draw | None, Any]],
+    loss: Loss,
+    window: ProcessWindow,
+    pitch_um: float,
+) -> tuple[Tensor, dict[str, float]]:
+    """The loss of one or several prints of a layout, over the draws of a process window.
+
+    Args:
+        prints: printed heights of the same layout by one or several models.
+        scenes: a draw (None for the print as modelled) and the optics in which it is looked at.
+        loss: height and optics to a loss and its parts.
+
+    Returns:
+        The mean over the prints; over several scenes, the risk of that mean. Parts are those of the
+        first print, or mean and worst over the scenes.
+    """
+    losses: list[Tensor] = []
+    parts: dict[str, float] = {}
+    for draw, bench in scenes:
+        drawn = [height if draw is None else draw.apply(height, pitch_um) for height in prints]
+        results = [loss(height, bench) for height in drawn]
+        parts = parts or results[0][1]
+        losses.append(torch.stack([value for value, _ in results]).mean())
+    if len(losses) == 1:
+        return losses[0], parts
+    together = torch.stack(losses)
+    seen = together.detach()
+    return risk(together, window), {"mean": float(seen.mean()), "worst": float(seen.max())}
+
+
 def risk(losses: Tensor, window: ProcessWindow) -> Tensor:
     """One figure of many losses: mean + weight * sd, or the mean of the worst share."""
     if window.risk == "mean-sd":
         return losses.mean() + window.weight * losses.std(correction=0)
     worst = max(1, round(window.tail * losses.numel()))
     return losses.topk(worst).values.mean()
+
+
+def measured_window(store: Any, window: ProcessWindow) -> ProcessWindow:
+    """``window`` with the spread of gain and offset, and their correlation, of measured prints.
+
+    Each scan is fitted as height = gain * nominal + offset; the spread between scans is that of the
+    process, of the microscope's own scale from scan to scan, and of what else the fit leaves in:
+    an upper bound of what one print differs from another.
+
+    Args:
+        store: a ``litho_data`` store of at least three scans.
+
+    Raises:
+        InputError: fewer scans, or layouts without structure.
+    """
+    fits = []
+    for scan in store.scans():
+        nominal, height = scan.layout_um[scan.valid], scan.height_um[scan.valid]
+        if nominal.std() > 0:
+            fits.append(np.polyfit(nominal.astype(float), height.astype(float), 1))
+    if len(fits) < 3:
+        raise InputError("process window", got=f"{len(fits)} scans with structure", wanted="three at least")
+    gain, offset = np.array(fits).T
+    return window.model_copy(
+        update={
+            "gain_sd": float(gain.std(ddof=1) / gain.mean()),
+            "offset_sd_um": float(offset.std(ddof=1)),
+            "gain_offset_correlation": float(np.corrcoef(gain, offset)[0, 1]),
+        }
+    )
+
+
+def _blur_rings(height: Tensor, sigma_px: float) -> Tensor:
+    """Gaussian blur along the radius; the centre continues as its mirror, the edge as it is."""
+    half = min(int(4 * sigma_px) + 1, height.numel() - 1)
+    x = torch.arange(-half, half + 1, dtype=height.dtype, device=height.device)
+    kernel = torch.exp(-(x**2) / (2 * sigma_px**2))
+    kernel = kernel / kernel.sum()
+    padded = torch.cat([height[:half].flip(0), height, height[-1:].expand(half)])
+    return torch.nn.functional.conv1d(padded[None, None], kernel.view(1, 1, -1))[0, 0]
 
 
 def _blur(image: Tensor, sigma_px: float) -> Tensor:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Literal
 
 from litho_data.results import Record
+from litho_design.ensemble import EnsemblePenalty
 from litho_design.hologram import HologramLoss
 from litho_design.lens_bench import ImagingSettings, LensView
 from litho_design.metrics import CameraView
@@ -25,6 +26,7 @@ class HoeSettings(Record):
     search: SearchSettings = SearchSettings()
     loss: HologramLoss = HologramLoss()
     window: ProcessWindow = ProcessWindow()
+    ensemble: EnsemblePenalty = EnsemblePenalty()
     camera: CameraView = CameraView()
 
 
@@ -73,6 +75,8 @@ class LensSettings(Record):
     )
     view: LensView = LensView(path="radial")
     imaging: ImagingSettings = ImagingSettings()
+    window: ProcessWindow = ProcessWindow()
+    ensemble: EnsemblePenalty = EnsemblePenalty()
 
 
 def lens_preset(variant: Variant, task: Literal["direct", "computational"]) -> LensSettings:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -25,6 +27,7 @@ from litho_design.design import (
     write_arrays,
     write_level_image,
 )
+from litho_design.ensemble import EnsembleRecord, disagreement_um
 from litho_design.fingerprint import record_sha256
 from litho_design.gauge import out_of_distribution, printability
 from litho_design.optics import Optics
@@ -61,6 +64,8 @@ class Task(Protocol):
     def name(self) -> DesignTask: ...
     @property
     def printer(self) -> Printer: ...
+    @property
+    def printers(self) -> Sequence[Printer]: ...
     @property
     def target_record(self) -> TargetRecord | None: ...
 
@@ -105,8 +110,8 @@ def run_design(
     """Optimise, polish and score one layout, and write the folder ``out``.
 
     The folder may hold an interrupted run of the same task (it goes on and ends as if it had never
-    stopped) or a finished one (it is returned as it is). The weights of the printer's model are
-    hashed before and after.
+    stopped) or a finished one (it is returned as it is). The weights of every model are hashed before
+    and after.
 
     Args:
         announce: print the expected time and memory to stderr before starting.
@@ -115,20 +120,23 @@ def run_design(
         InputError: ``out`` holds another design.
     """
     folder = Path(out)
-    hash_before = task.printer.weights_sha256()
-    parts: list[Record | str] = [settings_record, hash_before, task.name]
+    hashes_before = [printer.weights_sha256() for printer in task.printers]
+    parts: list[Record | str] = [settings_record, *hashes_before, task.name]
     fingerprint = record_sha256(*parts, *([task.target_record] if task.target_record else []))
     finished = _finished(folder, fingerprint)
     if finished is not None:
         return finished
     folder.mkdir(parents=True, exist_ok=True)
     heights = task.printer.level_heights_um()
-    with task.printer.at_precision(settings.search.precision):
+    with ExitStack() as precisions:
+        for printer in task.printers:
+            precisions.enter_context(printer.at_precision(settings.search.precision))
         outcome = _optimise(task, settings, folder, fingerprint, heights, announce)
     cells = make_parametrisation(settings.layout, settings.search).to(outcome.levels.device).cells
     layout_level = cells(outcome.levels)
+    level = layout_level[None, None].float()
     with torch.no_grad():
-        height = task.printer(layout_level[None, None].float())[0, 0]
+        height = task.printer(level)[0, 0]
     layout_array = layout_level.cpu().numpy().astype(np.uint8)
     arrays = {LEVELS_FILE: layout_array, HEIGHT_FILE: height.cpu().numpy(), **task.arrays(height)}
     files = write_arrays(folder, arrays) | write_level_image(folder, layout_array)
@@ -151,7 +159,9 @@ def run_design(
         optics=settings.optics,
         target=task.target_record,
         printer=task.printer.record(),
-        printer_unchanged=task.printer.weights_sha256() == hash_before,
+        printer_unchanged=[p.weights_sha256() for p in task.printers] == hashes_before,
+        tiling=task.printer.tiling_check(level),
+        ensemble=_ensemble(task.printers, level, settings.optics),
         stroke=make_stroke(heights, settings.optics, settings.layout),
         printability=printability(layout_array, settings.layout),
         out_of_distribution=out_of_distribution(layout_array, settings.layout, task.printer.card),
@@ -169,6 +179,18 @@ def run_design(
     design.write(folder)
     remove_checkpoint(folder)
     return design
+
+
+@torch.no_grad()
+def _ensemble(printers: Sequence[Printer], level: Tensor, optics: Optics) -> EnsembleRecord | None:
+    if len(printers) == 1:
+        return None
+    apart_um = float(disagreement_um(torch.stack([printer(level)[0, 0] for printer in printers])))
+    return EnsembleRecord(
+        members=[printer.record() for printer in printers[1:]],
+        disagreement_nm=1000 * apart_um,
+        disagreement_waves=apart_um / optics.wave_height_um,
+    )
 
 
 def _finished(folder: Path, fingerprint: str) -> Design | None:

@@ -103,7 +103,7 @@ def test_ring_path_sees_what_the_plane_path_sees(make_printer):
     )[0, 0]
     level = task.cells(smooth)[None, None]
     plane = bench(task.printer(level)[0, 0])
-    strip = rings(task._printed_rings(level))
+    strip = rings(task.printed_rings(level))
     # What differs: the disc's edge is a staircase of pixels (1e-3), the layout ends where its circle
     # touches the sides, and rings are flat across 0.1 µm where this rough print is not.
     assert float((plane - strip).abs().sum() / plane.sum()) < 0.04

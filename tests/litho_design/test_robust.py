@@ -9,7 +9,6 @@ import torch
 from litho_design.design import HEIGHT_FILE
 from litho_design.hoe import HoeTask, design_hoe
 from litho_design.optics import Optics
-from litho_design.parametrise import LayoutSettings
 from litho_design.robust import Draw, ProcessWindow, draws, risk
 from litho_design.targets import make_target
 
@@ -32,10 +31,9 @@ def test_risk_formulas():
 
 
 def test_extra_blur_keeps_the_mean_and_damps_a_wave_by_its_gaussian():
-    layout = LayoutSettings(size_px=128)
     x = (torch.arange(128) + 0.5) * 0.1
     wave = torch.cos(2 * torch.pi * x / 1.6).double().expand(128, 128)
-    blurred = Draw(1.0, 0.0, 0.2, Optics()).apply(wave, layout)
+    blurred = Draw(1.0, 0.0, 0.2, Optics()).apply(wave, 0.1)
     # exp(-2 pi^2 sigma^2 f^2) with sigma 0.2, f = 1 / 1.6; the kernel is cut at four sigma.
     expected = np.exp(-2 * np.pi**2 * 0.2**2 / 1.6**2)
     middle = slice(32, 96)

@@ -1,0 +1,101 @@
+"""Command `compare`: parse options, call one function, say where the result is."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated, Any, Literal
+
+import typer
+
+from litho_design.cli_options import (
+    TARGET_HELP,
+    Device,
+    Extrapolate,
+    Iterations,
+    LearningRate,
+    LevelHeight,
+    Levels,
+    ObjectPx,
+    Out,
+    RobustSamples,
+    SearchPrecision,
+    SizePx,
+    SpreadOf,
+    Start,
+    Variant,
+    WindowPx,
+    command_line,
+    hoe_settings,
+    lens_settings,
+    load_printers,
+)
+
+
+def compare(
+    models: Annotated[str, typer.Option(help="Arms, comma-separated: none, NAME=MODEL or MODEL.")],
+    out: Out,
+    judge: Annotated[
+        list[str] | None, typer.Option(help="Further judges, NAME=MODEL or MODEL; may be repeated.")
+    ] = None,
+    task: Annotated[
+        Literal["hoe", "lens-direct", "lens-computational"], typer.Option(help="What is designed.")
+    ] = "hoe",
+    target: Annotated[str, typer.Option(help=f"For hoe: {TARGET_HELP}")] = "text",
+    variant: Variant = "default",
+    size_px: SizePx = None,
+    distance_um: Annotated[float | None, typer.Option(help="Image distance or focal length, µm.")] = None,
+    levels: Levels = None,
+    level_height_um: LevelHeight = None,
+    window_px: WindowPx = None,
+    object_px: ObjectPx = None,
+    iterations: Iterations = None,
+    start: Start = None,
+    learning_rate: LearningRate = None,
+    precision: SearchPrecision = "float32",
+    robust_samples: RobustSamples = None,
+    spread_of: SpreadOf = None,
+    seeds: Annotated[int, typer.Option(help="Number of seeds, 0, 1, 2 …")] = 3,
+    device: Device = "cpu",
+    extrapolate: Extrapolate = False,
+) -> None:
+    """Design with every arm, print with every judge: the design-to-manufacturing gap."""
+    from litho_design.compare import HEADLINE
+    from litho_design.compare import compare as run_comparison
+    from litho_design.hoe import design_hoe
+    from litho_design.lens import design_lens
+    from litho_design.targets import make_target
+
+    options: dict[str, Any] = {
+        "size_px": size_px,
+        "distance_um": distance_um,
+        "levels": levels,
+        "level_height_um": level_height_um,
+        "iterations": iterations,
+        "start": start,
+        "learning_rate": learning_rate,
+        "precision": precision,
+        "samples": robust_samples,
+        "spread_of": spread_of,
+    }
+    if task == "hoe":
+        settings: Any = hoe_settings(variant, **options)
+        image, record = make_target(target, settings.layout.size_px)
+        if record.adaptation:
+            print(f"target: {record.adaptation}", file=sys.stderr)
+
+        def designer(settings, printer, place):
+            return design_hoe(settings, printer, image, record, place, command=command_line())
+    else:
+        kind = "direct" if task == "lens-direct" else "computational"
+        settings = lens_settings(variant, kind, window_px=window_px, object_px=object_px, **options)
+
+        def designer(settings, printer, place):
+            return design_lens(settings, printer, place, command=command_line())
+
+    arms = load_printers(models.split(","), settings.layout, device, extrapolate)
+    judges = load_printers(judge or [], settings.layout, device, extrapolate)
+    result = run_comparison(settings, designer, arms, judges, out, seeds=range(seeds), command=command_line())
+    for item in result.summary:
+        if item.figure == HEADLINE[result.task][0]:
+            print(f"designed with {item.arm}, printed by {item.judge}: {item.figure} {item.judged_mean:.3f}")
+    print(out / "report.html")

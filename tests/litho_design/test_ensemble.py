@@ -1,0 +1,111 @@
+"""Several models in one design: the penalty's formula, what it buys, and the check of the tiles."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from litho_design.design import LEVELS_FILE, Design
+from litho_design.ensemble import disagreement_um, penalised
+from litho_design.hoe import HoeTask, design_hoe
+from litho_design.lens import design_lens
+from litho_design.parametrise import LayoutSettings
+from litho_design.printer import Printer
+from litho_design.settings import lens_preset
+from litho_design.targets import make_target
+
+
+def test_disagreement_is_the_rms_spread_without_the_datum():
+    pattern = torch.tensor([[1.0, -1.0], [-1.0, 1.0]])
+    # Two models at +-0.1 of a pattern of unit rms, one of them 5 µm higher: the spread is 0.1 everywhere.
+    apart = torch.stack([0.1 * pattern, -0.1 * pattern + 5])
+    assert float(disagreement_um(apart)) == pytest.approx(0.1, rel=1e-5)
+    loss = torch.tensor(2.0)
+    assert float(penalised(loss, list(apart), 3.0, 0.5)) == pytest.approx(2 + 3 * 0.1 / 0.5, rel=1e-5)
+    assert penalised(loss, [pattern], 3.0, 0.5) is loss
+
+
+def test_where_all_models_agree_there_is_no_penalty_and_a_finite_gradient():
+    height = torch.rand(8, 8, requires_grad=True)
+    spread = disagreement_um(torch.stack([height, height]))
+    spread.backward()
+    # The floor of the root: 1e-6 µm, a thousandth of an ångström.
+    assert float(spread.detach()) == pytest.approx(1e-6, rel=1e-3)
+    assert torch.isfinite(height.grad).all()
+
+
+def test_the_penalty_brings_the_models_together(tmp_path, small_settings, make_printer):
+    target = make_target("ring", 128)
+    layout = small_settings.layout
+
+    def models() -> tuple[Printer, Printer]:
+        return make_printer(layout, sigma_um=0.2), make_printer(layout, sigma_um=0.35, name="wide")
+
+    apart = {}
+    for weight in (0.0, 20.0):
+        ensemble = small_settings.ensemble.model_copy(update={"weight": weight})
+        settings = small_settings.model_copy(update={"ensemble": ensemble})
+        main, other = models()
+        design = design_hoe(
+            settings, main, *target, tmp_path / f"{weight:g}", ensemble=[other], announce=False
+        )
+        assert design.printer_unchanged
+        assert [member.name for member in design.ensemble.members] == ["wide"]
+        assert Design.read(tmp_path / f"{weight:g}") == design
+        apart[weight] = design.ensemble.disagreement_waves
+    assert apart[20.0] < 0.8 * apart[0.0]
+    # The mean over the members, not the first one's loss alone.
+    main, other = models()
+    level = torch.from_numpy(np.load(tmp_path / "0" / LEVELS_FILE)).float()[None, None]
+    alone = [float(HoeTask(small_settings, p, *target).objective(level)[0]) for p in (main, other)]
+    free = small_settings.ensemble.model_copy(update={"weight": 0.0})
+    both = HoeTask(small_settings.model_copy(update={"ensemble": free}), main, *target, [other])
+    assert float(both.objective(level)[0]) == pytest.approx(sum(alone) / 2, rel=1e-5)
+
+
+def test_a_lens_takes_an_ensemble_too(tmp_path, make_printer):
+    layout = LayoutSettings(size_px=128, cell_um=0.1, symmetry="radial")
+    default = lens_preset("default", "direct")
+    settings = default.model_copy(
+        update={
+            "layout": layout,
+            "optics": default.optics.model_copy(update={"distance_um": 40.0}),
+            "search": default.search.model_copy(update={"iterations": 4, "polish_rounds": 0}),
+            "view": default.view.model_copy(update={"window_px": 64}),
+            "window": default.window.model_copy(update={"samples": 2}),
+        }
+    )
+    other = make_printer(layout, sigma_um=0.3, name="wide")
+    design = design_lens(settings, make_printer(layout), tmp_path, ensemble=[other], announce=False)
+    assert design.ensemble is not None
+    assert design.ensemble.disagreement_nm > 0
+    assert (tmp_path / "focus_window.csv").exists()
+    assert (tmp_path / "window.csv").exists()
+
+
+def test_tiles_with_their_halo_print_what_the_whole_does(make_printer):
+    layout = LayoutSettings(size_px=320)
+    level = torch.randint(0, 13, (1, 1, 320, 320), generator=torch.Generator().manual_seed(0)).float()
+    check = make_printer(layout).tiling_check(level, tile_px=128)
+    assert check is not None
+    assert check.tiles == 2
+    # Heights of 1 µm in float32, summed over 17 taps in another order.
+    assert check.max_nm < 1e-2
+    assert make_printer(layout).tiling_check(level, tile_px=320) is None
+    assert Printer(None, layout, source="none").tiling_check(level, tile_px=128) is None
+
+
+def test_a_model_that_looks_at_the_whole_image_is_found_out():
+    class Normalising(torch.nn.Module):
+        name, reach_um = "normalising", None
+
+        def forward(self, layout_um, pitch_um):
+            return layout_um / layout_um.max()
+
+    layout = LayoutSettings(size_px=256)
+    level = torch.full((1, 1, 256, 256), 6.0)
+    level[..., 100:104, 250:] = 12.0
+    # Tiles away from the high corner normalise by half the height: 1 µm where the whole says 0.5 µm.
+    check = Printer(Normalising(), layout, source="test").tiling_check(level, tile_px=64)
+    assert check.max_nm == pytest.approx(500, rel=1e-5)

@@ -1,0 +1,81 @@
+"""Through focus and gain: ranges in closed form, depth of focus of a perfect lens, measured spreads."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from litho_data.errors import InputError
+from litho_design.lens_bench import LensBench, LensView
+from litho_design.optics import Optics
+from litho_design.parametrise import LayoutSettings
+from litho_design.process_window import focus_window, range_above
+from litho_design.robust import Draw, ProcessWindow, draws, measured_window
+
+
+def test_range_above_a_limit_is_linear_between_samples():
+    x = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+    # 1 - |x| / 2 crosses 0.75 at +-0.5.
+    assert range_above(x, 1 - np.abs(x) / 2, 0.75) == pytest.approx(1.0)
+    assert range_above(x, np.ones(5), 0.75) == pytest.approx(4.0)
+    assert range_above(x, np.zeros(5), 0.75) == 0.0
+
+
+def test_a_perfect_lens_has_the_depth_of_focus_of_its_aperture():
+    # Defocus by d is a path of d NA^2 / 2 at the edge; the axial intensity behind a circle is
+    # sinc^2(d NA^2 / (2 lambda)), which is 0.8 at an argument of 0.2535 on both sides.
+    layout = LayoutSettings(size_px=600, cell_um=0.1, symmetry="radial")
+    bench = LensBench(layout, Optics(distance_um=100.0), LensView(window_px=64))
+    window = focus_window(bench, bench.ideal_height_um())
+    depth = 4 * 0.2535 * 0.6328 / bench.numerical_aperture**2
+    # Seven samples with chords between them, and a focus that falls off as 1 / z^2: 4 % over the depth.
+    assert window.depth_of_focus_um == pytest.approx(depth, rel=0.06)
+    assert np.argmax(window.strehl[2]) == 3
+    assert window.strehl[2][3] == pytest.approx(1, abs=1e-9)
+    # Gain g leaves sinc^2(1 - g) in the first order of a blazed zone.
+    for row, gain in enumerate(window.gain):
+        assert window.strehl[row][3] == pytest.approx(np.sinc(1 - gain) ** 2, abs=0.02)
+
+
+def test_rings_are_blurred_like_a_plane_wave_of_their_radius():
+    ring = torch.cos(2 * torch.pi * (torch.arange(400) + 0.5) * 0.1 / 1.6).double()
+    blurred = Draw(1.0, 0.0, 0.2, Optics()).apply(ring, 0.1)
+    expected = np.exp(-2 * np.pi**2 * 0.2**2 / 1.6**2)
+    # The mirror at the centre continues a cosine as it is; the outer end is left out.
+    assert torch.allclose(blurred[:360], expected * ring[:360], atol=1e-3)
+
+
+class _Scan:
+    def __init__(self, gain: float, offset_um: float):
+        generator = np.random.default_rng(0)
+        self.layout_um = generator.integers(0, 13, (32, 32)) * 0.1
+        self.height_um = gain * self.layout_um + offset_um
+        self.valid = np.ones((32, 32), bool)
+
+
+class _Store:
+    def __init__(self, *scans: _Scan):
+        self._scans = list(scans)
+
+    def scans(self) -> list[_Scan]:
+        return self._scans
+
+
+def test_spreads_of_measured_prints_come_back():
+    gains, offsets = np.array([0.5, 0.6, 0.7, 0.6]), np.array([0.12, 0.2, 0.16, 0.16])
+    store = _Store(*(_Scan(gain, offset) for gain, offset in zip(gains, offsets, strict=True)))
+    window = measured_window(store, ProcessWindow(samples=4))
+    assert window.samples == 4
+    assert window.gain_sd == pytest.approx(gains.std(ddof=1) / gains.mean(), rel=1e-6)
+    assert window.offset_sd_um == pytest.approx(offsets.std(ddof=1), rel=1e-6)
+    assert window.gain_offset_correlation == pytest.approx(np.corrcoef(gains, offsets)[0, 1], rel=1e-6)
+    with pytest.raises(InputError, match="three"):
+        measured_window(_Store(_Scan(0.6, 0.1)), ProcessWindow())
+
+
+def test_gain_and_offset_are_drawn_together():
+    many = draws(ProcessWindow(gain_offset_correlation=-0.8), Optics(), 4000)
+    measured = np.corrcoef([d.gain for d in many], [d.offset_um for d in many])[0, 1]
+    # Standard error of a correlation: (1 - r^2) / sqrt(n) = 0.006.
+    assert measured == pytest.approx(-0.8, abs=0.03)
