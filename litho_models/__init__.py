@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from litho_models import zoo
     from litho_models.freeze import FrozenSimulator, load_frozen, save_frozen
 
-__all__ = ["FrozenSimulator", "load_frozen", "save_frozen"]
+__all__ = ["FrozenSimulator", "load_frozen", "save_frozen", "zoo"]
 
 
 def __getattr__(name: str) -> Any:
     """Load torch only when a model is asked for."""
+    if name == "zoo":
+        return importlib.import_module("litho_models.zoo")
     if name in __all__:
         from litho_models import freeze
 
