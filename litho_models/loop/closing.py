@@ -20,6 +20,7 @@ from litho_models.loop.fitting import is_stiff, predict, set_vector
 from litho_models.loop.flexible import FoldedBase, Trainer, carry_over, same_for_all, train_folds
 from litho_models.loop.injecting import Planted, parse_injection, plant
 from litho_models.loop.measurement import MeasurementTest, measurement_tests
+from litho_models.loop.probes import Probed, probe_residual
 from litho_models.loop.scoring import DATUM_FREE, Score, Terms, names_to_terms, score
 from litho_models.loop.search import Search, State, fit_state, search_effects
 from litho_models.loop.structure import CovariateTest, covariate_tests, is_structured
@@ -47,6 +48,7 @@ class Closed:
     Attributes:
         development, locked: prepared scans; ``fold_of``: fold of each development scan.
         base, final: fitted states before and after; ``search``: how it got there.
+        probed: generic terms where no named effect won; ``final`` predicts with them.
         first_tests, last_tests: measurement tests before and after the process effects.
         accepted: measurement effects in force at the end.
         floor_nm: lower bound of the noise, nm (root mean square, mean absolute).
@@ -61,6 +63,7 @@ class Closed:
     base: State
     final: State
     search: Search
+    probed: Probed
     first_tests: list[MeasurementTest]
     last_tests: list[MeasurementTest]
     accepted: list[str]
@@ -157,7 +160,19 @@ def close_loop(
             seed=config.seed,
             report=report,
         )
-    final = search.state
+    report("testing what is left for structure")
+    left = covariate_tests(development, search.state.predictions)
+    probed = probe_residual(
+        search.state,
+        development,
+        fold_of,
+        terms,
+        floor_nm2=floor[0] ** 2,
+        seed=config.seed,
+        search=bool(is_structured(left)),
+        report=report,
+    )
+    final = probed.state
     last_tests = measurement_tests(
         development, final.predictions, fold_of, floor_nm2=floor[0] ** 2, seed=config.seed
     )
@@ -166,8 +181,6 @@ def close_loop(
     for text in config.inject:
         report(f"planting {text}")
         planted += plant(text, guide, development, fold_of, terms, config.seed)
-    report("testing what is left for structure")
-    residuals = [f.height - f.at_sample(p) for f, p in zip(development, final.predictions, strict=True)]
     return Closed(
         development=development,
         locked=locked,
@@ -175,12 +188,13 @@ def close_loop(
         base=start,
         final=final,
         search=search,
+        probed=probed,
         first_tests=first_tests,
         last_tests=last_tests,
         accepted=accepted,
         floor_nm=noise_lower_bound_nm(development, final.predictions),
-        structure=covariate_tests(development, final.predictions, residuals),
-        locked_scores=_locked_scores(locked, start, final, accepted, config)
+        structure=covariate_tests(development, final.predictions) if probed.added else left,
+        locked_scores=_locked_scores(locked, start, probed, accepted, config)
         if config.open_lock_box
         else None,
         untestable=untestable,
@@ -238,11 +252,12 @@ def _untestable(fields: Sequence[Field]) -> dict[str, str]:
 
 
 def _locked_scores(
-    locked: Sequence[Field], start: State, final: State, accepted: Sequence[str], config: LoopConfig
+    locked: Sequence[Field], start: State, probed: Probed, accepted: Sequence[str], config: LoopConfig
 ) -> tuple[tuple[Score, Score], tuple[Score, Score]] | None:
     if not locked:
         return None
-    before, after = ([predict(s.fits.chain, s.fits.common, f) for f in locked] for s in (start, final))
+    before, after = ([predict(s.fits.chain, s.fits.common, f) for f in locked] for s in (start, probed.state))
+    after = [probed.apply(f, p) for f, p in zip(locked, after, strict=True)]
     terms = DATUM_FREE | names_to_terms(accepted)
     return (
         (score(locked, before, frozenset(), config.seed), score(locked, before, DATUM_FREE, config.seed)),

@@ -11,6 +11,7 @@ from litho_models.loop.closing import Closed
 from litho_models.loop.confirming import FEWEST_SCANS
 from litho_models.loop.fitting import effect_slots
 from litho_models.loop.measurement import MeasurementTest
+from litho_models.loop.probes import AddedProbe, ProbeTest, figures
 from litho_models.loop.result import (
     AddedEffect,
     Candidate,
@@ -29,6 +30,7 @@ from litho_models.loop.result import (
 from litho_models.loop.scoring import DATUM_FREE, Score
 from litho_models.loop.screening import FAMILY_P, SMALLEST_RETAINED, Screened
 from litho_models.loop.search import Added, separating_experiment
+from litho_models.metrics import NM_PER_UM
 from litho_models.nuisance import BLOCK_PX
 from litho_models.run_info import run_info
 
@@ -108,7 +110,8 @@ def _added(closed: Closed) -> list[AddedEffect]:
     last = {t.effect.name: t for t in closed.last_tests if t.confirmation.passed}
     early = [_added_measurement(closed, first[name]) for name in first if name in last]
     late = [_added_measurement(closed, last[name]) for name in last if name not in first]
-    return early + [_added_process(closed, entry) for entry in closed.search.added] + late
+    process = [_added_process(closed, entry) for entry in closed.search.added]
+    return early + process + [_added_probe(entry) for entry in closed.probed.added] + late
 
 
 def _added_measurement(closed: Closed, test: MeasurementTest) -> AddedEffect:
@@ -158,6 +161,30 @@ def _added_process(closed: Closed, entry: Added) -> AddedEffect:
     )
 
 
+def _added_probe(entry: AddedProbe) -> AddedEffect:
+    """A generic term: where the residual lives, added to the height; never a cause."""
+    return AddedEffect(
+        name=entry.probe.name,
+        stage="development",
+        role="undetermined",
+        verdict="traced-to-covariate",
+        prior_hypothesis=False,
+        parameters={
+            name: ParameterEstimate(value=value, unit=unit, ci95=interval)
+            for name, (value, unit, interval) in figures(entry.probe, entry.estimate).items()
+        },
+        metric="mae_datum_free",
+        before_nm=entry.before.mean_mae_nm,
+        after_nm=entry.after.mean_mae_nm,
+        gain_ci95_nm=entry.confirmation.gain_ci95_nm,
+        p_screen=entry.p_control,
+        p_confirm=entry.confirmation.p,
+        scans_improved=entry.confirmation.improved,
+        confusable_with=[],
+        separating_experiment="print and scan the same layouts turned by 90 degrees",
+    )
+
+
 def parameter_estimates(closed: Closed, effect: Effect) -> dict[str, ParameterEstimate]:
     """Final values on all development scans, intervals from the spread over scans; choices have none."""
     from scipy.stats import t
@@ -198,7 +225,27 @@ def _candidates(closed: Closed, added: set[str]) -> list[Candidate]:
             )
         else:
             rows.append(_process_candidate(closed, name, added, sets))
-    return rows
+    return rows + [_probe_candidate(closed, test) for test in closed.probed.tests]
+
+
+def _probe_candidate(closed: Closed, test: ProbeTest) -> Candidate:
+    entry = next((e for e in closed.probed.added if e.probe.name == test.name), None)
+    if entry is not None:
+        better, count = entry.confirmation.improved
+        reason = (
+            f"confirmed on {better} of {count} held-out scans; gain {test.gain_nm2:.0f} nm², its control "
+            f"{test.control_nm2:.0f} nm² (95 %); halves of the scans agree by {test.agreement:.2f}"
+        )
+        return Candidate(
+            name=test.name,
+            verdict="traced-to-covariate",
+            reason=reason,
+            p_screen=entry.p_control,
+            gain_nm=entry.confirmation.gain_nm,
+        )
+    mse = float(closed.errors(closed.final, closed.terms).mse_nm2.mean())
+    gain = math.sqrt(mse) - math.sqrt(max(mse - test.gain_nm2, 0.0))
+    return Candidate(name=test.name, verdict="below-noise", reason=test.reason, p_screen=None, gain_nm=gain)
 
 
 def _measurement_candidate(closed: Closed, test: MeasurementTest, added: bool) -> Candidate:
@@ -280,14 +327,27 @@ def _shares(closed: Closed) -> Shares:
     """Parts of the base model's squared error without any fit; they sum to 1."""
     total = float(closed.errors(closed.base, _NO_TERMS).mse_nm2.mean())
     freed = min(total, float(closed.errors(closed.base, closed.terms).mse_nm2.mean()))
-    left = min(freed, float(closed.errors(closed.final, closed.terms).mse_nm2.mean()))
+    named = min(freed, float(closed.errors(closed.search.state, closed.terms).mse_nm2.mean()))
+    final = closed.errors(closed.final, closed.terms)
+    left = min(named, float(final.mse_nm2.mean()))
     floor = min(left, closed.floor_nm[0] ** 2)
-    parts = np.array([total - freed, freed - left, left - floor, floor]) / max(total, np.finfo(float).tiny)
-    return Shares(
-        nuisance=float(parts[0]),
-        effects=float(parts[1]),
-        traced=0.0,
-        masked_defects=0.0,
-        unexplained_structured=float(parts[2]),
-        noise_floor=float(parts[3]),
+    defects = min(left - floor, _squares_in_defects_nm2(closed, final))
+    parts = [total - freed, freed - named, named - left, defects, left - floor - defects, floor]
+    return Shares.model_validate(
+        dict(
+            zip(
+                ("nuisance", "effects", "traced", "masked_defects", "unexplained_structured", "noise_floor"),
+                np.array(parts) / max(total, np.finfo(float).tiny),
+                strict=True,
+            )
+        )
     )
+
+
+def _squares_in_defects_nm2(closed: Closed, final: Score) -> float:
+    """What the pixels of localised defects add to the mean squared error, nm²."""
+    parts = []
+    for residual, mask in zip(final.residual_um, closed.probed.defects.masks, strict=True):
+        scored = np.isfinite(residual)
+        parts.append((residual[scored & mask] ** 2).sum() / max(scored.sum(), 1) * NM_PER_UM**2)
+    return float(np.mean(parts))

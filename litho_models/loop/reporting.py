@@ -3,25 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
 
-from litho_data.report import Page, new_figure
-from litho_models.effects import get_effect
+from litho_data.report import Page
 from litho_models.loop.closing import Closed
-from litho_models.loop.confirming import FEWEST_SCANS
+from litho_models.loop.figures import curve_figure, map_figure, probe_figure, staircase_figure
 from litho_models.loop.measurement import scan_parameters
-from litho_models.loop.result import AddedEffect, CloseLoop
+from litho_models.loop.result import CloseLoop
 from litho_models.loop.scoring import DATUM_FREE, Score, Terms, names_to_terms, scan_parameter_names
+from litho_models.loop.wording import plain_words, warnings_for
 from litho_models.metrics import NM_PER_UM
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-_MAPS = 3
-_BEFORE, _AFTER = "#9aa5b1", "#0b6aa2"
 
 
 def write_report(closed: Closed, result: CloseLoop, folder: Path) -> Path:
@@ -48,92 +41,25 @@ def write_report(closed: Closed, result: CloseLoop, folder: Path) -> Path:
         ]
     )
     page.paragraph(plain_words(closed, result))
-    for warning in _warnings(closed, result):
+    for warning in warnings_for(closed, result):
         page.note(warning)
     _error_section(page, closed, result)
     _effect_section(page, result)
     _candidate_section(page, result)
     page.heading("Residual maps")
     page.figure(
-        _map_figure(closed, before, after),
+        map_figure(closed, before, after),
         "Measured minus predicted on held-out scans: the worst, the median and the best scan before; one "
         "colour "
         "scale for all. Per-scan terms were fitted on other pixels.",
     )
+    _probe_section(page, closed)
     _rest_section(page, closed, result)
     _power_section(page, closed)
     _scan_section(page, closed, before, after)
     page.heading("How it was run")
     page.code(result.run.command or "litho_models.loop.close_loop")
     return page.write(folder)
-
-
-def plain_words(closed: Closed, result: CloseLoop) -> str:
-    """One paragraph for a process engineer."""
-    scan_terms = [e for e in result.effects if get_effect(e.name).per_scan]
-    causes = [e for e in result.effects if not get_effect(e.name).per_scan]
-    total = len(closed.development)
-    parts = [
-        f"On {total} scans, each predicted by a fit that has not seen it, the model is wrong by "
-        f"{result.before.mae_abs_nm:.0f} nm as it stands and by {result.before.mae_datum_free_nm:.1f} nm "
-        "once the "
-        "zero of each scan is freed."
-    ]
-    if scan_terms:
-        names = ", ".join(get_effect(e.name).title for e in scan_terms)
-        parts.append(f"The microscope accounts for: {names}. This says nothing about the printer.")
-    for e in causes:
-        alike = f" (or {', '.join(e.confusable_with)}: these data cannot tell)" if e.confusable_with else ""
-        parts.append(
-            f"{_sentence_case(get_effect(e.name).title)} [{e.name}]{alike}: {_estimate_text(e)}; with it the "
-            f"held-out error falls from {e.before_nm:.2f} to {e.after_nm:.2f} nm, in "
-            f"{e.scans_improved[0]} of "
-            f"{e.scans_improved[1]} scans."
-        )
-        if e.separating_experiment and (e.confusable_with or e.role == "undetermined"):
-            parts.append(f"To be sure: {e.separating_experiment}.")
-    if not causes:
-        parts.append("No effect of the printer is confirmed as missing from the model.")
-    if result.residual.state == "unexplained":
-        parts.append(f"What is left is still structured: {result.residual.signature}.")
-    else:
-        parts.append("What is left shows no structure that is shared between scans.")
-    return " ".join(parts)
-
-
-def _warnings(closed: Closed, result: CloseLoop) -> list[str]:
-    warnings = []
-    if len(closed.development) < FEWEST_SCANS:
-        warnings.append(
-            f"Only {len(closed.development)} scans to work on, and nothing can be confirmed below "
-            f"{FEWEST_SCANS}: errors are given, verdicts are withheld."
-        )
-    if result.run.dropped:
-        warnings.append(f"Scans left out: {'; '.join(result.run.dropped)}")
-    if closed.development[0].scan.write is None:
-        warnings.append(
-            "The card says nothing about the write field: each scan is taken as a write field of its "
-            "own, its "
-            "lines written along x, one below the other."
-        )
-    if len({field.context.order for field in closed.development}) > 2:
-        warnings.append(
-            "Effects of the writing order rest on the order given in the card; where it gives none, the "
-            "sorted "
-            "names of the scans stand for it, which is an assumption."
-        )
-    if result.prior_hypotheses:
-        warnings.append(
-            f"Known from earlier looks at these data, so only a new print confirms them cleanly: "
-            f"{', '.join(result.prior_hypotheses)}."
-        )
-    if any(e.role == "undetermined" or e.confusable_with for e in result.effects):
-        warnings.append(
-            "Effects of undetermined role, and sets with a member that belongs to the microscope, are "
-            "left out "
-            "of the exported process model."
-        )
-    return warnings
 
 
 def _error_section(page: Page, closed: Closed, result: CloseLoop) -> None:
@@ -153,7 +79,7 @@ def _error_section(page: Page, closed: Closed, result: CloseLoop) -> None:
         ]
     )
     page.figure(
-        _staircase_figure(frame, result),
+        staircase_figure(frame, result),
         "Held-out mean absolute error; bars are 95 % bootstrap intervals over scans. Grey: per-scan terms of "
         "the microscope on the base model. Blue: with the effects added. Dotted: lower bound of the noise.",
     )
@@ -181,30 +107,9 @@ def _staircase(closed: Closed) -> list[tuple[str, Score]]:
         if terms != steps[-1][1]:
             steps.append((f"+ {name}", terms))
     rows = [(f"base: {label}", closed.errors(closed.base, terms)) for label, terms in steps]
-    if closed.search.added:
+    if closed.search.added or closed.probed.added:
         rows += [(f"corrected: {label}", closed.errors(closed.final, terms)) for label, terms in steps]
     return rows
-
-
-def _staircase_figure(frame: pd.DataFrame, result: CloseLoop) -> Figure:
-    figure = new_figure(9, 0.42 * len(frame) + 1.2)
-    axes = figure.subplots()
-    y = np.arange(len(frame))[::-1]
-    colours = [_BEFORE if label.startswith("base") else _AFTER for label in frame["model"]]
-    mae = frame["MAE (nm)"].to_numpy()
-    errors = np.abs(np.stack([mae - frame["low"], frame["high"] - mae]))
-    axes.barh(y, mae, xerr=errors, color=colours, height=0.66, error_kw={"elinewidth": 1.2})
-    for position, value, high in zip(y, mae, frame["high"], strict=True):
-        axes.annotate(
-            f"{value:.1f}", (high, position), (5, 0), textcoords="offset points", va="center", fontsize=9
-        )
-    if result.noise_floor.mae_nm:
-        axes.axvline(result.noise_floor.mae_nm, color="k", ls=":", lw=1)
-    axes.set_yticks(y, frame["model"])
-    axes.set_xlim(0, 1.12 * float(frame["high"].max()))
-    axes.set_xlabel("mean absolute error on held-out scans (nm)")
-    axes.spines[["top", "right"]].set_visible(False)
-    return figure
 
 
 def _effect_section(page: Page, result: CloseLoop) -> None:
@@ -254,7 +159,15 @@ def _effect_section(page: Page, result: CloseLoop) -> None:
 
 def _candidate_section(page: Page, result: CloseLoop) -> None:
     page.heading("Every candidate, and why")
-    order = ["explained", "confusable", "contradicted", "below-noise", "absorbed", "not-testable"]
+    order = [
+        "explained",
+        "confusable",
+        "traced-to-covariate",
+        "contradicted",
+        "below-noise",
+        "absorbed",
+        "not-testable",
+    ]
     page.table(
         pd.DataFrame(
             [
@@ -276,31 +189,34 @@ def _candidate_section(page: Page, result: CloseLoop) -> None:
     )
 
 
-def _map_figure(closed: Closed, before: Score, after: Score) -> Figure:
-    ranking = np.argsort(-before.mse_nm2)
-    picked = ranking[np.unique(np.linspace(0, len(ranking) - 1, _MAPS).astype(int))]
-    limit = 2.5 * before.rmse_nm
-    figure = new_figure(4.1 * len(picked) + 0.8, 8.2)
-    axes = figure.subplots(2, len(picked), squeeze=False)
-    for column, scan in enumerate(picked):
-        field = closed.development[scan]
-        extent_um = [
-            0,
-            field.usable.shape[1] * field.scan.pitch_um,
-            field.usable.shape[0] * field.scan.pitch_um,
-            0,
-        ]
-        for row, (label, s) in enumerate((("before", before), ("after", after))):
-            panel = axes[row, column]
-            panel.imshow(
-                s.residual_um[scan] * NM_PER_UM, cmap="RdBu_r", vmin=-limit, vmax=limit, extent=extent_um,
-                interpolation="nearest",
-            )  # fmt: skip
-            panel.set_title(f"{field.id} {label}: {s.mae_nm[scan]:.1f} nm", fontsize=10)
-            panel.set_xlabel("x (µm)" if row else "")
-            panel.set_ylabel("" if column else "y (µm)")
-    figure.colorbar(axes[0, 0].images[0], ax=axes, label="measured - predicted (nm)", shrink=0.6)
-    return figure
+def _probe_section(page: Page, closed: Closed) -> None:
+    probed = closed.probed
+    page.heading("What has no name")
+    for entry in probed.added:
+        page.figure(
+            probe_figure(entry),
+            f"{entry.probe.name}: held-out error {entry.before.mean_mae_nm:.2f} to "
+            f"{entry.after.mean_mae_nm:.2f} nm. It says where the residual lives, not why.",
+        )
+    if probed.trends:
+        page.table(
+            pd.DataFrame(
+                [vars(t) | {"left_out": " / ".join(f"{e:.3g}" for e in t.left_out)} for t in probed.trends]
+            ),
+            "Offset and gain of the scans against the order of printing: a line, or one step. p under "
+            "permuted orders; left out: error on prints not used, for mean / line / step.",
+            "order_trend.csv",
+            digits=4,
+        )
+    defects = probed.defects
+    share = 100 * float(np.mean(defects.share_of_pixels))
+    page.paragraph(
+        f"Localised defects: {len(defects.blobs)} blobs of 9 pixels or more, beyond 5 robust standard "
+        f"deviations; {share:.2f} % of the pixels, {100 * defects.share_of_squares:.1f} % of the squared "
+        "residual. They are kept out of the generic terms, and count in every error."
+    )
+    if defects.blobs:
+        page.table(pd.DataFrame([vars(b) for b in defects.blobs]), "Every blob.", "defects.csv", digits=2)
 
 
 def _rest_section(page: Page, closed: Closed, result: CloseLoop) -> None:
@@ -327,28 +243,9 @@ def _rest_section(page: Page, closed: Closed, result: CloseLoop) -> None:
     curves = [t for t in closed.structure if len(t.curve_nm)]
     if curves:
         page.figure(
-            _curve_figure(curves),
+            curve_figure(curves),
             "Mean residual along each covariate; bars are two standard errors over development scans.",
         )
-
-
-def _curve_figure(curves: list) -> Figure:
-    columns = 3
-    rows = -(-len(curves) // columns)
-    figure = new_figure(10, 2.3 * rows)
-    axes = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
-    for panel, test in zip(axes, curves, strict=False):
-        panel.axhline(0, color="k", lw=0.6)
-        panel.errorbar(
-            test.centres, test.curve_nm, 2 * test.error_nm, fmt="o-", color=_AFTER, ms=3.5, capsize=2
-        )
-        panel.set_xlabel(test.name, fontsize=8)
-        panel.tick_params(labelsize=8)
-    for panel in axes[len(curves) :]:
-        panel.set_visible(False)
-    for panel in axes[::columns]:
-        panel.set_ylabel("residual (nm)", fontsize=8)
-    return figure
 
 
 def _power_section(page: Page, closed: Closed) -> None:
@@ -394,17 +291,3 @@ def _scan_section(page: Page, closed: Closed, before: Score, after: Score) -> No
         "design.",
         "scans.csv",
     )
-
-
-def _sentence_case(text: str) -> str:
-    return text[:1].upper() + text[1:]
-
-
-def _estimate_text(effect: AddedEffect) -> str:
-    parts = []
-    for name, p in effect.parameters.items():
-        if p.ci95 is None:
-            continue
-        unit = "" if p.unit == "1" else f" {p.unit}"
-        parts.append(f"{name} {p.value:.3g}{unit} [{p.ci95[0]:.3g}, {p.ci95[1]:.3g}]")
-    return ", ".join(parts)

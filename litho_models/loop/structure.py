@@ -40,12 +40,11 @@ class CovariateTest:
     share: float
 
 
-def covariate_tests(
-    fields: Sequence[Field], predictions: Sequence[np.ndarray], residuals: Sequence[np.ndarray]
-) -> list[CovariateTest]:
-    """Test the residual (n,) µm at the sampled pixels against level, slopes, surroundings and place."""
+def covariate_tests(fields: Sequence[Field], predictions: Sequence[np.ndarray]) -> list[CovariateTest]:
+    """Test the residual at the sampled pixels against level, slopes, surroundings and place."""
     cleaned = []
-    for field, prediction, residual in zip(fields, predictions, residuals, strict=True):
+    for field, prediction in zip(fields, predictions, strict=True):
+        residual = field.height - field.at_sample(prediction)
         basis = orthonormal(nuisance_columns(field, prediction, gain=True))
         cleaned.append(residual - basis @ (basis.T @ residual))
     covariates = [_covariates(f, p) for f, p in zip(fields, predictions, strict=True)]

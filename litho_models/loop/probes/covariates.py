@@ -1,0 +1,136 @@
+"""Linear probes along the printed level and along the place in the field."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+from scipy.interpolate import BSpline
+from scipy.ndimage import gaussian_filter
+
+from litho_models.loop.fields import Field
+from litho_models.loop.probes.linear import LinearProbe, linear_probe, second_differences
+from litho_models.metrics import NM_PER_UM
+
+# The level that reaches a pixel is spread by the printer's spot.
+SPOT_UM = 0.2
+SPLINES = 5
+_FEWEST_SCANS, _SMALLEST_SHARE = 5, 0.01
+_FLIPS: tuple[Callable[[np.ndarray], np.ndarray], ...] = tuple(
+    partial(lambda grid, turns, mirror: np.rot90(grid.T if mirror else grid, turns), turns=t, mirror=m)
+    for t in range(4)
+    for m in (False, True)
+)
+
+
+def level_table(
+    fields: Sequence[Field], predictions: Sequence[np.ndarray], kept: Sequence[np.ndarray]
+) -> LinearProbe | None:
+    """One height correction per printed level; None where fewer than four levels can be estimated.
+
+    Offset and slope over the levels belong to each scan's datum and gain and are projected out with them.
+    Levels in fewer than 5 scans or 1 % of the pixels are left alone.
+    """
+    levels = estimated_levels(fields)
+    if len(levels) < 4:
+        return None
+    return linear_probe(
+        "level-table",
+        partial(_level_columns, levels=levels),
+        second_differences(len(levels)) + 1e-3 * np.eye(len(levels)),
+        lambda random, count: random.permutation(count),
+        lambda heights: {
+            f"level_{level}": (float(height) * NM_PER_UM, "nm")
+            for level, height in zip(levels, heights, strict=True)
+        },
+        fields,
+        predictions,
+        kept,
+    )
+
+
+def estimated_levels(fields: Sequence[Field]) -> list[int]:
+    """Levels that enough scans and pixels hold."""
+    highest = max(int(field.scan.levels) for field in fields)
+    counts = np.stack(
+        [np.bincount(field.scan.mask_level.ravel().astype(int), minlength=highest) for field in fields]
+    )
+    shares = counts.sum(axis=0) / counts.sum()
+    enough = (counts > 0).sum(axis=0) >= min(_FEWEST_SCANS, len(fields))
+    return [int(level) for level in np.flatnonzero(enough & (shares >= _SMALLEST_SHARE))]
+
+
+def position_map(
+    fields: Sequence[Field],
+    predictions: Sequence[np.ndarray],
+    kept: Sequence[np.ndarray],
+    *,
+    times_height: bool,
+) -> LinearProbe:
+    """A smooth map over the scan, 5 × 5 cubic splines, added or multiplied by the height.
+
+    Each scan's plane and bow are projected out, so only what is finer can be found.
+    """
+    return linear_probe(
+        "position-gain-map" if times_height else "position-map",
+        partial(_map_columns, times_height=times_height),
+        _roughness(SPLINES),
+        _turned,
+        partial(_size, times_height=times_height),
+        fields,
+        predictions,
+        kept,
+    )
+
+
+def drawn(coefficients: np.ndarray, size: int = 101) -> np.ndarray:
+    """The map (size, size) that the splines' coefficients stand for; first axis y."""
+    splines = _splines(size)
+    return splines.T @ coefficients.reshape(SPLINES, SPLINES) @ splines
+
+
+def _size(coefficients: np.ndarray, times_height: bool) -> dict[str, tuple[float, str]]:
+    values = drawn(coefficients)
+    scale, unit = (1.0, "1") if times_height else (NM_PER_UM, "nm")
+    return {
+        "rms": (float(values.std()) * scale, unit),
+        "peak_to_valley": (float(np.ptp(values)) * scale, unit),
+    }
+
+
+def _level_columns(field: Field, prediction: np.ndarray, levels: Sequence[int]) -> np.ndarray:
+    """Blurred indicators (levels, y, x)."""
+    sigma = SPOT_UM / field.scan.pitch_um
+    level = field.scan.mask_level
+    return np.stack(
+        [gaussian_filter((level == one).astype(np.float64), sigma, mode="nearest") for one in levels]
+    )
+
+
+def _map_columns(field: Field, prediction: np.ndarray, times_height: bool) -> np.ndarray:
+    """Products of splines along y and x over the scan (25, y, x)."""
+    along_y, along_x = (_splines(n) for n in field.scan.shape)
+    maps = np.einsum("iy,jx->ijyx", along_y, along_x).reshape(-1, *field.scan.shape)
+    return maps * prediction if times_height else maps
+
+
+def _splines(size: int) -> np.ndarray:
+    """Cubic splines (SPLINES, size) from one end of an axis to the other; they add up to 1."""
+    inner = np.linspace(-1, 1, SPLINES - 2)
+    knots = np.concatenate([[-1.0] * 3, inner, [1.0] * 3])
+    position = np.linspace(-1, 1, size)
+    return BSpline.design_matrix(position, knots, 3).toarray().T
+
+
+def _roughness(count: int) -> np.ndarray:
+    """Penalty on the bends of a grid of coefficients along both axes, a little on their size."""
+    one = second_differences(count)
+    return np.kron(one, np.eye(count)) + np.kron(np.eye(count), one) + 1e-2 * np.eye(count**2)
+
+
+def _turned(random: np.random.Generator, count: int) -> np.ndarray:
+    """Order of the coefficients after a random flip or quarter turn of the map."""
+    side = round(count**0.5)
+    grid = np.arange(count).reshape(side, side)
+    return _FLIPS[int(random.integers(len(_FLIPS)))](grid).ravel()

@@ -1,0 +1,100 @@
+"""Blobs that stand far out of one scan's residual: reported, kept out of the probes, never explained."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import find_objects, label
+
+from litho_models.loop.fields import Field
+from litho_models.loop.scoring import term_maps
+from litho_models.metrics import NM_PER_UM
+from litho_models.nuisance import least_squares
+
+FAR_SD = 5.0
+FEWEST_PX = 9
+# Scar-like: much longer along the scan lines than across.
+_ROW_LIMITED = 4.0
+SUSPICIOUS_SHARE = 0.02
+
+
+@dataclass(frozen=True)
+class Defect:
+    """One blob: scan, centre and area on the layout's grid, signed peak, whether it follows scan lines."""
+
+    scan: str
+    y_um: float
+    x_um: float
+    area_um2: float
+    peak_nm: float
+    row_limited: bool
+
+
+@dataclass(frozen=True)
+class Defects:
+    """All blobs, their pixels per scan (y, x), their share of each scan and of all squared error."""
+
+    blobs: list[Defect]
+    masks: list[np.ndarray]
+    share_of_pixels: list[float]
+    share_of_squares: float
+
+    @property
+    def suspicious(self) -> list[int]:
+        """Numbers of the scans of which more than 2 % is masked."""
+        return [i for i, share in enumerate(self.share_of_pixels) if share > SUSPICIOUS_SHARE]
+
+
+def find_defects(fields: Sequence[Field], predictions: Sequence[np.ndarray]) -> Defects:
+    """Connected pixels farther than 5 robust standard deviations from a scan's own background.
+
+    Args:
+        fields, predictions: scans and their held-out predictions (y, x) µm.
+    """
+    blobs, masks, shares = [], [], []
+    inside = total = 0.0
+    for field, prediction in zip(fields, predictions, strict=True):
+        residual = _freed(field, prediction)
+        seen = residual[field.usable]
+        spread = 1.4826 * float(np.median(np.abs(seen - np.median(seen))))
+        numbered, count = label(field.usable & (np.abs(residual) > FAR_SD * spread))
+        sizes = np.bincount(numbered.ravel(), minlength=count + 1)
+        large = np.flatnonzero(sizes >= FEWEST_PX)
+        large = large[large > 0]
+        mask = np.isin(numbered, large)
+        boxes = find_objects(numbered)
+        blobs += [_describe(field, residual, numbered == n, boxes[n - 1]) for n in large]
+        masks.append(mask)
+        shares.append(float(mask.sum() / max(field.usable.sum(), 1)))
+        inside += float((residual[mask] ** 2).sum())
+        total += float((seen**2).sum())
+    return Defects(blobs, masks, shares, inside / max(total, np.finfo(float).tiny))
+
+
+def _freed(field: Field, prediction: np.ndarray) -> np.ndarray:
+    difference = np.where(field.usable, field.scan.height_um - prediction, 0.0).astype(np.float64)
+    basis = term_maps(prediction, frozenset({"offset", "gain", "bow"}))
+    use = field.usable
+    return np.where(
+        use, difference - np.tensordot(least_squares(basis[:, use], difference[use]), basis, axes=1), 0.0
+    )
+
+
+def _describe(
+    field: Field, residual: np.ndarray, blob: np.ndarray, box: tuple[slice, slice] | None
+) -> Defect:
+    assert box is not None
+    y, x = np.nonzero(blob)
+    values = residual[blob]
+    pitch = field.scan.pitch_um
+    height, width = (part.stop - part.start for part in box)
+    return Defect(
+        scan=field.id,
+        y_um=float(y.mean() * pitch),
+        x_um=float(x.mean() * pitch),
+        area_um2=float(blob.sum() * pitch**2),
+        peak_nm=float(values[np.argmax(np.abs(values))] * NM_PER_UM),
+        row_limited=width >= _ROW_LIMITED * height,
+    )

@@ -1,0 +1,256 @@
+"""The missing linear response: what of the residual is the layout filtered by one kernel.
+
+A regularised cross-spectral (Wiener) estimate over all scans, cut to a finite support, judged on scans
+held out; its control swaps the layouts between the scans.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.fft import irfft2, rfft2
+from scipy.ndimage import label
+from scipy.signal import fftconvolve
+
+from litho_models.loop.fields import Field
+from litho_models.loop.probes.probe import Estimate
+from litho_models.loop.scoring import term_maps
+from litho_models.metrics import NM_PER_UM
+from litho_models.nuisance import least_squares
+
+SUPPORT_UM = 5.0
+# The regularisation, relative to the median power of the layouts.
+REGULARISATIONS = tuple(10.0**exponent for exponent in (-4, -3, -2, -1, 0, 1))
+# Printed features end here; beyond there is no layout to respond to, and half the band costs a quarter.
+_BAND_CYCLES_PER_UM = 2.5
+_FITTED_PX = 20_000
+# Closer to the centre, a kernel is a wrong blur rather than something of its own.
+_CENTRE_UM = 0.5
+_FINER = 4
+_PEAK_EDGE = 0.1
+
+
+@dataclass(frozen=True)
+class MissingKernel:
+    """Residual = k * layout with one kernel for all scans.
+
+    Attributes:
+        layouts, residuals: spectra (scans, fy, fx) of the tapered fields, µm, in the band.
+        size: (y, x) of the fields in pixels of ``pitch_um``, the pitch of the band.
+        pixels: squared taper summed over a field, in pixels of the band.
+        pitch_um: sampling that the band needs.
+    """
+
+    layouts: np.ndarray
+    residuals: np.ndarray
+    size: tuple[int, int]
+    pixels: float
+    pitch_um: float
+
+    @property
+    def name(self) -> str:
+        return "missing-kernel"
+
+    def held_out(self, fold_of: np.ndarray) -> Estimate:
+        """Kernels (flattened, support cut) without each fold and their gain on each held-out scan."""
+        cross = np.conj(self.layouts) * self.residuals
+        power = np.abs(self.layouts) ** 2
+        choice = self._best_regularisation(cross, power, fold_of)
+        return self._estimate(cross, power, fold_of, choice)
+
+    def control(self, fold_of: np.ndarray, random: np.random.Generator) -> float:
+        """Mean held-out gain, nm², with every residual next to the layout of another scan."""
+        count = len(self.layouts)
+        layouts = self.layouts[(np.arange(count) + random.integers(1, count)) % count]
+        layouts = layouts * random.choice([-1.0, 1.0], size=(count, 1, 1))
+        swapped = MissingKernel(layouts, self.residuals, self.size, self.pixels, self.pitch_um)
+        return swapped.held_out(fold_of).mean_gain_nm2
+
+    def agreement(self) -> float:
+        """Correlation over all layouts of the responses that two halves of the scans ask for."""
+        cross = np.conj(self.layouts) * self.residuals
+        power = np.abs(self.layouts) ** 2
+        transfers = []
+        for start in (0, 1):
+            kernel = self._kernel(cross[start::2].sum(axis=0), power[start::2].sum(axis=0), 0.1)
+            transfers.append(rfft2(kernel))
+        first, second = transfers
+        weight = _weights(power.sum(axis=0).shape, self.size) * power.sum(axis=0)
+        sizes = np.sqrt((weight * np.abs(first) ** 2).sum() * (weight * np.abs(second) ** 2).sum())
+        return float((weight * first * np.conj(second)).real.sum() / max(sizes, np.finfo(float).tiny))
+
+    def correction(self, parameters: np.ndarray, field: Field, prediction: np.ndarray) -> np.ndarray:
+        """The layout filtered by the kernel, its mean left to the datum, (y, x) µm."""
+        kernel = resampled(parameters.reshape(self.size), self.pitch_um, field.scan.pitch_um)
+        radius = kernel.shape[0] // 2
+        layout = field.scan.layout_um.astype(np.float64)
+        padded = np.pad(layout - layout.mean(), radius, mode="edge")
+        return fftconvolve(padded, kernel, mode="valid").astype(np.float32)
+
+    def summary(self, parameters: np.ndarray) -> dict[str, tuple[float, str]]:
+        """Sum, first moment, and the strongest peak off the centre, heights per layout height."""
+        kernel = self.kernel_map(parameters)
+        y, x = (np.fft.fftshift(np.fft.fftfreq(n, 1 / n)) * self.pitch_um for n in self.size)
+        peak_y, peak_x, amplitude = off_centre_peak(parameters.reshape(self.size), self.pitch_um)
+        return {
+            "sum": (float(kernel.sum()), "1"),
+            "first_moment_y": (float(y @ kernel.sum(axis=1)), "µm"),
+            "first_moment_x": (float(kernel.sum(axis=0) @ x), "µm"),
+            "peak_y": (peak_y, "µm"),
+            "peak_x": (peak_x, "µm"),
+            "peak_amplitude": (amplitude, "1"),
+        }
+
+    def kernel_map(self, parameters: np.ndarray) -> np.ndarray:
+        """The kernel with its origin in the middle, (y, x), per pixel of the band."""
+        return np.fft.fftshift(parameters.reshape(self.size))
+
+    def _estimate(
+        self, cross: np.ndarray, power: np.ndarray, fold_of: np.ndarray, regularisation: float
+    ) -> Estimate:
+        folds = int(fold_of.max()) + 1
+        weights = _weights(power.shape[1:], self.size)
+        kernels, gains = [], np.zeros(len(cross))
+        all_cross, all_power = cross.sum(axis=0), power.sum(axis=0)
+        for fold in range(folds):
+            own = fold_of == fold
+            kernel = self._kernel(
+                all_cross - cross[own].sum(axis=0), all_power - power[own].sum(axis=0), regularisation
+            )
+            transfer = rfft2(kernel)
+            for scan in np.flatnonzero(own):
+                agreed = 2 * (np.conj(transfer) * cross[scan]).real - np.abs(transfer) ** 2 * power[scan]
+                gains[scan] = float((weights * agreed).sum()) / (np.prod(self.size) * self.pixels)
+            kernels.append(kernel.ravel())
+        common = self._kernel(all_cross, all_power, regularisation).ravel()
+        return Estimate(common=common, per_fold=np.stack(kernels), gains_nm2=gains * NM_PER_UM**2)
+
+    def _best_regularisation(self, cross: np.ndarray, power: np.ndarray, fold_of: np.ndarray) -> float:
+        gains = [self._estimate(cross, power, fold_of, c).mean_gain_nm2 for c in REGULARISATIONS]
+        return REGULARISATIONS[int(np.argmax(gains))]
+
+    def _kernel(self, cross: np.ndarray, power: np.ndarray, regularisation: float) -> np.ndarray:
+        """Kernel (y, x), origin in the corner, zero beyond the support; its far ring is its zero."""
+        transfer = cross / (power + regularisation * np.median(power))
+        kernel = irfft2(transfer, s=self.size)
+        distance = _distance_um(self.size, self.pitch_um)
+        reach = _reach_um(self.size, self.pitch_um)
+        ring = (distance > 0.8 * reach) & (distance <= reach)
+        return np.where(distance <= reach, kernel - kernel[ring].mean(), 0.0)
+
+
+def missing_kernel(
+    fields: Sequence[Field], predictions: Sequence[np.ndarray], defects: Sequence[np.ndarray]
+) -> MissingKernel:
+    """Measure the spectra of layouts and residuals, both freed of what a scan may add by itself.
+
+    Args:
+        fields, predictions: scans and their held-out predictions (y, x) µm.
+        defects: bool (y, x) per scan, left out.
+    """
+    size = tuple(min(field.scan.shape[axis] for field in fields) for axis in (0, 1))
+    pitch_um = fields[0].scan.pitch_um
+    taper = np.outer(np.hanning(size[0]), np.hanning(size[1]))
+    band = tuple(_band_size(n, pitch_um) for n in size)
+    layouts: list[np.ndarray] = []
+    residuals: list[np.ndarray] = []
+    for field, prediction, defect in zip(fields, predictions, defects, strict=True):
+        usable = field.usable & ~defect
+        layout = field.scan.layout_um.astype(np.float64)
+        residual = np.where(usable, field.scan.height_um - prediction, 0.0).astype(np.float64)
+        # The gain is taken from the residual alone: a layout without its low frequencies, which the
+        # prediction holds, could not say how much of them the kernel needs.
+        for target, freed in (
+            (layouts, _freed(layout, None, usable)),
+            (residuals, _freed(residual, prediction, usable)),
+        ):
+            top, left = ((full - n) // 2 for full, n in zip(freed.shape, size, strict=True))
+            target.append(_in_band(taper * freed[top : top + size[0], left : left + size[1]], band))
+    coarser = size[0] / band[0]
+    return MissingKernel(
+        layouts=np.stack(layouts),
+        residuals=np.stack(residuals),
+        size=(band[0], band[1]),
+        pixels=float((taper**2).mean() * band[0] * band[1]),
+        pitch_um=pitch_um * coarser,
+    )
+
+
+def resampled(kernel: np.ndarray, pitch_um: float, wanted_um: float) -> np.ndarray:
+    """Kernel (origin in the corner) at a finer pitch: an odd square with its origin in the middle.
+
+    Interpolated by its Fourier series; the sum over pixels stays, so that it filters alike.
+    """
+    ny, nx = kernel.shape
+    factor = pitch_um / wanted_um
+    radius = round(_reach_um((ny, nx), pitch_um) / wanted_um)
+    offsets = np.arange(-radius, radius + 1) / factor
+    rows = np.exp(2j * np.pi * np.outer(offsets, np.fft.fftfreq(ny)))
+    columns = np.exp(2j * np.pi * np.outer(offsets, np.fft.fftfreq(nx)))
+    spectrum = np.fft.fft2(kernel)
+    return (rows @ spectrum @ columns.T).real / (ny * nx) / factor**2
+
+
+def off_centre_peak(kernel: np.ndarray, pitch_um: float) -> tuple[float, float, float]:
+    """(y, x) in µm of the largest magnitude farther than 0.5 µm from the origin, and what it holds.
+
+    The amplitude is the kernel summed over the peak down to a tenth of its height: height per layout
+    height, 0.9 of the whole for a Gaussian peak.
+
+    Args:
+        kernel: (y, x), origin in the corner, per pixel of ``pitch_um``.
+    """
+    fine_um = pitch_um / _FINER
+    fine = resampled(kernel, pitch_um, fine_um)
+    radius = fine.shape[0] // 2
+    y, x = (np.indices(fine.shape) - radius) * fine_um
+    outside = np.where(np.hypot(y, x) > _CENTRE_UM, np.abs(fine), 0.0)
+    at = np.unravel_index(int(np.argmax(outside)), fine.shape)
+    if not fine[at]:
+        return 0.0, 0.0, 0.0
+    blobs, _ = label(fine / fine[at] > _PEAK_EDGE)
+    return float(y[at]), float(x[at]), float(fine[blobs == blobs[at]].sum())
+
+
+def _freed(values: np.ndarray, prediction: np.ndarray | None, usable: np.ndarray) -> np.ndarray:
+    """Values minus their fit by plane, bow and (if given) prediction; zero where nothing was measured."""
+    terms = frozenset({"offset", "bow"}) if prediction is None else frozenset({"offset", "bow", "gain"})
+    basis = term_maps(values if prediction is None else prediction, terms)
+    inside = np.flatnonzero(usable)
+    thinned = inside[:: max(1, len(inside) // _FITTED_PX)]
+    coefficients = least_squares(basis.reshape(len(basis), -1)[:, thinned], values.ravel()[thinned])
+    return np.where(usable, values - np.tensordot(coefficients, basis, axes=1), 0.0)
+
+
+def _band_size(size: int, pitch_um: float) -> int:
+    """Even number of pixels whose Nyquist frequency is the end of the band."""
+    return min(size, 2 * round(size * min(1.0, 2 * pitch_um * _BAND_CYCLES_PER_UM) / 2))
+
+
+def _in_band(field: np.ndarray, band: tuple[int, ...]) -> np.ndarray:
+    """Half spectrum (fy, fx) of a field at the coarser sampling that its band needs."""
+    spectrum = rfft2(field)
+    ny, nx = band
+    half = ny // 2
+    rows = np.concatenate([spectrum[: ny - half], spectrum[len(spectrum) - half :]])
+    return rows[:, : nx // 2 + 1] * (ny * nx / field.size)
+
+
+def _weights(shape: tuple[int, ...], size: tuple[int, int]) -> np.ndarray:
+    """How often each entry of a half spectrum stands in the full one."""
+    weights = np.full(shape, 2.0)
+    weights[:, 0] = 1.0
+    if size[1] % 2 == 0:
+        weights[:, -1] = 1.0
+    return weights
+
+
+def _distance_um(size: tuple[int, int], pitch_um: float) -> np.ndarray:
+    y, x = (np.fft.fftfreq(n, 1 / n) * pitch_um for n in size)
+    return np.hypot(y[:, None], x[None, :])
+
+
+def _reach_um(size: tuple[int, int], pitch_um: float) -> float:
+    return min(SUPPORT_UM, min(size) * pitch_um / 8)

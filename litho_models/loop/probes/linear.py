@@ -1,0 +1,154 @@
+"""Probes that are linear in a few columns: ridge fits from inner products, judged on scans held out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from litho_models.loop.fields import Field
+from litho_models.loop.linear import nuisance_columns, orthonormal
+from litho_models.loop.probes.probe import Estimate
+from litho_models.metrics import NM_PER_UM
+
+# Relative to the mean information per column; the grid is wide, its choice is made on training scans.
+RIDGES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
+# A column that carries less than this part of the strongest one's information is not estimated.
+_IDLE = 1e-6
+
+Summary = Callable[[np.ndarray], dict[str, tuple[float, str]]]
+ColumnsOf = Callable[[Field, np.ndarray], np.ndarray]
+Shuffle = Callable[[np.random.Generator, int], np.ndarray]
+
+
+@dataclass(frozen=True)
+class LinearProbe:
+    """Residual = columns · coefficients, the same coefficients for all scans.
+
+    Attributes:
+        columns_of: (field, prediction (y, x) µm) -> maps (m, y, x).
+        penalty: (m, m), what a ridge fit keeps small.
+        shuffle: (generator, m) -> order of the columns of one scan under the probe's control.
+        summary: coefficients -> figures for people, name to (value, unit).
+        grams, rights: (scans, m, m) and (scans, m), freed of per-scan terms, µm².
+        pixels: (scans,).
+    """
+
+    name: str
+    columns_of: ColumnsOf
+    penalty: np.ndarray
+    shuffle: Shuffle
+    summary: Summary
+    grams: np.ndarray
+    rights: np.ndarray
+    pixels: np.ndarray
+
+    def held_out(self, fold_of: np.ndarray) -> Estimate:
+        """Coefficients without each fold, and the gain of each scan by those that have not seen it."""
+        return _held_out(self.grams, self.rights, self.pixels, self.penalty, fold_of)
+
+    def control(self, fold_of: np.ndarray, random: np.random.Generator) -> float:
+        """Mean held-out gain, nm², after the columns of every scan were shuffled on their own."""
+        grams, rights = np.empty_like(self.grams), np.empty_like(self.rights)
+        for scan in range(len(grams)):
+            order = self.shuffle(random, len(self.penalty))
+            grams[scan], rights[scan] = self.grams[scan][np.ix_(order, order)], self.rights[scan][order]
+        return _held_out(grams, rights, self.pixels, self.penalty, fold_of).mean_gain_nm2
+
+    def agreement(self) -> float:
+        """Correlation of the corrections that two disjoint halves of the scans ask for."""
+        halves = [np.arange(start, len(self.grams), 2) for start in (0, 1)]
+        first, second = (
+            _ridge(self.grams[h].sum(0), self.rights[h].sum(0), self.penalty, 1e-2) for h in halves
+        )
+        pooled = self.grams.sum(axis=0)
+        sizes = np.sqrt(max(first @ pooled @ first, 0.0) * max(second @ pooled @ second, 0.0))
+        return float(first @ pooled @ second / max(sizes, np.finfo(float).tiny))
+
+    def correction(self, parameters: np.ndarray, field: Field, prediction: np.ndarray) -> np.ndarray:
+        """Height to add (y, x), µm."""
+        return np.tensordot(parameters, self.columns_of(field, prediction), axes=1).astype(np.float32)
+
+
+def linear_probe(
+    name: str,
+    columns_of: ColumnsOf,
+    penalty: np.ndarray,
+    shuffle: Shuffle,
+    summary: Summary,
+    fields: Sequence[Field],
+    predictions: Sequence[np.ndarray],
+    kept: Sequence[np.ndarray],
+) -> LinearProbe:
+    """Measure a probe's inner products with the residual on the sampled pixels.
+
+    Args:
+        fields, predictions: scans and their held-out predictions (y, x) µm.
+        kept: bool (n,) per scan, sampled pixels to use: defects are left out.
+    """
+    grams, rights = [], []
+    for field, prediction, use in zip(fields, predictions, kept, strict=True):
+        maps = columns_of(field, prediction)
+        columns = np.stack([field.at_sample(m) for m in maps] + [field.height - field.at_sample(prediction)])
+        columns = columns[:, use].T
+        basis = orthonormal(nuisance_columns(field, prediction, gain=True)[use])
+        columns -= basis @ (basis.T @ columns)
+        products = columns.T @ columns
+        grams.append(products[:-1, :-1])
+        rights.append(products[:-1, -1])
+    pixels = np.array([use.sum() for use in kept])
+    return LinearProbe(name, columns_of, penalty, shuffle, summary, np.stack(grams), np.stack(rights), pixels)
+
+
+def second_differences(count: int) -> np.ndarray:
+    """Penalty (count, count) on the bends of a sequence."""
+    operator = np.diff(np.eye(count), n=2, axis=0)
+    return operator.T @ operator
+
+
+def _held_out(
+    grams: np.ndarray, rights: np.ndarray, pixels: np.ndarray, penalty: np.ndarray, fold_of: np.ndarray
+) -> Estimate:
+    folds = int(fold_of.max()) + 1
+    per_fold = []
+    gains = np.zeros(len(grams))
+    for fold in range(folds):
+        training = fold_of != fold
+        own = _best_ridge(grams[training], rights[training], penalty, fold_of[training])
+        per_fold.append(own)
+        for scan in np.flatnonzero(~training):
+            gains[scan] = _gain(grams[scan], rights[scan], own) / pixels[scan]
+    common = _best_ridge(grams, rights, penalty, fold_of)
+    return Estimate(common=common, per_fold=np.stack(per_fold), gains_nm2=gains * NM_PER_UM**2)
+
+
+def _best_ridge(
+    grams: np.ndarray, rights: np.ndarray, penalty: np.ndarray, fold_of: np.ndarray
+) -> np.ndarray:
+    """The ridge whose fits without a fold do best on that fold, then fitted on all these scans."""
+    totals = []
+    for ridge in RIDGES:
+        total = 0.0
+        for fold in np.unique(fold_of):
+            kept = fold_of != fold
+            if not kept.any():
+                continue
+            own = _ridge(grams[kept].sum(axis=0), rights[kept].sum(axis=0), penalty, ridge)
+            total += _gain(grams[~kept].sum(axis=0), rights[~kept].sum(axis=0), own)
+        totals.append(total)
+    return _ridge(grams.sum(axis=0), rights.sum(axis=0), penalty, RIDGES[int(np.argmax(totals))])
+
+
+def _ridge(gram: np.ndarray, right: np.ndarray, penalty: np.ndarray, ridge: float) -> np.ndarray:
+    information = np.diag(gram)
+    known = information > _IDLE * max(information.max(), np.finfo(float).tiny)
+    own = np.ix_(known, known)
+    weight = ridge * information[known].mean() / max(np.diag(penalty)[known].mean(), np.finfo(float).tiny)
+    coefficients = np.zeros(len(right))
+    coefficients[known] = np.linalg.lstsq(gram[own] + weight * penalty[own], right[known], rcond=1e-10)[0]
+    return coefficients
+
+
+def _gain(gram: np.ndarray, right: np.ndarray, coefficients: np.ndarray) -> float:
+    return float(2 * coefficients @ right - coefficients @ gram @ coefficients)

@@ -1,0 +1,64 @@
+"""What a probe is: a generic term along one covariate, estimated and judged without a name for its cause."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from litho_models.loop.fields import Field
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Parameters on all scans, without each fold, and the gain in squared error on each held-out scan.
+
+    ``common``: (m,); ``per_fold``: (folds, m); ``gains_nm2``: (scans,).
+    """
+
+    common: np.ndarray
+    per_fold: np.ndarray
+    gains_nm2: np.ndarray
+
+    @property
+    def mean_gain_nm2(self) -> float:
+        return float(self.gains_nm2.mean())
+
+
+def figures(probe: Probe, estimate: Estimate) -> dict[str, tuple[float, str, tuple[float, float]]]:
+    """The probe's figures, name to (value, unit, 95 % interval from the jackknife over folds)."""
+    from scipy.stats import t
+
+    folds = [probe.summary(one) for one in estimate.per_fold]
+    count = len(folds)
+    reach = float(t.ppf(0.975, max(count - 1, 1)))
+    found = {}
+    for name, (value, unit) in probe.summary(estimate.common).items():
+        values = np.array([fold[name][0] for fold in folds])
+        half = reach * float(np.sqrt((count - 1) / count * ((values - values.mean()) ** 2).sum()))
+        found[name] = (value, unit, (value - half, value + half))
+    return found
+
+
+class Probe(Protocol):
+    """One generic term; it says where a residual lives, not why."""
+
+    @property
+    def name(self) -> str:
+        """Identifier in the result."""
+
+    def held_out(self, fold_of: np.ndarray) -> Estimate:
+        """Fit without each fold; ``fold_of``: (scans,)."""
+
+    def control(self, fold_of: np.ndarray, random: np.random.Generator) -> float:
+        """Mean held-out gain, nm², of the same fit where there can be nothing to find."""
+
+    def agreement(self) -> float:
+        """Correlation of what two disjoint halves of the scans ask for."""
+
+    def summary(self, parameters: np.ndarray) -> dict[str, tuple[float, str]]:
+        """Figures for people: name to (value, unit)."""
+
+    def correction(self, parameters: np.ndarray, field: Field, prediction: np.ndarray) -> np.ndarray:
+        """Height to add (y, x), µm, to a prediction (y, x), µm."""

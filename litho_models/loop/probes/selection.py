@@ -1,0 +1,150 @@
+"""Add generic terms where no named effect wins: forward selection on held-out scans, against controls."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from litho_models.loop.confirming import SMALLEST_SHARE, Confirmation, confirm
+from litho_models.loop.fields import Field
+from litho_models.loop.probes.covariates import level_table, position_map
+from litho_models.loop.probes.defects import Defects, find_defects
+from litho_models.loop.probes.kernel import missing_kernel
+from litho_models.loop.probes.probe import Estimate, Probe
+from litho_models.loop.probes.trend import OrderTrend, order_trends
+from litho_models.loop.scoring import Score, Terms, score
+from litho_models.loop.search import State
+
+CONTROLS = 199
+CONTROL_QUANTILE = 0.95
+SMALLEST_AGREEMENT = 0.7
+
+
+@dataclass(frozen=True)
+class ProbeTest:
+    """One probe's evidence when last tried; ``control_nm2`` and ``agreement`` are NaN if not reached."""
+
+    name: str
+    gain_nm2: float
+    control_nm2: float
+    agreement: float
+    reason: str
+
+
+@dataclass(frozen=True)
+class AddedProbe:
+    """A probe taken into the prediction, with its estimate and held-out errors before and after."""
+
+    probe: Probe
+    estimate: Estimate
+    before: Score
+    after: Score
+    confirmation: Confirmation
+    p_control: float
+
+
+@dataclass(frozen=True)
+class Probed:
+    """What the probes found; ``state`` has the chain's fits and the corrected held-out predictions."""
+
+    state: State
+    added: list[AddedProbe]
+    tests: list[ProbeTest]
+    defects: Defects
+    trends: list[OrderTrend]
+
+    def apply(self, field: Field, prediction: np.ndarray) -> np.ndarray:
+        """Add the accepted terms, estimated on all development scans, to the prediction of a new scan."""
+        for entry in self.added:
+            prediction = prediction + entry.probe.correction(entry.estimate.common, field, prediction)
+        return prediction
+
+
+def probe_residual(
+    state: State,
+    fields: Sequence[Field],
+    fold_of: np.ndarray,
+    terms: Terms,
+    *,
+    floor_nm2: float,
+    seed: int,
+    search: bool,
+    report: Callable[[str], None] = lambda message: None,
+) -> Probed:
+    """Look for what has no name in the residual that the named effects leave.
+
+    Args:
+        state: the model after the named effects; ``fields``: development scans.
+        fold_of: fold that holds each scan out; ``terms``: per-scan terms of the scoring.
+        floor_nm2: squared noise floor or its lower bound.
+        search: whether the residual is structured; otherwise only defects and trends are looked at.
+    """
+    defects = find_defects(fields, state.predictions)
+    trends = order_trends(fields, state.predictions, seed)
+    added: list[AddedProbe] = []
+    tests: dict[str, ProbeTest] = {}
+    while search:
+        taken = {entry.probe.name for entry in added}
+        candidates = [p for p in _probes(fields, state.predictions, defects) if p.name not in taken]
+        found = _best(candidates, state, fields, fold_of, terms, floor_nm2, seed, tests, report)
+        if found is None:
+            break
+        entry, state = found
+        added.append(entry)
+    return Probed(state, added, list(tests.values()), defects, trends)
+
+
+def _probes(fields: Sequence[Field], predictions: Sequence[np.ndarray], defects: Defects) -> list[Probe]:
+    kept = [~mask.reshape(-1)[field.sample] for mask, field in zip(defects.masks, fields, strict=True)]
+    table = level_table(fields, predictions, kept)
+    maps = [position_map(fields, predictions, kept, times_height=times) for times in (False, True)]
+    kernel = missing_kernel(fields, predictions, defects.masks)
+    return [*([table] if table else []), *maps, kernel]
+
+
+def _best(
+    candidates: Sequence[Probe],
+    state: State,
+    fields: Sequence[Field],
+    fold_of: np.ndarray,
+    terms: Terms,
+    floor_nm2: float,
+    seed: int,
+    tests: dict[str, ProbeTest],
+    report: Callable[[str], None],
+) -> tuple[AddedProbe, State] | None:
+    """The probe with the largest held-out gain that passes every rule, and the state with it."""
+    before = score(fields, state.predictions, terms, seed)
+    estimates = [(probe, probe.held_out(fold_of)) for probe in candidates]
+    for probe, estimate in sorted(estimates, key=lambda e: -e[1].mean_gain_nm2):
+        gain = estimate.mean_gain_nm2
+        nothing = ProbeTest(probe.name, gain, np.nan, np.nan, "")
+        if gain < SMALLEST_SHARE * before.mse_nm2.mean():
+            tests[probe.name] = replace(nothing, reason="gain on held-out scans too small to matter")
+            continue
+        report(f"probing with {probe.name}")
+        random = np.random.default_rng([seed, 7])
+        controls = np.array([probe.control(fold_of, random) for _ in range(CONTROLS)])
+        limit = float(np.quantile(controls, CONTROL_QUANTILE))
+        agreement = probe.agreement()
+        corrected = [
+            p + probe.correction(estimate.per_fold[fold], field, p)
+            for field, p, fold in zip(fields, state.predictions, fold_of, strict=True)
+        ]
+        after = score(fields, corrected, terms, seed)
+        confirmation = confirm(
+            before.mse_nm2, after.mse_nm2, before.mae_nm, after.mae_nm, floor_nm2=floor_nm2, seed=seed
+        )
+        reasons = [confirmation.reason] if confirmation.reason else []
+        if gain <= limit:
+            reasons.append("no more gain than its control")
+        if agreement < SMALLEST_AGREEMENT:
+            reasons.append(f"two halves of the scans agree by {agreement:.2f} only")
+        tests[probe.name] = ProbeTest(probe.name, gain, limit, agreement, "; ".join(reasons))
+        if not reasons:
+            p_control = float((1 + (controls >= gain).sum()) / (CONTROLS + 1))
+            entry = AddedProbe(probe, estimate, before, after, confirmation, p_control)
+            return entry, State(state.fits, corrected)
+    return None

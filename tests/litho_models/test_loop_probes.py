@@ -1,0 +1,160 @@
+"""Probes: what is planted comes back where it was planted; where nothing is, nothing is taken."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter
+
+from litho_models.loop.fields import Field, prepare_fields
+from litho_models.loop.fitting import FoldFits
+from litho_models.loop.probes import Probed, figures, probe_residual
+from litho_models.loop.probes.covariates import SPOT_UM, drawn
+from litho_models.loop.probes.defects import find_defects
+from litho_models.loop.probes.kernel import off_centre_peak, resampled
+from litho_models.loop.probes.trend import order_trends
+from litho_models.loop.search import State
+from tests.litho_models.loop_scans import printed_scans, true_model
+
+COUNT, SIZE_PX, NOISE_UM = 10, 128, 0.006
+FOLD_OF = np.arange(COUNT) % 5
+
+
+def scene(
+    change: Callable[[Field], np.ndarray] | None = None, seed: int = 3
+) -> tuple[list[Field], list[np.ndarray]]:
+    """Scans of a known model with a change added to their height, and the known model's predictions."""
+    scans = printed_scans(count=COUNT, size_px=SIZE_PX, noise_um=NOISE_UM, seed=seed)
+    chain = true_model({})
+    predictions = []
+    for field in prepare_fields(scans):
+        with torch.no_grad():
+            predictions.append(chain(field.layout, field.context)[0, 0].numpy())
+    if change is not None:
+        scans = [
+            replace(f.scan, height_um=(f.scan.height_um + change(f)).astype(np.float32))
+            for f in prepare_fields(scans)
+        ]
+    return prepare_fields(scans), predictions
+
+
+def probed(fields: list[Field], predictions: list[np.ndarray]) -> Probed:
+    nothing = np.empty(0)
+    fits = FoldFits(true_model({}), nothing, np.empty((5, 0)), np.empty((0, 0)), [])
+    return probe_residual(
+        State(fits, predictions), fields, FOLD_OF, frozenset({"offset", "bow"}),
+        floor_nm2=(1e3 * NOISE_UM) ** 2, seed=0, search=True,
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_nothing_is_taken_where_nothing_is_missing() -> None:
+    found = probed(*scene())
+    assert found.added == []
+    assert all(test.reason for test in found.tests)
+
+
+@pytest.mark.slow
+def test_a_response_displaced_from_the_layout_comes_back_in_place_and_size() -> None:
+    """A ghost of 3 % of the layout, 0.8 µm down and 0.6 µm to the left."""
+    found = probed(*scene(lambda f: 0.03 * np.roll(f.scan.layout_um, (8, -6), (0, 1))))
+    assert found.added[0].probe.name == "missing-kernel"
+    entry = found.added[0]
+    values = {name: value for name, (value, _, _) in figures(entry.probe, entry.estimate).items()}
+    # EFFECTS asks for 1 px = 0.1 µm in place; the peak is read on a grid of 0.05 µm.
+    assert values["peak_y"] == pytest.approx(0.8, abs=0.1)
+    assert values["peak_x"] == pytest.approx(-0.6, abs=0.1)
+    assert values["peak_amplitude"] == pytest.approx(0.03, rel=0.2)
+    assert entry.after.rmse_nm < 0.5 * (entry.before.rmse_nm + 1e3 * NOISE_UM)
+
+
+@pytest.mark.slow
+def test_a_wrong_level_comes_back_at_its_level() -> None:
+    """Level 6 printed 50 nm too high, spread by the spot like everything printed."""
+
+    def one_level(field: Field) -> np.ndarray:
+        sigma_px = SPOT_UM / field.scan.pitch_um
+        return 0.05 * gaussian_filter((field.scan.mask_level == 6).astype(float), sigma_px, mode="nearest")
+
+    found = probed(*scene(one_level))
+    entry = next(e for e in found.added if e.probe.name == "level-table")
+    values = figures(entry.probe, entry.estimate)
+    heights = np.array([value for value, _, _ in values.values()])
+    levels = [int(name.removeprefix("level_")) for name in values]
+    own = heights[levels.index(6)] - (heights[levels.index(5)] + heights[levels.index(7)]) / 2
+    assert levels[int(np.argmax(heights))] == 6
+    # The second difference at the level is what no datum, gain or slope over levels can carry.
+    assert own == pytest.approx(50, rel=0.2)
+
+
+@pytest.mark.slow
+def test_a_map_that_all_scans_share_is_found_and_drawn() -> None:
+    def ripple(field: Field) -> np.ndarray:
+        y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in field.scan.shape), indexing="ij")
+        return 0.012 * np.sin(3 * x + 1) * np.cos(3.5 * y)
+
+    found = probed(*scene(ripple))
+    entry = found.added[0]
+    assert entry.probe.name == "position-map"
+    planted = ripple(scene()[0][0])[:: SIZE_PX // 32, :: SIZE_PX // 32]
+    size = planted.shape[0]
+    y, x = np.meshgrid(*(np.linspace(-1, 1, size),) * 2, indexing="ij")
+    plane_and_bow = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y]).reshape(6, -1).T
+
+    def fine(values: np.ndarray) -> np.ndarray:
+        fitted = plane_and_bow @ np.linalg.lstsq(plane_and_bow, values.ravel(), rcond=None)[0]
+        return values.ravel() - fitted
+
+    estimate = drawn(entry.estimate.common, size)
+    assert np.corrcoef(fine(estimate), fine(planted))[0, 1] > 0.9
+
+
+def test_blobs_are_found_and_their_place_is_told() -> None:
+    """Blobs of 8 robust standard deviations: EFFECTS asks for a recall of 0.9."""
+    spots = [(20, 30), (60, 90), (100, 40)]
+
+    def blobs(field: Field) -> np.ndarray:
+        change = np.zeros(field.scan.shape)
+        for y, x in spots:
+            change[y - 2 : y + 3, x - 2 : x + 3] = 8 * NOISE_UM * (1 if y != 60 else -1)
+        return change
+
+    fields, predictions = scene(blobs)
+    found = find_defects(fields, predictions)
+    first = [b for b in found.blobs if b.scan == fields[0].id]
+    near = [
+        min((abs(b.y_um - y / 10) + abs(b.x_um - x / 10) for b in first), default=9.0) < 0.2 for y, x in spots
+    ]
+    assert sum(near) == len(spots)
+    assert len(found.blobs) >= 0.9 * len(spots) * COUNT
+    assert {np.sign(b.peak_nm) for b in first} == {-1.0, 1.0}
+    assert not any(b.row_limited for b in first)
+    clean_fields, clean_predictions = scene()
+    assert not find_defects(clean_fields, clean_predictions).blobs
+
+
+def test_a_step_in_the_order_of_printing_is_told_from_none() -> None:
+    later = {f.id for f in scene()[0][6:]}
+    fields, predictions = scene(lambda f: np.full(f.scan.shape, 0.06 * (f.id in later)))
+    offset, gain = order_trends(fields, predictions)
+    assert offset.step_p < 0.05
+    assert offset.step_after == fields[5].id
+    # Ten datums of 20 nm: the two means differ by 20 sqrt(1/6 + 1/4) = 13 nm, three of which are allowed.
+    assert offset.step == pytest.approx(60, abs=39)
+    assert gain.step_p > 0.05
+    mean, _, step = offset.left_out
+    assert step < mean
+
+
+def test_a_kernel_filters_alike_at_any_sampling() -> None:
+    coarse = np.zeros((64, 64))
+    coarse[3, 60] = 0.02
+    coarse = gaussian_filter(coarse, 1.0, mode="wrap")
+    fine = resampled(coarse, 0.2, 0.1)
+    assert fine.sum() == pytest.approx(coarse.sum(), rel=1e-3)
+    y, x, _ = off_centre_peak(coarse, 0.2)
+    assert (y, x) == pytest.approx((0.6, -0.8), abs=0.05)
