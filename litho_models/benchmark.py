@@ -37,7 +37,7 @@ from litho_models.scores import (
 )
 from litho_models.splits import ids_sha256
 from litho_models.tiles import predict_scan
-from litho_models.training import TrainingConfig, fit_with_record
+from litho_models.training import TrainingConfig, fit_in_cache
 from litho_models.training.fit import common_geometry, run_key
 
 BASELINES = ("identity", "affine", "affine-mtf", "blur-table", "linear")
@@ -178,7 +178,7 @@ def _fit_or_load(
     key = run_key(untrained, fold.training, config, held_out_ids)
     folder = cache / f"{name}-{key[:16]}"
     if not (folder / "fit.json").exists():
-        fitted = fit_with_record(name, fold.training, config, checkpoint=cache / f"{folder.name}.checkpoint")
+        fitted = fit_in_cache(name, fold.training, config, cache)
         record = FitRecord(
             model=name,
             fold=fold.number,

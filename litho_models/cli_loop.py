@@ -35,6 +35,15 @@ def close_loop(
         bool, typer.Option("--open-lock-box", help="also score the locked scans; do this once")
     ] = False,
     folds: Annotated[int, typer.Option("--folds", min=2, help="outer folds, by scan")] = 6,
+    steps: Annotated[
+        int | None, typer.Option("--steps", min=1, help="optimiser steps of a network as base, per fold")
+    ] = None,
+    cache: Annotated[
+        Path | None,
+        typer.Option(
+            "--cache", help="folder of trained folds, e.g. of a benchmark; beside --out by default"
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="folds, locked scans, bootstrap")] = 0,
 ) -> None:
     """Find what a model lacks on measured prints, add it, and report the error on held-out scans (nm)."""
@@ -52,6 +61,8 @@ def close_loop(
         out,
         base=base,
         config=config,
+        steps=steps,
+        cache=cache,
         report=lambda message: print(message, file=sys.stderr, flush=True),
     )
     print(f"verdict: {result.verdict}")

@@ -32,6 +32,8 @@ def close_loop_on_store(
     *,
     base: str = "physics",
     config: LoopConfig | None = None,
+    steps: int | None = None,
+    cache: str | Path | None = None,
     report: Callable[[str], None] = lambda message: None,
 ) -> CloseLoop:
     """Close the loop on a dataset store and write everything to ``out``, which appears when complete.
@@ -40,6 +42,9 @@ def close_loop_on_store(
         store: a store made by ``litho-data build``.
         base: name of a model, or the folder of a frozen one.
         config: settings; ``report`` is told what happens, a sentence at a time.
+        steps: optimiser steps of a base that is trained per fold; the recipe's by default.
+        cache: folder where such trainings are kept and continued, by default beside ``out``; that of a
+            benchmark with the same folds and settings spares its trainings.
 
     Raises:
         InputError: no store, no such base, a base of another pitch, or too few usable scans.
@@ -53,7 +58,9 @@ def close_loop_on_store(
     usable = [scan for scan in scans if np.count_nonzero(scan.valid & np.isfinite(scan.height_um)) >= 1024]
     kept = {scan.id for scan in usable}
     dropped = [f"{scan.id}: fewer than 1024 measured pixels" for scan in scans if scan.id not in kept]
-    trainer = _trainer(base, config) if base in MODELS and not is_stiff(simulator) else None
+    trainer = None
+    if base in MODELS and not is_stiff(simulator):
+        trainer = _trainer(base, config, steps, Path(cache or f"{out}-cache"))
     closed = close_loop(usable, simulator, config, trainer=trainer, report=report)
     result = summarise(closed, dataset=(opened.name, opened.sha256), base_name=name, dropped=dropped)
     with atomic_folder(out) as folder:
@@ -80,11 +87,12 @@ def parse_priors(text: str | None) -> tuple[str, ...]:
     return tuple(get_effect(name).name for name in names if name)
 
 
-def _trainer(base: str, config: LoopConfig | None) -> Trainer:
-    from litho_models.training import TrainingConfig, fit
+def _trainer(base: str, config: LoopConfig | None, steps: int | None, cache: Path) -> Trainer:
+    from litho_models.training import TrainingConfig, fit_in_cache
 
-    settings = TrainingConfig.of_recipe("fast", base, seed=config.seed if config else 0)
-    return lambda scans: fit(base, scans, settings)
+    given = {} if steps is None else {"steps": steps}
+    settings = TrainingConfig.of_recipe("fast", base, seed=config.seed if config else 0, **given)
+    return lambda scans: fit_in_cache(base, scans, settings, cache).model
 
 
 def _base_model(base: str, store: Store) -> tuple[Simulator, str]:

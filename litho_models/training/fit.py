@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from litho_data.errors import InputError
@@ -81,11 +82,9 @@ def fit_with_record(
         folder = None
         if checkpoint is not None:
             folder = CheckpointFolder(checkpoint, run_key(model, scans, config))
-        stiff = build_model(STIFF_MODEL, **geometry)
-        if config.nuisance != "none":
-            fit_gauss_newton(stiff, training, config.nuisance, config.free_gain)
-        first = [predict_scan(stiff, scan) for scan in training]
-        history = train_network(model, training, validation, config, first, folder)
+        history = train_network(
+            model, training, validation, config, lambda: _stiff_predictions(training, config), folder
+        )
     return Fitted(
         model=model.eval(),
         training_ids=[scan_id for scan_id in ids if scan_id not in validation_ids],
@@ -93,6 +92,26 @@ def fit_with_record(
         history=history,
         seconds=time.monotonic() - started,
     )
+
+
+def fit_in_cache(
+    model_name: str, scans: Sequence[PrintedScan], config: TrainingConfig, cache: Path
+) -> Fitted:
+    """As ``fit_with_record``, continued from (and kept in) a folder of ``cache`` named after its key.
+
+    Benchmark and loop that train the same model on the same scans find each other's work there.
+    """
+    untrained = build_model(model_name, config.variant, **common_geometry(scans))
+    name = f"{model_name}-{run_key(untrained, scans, config)[:16]}"
+    return fit_with_record(model_name, scans, config, checkpoint=cache / f"{name}.checkpoint")
+
+
+def _stiff_predictions(scans: Sequence[PrintedScan], config: TrainingConfig) -> list[np.ndarray]:
+    """Heights of a stiff model fitted to the scans, from which a network's first nuisances come."""
+    stiff = build_model(STIFF_MODEL, **common_geometry(scans))
+    if config.nuisance != "none":
+        fit_gauss_newton(stiff, scans, config.nuisance, config.free_gain)
+    return [predict_scan(stiff, scan) for scan in scans]
 
 
 def run_key(

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, cast
 
@@ -41,13 +41,14 @@ def train_network(
     training: Sequence[PrintedScan],
     validation: Sequence[PrintedScan],
     config: TrainingConfig,
-    first_predictions_um: Sequence[np.ndarray],
+    first_predictions_um: Callable[[], Sequence[np.ndarray]],
     checkpoints: CheckpointFolder | None = None,
 ) -> list[RoundRecord]:
     """Train ``model`` in place; it ends with the weights of the best round on ``validation``.
 
-    Without validation scans the last round counts. ``first_predictions_um`` are the heights of a
-    stiff model on the training scans, from which the first nuisances are estimated.
+    Without validation scans the last round counts. ``first_predictions_um`` makes the
+    heights of a stiff model on the training scans, from which the first nuisances are estimated; a run
+    that continues has no need of it.
     """
     if model.tile is not None and config.crops == "random":
         config = config.model_copy(update={"crop_px": model.tile.size_px})
@@ -64,7 +65,7 @@ def train_network(
         if last <= state.step:
             continue
         started = time.monotonic()
-        predictions = [predict_scan(model, scan) for scan in training] if first else first_predictions_um
+        predictions = [predict_scan(model, scan) for scan in training] if first else first_predictions_um()
         nuisances = estimate_nuisances(training, predictions, config.nuisance, config.free_gain)
         targets = _Targets(training, nuisances, _overhang_px(model, training, config))
         losses = []

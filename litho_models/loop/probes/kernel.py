@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.fft import irfft2, rfft2
+from scipy.fft import irfft2, rfft2
 from scipy.ndimage import label
 from scipy.signal import fftconvolve
 
@@ -55,18 +55,26 @@ class MissingKernel:
 
     def held_out(self, fold_of: np.ndarray) -> Estimate:
         """Kernels (flattened, support cut) without each fold and their gain on each held-out scan."""
-        cross = np.conj(self.layouts) * self.residuals
-        power = np.abs(self.layouts) ** 2
-        choice = self._best_regularisation(cross, power, fold_of)
-        return self._estimate(cross, power, fold_of, choice)
+        cross, power = np.conj(self.layouts) * self.residuals, np.abs(self.layouts) ** 2
+        sums = _by_fold(cross, fold_of), _by_fold(power, fold_of)
+        choice = max(REGULARISATIONS, key=lambda c: self._pooled_gain(*sums, c))
+        kernels = self._without_each(*sums, choice)
+        gains = np.zeros(len(cross))
+        for fold, kernel in enumerate(kernels):
+            for scan in np.flatnonzero(fold_of == fold):
+                gains[scan] = self._gain(kernel, cross[scan], power[scan])
+        common = self._kernel(sums[0].sum(axis=0), sums[1].sum(axis=0), choice).ravel()
+        per_fold = np.stack([kernel.ravel() for kernel in kernels])
+        return Estimate(common=common, per_fold=per_fold, gains_nm2=gains)
 
     def control(self, fold_of: np.ndarray, random: np.random.Generator) -> float:
         """Mean held-out gain, nm², with every residual next to the layout of another scan."""
         count = len(self.layouts)
-        layouts = self.layouts[(np.arange(count) + random.integers(1, count)) % count]
-        layouts = layouts * random.choice([-1.0, 1.0], size=(count, 1, 1))
-        swapped = MissingKernel(layouts, self.residuals, self.size, self.pixels, self.pitch_um)
-        return swapped.held_out(fold_of).mean_gain_nm2
+        other = (np.arange(count) + random.integers(1, count)) % count
+        signs = random.choice([-1.0, 1.0], size=(count, 1, 1))
+        cross = np.conj(self.layouts[other]) * self.residuals * signs.astype(np.float32)
+        sums = _by_fold(cross, fold_of), _by_fold(np.abs(self.layouts[other]) ** 2, fold_of)
+        return max(self._pooled_gain(*sums, c) for c in REGULARISATIONS) / count
 
     def agreement(self) -> float:
         """Correlation over all layouts of the responses that two halves of the scans ask for."""
@@ -107,29 +115,25 @@ class MissingKernel:
         """The kernel with its origin in the middle, (y, x), per pixel of the band."""
         return np.fft.fftshift(parameters.reshape(self.size))
 
-    def _estimate(
-        self, cross: np.ndarray, power: np.ndarray, fold_of: np.ndarray, regularisation: float
-    ) -> Estimate:
-        folds = int(fold_of.max()) + 1
-        weights = _weights(power.shape[1:], self.size)
-        kernels, gains = [], np.zeros(len(cross))
+    def _without_each(self, cross: np.ndarray, power: np.ndarray, regularisation: float) -> list[np.ndarray]:
+        """Kernels from the sums of all folds but one; ``cross``, ``power``: (folds, fy, fx)."""
         all_cross, all_power = cross.sum(axis=0), power.sum(axis=0)
-        for fold in range(folds):
-            own = fold_of == fold
-            kernel = self._kernel(
-                all_cross - cross[own].sum(axis=0), all_power - power[own].sum(axis=0), regularisation
-            )
-            transfer = rfft2(kernel)
-            for scan in np.flatnonzero(own):
-                agreed = 2 * (np.conj(transfer) * cross[scan]).real - np.abs(transfer) ** 2 * power[scan]
-                gains[scan] = float((weights * agreed).sum()) / (np.prod(self.size) * self.pixels)
-            kernels.append(kernel.ravel())
-        common = self._kernel(all_cross, all_power, regularisation).ravel()
-        return Estimate(common=common, per_fold=np.stack(kernels), gains_nm2=gains * NM_PER_UM**2)
+        return [
+            self._kernel(all_cross - own_cross, all_power - own_power, regularisation)
+            for own_cross, own_power in zip(cross, power, strict=True)
+        ]
 
-    def _best_regularisation(self, cross: np.ndarray, power: np.ndarray, fold_of: np.ndarray) -> float:
-        gains = [self._estimate(cross, power, fold_of, c).mean_gain_nm2 for c in REGULARISATIONS]
-        return REGULARISATIONS[int(np.argmax(gains))]
+    def _pooled_gain(self, cross: np.ndarray, power: np.ndarray, regularisation: float) -> float:
+        """Held-out gain summed over all scans, nm²."""
+        kernels = self._without_each(cross, power, regularisation)
+        return sum(self._gain(k, c, p) for k, c, p in zip(kernels, cross, power, strict=True))
+
+    def _gain(self, kernel: np.ndarray, cross: np.ndarray, power: np.ndarray) -> float:
+        """Gain in mean squared error, nm², summed over the scans whose spectra were summed."""
+        transfer = rfft2(kernel)
+        agreed = 2 * (np.conj(transfer) * cross).real - np.abs(transfer) ** 2 * power
+        weights = _weights(power.shape, self.size)
+        return float((weights * agreed).sum()) / (np.prod(self.size) * self.pixels) * NM_PER_UM**2
 
     def _kernel(self, cross: np.ndarray, power: np.ndarray, regularisation: float) -> np.ndarray:
         """Kernel (y, x), origin in the corner, zero beyond the support; its far ring is its zero."""
@@ -170,8 +174,8 @@ def missing_kernel(
             target.append(_in_band(taper * freed[top : top + size[0], left : left + size[1]], band))
     coarser = size[0] / band[0]
     return MissingKernel(
-        layouts=np.stack(layouts),
-        residuals=np.stack(residuals),
+        layouts=np.stack(layouts).astype(np.complex64),
+        residuals=np.stack(residuals).astype(np.complex64),
         size=(band[0], band[1]),
         pixels=float((taper**2).mean() * band[0] * band[1]),
         pitch_um=pitch_um * coarser,
@@ -191,6 +195,11 @@ def resampled(kernel: np.ndarray, pitch_um: float, wanted_um: float) -> np.ndarr
     columns = np.exp(2j * np.pi * np.outer(offsets, np.fft.fftfreq(nx)))
     spectrum = np.fft.fft2(kernel)
     return (rows @ spectrum @ columns.T).real / (ny * nx) / factor**2
+
+
+def _by_fold(values: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
+    """Sums over the scans of each fold (folds, …)."""
+    return np.stack([values[fold_of == fold].sum(axis=0) for fold in range(int(fold_of.max()) + 1)])
 
 
 def off_centre_peak(kernel: np.ndarray, pitch_um: float) -> tuple[float, float, float]:

@@ -146,7 +146,8 @@ def _ridge(gram: np.ndarray, right: np.ndarray, penalty: np.ndarray, ridge: floa
     own = np.ix_(known, known)
     weight = ridge * information[known].mean() / max(np.diag(penalty)[known].mean(), np.finfo(float).tiny)
     coefficients = np.zeros(len(right))
-    coefficients[known] = np.linalg.lstsq(gram[own] + weight * penalty[own], right[known], rcond=1e-10)[0]
+    # Every penalty has some weight on the size, so that the system has one solution.
+    coefficients[known] = np.linalg.solve(gram[own] + weight * penalty[own], right[known])
     return coefficients
 
 
