@@ -1,24 +1,22 @@
 """Levelling speed on one 540 x 540 scan, beside the time of Gwyddion's C library where it is known.
 
-    OMP_NUM_THREADS=1 python benchmarks/levelling.py --out FOLDER [--scan FILE --unit m]
+    OMP_NUM_THREADS=1 python -m benchmarks.levelling --out FILE.json [--scan FILE --unit m] [--publish]
 
-Prints one table and writes `levelling.json` and `levelling.csv`. Best and median of many runs.
+Best and median of many runs of each method. --publish also writes the table into docs/levelling.md.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
-import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import pandas as pd
 
-from litho_data.files import atomic_file
+from benchmarks.record import publish, usable_cores, write_record
 from litho_data.level import (
     align_rows,
     level_facet,
@@ -34,6 +32,9 @@ from litho_data.level.facet import facet_pass
 from litho_data.readers import read_scan
 from litho_data.results import software_versions
 
+PAGE = Path(__file__).parents[1] / "docs" / "levelling.md"
+RESULT = PAGE.parent / "results" / "levelling" / "levelling.json"
+NAME = "levelling.json"
 SHAPE = (540, 540)
 PITCH_UM = (0.1, 0.1)
 # Gwyddion 2.62's C functions on a field of this size, ms, on the machine class of this project.
@@ -52,31 +53,49 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--out", type=Path, required=True, help="folder for levelling.json and levelling.csv")
+    parser.add_argument("--out", type=Path, default=RESULT, help="JSON file to write")
     parser.add_argument("--scan", type=Path, help="a 540 x 540 scan; by default an artificial one")
     parser.add_argument("--unit", help="unit of its heights where the file states none")
     parser.add_argument("--repeats", type=int, default=50)
+    parser.add_argument("--publish", action="store_true", help="write the table into docs/levelling.md")
     arguments = parser.parse_args()
     height_um = (
         artificial_scan()
         if arguments.scan is None
         else read_scan(arguments.scan, unit=arguments.unit).height_um
     )
-    table = measure(height_um, arguments.repeats)
-    print(table.to_string(index=False, float_format=lambda value: f"{value:.2f}", na_rep=""))
-    arguments.out.mkdir(parents=True, exist_ok=True)
-    table.to_csv(arguments.out / "levelling.csv", index=False)
     record = {
         "schema": "litho-data/benchmark-levelling/1",
-        "shape": list(height_um.shape),
         "scan": "artificial" if arguments.scan is None else arguments.scan.name,
-        "machine": platform.processor() or platform.machine(),
+        "shape": list(height_um.shape),
+        "repeats": arguments.repeats,
+        "machine": {"cores": usable_cores()},
         "threads": os.environ.get("OMP_NUM_THREADS", "as many as there are cores"),
         "versions": software_versions(),
-        "rows": json.loads(table.to_json(orient="records")),
+        "goal": GOAL,
+        "methods": measure(height_um, arguments.repeats),
     }
-    with atomic_file(arguments.out / "levelling.json") as temporary:
-        temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    write_record(arguments.out, record)
+    print(as_markdown(record))
+    if arguments.publish:
+        publish(PAGE, NAME, as_markdown(record))
+
+
+def as_markdown(record: Mapping[str, Any]) -> str:
+    """The measurement as a table, with what it was measured on."""
+    ny, nx = record["shape"]
+    rows = [
+        f"| {row['method']} | {row['best_ms']:.2f} | {row['median_ms']:.2f} "
+        + ("| | |" if row["gwyddion_ms"] is None else f"| {row['gwyddion_ms']:g} | {row['ratio']:.2f} |")
+        for row in record["methods"]
+    ]
+    return (
+        f"One {ny} × {nx} scan ({record['scan']}), {record['machine']['cores']} cores, threads: "
+        f"{record['threads']}, best and median of {record['repeats']} runs, numpy "
+        f"{record['versions']['numpy']}.\n\n"
+        "| method | best, ms | median, ms | Gwyddion, ms | best / Gwyddion |\n|---|---|---|---|---|\n"
+        + "\n".join(rows)
+    )
 
 
 def artificial_scan() -> np.ndarray:
@@ -90,27 +109,25 @@ def artificial_scan() -> np.ndarray:
     return 0.5 + 0.15 * blobs / blobs.std() + rows + tilt + 0.004 * rng.normal(size=SHAPE)
 
 
-def measure(height_um: np.ndarray, repeats: int) -> pd.DataFrame:
+def measure(height_um: np.ndarray, repeats: int) -> list[dict[str, Any]]:
     """One row per method: best and median time in ms, Gwyddion's, and the ratio of the best to it."""
     # One large free makes the C allocator keep its pages, as in any process that has read a few scans.
     np.ones(1 << 22).sum()
     rows = []
     for name, run in cases(height_um).items():
         run()
-        times_ms = np.array([timed_ms(run) for _ in range(repeats)])
-        gwyddion_ms = GWYDDION_MS.get(name, np.nan)
-        best_ms = float(times_ms.min())
+        times_ms = [timed_ms(run) for _ in range(repeats)]
+        best_ms, gwyddion_ms = min(times_ms), GWYDDION_MS.get(name)
         rows.append(
             {
                 "method": name,
-                "best_ms": best_ms,
-                "median_ms": float(np.median(times_ms)),
+                "best_ms": round(best_ms, 4),
+                "median_ms": round(float(np.median(times_ms)), 4),
                 "gwyddion_ms": gwyddion_ms,
-                "best_to_gwyddion": best_ms / gwyddion_ms,
-                "goal_met": "" if np.isnan(gwyddion_ms) else "yes" if best_ms <= GOAL * gwyddion_ms else "no",
+                "ratio": None if gwyddion_ms is None else round(best_ms / gwyddion_ms, 4),
             }
         )
-    return pd.DataFrame(rows)
+    return rows
 
 
 def cases(z: np.ndarray) -> dict[str, Callable[[], object]]:

@@ -1,0 +1,188 @@
+"""Time and memory of `litho-data build`, every build in a fresh process.
+
+    python -m benchmarks.build --out FILE.json [--scans 1000] [--workers 2] [--publish]
+
+First the measured prints (LITHO_DATA_DIR says where they are), then many virtual scans. These come from a
+cheap generator, not from the virtual fab: blurred random layouts with white noise, as .npy files. Making them
+is not part of what is measured. --publish also writes the table into docs/dataset_store.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmarks.record import publish, usable_cores, write_record
+from litho_data.layouts import random_layout
+from litho_data.layouts.card_text import write_layout
+from litho_data.results import software_versions
+
+PAGE = Path(__file__).parents[1] / "docs" / "dataset_store.md"
+RESULT = PAGE.parent / "results" / "build" / "build.json"
+NAME = "build.json"
+MEASURED_CARD = Path(__file__).parents[1] / "datasets" / "neural-lithography.toml"
+GOAL_WALL_S, GOAL_PEAK_MIB = 25.0, 1536.0
+_MARGIN_PX = 14
+_SAMPLED_EVERY_S = 0.05
+
+
+class Cost(NamedTuple):
+    """Of one process with all it started. ``peak_mib`` adds resident sets, shared pages each time anew."""
+
+    wall_s: float
+    cpu_s: float
+    peak_mib: float
+
+
+def main() -> None:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, default=RESULT, help="JSON file to write")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument(
+        "--repeats", type=int, default=3, help="builds of the measured prints; 0 leaves them out"
+    )
+    parser.add_argument("--scans", type=int, default=1000, help="virtual scans; 0 leaves them out")
+    parser.add_argument("--size", type=int, default=512, help="side of their layouts, pixels")
+    parser.add_argument("--scratch", type=Path, help="folder for scans and stores; 6 MB per virtual scan")
+    parser.add_argument("--publish", action="store_true", help="write the table into docs/dataset_store.md")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory(dir=arguments.scratch) as scratch:
+        folder = Path(scratch)
+        runs = []
+        if arguments.repeats:
+            runs.append(
+                measure("measured prints", MEASURED_CARD, folder, arguments.workers, arguments.repeats)
+            )
+        if arguments.scans:
+            card = write_virtual_scans(folder / "virtual", arguments.scans, arguments.size)
+            runs.append(measure("virtual scans", card, folder, arguments.workers, repeats=1))
+    record = {
+        "schema": "litho-data/benchmark-build/1",
+        "machine": {"cores": usable_cores()},
+        "versions": software_versions(),
+        "goal": {"wall_s": GOAL_WALL_S, "peak_mib": GOAL_PEAK_MIB},
+        "generator": "blurred random layouts with white noise, .npy",
+        "runs": runs,
+    }
+    write_record(arguments.out, record)
+    print(as_markdown(record))
+    if arguments.publish:
+        publish(PAGE, NAME, as_markdown(record))
+
+
+def as_markdown(record: Mapping[str, Any]) -> str:
+    """The measurement as a table, with what it was measured on."""
+    rows = [
+        f"| {run['scans']} {run['what']} | {run['workers']} | {min(run['wall_s']):.1f} "
+        f"| {max(run['wall_s']):.1f} | {max(run['cpu_s']):.1f} | {max(run['peak_mib']):.0f} |"
+        for run in record["runs"]
+    ]
+    return (
+        f"{record['machine']['cores']} cores. Virtual scans: {record['generator']}.\n\n"
+        "| build of | workers | wall, best, s | wall, worst, s | processor time, s | peak memory, MiB |\n"
+        "|---|---|---|---|---|---|\n" + "\n".join(rows)
+    )
+
+
+def measure(what: str, card: Path, folder: Path, workers: int, repeats: int) -> dict[str, Any]:
+    """Build a card ``repeats`` times, each into a store of its own and in a process of its own."""
+    costs, result = [], {}
+    for _ in range(repeats):
+        with tempfile.TemporaryDirectory(dir=folder) as scratch:
+            store = Path(scratch) / "prints.zarr"
+            command = [Path(sys.executable).with_name("litho-data"), "build", card, "--out", store]
+            costs.append(cost_of([*map(str, command), "--workers", str(workers)]))
+            result = json.loads((Path(scratch) / "prints-report" / "build.json").read_text(encoding="utf-8"))
+    return {
+        "what": what,
+        "scans": result["n_scans"],
+        "skipped": len(result["skipped"]),
+        "workers": workers,
+        **{name: [round(getattr(cost, name), 2) for cost in costs] for name in Cost._fields},
+        "dataset_sha256": result["dataset"]["sha256"],
+    }
+
+
+def cost_of(command: list[str]) -> Cost:
+    """Run a command and watch it and all its descendants.
+
+    Raises:
+        CalledProcessError: it fails.
+    """
+    started = time.perf_counter()
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    peak_bytes, ended = 0, 0
+    try:
+        while not ended:
+            peak_bytes = max(peak_bytes, sum(_resident_bytes(pid) for pid in _with_descendants(process.pid)))
+            time.sleep(_SAMPLED_EVERY_S)
+            ended, status, usage = os.wait4(process.pid, os.WNOHANG)
+    finally:
+        if not ended:
+            process.kill()
+    wall_s = time.perf_counter() - started
+    process.returncode = os.waitstatus_to_exitcode(status)
+    if process.returncode:
+        raise subprocess.CalledProcessError(process.returncode, command)
+    return Cost(wall_s, usage.ru_utime + usage.ru_stime, peak_bytes / 2**20)
+
+
+def write_virtual_scans(folder: Path, count: int, size_px: int) -> Path:
+    """Layouts and scans of ``size_px`` with a margin; returns the card."""
+    from scipy.ndimage import gaussian_filter
+
+    (folder / "scans").mkdir(parents=True)
+    for index in range(count):
+        rng = np.random.default_rng(index)
+        layout = random_layout((size_px, size_px), cutoff_per_um=0.5, seed=rng)
+        write_layout(folder, f"V{index:05}", layout)
+        height_um = gaussian_filter(np.pad(0.08 * layout.astype(np.float32), _MARGIN_PX, mode="edge"), 3.0)
+        height_um += rng.normal(0, 0.01, height_um.shape).astype(np.float32)
+        np.save(folder / "scans" / f"V{index:05}.npy", height_um)
+    side_um = (size_px + 2 * _MARGIN_PX) * 0.1
+    text = (
+        'name = "virtual-scans"\n[layout]\nfiles = "layouts/{id}.tif"\npitch_um = 0.1\n'
+        "level_height_um = 0.1\nlevels = 13\n"
+        '[scan]\nfiles = "scans/{id}.npy"\nformat = "npy"\nunit = "um"\n'
+        f"size_um = [{side_um}, {side_um}]\n"
+    )
+    card = folder / "card.toml"
+    card.write_text(text, encoding="utf-8")
+    return card
+
+
+def _with_descendants(pid: int) -> list[int]:
+    """Linux: the process and all that it started, as far as they live."""
+    found = [pid]
+    for parent in found:
+        try:
+            threads = list(Path(f"/proc/{parent}/task").iterdir())
+            children = [child for thread in threads for child in (thread / "children").read_text().split()]
+        except OSError:
+            continue
+        found += [int(child) for child in children]
+    return found
+
+
+def _resident_bytes(pid: int) -> int:
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, IndexError):
+        return 0
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,51 @@
+"""What the benchmarks share: the machine, a result file, and its place in a page of the documentation."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from litho_data.errors import InputError
+from litho_data.files import atomic_file
+
+NOT_MEASURED = "Not measured yet."
+
+
+def usable_cores() -> int:
+    """Cores that this process may run on."""
+    return len(os.sched_getaffinity(0))
+
+
+def write_record(path: Path, record: Mapping[str, Any]) -> None:
+    """Write a result as JSON."""
+    with atomic_file(path) as temporary:
+        temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+
+
+def publish(page: Path, name: str, text: str) -> None:
+    """Put a text between the two marks of that name in a Markdown page.
+
+    Raises:
+        InputError: a page without the two marks in this order.
+    """
+    before, _, after = _parts(page, name)
+    with atomic_file(page) as temporary:
+        temporary.write_text(f"{before}\n{text}\n{after}", encoding="utf-8")
+
+
+def published(page: Path, name: str) -> str:
+    """What stands between the marks; InputError for a page without them."""
+    return _parts(page, name)[1].strip("\n")
+
+
+def _parts(page: Path, name: str) -> tuple[str, str, str]:
+    """The page up to the first mark, between the marks, and from the second one on; marks belong outside."""
+    start, end = f"<!-- {name}: written by the benchmark -->", f"<!-- end of {name} -->"
+    before, found, rest = page.read_text(encoding="utf-8").partition(start)
+    inside, found_end, after = rest.partition(end)
+    if not found or not found_end:
+        raise InputError(f"marks in {page}", got="not both", wanted=f"{start} … {end}")
+    return before + start, inside, end + after

@@ -1,0 +1,70 @@
+"""The benchmarks of this package measure what they say, and the pages quote what was measured."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import build as build_benchmark
+from benchmarks import levelling as levelling_benchmark
+from benchmarks.record import NOT_MEASURED, publish, published
+from litho_data.errors import InputError
+
+
+@pytest.mark.parametrize("benchmark", [build_benchmark, levelling_benchmark])
+def test_the_page_quotes_the_committed_measurement(benchmark):
+    text = published(benchmark.PAGE, benchmark.NAME)
+    if not benchmark.RESULT.exists():
+        assert text == NOT_MEASURED
+        return
+    assert text == benchmark.as_markdown(json.loads(benchmark.RESULT.read_text(encoding="utf-8")))
+
+
+def test_publishing_replaces_what_stands_between_the_marks(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("top\n<!-- a: written by the benchmark -->\nold\n<!-- end of a -->\nbottom\n")
+    publish(page, "a", "| new |")
+    publish(page, "a", "| newer |")
+    assert published(page, "a") == "| newer |"
+    assert page.read_text().startswith("top\n")
+    assert page.read_text().endswith("-->\nbottom\n")
+    with pytest.raises(InputError, match="marks"):
+        publish(page, "b", "x")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is read from /proc")
+def test_cost_counts_the_memory_and_the_work_of_descendants():
+    child = (
+        "import time; x = bytearray(b'1') * (200 << 20); t = time.process_time()\n"
+        "while time.process_time() < t + 0.3: pass"
+    )
+    parent = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}], check=True)"
+    started = time.perf_counter()
+    cost = build_benchmark.cost_of([sys.executable, "-c", parent])
+    assert 0.3 < cost.wall_s < time.perf_counter() - started + 1e-3
+    assert cost.cpu_s > 0.3
+    # Two interpreters of about 10 MiB each beside the 200.
+    assert 200 < cost.peak_mib < 300
+
+
+def test_levelling_is_compared_where_gwyddions_time_is_known():
+    rows = levelling_benchmark.measure(levelling_benchmark.artificial_scan(), repeats=1)
+    known = {row["method"]: row for row in rows if row["ratio"] is not None}
+    assert set(known) == set(levelling_benchmark.GWYDDION_MS)
+    for row in known.values():
+        # Both times are rounded to four digits after the point.
+        assert row["ratio"] == pytest.approx(row["best_ms"] / row["gwyddion_ms"], abs=2e-4)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="memory is read from /proc")
+def test_virtual_scans_of_the_benchmark_can_be_built(tmp_path: Path):
+    card = build_benchmark.write_virtual_scans(tmp_path / "virtual", 3, 128)
+    run = build_benchmark.measure("virtual scans", card, tmp_path, workers=2, repeats=1)
+    assert (run["scans"], run["skipped"]) == (3, 0)
+    assert np.isfinite([*run["wall_s"], *run["cpu_s"], *run["peak_mib"]]).all()
