@@ -80,13 +80,20 @@ def test_a_wrong_level_comes_back_at_its_level() -> None:
         sigma_px = SPOT_UM / field.scan.pitch_um
         return 0.05 * gaussian_filter((field.scan.mask_level == 6).astype(float), sigma_px, mode="nearest")
 
-    found = probed(*scene(one_level))
+    fields, predictions = scene(one_level)
+    found = probed(fields, predictions)
     entry = next(e for e in found.added if e.probe.name == "level-table")
     values = figures(entry.probe, entry.estimate)
     heights = np.array([value for value, _, _ in values.values()])
     levels = [int(name.removeprefix("level_")) for name in values]
     own = heights[levels.index(6)] - (heights[levels.index(5)] + heights[levels.index(7)]) / 2
     assert levels[int(np.argmax(heights))] == 6
+    # What all scans share stays where it was: a datum that a probe cannot know is not made up.
+    before, after = (
+        np.mean([np.mean(f.scan.height_um - p) for f, p in zip(fields, one, strict=True)])
+        for one in (predictions, found.state.predictions)
+    )
+    assert abs(after) <= abs(before) + 1e-3
     # The second difference at the level is what no datum, gain or slope over levels can carry.
     assert own == pytest.approx(50, rel=0.2)
 

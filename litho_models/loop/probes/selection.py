@@ -35,10 +35,14 @@ class ProbeTest:
 
 @dataclass(frozen=True)
 class AddedProbe:
-    """A probe taken into the prediction, with its estimate and held-out errors before and after."""
+    """A probe taken into the prediction, with its estimate and held-out errors before and after.
+
+    ``anchor``: (offset µm, relative gain) that go with the correction on all development scans.
+    """
 
     probe: Probe
     estimate: Estimate
+    anchor: np.ndarray
     before: Score
     after: Score
     confirmation: Confirmation
@@ -58,7 +62,7 @@ class Probed:
     def apply(self, field: Field, prediction: np.ndarray) -> np.ndarray:
         """Add the accepted terms, estimated on all development scans, to the prediction of a new scan."""
         for entry in self.added:
-            prediction = prediction + entry.probe.correction(entry.estimate.common, field, prediction)
+            prediction = _corrected(entry.probe, entry.estimate.common, entry.anchor, field, prediction)
         return prediction
 
 
@@ -129,8 +133,12 @@ def _best(
         controls = np.array([probe.control(fold_of, random) for _ in range(CONTROLS)])
         limit = float(np.quantile(controls, CONTROL_QUANTILE))
         agreement = probe.agreement()
+        anchors = [
+            _anchor(probe, own, fields, state.predictions, fold_of != fold)
+            for fold, own in enumerate(estimate.per_fold)
+        ]
         corrected = [
-            p + probe.correction(estimate.per_fold[fold], field, p)
+            _corrected(probe, estimate.per_fold[fold], anchors[fold], field, p)
             for field, p, fold in zip(fields, state.predictions, fold_of, strict=True)
         ]
         after = score(fields, corrected, terms, seed)
@@ -145,6 +153,38 @@ def _best(
         tests[probe.name] = ProbeTest(probe.name, gain, limit, agreement, "; ".join(reasons))
         if not reasons:
             p_control = float((1 + (controls >= gain).sum()) / (CONTROLS + 1))
-            entry = AddedProbe(probe, estimate, before, after, confirmation, p_control)
+            everything = np.ones(len(fields), bool)
+            anchor = _anchor(probe, estimate.common, fields, state.predictions, everything)
+            entry = AddedProbe(probe, estimate, anchor, before, after, confirmation, p_control)
             return entry, State(state.fits, corrected)
     return None
+
+
+def _corrected(
+    probe: Probe, parameters: np.ndarray, anchor: np.ndarray, field: Field, prediction: np.ndarray
+) -> np.ndarray:
+    offset_um, gain = anchor.astype(np.float32)
+    return prediction + probe.correction(parameters, field, prediction) + offset_um + gain * prediction
+
+
+def _anchor(
+    probe: Probe,
+    parameters: np.ndarray,
+    fields: Sequence[Field],
+    predictions: Sequence[np.ndarray],
+    training: np.ndarray,
+) -> np.ndarray:
+    """Offset and gain common to the training scans once the correction is made.
+
+    A probe is estimated free of every scan's own datum and gain, so it says nothing about those that
+    all scans share; without this it would move the absolute height at random.
+    """
+    normal, right = np.zeros((2, 2)), np.zeros(2)
+    for i in np.flatnonzero(training):
+        field, prediction = fields[i], predictions[i]
+        here = field.at_sample(prediction)
+        left = field.height - here - field.at_sample(probe.correction(parameters, field, prediction))
+        columns = np.stack([np.ones_like(here), here])
+        normal += columns @ columns.T / len(here)
+        right += columns @ left / len(here)
+    return np.linalg.lstsq(normal, right, rcond=1e-10)[0]
