@@ -18,9 +18,11 @@ from litho_models.noise.surface import NM_PER_UM
 
 # Off every change of level by four σ of the optical spot and two of a diffusion of 0.5 µm.
 GUARD_UM = 1.0
-# A step that prints at less than half its nominal height is lost.
+# A step that prints at less than half of what the steps of its dose usually do is lost.
 LOST_BELOW = 0.5
 _FEWEST_PIXELS = 50
+# Beyond the guard a print still feels its surroundings: diffusion reaches up to 2.5 µm.
+_REACHES_UM = (1.0, 2.0)
 
 
 class LevelHeight(Record):
@@ -40,8 +42,9 @@ class DoseRow(Record):
         height_gain: printed over nominal height, slope of a straight line through the levels.
         full_height_nm: printed height of the highest level above the lowest.
         roughness_nm: rms deviation within areas of one level.
-        lost_low, lost_high: steps at the low and at the high end that print at under half their height:
-            under-exposure (nothing is left there) and over-exposure (the resist has no more to give).
+        lost_low, lost_high: steps at the low and at the high end, per level under half the median step of
+            this dose: under-exposure (nothing is left there) and over-exposure (the resist has no more to
+            give). Relative to the dose's own steps, so that shrinkage does not count as exposure.
         worst_readability: smallest step over σ of its two levels; 3.92 tells single pixels apart.
     """
 
@@ -70,8 +73,8 @@ class DoseMatrix(Record):
 def dose_matrix(scans: Sequence[PrintedScan], guard_um: float = GUARD_UM) -> DoseMatrix | None:
     """Judge the doses of the scans that carry one; None with fewer than two doses.
 
-    Recommended is, among the doses that lose no step at either end, the one whose worst step stands
-    out most from the roughness; if all lose some, the one that loses fewest.
+    Recommended is, among the doses that lose the fewest steps at either end, the one whose height comes
+    nearest to the nominal one.
 
     Raises:
         InputError: doses whose layouts have no area of one level wide enough to measure on.
@@ -83,21 +86,15 @@ def dose_matrix(scans: Sequence[PrintedScan], guard_um: float = GUARD_UM) -> Dos
     if len(by_dose) < 2:
         return None
     rows = [_row(dose, by_dose[dose], guard_um) for dose in sorted(by_dose)]
-    sound = [row for row in rows if not (row.under_exposed or row.over_exposed)]
-    if sound:
-        best = max(sound, key=lambda row: row.worst_readability)
-        readable = (
-            "all levels readable pixel by pixel"
-            if best.worst_readability >= READABLE_AT
-            else (
-                f"its worst step is {best.worst_readability:.2f} σ, under the {READABLE_AT:.2f} σ at which "
-                "single pixels are told apart"
-            )
-        )
-        reason = f"largest worst step over roughness of the {len(sound)} doses that lose no step; {readable}"
-    else:
-        best = min(rows, key=lambda row: (row.lost_low + row.lost_high, -row.worst_readability))
-        reason = f"every dose loses steps; this one loses fewest ({best.lost_low + best.lost_high})"
+    fewest = min(row.lost_low + row.lost_high for row in rows)
+    sound = [row for row in rows if row.lost_low + row.lost_high == fewest]
+    best = min(sound, key=lambda row: abs(row.height_gain - 1))
+    told_apart = "can" if best.worst_readability >= READABLE_AT else "cannot all"
+    reason = (
+        f"of the {len(sound)} doses that lose the fewest steps ({fewest}), its height comes nearest to the "
+        f"nominal one (gain {best.height_gain:.3f}); single pixels of neighbouring levels {told_apart} be "
+        f"told apart (worst step {best.worst_readability:.2f} σ, needed {READABLE_AT:.2f} σ)"
+    )
     return DoseMatrix(rows=rows, recommended_dose=best.dose, reason=reason, guard_um=guard_um)
 
 
@@ -114,7 +111,8 @@ def _row(dose: float, scans: Sequence[PrintedScan], guard_um: float) -> DoseRow:
     sigma = np.array([entry.sigma_nm for entry in levels])
     step = np.diff(height)
     spread = np.maximum(np.sqrt((sigma[1:] ** 2 + sigma[:-1] ** 2) / 2), 1e-4)
-    lost = step < LOST_BELOW * np.diff(nominal)
+    per_level = step / np.diff(nominal)
+    lost = per_level < LOST_BELOW * np.median(per_level)
     lost_low, lost_high = _run_length(lost), _run_length(lost[::-1])
     return DoseRow(
         dose=dose,
@@ -132,7 +130,7 @@ def _row(dose: float, scans: Sequence[PrintedScan], guard_um: float) -> DoseRow:
 
 
 def _level_heights(scans: Sequence[PrintedScan], guard_um: float) -> list[LevelHeight]:
-    """Per level mean and sd of the pixels inside areas of one level; datum and tilt of each scan removed."""
+    """Per level mean and sd inside areas of one level; datum, tilt and surroundings of each scan removed."""
     found: dict[int, list[np.ndarray]] = {}
     for scan in scans:
         inside = _plateaus(scan, guard_um)
@@ -142,12 +140,13 @@ def _level_heights(scans: Sequence[PrintedScan], guard_um: float) -> list[LevelH
         y, x = np.nonzero(inside)
         present = np.unique(level)
         dummies = (level[:, None] == present[None, :]).astype(np.float64)
-        # One tilt and one height per level; a tilt is separable from a ladder along the other axis and
-        # by the slope within the treads.
+        # One height per level, one tilt, and what higher or lower surroundings add: all three are told
+        # apart by how the height runs within the treads.
         slopes = np.stack([y / scan.shape[0], x / scan.shape[1]], axis=1) - 0.5
+        others = np.hstack([slopes, _surroundings(scan)[:, inside].T])
         height_nm = NM_PER_UM * scan.height_um[inside].astype(np.float64)
-        weights, *_ = np.linalg.lstsq(np.hstack([dummies, slopes]), height_nm, rcond=None)
-        flat = height_nm - slopes @ weights[len(present) :] - weights[0]
+        weights, *_ = np.linalg.lstsq(np.hstack([dummies, others]), height_nm, rcond=None)
+        flat = height_nm - others @ weights[len(present) :] - weights[0]
         for value in present:
             found.setdefault(int(value), []).append(flat[level == value])
     rows = []
@@ -160,6 +159,15 @@ def _level_heights(scans: Sequence[PrintedScan], guard_um: float) -> list[LevelH
         LevelHeight(level=level, height_nm=mean - ground, sigma_nm=sd, pixels=pixels)
         for level, mean, sd, pixels in rows
     ]
+
+
+def _surroundings(scan: PrintedScan) -> np.ndarray:
+    """How much higher the layout is around each pixel than at it, over 1 and 2 µm, (2, ny, nx) µm."""
+    from scipy.ndimage import gaussian_filter
+
+    layout = scan.layout_um.astype(np.float64)
+    blurs = [gaussian_filter(layout, reach / scan.pitch_um, mode="nearest") for reach in _REACHES_UM]
+    return np.stack(blurs) - layout
 
 
 def _plateaus(scan: PrintedScan, guard_um: float) -> np.ndarray:

@@ -122,7 +122,7 @@ def dose(found: DoseMatrix) -> Figure:
     middle.set_ylabel("roughness, nm")
     right.plot(doses, [row.worst_readability for row in found.rows], "o-", color="#0b6aa2", ms=4)
     right.axhline(READABLE_AT, color="#9aa7b5", ls="--", lw=1)
-    right.set_ylabel("worst step over σ (dashed: single pixels told apart)")
+    right.set_ylabel("worst step over σ")
     for axes in (middle, right):
         axes.set_xlabel("relative dose")
         axes.axvline(found.recommended_dose, color="#2d8a4e", lw=1.2)

@@ -95,7 +95,10 @@ def _dose(page: Page, found: DoseMatrix) -> None:
 
     page.heading("Dose matrix")
     page.paragraph(f"Recommended dose: {found.recommended_dose:g}. Reason: {found.reason}.")
-    page.figure(figures.dose(found), "Green: recommended. Shaded: steps are lost.")
+    page.figure(
+        figures.dose(found),
+        "Green: recommended. Shaded: steps are lost. Dashed: single pixels of two levels are told apart.",
+    )
     rows = [{**row.model_dump(exclude={"levels", "scans"}), "scans": len(row.scans)} for row in found.rows]
     page.table(
         pd.DataFrame(rows),

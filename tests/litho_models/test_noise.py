@@ -201,6 +201,17 @@ def test_the_dose_matrix_sees_height_roughness_and_lost_steps():
     assert nominal.worst_readability == pytest.approx(100 / 6, rel=0.05)
 
 
+def test_shrinkage_alone_is_no_wrong_exposure_and_the_nearest_height_wins():
+    shrunk = [
+        replace(ladder(dose), height_um=(0.6 * ladder(dose).height_um).astype(np.float32))
+        for dose in (0.9, 1.0, 1.15)
+    ]
+    found = dose_matrix(shrunk)
+    assert not any(row.under_exposed or row.over_exposed for row in found.rows)
+    # 0.6 · 1.15 = 0.69 is the nearest to 1.
+    assert found.recommended_dose == 1.15
+
+
 def test_a_tilted_scan_does_not_change_its_dose_row():
     level_scan = ladder(1.0)
     y = np.linspace(-0.1, 0.1, 60, dtype=np.float32)[:, None]
