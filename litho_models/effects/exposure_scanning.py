@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from litho_models.effects.effect import Effect, FieldContext, Parameter, Values
@@ -34,6 +35,13 @@ def write_order_memory(layout: Tensor, values: Values, context: FieldContext) ->
 
     reach = _TAIL_LENGTHS * float(length.detach())
     return add_filtered(layout, transfer_minus_one, context.pitch_um, reach, "zero")
+
+
+def line_roughness(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """H + s_i, s_i ~ N(0, σ²) for each row i of the layout, drawn anew for every print."""
+    generator = torch.Generator().manual_seed(context.seed)
+    draws = torch.randn(height.shape[-2], generator=generator).to(height)
+    return height + values["sd_um"] * draws[:, None]
 
 
 EFFECTS = (
@@ -73,5 +81,17 @@ EFFECTS = (
         ),
         source="oxygen and radical depletion along the slow writing axis, y unless the card says x",
         separating="print the same layout with the writing order reversed",
+    ),
+    Effect(
+        name="line-roughness",
+        title="height of the single written line",
+        stage="exposure",
+        role="nuisance",
+        acts_on="height",
+        parameters={"sd_um": Parameter("µm", 0.0, 0.1, 0.008)},
+        apply=line_roughness,
+        source="arXiv:2309.17343, line-like noise along the hatching; random, so no model predicts it",
+        separating="scan the same field at 0 and 90 degrees",
+        per_scan=True,
     ),
 )

@@ -35,6 +35,7 @@ _FORWARD_ORDER = (
     "feature-collapse",
     "trench-residue",
     "slope-thinning",
+    "line-roughness",
     "tip-dilation",
     "feedback-lag",
     "registration-residual",
@@ -63,7 +64,6 @@ UNTESTABLE = {
     "layer-stacking": "needs the printer's slice table, which the card does not hold",
     "min-to-zero-datum": "an order statistic per scan; what it leaves is carried by datum-offset",
     "quantisation": "heights are floating point here; see the histogram of the raw file",
-    "line-roughness": "random from print to print: part of the noise, not of the mean",
     "scars-and-spikes": "a mask, not a term: masked pixels are counted in the dataset",
 }
 

@@ -14,19 +14,22 @@ import numpy as np
 from litho_models.effects import Effect, get_effect
 from litho_models.loop.confirming import BINOMIAL_P, Confirmation, confirm_variance, one_sided_flip_p
 from litho_models.loop.fields import Field
-from litho_models.loop.scoring import TERMS_OF, Score, Terms, score, term_maps
+from litho_models.loop.scoring import LINE_TERMS, TERMS_OF, Score, Terms, score, term_maps
 from litho_models.metrics import NM_PER_UM, bootstrap_interval, paired_difference
 from litho_models.nuisance import least_squares
 
 # Terms whose mean over scans could be a property of the process.
 _SHARED = {"gain", "bow"}
+_LINES = ("scan-line-stripes", "line-roughness")
+_FRAME = {"scan-line-stripes": "the scan lines", "line-roughness": "the layout's rows"}
 
 
 @dataclass(frozen=True)
 class MeasurementTest:
     """One nested step: per-scan terms without and with those of ``effect``.
 
-    ``spread``: parameter name to (standard deviation over scans, unit); ``evidence`` is a sentence.
+    ``spread``: parameter name to (standard deviation over scans, unit); ``evidence`` is a sentence;
+    ``confusable_with``: effects that these scans cannot tell from it.
     """
 
     effect: Effect
@@ -36,6 +39,7 @@ class MeasurementTest:
     p_screen: float
     spread: dict[str, tuple[float, tuple[float, float], str]]
     evidence: str
+    confusable_with: tuple[str, ...] = ()
 
 
 def measurement_tests(
@@ -50,15 +54,14 @@ def measurement_tests(
     accepted: Terms = frozenset()
     tests = []
     for name, term in TERMS_OF.items():
-        if term == "rows":
-            test = _test_lines(fields, predictions, accepted, floor_nm2, seed)
-        else:
-            test = _test_term(name, term, fields, predictions, fold_of, accepted, floor_nm2, seed)
+        if term in LINE_TERMS:
+            continue
+        test = _test_term(name, term, fields, predictions, fold_of, accepted, floor_nm2, seed)
         tests.append(test)
         # The datum is free in every later comparison, whatever this test says.
         if test.confirmation.passed or name == "datum-offset":
             accepted |= {term}
-    return tests
+    return tests + _test_lines(fields, predictions, accepted, floor_nm2, seed)
 
 
 def scan_parameters(fields: Sequence[Field], predictions: Sequence[np.ndarray], terms: Terms) -> np.ndarray:
@@ -108,38 +111,60 @@ def _test_term(
 
 def _test_lines(
     fields: Sequence[Field], predictions: Sequence[np.ndarray], accepted: Terms, floor_nm2: float, seed: int
-) -> MeasurementTest:
-    effect, terms = get_effect("scan-line-stripes"), accepted | {"rows"}
+) -> list[MeasurementTest]:
+    """Offsets of lines, along the scan and along the layout: against the columns, then against each other.
+
+    Scans are turned a little against their layouts. Lines that follow the layout's rows better were
+    written, lines that follow the scan's were measured; where no scan is turned nobody can tell.
+    """
     before = score(fields, predictions, accepted, seed, stripes=True)
-    after = score(fields, predictions, terms, seed)
-    turned = [_turned(field) for field in fields]
-    turned_predictions = [p.T for p in predictions]
+    turned, turned_predictions = [_turned(field) for field in fields], [p.T for p in predictions]
     control_before = score(turned, turned_predictions, accepted, seed, stripes=True)
-    control_after = score(turned, turned_predictions, terms, seed)
-    rows, columns = before.mse_nm2 - after.mse_nm2, control_before.mse_nm2 - control_after.mse_nm2
-    confirmation = _confirm(before, after, floor_nm2, seed)
-    excess_p = one_sided_flip_p(rows - columns)
-    if excess_p > BINOMIAL_P:
-        excess = f"rows gain no more than columns (p = {excess_p:.3f})"
-        reason = "; ".join(part for part in (confirmation.reason, excess) if part)
-        confirmation = replace(confirmation, passed=False, reason=reason)
-    variance = np.maximum(rows, 0) / NM_PER_UM**2
-    low, high = bootstrap_interval(variance.tolist(), seed=seed)
-    return MeasurementTest(
-        effect=effect,
-        before=before,
-        after=after,
-        confirmation=confirmation,
-        p_screen=excess_p,
-        spread={
-            "sd_um": (float(np.sqrt(variance.mean())), (float(np.sqrt(low)), float(np.sqrt(high))), "µm")
-        },
-        evidence=(
-            f"line offsets, estimated on half of the columns, remove {rows.mean():.1f} nm² on the other "
-            "half; "
-            f"offsets of the columns, treated alike, {columns.mean():.1f} nm²"
-        ),
-    )
+    control_after = score(turned, turned_predictions, accepted | {"rows"}, seed)
+    columns = control_before.mse_nm2 - control_after.mse_nm2
+    after = {name: score(fields, predictions, accepted | {TERMS_OF[name]}, seed) for name in _LINES}
+    gains = {name: before.mse_nm2 - own.mse_nm2 for name, own in after.items()}
+    tests = []
+    for name, other in (_LINES, _LINES[::-1]):
+        beaten_p = one_sided_flip_p(gains[other] - gains[name])
+        better_p = one_sided_flip_p(gains[name] - gains[other])
+        untold = beaten_p > BINOMIAL_P and better_p > BINOMIAL_P
+        excess_p = one_sided_flip_p(gains[name] - columns)
+        reasons = [_confirm(before, after[name], floor_nm2, seed).reason]
+        if excess_p > BINOMIAL_P:
+            reasons.append(f"rows gain no more than columns (p = {excess_p:.3f})")
+        if beaten_p <= BINOMIAL_P:
+            reasons.append(f"the lines follow {_FRAME[other]} more closely (p = {beaten_p:.4f}): {other}")
+        elif untold and name == _LINES[1]:
+            reasons.append(f"cannot be told from {other}: no scan is turned enough against its layout")
+        reason = "; ".join(part for part in reasons if part)
+        confirmation = _confirm(before, after[name], floor_nm2, seed)
+        variance = np.maximum(gains[name], 0) / NM_PER_UM**2
+        interval = bootstrap_interval(variance.tolist(), seed=seed)
+        low, high = (float(np.sqrt(end)) for end in interval)
+        tests.append(
+            MeasurementTest(
+                effect=get_effect(name),
+                before=before,
+                after=after[name],
+                confirmation=replace(confirmation, passed=not reason, reason=reason),
+                p_screen=excess_p,
+                spread={
+                    "sd_um": (
+                        float(np.sqrt(variance.mean())),
+                        (float(np.sqrt(low)), float(np.sqrt(high))),
+                        "µm",
+                    )
+                },
+                evidence=(
+                    "line offsets, estimated on half of the columns, remove on the other half "
+                    f"{gains[name].mean():.1f} nm² along {_FRAME[name]}, {gains[other].mean():.1f} nm² along "
+                    f"{_FRAME[other]}; offsets of the columns, treated alike, {columns.mean():.1f} nm²"
+                ),
+                confusable_with=(other,) if untold else (),
+            )
+        )
+    return tests
 
 
 def _confirm(before: Score, after: Score, floor_nm2: float, seed: int) -> Confirmation:

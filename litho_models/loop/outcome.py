@@ -120,7 +120,7 @@ def _added_measurement(closed: Closed, test: MeasurementTest) -> AddedEffect:
         name=effect.name,
         stage=effect.stage,
         role=effect.role,
-        verdict="explained",
+        verdict="confusable" if test.confusable_with else "explained",
         prior_hypothesis=effect.name in closed.config.prior_hypotheses,
         parameters={
             name if name.startswith("sd") else f"{name}_sd_between_scans": ParameterEstimate(
@@ -135,7 +135,7 @@ def _added_measurement(closed: Closed, test: MeasurementTest) -> AddedEffect:
         p_screen=test.p_screen,
         p_confirm=test.confirmation.p,
         scans_improved=test.confirmation.improved,
-        confusable_with=[],
+        confusable_with=list(test.confusable_with),
         separating_experiment=effect.separating,
     )
 
@@ -251,9 +251,12 @@ def _probe_candidate(closed: Closed, test: ProbeTest) -> Candidate:
 def _measurement_candidate(closed: Closed, test: MeasurementTest, added: bool) -> Candidate:
     too_few = len(closed.development) < FEWEST_SCANS
     reason = test.evidence if added else f"{test.evidence}; {test.confirmation.reason}"
+    verdict: CandidateVerdict = "not-testable" if too_few else "below-noise"
+    if added or test.confirmation.reason.startswith("cannot be told"):
+        verdict = "confusable" if test.confusable_with else "explained"
     return Candidate(
         name=test.effect.name,
-        verdict="explained" if added else "not-testable" if too_few else "below-noise",
+        verdict=verdict,
         reason=reason,
         p_screen=test.p_screen,
         gain_nm=test.confirmation.gain_nm,

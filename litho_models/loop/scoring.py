@@ -16,6 +16,7 @@ from litho_models.nuisance import (
     calibration_stripes,
     least_squares,
     nuisance_basis,
+    row_index,
     shrunk_line_offsets,
 )
 
@@ -26,7 +27,10 @@ TERMS_OF = {
     "tilt-bow": "bow",
     "registration-residual": "warp",
     "scan-line-stripes": "rows",
+    "line-roughness": "print-rows",
 }
+# Offsets of lines, along the scan or along the layout; their halves are stripes of columns.
+LINE_TERMS = frozenset({"rows", "print-rows"})
 
 Terms = frozenset[str]
 DATUM_FREE: Terms = frozenset({"offset"})
@@ -67,7 +71,7 @@ def score(
     maps, freedom = [], []
     for field, prediction in zip(fields, predictions, strict=True):
         residual, dof = cross_fit(
-            field, prediction, terms, seed, stripes="rows" in terms if stripes is None else stripes
+            field, prediction, terms, seed, stripes=bool(LINE_TERMS & terms) if stripes is None else stripes
         )
         maps.append(residual)
         freedom.append(dof)
@@ -95,9 +99,10 @@ def cross_fit(
         calibrate, scored = half.calibrate & field.usable, half.score & field.usable
         nuisance = np.tensordot(least_squares(basis[:, calibrate], difference[calibrate]), basis, axes=1)
         dof = float(len(basis))
-        if "rows" in terms:
-            offsets, weight, _ = shrunk_line_offsets(difference - nuisance, calibrate, field.line)
-            nuisance = nuisance + offsets[field.line]
+        for term in sorted(LINE_TERMS & terms):
+            line = field.line if term == "rows" else row_index(difference.shape)
+            offsets, weight, _ = shrunk_line_offsets(difference - nuisance, calibrate, line)
+            nuisance = nuisance + offsets[line]
             dof += float(weight.sum())
         residual[scored] = (difference - nuisance)[scored]
         freedom.append(dof)

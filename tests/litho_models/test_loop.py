@@ -139,11 +139,35 @@ def test_line_offsets_are_told_from_columns() -> None:
     tests = {t.effect.name: t for t in measurement_tests(fields, predictions, fold_of, floor_nm2=0, seed=0)}
     stripes = tests["scan-line-stripes"]
     assert stripes.confirmation.passed
+    # No scan is turned: the lines could as well have been written so.
+    assert stripes.confusable_with == ("line-roughness",)
+    assert not tests["line-roughness"].confirmation.passed
     # Shrinkage takes s⁴/(s² + noise) of s²: the recovered size lies below the planted one, not far.
     assert 0.004 < stripes.spread["sd_um"][0] < 0.0065
     plain = prepare_fields(printed_scans(count=10, size_px=160, seed=4))
     without = measurement_tests(plain, [_truth(f) for f in plain], fold_of, floor_nm2=0, seed=0)
     assert not {t.effect.name: t for t in without}["scan-line-stripes"].confirmation.passed
+
+
+@pytest.mark.parametrize("written", [True, False])
+def test_lines_of_the_print_are_told_from_lines_of_the_scan(written: bool) -> None:
+    """Scans turned by 1.5°: over 160 px a scan line crosses four rows of the layout."""
+    angle = np.deg2rad(1.5)
+    turned = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    scans = [replace(s, scan_to_layout=turned) for s in printed_scans(count=10, size_px=160, seed=3)]
+    random = np.random.default_rng(5)
+    striped = []
+    for field in prepare_fields(scans):
+        line = np.indices(field.scan.shape)[0] if written else field.line
+        offsets = 0.006 * random.normal(size=int(line.max()) + 1)
+        striped.append(replace(field.scan, height_um=field.scan.height_um + offsets[line].astype(np.float32)))
+    fields = prepare_fields(striped)
+    found = measurement_tests(fields, [_truth(f) for f in fields], np.arange(10) % 5, floor_nm2=0, seed=0)
+    tests = {t.effect.name: t for t in found}
+    right, wrong = ("line-roughness", "scan-line-stripes")[:: 1 if written else -1]
+    assert tests[right].confirmation.passed
+    assert not tests[wrong].confirmation.passed
+    assert right in tests[wrong].confirmation.reason
 
 
 def test_too_few_scans_confirm_nothing_and_say_so() -> None:

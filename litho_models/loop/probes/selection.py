@@ -163,7 +163,7 @@ def _best(
 def _corrected(
     probe: Probe, parameters: np.ndarray, anchor: np.ndarray, field: Field, prediction: np.ndarray
 ) -> np.ndarray:
-    offset_um, gain = anchor.astype(np.float32)
+    offset_um, gain = np.float32(anchor[0]), np.float32(anchor[1])
     return prediction + probe.correction(parameters, field, prediction) + offset_um + gain * prediction
 
 
@@ -180,7 +180,7 @@ def _anchor(
     all scans share; without this it would move the absolute height at random.
     """
     normal, right = np.zeros((2, 2)), np.zeros(2)
-    for i in np.flatnonzero(training):
+    for i in np.flatnonzero(training).tolist():
         field, prediction = fields[i], predictions[i]
         here = field.at_sample(prediction)
         left = field.height - here - field.at_sample(probe.correction(parameters, field, prediction))
