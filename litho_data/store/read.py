@@ -184,11 +184,7 @@ class Store:
 
     def computed_sha256(self) -> str:
         """Hash of the dataset from the arrays as they are now."""
-        facts: dict[str, Any] = {
-            "pitch_um": self.pitch_um,
-            "level_height_um": self.level_height_um,
-            "levels": self.levels,
-        }
+        facts = {name: getattr(self, name) for name in ("pitch_um", "level_height_um", "levels")}
         if self.write:
             facts["write"] = self.write
         return dataset_sha256(facts, [self._identity(row) for row in range(len(self))])
