@@ -14,6 +14,7 @@ from benchmarks.blind_trials.draws import draw_trials
 from benchmarks.blind_trials.records import Draw, Draws, Trial
 from benchmarks.blind_trials.trial import failed, run_trial, trial_folder
 from litho_data.errors import InputError
+from litho_data.virtual_fab.jobs import Plan
 
 _ROOT = Path(__file__).parents[2]
 # One thread per trial: trials side by side use the cores better than threads within one.
@@ -26,6 +27,7 @@ def open_campaign(out: Path, *, count: int, seed: int, n_scans: int, size_px: in
     Raises:
         InputError: ``out`` holds the campaign of other settings, or settings that cannot be drawn.
     """
+    Plan(n_scans, (size_px, size_px))  # refuses fields that cannot be printed, before any trial fails by it
     draws = Draws(
         schema=Draws.SCHEMA,
         seed=seed,

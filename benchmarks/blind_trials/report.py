@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,7 @@ from benchmarks.blind_trials.trial import trial_folder
 from litho_data.report import Page, new_figure
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 CSV_NAME = "scoreboard.csv"
@@ -84,6 +86,7 @@ def _outcomes(trials: list[Trial]) -> Figure:
             axes.scatter(x, y, c=colour, marker=marker, s=48, label=judgement, zorder=3)
     axes.axvline(COUNTS_FROM_RMS_NM, color="0.4", linestyle="--", linewidth=1)
     axes.set_xscale("log")
+    _plain_ticks(axes, (1, 2, 4, 8, 15, 30, 60))
     axes.set_xlabel("rms of the effect, free of nuisances (nm)")
     axes.set_yticks(range(len(rows)), [label for label, _ in rows], fontsize=8)
     axes.grid(axis="x", alpha=0.3)
@@ -107,10 +110,19 @@ def _errors(trials: list[Trial]) -> Figure:
     labels = [f"{' + '.join(_labels(trial))} · {trial.draw.number}" for trial, _ in done]
     axes.set_yticks(range(len(done)), labels, fontsize=8)
     axes.set_xscale("log")
+    _plain_ticks(axes, (8, 10, 12, 15, 20, 30, 50, 80, 120, 200))
     axes.set_xlabel("mean absolute error, held-out, datum-free (nm)")
-    axes.grid(axis="x", which="both", alpha=0.3)
+    axes.grid(axis="x", alpha=0.3)
     axes.invert_yaxis()
     return figure
+
+
+def _plain_ticks(axes: Axes, values: Sequence[float]) -> None:
+    """Those of the values that the logarithmic axis shows, written out."""
+    low, high = axes.get_xlim()
+    shown = [value for value in values if low <= value <= high]
+    axes.set_xticks(shown, [f"{value:g}" for value in shown])
+    axes.set_xticks([], minor=True)
 
 
 def _labels(trial: Trial) -> list[str]:

@@ -330,6 +330,12 @@ def test_a_folder_with_other_draws_is_refused(tmp_path):
         campaign.open_campaign(tmp_path, count=4, seed=1, n_scans=12, size_px=64)
 
 
+def test_fields_that_cannot_be_printed_are_refused_before_the_first_trial(tmp_path):
+    with pytest.raises(InputError, match="at least 32"):
+        campaign.open_campaign(tmp_path, count=4, seed=0, n_scans=12, size_px=8)
+    assert not list(tmp_path.iterdir())
+
+
 def test_an_error_inside_a_trial_is_its_result(tmp_path, capfd):
     # 8 px cannot be printed.
     trial = run_trial(drawn({"vignetting": 20}), tmp_path, n_scans=2, size_px=8)
