@@ -149,13 +149,7 @@ def _test_lines(
                 after=after[name],
                 confirmation=replace(confirmation, passed=not reason, reason=reason),
                 p_screen=excess_p,
-                spread={
-                    "sd_um": (
-                        float(np.sqrt(variance.mean())),
-                        (float(np.sqrt(low)), float(np.sqrt(high))),
-                        "µm",
-                    )
-                },
+                spread={"sd_um": (float(np.sqrt(variance.mean())), (low, high), "µm")},
                 evidence=(
                     "line offsets, estimated on half of the columns, remove on the other half "
                     f"{gains[name].mean():.1f} nm² along {_FRAME[name]}, {gains[other].mean():.1f} nm² along "
