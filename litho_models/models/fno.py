@@ -29,7 +29,7 @@ class FnoConfig(SimulatorConfig):
     coordinates: bool = Field(False, description="y and x on 0 ... 1 of the image as further inputs")
     padding_fraction: float = Field(0.0, ge=0, description="zeros added at bottom and right, share of image")
     tile_px: int | None = Field(128, ge=8, description="side of a tile; None takes the image as it is")
-    overlap_px: int = Field(64, ge=0, description="blended pixels of neighbouring tiles, at most half a tile")
+    overlap_px: int = Field(32, ge=0, description="blended pixels of neighbouring tiles, at most half a tile")
     # Start as the layout and learn what differs; the paper's network starts at random.
     starts_as_layout: bool = True
 

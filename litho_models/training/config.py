@@ -33,7 +33,9 @@ class TrainingConfig(BaseModel):
         4, ge=1, description="times that nuisances are re-estimated, validation runs, a checkpoint is kept"
     )
     batch: int = Field(4, ge=1, description="crops per step")
-    crop_px: int = Field(128, ge=8, description="scored width and height of a crop")
+    crop_px: int = Field(
+        128, ge=8, description="scored width and height of a crop; a model with tiles takes its own"
+    )
     crops: Literal["random", "quadrants"] = "random"
     flips: bool = False
     optimiser: Literal["adamw", "adam"] = "adamw"
