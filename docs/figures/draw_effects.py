@@ -1,0 +1,68 @@
+"""One picture per effect: what it changes in a print, at twice its typical size.
+
+python docs/figures/draw_effects.py
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from litho_data.layouts import random_layout
+from litho_data.report import new_figure
+from litho_models.effects import CATALOGUE, Effect, FieldContext
+from litho_models.effects.chain import EffectChain
+from litho_models.models import build_model
+
+OUT = Path(__file__).parent / "effects.jpg"
+SIZE_PX, BORDER_PX, PITCH_UM, LEVEL_HEIGHT_UM, LEVELS, COLUMNS = 176, 24, 0.1, 0.1, 13, 7
+STRENGTH = 2.0
+_LAST_IN_ORDER, _CORNER_UM = 0.5, 8.0
+
+
+def main() -> None:
+    """Draw every effect of the catalogue on one random layout."""
+    level = random_layout((SIZE_PX, SIZE_PX), cutoff_per_um=0.5, seed=4)
+    layout = torch.from_numpy((level * LEVEL_HEIGHT_UM).astype(np.float32))[None, None]
+    # Away from the middle of the write field and late in the order, where place and time show.
+    context = FieldContext(
+        layout, PITCH_UM, LEVEL_HEIGHT_UM * (LEVELS - 1), (_CORNER_UM, _CORNER_UM), 24.0, order=_LAST_IN_ORDER
+    )
+    base = build_model("physics", pitch_um=PITCH_UM, level_height_um=LEVEL_HEIGHT_UM, levels=LEVELS)
+    rows = -(-(len(CATALOGUE) + 1) // COLUMNS)
+    figure = new_figure(2.1 * COLUMNS, 2.25 * rows)
+    panels = figure.subplots(rows, COLUMNS).ravel()
+    panels[0].imshow(level[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX], cmap="viridis")
+    panels[0].set_title("layout", fontsize=9)
+    for panel, effect in zip(panels[1:], CATALOGUE.values(), strict=False):
+        change = 1e3 * signature(effect, base, layout, context)
+        limit = max(float(np.quantile(np.abs(change), 0.99)), 1e-3)
+        panel.imshow(change, cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
+        panel.set_title(f"{effect.name}\n± {limit:.0f} nm", fontsize=8)
+    for panel in panels:
+        panel.set_axis_off()
+    figure.savefig(OUT, dpi=60, pil_kwargs={"quality": 70})
+
+
+def signature(
+    effect: Effect, base: torch.nn.Module, layout: torch.Tensor, context: FieldContext
+) -> np.ndarray:
+    """Height with the effect minus without (y, x), µm; the border, with nothing written beside, is cut off."""
+    trial = {**effect.off_values(), **(effect.trials[0] if effect.trials else {})}
+    for name in effect.amplitudes:
+        parameter = effect.parameters[name]
+        if not effect.trials or name in effect.trials[0]:
+            wanted = parameter.null + STRENGTH * (parameter.typical - parameter.null)
+            trial[name] = min(max(wanted, parameter.lower), parameter.upper)
+    geometry = {"full_height_um": context.full_height_um, "pitch_um": PITCH_UM}
+    with torch.no_grad():
+        off, on = (
+            EffectChain(base, effects, **geometry)(layout, context) for effects in ({}, {effect.name: trial})
+        )
+    return (on - off)[0, 0, BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX].numpy()
+
+
+if __name__ == "__main__":
+    main()
