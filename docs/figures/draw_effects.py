@@ -49,7 +49,7 @@ def main() -> None:
 def signature(
     effect: Effect, base: torch.nn.Module, layout: torch.Tensor, context: FieldContext
 ) -> np.ndarray:
-    """Height with the effect minus without (y, x), µm; the border, with nothing written beside, is cut off."""
+    """Height with the effect minus without (y, x), µm; the border, with nothing beside it, is cut off."""
     trial = {**effect.off_values(), **(effect.trials[0] if effect.trials else {})}
     for name in effect.amplitudes:
         parameter = effect.parameters[name]
