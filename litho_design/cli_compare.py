@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Annotated, Any, Literal
 
 import typer
@@ -77,23 +76,27 @@ def compare(
         "samples": robust_samples,
         "spread_of": spread_of,
     }
+
+    def printers(layout):
+        sources = (models.split(","), judge or [])
+        return [load_printers(specs, layout, device, extrapolate) for specs in sources]
+
+    # Printers first: what is wrong with them is told before a target is drawn.
     if task == "hoe":
         settings: Any = hoe_settings(variant, **options)
+        arms, judges = printers(settings.layout)
         image, record = make_target(target, settings.layout.size_px)
-        if record.adaptation:
-            print(f"target: {record.adaptation}", file=sys.stderr)
 
         def designer(settings, printer, place):
             return design_hoe(settings, printer, image, record, place, command=command_line())
     else:
         kind = "direct" if task == "lens-direct" else "computational"
         settings = lens_settings(variant, kind, window_px=window_px, object_px=object_px, **options)
+        arms, judges = printers(settings.layout)
 
         def designer(settings, printer, place):
             return design_lens(settings, printer, place, command=command_line())
 
-    arms = load_printers(models.split(","), settings.layout, device, extrapolate)
-    judges = load_printers(judge or [], settings.layout, device, extrapolate)
     result = run_comparison(settings, designer, arms, judges, out, seeds=range(seeds), command=command_line())
     for item in result.summary:
         if item.figure == HEADLINE[result.task][0]:

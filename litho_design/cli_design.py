@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from typing import Annotated, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -41,6 +42,9 @@ from litho_design.cli_options import (
     lens_settings,
     load_printers,
 )
+
+if TYPE_CHECKING:
+    from litho_design.design import Design
 
 Model = Annotated[str, typer.Option(help="Folder of a frozen model, or `none` for nominal heights.")]
 
@@ -86,15 +90,13 @@ def hoe(
         gain_sd=gain_sd, blur_sd_um=blur_sd_um, defocus_sd_um=defocus_sd_um,
         wavelength_sd_um=wavelength_sd_um, spread_of=spread_of, ensemble_weight=ensemble_weight, seed=seed,
     )  # fmt: skip
-    image, record = make_target(target, settings.layout.size_px)
-    if record.adaptation:
-        print(f"target: {record.adaptation}", file=sys.stderr)
     printer = load_printer(model, settings.layout, device=device, extrapolate=extrapolate)
     others = load_printers(ensemble or [], settings.layout, device, extrapolate)
+    image, record = make_target(target, settings.layout.size_px)
     design = design_hoe(
         settings, printer, image, record, out, ensemble=list(others.values()), command=command_line()
     )
-    print(f"{out / 'report.html'}: {headline(design.predicted)} (judged by its own model)")
+    _tell(design, out)
 
 
 def lens(
@@ -146,4 +148,15 @@ def lens(
     printer = load_printer(model, settings.layout, device=device, extrapolate=extrapolate)
     others = load_printers(ensemble or [], settings.layout, device, extrapolate)
     design = design_lens(settings, printer, out, ensemble=list(others.values()), command=command_line())
+    _tell(design, out)
+
+
+def _tell(design: Design, out: Path) -> None:
+    gauge = design.out_of_distribution
+    if gauge is not None and gauge.flagged:
+        print(
+            f"the layout is unlike the model's training layouts: {100 * gauge.level_distance:.0f} % of its "
+            "pixels would have to change level to match them",
+            file=sys.stderr,
+        )
     print(f"{out / 'report.html'}: {headline(design.predicted)} (judged by its own model)")

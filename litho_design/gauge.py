@@ -27,6 +27,7 @@ class Printability(Record):
     steepest_slope: float
     large_jump_share: float
     used_levels: int
+    smallest_ring_um: float | None = None
 
 
 class OutOfDistribution(Record):
@@ -42,7 +43,8 @@ def printability(levels: np.ndarray, layout: LayoutSettings) -> Printability:
     """Check a layout against what a printer must resolve.
 
     A feature is a run of pixels of one level along a row or a column that ends at other levels on
-    both sides; runs that touch the border are not counted, they may continue in a neighbour.
+    both sides; runs that touch the border are not counted, they may continue in a neighbour. In a ring
+    layout rows cut rings at every angle, so the narrowest ring is also given, along a radius.
 
     Args:
         levels: integer levels (ny, nx).
@@ -60,6 +62,7 @@ def printability(levels: np.ndarray, layout: LayoutSettings) -> Printability:
         steepest_slope=steepest / layout.pitch_um,
         large_jump_share=float((steps >= _LARGE_JUMP_LEVELS).mean()) if steps.size else 0.0,
         used_levels=len(np.unique(levels)),
+        smallest_ring_um=_smallest_ring_um(levels, layout),
     )
 
 
@@ -81,6 +84,19 @@ def out_of_distribution(
         extreme_level_share=float(share[0] + share[top]),
         training_extreme_level_share=float(trained[0] + trained[top]),
     )
+
+
+def _smallest_ring_um(levels: np.ndarray, layout: LayoutSettings) -> float | None:
+    """Narrowest run of one level along the radius; None without rings, or where only one level is left."""
+    if layout.symmetry != "radial":
+        return None
+    middle = levels.shape[0] // 2
+    edges = np.flatnonzero(np.diff(levels[middle, middle:].astype(int))) + 1
+    if edges.size == 0:
+        return None
+    # The central disc is twice as wide as its run, and the outermost ring may be cut.
+    widths = [2 * int(edges[0]), *np.diff(edges).tolist()]
+    return min(widths) * layout.pitch_um
 
 
 def _inner_runs(levels: np.ndarray) -> np.ndarray:

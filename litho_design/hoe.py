@@ -77,6 +77,7 @@ class HoeTask:
             raise InputError("start", got="'fresnel'", wanted="'random', 'gs' or 'wgs' for a hologram")
         self.settings, self.printer, self.target_record = settings, printer, record
         self.printers = [printer, *ensemble]
+        self.notes = [f"target {record.adaptation}"] if record.adaptation else []
         self.cells = CellMap(settings.layout).to(device)
         self.bench = HologramBench(settings.layout, settings.optics).to(device)
         self.target = torch.from_numpy(target).to(device)

@@ -35,6 +35,7 @@ from litho_design.task import run_design
 # The same noise in every iteration: the search compares layouts, not noise; the score draws its own.
 _DESIGN_NOISE_SEED = 0
 _WINDOW_DRAWS = 16
+_PLANE_NOTE = "searched on the whole plane, not along a radius: the printer's effects depend on the position"
 
 
 def design_lens(
@@ -74,7 +75,9 @@ class LensTask:
         device = printer.device
         self.cells = CellMap(settings.layout).to(device)
         self.bench = LensBench(settings.layout, settings.optics, settings.view).to(device)
-        self.radial = settings.view.path == "radial"
+        rings, placed = settings.view.path == "radial", any(p.depends_on_position for p in self.printers)
+        self.radial = rings and not placed
+        self.notes = [_PLANE_NOTE] if rings and placed else []
         self.strips = [_strip_rings(self.cells, p.halo_px) for p in self.printers] if self.radial else []
         self.scenes: list[tuple[Draw | None, LensBench | RadialLensBench]] = [
             (draw, self._search_bench(draw.optics))

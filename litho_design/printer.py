@@ -34,11 +34,12 @@ class TilingCheck(Record):
 
 
 class PrinterRecord(Record):
-    """Which printer a design or a score was made with."""
+    """Which printer a design or a score was made with; the dataset is the one its model was trained on."""
 
     name: str
     sha256: str
     source: str
+    dataset_sha256: str = ""
     guard_um: float
     extrapolated: bool = False
 
@@ -89,6 +90,11 @@ class Printer(nn.Module):
         return getattr(self.simulator, "card", {})
 
     @property
+    def depends_on_position(self) -> bool:
+        """Whether added effects may depend on the place in the write field: a patch says nothing then."""
+        return bool(self.card.get("process_effects"))
+
+    @property
     def device(self) -> torch.device:
         """Where the model lives, also where there is no model."""
         return self.device_marker.device
@@ -114,10 +120,11 @@ class Printer(nn.Module):
             tile_px: side of a tile without its halo; up to four of them along the diagonal are compared.
 
         Returns:
-            The differences; None for nominal heights and for elements that are not larger than one tile.
+            The differences; None where there is nothing to compare: nominal heights, an element not larger
+            than one tile, or a print that depends on the position.
         """
         size, halo = self.layout.size_px, self.halo_px
-        if self.simulator is None or size <= tile_px:
+        if self.simulator is None or size <= tile_px or self.depends_on_position:
             return None
         whole = self(level)
         around = F.pad(level, (halo,) * 4)
@@ -156,11 +163,12 @@ class Printer(nn.Module):
                 network.adjoint_dtype = None
 
     def record(self) -> PrinterRecord:
-        """Name, weights hash and guard ring, for the results."""
+        """Name, hashes and guard ring, for the results."""
         return PrinterRecord(
             name=self.name,
             sha256=self.weights_sha256(),
             source=self.source,
+            dataset_sha256=(self.card.get("dataset") or {}).get("sha256", ""),
             guard_um=self.guard_px * self.layout.pitch_um,
             extrapolated=self.extrapolate,
         )
@@ -218,8 +226,10 @@ def load_printer(
     ``name`` is what results call it; the model's own name by default.
 
     Raises:
-        InputError: no frozen model there, another pitch, or levels the model was not calibrated for.
+        InputError: no frozen model there, another pitch, levels the model was not calibrated for, or a
+            device that this machine does not have.
     """
+    _check_device(device)
     if source == "none":
         return Printer(None, layout, source=source, name=name).to(device)
     from litho_models import load_frozen
@@ -237,6 +247,7 @@ def _check_calibration(card: Mapping[str, Any], layout: LayoutSettings, extrapol
                 f"{name} of the layout",
                 got=f"{asked:g} µm",
                 wanted=f"{calibrated:g} µm, as the model was trained",
+                hint="" if name == "pitch_um" else "--extrapolate accepts a guess",
             )
     highest, asked = card["calibrated_range_um"][1], (layout.levels - 1) * layout.level_height_um
     if asked > highest + 1e-6 and not extrapolate:
@@ -245,6 +256,18 @@ def _check_calibration(card: Mapping[str, Any], layout: LayoutSettings, extrapol
             got=f"{layout.levels} levels of {layout.level_height_um:g} µm ({asked:g} µm)",
             wanted=f"at most {highest:g} µm, what the model was calibrated for",
             hint="use fewer levels, or --extrapolate to accept a guess",
+        )
+
+
+def _check_device(device: str | torch.device) -> None:
+    try:
+        wanted = torch.device(device)
+        there = wanted.type != "cuda" or (wanted.index or 0) < torch.cuda.device_count()
+    except RuntimeError:
+        there = False
+    if not there:
+        raise InputError(
+            "device", got=repr(str(device)), wanted="cpu, or a GPU of this machine: cuda, cuda:1 …"
         )
 
 

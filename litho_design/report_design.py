@@ -169,7 +169,8 @@ def add_gauge(page: Page, design: Design) -> None:
             f"({ensemble.disagreement_waves:.3f} waves) apart, rms over the pixels."
         )
     figures = design.printability.model_dump() | (gauge.model_dump() if gauge else {})
-    frame = pd.DataFrame({"name": list(figures), "value": [float(value) for value in figures.values()]})
+    given = {name: float(value) for name, value in figures.items() if value is not None}
+    frame = pd.DataFrame({"name": list(given), "value": list(given.values())})
     page.table(frame, "Lengths in µm; shares of pixel pairs or runs", "printability.csv", digits=3)
 
 

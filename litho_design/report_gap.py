@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
     from litho_design.compare import GapResult
 
+# Side of the cut-out that shows layout against print; features of some pixels must stay visible.
+_DETAIL_PX = 160
 _LABELS = {**SCORE_LABELS, **LENS_LABELS}
 
 
@@ -51,6 +53,11 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
         _pictures(result, judged),
         f"Seed {result.seeds[0]}. Rows: designed with; columns: printed by. "
         + ("Images at matched scale." if result.task == "hoe" else "Square root of the PSF over its peak."),
+    )
+    page.figure(
+        _prints(result, judged, printers),
+        f"Seed {result.seeds[0]}: layout and prints in the middle of the element, heights in µm, each in the "
+        "range of its row.",
     )
     if result.task != "hoe":
         page.figure(
@@ -109,6 +116,32 @@ def _pictures(result: GapResult, judged: dict[str, tuple[Judging, dict[str, np.n
         titles.append([f"{arm}: in design" if name == arm else f"printed by {name}" for name in by_judge])
         side_um = judging.window_um
     return image_grid(images, titles, list(judged), side_um)
+
+
+def _prints(
+    result: GapResult,
+    judged: dict[str, tuple[Judging, dict[str, np.ndarray]]],
+    printers: Mapping[str, Printer],
+):
+    """The layout (nominal heights) and what every judge prints of it, cut out around the centre."""
+    layout = result.settings.layout
+    side = min(layout.size_px, _DETAIL_PX)
+    first = (layout.size_px - side) // 2
+    middle = (slice(first, first + side), slice(first, first + side))
+    extent = (0, side * layout.pitch_um, side * layout.pitch_um, 0)
+    figure = new_figure(2.3 * (len(printers) + 1) + 0.6, 2.45 * len(judged))
+    axes = figure.subplots(len(judged), len(printers) + 1, squeeze=False)
+    for (arm, (judging, _)), row in zip(judged.items(), axes, strict=True):
+        maps = {"layout, nominal": judging.level.cpu().numpy() * layout.level_height_um}
+        maps |= {f"printed by {name}": judging.printed_um(p).cpu().numpy() for name, p in printers.items()}
+        highest = max(float(height[middle].max()) for height in maps.values())
+        for axis, (name, height) in zip(row, maps.items(), strict=True):
+            shown = axis.imshow(height[middle], cmap="viridis", vmin=0, vmax=highest, extent=extent)
+            axis.set_title(name, fontsize=8)
+            axis.tick_params(labelsize=6)
+        row[0].set_ylabel(f"designed with {arm}", fontsize=8)
+        figure.colorbar(shown, ax=row.tolist(), label="µm", shrink=0.8)
+    return figure
 
 
 def _profiles(result: GapResult, judged: dict[str, tuple[Judging, dict[str, np.ndarray]]]):

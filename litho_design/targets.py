@@ -120,7 +120,9 @@ def _read_image(path: Path, size_px: int) -> tuple[np.ndarray, str]:
             "target", got=str(path), wanted="an image that OpenCV can read (PNG, TIFF, JPEG, BMP)"
         )
     grey: np.ndarray = picture.astype(np.float32)
-    if not np.isfinite(grey).all() or grey.max() <= 0:
+    if not np.isfinite(grey).all():
+        raise InputError("target", got=f"{path} with values that are no numbers", wanted="finite brightness")
+    if grey.max() <= 0:
         raise InputError("target", got=f"{path} without any light", wanted="an image with bright pixels")
     notes = []
     height, width = grey.shape

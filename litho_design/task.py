@@ -68,6 +68,9 @@ class Task(Protocol):
     def printers(self) -> Sequence[Printer]: ...
     @property
     def target_record(self) -> TargetRecord | None: ...
+    @property
+    def notes(self) -> Sequence[str]:
+        """What was adapted, for the record."""
 
     def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
         """Loss and its parts, of levels on the pixels (1, 1, size, size)."""
@@ -140,7 +143,6 @@ def run_design(
     layout_array = layout_level.cpu().numpy().astype(np.uint8)
     arrays = {LEVELS_FILE: layout_array, HEIGHT_FILE: height.cpu().numpy(), **task.arrays(height)}
     files = write_arrays(folder, arrays) | write_level_image(folder, layout_array)
-    adaptation = task.target_record.adaptation if task.target_record else ""
     design = Design(
         task=task.name,
         variant=settings.variant,
@@ -165,7 +167,7 @@ def run_design(
         stroke=make_stroke(heights, settings.optics, settings.layout),
         printability=printability(layout_array, settings.layout),
         out_of_distribution=out_of_distribution(layout_array, settings.layout, task.printer.card),
-        notes=[f"target {adaptation}"] if adaptation else [],
+        notes=list(task.notes),
         iterations=outcome.state.iteration,
         start_loss=outcome.start_loss,
         sample_loss=outcome.state.history[-1]["sample_loss"],
@@ -223,6 +225,8 @@ def _optimise(
         start_loss = float(task.objective(parameters.cells(parameters.best_levels())[None, None].float())[0])
     budget = measure_budget(parameters, task.objective, search)
     if announce:
+        for note in task.notes:
+            print(note, file=sys.stderr)
         print(budget.sentence(search), file=sys.stderr)
     state = search_layout(parameters, task.objective, search, folder=folder, fingerprint=fingerprint)
     levels, polished = state.best_levels, state.best_loss

@@ -103,7 +103,7 @@ def make_sidecar(
         wavelength_um=optics.wavelength_um,
         index_step=optics.index_step,
         distance_um=optics.distance_um,
-        minimum_feature_um=design.printability.smallest_feature_um,
+        minimum_feature_um=design.printability.smallest_ring_um or design.printability.smallest_feature_um,
         printability=design.printability,
         out_of_distribution=design.out_of_distribution,
         predicted=design.predicted,

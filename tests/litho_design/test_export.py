@@ -140,6 +140,19 @@ def test_printability_of_known_stripes():
     assert figures.used_levels == 3
 
 
+def test_smallest_ring_is_measured_along_the_radius():
+    layout = LayoutSettings(size_px=40, cell_um=0.1, symmetry="radial")
+    # Rings 0-4 (the disc), 5-7, 8-9, 10-27 in levels 3, 0, 5, 1: the narrowest has 2 pixels.
+    ring = np.repeat([3, 0, 5, 1], [5, 3, 2, 20])
+    centre = np.arange(40) - 19.5
+    levels = ring[np.floor(np.hypot(centre[:, None], centre[None, :])).astype(int)].astype(np.uint8)
+    figures = printability(levels, layout)
+    assert figures.smallest_ring_um == pytest.approx(0.2)
+    # A row that grazes a ring cuts single pixels off it; that is no ring.
+    assert figures.smallest_feature_um < 0.2
+    assert printability(levels, layout.model_copy(update={"symmetry": "none"})).smallest_ring_um is None
+
+
 def test_distance_to_the_training_levels():
     layout = LayoutSettings(size_px=16, levels=4)
     levels = np.repeat(np.arange(4, dtype=np.uint8), 64).reshape(16, 16)

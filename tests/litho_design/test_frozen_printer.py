@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import sys
 
+import cv2
 import numpy as np
 import pytest
+import tifffile
 import torch
 
 from litho_data.errors import InputError
@@ -93,6 +95,32 @@ def test_commands_design_score_and_compare(tmp_path, affine_folder):
     assert {entry["arm"] for entry in gap["entries"]} == {"none", "affine"}
 
 
+def test_an_odd_picture_is_adapted_and_the_adaptation_is_told(tmp_path, capsys, monkeypatch):
+    picture = np.zeros((40, 90), np.uint8)
+    picture[10:30, 20:70] = 200
+    cv2.imwrite(str(tmp_path / "wide.png"), picture)
+    arguments = (
+        "hoe",
+        "--model",
+        "none",
+        "--target",
+        str(tmp_path / "wide.png"),
+        "--out",
+        str(tmp_path / "d"),
+    )
+    monkeypatch.setattr(sys, "argv", ["litho-design", *arguments, *SMALL[:4], "--iterations", "2"])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 0
+    told = "40 x 90 px centred on a black square; resampled from 90 to 128 px"
+    assert told in capsys.readouterr().err
+    assert Design.read(tmp_path / "d").notes == [f"target {told}"]
+    # The picture keeps its proportions: 90 px become 128, 50 px of light become 71.
+    lit = np.load(tmp_path / "d" / "target.npy") > 0.5
+    assert abs(lit.any(0).sum() - 50 * 128 / 90) <= 1
+    assert abs(lit.any(1).sum() - 20 * 128 / 90) <= 1
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -100,13 +128,37 @@ def test_commands_design_score_and_compare(tmp_path, affine_folder):
         (("hoe", "--model", "none", "--target", "note.txt", "--out", "out"), "an image"),
         (("hoe", "--model", "none", "--size-px", "1022", "--out", "out"), "cell_um"),
         (("hoe", "--model", "none", "--levels", "1", "--out", "out"), "levels"),
-        (("hoe", "--model", "none", "--distance-um", "0.01", "--out", "out"), "propagation distance"),
+        (
+            ("hoe", "--model", "none", *SMALL[:2], "--distance-um", "0.01", "--out", "out"),
+            "propagation distance",
+        ),
         (("score", "nowhere", "--judge", "none", "--out", "out"), "nowhere"),
         (("compare", "--models", "none,none", "--out", "out"), "twice"),
+        (("compare", "--models", "none", *SMALL[:2], "--seeds", "0", "--out", "out"), "at least one"),
+        (("hoe", "--model", "none", "--target", "black.png", "--out", "out"), "without any light"),
+        (("hoe", "--model", "none", "--target", "nan.tif", "--out", "out"), "no numbers"),
+        (("hoe", "--model", "coarse", "--out", "out"), "got 0.1 µm, wanted 0.2 µm, as the model was"),
+        (("hoe", "--model", "affine", "--levels", "16", "--out", "out"), "what the model was calibrated for"),
+        (("hoe", "--model", "affine", "--level-height-um", "0.13", "--out", "out"), "as the model was"),
+        (("hoe", "--model", "none", "--start", "fresnel", "--size-px", "64", "--out", "out"), "'fresnel'"),
+        (("hoe", "--model", "none", "--risk-tail", "0", "--out", "out"), "tail"),
+        (("hoe", "--model", "none", "--spread-of", "no.zarr", "--out", "out"), "no.zarr"),
+        (("hoe", "--model", "none", "--ensemble", "b=nowhere", "--out", "out"), "nowhere"),
+        (("lens", "--model", "none", "--focal-length-um", "0.02", "--out", "out"), "propagation distance"),
+        (("hoe", "--model", "none", "--device", "abacus", "--out", "out"), "'abacus'"),
+        (("hoe", "--model", "none", "--device", "cuda:99", "--out", "out"), "'cuda:99'"),
+        (("lens", "--model", "none", "--size-px", "127", "--out", "out"), "even number"),
+        (("lens", "--model", "none", "--start", "gs", "--out", "out"), "'gs'"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(tmp_path, monkeypatch, capsys, arguments, words):
     (tmp_path / "note.txt").write_text("words")
+    black = np.zeros((64, 64), np.uint8)
+    cv2.imwrite(str(tmp_path / "black.png"), black)
+    tifffile.imwrite(tmp_path / "nan.tif", np.full((64, 64), np.nan, np.float32))
+    for name, pitch_um in (("affine", 0.1), ("coarse", 0.2)):
+        simulator_class = model_class("affine")
+        save_frozen(simulator_class(simulator_class.Config(pitch_um=pitch_um)), tmp_path / name)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "argv", ["litho-design", *arguments])
     with pytest.raises(SystemExit) as stop:

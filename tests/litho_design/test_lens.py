@@ -109,6 +109,21 @@ def test_ring_path_sees_what_the_plane_path_sees(make_printer):
     assert float((plane - strip).abs().sum() / plane.sum()) < 0.04
 
 
+def test_a_printer_that_knows_the_position_is_asked_for_the_whole_plane(settings, make_printer):
+    printer = make_printer(LAYOUT)
+    printer.simulator.card = {"process_effects": {"vignetting": {"strength": 0.1}}}
+    task = LensTask(settings, printer)
+    assert not task.radial
+    assert "whole plane" in task.notes[0]
+    assert not task.strips
+    level = torch.full((1, 1, 300, 300), 3.0)
+    # The objective sees the print of the element itself, not of a strip.
+    centre_px = round(settings.view.centre_um / LAYOUT.pitch_um)
+    ratio = centre_to_background(task.bench(printer(level)[0, 0]), centre_px, 300)
+    assert float(task.objective(level)[0]) == pytest.approx(-math.log(float(ratio)), rel=1e-6)
+    assert printer.tiling_check(level, tile_px=64) is None
+
+
 def test_light_thrown_out_of_the_window_counts_as_background():
     psf = torch.zeros(64, 64)
     psf[27:37, 27:37] = 0.004
