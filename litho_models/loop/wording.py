@@ -21,9 +21,14 @@ def plain_words(closed: Closed, result: CloseLoop) -> str:
         "once the "
         "zero of each scan is freed."
     ]
-    if scan_terms:
-        names = ", ".join(get_effect(e.name).title for e in scan_terms)
-        parts.append(f"The microscope accounts for: {names}. This says nothing about the printer.")
+    microscope = [get_effect(e.name).title for e in scan_terms if e.role == "measurement"]
+    written = [get_effect(e.name).title for e in scan_terms if e.role != "measurement"]
+    if microscope:
+        parts.append(
+            f"The microscope accounts for: {', '.join(microscope)}. This says nothing about the printer."
+        )
+    if written:
+        parts.append(f"Every print adds anew, so that no model can foretell it: {', '.join(written)}.")
     for e in causes:
         alike = f" (or {', '.join(e.confusable_with)}: these data cannot tell)" if e.confusable_with else ""
         parts.append(
