@@ -7,12 +7,12 @@ from dataclasses import fields as fields_of
 
 import numpy as np
 
+from benchmarks.blind_trials.judging import scan_terms
 from benchmarks.blind_trials.records import ErrorPair
 from litho_data.register.resample import resample_to_layout
 from litho_data.store import Store
 from litho_data.virtual_fab import Fab, Job, KnobSetting, Microscope, Noise, Printer, Truth, scan_job
 from litho_data.virtual_fab.knobs import KnobBoard
-from litho_models.effects import CATALOGUE
 from litho_models.loop.fields import prepare_fields
 from litho_models.loop.result import CloseLoop
 from litho_models.loop.scoring import DATUM_FREE, names_to_terms, score
@@ -45,8 +45,7 @@ def true_floor(truth: Truth, jobs: Sequence[Job], store: Store, result: CloseLoo
         )
         predictions.append(np.where(valid, height, np.float32(np.nanmean(height))))
     stripes = any(knob.name == "scan-line-stripes" for knob in truth.knobs)
-    named = [e.name for e in result.effects if CATALOGUE[e.name].per_scan]
-    terms = DATUM_FREE | names_to_terms(named + ["scan-line-stripes"] * stripes)
+    terms = DATUM_FREE | names_to_terms(scan_terms(result) + ["scan-line-stripes"] * stripes)
     errors = score(prepare_fields(scans), predictions, terms, result.nuisance.seed)
     return ErrorPair(mae_nm=errors.mean_mae_nm, rmse_nm=errors.rmse_nm)
 

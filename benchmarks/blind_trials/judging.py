@@ -11,15 +11,21 @@ from litho_models.loop.result import CloseLoop
 _CAUSES = ("explained", "confusable")
 
 
+def scan_terms(result: CloseLoop) -> list[str]:
+    """Effects of single scans that the loop accepted: the nuisance span. Probes are no catalogue names."""
+    return [e.name for e in result.effects if e.name in CATALOGUE and CATALOGUE[e.name].per_scan]
+
+
 def named_outside_span(result: CloseLoop) -> list[Named]:
     """Effects that the loop added, without what the default noise has in every scan anyway.
 
     Datum, gain, tilt and bow, line offsets and warp of single scans are in the nuisance span.
     """
+    span = scan_terms(result)
     return [
         Named(names=[effect.name, *effect.confusable_with], verdict=effect.verdict)
         for effect in result.effects
-        if effect.name not in CATALOGUE or not CATALOGUE[effect.name].per_scan
+        if effect.name not in span
     ]
 
 

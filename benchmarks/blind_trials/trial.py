@@ -10,13 +10,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks.blind_trials.floor import true_floor
-from benchmarks.blind_trials.judging import judge, named_outside_span, strangers
+from benchmarks.blind_trials.judging import judge, named_outside_span, scan_terms, strangers
 from benchmarks.blind_trials.planting import plant, settings, trial_jobs
 from benchmarks.blind_trials.records import Cost, Draw, ErrorPair, Outcome, Planted, Trial, TrialErrors
 from litho_data.build import build
 from litho_data.store import open_store
 from litho_data.virtual_fab import Truth, simulate
-from litho_models.effects import CATALOGUE
 from litho_models.loop.result import CloseLoop, Errors
 from litho_models.loop.run import close_loop_on_store
 
@@ -114,7 +113,7 @@ def _judged(draw: Draw, planted: list[Planted], result: CloseLoop, floor: ErrorP
         outcomes=judge(draw.kind, planted, result),
         also_named=strangers(named, planted),
         named=named,
-        scan_terms=[e.name for e in result.effects if e.name in CATALOGUE and CATALOGUE[e.name].per_scan],
+        scan_terms=scan_terms(result),
         verdict=result.verdict,
         dropped=result.run.dropped,
         errors=TrialErrors(before=_pair(result.before), after=_pair(result.after), floor=floor),

@@ -13,7 +13,7 @@ from benchmarks.blind_trials import campaign
 from benchmarks.blind_trials.__main__ import PAGE, REPORTED_SEED, RESULTS
 from benchmarks.blind_trials.document import END, START, as_markdown, publish, published
 from benchmarks.blind_trials.draws import LARGEST_RMS_NM, SMALLEST_RMS_NM, draw_trials
-from benchmarks.blind_trials.judging import judge, strangers
+from benchmarks.blind_trials.judging import judge, scan_terms, strangers
 from benchmarks.blind_trials.planting import plant, settings, trial_jobs
 from benchmarks.blind_trials.records import (
     Cost,
@@ -178,6 +178,11 @@ def planted_effect(effect: str, rms_nm: float = 20.0) -> Planted:
 def test_judgements(kind, planted, sets, wanted):
     outcomes = judge(kind, [planted_effect(effect) for effect in planted], loop_result(*sets))
     assert [outcome.judgement for outcome in outcomes] == wanted
+
+
+def test_terms_of_single_scans_are_those_of_the_catalogue():
+    result = loop_result(("datum-offset",), ("position-gain-map",), ("vignetting",), ("scan-line-stripes",))
+    assert scan_terms(result) == ["datum-offset", "scan-line-stripes"]
 
 
 def test_an_effect_without_a_name_may_be_noticed_or_missed():
