@@ -75,7 +75,8 @@ class Printer(nn.Module):
         self.extrapolate = extrapolate
         self._reduced = False
         self.name = name or ("none" if simulator is None else str(simulator.name))
-        self.guard_px = 0 if simulator is None else math.ceil(_guard_um(simulator) / layout.pitch_um)
+        # The reach is a whole number of pixels times the pitch, give or take a rounding.
+        self.guard_px = 0 if simulator is None else math.ceil(_guard_um(simulator) / layout.pitch_um - 1e-6)
         self.halo_px = 0 if simulator is None else _halo_px(simulator, self.guard_px)
         # What lies in the guard ring is cut off again: a model that can leave it out need not compute it.
         self._interior: Callable[..., Tensor] | None = None

@@ -48,6 +48,24 @@ def test_simple_models_print_their_closed_form(tmp_path, name):
     ).tolist(), abs=1e-6)  # fmt: skip
 
 
+@pytest.mark.parametrize("sigma_um", [0.3, 0.65, 0.825])
+def test_a_model_with_an_interior_is_not_asked_for_the_guard_ring(tmp_path, sigma_um):
+    simulator_class = model_class("affine-mtf")
+    simulator = simulator_class(simulator_class.Config(sigmas_um=(0.1, sigma_um)))
+    with torch.no_grad():
+        for parameter in simulator.parameters():
+            parameter.add_(0.1)
+    layout = LayoutSettings(size_px=32)
+    printer = load_printer(str(save_frozen(simulator, tmp_path / "mtf")), layout)
+    # The guard is the reach itself, 12, 26 and 33 px, whatever a pitch of 0.1 does to a quotient.
+    assert printer.guard_px == simulator.reach_px
+    level = torch.randint(0, 13, (1, 1, 32, 32), generator=torch.Generator().manual_seed(0)).float()
+    wide = torch.nn.functional.pad(level * 0.1, (60,) * 4)
+    with torch.no_grad():
+        expected = simulator(wide)[..., 60:-60, 60:-60]
+    assert torch.allclose(printer(level), expected, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
