@@ -233,5 +233,5 @@ def _notes(found: ReferencePrints, bounds: Sequence[NoiseBound], dosed: Sequence
     if found.flats and not found.substrates:
         notes.append("No bare substrate: the flat print's roughness includes microscope and substrate.")
     if not dosed:
-        notes.append("No doses in the store: a dose matrix needs a `dose` column in the card's table.")
+        notes.append("No doses in the store: a dose matrix needs a column 'dose' in the card's table.")
     return notes

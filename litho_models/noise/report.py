@@ -38,8 +38,8 @@ def write_noise_report(result: NoiseAnalysis, references: Sequence[Reference], o
     if result.bounds:
         page.heading("Bounds from ordinary prints")
         page.paragraph(
-            "Each figure says how it errs. A lower bound holds whatever the prints look like; an upper bound "
-            "holds topography as well."
+            "Each figure says how it errs. The lower bound holds if the printer is no sharper than stated; "
+            "an upper bound counts topography as well."
         )
         page.figure(figures.bounds(result.bounds, floor), "σ of each figure.")
         page.table(_bounds(result), "What each contains, and what not.", "bounds.csv")
