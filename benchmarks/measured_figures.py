@@ -1,0 +1,68 @@
+"""Figures of the measured run for the documentation."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from litho_data.report import new_figure
+from litho_data.store import open_store
+
+_BASE, _CORRECTED = "#9aa5b1", "#0b6aa2"
+
+
+def draw_steps(errors_csv: Path, path: Path) -> None:
+    """Held-out error of the base and the corrected model as per-scan terms are freed."""
+    frame = pd.read_csv(errors_csv)
+    figure = new_figure(8, 0.36 * len(frame) + 1.0)
+    axes = figure.subplots()
+    y = np.arange(len(frame))[::-1]
+    mae = frame["MAE (nm)"].to_numpy()
+    spread = np.abs(np.stack([mae - frame["low"], frame["high"] - mae]))
+    colours = [_BASE if str(label).startswith("base") else _CORRECTED for label in frame["model"]]
+    axes.barh(y, mae, xerr=spread, color=colours, height=0.66)
+    for position, value, high in zip(y, mae, frame["high"], strict=True):
+        axes.annotate(f"{value:.1f}", (high, position), (5, 0), textcoords="offset points", va="center")
+    axes.set_yticks(y, frame["model"])
+    axes.set_xlabel("mean absolute error on held-out scans (nm)")
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.savefig(path, dpi=110)
+
+
+def draw_prediction(store: Path, benchmark: Path, path: Path, model: str = "pbl") -> None:
+    """Layout, measured print, held-out prediction and difference of the median scan of one model."""
+    result = json.loads((benchmark / "benchmark.json").read_text(encoding="utf-8"))
+    rows = next(s for s in result["scores"] if s["model"] == model)["scans"]
+    errors = [row["mae_datum_free_nm"] for row in rows]
+    chosen = rows[int(np.argsort(errors)[len(errors) // 2])]
+    scan = next(s for s in open_store(store).scans() if s.id == chosen["scan"])
+    prediction = _held_out(benchmark / "cache", model, scan.id)
+    difference = 1e3 * np.where(scan.valid, scan.height_um - prediction, np.nan)
+    difference -= np.nanmedian(difference)
+    panels = [
+        ("layout (µm)", scan.layout_um, "viridis", (0, 1.2)),
+        ("measured (µm)", np.where(scan.valid, scan.height_um, np.nan), "viridis", (0, 1.2)),
+        (f"{model}, not trained on this scan (µm)", prediction, "viridis", (0, 1.2)),
+        ("measured - predicted (nm)", difference, "RdBu_r", (-80, 80)),
+    ]
+    figure = new_figure(15, 3.9)
+    size = [0, scan.shape[1] * scan.pitch_um, scan.shape[0] * scan.pitch_um, 0]
+    for axes, (title, values, colours, limits) in zip(figure.subplots(1, 4), panels, strict=True):
+        shown = axes.imshow(values, cmap=colours, vmin=limits[0], vmax=limits[1], extent=size)
+        axes.set_title(title, fontsize=10)
+        axes.set_xlabel("x (µm)")
+        figure.colorbar(shown, ax=axes, shrink=0.8)
+    figure.suptitle(f"{scan.id}, the median held-out scan: {chosen['mae_datum_free_nm']:.1f} nm", fontsize=11)
+    # Roughness does not compress without loss.
+    figure.savefig(path, dpi=75, pil_kwargs={"quality": 80})
+
+
+def _held_out(cache: Path, model: str, scan_id: str) -> np.ndarray:
+    for record in cache.glob(f"{model}-*/fit.json"):
+        ids = json.loads(record.read_text(encoding="utf-8"))["held_out_ids"]
+        if scan_id in ids:
+            return np.load(record.parent / f"prediction_{ids.index(scan_id):03d}.npy", allow_pickle=False)
+    raise FileNotFoundError(f"no held-out prediction of {scan_id} by {model} in {cache}")

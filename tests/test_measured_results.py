@@ -1,0 +1,32 @@
+"""The pages quote the committed results of the measured run, figure by figure."""
+
+from __future__ import annotations
+
+import pytest
+
+from benchmarks.measured import FOLDER, PAGES, RESULTS, texts
+from benchmarks.record import published
+from litho_design.compare import GapResult
+from litho_models.benchmark import Benchmark
+from litho_models.loop.result import CloseLoop
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.parent.name)
+def test_the_page_quotes_the_committed_results(page):
+    for name in PAGES[page]:
+        assert published(page, name) == texts(FOLDER)[name]
+
+
+def test_the_committed_results_are_of_the_published_schemas():
+    loop = CloseLoop.read(FOLDER)
+    benchmark = Benchmark.read(FOLDER)
+    GapResult.read(FOLDER)
+    assert loop.dataset.sha256 == benchmark.dataset.sha256
+    # Nobody looked at the locked scans.
+    assert loop.locked_after is None
+    assert not benchmark.locked_scores
+    assert not set(loop.split.lock_box) & set(benchmark.split.scored_ids)
+
+
+def test_every_result_is_there():
+    assert {path.name for path in FOLDER.iterdir()} >= {*RESULTS, "prediction.jpg", "loop_steps.png"}
