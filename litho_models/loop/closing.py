@@ -160,6 +160,10 @@ def close_loop(
             seed=config.seed,
             report=report,
         )
+        # What single scans add to the model that is reported, not to the guide.
+        first_tests = measurement_tests(
+            development, start.predictions, fold_of, floor_nm2=floor[0] ** 2, seed=config.seed
+        )
     report("testing what is left for structure")
     left = covariate_tests(development, search.state.predictions)
     probed = probe_residual(
