@@ -165,20 +165,26 @@ def close_loop(
             development, start.predictions, fold_of, floor_nm2=floor[0] ** 2, seed=config.seed
         )
     report("testing what is left for structure")
+    # Effects that displace a print leave a shift in every scan, which its registration then takes up.
+    between = measurement_tests(
+        development, search.state.predictions, fold_of, floor_nm2=floor[0] ** 2, seed=config.seed
+    )
     left = covariate_tests(development, search.state.predictions)
     probed = probe_residual(
         search.state,
         development,
         fold_of,
-        terms,
+        DATUM_FREE | names_to_terms([t.effect.name for t in between if t.confirmation.passed]),
         floor_nm2=floor[0] ** 2,
         seed=config.seed,
         search=bool(is_structured(left)),
         report=report,
     )
     final = probed.state
-    last_tests = measurement_tests(
-        development, final.predictions, fold_of, floor_nm2=floor[0] ** 2, seed=config.seed
+    last_tests = (
+        measurement_tests(development, final.predictions, fold_of, floor_nm2=floor[0] ** 2, seed=config.seed)
+        if probed.added
+        else between
     )
     accepted = [test.effect.name for test in last_tests if test.confirmation.passed]
     planted = []

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -28,6 +28,7 @@ _START_EVERY = 3
 # Base parameters are lengths in µm or logits of order 1. Beyond 4 a logit has no slope left, and a
 # fit that has run there (on scans that a fold holds out, say) could not come back.
 _LONGEST_STEP, _LARGEST_VALUE = 1.0, 4.0
+_AT_BOUND = 1e-6
 _FOLD_STEPS = 6
 _FOLD_GAIN = 1e-4
 # Keeps combinations of parameters without influence where the common fit put them.
@@ -59,7 +60,8 @@ class FoldFits:
         common: (p,) fitted on all development scans.
         per_fold: (folds, p), each fitted without its own scans.
         covariance: (p, p), cluster-robust over scans.
-        linear: linearisation of each development scan at ``common``.
+        linear: linearisation of each development scan at ``common``; a parameter that has run against
+            its bound has no derivative there, since it cannot follow a candidate outwards.
     """
 
     chain: EffectChain
@@ -95,6 +97,8 @@ def fit_folds(chain: EffectChain, fields: Sequence[Field], fold_of: np.ndarray) 
             for fold in range(int(fold_of.max()) + 1)
         ]
     )
+    free = _within_bounds(chain, common)
+    linear = [replace(part, jacobian=part.jacobian * free) for part in linear]
     return FoldFits(chain, common, per_fold, _robust_covariance(linear), linear)
 
 
@@ -229,6 +233,12 @@ def _room(chain: EffectChain, vector: np.ndarray) -> tuple[np.ndarray, np.ndarra
         limits = get_effect(name).parameters[parameter]
         lowest[slot], highest[slot] = limits.lower - vector[slot], limits.upper - vector[slot]
     return np.minimum(lowest, 0), np.maximum(highest, 0)
+
+
+def _within_bounds(chain: EffectChain, vector: np.ndarray) -> np.ndarray:
+    """True for parameters (p,) with room on both sides."""
+    lowest, highest = _room(chain, vector)
+    return (lowest < -_AT_BOUND) & (highest > _AT_BOUND)
 
 
 def _steps(chain: EffectChain, vector: np.ndarray) -> np.ndarray:

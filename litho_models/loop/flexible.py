@@ -17,7 +17,7 @@ from litho_models.loop.confirming import confirm
 from litho_models.loop.fields import Field
 from litho_models.loop.fitting import effect_slots
 from litho_models.loop.scoring import Terms, score
-from litho_models.loop.search import Added, Search, State, fit_state, fold_amplitudes
+from litho_models.loop.search import Added, Search, State, fit_state, fold_amplitudes, terms_for
 
 Trainer = Callable[[Sequence[PrintedScan]], nn.Module]
 
@@ -88,7 +88,7 @@ def carry_over(
         }
         chain = carried.state.fits.chain
         extended = fit_state(chain.with_effects({**chain.values(), name: values}), fields, fold_of)
-        own_terms = terms - {"gain"} if found.first[name].projection == "no-gain" else terms
+        own_terms = terms_for(terms, found.first[name])
         before = score(fields, carried.state.predictions, own_terms, seed)
         after = score(fields, extended.predictions, own_terms, seed)
         verdict = confirm(

@@ -150,7 +150,11 @@ def _one_round(
         if chosen.mean_gain_nm2 < WORTH_FITTING * SMALLEST_SHARE * mse_nm2:
             found.failures[chosen.effect.name] = "predicted gain on held-out scans too small to matter"
             continue
-        alike = [s for s in eligible if s is not chosen and abs(cosine(directions, chosen, s)) >= SAME_COSINE]
+        alike = [
+            s
+            for s in screened
+            if s is not chosen and may_be(s) and abs(cosine(directions, chosen, s)) >= SAME_COSINE
+        ]
         winners = best_by_fold(directions, eligible[attempt:], fold_of)
         same = {chosen.effect.name, *(s.effect.name for s in alike)}
         agreeing = sum(winner in same for winner in winners)
@@ -167,13 +171,18 @@ def _one_round(
     return False
 
 
+def may_be(s: Screened) -> bool:
+    """Physical, testable and of some use: enough for a member of a set of which another stands out."""
+    return s.in_range and s.retained >= SMALLEST_RETAINED and s.mean_gain_nm2 > 0
+
+
 def is_eligible(s: Screened, mse_nm2: float) -> bool:
     """Physical, testable, promises a gain on held-out scans, and stands out.
 
     To stand out: family-wise by the score test or, where few scans leave that test little power, by
     a gain on scans not used for its estimate that satisfies the rules of the confirmation by itself.
     """
-    if not (s.in_range and s.retained >= SMALLEST_RETAINED and s.mean_gain_nm2 > 0):
+    if not may_be(s):
         return False
     improved = int((s.gain_nm2 > 0).sum())
     consistent = binomial_p(improved, len(s.gain_nm2)) <= BINOMIAL_P
@@ -191,7 +200,7 @@ def _fit_and_confirm(
     seed: int,
     report: Callable[[str], None],
 ) -> tuple[Added, State]:
-    own_terms = terms - {"gain"} if chosen.projection == "no-gain" else terms
+    own_terms = terms_for(terms, chosen)
     before = score(fields, state.predictions, own_terms, seed)
     members = [chosen, *sorted(alike, key=lambda s: -s.mean_gain_nm2)]
     refitted = []
@@ -217,6 +226,16 @@ def _fit_and_confirm(
         seed=seed,
     )
     return Added(best[0].effect, sorted(untold), before, best[2], confirmation, best[0].p), best[1]
+
+
+def terms_for(terms: Terms, screened: Screened) -> Terms:
+    """Per-scan terms of the comparison without and with an effect: those that the fit leaves free.
+
+    Registration has already taken the mean shift and magnification out of every scan, so an effect that
+    has them must not be charged for them; what acts as a gain must not be hidden by the scans' own gain.
+    """
+    free = terms | {"warp"}
+    return free - {"gain"} if screened.projection == "no-gain" else free
 
 
 def fold_amplitudes(fits: FoldFits, effect: Effect) -> dict[str, np.ndarray]:
@@ -252,7 +271,7 @@ def _drop_idle(
         chain = found.state.fits.chain
         kept = {other: values for other, values in chain.values().items() if other != name}
         without = fit_state(chain.with_effects(kept), fields, fold_of)
-        own_terms = terms - {"gain"} if found.first[name].projection == "no-gain" else terms
+        own_terms = terms_for(terms, found.first[name])
         before = score(fields, without.predictions, own_terms, seed)
         after = score(fields, found.state.predictions, own_terms, seed)
         still = confirm(
