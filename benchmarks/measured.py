@@ -22,11 +22,12 @@ FOLDER = ROOT / "docs" / "results" / "neural-lithography"
 RESULTS = {
     "benchmark.json": "benchmark/benchmark.json",
     "close_loop.json": "close-loop/close_loop.json",
+    "close_loop_pbl.json": "close-loop-pbl/close_loop.json",
     "close_loop_candidates.csv": "close-loop/candidates.csv",
     "gap.json": "compare/gap.json",
     "score.json": "score/score.json",
 }
-NAMES = ("benchmark", "loop", "design")
+NAMES = ("benchmark", "loop", "loop with PBL", "design")
 PAGES = {ROOT / "README.md": NAMES, FOLDER / "README.md": NAMES}
 
 
@@ -73,6 +74,9 @@ def loop_table(loop: dict[str, Any]) -> str:
             f"| `{effect['name']}`{alike} | {effect['role']}, {effect['verdict']}{known} "
             f"| {effect['before_nm']:.2f} nm ({figure}) | {effect['after_nm']:.2f} nm | {better} of {count} |"
         )
+    absorbed = [c["name"] for c in loop["candidates"] if c["verdict"] == "absorbed"]
+    if absorbed:
+        rows.append(f"\nFound on Physics and already carried by the network: {', '.join(absorbed)}.")
     rows.append(
         f"\nBase model {loop['base_model']}: datum-free {before['mae_datum_free_nm']:.2f} nm before, "
         f"{after['mae_datum_free_nm']:.2f} nm after, {loop['split']['folds']} folds by scan. "
@@ -110,6 +114,7 @@ def texts(folder: Path) -> dict[str, str]:
     makers = {
         "benchmark": (benchmark_table, "benchmark.json"),
         "loop": (loop_table, "close_loop.json"),
+        "loop with PBL": (loop_table, "close_loop_pbl.json"),
         "design": (design_table, "gap.json"),
     }
     return {

@@ -104,6 +104,19 @@ def plan(out: Path, dataset: str) -> list[Step]:
             loop / "report.html",
         ),
     ]  # fmt: skip
+    if dataset:
+        network = out / "close-loop-pbl"
+        steps.append(
+            Step(
+                "What does the network lack?",
+                _models(
+                    "close-loop", store, "--base", "pbl", "--folds", effort.folds, *training,
+                    "--cache", out / "benchmark" / "cache", *prior, "--out", network,
+                ),
+                network / "close_loop.json",
+                network / "report.html",
+            )
+        )  # fmt: skip
     for model in ARMS:
         trained, frozen = out / "runs" / model, out / "models" / model
         steps += [
