@@ -28,9 +28,12 @@ def dose_dependent_shrinkage(height: Tensor, values: Values, context: FieldConte
 
 
 def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H(x + s (H / full) (x - xc)): tops pull in towards the centre of the field, bases stay put."""
+    """H(x + s ((H - mean) / full) (x - xc)): tops pull in towards the centre of the field, more than bases.
+
+    What the mean height pulls is a magnification, which registration has taken out of a scan.
+    """
     y, x = context.centred_um()
-    pull = values["fraction"] * height[0, 0] / context.full_height_um
+    pull = values["fraction"] * (height[0, 0] - height.mean()) / context.full_height_um
     return add_warp(height, pull * y, pull * x, context.pitch_um)
 
 

@@ -6,19 +6,19 @@ import torch
 from torch import Tensor
 
 from litho_models.effects.effect import Effect, FieldContext, Parameter, Values
-from litho_models.effects.filters import add_filtered, trailing_response
+from litho_models.effects.filters import add_filtered, centred_lag, trailing_response
 
 _TAIL_LENGTHS = 6
 
 
 def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """The beam follows the command late: one-sided exponential of length l = v τ along the written lines."""
+    """The beam follows the command late: one-sided exponential of length l = v τ, without its mean delay."""
     length = values["length_um"]
     forward = float(values["direction"]) > 0
 
     def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
         along = fx if context.slow_axis == "y" else fy
-        return trailing_response(along if forward else -along, length, context.pitch_um) - 1
+        return centred_lag(along if forward else -along, length, context.pitch_um) - 1
 
     reach = _TAIL_LENGTHS * float(length.detach()) + context.pitch_um
     return add_filtered(layout, transfer_minus_one, context.pitch_um, reach, "zero")

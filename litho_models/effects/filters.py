@@ -64,6 +64,12 @@ def trailing_response(frequency: Tensor, length_um: Tensor, pitch_um: float) -> 
     return 1 / (1 + length_um / pitch_um * difference)
 
 
+def centred_lag(frequency: Tensor, length_um: Tensor, pitch_um: float) -> Tensor:
+    """``trailing_response`` without its mean delay l, which registration has taken out of a scan."""
+    advance = torch.exp(2j * math.pi * frequency * length_um)
+    return trailing_response(frequency, length_um, pitch_um) * advance
+
+
 def gradient(field: Tensor, pitch_um: float) -> tuple[Tensor, Tensor]:
     """Central differences (d/dy, d/dx) with replicated edges, per µm."""
     padded = functional.pad(field, (1, 1, 1, 1), mode="replicate")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from litho_models.effects.effect import Effect, FieldContext, Parameter, Values
-from litho_models.effects.filters import add_blur, add_filtered, add_warp, gradient, trailing_response
+from litho_models.effects.filters import add_blur, add_filtered, add_warp, centred_lag, gradient
 
 _TAIL_LENGTHS = 6
 
@@ -17,12 +17,12 @@ def tip_dilation(height: Tensor, values: Values, context: FieldContext) -> Tenso
 
 
 def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """The probe follows late: one-sided exponential of length l along the fast axis."""
+    """The probe follows late: one-sided exponential of length l along the fast axis, mean delay taken out."""
     length = values["length_um"]
     forward = float(values["direction"]) > 0
 
     def transfer_minus_one(_: Tensor, fx: Tensor) -> Tensor:
-        return trailing_response(fx if forward else -fx, length, context.pitch_um) - 1
+        return centred_lag(fx if forward else -fx, length, context.pitch_um) - 1
 
     reach = _TAIL_LENGTHS * float(length.detach()) + context.pitch_um
     return add_filtered(height, transfer_minus_one, context.pitch_um, reach, "replicate")

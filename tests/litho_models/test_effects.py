@@ -173,20 +173,22 @@ def test_long_range_proximity_keeps_a_flat_dose_and_damps_a_fast_wave() -> None:
     assert torch.allclose(inner, torch.ones_like(inner), rtol=0, atol=0.2 * 4 * 0.00135)
 
 
-def test_galvo_lag_is_a_causal_exponential_of_unit_area() -> None:
+def test_galvo_lag_is_a_one_sided_exponential_of_unit_area_about_its_mean() -> None:
     effect = get_effect("galvo-lag")
     point = torch.zeros(1, 1, 9, 200, dtype=torch.float64)
     point[..., 4, 100] = 1
     context = FieldContext(point, PITCH_UM, 1.2)
     response = effect(point, {"length_um": 0.3, "direction": 1.0}, context)[0, 0, 4]
-    lags = torch.arange(200) - 100
+    # The tail starts a mean delay of 0.3 µm = 3 px early, so that the response stays in place.
+    lags = torch.arange(200) - 100 + 3
     ratio = 0.3 / (0.3 + PITCH_UM)
     expected = torch.where(lags >= 0, (1 - ratio) * ratio ** lags.clamp(min=0).double(), 0.0)
     # The padded period is 6 lengths longer than the field: the tail that wraps is below ratio^100.
     assert torch.allclose(response, expected, rtol=0, atol=1e-9)
+    assert float((response * (torch.arange(200) - 100)).sum()) == pytest.approx(0, abs=1e-6)
     mirrored = effect(point, {"length_um": 0.3, "direction": -1.0}, context)[0, 0, 4]
-    assert torch.allclose(mirrored[:101].flip(0)[:99], response[100:199], rtol=0, atol=1e-9)
-    assert float(mirrored[101:].abs().max()) < 1e-9
+    assert torch.allclose(mirrored[1:].flip(0), response[1:], rtol=0, atol=1e-9)
+    assert float(mirrored[104:].abs().max()) < 1e-9
 
 
 def test_slow_axis_turns_galvo_lag_and_memory() -> None:
