@@ -40,9 +40,7 @@ def close_loop(
     ] = None,
     cache: Annotated[
         Path | None,
-        typer.Option(
-            "--cache", help="folder of trained folds, e.g. of a benchmark; beside --out by default"
-        ),
+        typer.Option("--cache", help="folder of trained folds, e.g. of a benchmark; beside --out by default"),
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="folds, locked scans, bootstrap")] = 0,
 ) -> None:
