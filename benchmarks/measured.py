@@ -74,6 +74,10 @@ def loop_table(loop: dict[str, Any]) -> str:
             f"| `{effect['name']}`{alike} | {effect['role']}, {effect['verdict']}{known} "
             f"| {effect['before_nm']:.2f} nm ({figure}) | {effect['after_nm']:.2f} nm | {better} of {count} |"
         )
+    rows.append(
+        "\nA row need not begin where the last one ended: both sides of a process effect leave each scan's "
+        "registration free, and both sides of one that acts as a gain go without the gain of single scans."
+    )
     absorbed = [c["name"] for c in loop["candidates"] if c["verdict"] == "absorbed"]
     if absorbed:
         rows.append(f"\nFound on Physics and already carried by the network: {', '.join(absorbed)}.")
