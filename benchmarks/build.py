@@ -59,6 +59,8 @@ def main() -> None:
     parser.add_argument("--scratch", type=Path, help="folder for scans and stores; 6 MB per virtual scan")
     parser.add_argument("--publish", action="store_true", help="write the table into docs/dataset_store.md")
     arguments = parser.parse_args()
+    if arguments.scratch:
+        Path(arguments.scratch).mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=arguments.scratch) as scratch:
         folder = Path(scratch)
         runs = []
