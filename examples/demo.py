@@ -38,7 +38,7 @@ class Effort:
 
 
 # A quarter of the paper's element at a quarter of its distance keeps the diffraction angles.
-QUICK = Effort(training_steps=100, folds=3, element_px=256, distance_um=75, iterations=60, seeds=1)
+QUICK = Effort(training_steps=60, folds=3, element_px=256, distance_um=75, iterations=60, seeds=1)
 MEASURED = Effort(training_steps=2000, folds=5, element_px=256, distance_um=75, iterations=100, seeds=1)
 
 
