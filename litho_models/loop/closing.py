@@ -131,11 +131,15 @@ def close_loop(
     start = fit_state(chain, development, fold_of)
     untestable = dict(UNTESTABLE) | _untestable(development)
     floor = noise_lower_bound_nm(development, start.predictions)
+
+    def test_single_scans(state: State) -> list[MeasurementTest]:
+        return measurement_tests(
+            development, state.predictions, fold_of, floor_nm2=floor[0] ** 2, seed=config.seed
+        )
+
     report("testing what single scans add")
-    first_tests = measurement_tests(
-        development, start.predictions, fold_of, floor_nm2=floor[0] ** 2, seed=config.seed
-    )
-    terms = DATUM_FREE | names_to_terms([t.effect.name for t in first_tests if t.confirmation.passed])
+    first_tests = test_single_scans(start)
+    terms = DATUM_FREE | names_to_terms(_passed(first_tests))
     search = search_effects(
         start,
         development,
@@ -161,32 +165,24 @@ def close_loop(
             report=report,
         )
         # What single scans add to the model that is reported, not to the guide.
-        first_tests = measurement_tests(
-            development, start.predictions, fold_of, floor_nm2=floor[0] ** 2, seed=config.seed
-        )
+        first_tests = test_single_scans(start)
     report("testing what is left for structure")
     # Effects that displace a print leave a shift in every scan, which its registration then takes up.
-    between = measurement_tests(
-        development, search.state.predictions, fold_of, floor_nm2=floor[0] ** 2, seed=config.seed
-    )
+    between = first_tests if search.state is start else test_single_scans(search.state)
     left = covariate_tests(development, search.state.predictions)
     probed = probe_residual(
         search.state,
         development,
         fold_of,
-        DATUM_FREE | names_to_terms([t.effect.name for t in between if t.confirmation.passed]),
+        DATUM_FREE | names_to_terms(_passed(between)),
         floor_nm2=floor[0] ** 2,
         seed=config.seed,
         search=bool(is_structured(left)),
         report=report,
     )
     final = probed.state
-    last_tests = (
-        measurement_tests(development, final.predictions, fold_of, floor_nm2=floor[0] ** 2, seed=config.seed)
-        if probed.added
-        else between
-    )
-    accepted = [test.effect.name for test in last_tests if test.confirmation.passed]
+    last_tests = test_single_scans(final) if probed.added else between
+    accepted = _passed(last_tests)
     planted = []
     for text in config.inject:
         report(f"planting {text}")
@@ -211,6 +207,10 @@ def close_loop(
         planted=planted,
         config=config,
     )
+
+
+def _passed(tests: Sequence[MeasurementTest]) -> list[str]:
+    return [test.effect.name for test in tests if test.confirmation.passed]
 
 
 def noise_lower_bound_nm(fields: Sequence[Field], predictions: Sequence[np.ndarray]) -> tuple[float, float]:

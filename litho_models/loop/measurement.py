@@ -130,7 +130,8 @@ def _test_lines(
         better_p = one_sided_flip_p(gains[name] - gains[other])
         untold = beaten_p > BINOMIAL_P and better_p > BINOMIAL_P
         excess_p = one_sided_flip_p(gains[name] - columns)
-        reasons = [_confirm(before, after[name], floor_nm2, seed).reason]
+        confirmation = _confirm(before, after[name], floor_nm2, seed)
+        reasons = [confirmation.reason]
         if excess_p > BINOMIAL_P:
             reasons.append(f"rows gain no more than columns (p = {excess_p:.3f})")
         if beaten_p <= BINOMIAL_P:
@@ -138,7 +139,6 @@ def _test_lines(
         elif untold and name == _LINES[1]:
             reasons.append(f"cannot be told from {other}: no scan is turned enough against its layout")
         reason = "; ".join(part for part in reasons if part)
-        confirmation = _confirm(before, after[name], floor_nm2, seed)
         variance = np.maximum(gains[name], 0) / NM_PER_UM**2
         interval = bootstrap_interval(variance.tolist(), seed=seed)
         low, high = (float(np.sqrt(end)) for end in interval)
