@@ -24,7 +24,10 @@ def score(
     design: Annotated[Path, typer.Argument(help="Folder of a design.")],
     out: Out,
     judge: Annotated[
-        list[str] | None, typer.Option(help="NAME=MODEL, MODEL or `none`; may be repeated.")
+        list[str] | None,
+        typer.Option(
+            help="NAME=MODEL, MODEL or `none`; MODEL may be truth/ of a virtual fab; may be repeated."
+        ),
     ] = None,
     scan: Annotated[Path | None, typer.Option(help="AFM height map of the printed part.")] = None,
     scan_unit: Annotated[str | None, typer.Option(help="Unit of its heights, if the file has none.")] = None,

@@ -34,7 +34,10 @@ def compare(
     models: Annotated[str, typer.Option(help="Arms, comma-separated: none, NAME=MODEL or MODEL.")],
     out: Out,
     judge: Annotated[
-        list[str] | None, typer.Option(help="Further judges, NAME=MODEL or MODEL; may be repeated.")
+        list[str] | None,
+        typer.Option(
+            help="Further judges, NAME=MODEL or MODEL (or truth/ of a virtual fab); may be repeated."
+        ),
     ] = None,
     task: Annotated[
         Literal["hoe", "lens-direct", "lens-computational"], typer.Option(help="What is designed.")

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from litho_data.errors import InputError
 from litho_data.results import Record
+from litho_design.fab_judge import FabSimulator, is_fab, load_fab
 from litho_design.parametrise import LayoutSettings
 
 _GUARD_UM = 6.4
@@ -89,6 +90,11 @@ class Printer(nn.Module):
     def card(self) -> Mapping[str, Any]:
         """The card of the model; empty where there is none."""
         return getattr(self.simulator, "card", {})
+
+    @property
+    def only_judges(self) -> bool:
+        """Whether it prints without gradients: layouts cannot be searched through it."""
+        return isinstance(self.simulator, FabSimulator)
 
     @property
     def depends_on_position(self) -> bool:
@@ -224,7 +230,8 @@ def load_printer(
 ) -> Printer:
     """The printer for ``source``: a folder of a frozen model, or ``none`` for nominal heights.
 
-    ``name`` is what results call it; the model's own name by default.
+    The folder ``truth`` of a virtual fab is a printer that can only judge. ``name`` is what results
+    call it; the model's own name by default.
 
     Raises:
         InputError: no frozen model there, another pitch, levels the model was not calibrated for, or a
@@ -233,6 +240,8 @@ def load_printer(
     _check_device(device)
     if source == "none":
         return Printer(None, layout, source=source, name=name).to(device)
+    if is_fab(source):
+        return Printer(load_fab(source, layout), layout, source=source, name=name).to(device)
     from litho_models import load_frozen
 
     simulator = load_frozen(source, device=device, extrapolate=extrapolate)

@@ -120,8 +120,9 @@ def run_design(
         announce: print the expected time and memory to stderr before starting.
 
     Raises:
-        InputError: ``out`` holds another design.
+        InputError: ``out`` holds another design, or a printer that only judges.
     """
+    _check_printers(task.printers)
     folder = Path(out)
     hashes_before = [printer.weights_sha256() for printer in task.printers]
     parts: list[Record | str] = [settings_record, *hashes_before, task.name]
@@ -193,6 +194,17 @@ def _ensemble(printers: Sequence[Printer], level: Tensor, optics: Optics) -> Ens
         disagreement_nm=1000 * apart_um,
         disagreement_waves=apart_um / optics.wave_height_um,
     )
+
+
+def _check_printers(printers: Sequence[Printer]) -> None:
+    for printer in printers:
+        if printer.only_judges:
+            raise InputError(
+                f"model {printer.name}",
+                got="a virtual fab",
+                wanted="a frozen model, or none",
+                hint="the fab only judges: --judge",
+            )
 
 
 def _finished(folder: Path, fingerprint: str) -> Design | None:
