@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from litho_data.errors import InputError
-from litho_data.level.plane import tilt
-from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
+from litho_data.level.plane import subtract_tilt
+from litho_data.level.selection import Levelled, Masking, as_height, select
 
 _MAX_PASSES = 100
 # Gwyddion 2.62; version 2.45 stopped at 1e-8, which moves the result by 2e-3 of the range.
@@ -50,7 +50,7 @@ def level_facet(
         total_y += step_y
         if step_x**2 + step_y**2 < _CONVERGED:
             break
-    return subtract(z, tilt((total_x * pitch_um[1], total_y * pitch_um[0]), z.shape))
+    return subtract_tilt(z, (total_x * pitch_um[1], total_y * pitch_um[0]))
 
 
 def _cell_slopes(

@@ -8,7 +8,7 @@ import numpy as np
 
 from litho_data.errors import InputError
 from litho_data.level.polynomial import Terms, fit_terms
-from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
+from litho_data.level.selection import Levelled, Masking, as_height, select, subtract_product
 
 PLANE: Terms = ((0, 0), (1, 0), (0, 1))
 
@@ -28,7 +28,7 @@ def level_plane(
     z = as_height(height)
     chosen = select(z, mask, masking)
     weights = None if chosen is None else chosen.astype(np.float64)
-    return subtract(z, tilt(slopes_per_px(fit_terms(z, weights, PLANE), z.shape), z.shape))
+    return subtract_tilt(z, slopes_per_px(fit_terms(z, weights, PLANE), z.shape))
 
 
 def level_three_point(
@@ -64,8 +64,8 @@ def level_three_point(
             "three-point levelling", got=f"points {list(points_px)}", wanted="points not on one line"
         )
     constant, slope_x, slope_y = np.linalg.solve(design, heights)
-    removed = tilt((slope_x, slope_y), z.shape)
-    return subtract(z, removed - removed[0, 0] + constant if set_zero else removed)
+    at_pivot = constant + slope_x * z.shape[1] / 2 + slope_y * z.shape[0] / 2
+    return subtract_tilt(z, (slope_x, slope_y), at_pivot if set_zero else 0.0)
 
 
 def slopes_per_px(coefficients: np.ndarray, shape: tuple[int, ...]) -> tuple[float, float]:
@@ -73,10 +73,12 @@ def slopes_per_px(coefficients: np.ndarray, shape: tuple[int, ...]) -> tuple[flo
     return 2 * coefficients[0, 1] / (shape[1] - 1), 2 * coefficients[1, 0] / (shape[0] - 1)
 
 
-def tilt(slopes: tuple[float, float], shape: tuple[int, ...]) -> np.ndarray:
-    """The plane with these slopes (x, y) per pixel that is zero at column nx/2, row ny/2."""
-    ny, nx = shape
-    return np.add.outer(slopes[1] * (np.arange(ny) - ny / 2), slopes[0] * (np.arange(nx) - nx / 2))
+def subtract_tilt(z: np.ndarray, slopes: tuple[float, float], at_pivot: float = 0.0) -> Levelled:
+    """The map less the plane of these slopes (x, y) per pixel and this height at column nx/2, row ny/2."""
+    ny, nx = z.shape
+    along_y = slopes[1] * (np.arange(ny) - ny / 2) + at_pivot
+    along_x = slopes[0] * (np.arange(nx) - nx / 2)
+    return subtract_product(z, np.stack([along_y, np.ones(ny)], axis=1), np.stack([np.ones(nx), along_x]))
 
 
 def _disc_mean(z: np.ndarray, chosen: np.ndarray | None, point: tuple[float, float], radius: float) -> float:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.polynomial import legendre
 
 from litho_data.errors import InputError
-from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
+from litho_data.level.selection import Levelled, Masking, as_height, select, subtract_product
 
 MAX_DEGREE = 11
 Terms = tuple[tuple[int, int], ...]
@@ -42,7 +44,7 @@ def level_polynomial(
     terms = polynomial_terms(x_degree, y_degree, total_degree)
     chosen = select(z, mask, masking)
     weights = None if chosen is None else chosen.astype(np.float64)
-    return subtract(z, evaluate(fit_terms(z, weights, terms), z.shape))
+    return subtract_product(z, *surface_factors(fit_terms(z, weights, terms), z.shape))
 
 
 def polynomial_terms(x_degree: int, y_degree: int, total_degree: int | None = None) -> Terms:
@@ -95,13 +97,22 @@ def fit_terms(z: np.ndarray, weights: np.ndarray | None, terms: Terms) -> np.nda
 
 def evaluate(coefficients: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     """The surface of ``fit_terms``'s coefficients on (ny, nx) pixels."""
+    along_y, along_x = surface_factors(coefficients, shape)
+    return along_y @ along_x
+
+
+def surface_factors(coefficients: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """(ny, k) and (k, nx): the surface of ``fit_terms``'s coefficients is their product."""
     basis_y = _basis(shape[0], coefficients.shape[0] - 1)
     basis_x = _basis(shape[1], coefficients.shape[1] - 1)
-    return basis_y @ (coefficients @ basis_x.T)
+    return basis_y, coefficients @ basis_x.T
 
 
+@lru_cache(maxsize=64)
 def _basis(n: int, degree: int) -> np.ndarray:
-    return legendre.legvander(np.linspace(-1.0, 1.0, n), degree)
+    basis = legendre.legvander(np.linspace(-1.0, 1.0, n), degree)
+    basis.flags.writeable = False
+    return basis
 
 
 def _normal_matrix(

@@ -74,25 +74,10 @@ def _dense_trimmed_mean(values: np.ndarray, trim: float) -> np.ndarray:
     n = values.shape[1]
     cut = int(np.floor(trim * n + 0.5))
     if trim >= MEDIAN_TRIM or 2 * cut >= n:
-        return _dense_upper_median(values)
+        return np.partition(values, n // 2, axis=1)[:, n // 2]
     if cut == 0:
         return values.mean(axis=1)
     return np.partition(values, (cut, n - cut - 1), axis=1)[:, cut : n - cut].mean(axis=1)
-
-
-def _dense_upper_median(values: np.ndarray) -> np.ndarray:
-    """sorted[n // 2] of each row.
-
-    Rounding to float32 keeps the order, so the float32 median, found in half the time, says which
-    value is the exact one unless several values round to it.
-    """
-    middle = values.shape[1] // 2
-    rounded = values.astype(np.float32)
-    candidates = rounded == np.partition(rounded, middle, axis=1)[:, middle, None]
-    medians = values[np.arange(len(values)), candidates.argmax(axis=1)]
-    shared = np.count_nonzero(candidates, axis=1) > 1
-    medians[shared] = np.partition(values[shared], middle, axis=1)[:, middle]
-    return medians
 
 
 def _modus(ordered: np.ndarray) -> float:

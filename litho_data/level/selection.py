@@ -11,6 +11,7 @@ from litho_data.errors import InputError
 
 Masking = Literal["ignore", "exclude", "include"]
 MASKINGS: tuple[Masking, ...] = ("ignore", "exclude", "include")
+_ROWS_IN_CACHE = 32
 
 
 class Levelled(NamedTuple):
@@ -63,3 +64,16 @@ def select(z: np.ndarray, mask: np.ndarray | None, masking: Masking) -> np.ndarr
 def subtract(z: np.ndarray, removed: np.ndarray) -> Levelled:
     """The map less the surface."""
     return Levelled(z - removed, removed)
+
+
+def subtract_product(z: np.ndarray, along_y: np.ndarray, along_x: np.ndarray) -> Levelled:
+    """The map less the surface ``along_y @ along_x``, factors (ny, k) and (k, nx).
+
+    A few rows at a time: the surface is then still in the cache when it is subtracted.
+    """
+    levelled = Levelled(np.empty_like(z), np.empty_like(z))
+    for first in range(0, len(z), _ROWS_IN_CACHE):
+        rows = slice(first, first + _ROWS_IN_CACHE)
+        surface = np.matmul(along_y[rows], along_x, out=levelled.removed[rows])
+        np.subtract(z[rows], surface, out=levelled.height[rows])
+    return levelled
