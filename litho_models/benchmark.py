@@ -6,7 +6,6 @@ it; a benchmark that was stopped continues where it was, and an unchanged fit is
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -15,10 +14,12 @@ import numpy as np
 from pydantic import Field
 
 from litho_data.commands import progress
-from litho_data.files import atomic_folder
+from litho_data.files import atomic_file, atomic_folder
 from litho_data.results import Record, Result
 from litho_data.store import PrintedScan, open_store
+from litho_models.background import BackgroundUse
 from litho_models.benchmark_report import write_benchmark_report
+from litho_models.diagnostics import FitDiagnostics, diagnose
 from litho_models.evaluate import SplitRecord
 from litho_models.folds import GROUPED_FOLDS, Fold, SplitKind, plan_folds
 from litho_models.freeze import DatasetName
@@ -31,6 +32,7 @@ from litho_models.scores import (
     ModelScores,
     NoiseFloor,
     NuisanceProtocol,
+    Prediction,
     noise_floor,
     protocol_for,
     score_model,
@@ -45,7 +47,10 @@ DEFAULT_MODELS = (*BASELINES, "physics", "pbl")
 
 
 class FitRecord(Record):
-    """One fit: what it saw and what it cost; errors are nm, None where the model has no rounds."""
+    """One fit: what it saw and what it cost; errors are nm, None where the model has no rounds.
+
+    Only results of before they were made have no ``diagnostics``.
+    """
 
     model: str
     fold: int
@@ -58,6 +63,7 @@ class FitRecord(Record):
     steps: list[int]
     training_mae_nm: list[float]
     validation_mae_datum_free_nm: list[float | None]
+    diagnostics: FitDiagnostics | None = None
 
 
 class Paired(Record):
@@ -100,6 +106,7 @@ def benchmark(
     settings: dict[str, Any] | None = None,
     folds: int = GROUPED_FOLDS,
     policy: Policy = "offset",
+    background: BackgroundUse = "training",
     open_lock_box: bool = False,
     seed: int = 0,
 ) -> Benchmark:
@@ -114,6 +121,7 @@ def benchmark(
         settings: fields of ``TrainingConfig`` that replace the recipe's.
         folds: number of folds of ``grouped``, at most the number of development scans.
         policy: nuisances of ``mae_datum_free_nm``.
+        background: whether each fit's background, learned on its training scans, is added to its predictions.
         open_lock_box: also train on all development scans and score the locked ones.
         seed: of the split, the nuisance blocks and the training.
 
@@ -128,16 +136,21 @@ def benchmark(
     plan = plan_folds(scans, locked, split, folds=folds, seed=seed, open_lock_box=open_lock_box)
     configs = {name: _config(name, settings, seed) for name in models}
     fits: list[FitRecord] = []
-    predicted: dict[tuple[str, bool], dict[str, np.ndarray]] = {}
+    predicted: dict[tuple[str, bool], dict[str, Prediction]] = {}
     jobs = [(name, fold) for name in models for fold in plan]
     for name, fold in progress(jobs, f"benchmark of {dataset.name}"):
-        record, predictions = _fit_or_load(name, fold, configs[name], Path(out) / "cache")
+        record, predictions = _fit_or_load(name, fold, configs[name], Path(out) / "cache", background)
         fits.append(record)
         predicted.setdefault((name, fold.locked), {}).update(predictions)
-    protocol = protocol_for(policy, seed)
+    protocol = protocol_for(policy, seed, background)
     scored = [scan for fold in plan if not fold.locked for scan in fold.held_out]
     boxed = [scan for fold in plan if fold.locked for scan in fold.held_out]
-    scores = [_score(name, scored, predicted[name, False], protocol) for name in models]
+
+    def score(name: str, judged: Sequence[PrintedScan], locked: bool) -> ModelScores:
+        own = predicted[name, locked]
+        return score_model(name, judged, [own[scan.id] for scan in judged], protocol)
+
+    scores = [score(name, scored, False) for name in models]
     ids = [scan.id for scan in scored]
     result = Benchmark(
         schema="litho-models/benchmark/1",
@@ -156,12 +169,13 @@ def benchmark(
         noise_floor=noise_floor(dataset.name),
         training={name: config.model_dump(mode="json") for name, config in configs.items()},
         scores=scores,
-        locked_scores=[_score(n, boxed, predicted[n, True], protocol) for n in models] if boxed else [],
+        locked_scores=[score(name, boxed, True) for name in models] if boxed else [],
         paired=_all_pairs(scores, seed),
         fits=fits,
     )
     result.write(out)
-    write_benchmark_report(result, scored, {name: predicted[name, False] for name in models}, out)
+    maps = {name: {scan.id: predicted[name, False][scan.id].map_um for scan in scored} for name in models}
+    write_benchmark_report(result, scored, maps, out)
     return result
 
 
@@ -171,12 +185,13 @@ def _config(name: str, settings: dict[str, Any] | None, seed: int) -> TrainingCo
 
 
 def _fit_or_load(
-    name: str, fold: Fold, config: TrainingConfig, cache: Path
-) -> tuple[FitRecord, dict[str, np.ndarray]]:
+    name: str, fold: Fold, config: TrainingConfig, cache: Path, background: BackgroundUse
+) -> tuple[FitRecord, dict[str, Prediction]]:
     untrained = build_model(name, config.variant, **common_geometry(fold.training))
     held_out_ids = [scan.id for scan in fold.held_out]
     key = run_key(untrained, fold.training, config, held_out_ids)
     folder = cache / f"{name}-{key[:16]}"
+    fitted = None
     if not (folder / "fit.json").exists():
         fitted = fit_in_cache(name, fold.training, config, cache)
         record = FitRecord(
@@ -196,16 +211,23 @@ def _fit_or_load(
             for number, scan in enumerate(fold.held_out):
                 np.save(temporary / f"prediction_{number:03d}.npy", predict_scan(fitted.model, scan))
             (temporary / "fit.json").write_text(record.model_dump_json(indent=1), encoding="utf-8")
-    record = FitRecord.model_validate(json.loads((folder / "fit.json").read_text(encoding="utf-8")))
-    files = sorted(folder.glob("prediction_*.npy"))
-    predictions = [np.load(file, allow_pickle=False) for file in files]
-    return record, dict(zip(held_out_ids, predictions, strict=True))
-
-
-def _score(
-    name: str, scans: Sequence[PrintedScan], predictions: dict[str, np.ndarray], protocol: NuisanceProtocol
-) -> ModelScores:
-    return score_model(name, scans, [predictions[scan.id] for scan in scans], protocol)
+    record = FitRecord.model_validate_json((folder / "fit.json").read_text(encoding="utf-8"))
+    heights = [np.load(file, allow_pickle=False) for file in sorted(folder.glob("prediction_*.npy"))]
+    if not (folder / "diagnostics.json").exists():
+        # A finished training is read from its checkpoint; models without one are fitted within seconds.
+        fitted = fitted or fit_in_cache(name, fold.training, config, cache)
+        found = diagnose(fitted.model, fold.training, record.validation_ids, fold.held_out, heights)
+        with atomic_file(folder / "diagnostics.json") as temporary:
+            temporary.write_text(found.model_dump_json(indent=1), encoding="utf-8")
+    diagnostics = FitDiagnostics.model_validate_json(
+        (folder / "diagnostics.json").read_text(encoding="utf-8")
+    )
+    learned = diagnostics.background if background == "training" else None
+    predictions = {
+        scan.id: Prediction(height, learned.map_um(scan.shape) if learned else None)
+        for scan, height in zip(fold.held_out, heights, strict=True)
+    }
+    return record.model_copy(update={"diagnostics": diagnostics}), predictions
 
 
 def _all_pairs(scores: Sequence[ModelScores], seed: int) -> list[Paired]:

@@ -62,11 +62,18 @@ def write_benchmark_report(
             "Trained on all development scans, scored once on the locked scans.",
             "lock_box.csv",
         )
-    page.table(score_tables.policy_table(scores), "MAE under every nuisance policy, nm.", "policies.csv")
+    page.table(
+        score_tables.policy_table(scores, result.nuisance),
+        "MAE under every nuisance policy, with and without the background, nm.",
+        "policies.csv",
+    )
     page.heading("Pairs of models")
     page.table(
         _pairs(result), "Datum-free MAE, first minus second, over the same scans.", "pairs.csv", digits=3
     )
+    page.heading("Phase, similarity, edges")
+    page.table(score_tables.shape_table(scores), "Means over held-out scans.", "shapes.csv", digits=3)
+    page.paragraph(score_tables.shape_text())
     page.heading("One scan")
     middle = _median_scan(best.scans)
     shown = {s.model: predictions_um[s.model][scans[middle].id] for s in scores}
@@ -81,7 +88,11 @@ def write_benchmark_report(
     page.figure(figures.transfer(scores), "Transfer and coherence.")
     page.heading("Training")
     page.table(
-        _costs(result), "What the fits cost, and training, inner-validation and held-out error.", "fits.csv"
+        _fits(result),
+        "Every fit: datum-free error on its training, inner-validation and held-out scans, all without a "
+        "background (policy offset), so that over-fitting shows; the largest and the RMS difference of the "
+        "same pixels in another crop; what training and predicting a scan cost on the machine at hand.",
+        "fits.csv",
     )
     curves = [fit for fit in result.fits if len(fit.steps) > 1]
     if curves:
@@ -123,36 +134,26 @@ def _pairs(result: Benchmark) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _costs(result: Benchmark) -> pd.DataFrame:
+def _fits(result: Benchmark) -> pd.DataFrame:
     import pandas as pd
 
-    errors = {s.model: {row.scan: row.mae_datum_free_nm for row in s.scans} for s in result.scores}
-    errors |= {
-        f"{s.model} locked": {row.scan: row.mae_datum_free_nm for row in s.scans}
-        for s in result.locked_scores
-    }
     rows = []
     for fit in result.fits:
-        known = {**errors[fit.model], **errors.get(f"{fit.model} locked", {})}
+        found = fit.diagnostics
+        assert found is not None, "a benchmark diagnoses every fit"
         rows.append(
             {
                 "model": fit.model,
                 "fold": fit.fold,
+                "training_nm": found.training_nm,
+                "inner_validation_nm": found.inner_validation_nm,
+                "held_out_nm": found.held_out_nm,
                 "parameters": fit.parameters,
-                "seconds": fit.seconds,
-                "training_mae_nm": fit.training_mae_nm[-1] if fit.training_mae_nm else float("nan"),
-                "inner_validation_nm": _last_number(fit.validation_mae_datum_free_nm),
-                "held_out_mae_datum_free_nm": float(
-                    np.mean([known[scan_id] for scan_id in fit.held_out_ids])
-                ),
+                "training_s": fit.seconds,
+                **score_tables.prediction_columns(found.tiles, found.cost),
             }
         )
     return pd.DataFrame(rows)
-
-
-def _last_number(values: Sequence[float | None]) -> float:
-    numbers = [value for value in values if value is not None]
-    return min(numbers) if numbers else float("nan")
 
 
 def _median_scan(rows: Sequence) -> int:

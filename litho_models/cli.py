@@ -21,6 +21,13 @@ PolicyOption = Annotated[
     Literal["none", "offset", "offset-gain", "full", "full+rows"],
     typer.Option(help="nuisances that a scan may be freed of in mae_datum_free"),
 ]
+BackgroundOption = Annotated[
+    Literal["training", "none"],
+    typer.Option(
+        help="training: add the smooth background that the training scans share to predictions of measured "
+        "maps; both errors are in the tables"
+    ),
+]
 RecipeOption = Annotated[
     Literal["fast", "paper"],
     typer.Option(help="fast: one-cycle with nuisances fitted jointly; paper: 4,000 epochs of Adam"),
@@ -65,6 +72,7 @@ def evaluate(
     store: StorePath,
     out: Out,
     policy: PolicyOption = "offset",
+    background: BackgroundOption = "training",
     extrapolate: Annotated[
         bool, typer.Option("--extrapolate", help="accept layouts beyond the calibrated range")
     ] = False,
@@ -72,7 +80,7 @@ def evaluate(
     """Score one frozen model on all scans of a store."""
     from litho_models.evaluate import evaluate as evaluate_model
 
-    result = evaluate_model(model, store, out, policy=policy, extrapolate=extrapolate)
+    result = evaluate_model(model, store, out, policy=policy, background=background, extrapolate=extrapolate)
     scores = result.scores
     typer.echo(
         f"{scores.model}: mae_datum_free {scores.mae_datum_free_nm:.2f} nm, "
@@ -96,6 +104,7 @@ def benchmark(
     steps: Steps = None,
     folds: Annotated[int, typer.Option(min=2, help="folds of the grouped split")] = 5,
     policy: PolicyOption = "offset",
+    background: BackgroundOption = "training",
     open_lock_box: Annotated[
         bool, typer.Option("--open-lock-box", help="also score the locked scans; once per release")
     ] = False,
@@ -114,6 +123,7 @@ def benchmark(
         settings=settings,
         folds=folds,
         policy=policy,
+        background=background,
         open_lock_box=open_lock_box,
         seed=seed,
     )

@@ -10,10 +10,12 @@ import numpy as np
 import torch
 from pydantic import Field
 
-from litho_data.commands import progress
 from litho_data.errors import InputError
 from litho_data.results import Record, Result
 from litho_data.store import PrintedScan, open_store
+from litho_models.background import Background, BackgroundUse
+from litho_models.cost import PredictionCost, measured_predictions
+from litho_models.diagnostics import TileConsistency, device_of, tile_consistency
 from litho_models.evaluation_report import write_evaluation_report
 from litho_models.freeze import DatasetName, FrozenSimulator, load_frozen
 from litho_models.nuisance import Policy
@@ -22,6 +24,7 @@ from litho_models.scores import (
     ModelScores,
     NoiseFloor,
     NuisanceProtocol,
+    Prediction,
     noise_floor,
     protocol_for,
     score_model,
@@ -42,11 +45,14 @@ class SplitRecord(Record):
 
 
 class ModelRecord(Record):
-    """The frozen model that was scored."""
+    """The frozen model that was scored, and what its predictions cost."""
 
     name: str
     sha256: str
     extrapolated: bool
+    parameters: int | None = None
+    tiles: TileConsistency | None = None
+    cost: PredictionCost | None = None
 
 
 class Evaluation(Result):
@@ -72,6 +78,7 @@ def evaluate(
     out: str | Path,
     *,
     policy: Policy = "offset",
+    background: BackgroundUse = "training",
     scan_ids: Sequence[str] | None = None,
     extrapolate: bool = False,
     device: str = "cpu",
@@ -83,6 +90,8 @@ def evaluate(
         store: dataset store.
         out: folder for ``evaluation.json``, ``report.html`` and the CSV tables.
         policy: nuisances that a scan may be freed of.
+        background: whether the background in the model's card is added to the predictions; a card without
+            one, or with one of fields of another size, adds none, and the result says so.
         scan_ids: only these scans; all if None.
         extrapolate: accept layouts beyond the model's calibrated range.
 
@@ -96,14 +105,26 @@ def evaluate(
     if not ids:
         raise InputError(f"scans of {store}", got="none", wanted="at least one to score")
     scans = [dataset.scan(scan_id) for scan_id in ids]
-    predictions = [predict_frozen(frozen, scan) for scan in progress(scans, "predicting")]
-    protocol = protocol_for(policy)
+    learned = card_background(frozen, scans) if background == "training" else None
+    heights, cost = measured_predictions(lambda scan: predict_frozen(frozen, scan), scans, device_of(frozen))
+    predictions = [
+        Prediction(height, learned.map_um(scan.shape) if learned else None)
+        for scan, height in zip(scans, heights, strict=True)
+    ]
+    protocol = protocol_for(policy, background="training" if learned else "none")
     trained_on = set(frozen.card["training"].get("scan_ids", [])) & set(ids)
     result = Evaluation(
         schema="litho-models/evaluation/1",
         run=run_info([protocol.seed], len(scans)),
         dataset=DatasetName(name=dataset.name, sha256=dataset.sha256),
-        model=ModelRecord(name=frozen.name, sha256=frozen.sha256, extrapolated=extrapolate),
+        model=ModelRecord(
+            name=frozen.name,
+            sha256=frozen.sha256,
+            extrapolated=extrapolate,
+            parameters=frozen.card["parameters"],
+            tiles=tile_consistency(frozen.simulator, scans[0]),
+            cost=cost,
+        ),
         split=SplitRecord(kind="given", scored_ids=ids, scored_ids_sha256=ids_sha256(ids)),
         nuisance=protocol,
         noise_floor=noise_floor(dataset.name),
@@ -111,8 +132,15 @@ def evaluate(
         scores=score_model(frozen.name, scans, predictions, protocol),
     )
     result.write(out)
-    write_evaluation_report(result, scans, predictions, out)
+    write_evaluation_report(result, scans, [prediction.map_um for prediction in predictions], out)
     return result
+
+
+def card_background(model: FrozenSimulator, scans: Sequence[PrintedScan]) -> Background | None:
+    """The background in a model's card, if it has one and the scans are of the size it was learned on."""
+    stated = model.card["background"]
+    learned = Background.model_validate(stated) if stated is not None else None
+    return learned if learned is not None and all(learned.fits(scan) for scan in scans) else None
 
 
 def predict_frozen(model: FrozenSimulator, scan: PrintedScan) -> np.ndarray:

@@ -13,7 +13,9 @@ from litho_data.store import PrintedScan
 from litho_models import figures, score_tables
 
 if TYPE_CHECKING:
-    from litho_models.evaluate import Evaluation
+    import pandas as pd
+
+    from litho_models.evaluate import Evaluation, ModelRecord
 
 
 def write_evaluation_report(
@@ -39,7 +41,18 @@ def write_evaluation_report(
         page.note("Layouts beyond the calibrated range were accepted (extrapolate).")
     page.paragraph(score_tables.protocol_text(result.nuisance))
     page.table(score_tables.headline_table([scores]), "Error over scans.", "headline.csv")
-    page.table(score_tables.policy_table([scores]), "MAE under every nuisance policy, nm.", "policies.csv")
+    page.table(
+        score_tables.policy_table([scores], result.nuisance),
+        "MAE under every nuisance policy, with and without the background, nm.",
+        "policies.csv",
+    )
+    page.table(score_tables.shape_table([scores]), "Phase, similarity, edges.", "shapes.csv", digits=3)
+    page.paragraph(score_tables.shape_text())
+    page.table(
+        _model(result.model),
+        "The same pixels in another crop; what predicting a scan costs on the machine that made this.",
+        "model.csv",
+    )
     worst = max(range(len(scans)), key=lambda i: scores.scans[i].mae_datum_free_nm)
     shown = {scores.model: predictions_um[worst]}
     page.heading("The worst scan")
@@ -56,3 +69,11 @@ def write_evaluation_report(
         page.paragraph(note)
     page.code(result.run.command)
     return page.write(out)
+
+
+def _model(model: ModelRecord) -> pd.DataFrame:
+    import pandas as pd
+
+    assert model.cost is not None, "an evaluation measures its predictions"
+    columns = score_tables.prediction_columns(model.tiles, model.cost)
+    return pd.DataFrame([{"model": model.name, "parameters": model.parameters, **columns}])

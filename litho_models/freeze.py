@@ -20,6 +20,7 @@ from litho_data.errors import InputError
 from litho_data.files import atomic_folder, file_sha256
 from litho_data.outputs import require_replaceable_folder
 from litho_data.results import Record, Result, first_error, software_versions
+from litho_models.background import Background, BackgroundUse
 from litho_models.model_readme import model_readme
 from litho_models.models import model_class
 from litho_models.simulator import Simulator
@@ -40,17 +41,22 @@ class DatasetName(Record):
 
 
 class Metric(Record):
-    """One reported figure: what, how much, on which scans, freed of which nuisances."""
+    """One reported figure: what, how much, on which scans, with which nuisances and background."""
 
     name: str
     value: float
     unit: str = "nm"
     split: str
     policy: str
+    background: BackgroundUse = "none"
 
 
 class ModelCard(Result):
-    """All that is needed to load, use and judge a frozen model."""
+    """All that is needed to load, use and judge a frozen model.
+
+    ``background`` is what the microscope added to the training scans on average; only a comparison with
+    measured maps uses it, the model's height never contains it.
+    """
 
     SCHEMA: ClassVar[str] = "litho-models/frozen/1"
     FILE_NAME: ClassVar[str] = CARD_FILE
@@ -73,6 +79,7 @@ class ModelCard(Result):
     command: str = ""
     split: dict[str, Any] = Field(default_factory=dict)
     nuisance: dict[str, Any] = Field(default_factory=dict)
+    background: Background | None = None
     metrics: list[Metric] = Field(default_factory=list)
     noise_floor: dict[str, Any] | None = None
     process_effects: EffectValues = Field(default_factory=dict)

@@ -15,6 +15,8 @@ from litho_data.errors import InputError
 from litho_models.nuisance import BLOCK_PX, BUFFER_PX, Policy, cross_fitted_residual
 
 NM_PER_UM = 1000.0
+# The step of index from air to the resist, at a red helium-neon line: where its elements are used.
+INDEX_STEP, WAVELENGTH_UM = 0.548, 0.6328
 BOOTSTRAP_DRAWS = 2000
 EXACT_SIGN_FLIP_SCANS = 14
 SIGN_FLIP_DRAWS = 9999
@@ -94,6 +96,11 @@ def score_scan(
         slope=slope,
         intercept_nm=intercept * NM_PER_UM,
     )
+
+
+def phase_waves(height_error_um: float) -> float:
+    """Phase error, in waves, of light that passes an element whose height is wrong by so many µm."""
+    return height_error_um * INDEX_STEP / WAVELENGTH_UM
 
 
 def regression_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:

@@ -24,7 +24,7 @@ _RESULT = """
   - task: {{type: image-to-image, name: layout to printed height}}
     dataset: {{name: {dataset}, type: {dataset}, split: {split}, revision: {revision}}}
     metrics:
-    - {{type: {metric}, value: {value:.4f}, config: nuisance policy {policy}}}"""
+    - {{type: {metric}, value: {value:.4f}, config: "nuisance policy {policy}, background {background}"}}"""
 
 
 def model_readme(card: ModelCard) -> str:
@@ -39,6 +39,7 @@ def model_readme(card: ModelCard) -> str:
             metric=metric.name,
             value=metric.value,
             policy=metric.policy,
+            background=metric.background,
         )
         for metric in card.metrics
     )
@@ -58,7 +59,13 @@ def model_readme(card: ModelCard) -> str:
         "refused unless `extrapolate=True`.\n",
         "## What it is not\n",
         "It knows one machine, one resist and one batch of prints, and nothing about the microscope: datum, "
-        "tilt, bow and line offsets of a scan are not part of it.\n",
+        "tilt, bow and line offsets of a scan are not part of it"
+        + (
+            "; the smooth background that its training scans share is in the card, for comparison with "
+            "measured maps only.\n"
+            if card.background
+            else ".\n"
+        ),
         "## Training\n",
         _training(card),
         "## Figures\n",
@@ -85,8 +92,12 @@ def _training(card: ModelCard) -> str:
 def _metrics(card: ModelCard) -> str:
     if not card.metrics:
         return "Not evaluated.\n"
-    lines = [f"| {m.name} | {m.value:.2f} {m.unit} | {m.split} | {m.policy} |" for m in card.metrics]
-    return "| figure | value | split | nuisance policy |\n|---|---|---|---|\n" + "\n".join(lines) + "\n"
+    head = "| figure | value | split | nuisance policy | background |\n|---|---|---|---|---|\n"
+    lines = [
+        f"| {m.name} | {m.value:.2f} {m.unit} | {m.split} | {m.policy} | {m.background} |"
+        for m in card.metrics
+    ]
+    return head + "\n".join(lines) + "\n"
 
 
 def _names(effects: dict[str, dict[str, float]]) -> str:

@@ -117,11 +117,17 @@ def nuisance_basis(prediction_um: np.ndarray, policy: Policy) -> FloatMap:
     """
     _check_policy(policy)
     prediction = np.asarray(prediction_um, np.float64)
-    ny, nx = prediction.shape
+    if not TERM_COUNT[policy]:
+        return np.empty((0, *prediction.shape))
+    terms = [np.ones_like(prediction), prediction - prediction.mean(), *smooth_shapes(prediction.shape)]
+    return np.stack(terms[: TERM_COUNT[policy]])
+
+
+def smooth_shapes(shape: tuple[int, ...]) -> FloatMap:
+    """x, y, x², xy, y² on -1 ... 1 over a field (ny, nx), each of zero mean: (5, ny, nx)."""
+    ny, nx = shape
     y, x = np.meshgrid(np.linspace(-1, 1, ny), np.linspace(-1, 1, nx), indexing="ij")
-    shapes = [prediction, x, y, x * x, x * y, y * y]
-    terms = [np.ones_like(prediction), *(shape - shape.mean() for shape in shapes)]
-    return np.stack(terms[: TERM_COUNT[policy]]) if TERM_COUNT[policy] else np.empty((0, ny, nx))
+    return np.stack([term - term.mean() for term in (x, y, x * x, x * y, y * y)])
 
 
 def calibration_blocks(

@@ -17,9 +17,11 @@ from litho_models.freeze import CARD_FILE, DatasetName, ModelCard, load_simulato
 from litho_models.run_info import RunInfo, run_info
 from litho_models.simulator import Variant
 from litho_models.splits import ids_sha256, lock_box, lock_box_size
+from litho_models.tiles import predict_scan
 from litho_models.training import TrainingConfig, fit_with_record
 from litho_models.training.checkpoint import RoundRecord
 from litho_models.training.config import Recipe
+from litho_models.training.nuisances import learn_background
 
 MODEL_FOLDER, CHECKPOINT_FOLDER = "model", "checkpoint"
 
@@ -98,6 +100,7 @@ def train(
             "seconds": round(fitted.seconds, 1),
         },
         training_level_share=level_share(used),
+        background=learn_background(used, [predict_scan(fitted.model, scan) for scan in used]),
         command=record.run.command,
         split={"kind": "development", "lock_box": locked, "lock_box_sha256": ids_sha256(locked)},
         limitations=["Not evaluated yet: see the evaluation of this model for its error."],
@@ -147,6 +150,7 @@ _CARRIED_FIELDS = {
     "command",
     "split",
     "nuisance",
+    "background",
     "metrics",
     "noise_floor",
     "measurement_effects",

@@ -5,10 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from litho_models.edges import SEARCH_UM
+from litho_models.metrics import INDEX_STEP, WAVELENGTH_UM
 from litho_models.scores import Interval, ModelScores, NuisanceProtocol
+from litho_models.similarity import SSIM_RANGE_UM, SSIM_SIGMA_PX, SSIM_WINDOW_PX
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from litho_models.cost import PredictionCost
+    from litho_models.diagnostics import TileConsistency
 
 
 def headline_table(scores: Sequence[ModelScores]) -> pd.DataFrame:
@@ -32,13 +38,26 @@ def headline_table(scores: Sequence[ModelScores]) -> pd.DataFrame:
     )
 
 
-def policy_table(scores: Sequence[ModelScores]) -> pd.DataFrame:
-    """One row per model, one column per nuisance policy."""
+def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol) -> pd.DataFrame:
+    """One row per model and background, one column per nuisance policy."""
     import pandas as pd
 
-    return pd.DataFrame(
-        [{"model": s.model, **{f"{e.policy}_mae_nm": e.mae_nm for e in s.by_policy}} for s in scores]
-    )
+    rows = []
+    for s in scores:
+        for background, errors in ((protocol.background, s.by_policy), ("none", s.without_background)):
+            if errors:
+                named = {f"{error.policy}_mae_nm": error.mae_nm for error in errors}
+                rows.append({"model": s.model, "background": background, **named})
+    return pd.DataFrame(rows)
+
+
+def shape_table(scores: Sequence[ModelScores]) -> pd.DataFrame:
+    """One row per model: phase error, structural similarity and edge placement."""
+    import pandas as pd
+
+    fields = ("phase_rms_waves", "ssim", "edge_mean_nm", "edge_p95_nm")
+    counts = ("edge_matched", "edge_unmatched", "edge_unmatched_expected")
+    return pd.DataFrame([s.model_dump(include={"model", *fields, *counts}) for s in scores])
 
 
 def scan_table(scores: Sequence[ModelScores]) -> pd.DataFrame:
@@ -55,6 +74,16 @@ def level_table(scores: Sequence[ModelScores]) -> pd.DataFrame:
     return pd.DataFrame([{"model": s.model, **entry.model_dump()} for s in scores for entry in s.by_level])
 
 
+def prediction_columns(tiles: TileConsistency | None, cost: PredictionCost) -> dict[str, float | None]:
+    """Crop dependence and cost of a model's predictions, as columns."""
+    return {
+        "tile_max_nm": tiles.max_nm if tiles else None,
+        "tile_rms_nm": tiles.rms_nm if tiles else None,
+        "prediction_s": cost.seconds_per_scan,
+        "prediction_mib": cost.peak_memory_mib,
+    }
+
+
 def interval_text(interval: Interval) -> str:
     """An interval for people."""
     return "–" if interval is None else f"{interval[0]:.2f} … {interval[1]:.2f}"
@@ -67,7 +96,27 @@ def protocol_text(protocol: NuisanceProtocol) -> str:
         f"'{protocol.policy}' (k = {protocol.k:g} per scan), fitted on one half of a checkerboard of "
         f"{protocol.block_px} px blocks shrunk by {protocol.buffer_px} px and scored on the other half, "
         "both halves swapped; 'full+rows' uses stripes of columns instead. Means are per scan first, then "
-        "over scans; intervals resample whole scans (2,000 draws)."
+        f"over scans; intervals resample whole scans (2,000 draws). {_BACKGROUND_TEXT[protocol.background]}"
+    )
+
+
+_BACKGROUND_TEXT = {
+    "none": "Background 'none': predictions are those of the print alone.",
+    "training": "Background 'training': to each prediction is added what the training scans have in common "
+    "beside their prints (five smooth terms, nothing fitted to the scored scan); the table of policies has "
+    "the errors without it too. Policies with smooth terms of their own cannot tell the difference.",
+}
+
+
+def shape_text() -> str:
+    """What the figures of ``shape_table`` are."""
+    return (
+        f"phase_rms_waves is the RMS error seen by light of {WAVELENGTH_UM:g} µm that passes the print "
+        f"(index step {INDEX_STEP:g}). ssim has a Gaussian window of {SSIM_SIGMA_PX:g} px, "
+        f"{SSIM_WINDOW_PX} px wide, and a data range of {SSIM_RANGE_UM:g} µm. edge_mean and edge_p95 are "
+        "distances of the measured contours from the predicted ones at the heights half way between nominal "
+        f"levels, over the pieces whose partner lies within {SEARCH_UM:g} µm; the counts are of pieces: of "
+        "the measured contours with and without a partner, of the predicted contours without."
     )
 
 

@@ -5,15 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from pydantic import Field
 
 from litho_data.errors import InputError
 from litho_data.results import Record
 from litho_data.store import PrintedScan
+from litho_models.background import BackgroundUse
 from litho_models.curves import LevelError, TransferCurves, level_errors, transfer_curves
-from litho_models.metrics import ScanScore, bootstrap_interval, score_scan
+from litho_models.edges import edge_placement, mid_step_heights_um
+from litho_models.metrics import NM_PER_UM, ScanScore, bootstrap_interval, phase_waves, score_scan
 from litho_models.nuisance import (
     BLOCK_PX,
     BUFFER_PX,
@@ -23,18 +26,40 @@ from litho_models.nuisance import (
     cross_fitted_residual,
     scan_line_index,
 )
+from litho_models.similarity import structural_similarity
 
 Interval = tuple[float, float] | None
 
 
+# Policies without smooth terms of their own: only their errors know of a smooth background.
+_BLIND_POLICIES: tuple[Policy, ...] = ("none", "offset", "offset-gain")
+
+
 class NuisanceProtocol(Record):
-    """What a scan may be freed of before it is scored, and on which pixels that was fitted."""
+    """What a scan may be freed of before it is scored, and on which pixels that was fitted.
+
+    ``background``: ``training`` if the smooth background learned on the training scans was added to the
+    predictions; nothing of it is fitted to the scored scan.
+    """
 
     policy: Policy = "offset"
     k: float = 1.0
     block_px: int = BLOCK_PX
     buffer_px: int = BUFFER_PX
     seed: int = 0
+    background: BackgroundUse = "none"
+
+
+class Prediction(NamedTuple):
+    """What a model expects of a scan, (ny, nx) µm: the print, and what all scans add, if that is known."""
+
+    height_um: np.ndarray
+    background_um: np.ndarray | None = None
+
+    @property
+    def map_um(self) -> np.ndarray:
+        """The map that the microscope should show."""
+        return self.height_um if self.background_um is None else self.height_um + self.background_um
 
 
 class NoiseFloor(Record):
@@ -56,7 +81,9 @@ class PolicyError(Record):
 
 
 class ScanRow(Record):
-    """The figures of one scan."""
+    """The figures of one scan. Edges as in ``EdgePlacement``; None where the scan has none, or a result of
+    before they were scored.
+    """
 
     scan: str
     print: str
@@ -69,10 +96,22 @@ class ScanRow(Record):
     slope: float
     intercept_nm: float
     pixels: int
+    ssim: float | None = None
+    edge_mean_nm: float | None = None
+    edge_p95_nm: float | None = None
+    edge_matched: int | None = None
+    edge_unmatched: int | None = None
+    edge_unmatched_expected: int | None = None
 
 
 class ModelScores(Record):
-    """Everything reported about one model; means are over scans, intervals resample scans."""
+    """Everything reported about one model; means are over scans, intervals resample scans.
+
+    ``without_background`` repeats ``by_policy`` without the background of the protocol, for the policies
+    that have no smooth terms themselves; it is empty where the protocol has no background.
+    ``phase_rms_waves`` is the RMS error as light sees it that passes the print. Edges are compared and
+    counted as in ``EdgePlacement``, SSIM as in ``structural_similarity``, both freed of the nuisances.
+    """
 
     model: str
     scans: list[ScanRow]
@@ -84,6 +123,14 @@ class ModelScores(Record):
     rmse_datum_free_nm: float
     rmse_datum_free_ci95_nm: Interval
     by_policy: list[PolicyError]
+    without_background: list[PolicyError] = Field(default_factory=list)
+    phase_rms_waves: float | None = None
+    ssim: float | None = None
+    edge_mean_nm: float | None = None
+    edge_p95_nm: float | None = None
+    edge_matched: int | None = None
+    edge_unmatched: int | None = None
+    edge_unmatched_expected: int | None = None
     by_level: list[LevelError]
     transfer: TransferCurves
     row_offset_sd_nm: float
@@ -95,7 +142,7 @@ class ModelScores(Record):
 def score_model(
     name: str,
     scans: Sequence[PrintedScan],
-    predictions_um: Sequence[np.ndarray],
+    predictions: Sequence[Prediction],
     protocol: NuisanceProtocol,
 ) -> ModelScores:
     """Score the predictions of one model on whole scans under one protocol and, beside it, all policies.
@@ -103,33 +150,34 @@ def score_model(
     ``row_offset_sd_nm`` and ``scan_line_offset_sd_nm`` say in which frame line offsets live: along the
     layout's rows (the print) or along the scan's own lines (the microscope).
 
+    Args:
+        name: name of the model.
+        scans: the scans; ``predictions``: what the model expects of each.
+        protocol: what scans are freed of, and whether the predictions have backgrounds.
+
     Raises:
         InputError: predictions that are not finite, or a scan too small for the policies.
     """
     geometry: dict[str, Any] = protocol.model_dump(include={"block_px", "buffer_px", "seed"})
-    by_policy: list[PolicyError] = []
-    chosen: list[ScanScore] = []
-    for policy in POLICIES:
-        scores = [
-            score_scan(scan.id, scan.height_um, prediction, scan.valid, policy, **geometry)
-            for scan, prediction in zip(scans, predictions_um, strict=True)
-        ]
-        values = [score.mae_datum_free_nm for score in scores]
-        freedom = float(np.mean([score.degrees_of_freedom for score in scores]))
-        by_policy.append(
-            PolicyError(policy=policy, k=freedom, mae_nm=float(np.mean(values)), ci95_nm=interval(values))
-        )
-        chosen = scores if policy == protocol.policy else chosen
+    maps = [prediction.map_um for prediction in predictions]
+    heights = [prediction.height_um for prediction in predictions]
+    scores = {policy: _scan_scores(scans, maps, policy, geometry) for policy in POLICIES}
+    chosen = scores[protocol.policy]
+    bare = _BLIND_POLICIES if protocol.background == "training" else ()
     residuals, rows, lines = [], [], []
-    for scan, prediction in zip(scans, predictions_um, strict=True):
-        arrays = (scan.height_um, prediction, scan.valid)
+    for scan, expected in zip(scans, maps, strict=True):
+        arrays = (scan.height_um, expected, scan.valid)
         residuals.append(cross_fitted_residual(*arrays, protocol.policy, **geometry).residual_um)
         line = scan_line_index(scan.shape, scan.scan_to_layout, scan.pitch_um)
         rows.append(cross_fitted_residual(*arrays, "full+rows", **geometry).row_sd_um)
         lines.append(cross_fitted_residual(*arrays, "full+rows", scan_line=line, **geometry).row_sd_um)
+    own_rows = [
+        _row(scan, score, expected, residual)
+        for scan, score, expected, residual in zip(scans, chosen, maps, residuals, strict=True)
+    ]
     return ModelScores(
         model=name,
-        scans=[_row(scan, score) for scan, score in zip(scans, chosen, strict=True)],
+        scans=own_rows,
         mae_abs_nm=_mean(chosen, "mae_abs_nm"),
         mae_abs_ci95_nm=interval([score.mae_abs_nm for score in chosen]),
         bias_nm=_mean(chosen, "bias_nm"),
@@ -137,19 +185,44 @@ def score_model(
         mae_datum_free_ci95_nm=interval([score.mae_datum_free_nm for score in chosen]),
         rmse_datum_free_nm=_mean(chosen, "rmse_datum_free_nm"),
         rmse_datum_free_ci95_nm=interval([score.rmse_datum_free_nm for score in chosen]),
-        by_policy=by_policy,
+        by_policy=[_policy_error(policy, scores[policy]) for policy in POLICIES],
+        without_background=[
+            _policy_error(policy, _scan_scores(scans, heights, policy, geometry)) for policy in bare
+        ],
+        phase_rms_waves=phase_waves(_mean(chosen, "rmse_datum_free_nm") / NM_PER_UM),
+        ssim=_mean_known([row.ssim for row in own_rows]),
+        edge_mean_nm=_mean_known([row.edge_mean_nm for row in own_rows]),
+        edge_p95_nm=_mean_known([row.edge_p95_nm for row in own_rows]),
+        edge_matched=sum(row.edge_matched or 0 for row in own_rows),
+        edge_unmatched=sum(row.edge_unmatched or 0 for row in own_rows),
+        edge_unmatched_expected=sum(row.edge_unmatched_expected or 0 for row in own_rows),
         by_level=level_errors(scans, residuals),
-        transfer=transfer_curves(scans, predictions_um),
-        row_offset_sd_nm=1000 * float(np.sqrt(np.mean(np.square(rows)))),
-        scan_line_offset_sd_nm=1000 * float(np.sqrt(np.mean(np.square(lines)))),
+        transfer=transfer_curves(scans, maps),
+        row_offset_sd_nm=NM_PER_UM * float(np.sqrt(np.mean(np.square(rows)))),
+        scan_line_offset_sd_nm=NM_PER_UM * float(np.sqrt(np.mean(np.square(lines)))),
         dropped_pixels=sum(int(np.sum(~np.isfinite(r))) for r in residuals),
-        constant_predictions=sum(bool(np.ptp(prediction) == 0) for prediction in predictions_um),
+        constant_predictions=sum(bool(np.ptp(height) == 0) for height in heights),
     )
 
 
-def protocol_for(policy: Policy, seed: int = 0) -> NuisanceProtocol:
+def _scan_scores(
+    scans: Sequence[PrintedScan], maps_um: Sequence[np.ndarray], policy: Policy, geometry: dict[str, Any]
+) -> list[ScanScore]:
+    return [
+        score_scan(scan.id, scan.height_um, prediction, scan.valid, policy, **geometry)
+        for scan, prediction in zip(scans, maps_um, strict=True)
+    ]
+
+
+def _policy_error(policy: Policy, scores: Sequence[ScanScore]) -> PolicyError:
+    values = [score.mae_datum_free_nm for score in scores]
+    freedom = float(np.mean([score.degrees_of_freedom for score in scores]))
+    return PolicyError(policy=policy, k=freedom, mae_nm=float(np.mean(values)), ci95_nm=interval(values))
+
+
+def protocol_for(policy: Policy, seed: int = 0, background: BackgroundUse = "none") -> NuisanceProtocol:
     """The standard protocol of a policy: k is the number of its smooth terms."""
-    return NuisanceProtocol(policy=policy, k=float(TERM_COUNT[policy]), seed=seed)
+    return NuisanceProtocol(policy=policy, k=float(TERM_COUNT[policy]), seed=seed, background=background)
 
 
 def interval(values: Sequence[float]) -> Interval:
@@ -188,9 +261,23 @@ def noise_floor(dataset_name: str, analysis: str | Path | None = None) -> NoiseF
     )
 
 
-def _row(scan: PrintedScan, score: ScanScore) -> ScanRow:
+def _row(scan: PrintedScan, score: ScanScore, expected_um: np.ndarray, residual_um: np.ndarray) -> ScanRow:
+    freed = expected_um + residual_um
+    heights = mid_step_heights_um(scan.levels, scan.level_height_um)
+    edges = edge_placement(freed, expected_um, heights, scan.pitch_um)
     kept = {key: value for key, value in asdict(score).items() if key in ScanRow.model_fields}
-    return ScanRow(scan=scan.id, print=scan.print_id, **kept)
+    return ScanRow(
+        scan=scan.id,
+        print=scan.print_id,
+        ssim=structural_similarity(freed, expected_um),
+        **{f"edge_{key}": value for key, value in edges._asdict().items()},
+        **kept,
+    )
+
+
+def _mean_known(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
 
 
 def _mean(scores: Sequence[ScanScore], field: str) -> float:

@@ -10,11 +10,12 @@ from typing import Any
 from litho_data.errors import InputError
 from litho_data.store import PrintedScan, Store, open_store
 from litho_models import zoo
-from litho_models.evaluate import predict_frozen
+from litho_models.background import BackgroundUse
+from litho_models.evaluate import card_background, predict_frozen
 from litho_models.freeze import Metric, ModelCard, load_frozen
 from litho_models.nuisance import Policy
 from litho_models.runs import MODEL_FOLDER, freeze, locked_ids, train
-from litho_models.scores import ModelScores, noise_floor, protocol_for, score_model
+from litho_models.scores import ModelScores, Prediction, noise_floor, protocol_for, score_model
 from litho_models.simulator import Variant
 from litho_models.training.config import Recipe
 
@@ -66,7 +67,7 @@ def make_zoo(
         described = {
             "metrics": metrics,
             "command": _command(dataset.name, name, recipe, variant, given),
-            "nuisance": protocol_for("offset").model_dump(mode="json"),
+            "nuisance": protocol_for("offset", background="training").model_dump(mode="json"),
             "noise_floor": noise_floor(dataset.name).model_dump(mode="json"),
             "limitations": _limitations(metrics),
         }
@@ -81,8 +82,13 @@ def make_zoo(
 def scored_metrics(model: str | Path, scans: Sequence[PrintedScan], split: str) -> list[Metric]:
     """The errors of a frozen model on scans, as they stand in its card."""
     frozen = load_frozen(model)
-    predictions = [predict_frozen(frozen, scan) for scan in scans]
-    return _metrics(score_model(frozen.name, scans, predictions, protocol_for("offset")), split)
+    learned = card_background(frozen, scans)
+    predictions = [
+        Prediction(predict_frozen(frozen, scan), learned.map_um(scan.shape) if learned else None)
+        for scan in scans
+    ]
+    protocol = protocol_for("offset", background="training" if learned else "none")
+    return _metrics(score_model(frozen.name, scans, predictions, protocol), split, protocol.background)
 
 
 def differing_metrics(store: str | Path, root: str | Path = zoo.ZOO_FOLDER) -> dict[str, list[str]]:
@@ -115,17 +121,19 @@ def differing_metrics(store: str | Path, root: str | Path = zoo.ZOO_FOLDER) -> d
     return found
 
 
-def _metrics(scores: ModelScores, split: str) -> list[Metric]:
-    def metric(name: str, value: float, policy: Policy) -> Metric:
-        return Metric(name=name, value=value, split=split, policy=policy)
+def _metrics(scores: ModelScores, split: str, background: BackgroundUse) -> list[Metric]:
+    """The figures of a card, first as the protocol has them, then without its background."""
+
+    def metric(name: str, value: float, policy: Policy, used: BackgroundUse) -> Metric:
+        return Metric(name=name, value=value, split=split, policy=policy, background=used)
 
     return [
-        metric("mae_abs", scores.mae_abs_nm, "none"),
-        metric("rmse_datum_free", scores.rmse_datum_free_nm, "offset"),
+        metric("mae_abs", scores.mae_abs_nm, "none", background),
+        metric("rmse_datum_free", scores.rmse_datum_free_nm, "offset", background),
         *(
-            metric("mae_datum_free", one.mae_nm, one.policy)
-            for one in scores.by_policy
-            if one.policy != "none"
+            metric("mae_abs" if one.policy == "none" else "mae_datum_free", one.mae_nm, one.policy, used)
+            for used, errors in ((background, scores.by_policy[1:]), ("none", scores.without_background))
+            for one in errors
         ),
     ]
 
@@ -140,7 +148,8 @@ def _out_of_fold(benchmark: str | Path, dataset: Store) -> dict[str, list[Metric
             got=f"split {result.split.kind} of {result.dataset.name}",
             wanted=f"split grouped of {dataset.name}, the store given",
         )
-    return {scores.model: _metrics(scores, OUT_OF_FOLD) for scores in result.scores}
+    background = result.nuisance.background
+    return {scores.model: _metrics(scores, OUT_OF_FOLD, background) for scores in result.scores}
 
 
 def _limitations(metrics: Sequence[Metric]) -> list[str]:

@@ -1,4 +1,4 @@
-"""Per-scan nuisances fitted jointly with a model, and what a scan's height is without them."""
+"""Per-scan nuisances fitted jointly with a model, and the background that all scans have in common."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from litho_data.store import PrintedScan
+from litho_models.background import Background, field_um
+from litho_models.metrics import NM_PER_UM
 from litho_models.nuisance import (
     TERM_COUNT,
     Policy,
@@ -44,6 +46,25 @@ def estimate_nuisances(
             smooth = smooth + _row_offsets(scan, prediction, smooth)
         maps.append(smooth.astype(np.float32))
     return maps
+
+
+def learn_background(scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray]) -> Background:
+    """The smooth background that the scans have in common beside a fitted model's heights.
+
+    Each scan is fitted with all terms of policy ``full``, offset and gain included, on its valid pixels;
+    the mean over the scans of the five smooth terms is kept.
+
+    Args:
+        scans: the scans that the model was fitted to, of one size; ``predictions_um``: its heights (ny, nx).
+    """
+    coefficients = [
+        _coefficients(scan, prediction, nuisance_basis(prediction, "full"))
+        for scan, prediction in zip(scans, predictions_um, strict=True)
+    ]
+    x, y, xx, xy, yy = (NM_PER_UM * np.mean(coefficients, axis=0)[2:]).tolist()
+    return Background(
+        x_nm=x, y_nm=y, xx_nm=xx, xy_nm=xy, yy_nm=yy, field_um=field_um(scans[0]), scans=len(scans)
+    )
 
 
 def training_basis(prediction_um: np.ndarray, policy: Policy, free_gain: bool) -> np.ndarray:

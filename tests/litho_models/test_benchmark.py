@@ -65,12 +65,24 @@ def test_the_result_is_complete_on_disk(result):
     assert (out / "report.html").stat().st_size > 50_000
     table = pd.read_csv(out / "benchmark.csv")
     assert sorted(table["model"]) == sorted(MODELS)
-    assert {"pairs.csv", "scans.csv", "levels.csv", "policies.csv", "fits.csv"} <= {
+    assert {"pairs.csv", "scans.csv", "levels.csv", "policies.csv", "fits.csv", "shapes.csv"} <= {
         p.name for p in out.iterdir()
     }
     best = [pair for pair in record.paired if {pair.first, pair.second} == {"affine", "linear"}]
     assert best[0].mean_nm > 0
     assert best[0].first_better == 0
+
+
+def test_over_fitting_shows_because_three_errors_are_alike(result):
+    record, _ = result
+    for scores in record.scores:
+        fits = [fit for fit in record.fits if fit.model == scores.model and fit.fold < record.split.folds]
+        held_out = {scan_id: fit.diagnostics.held_out_nm for fit in fits for scan_id in fit.held_out_ids}
+        plain = next(error for error in scores.without_background if error.policy == "offset")
+        assert np.mean([held_out[row.scan] for row in scores.scans]) == pytest.approx(plain.mae_nm)
+        assert all(fit.diagnostics.training_nm > 0 for fit in fits)
+        # Fitted by Gauss-Newton: no checkpoint to choose.
+        assert all(fit.diagnostics.inner_validation_nm is None for fit in fits)
 
 
 def test_an_unchanged_benchmark_fits_nothing_again(result, store, monkeypatch):
@@ -136,7 +148,7 @@ def test_a_model_of_another_geometry_is_refused(store, tmp_path):
 
 
 def test_line_offsets_are_attributed_to_their_frame():
-    from litho_models.scores import protocol_for, score_model
+    from litho_models.scores import Prediction, protocol_for, score_model
 
     scans = make_scans(1, size_px=256, noise_um=0.005)
     angle = np.deg2rad(1.0)
@@ -148,7 +160,7 @@ def test_line_offsets_are_attributed_to_their_frame():
 
     scan = replace(scans[0], height_um=scans[0].height_um + stripes, scan_to_layout=turned)
     truth = printed_height_um(scan.layout_um).astype(np.float32)
-    scores = score_model("truth", [scan], [truth], protocol_for("offset"))
+    scores = score_model("truth", [scan], [Prediction(truth)], protocol_for("offset"))
     # Stripes of 10 nm along the layout's rows; along scan lines turned by 1° they average out over
     # 57 px, of which 256 px hold 4.5: a half to a third is left.
     assert scores.row_offset_sd_nm == pytest.approx(10, abs=1.5)

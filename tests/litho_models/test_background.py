@@ -1,0 +1,161 @@
+"""The background that all scans share: learned on training scans, scored openly, never in a design."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from prints import make_scans, printed_height_um, write_store
+
+from litho_data.errors import InputError
+from litho_data.results import Result
+from litho_models import load_frozen, save_frozen
+from litho_models.background import Background
+from litho_models.benchmark import benchmark
+from litho_models.compare import compare
+from litho_models.evaluate import evaluate
+from litho_models.folds import plan_folds
+from litho_models.freeze import ModelCard
+from litho_models.models import build_model
+from litho_models.nuisance import TERM_COUNT
+from litho_models.runs import freeze, train
+from litho_models.scores import Prediction, protocol_for, score_model
+from litho_models.training.nuisances import learn_background
+
+BOW_NM = 40.0
+SMOOTH = ("full", "full+rows")
+
+
+@pytest.fixture(scope="module")
+def scans():
+    return make_scans(6, size_px=128, bow_um=BOW_NM / 1000)
+
+
+@pytest.fixture(scope="module")
+def store(scans, tmp_path_factory):
+    return write_store(tmp_path_factory.mktemp("bowed") / "made.zarr", scans)
+
+
+@pytest.fixture(scope="module")
+def result(store, tmp_path_factory):
+    out = tmp_path_factory.mktemp("benchmark")
+    return benchmark(store, out, models=("identity", "affine"), folds=2), out
+
+
+def truth(scan):
+    return printed_height_um(scan.layout_um).astype(np.float32)
+
+
+def some_background(**changes):
+    fields = {"x_nm": 1.0, "y_nm": -2.0, "xx_nm": 3.0, "xy_nm": -4.0, "yy_nm": 5.0}
+    return Background(**{**fields, "field_um": (12.8, 12.8), "scans": 6, **changes})
+
+
+def test_a_planted_bow_is_learned_whatever_each_scan_s_datum(scans):
+    learned = learn_background(scans, [truth(scan) for scan in scans])
+    # 6 · 128² heights with 4 nm of white noise: standard error 4/√(6 · 128²)/0.3 = 0.04 nm for a term of
+    # standard deviation 0.3; five of them.
+    assert learned.yy_nm == pytest.approx(BOW_NM, abs=0.2)
+    for other in (learned.x_nm, learned.y_nm, learned.xx_nm, learned.xy_nm):
+        assert abs(other) < 0.2
+    assert (learned.scans, learned.field_um) == (6, pytest.approx((12.8, 12.8)))
+
+
+def test_a_background_moves_no_datum_and_is_what_its_terms_say():
+    background = some_background()
+    field = background.map_um((90, 110))
+    assert abs(field.mean()) < 1e-12
+    y, x = np.meshgrid(np.linspace(-1, 1, 90), np.linspace(-1, 1, 110), indexing="ij")
+    stated = x - 2 * y + 3 * x * x - 4 * x * y + 5 * y * y
+    assert np.allclose(1000 * field, stated - stated.mean())
+
+
+def test_no_fit_of_a_benchmark_takes_its_background_from_the_scans_that_it_is_judged_on(result, scans):
+    record, _ = result
+    development = [scan for scan in scans if scan.id not in record.split.lock_box]
+    plan = plan_folds(development, [], "grouped", folds=2)
+    for fit in (fit for fit in record.fits if fit.model == "identity"):
+        fold = next(fold for fold in plan if [scan.id for scan in fold.held_out] == fit.held_out_ids)
+        # Identity has nothing to fit: its heights are the layouts.
+        learned = learn_background(fold.training, [scan.layout_um for scan in fold.training])
+        assert fit.diagnostics.background == learned
+
+
+def test_both_figures_are_told_and_only_policies_without_smooth_terms_differ(result, store, tmp_path):
+    record, out = result
+    assert record.nuisance.background == "training"
+    plain = benchmark(store, tmp_path / "plain", models=("identity", "affine"), folds=2, background="none")
+    assert plain.nuisance.background == "none"
+    for with_it, without in zip(record.scores, plain.scores, strict=True):
+        assert without.without_background == []
+        stated = {error.policy: error.mae_nm for error in with_it.without_background}
+        assert stated == {e.policy: e.mae_nm for e in without.by_policy if e.policy not in SMOOTH}
+        for ours, theirs in zip(with_it.by_policy, without.by_policy, strict=True):
+            if ours.policy in SMOOTH:
+                # Their own terms span the background: least squares finds the same residual.
+                assert ours.mae_nm == pytest.approx(theirs.mae_nm, abs=1e-6)
+            elif TERM_COUNT[ours.policy]:
+                assert ours.mae_nm < theirs.mae_nm
+    table = (out / "policies.csv").read_text().splitlines()
+    assert [line.split(",")[:2] for line in table[1:3]] == [["identity", "training"], ["identity", "none"]]
+    with pytest.raises(InputError, match="nuisance differs"):
+        compare(out, tmp_path / "plain")
+
+
+def test_with_the_true_print_and_background_only_the_noise_is_left(scans):
+    bow = some_background(x_nm=0, y_nm=0, xx_nm=0, xy_nm=0, yy_nm=BOW_NM).map_um(scans[0].shape)
+    scores = score_model(
+        "truth",
+        scans,
+        [Prediction(truth(scan), bow) for scan in scans],
+        protocol_for("offset", background="training"),
+    )
+    # White noise of 4 nm has a mean absolute value of 3.19 nm.
+    assert scores.mae_datum_free_nm == pytest.approx(3.19, rel=0.01)
+    offset = next(error for error in scores.without_background if error.policy == "offset")
+    assert offset.mae_nm > 9  # the mean absolute value of 40 nm · (y² - 1/3) alone is 10.3 nm
+
+
+def test_the_height_that_a_design_gets_is_the_same_bit_for_bit(tmp_path):
+    model = build_model("physics")
+    with_it = save_frozen(model, tmp_path / "with", background=some_background(yy_nm=500.0))
+    layout = torch.rand(1, 1, 128, 128, generator=torch.Generator().manual_seed(0)) * 1.2
+    outcomes = []
+    for folder in (save_frozen(model, tmp_path / "without"), with_it):
+        asked = layout.clone().requires_grad_()
+        height = load_frozen(folder)(asked, pitch_um=0.1)
+        height.square().sum().backward()
+        outcomes.append((height.detach(), asked.grad))
+    assert torch.equal(outcomes[0][0], outcomes[1][0])
+    assert torch.equal(outcomes[0][1], outcomes[1][1])
+    assert ModelCard.read(with_it).background == some_background(yy_nm=500.0)
+
+
+def test_training_puts_it_into_the_card_and_freezing_keeps_it(store, tmp_path):
+    run = train(store, "affine", tmp_path / "run")
+    card = freeze(tmp_path / "run", tmp_path / "model")
+    assert card.background == ModelCard.read(tmp_path / "run" / "model").background
+    assert card.background.scans == len(run.training_ids)
+    assert card.background.yy_nm == pytest.approx(BOW_NM, rel=0.2)
+    scored = evaluate(tmp_path / "model", store, tmp_path / "with")
+    assert scored.nuisance.background == "training"
+    assert scored.scores.without_background
+    off = evaluate(tmp_path / "model", store, tmp_path / "off", background="none")
+    assert (off.nuisance.background, off.scores.without_background) == ("none", [])
+
+
+def test_a_card_without_one_or_of_another_field_size_adds_none_and_says_so(store, tmp_path):
+    for name, fields in {"none": {}, "small": {"background": some_background(field_um=(6.4, 6.4))}}.items():
+        save_frozen(build_model("identity"), tmp_path / name, **fields)
+        scored: Result = evaluate(tmp_path / name, store, tmp_path / f"{name}-out")
+        assert scored.nuisance.background == "none"
+
+
+def test_a_cache_of_before_is_completed_without_changing_a_figure(result, store):
+    record, out = result
+    for file in (out / "cache").glob("*/diagnostics.json"):
+        file.unlink()
+    again = benchmark(store, out, models=("identity", "affine"), folds=2)
+    assert again.scores == record.scores
+    for new, old in zip(again.fits, record.fits, strict=True):
+        assert new.diagnostics.background == old.diagnostics.background

@@ -1,0 +1,163 @@
+"""Edges, similarity, phase, crops: closed forms."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from prints import make_scan, make_scans
+
+from litho_models.cost import measured_predictions
+from litho_models.diagnostics import tile_consistency
+from litho_models.edges import edge_placement, mid_step_heights_um
+from litho_models.metrics import phase_waves
+from litho_models.models import build_model
+from litho_models.scores import Prediction, protocol_for, score_model
+from litho_models.similarity import SSIM_WINDOW_PX, structural_similarity
+from litho_models.tiles import predict_scan
+
+PITCH_UM = 0.1
+HEIGHTS_UM = mid_step_heights_um(13, 0.1)
+
+
+def ramp(shift_px=0.0, degrees=0.0, shape=(120, 140)):
+    """A plane that rises 1.2 µm over 100 px in the given direction, displaced along it."""
+    y, x = np.meshgrid(*(np.arange(n, dtype=float) for n in shape), indexing="ij")
+    angle = np.deg2rad(degrees)
+    return 0.012 * (x * np.cos(angle) + y * np.sin(angle) - 10 - shift_px)
+
+
+def test_contours_lie_half_way_between_the_levels():
+    assert mid_step_heights_um(4, 0.2) == pytest.approx([0.1, 0.3, 0.5])
+
+
+@pytest.mark.parametrize("shift_px", [0.0, 0.13, -0.5, 2.75, 4.9])
+@pytest.mark.parametrize("degrees", [0, 90])
+def test_the_displacement_of_a_shifted_edge_is_the_shift(shift_px, degrees):
+    found = edge_placement(ramp(shift_px, degrees), ramp(0, degrees), HEIGHTS_UM, PITCH_UM)
+    # A plane is interpolated exactly; what is left is rounding of heights of 1 µm over a slope of 12 nm/px.
+    assert found.mean_nm == pytest.approx(100 * abs(shift_px), abs=1e-6)
+    assert found.p95_nm == pytest.approx(100 * abs(shift_px), abs=1e-6)
+    assert found.matched > 10 * 100
+    assert found.unmatched == found.unmatched_expected == 0
+
+
+def test_an_oblique_edge_is_measured_across_not_along_the_grid():
+    found = edge_placement(ramp(1.5, 30), ramp(0, 30), HEIGHTS_UM, PITCH_UM)
+    # Along the grid it would be 173 nm. Where a contour leaves the field, most of all in a corner, the
+    # nearest piece is the last one, which lies farther: under 1 % on average.
+    assert 150 <= found.mean_nm < 151.5
+    assert found.p95_nm == pytest.approx(150, abs=1e-6)
+
+
+def test_an_edge_farther_than_the_search_has_no_partner():
+    found = edge_placement(ramp(5.1), ramp(), HEIGHTS_UM, PITCH_UM)
+    assert (found.matched, found.mean_nm, found.p95_nm) == (0, None, None)
+    assert found.unmatched > 1000
+    assert found.unmatched_expected > 1000
+
+
+def test_the_other_side_of_a_line_is_no_partner():
+    x = np.arange(60.0)
+    profile = [np.clip(0.6 - 0.2 * np.abs(x - centre), 0, None) for centre in (30.0, 34.0)]
+    measured, expected = (np.tile(p, (40, 1)) for p in profile)
+    # At 0.3 µm the measured line falls 0.5 px beside where the expected one rises, 4 px from its partner.
+    found = edge_placement(measured, expected, np.array([0.3]), PITCH_UM)
+    assert found.mean_nm == pytest.approx(400)
+
+
+def test_pixels_that_are_not_scored_have_no_contours():
+    measured = ramp(1.0)
+    measured[:, 40:80] = np.nan
+    found = edge_placement(measured, ramp(), HEIGHTS_UM, PITCH_UM)
+    whole = edge_placement(ramp(1.0), ramp(), HEIGHTS_UM, PITCH_UM)
+    assert found.matched < whole.matched
+    assert found.mean_nm == pytest.approx(100, rel=0.02)
+
+
+def test_flat_maps_have_no_edges():
+    flat = np.full((40, 40), 0.6)
+    assert edge_placement(flat, flat, HEIGHTS_UM, PITCH_UM) == (None, None, 0, 0, 0)
+
+
+def test_similarity_is_one_for_equal_maps_and_known_for_a_constant_offset():
+    height = 0.6 + 0.2 * np.random.default_rng(0).standard_normal((64, 64))
+    assert structural_similarity(height, height) == pytest.approx(1, abs=1e-12)
+    # Of flat maps only the means are left: (2ab + c)/(a² + b² + c), c = (0.01 · 1.2 µm)².
+    a, b, c = 0.5, 0.6, 0.012**2
+    flat = structural_similarity(np.full((32, 32), a), np.full((32, 32), b))
+    assert flat == pytest.approx((2 * a * b + c) / (a * a + b * b + c))
+
+
+def test_similarity_does_not_look_at_pixels_that_are_not_scored():
+    random = np.random.default_rng(1)
+    measured, expected = random.uniform(0, 1.2, (2, 64, 64))
+    holed = measured.copy()
+    holed[:, 40:] = np.nan
+    changed = expected.copy()
+    changed[:, 40:] += 1.0
+    # Windows that lie within the first 40 columns are the same in both.
+    assert structural_similarity(holed, changed) == structural_similarity(holed, expected)
+    assert structural_similarity(np.full((64, 64), np.nan), expected) is None
+    small = np.zeros((SSIM_WINDOW_PX, SSIM_WINDOW_PX))
+    assert structural_similarity(small, small) == 1
+
+
+def test_the_paper_s_error_in_waves():
+    assert phase_waves(0.0277) == pytest.approx(0.024, abs=5e-5)
+
+
+def test_the_scores_of_the_truth_with_a_constant_error():
+    scan = make_scan(0, 128, noise_um=0.0, datum_um=0.0)
+    constant = Prediction(scan.height_um - np.float32(0.05))
+    scores = score_model("truth", [scan], [constant], protocol_for("none"))
+    # Waves are those of 50 nm; float32 heights of 1 µm are good to 1e-4 nm.
+    assert scores.phase_rms_waves == pytest.approx(0.05 * 0.548 / 0.6328, rel=1e-5)
+    free = score_model("truth", [scan], [constant], protocol_for("offset"))
+    assert free.phase_rms_waves == pytest.approx(0, abs=1e-6)
+    assert free.ssim == pytest.approx(1, abs=1e-6)
+    assert free.edge_mean_nm == pytest.approx(0, abs=0.1)
+    assert free.edge_matched > 1000
+    assert free.scans[0].edge_matched == free.edge_matched
+    assert scores.ssim < free.ssim
+    assert scores.edge_mean_nm > free.edge_mean_nm
+
+
+@pytest.mark.parametrize("name", ["identity", "affine"])
+def test_a_model_of_single_pixels_is_the_same_in_every_crop(name):
+    found = tile_consistency(build_model(name), make_scan(0, 96))
+    assert (found.max_nm, found.rms_nm) == (0, 0)
+    assert found.pixels == 64 * 64
+
+
+def test_a_model_that_looks_at_the_whole_image_is_found_out():
+    scan = make_scan(0, 96)
+    scan.mask_level[0, 0] = 12
+    # The authors' variant divides by the maximum of the image it is given.
+    found = tile_consistency(build_model("physics", "authors"), scan)
+    assert found.max_nm > 1
+
+
+def test_small_fields_leave_nothing_to_compare():
+    assert tile_consistency(build_model("fno"), make_scan(0, 96)) is None
+
+
+def test_predictions_are_measured_and_unchanged():
+    model, scans = build_model("physics"), make_scans(3, size_px=64)
+    heights, cost = measured_predictions(lambda scan: predict_scan(model, scan), scans, "cpu")
+    for scan, height in zip(scans, heights, strict=True):
+        assert np.array_equal(height, predict_scan(model, scan))
+    assert cost.seconds_per_scan > 0
+
+
+def test_memory_held_for_a_moment_is_seen():
+    scans = make_scans(3, size_px=32)
+
+    def greedy(scan):
+        return torch.ones(64 * 2**18).reshape(64, -1)[:, :1].numpy().copy()
+
+    _, cost = measured_predictions(greedy, scans, "cpu")
+    if cost.peak_memory_mib is None:
+        pytest.skip("the peak of resident memory cannot be reset here")
+    # 64 MiB of float32; pages come in fours of KiB, an allocator may round up a little.
+    assert cost.peak_memory_mib == pytest.approx(64, rel=0.05)
