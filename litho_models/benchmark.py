@@ -43,7 +43,7 @@ from litho_models.training import TrainingConfig, fit_in_cache
 from litho_models.training.fit import common_geometry, run_key
 
 BASELINES = ("identity", "affine", "affine-mtf", "blur-table", "linear")
-DEFAULT_MODELS = (*BASELINES, "physics", "pbl")
+DEFAULT_MODELS = (*BASELINES, "physics", "pbl", "fno")
 
 
 class FitRecord(Record):
@@ -107,6 +107,7 @@ def benchmark(
     folds: int = GROUPED_FOLDS,
     policy: Policy = "offset",
     background: BackgroundUse = "training",
+    noise: str | Path | None = None,
     open_lock_box: bool = False,
     seed: int = 0,
 ) -> Benchmark:
@@ -122,16 +123,19 @@ def benchmark(
         folds: number of folds of ``grouped``, at most the number of development scans.
         policy: nuisances of ``mae_datum_free_nm``.
         background: whether each fit's background, learned on its training scans, is added to its predictions.
+        noise: ``noise.json`` of this dataset, or its folder: the floor beside the errors is the one in it.
         open_lock_box: also train on all development scans and score the locked ones.
         seed: of the split, the nuisance blocks and the training.
 
     Raises:
-        InputError: unknown model, a store that cannot be read or is too small for the split.
+        InputError: unknown model, a store that cannot be read or is too small for the split, or a noise
+            analysis of other data.
     """
     for name in models:
         model_class(name)
     dataset = open_store(store)
     scans = dataset.scans()
+    floor = noise_floor(dataset.name, noise)
     locked = locked_ids(scans)
     plan = plan_folds(scans, locked, split, folds=folds, seed=seed, open_lock_box=open_lock_box)
     configs = {name: _config(name, settings, seed) for name in models}
@@ -166,7 +170,7 @@ def benchmark(
             lock_box_opened=open_lock_box or split == "paper",
         ),
         nuisance=protocol,
-        noise_floor=noise_floor(dataset.name),
+        noise_floor=floor,
         training={name: config.model_dump(mode="json") for name, config in configs.items()},
         scores=scores,
         locked_scores=[score(name, boxed, True) for name in models] if boxed else [],

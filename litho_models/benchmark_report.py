@@ -49,12 +49,7 @@ def write_benchmark_report(
     page.paragraph(score_tables.protocol_text(result.nuisance))
     if on_paper_data:
         page.note(paper_sentence(result.split.kind))
-    floor = result.noise_floor
-    page.paragraph(
-        f"Noise floor ({floor.kind}): "
-        + (f"MAE {floor.mae_nm:g} nm, RMSE {floor.rmse_nm:g} nm; " if floor.mae_nm is not None else "")
-        + floor.source
-    )
+    page.paragraph(score_tables.floor_text(result.noise_floor))
     if result.locked_scores:
         page.heading("Lock box")
         page.table(

@@ -28,6 +28,10 @@ BackgroundOption = Annotated[
         "maps; both errors are in the tables"
     ),
 ]
+NoiseOption = Annotated[
+    Path | None,
+    typer.Option(help="noise.json of `litho-models noise` on this dataset, for the floor beside the errors"),
+]
 RecipeOption = Annotated[
     Literal["fast", "paper"],
     typer.Option(help="fast: one-cycle with nuisances fitted jointly; paper: 4,000 epochs of Adam"),
@@ -73,6 +77,7 @@ def evaluate(
     out: Out,
     policy: PolicyOption = "offset",
     background: BackgroundOption = "training",
+    noise: NoiseOption = None,
     extrapolate: Annotated[
         bool, typer.Option("--extrapolate", help="accept layouts beyond the calibrated range")
     ] = False,
@@ -80,7 +85,9 @@ def evaluate(
     """Score one frozen model on all scans of a store."""
     from litho_models.evaluate import evaluate as evaluate_model
 
-    result = evaluate_model(model, store, out, policy=policy, background=background, extrapolate=extrapolate)
+    result = evaluate_model(
+        model, store, out, policy=policy, background=background, noise=noise, extrapolate=extrapolate
+    )
     scores = result.scores
     typer.echo(
         f"{scores.model}: mae_datum_free {scores.mae_datum_free_nm:.2f} nm, "
@@ -96,21 +103,21 @@ def benchmark(
     split: Annotated[
         Literal["grouped", "paper", "leave-one-print-out"], typer.Option(help="what is held out")
     ] = "grouped",
-    models: Annotated[str, typer.Option(help="names, separated by commas")] = ",".join(
-        ("identity", "affine", "affine-mtf", "blur-table", "linear", "physics", "pbl")
-    ),
+    models: Annotated[str | None, typer.Option(help="names, separated by commas; all by default")] = None,
     recipe: RecipeOption = "fast",
     variant: VariantOption = "default",
     steps: Steps = None,
     folds: Annotated[int, typer.Option(min=2, help="folds of the grouped split")] = 5,
     policy: PolicyOption = "offset",
     background: BackgroundOption = "training",
+    noise: NoiseOption = None,
     open_lock_box: Annotated[
         bool, typer.Option("--open-lock-box", help="also score the locked scans; once per release")
     ] = False,
     seed: Seed = 0,
 ) -> None:
     """Train every model per fold and score it on scans it never saw; resumable."""
+    from litho_models.benchmark import DEFAULT_MODELS
     from litho_models.benchmark import benchmark as run_benchmark
     from litho_models.score_tables import headline_table
 
@@ -119,11 +126,12 @@ def benchmark(
         store,
         out,
         split=split,
-        models=[name.strip() for name in models.split(",") if name.strip()],
+        models=[name.strip() for name in models.split(",") if name.strip()] if models else DEFAULT_MODELS,
         settings=settings,
         folds=folds,
         policy=policy,
         background=background,
+        noise=noise,
         open_lock_box=open_lock_box,
         seed=seed,
     )

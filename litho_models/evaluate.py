@@ -79,6 +79,7 @@ def evaluate(
     *,
     policy: Policy = "offset",
     background: BackgroundUse = "training",
+    noise: str | Path | None = None,
     scan_ids: Sequence[str] | None = None,
     extrapolate: bool = False,
     device: str = "cpu",
@@ -92,13 +93,16 @@ def evaluate(
         policy: nuisances that a scan may be freed of.
         background: whether the background in the model's card is added to the predictions; a card without
             one, or with one of fields of another size, adds none, and the result says so.
+        noise: ``noise.json`` of this dataset, or its folder: the floor beside the errors is the one in it.
         scan_ids: only these scans; all if None.
         extrapolate: accept layouts beyond the model's calibrated range.
 
     Raises:
-        InputError: a model or store that cannot be read, or geometries that differ.
+        InputError: a model or store that cannot be read, geometries that differ, or a noise analysis of
+            other data.
     """
     dataset = open_store(store)
+    floor = noise_floor(dataset.name, noise)
     frozen = load_frozen(model, device=device, extrapolate=extrapolate)
     frozen.check_geometry(dataset.pitch_um, dataset.level_height_um)
     ids = list(scan_ids) if scan_ids is not None else dataset.ids
@@ -127,7 +131,7 @@ def evaluate(
         ),
         split=SplitRecord(kind="given", scored_ids=ids, scored_ids_sha256=ids_sha256(ids)),
         nuisance=protocol,
-        noise_floor=noise_floor(dataset.name),
+        noise_floor=floor,
         trained_on_scored_scans=sorted(trained_on),
         scores=score_model(frozen.name, scans, predictions, protocol),
     )

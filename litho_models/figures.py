@@ -49,7 +49,7 @@ def error_bars(scores: Sequence[ModelScores], floor: NoiseFloor, paper_line: boo
         )
     if floor.mae_nm is not None:
         axes.axvline(
-            floor.mae_nm, color="#2d8a4e", ls="--", label=f"noise floor, {floor.kind}: {floor.mae_nm:g} nm"
+            floor.mae_nm, color="#2d8a4e", ls="--", label=f"noise floor, {floor.kind}: {floor.mae_nm:.1f} nm"
         )
     if paper_line:
         axes.axvline(
@@ -57,7 +57,7 @@ def error_bars(scores: Sequence[ModelScores], floor: NoiseFloor, paper_line: boo
         )
     axes.set_yticks(position, [s.model for s in scores])
     axes.invert_yaxis()
-    axes.set_xlabel("error over held-out scans, nm (bars: 95 % interval over scans)")
+    axes.set_xlabel("error over scans, nm (bars: 95 % interval over scans)")
     figure.legend(loc="outside lower center", ncols=2, fontsize=8)
     axes.grid(axis="x", alpha=0.3)
     return figure

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from litho_models.edges import SEARCH_UM
 from litho_models.metrics import INDEX_STEP, WAVELENGTH_UM
-from litho_models.scores import Interval, ModelScores, NuisanceProtocol
+from litho_models.scores import Interval, ModelScores, NoiseFloor, NuisanceProtocol
 from litho_models.similarity import SSIM_RANGE_UM, SSIM_SIGMA_PX, SSIM_WINDOW_PX
 
 if TYPE_CHECKING:
@@ -106,6 +106,12 @@ _BACKGROUND_TEXT = {
     "beside their prints (five smooth terms, nothing fitted to the scored scan); the table of policies has "
     "the errors without it too. Policies with smooth terms of their own cannot tell the difference.",
 }
+
+
+def floor_text(floor: NoiseFloor) -> str:
+    """The noise floor and how it is known."""
+    known = f"MAE {floor.mae_nm:.2f} nm, RMSE {floor.rmse_nm:.2f} nm; " if floor.mae_nm is not None else ""
+    return f"Noise floor ({floor.kind}): {known}{floor.source}"
 
 
 def shape_text() -> str:

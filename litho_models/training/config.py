@@ -13,6 +13,8 @@ from litho_models.simulator import Variant
 Recipe = Literal["fast", "paper"]
 RECIPES: tuple[str, ...] = get_args(Recipe)
 PAPER_EPOCHS, PAPER_CROPS, PAPER_BATCH = 4000, 72, 4
+# Others are fitted by Gauss-Newton and take no steps.
+FAST_STEPS = {"pbl": 2000, "fno": 1000}
 PAPER_LEARNING_RATE = {"pbl": 5e-4, "fno": 1e-4, "physics": 1e-2}
 
 
@@ -56,7 +58,8 @@ class TrainingConfig(BaseModel):
         """The settings of a named recipe for a model; ``settings`` override single fields.
 
         ``paper``: Adam, batch 4, L1, 4,000 epochs over 72 quadrants, the paper's learning rates, no
-        nuisances. ``fast``: AdamW with a one-cycle schedule, random crops, nuisances fitted jointly.
+        nuisances. ``fast``: AdamW with a one-cycle schedule, random crops, nuisances fitted jointly, and
+        ``FAST_STEPS``.
 
         Raises:
             InputError: unknown recipe.
@@ -64,7 +67,8 @@ class TrainingConfig(BaseModel):
         if recipe not in RECIPES:
             raise InputError("recipe", got=repr(recipe), wanted=", ".join(RECIPES))
         if recipe == "fast":
-            return cls(**{"recipe": recipe, **settings})
+            steps = {"steps": FAST_STEPS[model_name]} if model_name in FAST_STEPS else {}
+            return cls(**{"recipe": recipe, **steps, **settings})
         paper: dict[str, Any] = {
             "steps": PAPER_EPOCHS * PAPER_CROPS // PAPER_BATCH,
             "rounds": 100,

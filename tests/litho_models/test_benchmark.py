@@ -14,6 +14,7 @@ from litho_models.benchmark import Benchmark, benchmark
 from litho_models.compare import compare
 from litho_models.evaluate import Evaluation, evaluate
 from litho_models.folds import plan_folds
+from litho_models.freeze import DatasetName
 from litho_models.runs import TrainingRun, freeze, train
 
 MODELS = ("identity", "affine", "linear")
@@ -137,6 +138,31 @@ def test_comparing_different_protocols_is_refused(store, tmp_path):
         compare(tmp_path / "offset", tmp_path / "full")
     with pytest.raises(InputError):
         compare(tmp_path / "offset", tmp_path / "nothing")
+
+
+def test_the_floor_beside_the_errors_is_that_of_the_noise_analysis_given(store, tmp_path):
+    from litho_models.noise import NoiseAnalysis, noise_of_files
+
+    flat = 0.016 * np.random.default_rng(0).standard_normal((64, 64))
+    np.save(tmp_path / "flat.npy", flat)
+    noise_of_files(tmp_path / "noise", flat=tmp_path / "flat.npy", unit="um", size_um=(6.4, 6.4))
+    scored = benchmark(store, tmp_path / "b", models=["identity"], folds=2, noise=tmp_path / "noise")
+    assert scored.noise_floor.kind == "measured"
+    # 64² independent heights: relative standard error of σ is 1/√(2 · 64²) = 1.1 %; three of them.
+    assert scored.noise_floor.rmse_nm == pytest.approx(16, rel=0.034)
+    assert "flat print" in (tmp_path / "b" / "report.html").read_text()
+    train(store, "identity", tmp_path / "run")
+    file = tmp_path / "noise" / "noise.json"
+    assert (
+        evaluate(tmp_path / "run" / "model", store, tmp_path / "e", noise=file).noise_floor
+        == scored.noise_floor
+    )
+    assert "flat print" in (tmp_path / "e" / "report.html").read_text()
+    other = NoiseAnalysis.read(file).model_copy(update={"dataset": DatasetName(name="else", sha256="0" * 64)})
+    other.write(tmp_path / "other")
+    with pytest.raises(InputError, match="noise analysis"):
+        benchmark(store, tmp_path / "c", models=["identity"], folds=2, noise=tmp_path / "other")
+    assert not (tmp_path / "c").exists()
 
 
 def test_a_model_of_another_geometry_is_refused(store, tmp_path):

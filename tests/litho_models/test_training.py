@@ -17,7 +17,7 @@ from litho_models.models import build_model
 from litho_models.tiles import predict_scan
 from litho_models.training import TrainingConfig, fit, fit_with_record
 from litho_models.training.checkpoint import CheckpointFolder
-from litho_models.training.config import PAPER_LEARNING_RATE
+from litho_models.training.config import FAST_STEPS, PAPER_LEARNING_RATE
 from litho_models.training.crops import Window, cut, plan_batch
 from litho_models.training.gauss_newton import fit_gauss_newton
 from litho_models.training.network import learning_rate
@@ -193,6 +193,13 @@ def test_the_paper_recipe_is_the_papers():
         assert config.steps == 72_000
         assert config.learning_rate == rate
         assert config.nuisance == "none"
+
+
+def test_the_fast_recipe_takes_each_network_s_own_number_of_steps_unless_told():
+    assert {name: TrainingConfig.of_recipe("fast", name).steps for name in FAST_STEPS} == FAST_STEPS
+    assert TrainingConfig.of_recipe("fast", "pbl", steps=7).steps == 7
+    # A cached fit is found by its settings: a default must be what spelling it out is.
+    assert TrainingConfig.of_recipe("fast", "pbl") == TrainingConfig.of_recipe("fast", "pbl", steps=2000)
 
 
 def test_one_cycle_rises_to_the_rate_and_falls_to_a_thousandth():
