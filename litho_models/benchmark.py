@@ -28,15 +28,8 @@ from litho_models.models import build_model, model_class
 from litho_models.nuisance import Policy
 from litho_models.run_info import RunInfo, run_info
 from litho_models.runs import locked_ids, training_config
-from litho_models.scores import (
-    ModelScores,
-    NoiseFloor,
-    NuisanceProtocol,
-    Prediction,
-    noise_floor,
-    protocol_for,
-    score_model,
-)
+from litho_models.score_records import ModelScores, NuisanceProtocol, Prediction
+from litho_models.scores import NoiseFloor, noise_floor, protocol_for, score_model
 from litho_models.splits import ids_sha256
 from litho_models.tiles import predict_scan
 from litho_models.training import TrainingConfig, fit_in_cache
@@ -218,7 +211,7 @@ def _fit_or_load(
     record = FitRecord.model_validate_json((folder / "fit.json").read_text(encoding="utf-8"))
     heights = [np.load(file, allow_pickle=False) for file in sorted(folder.glob("prediction_*.npy"))]
     if not (folder / "diagnostics.json").exists():
-        # A finished training is read from its checkpoint; models without one are fitted within seconds.
+        # An interrupted call: a finished training is read from its checkpoint, a small model fitted again.
         fitted = fitted or fit_in_cache(name, fold.training, config, cache)
         found = diagnose(fitted.model, fold.training, record.validation_ids, fold.held_out, heights)
         with atomic_file(folder / "diagnostics.json") as temporary:

@@ -11,7 +11,7 @@ from litho_data.errors import InputError
 from litho_models.benchmark import Benchmark
 from litho_models.evaluate import Evaluation
 from litho_models.metrics import paired_difference
-from litho_models.scores import ModelScores
+from litho_models.score_records import ModelScores
 
 if TYPE_CHECKING:
     import pandas as pd

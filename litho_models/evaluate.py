@@ -20,15 +20,8 @@ from litho_models.evaluation_report import write_evaluation_report
 from litho_models.freeze import DatasetName, FrozenSimulator, load_frozen
 from litho_models.nuisance import Policy
 from litho_models.run_info import RunInfo, run_info
-from litho_models.scores import (
-    ModelScores,
-    NoiseFloor,
-    NuisanceProtocol,
-    Prediction,
-    noise_floor,
-    protocol_for,
-    score_model,
-)
+from litho_models.score_records import ModelScores, NuisanceProtocol, Prediction
+from litho_models.scores import NoiseFloor, noise_floor, protocol_for, score_model
 from litho_models.splits import ids_sha256
 
 

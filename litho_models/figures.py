@@ -10,7 +10,8 @@ import numpy as np
 from litho_data.report import new_figure
 from litho_data.store import PrintedScan
 from litho_models.nuisance import cross_fitted_residual
-from litho_models.scores import ModelScores, NoiseFloor, NuisanceProtocol
+from litho_models.score_records import ModelScores, NuisanceProtocol
+from litho_models.scores import NoiseFloor
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

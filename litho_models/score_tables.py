@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 from litho_models.edges import SEARCH_UM
 from litho_models.metrics import INDEX_STEP, WAVELENGTH_UM
-from litho_models.scores import Interval, ModelScores, NoiseFloor, NuisanceProtocol
+from litho_models.score_records import Interval, ModelScores, NuisanceProtocol
+from litho_models.scores import NoiseFloor
 from litho_models.similarity import SSIM_RANGE_UM, SSIM_SIGMA_PX, SSIM_WINDOW_PX
 
 if TYPE_CHECKING:
@@ -64,7 +65,9 @@ def scan_table(scores: Sequence[ModelScores]) -> pd.DataFrame:
     """One row per model and scan."""
     import pandas as pd
 
-    return pd.DataFrame([{"model": s.model, **row.model_dump()} for s in scores for row in s.scans])
+    return pd.DataFrame(
+        [{"model": s.model, "scan": row.scan, **row.model_dump()} for s in scores for row in s.scans]
+    )
 
 
 def level_table(scores: Sequence[ModelScores]) -> pd.DataFrame:

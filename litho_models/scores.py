@@ -5,61 +5,37 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
 from litho_data.errors import InputError
 from litho_data.results import Record
 from litho_data.store import PrintedScan
 from litho_models.background import BackgroundUse
-from litho_models.curves import LevelError, TransferCurves, level_errors, transfer_curves
+from litho_models.curves import level_errors, transfer_curves
 from litho_models.edges import edge_placement, mid_step_heights_um
 from litho_models.metrics import NM_PER_UM, ScanScore, bootstrap_interval, phase_waves, score_scan
 from litho_models.nuisance import (
-    BLOCK_PX,
-    BUFFER_PX,
     POLICIES,
     TERM_COUNT,
     Policy,
     cross_fitted_residual,
     scan_line_index,
 )
+from litho_models.score_records import (
+    Interval,
+    ModelScores,
+    NuisanceProtocol,
+    PolicyError,
+    Prediction,
+    ScanRow,
+    ShapeFigures,
+)
 from litho_models.similarity import structural_similarity
-
-Interval = tuple[float, float] | None
-
 
 # Policies without smooth terms of their own: only their errors know of a smooth background.
 _BLIND_POLICIES: tuple[Policy, ...] = ("none", "offset", "offset-gain")
-
-
-class NuisanceProtocol(Record):
-    """What a scan may be freed of before it is scored, and on which pixels that was fitted.
-
-    ``background``: ``training`` if the smooth background learned on the training scans was added to the
-    predictions; nothing of it is fitted to the scored scan.
-    """
-
-    policy: Policy = "offset"
-    k: float = 1.0
-    block_px: int = BLOCK_PX
-    buffer_px: int = BUFFER_PX
-    seed: int = 0
-    background: BackgroundUse = "none"
-
-
-class Prediction(NamedTuple):
-    """What a model expects of a scan, (ny, nx) µm: the print, and what all scans add, if that is known."""
-
-    height_um: np.ndarray
-    background_um: np.ndarray | None = None
-
-    @property
-    def map_um(self) -> np.ndarray:
-        """The map that the microscope should show."""
-        return self.height_um if self.background_um is None else self.height_um + self.background_um
 
 
 class NoiseFloor(Record):
@@ -69,74 +45,6 @@ class NoiseFloor(Record):
     rmse_nm: float | None
     kind: str
     source: str
-
-
-class PolicyError(Record):
-    """Mean absolute error under one nuisance policy, nm, with its interval over scans."""
-
-    policy: Policy
-    k: float
-    mae_nm: float
-    ci95_nm: Interval
-
-
-class ScanRow(Record):
-    """The figures of one scan. Edges as in ``EdgePlacement``; None where the scan has none, or a result of
-    before they were scored.
-    """
-
-    scan: str
-    print: str
-    mae_abs_nm: float
-    bias_nm: float
-    mae_datum_free_nm: float
-    rmse_datum_free_nm: float
-    median_abs_datum_free_nm: float
-    p95_abs_datum_free_nm: float
-    slope: float
-    intercept_nm: float
-    pixels: int
-    ssim: float | None = None
-    edge_mean_nm: float | None = None
-    edge_p95_nm: float | None = None
-    edge_matched: int | None = None
-    edge_unmatched: int | None = None
-    edge_unmatched_expected: int | None = None
-
-
-class ModelScores(Record):
-    """Everything reported about one model; means are over scans, intervals resample scans.
-
-    ``without_background`` repeats ``by_policy`` without the background of the protocol, for the policies
-    that have no smooth terms themselves; it is empty where the protocol has no background.
-    ``phase_rms_waves`` is the RMS error as light sees it that passes the print. Edges are compared and
-    counted as in ``EdgePlacement``, SSIM as in ``structural_similarity``, both freed of the nuisances.
-    """
-
-    model: str
-    scans: list[ScanRow]
-    mae_abs_nm: float
-    mae_abs_ci95_nm: Interval
-    bias_nm: float
-    mae_datum_free_nm: float
-    mae_datum_free_ci95_nm: Interval
-    rmse_datum_free_nm: float
-    rmse_datum_free_ci95_nm: Interval
-    by_policy: list[PolicyError]
-    without_background: list[PolicyError] = Field(default_factory=list)
-    phase_rms_waves: float | None = None
-    ssim: float | None = None
-    edge_mean_nm: float | None = None
-    edge_p95_nm: float | None = None
-    edge_matched: int | None = None
-    edge_unmatched: int | None = None
-    edge_unmatched_expected: int | None = None
-    by_level: list[LevelError]
-    transfer: TransferCurves
-    row_offset_sd_nm: float
-    scan_line_offset_sd_nm: float
-    dropped_pixels: int
-    constant_predictions: int
 
 
 def score_model(
@@ -171,13 +79,13 @@ def score_model(
         line = scan_line_index(scan.shape, scan.scan_to_layout, scan.pitch_um)
         rows.append(cross_fitted_residual(*arrays, "full+rows", **geometry).row_sd_um)
         lines.append(cross_fitted_residual(*arrays, "full+rows", scan_line=line, **geometry).row_sd_um)
-    own_rows = [
-        _row(scan, score, expected, residual)
-        for scan, score, expected, residual in zip(scans, chosen, maps, residuals, strict=True)
+    shapes = [
+        _shape(scan, expected, residual)
+        for scan, expected, residual in zip(scans, maps, residuals, strict=True)
     ]
     return ModelScores(
         model=name,
-        scans=own_rows,
+        scans=[_row(scan, score, shape) for scan, score, shape in zip(scans, chosen, shapes, strict=True)],
         mae_abs_nm=_mean(chosen, "mae_abs_nm"),
         mae_abs_ci95_nm=interval([score.mae_abs_nm for score in chosen]),
         bias_nm=_mean(chosen, "bias_nm"),
@@ -190,12 +98,7 @@ def score_model(
             _policy_error(policy, _scan_scores(scans, heights, policy, geometry)) for policy in bare
         ],
         phase_rms_waves=phase_waves(_mean(chosen, "rmse_datum_free_nm") / NM_PER_UM),
-        ssim=_mean_known([row.ssim for row in own_rows]),
-        edge_mean_nm=_mean_known([row.edge_mean_nm for row in own_rows]),
-        edge_p95_nm=_mean_known([row.edge_p95_nm for row in own_rows]),
-        edge_matched=sum(row.edge_matched or 0 for row in own_rows),
-        edge_unmatched=sum(row.edge_unmatched or 0 for row in own_rows),
-        edge_unmatched_expected=sum(row.edge_unmatched_expected or 0 for row in own_rows),
+        **_over_scans(shapes),
         by_level=level_errors(scans, residuals),
         transfer=transfer_curves(scans, maps),
         row_offset_sd_nm=NM_PER_UM * float(np.sqrt(np.mean(np.square(rows)))),
@@ -261,23 +164,28 @@ def noise_floor(dataset_name: str, analysis: str | Path | None = None) -> NoiseF
     )
 
 
-def _row(scan: PrintedScan, score: ScanScore, expected_um: np.ndarray, residual_um: np.ndarray) -> ScanRow:
+def _row(scan: PrintedScan, score: ScanScore, shape: ShapeFigures) -> ScanRow:
+    kept = {key: value for key, value in asdict(score).items() if key in ScanRow.model_fields}
+    return ScanRow(scan=scan.id, print=scan.print_id, **kept, **shape.model_dump())
+
+
+def _shape(scan: PrintedScan, expected_um: np.ndarray, residual_um: np.ndarray) -> ShapeFigures:
     freed = expected_um + residual_um
     heights = mid_step_heights_um(scan.levels, scan.level_height_um)
     edges = edge_placement(freed, expected_um, heights, scan.pitch_um)
-    kept = {key: value for key, value in asdict(score).items() if key in ScanRow.model_fields}
-    return ScanRow(
-        scan=scan.id,
-        print=scan.print_id,
-        ssim=structural_similarity(freed, expected_um),
-        **{f"edge_{key}": value for key, value in edges._asdict().items()},
-        **kept,
-    )
+    named = {f"edge_{key}": value for key, value in edges._asdict().items()}
+    return ShapeFigures(ssim=structural_similarity(freed, expected_um), **named)
 
 
-def _mean_known(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None
+def _over_scans(shapes: Sequence[ShapeFigures]) -> dict[str, Any]:
+    """Means of what is known, sums of counts."""
+    figures: dict[str, Any] = {}
+    for name in ("ssim", "edge_mean_nm", "edge_p95_nm"):
+        known = [value for value in (getattr(shape, name) for shape in shapes) if value is not None]
+        figures[name] = float(np.mean(known)) if known else None
+    for name in ("edge_matched", "edge_unmatched", "edge_unmatched_expected"):
+        figures[name] = sum(getattr(shape, name) for shape in shapes)
+    return figures
 
 
 def _mean(scores: Sequence[ScanScore], field: str) -> float:

@@ -19,7 +19,8 @@ from litho_models.freeze import ModelCard
 from litho_models.models import build_model
 from litho_models.nuisance import TERM_COUNT
 from litho_models.runs import freeze, train
-from litho_models.scores import Prediction, protocol_for, score_model
+from litho_models.score_records import Prediction
+from litho_models.scores import protocol_for, score_model
 from litho_models.training.nuisances import learn_background
 
 BOW_NM = 40.0

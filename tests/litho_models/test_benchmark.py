@@ -174,7 +174,8 @@ def test_a_model_of_another_geometry_is_refused(store, tmp_path):
 
 
 def test_line_offsets_are_attributed_to_their_frame():
-    from litho_models.scores import Prediction, protocol_for, score_model
+    from litho_models.score_records import Prediction
+    from litho_models.scores import protocol_for, score_model
 
     scans = make_scans(1, size_px=256, noise_um=0.005)
     angle = np.deg2rad(1.0)

@@ -12,7 +12,8 @@ from litho_models.diagnostics import tile_consistency
 from litho_models.edges import edge_placement, mid_step_heights_um
 from litho_models.metrics import phase_waves
 from litho_models.models import build_model
-from litho_models.scores import Prediction, protocol_for, score_model
+from litho_models.score_records import Prediction
+from litho_models.scores import protocol_for, score_model
 from litho_models.similarity import SSIM_WINDOW_PX, structural_similarity
 from litho_models.tiles import predict_scan
 
