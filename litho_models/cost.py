@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import re
 import time
@@ -61,6 +62,11 @@ def _start_of_peak(device: str) -> int | None:
     if device.startswith("cuda"):
         torch.cuda.reset_peak_memory_stats()
         return torch.cuda.memory_allocated()
+    if not _CLEAR_REFS.exists():
+        return None
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:
+        trim(0)  # what the last prediction left free is still resident, and would be used again unseen
     try:
         _CLEAR_REFS.write_text(_RESET_PEAK)
     except OSError:

@@ -151,14 +151,16 @@ def test_predictions_are_measured_and_unchanged():
     assert cost.seconds_per_scan > 0
 
 
-def test_memory_held_for_a_moment_is_seen():
-    scans = make_scans(3, size_px=32)
+@pytest.mark.parametrize("mib", [8, 64])
+def test_memory_held_for_a_moment_is_seen(mib):
+    scans = make_scans(5, size_px=32)
 
     def greedy(scan):
-        return torch.ones(64 * 2**18).reshape(64, -1)[:, :1].numpy().copy()
+        parts = [torch.ones(2**18) for _ in range(mib)]
+        return torch.stack([part[:1] for part in parts]).numpy().copy()
 
     _, cost = measured_predictions(greedy, scans, "cpu")
     if cost.peak_memory_mib is None:
         pytest.skip("the peak of resident memory cannot be reset here")
-    # 64 MiB of float32; pages come in fours of KiB, an allocator may round up a little.
-    assert cost.peak_memory_mib == pytest.approx(64, rel=0.05)
+    # Parts of 1 MiB of float32, which the allocator keeps once freed; pages of 4 KiB, headers, rounding.
+    assert cost.peak_memory_mib == pytest.approx(mib, rel=0.1)
