@@ -23,7 +23,7 @@ def dose_dependent_shrinkage(height: Tensor, values: Values, context: FieldConte
     """H (1 - k (1 - u)), u the relative nominal height nearby: thin surroundings shrink more."""
     length = values["length_um"]
     relative = context.layout_um / context.full_height_um
-    dose = add_blur(relative, length**2, context.pitch_um, 3 * float(length.detach()), "replicate")
+    dose = add_blur(relative, length**2, context.pitch_um, 3 * float(length.detach()))
     return height * (1 - values["fraction"] * (1 - dose))
 
 
@@ -43,7 +43,7 @@ def feature_collapse(height: Tensor, values: Values, context: FieldContext) -> T
     width_um = 1.0
     standing = torch.sigmoid((context.layout_um / context.full_height_um - 0.5) / 0.05)
     variance = torch.as_tensor(width_um**2, dtype=height.dtype, device=height.device)
-    share = add_blur(standing, variance, context.pitch_um, 3 * width_um, "replicate")
+    share = add_blur(standing, variance, context.pitch_um, 3 * width_um)
     aspect = height / (width_um * torch.clamp(share, min=0.05))
     excess = functional.softplus((aspect - values["aspect_ratio"]) / sharpness) * sharpness
     return height - values["loss_um"] * excess
@@ -71,7 +71,7 @@ EFFECTS = (
         stage="development",
         role="process",
         acts_on="height",
-        parameters={"fraction": Parameter("1", -0.2, 0.5, 0.05)},
+        parameters={"fraction": Parameter("1", -0.2, 0.7, 0.05)},
         apply=vertical_shrinkage,
         trials=({"fraction": 0.05},),
         source="Meisel 2006, cited in the paper",

@@ -31,10 +31,9 @@ def laser_drift(layout: Tensor, values: Values, context: FieldContext) -> Tensor
     return layout * (1 + values["drift"] * context.order)
 
 
-def interface_offset(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """Writing starts z0 above or below the substrate: what would lie under it is cut off."""
-    positive = torch.relu(height)
-    return height + torch.relu(positive + values["offset_um"]) - positive
+def interface_offset(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """max(M + z0, 0): writing starts z0 above the interface; what would lie below it is never written."""
+    return layout + torch.relu(layout + values["offset_um"]) - torch.relu(layout)
 
 
 EFFECTS = (
@@ -84,10 +83,10 @@ EFFECTS = (
         title="writing started above or below the substrate",
         stage="exposure",
         role="process",
-        acts_on="height",
-        parameters={"offset_um": Parameter("µm", -0.3, 0.3, -0.05)},
+        acts_on="layout",
+        parameters={"offset_um": Parameter("µm", -0.5, 0.3, -0.05)},
         apply=interface_offset,
-        trials=({"offset_um": -0.05},),
+        trials=({"offset_um": -0.05}, {"offset_um": -0.15}, {"offset_um": -0.3}),
         source="search of the interface before writing; clipping at the substrate",
         separating="leave bare substrate in every field",
     ),

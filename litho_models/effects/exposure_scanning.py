@@ -21,7 +21,7 @@ def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
         return centred_lag(along if forward else -along, length, context.pitch_um) - 1
 
     reach = _TAIL_LENGTHS * float(length.detach()) + context.pitch_um
-    return add_filtered(layout, transfer_minus_one, context.pitch_um, reach, "zero")
+    return add_filtered(layout, transfer_minus_one, context.pitch_um, reach)
 
 
 def write_order_memory(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -34,7 +34,7 @@ def write_order_memory(layout: Tensor, values: Values, context: FieldContext) ->
         return -strength * trailing_response(along if onwards else -along, length, context.pitch_um)
 
     reach = _TAIL_LENGTHS * float(length.detach())
-    return add_filtered(layout, transfer_minus_one, context.pitch_um, reach, "zero")
+    return add_filtered(layout, transfer_minus_one, context.pitch_um, reach)
 
 
 def line_roughness(height: Tensor, values: Values, context: FieldContext) -> Tensor:

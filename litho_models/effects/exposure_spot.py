@@ -25,7 +25,7 @@ def elliptical_psf(layout: Tensor, values: Values, context: FieldContext) -> Ten
         moment = isotropic * (fx * fx + fy * fy) + stretch * (fx * fx - fy * fy) + 2 * shear * fx * fy
         return torch.expm1(-(math.pi**2) * moment)
 
-    return add_filtered(layout, transfer_minus_one, context.pitch_um, _SPOT_REACH_UM, "zero")
+    return add_filtered(layout, transfer_minus_one, context.pitch_um, _SPOT_REACH_UM)
 
 
 def long_range_proximity(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -36,7 +36,7 @@ def long_range_proximity(layout: Tensor, values: Values, context: FieldContext) 
         blur_minus_one = torch.expm1(-2 * math.pi**2 * length**2 * (fy * fy + fx * fx))
         return weight / (1 + weight) * blur_minus_one
 
-    return add_filtered(layout, transfer_minus_one, context.pitch_um, 3 * float(length.detach()), "zero")
+    return add_filtered(layout, transfer_minus_one, context.pitch_um, 3 * float(length.detach()))
 
 
 def dose_exponent(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -56,11 +56,18 @@ EFFECTS = (
         role="process",
         acts_on="layout",
         parameters={
-            "stretch_um2": Parameter("µm²", -0.12, 0.12, 0.02),
-            "shear_um2": Parameter("µm²", -0.12, 0.12, 0.02),
+            "stretch_um2": Parameter("µm²", -0.3, 0.3, 0.02),
+            "shear_um2": Parameter("µm²", -0.3, 0.3, 0.02),
         },
         apply=elliptical_psf,
-        trials=({"stretch_um2": 0.02}, {"shear_um2": 0.02}),
+        trials=(
+            {"stretch_um2": 0.02},
+            {"shear_um2": 0.02},
+            {"stretch_um2": 0.1},
+            {"shear_um2": 0.1},
+            {"stretch_um2": -0.1},
+            {"shear_um2": -0.1},
+        ),
         source="Gaussian spot of the paper, with a full second-moment matrix",
         separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
     ),
@@ -71,7 +78,7 @@ EFFECTS = (
         role="process",
         acts_on="layout",
         parameters={
-            "weight": Parameter("1", -0.3, 0.5, 0.1),
+            "weight": Parameter("1", -0.3, 1.5, 0.1),
             "length_um": Parameter("µm", 0.6, 10.0, 2.0, kind="shape"),
         },
         apply=long_range_proximity,

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Literal
 
 import torch
 from torch import Tensor
 from torch.nn import functional
-
-Edge = Literal["zero", "replicate"]
 
 
 def add_filtered(
@@ -18,7 +15,6 @@ def add_filtered(
     transfer_minus_one: Callable[[Tensor, Tensor], Tensor],
     pitch_um: float,
     reach_um: float,
-    edge: Edge,
 ) -> Tensor:
     """Field plus the field filtered with (T - 1), so that T = 1 gives the field bit for bit.
 
@@ -26,17 +22,13 @@ def add_filtered(
         field: (b, 1, y, x).
         transfer_minus_one: (fy, fx) in cycles/µm, shapes (y, 1) and (1, x/2 + 1) -> T(f) - 1.
         pitch_um: sampling, µm.
-        reach_um: half the support of the kernel; the field is padded by it.
-        edge: what lies outside: ``zero`` (nothing is written there) or ``replicate``.
+        reach_um: half the support of the kernel; the field is continued by it as the base models continue it.
     """
     ny, nx = field.shape[-2:]
     pad = min(round(reach_um / pitch_um) + 1, ny - 1, nx - 1)
     size_y, size_x = _fast_length(ny + 2 * pad), _fast_length(nx + 2 * pad)
     padding = (pad, size_x - nx - pad, pad, size_y - ny - pad)
-    if edge == "zero":
-        padded = functional.pad(field, padding)
-    else:
-        padded = functional.pad(field, padding, mode="replicate")
+    padded = functional.pad(field, padding, mode="replicate")
     fy = torch.fft.fftfreq(size_y, pitch_um, dtype=field.dtype, device=field.device)[:, None]
     fx = torch.fft.rfftfreq(size_x, pitch_um, dtype=field.dtype, device=field.device)[None, :]
     spectrum = torch.fft.rfft2(padded) * transfer_minus_one(fy, fx)
@@ -44,14 +36,13 @@ def add_filtered(
     return field + change[..., pad : pad + ny, pad : pad + nx]
 
 
-def add_blur(field: Tensor, variance_um2: Tensor, pitch_um: float, reach_um: float, edge: Edge) -> Tensor:
+def add_blur(field: Tensor, variance_um2: Tensor, pitch_um: float, reach_um: float) -> Tensor:
     """Isotropic Gaussian blur of the given variance, µm²: T = exp(-2 π² s² f²)."""
     return add_filtered(
         field,
         lambda fy, fx: torch.expm1(-2 * math.pi**2 * variance_um2 * (fy * fy + fx * fx)),
         pitch_um,
         reach_um,
-        edge,
     )
 
 

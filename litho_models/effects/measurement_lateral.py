@@ -25,7 +25,7 @@ def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tenso
         return centred_lag(fx if forward else -fx, length, context.pitch_um) - 1
 
     reach = _TAIL_LENGTHS * float(length.detach()) + context.pitch_um
-    return add_filtered(height, transfer_minus_one, context.pitch_um, reach, "replicate")
+    return add_filtered(height, transfer_minus_one, context.pitch_um, reach)
 
 
 def registration_residual(height: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -50,7 +50,7 @@ def piezo_nonlinearity(height: Tensor, values: Values, context: FieldContext) ->
 
 def resampling_blur(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """H blurred by the interpolation of the registration: Gaussian of a fraction of a pixel."""
-    return add_blur(height, values["variance_um2"], context.pitch_um, 1.0, "replicate")
+    return add_blur(height, values["variance_um2"], context.pitch_um, 1.0)
 
 
 EFFECTS = (

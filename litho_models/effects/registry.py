@@ -17,6 +17,7 @@ from litho_models.effects import (
 from litho_models.effects.effect import Effect
 
 _FORWARD_ORDER = (
+    "interface-offset",
     "dose-exponent",
     "elliptical-psf",
     "galvo-lag",
@@ -27,7 +28,6 @@ _FORWARD_ORDER = (
     "threshold-softness",
     "diffusion-blur",
     "height-saturation",
-    "interface-offset",
     "field-curvature",
     "vertical-shrinkage",
     "dose-dependent-shrinkage",

@@ -13,7 +13,7 @@ _BLUR_REACH_UM = 4.0
 
 def diffusion_blur(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """H blurred by an isotropic Gaussian of variance s²: reactants diffuse after the exposure."""
-    return add_blur(height, values["variance_um2"], context.pitch_um, _BLUR_REACH_UM, "replicate")
+    return add_blur(height, values["variance_um2"], context.pitch_um, _BLUR_REACH_UM)
 
 
 def threshold_softness(height: Tensor, values: Values, context: FieldContext) -> Tensor:

@@ -22,7 +22,8 @@ from litho_models.loop.injecting import Planted, parse_injection, plant
 from litho_models.loop.measurement import MeasurementTest, measurement_tests
 from litho_models.loop.probes import Probed, probe_residual
 from litho_models.loop.scoring import DATUM_FREE, Score, Terms, names_to_terms, score
-from litho_models.loop.search import Search, State, fit_state, search_effects
+from litho_models.loop.search import Search, search_effects
+from litho_models.loop.state import State, fit_state
 from litho_models.loop.structure import CovariateTest, covariate_tests, is_structured
 from litho_models.metrics import NM_PER_UM
 from litho_models.models import build_model

@@ -59,6 +59,7 @@ class FoldFits:
         chain: the model; its parameters are set by ``set_vector``.
         common: (p,) fitted on all development scans.
         per_fold: (folds, p), each fitted without its own scans.
+        training_error: (folds,) weighted sum of squares over the scans of each of these fits, µm².
         covariance: (p, p), cluster-robust over scans.
         linear: linearisation of each development scan at ``common``; a parameter that has run against
             its bound has no derivative there, since it cannot follow a candidate outwards.
@@ -67,6 +68,7 @@ class FoldFits:
     chain: EffectChain
     common: np.ndarray
     per_fold: np.ndarray
+    training_error: np.ndarray
     covariance: np.ndarray
     linear: list[Linearisation]
 
@@ -91,15 +93,14 @@ def fit_folds(chain: EffectChain, fields: Sequence[Field], fold_of: np.ndarray) 
     if len(fields) > 2 * _START_EVERY:
         _fit_common(chain, fields[::_START_EVERY])
     common, linear = _fit_common(chain, fields)
-    per_fold = np.stack(
-        [
-            _fit_without(chain, common, linear, fields, np.flatnonzero(fold_of != fold))
-            for fold in range(int(fold_of.max()) + 1)
-        ]
-    )
+    own = [
+        _fit_without(chain, common, linear, fields, np.flatnonzero(fold_of != fold))
+        for fold in range(int(fold_of.max()) + 1)
+    ]
+    per_fold, training_error = np.stack([vector for vector, _ in own]), np.array([error for _, error in own])
     free = _within_bounds(chain, common)
     linear = [replace(part, jacobian=part.jacobian * free) for part in linear]
-    return FoldFits(chain, common, per_fold, _robust_covariance(linear), linear)
+    return FoldFits(chain, common, per_fold, training_error, _robust_covariance(linear), linear)
 
 
 def predict(chain: EffectChain, vector: np.ndarray, field: Field) -> np.ndarray:
@@ -183,11 +184,12 @@ def _fit_without(
     linear: Sequence[Linearisation],
     fields: Sequence[Field],
     training: np.ndarray,
-) -> np.ndarray:
-    """Fit on some of the scans; cheap steps with the common derivatives, full ones where those fail."""
-    if not len(common):
-        return common
+) -> tuple[np.ndarray, float]:
+    """Fit on some of the scans, and their weighted sum of squares; cheap steps with the common derivatives,
+    full ones where those fail."""
     parts = [linear[i].normal() for i in training]
+    if not len(common):
+        return common, sum(p[2] for p in parts)
     normal, right = np.sum([p[0] for p in parts], axis=0), np.sum([p[1] for p in parts], axis=0)
     start = best = sum(p[2] for p in parts)
     vector = common
@@ -201,12 +203,13 @@ def _fit_without(
             total += squares
         gained, vector = best - total, moved
         if abs(gained) <= _FOLD_GAIN * total:
-            return vector
+            return vector, total
         if total > start:
             break
         best = total
     set_vector(chain, common)
-    return _fit_common(chain, [fields[i] for i in training])[0]
+    vector, linear = _fit_common(chain, [fields[i] for i in training])
+    return vector, sum(part.normal()[2] for part in linear)
 
 
 def _sum_of_squares(part: Linearisation, field: Field, prediction: np.ndarray) -> float:

@@ -14,10 +14,12 @@ from torch import Tensor, nn
 from litho_data.store.read import PrintedScan
 from litho_models.effects.chain import EffectChain
 from litho_models.loop.confirming import confirm
+from litho_models.loop.contest import Added, fold_amplitudes, terms_for
 from litho_models.loop.fields import Field
 from litho_models.loop.fitting import effect_slots
 from litho_models.loop.scoring import Terms, score
-from litho_models.loop.search import Added, Search, State, fit_state, fold_amplitudes, terms_for
+from litho_models.loop.search import Search
+from litho_models.loop.state import State, fit_state
 
 Trainer = Callable[[Sequence[PrintedScan]], nn.Module]
 
@@ -88,7 +90,7 @@ def carry_over(
         }
         chain = carried.state.fits.chain
         extended = fit_state(chain.with_effects({**chain.values(), name: values}), fields, fold_of)
-        own_terms = terms_for(terms, found.first[name])
+        own_terms = terms_for(terms, [found.first[name]])
         before = score(fields, carried.state.predictions, own_terms, seed)
         after = score(fields, extended.predictions, own_terms, seed)
         verdict = confirm(

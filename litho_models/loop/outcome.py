@@ -9,6 +9,7 @@ import numpy as np
 from litho_models.effects import CATALOGUE, Effect
 from litho_models.loop.closing import Closed
 from litho_models.loop.confirming import FEWEST_SCANS
+from litho_models.loop.contest import Added
 from litho_models.loop.fitting import effect_slots
 from litho_models.loop.measurement import MeasurementTest
 from litho_models.loop.probes import AddedProbe, ProbeTest, figures
@@ -29,7 +30,7 @@ from litho_models.loop.result import (
 )
 from litho_models.loop.scoring import DATUM_FREE, Score
 from litho_models.loop.screening import FAMILY_P, SMALLEST_RETAINED, Screened
-from litho_models.loop.search import Added, separating_experiment
+from litho_models.loop.search import separating_experiment
 from litho_models.metrics import NM_PER_UM
 from litho_models.nuisance import BLOCK_PX
 from litho_models.run_info import run_info

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from litho_models.effects import Effect
 from litho_models.effects.chain import EffectChain
+from litho_models.effects.effect import Parameter
 from litho_models.loop.confirming import sign_flips
 from litho_models.loop.fields import Field
 from litho_models.loop.fitting import Linearisation, set_vector
@@ -23,13 +25,13 @@ from litho_models.loop.linear import gram_inside, nuisance_columns, orthonormal
 FAMILY_P = 0.05
 SAME_COSINE = 0.8
 # Of a direction's information, what must survive the projections for a test to mean anything.
-SMALLEST_RETAINED = 1e-3
+SMALLEST_RETAINED = 1e-5
 GAIN_LIKE = 0.05
 
 
 @dataclass(frozen=True)
 class Block:
-    """Trials of one effect that share their shape parameters; their amplitudes are fitted jointly."""
+    """Trials of one effect that share shape and size; their amplitudes are fitted jointly."""
 
     effect: Effect
     shape: Mapping[str, float]
@@ -90,14 +92,21 @@ class Screened:
 
 
 def blocks_of(effects: Sequence[Effect]) -> list[Block]:
-    """Group the trials of the effects by their shape parameters; number the columns."""
+    """Group the trials of the effects by shape and by size; number the columns.
+
+    A second trial of the same amplitudes at the same shape is another size: what an effect does
+    when it is large need not be a multiple of what it does when it is small.
+    """
     blocks, column = [], 0
     for effect in effects:
         grouped: dict[tuple, list[Mapping[str, float]]] = {}
         for trial in effect.trials:
             shape = tuple(sorted((k, v) for k, v in trial.items() if k not in effect.amplitudes))
-            grouped.setdefault(shape, []).append(trial)
-        for shape, trials in grouped.items():
+            names, size = set(trial), 0
+            while any(set(other) == names for other in grouped.get((shape, size), [])):
+                size += 1
+            grouped.setdefault((shape, size), []).append(trial)
+        for (shape, _), trials in grouped.items():
             columns = tuple(range(column, column + len(trials)))
             blocks.append(Block(effect, dict(shape), columns, tuple(trials)))
             column += len(trials)
@@ -171,12 +180,7 @@ def best_by_fold(directions: Directions, screened: Sequence[Screened], fold_of: 
         for entry in screened:
             own = [b for b in directions.blocks if b.effect.name == entry.effect.name]
             estimates = [_estimate(freed[entry.projection], b, training) for b in own]
-            allowed = [
-                gain
-                for block, (multiples, gain) in zip(own, estimates, strict=True)
-                if _in_range(block, multiples)
-            ]
-            gains[entry.effect.name] = max(allowed, default=-np.inf)
+            gains[entry.effect.name] = max(e.gain if e.physical else -np.inf for e in estimates)
         winners.append(max(gains, key=lambda name: gains[name]) if gains else "")
     return winners
 
@@ -231,8 +235,8 @@ def _screen_one(
     everything = np.arange(len(fold_of))
     chosen = projection[own[0].columns[0]]
     estimates = [_estimate(free[chosen], block, everything) for block in own]
-    ranked = sorted(range(len(own)), key=lambda i: (not _in_range(own[i], estimates[i][0]), -estimates[i][1]))
-    block, multiples = own[ranked[0]], estimates[ranked[0]][0]
+    best = max(range(len(own)), key=lambda i: (estimates[i].physical, estimates[i].gain))
+    block, multiples = own[best], estimates[best].multiples
     columns = [c for b in own for c in b.columns]
     strongest = float(z[max(columns, key=lambda c: abs(z[c]))])
     signature = np.zeros(free[chosen].shape[1] - 1)
@@ -248,7 +252,7 @@ def _screen_one(
         gain_nm2=_held_out_gain(directions, own, chosen, fold_of),
         signature=signature,
         projection=chosen,
-        in_range=_in_range(block, multiples),
+        in_range=estimates[best].physical,
         retained=retained,
         detectable=_detectable(block, free[chosen], float(np.quantile(null_max, 1 - FAMILY_P))),
     )
@@ -262,11 +266,11 @@ def _held_out_gain(
         training, held_out = np.flatnonzero(fold_of != fold), np.flatnonzero(fold_of == fold)
         freed = _freed(directions, projection, training)
         estimates = [_estimate(freed, block, training) for block in own]
-        allowed = [i for i in range(len(own)) if _in_range(own[i], estimates[i][0])]
+        allowed = [i for i in range(len(own)) if estimates[i].physical]
         if not allowed:
             continue
-        best = max(allowed, key=lambda i: estimates[i][1])
-        multiples, columns = estimates[best][0], [1 + c for c in own[best].columns]
+        best = max(allowed, key=lambda i: estimates[i].gain)
+        multiples, columns = estimates[best].multiples, [1 + c for c in own[best].columns]
         for scan in held_out:
             score = freed[scan][0, columns]
             information = freed[scan][np.ix_(columns, columns)]
@@ -276,31 +280,50 @@ def _held_out_gain(
     return gain * 1e6
 
 
-def _estimate(freed: np.ndarray, block: Block, scans: np.ndarray) -> tuple[np.ndarray, float]:
-    """One-step multiples of a block's trials and the predicted gain in the sum of squares, µm²."""
+class Estimate(NamedTuple):
+    """One-step multiples of a block's trials, the gain they promise in the sum of squares (µm²), and
+    whether their signs are physical."""
+
+    multiples: np.ndarray
+    gain: float
+    physical: bool
+
+
+def _estimate(freed: np.ndarray, block: Block, scans: np.ndarray) -> Estimate:
     columns = [1 + c for c in block.columns]
     score = freed[scans][:, 0, columns].sum(axis=0)
     information = freed[scans][:, columns][:, :, columns].sum(axis=0)
     multiples = np.linalg.lstsq(information, score, rcond=1e-8)[0]
-    return multiples, float(score @ multiples)
+    physical = _is_physical(block, multiples)
+    multiples = multiples * _shortening(block, multiples)
+    return Estimate(multiples, float(2 * multiples @ score - multiples @ information @ multiples), physical)
 
 
-def _in_range(block: Block, multiples: np.ndarray) -> bool:
-    """Physical values; a one-sided amplitude may fall short of its null by noise, but not lead."""
-    values = block.values(multiples)
-    weights = {}
-    for name in block.effect.amplitudes:
-        parameter = block.effect.parameters[name]
-        if not any(name in trial for trial in block.trials):
-            continue
+def _is_physical(block: Block, multiples: np.ndarray) -> bool:
+    """No amplitude on the wrong side of a null that bounds it, unless noise may have put it there."""
+    values, weights, wrong = block.values(multiples), {}, []
+    for name, parameter in _amplitudes(block).items():
         weights[name] = abs(values[name] - parameter.null) / abs(parameter.typical - parameter.null)
-    main = max(weights, key=lambda name: weights[name])
-    for name in weights:
-        parameter = block.effect.parameters[name]
-        outside = not parameter.lower <= values[name] <= parameter.upper
-        if outside and (name == main or weights[name] > 0.3 * weights[main]):
-            return False
-    return True
+        low, high = values[name] < parameter.null, values[name] > parameter.null
+        if (low and parameter.lower >= parameter.null) or (high and parameter.upper <= parameter.null):
+            wrong.append(name)
+    return not any(weights[name] > 0.3 * max(weights.values()) for name in wrong)
+
+
+def _shortening(block: Block, multiples: np.ndarray) -> float:
+    """Share of the step that stays within the physical range: a straight line from the null overshoots."""
+    values, share = block.values(multiples), 1.0
+    for name, parameter in _amplitudes(block).items():
+        step = values[name] - parameter.null
+        room = (parameter.upper if step > 0 else parameter.lower) - parameter.null
+        if abs(room) < abs(step) and room != 0:
+            share = min(share, room / step)
+    return share
+
+
+def _amplitudes(block: Block) -> dict[str, Parameter]:
+    named = {name for trial in block.trials for name in trial}
+    return {n: block.effect.parameters[n] for n in block.effect.amplitudes if n in named}
 
 
 def _freed(directions: Directions, projection: str, scans: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from litho_models.loop.probes.covariates import SPOT_UM, drawn
 from litho_models.loop.probes.defects import find_defects
 from litho_models.loop.probes.kernel import off_centre_peak, resampled
 from litho_models.loop.probes.trend import order_trends
-from litho_models.loop.search import State
+from litho_models.loop.state import State
 from tests.litho_models.loop_scans import printed_scans, true_model
 
 COUNT, SIZE_PX, NOISE_UM = 10, 128, 0.006
@@ -44,7 +44,7 @@ def scene(
 
 def probed(fields: list[Field], predictions: list[np.ndarray]) -> Probed:
     nothing = np.empty(0)
-    fits = FoldFits(true_model({}), nothing, np.empty((5, 0)), np.empty((0, 0)), [])
+    fits = FoldFits(true_model({}), nothing, np.empty((5, 0)), np.zeros(5), np.empty((0, 0)), [])
     return probe_residual(
         State(fits, predictions), fields, FOLD_OF, frozenset({"offset", "bow"}),
         floor_nm2=(1e3 * NOISE_UM) ** 2, seed=0, search=True,

@@ -15,7 +15,7 @@ from litho_models.loop.probes.kernel import missing_kernel
 from litho_models.loop.probes.probe import Estimate, Probe
 from litho_models.loop.probes.trend import OrderTrend, order_trends
 from litho_models.loop.scoring import Score, Terms, score
-from litho_models.loop.search import State
+from litho_models.loop.state import State
 
 CONTROLS = 199
 CONTROL_QUANTILE = 0.95

@@ -1,0 +1,265 @@
+"""Candidates that promise much are fitted side by side: which the scans agree on, and what equals it.
+
+A score test at the null foretells the gain of a small effect. Of a large one it is a guess, and a
+candidate that merely comes near may promise more than the true one delivers. So all that promise
+a good part of the best gain are fitted in full before one is chosen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from litho_models.effects import Effect
+from litho_models.loop.confirming import BINOMIAL_P, SMALLEST_SHARE, Confirmation, confirm
+from litho_models.loop.fields import Field
+from litho_models.loop.fitting import FoldFits, effect_slots
+from litho_models.loop.linear import nuisance_columns, orthonormal
+from litho_models.loop.scoring import Score, Terms, score
+from litho_models.loop.screening import (
+    FAMILY_P,
+    SAME_COSINE,
+    SMALLEST_RETAINED,
+    Directions,
+    Screened,
+    cosine,
+    measure_directions,
+    screen,
+)
+from litho_models.loop.state import State, fit_state, held_out_residuals
+
+TRIES_PER_ROUND = 3
+# Promising this part of the best predicted gain is enough to be fitted.
+CONTENDER_SHARE = 0.3
+MOST_CONTENDERS, MOST_RELATIVES = 6, 3
+# A member of a confusable set that loses this part of the gain in nearly every scan is told apart.
+TOLD_APART_SHARE = 0.25
+# The score test predicts the gain of a full fit within a factor of two or so.
+WORTH_FITTING = 0.3
+
+
+@dataclass(frozen=True)
+class Added:
+    """An effect taken into the model and the evidence for it."""
+
+    effect: Effect
+    confusable_with: list[str]
+    before: Score
+    after: Score
+    confirmation: Confirmation
+    p_screen: float
+
+
+@dataclass(frozen=True)
+class Entrant:
+    """A candidate with the model that has it, fitted jointly."""
+
+    screened: Screened
+    state: State
+
+    @property
+    def name(self) -> str:
+        return self.screened.effect.name
+
+    @property
+    def training_error(self) -> np.ndarray:
+        """Squared error on the training scans of each fold."""
+        return self.state.fits.training_error
+
+
+@dataclass
+class Contest:
+    """What one contest found: all screenings, the winner if one was confirmed, why others were not."""
+
+    screened: list[Screened]
+    winner: tuple[Added, State] | None = None
+    failures: dict[str, str] = field(default_factory=dict)
+
+
+def hold_contest(
+    state: State,
+    candidates: Sequence[Effect],
+    fields: Sequence[Field],
+    fold_of: np.ndarray,
+    terms: Terms,
+    *,
+    floor_nm2: float,
+    seed: int,
+    holder: tuple[str, State] | None = None,
+    report: Callable[[str], None] = lambda message: None,
+) -> Contest:
+    """Screen the candidates, fit those that stand out, and confirm the one the training sets agree on.
+
+    Args:
+        state: the model without any of the candidates.
+        candidates: effects that are not in it.
+        fields: development scans; ``fold_of``: fold that holds each out.
+        terms: per-scan terms of the scoring.
+        floor_nm2: squared noise floor or its lower bound.
+        holder: a candidate that takes part whatever its screening says, and the fitted model with it.
+        report: told in a sentence what happens.
+    """
+    windows = [f.window for f in fields]
+    residuals = held_out_residuals(state, windows, fold_of)
+    fits = state.fits
+    directions = measure_directions(fits.chain, fits.common, fits.linear, windows, residuals, candidates)
+    found = Contest(screen(directions, fold_of))
+    mse_nm2 = float(score(fields, state.predictions, terms, seed).mse_nm2.mean())
+    eligible = [s for s in found.screened if is_eligible(s, mse_nm2)]
+    report(f"{len(eligible)} of {len(found.screened)} candidates stand out")
+    worth = WORTH_FITTING * SMALLEST_SHARE * mse_nm2
+    for s in eligible:
+        if s.mean_gain_nm2 < worth:
+            found.failures[s.effect.name] = "predicted gain on held-out scans too small to matter"
+    shortlist, relatives = _shortlist(
+        found.screened, [s for s in eligible if s.mean_gain_nm2 >= worth], directions
+    )
+    entrants = _fitted(state, shortlist, holder, found.screened, fields, fold_of, report)
+    changes = {e.name: _changes(state, e.state, fields) for e in entrants}
+    for attempt, entrant in enumerate(entrants[:TRIES_PER_ROUND]):
+        own = terms_for(terms, [entrant.screened])
+        before, after = (score(fields, s.predictions, own, seed) for s in (state, entrant.state))
+        alike = [
+            rival
+            for rival in entrants
+            if rival is not entrant and _cosine(changes[entrant.name], changes[rival.name]) >= SAME_COSINE
+        ]
+        untold = [r.name for r in alike if not _told_apart(state, entrant, r, fields, terms, seed)]
+        untold += [
+            s.effect.name for s in relatives if abs(cosine(directions, entrant.screened, s)) >= SAME_COSINE
+        ]
+        agreeing, folds = _agreement(entrants[attempt:], {entrant.name, *untold})
+        if agreeing < folds - 1:
+            found.failures[entrant.name] = f"the best in only {agreeing} of {folds} training sets"
+            continue
+        confirmation = confirm(
+            before.mse_nm2,
+            after.mse_nm2,
+            before.mae_nm,
+            after.mae_nm,
+            floor_nm2=floor_nm2,
+            amplitudes=fold_amplitudes(entrant.state.fits, entrant.screened.effect),
+            seed=seed,
+        )
+        if confirmation.passed:
+            added = Added(
+                entrant.screened.effect, sorted(untold), before, after, confirmation, entrant.screened.p
+            )
+            found.winner = added, entrant.state
+            found.failures.pop(entrant.name, None)
+            break
+        found.failures[entrant.name] = confirmation.reason
+    return found
+
+
+def may_be(s: Screened) -> bool:
+    """Physical, testable and of some use: enough for a member of a set of which another stands out."""
+    return s.in_range and s.retained >= SMALLEST_RETAINED and s.mean_gain_nm2 > 0
+
+
+def is_eligible(s: Screened, mse_nm2: float) -> bool:
+    """Physical, testable, promises a gain on held-out scans, and stands out.
+
+    To stand out: family-wise by the score test or, where few scans leave that test little power, by
+    a gain that would matter on scans not used for its estimate. Whether it is real, the fit decides.
+    """
+    return may_be(s) and (s.p <= FAMILY_P or s.mean_gain_nm2 >= SMALLEST_SHARE * mse_nm2)
+
+
+def terms_for(terms: Terms, screened: Sequence[Screened]) -> Terms:
+    """Per-scan terms of the comparison without and with effects: those that the fit leaves free.
+
+    Registration has already taken the mean shift and magnification out of every scan, so an effect that
+    has them must not be charged for them; what acts as a gain must not be hidden by the scans' own gain.
+    """
+    free = terms | {"warp"}
+    return free - {"gain"} if any(s.projection == "no-gain" for s in screened) else free
+
+
+def fold_amplitudes(fits: FoldFits, effect: Effect) -> dict[str, np.ndarray]:
+    """Distance of each amplitude from its null in every fold, in typical sizes."""
+    slots = effect_slots(fits.chain)
+    amplitudes = {}
+    for name in effect.amplitudes:
+        parameter = effect.parameters[name]
+        values = fits.per_fold[:, slots[effect.name, name]]
+        amplitudes[name] = (values - parameter.null) / abs(parameter.typical - parameter.null)
+    return amplitudes
+
+
+def _shortlist(
+    screened: Sequence[Screened], eligible: Sequence[Screened], directions: Directions
+) -> tuple[list[Screened], list[Screened]]:
+    """Those to fit, and what looks like the first of them but is one too many to fit."""
+    if not eligible:
+        return [], []
+    first = eligible[0]
+    contenders = [s for s in eligible if s.mean_gain_nm2 >= CONTENDER_SHARE * first.mean_gain_nm2]
+    contenders = contenders[:MOST_CONTENDERS]
+    relatives = [
+        s
+        for s in screened
+        if s not in contenders and may_be(s) and abs(cosine(directions, first, s)) >= SAME_COSINE
+    ]
+    return contenders + relatives[:MOST_RELATIVES], relatives[MOST_RELATIVES:]
+
+
+def _fitted(
+    state: State,
+    shortlist: Sequence[Screened],
+    holder: tuple[str, State] | None,
+    screened: Sequence[Screened],
+    fields: Sequence[Field],
+    fold_of: np.ndarray,
+    report: Callable[[str], None],
+) -> list[Entrant]:
+    """All entrants, the smallest error on the training sets first."""
+    entrants = []
+    if holder is not None:
+        entrants.append(Entrant(next(s for s in screened if s.effect.name == holder[0]), holder[1]))
+    chain = state.fits.chain
+    for s in shortlist:
+        if holder is not None and s.effect.name == holder[0]:
+            continue
+        report(f"fitting {s.effect.name}")
+        extended = chain.with_effects({**chain.values(), s.effect.name: s.values})
+        entrants.append(Entrant(s, fit_state(extended, fields, fold_of)))
+    return sorted(entrants, key=lambda e: float(e.training_error.sum()))
+
+
+def _agreement(entrants: Sequence[Entrant], names: set[str]) -> tuple[int, int]:
+    """In how many training sets one of these names has the smallest error, and of how many."""
+    best = np.argmin([e.training_error for e in entrants], axis=0)
+    return sum(entrants[i].name in names for i in best), len(best)
+
+
+def _told_apart(
+    state: State, winner: Entrant, rival: Entrant, fields: Sequence[Field], terms: Terms, seed: int
+) -> bool:
+    """The rival is worse in nearly every held-out scan, by a good part of the gain."""
+    own = terms_for(terms, [winner.screened, rival.screened])
+    before, best, other = (
+        score(fields, s.predictions, own, seed) for s in (state, winner.state, rival.state)
+    )
+    verdict = confirm(other.mse_nm2, best.mse_nm2, other.mae_nm, best.mae_nm, seed=seed)
+    gain, lost = before.mse_nm2.mean() - best.mse_nm2.mean(), other.mse_nm2.mean() - best.mse_nm2.mean()
+    return verdict.p <= BINOMIAL_P and lost >= TOLD_APART_SHARE * gain
+
+
+def _changes(before: State, after: State, fields: Sequence[Field]) -> list[np.ndarray]:
+    """What a candidate changes in the held-out predictions, freed of what single scans may add, µm."""
+    changes = []
+    for f, old, new in zip(fields, before.predictions, after.predictions, strict=True):
+        change = f.at_sample(new - old)
+        basis = orthonormal(nuisance_columns(f, old, gain=False))
+        changes.append(change - basis @ (basis.T @ change))
+    return changes
+
+
+def _cosine(a: Sequence[np.ndarray], b: Sequence[np.ndarray]) -> float:
+    inner, own, other = (
+        sum(float(x @ y) for x, y in zip(*pair, strict=True)) for pair in ((a, b), (a, a), (b, b))
+    )
+    return inner / max(np.sqrt(own * other), np.finfo(float).tiny)
