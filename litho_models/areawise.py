@@ -1,154 +1,214 @@
-"""A stack of 3 x 3 convolutions with fixed weights, in small tiles: what a design through it costs.
+"""A stack of 3 x 3 convolutions on a CPU, in tiles whose features lie in the cache.
 
-Where the weights are fixed, the gradient with respect to the input needs the sign of each hidden
-value and nothing else. So each tile runs while its features lie in the cache, keeps its signs (as the
-features themselves in bfloat16, rounding keeps a sign), and is forgotten.
+Of each tile is kept what the gradient needs, in as few bytes as will do: where the weights are fixed
+the sign of each hidden value and nothing else (as the value in bfloat16: rounding keeps a sign),
+where they learn the values themselves.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
-# 64 channels of 128 x 128 pixels are 4 MiB; larger tiles leave the cache, smaller ones repeat more halo.
-_TILE_PX = 128
+# 64 channels of 96 x 96 pixels are 1.1 MiB in bfloat16; larger tiles leave the cache, smaller ones repeat
+# more halo.
+_TILE_PX = 96
 
 
-@dataclass(frozen=True)
-class FixedStack:
-    """Weights of 1 -> channels -> 1, 3 x 3 each, leaky ReLU after each but the last.
+class StackSettings(NamedTuple):
+    """How a stack runs.
 
     Args:
-        weights: (outputs, inputs, 3, 3) per layer, at least two.
-        biases: (outputs,) per layer.
         leaky_slope: slope below zero, above 0.
-        hidden_dtype: of the layers between the first and the last; these two keep full precision.
+        hidden_dtype: of the layers between the first and the last; these two keep that of the weights.
         adjoint_dtype: of the same layers on the way back.
     """
 
-    weights: Sequence[Tensor]
-    biases: Sequence[Tensor]
     leaky_slope: float
     hidden_dtype: torch.dtype
     adjoint_dtype: torch.dtype
 
-    def __call__(self, field: Tensor) -> Tensor:
-        """Interior of ``field`` (b, 1, y, x): (b, 1, y - 2n, x - 2n) for n layers; gradient to ``field``."""
-        return _Stack.apply(field, self)
 
-    @property
-    def halo_px(self) -> int:
-        """Pixels that the interior is smaller by, on each side."""
-        return len(self.weights)
+def convolution_stack(
+    field: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], settings: StackSettings
+) -> Tensor:
+    """Interior of ``field`` (b, 1, y, x): (b, 1, y - 2n, x - 2n) for n layers, leaky ReLU between them.
+
+    Args:
+        field: on the CPU, in the dtype of the weights; gradients flow back to it, once.
+        weights: (outputs, inputs, 3, 3) per layer, 1 -> channels -> 1, two layers at least; they learn
+            where one of them or of the biases wants a gradient.
+        biases: (outputs,) per layer.
+        settings: slope and precision.
+    """
+    return _Stack.apply(field, settings, *weights, *biases)
 
 
 class _Stack(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, field: Tensor, stack: FixedStack) -> Tensor:
-        ctx.stack, ctx.shape = stack, field.shape
-        keep = field.requires_grad
-        hidden = _channels_last(stack.weights[1:-1], stack.hidden_dtype)
-        biases = [bias.to(stack.hidden_dtype) for bias in stack.biases[1:-1]]
-        halo = 2 * stack.halo_px
+    def forward(ctx: Any, field: Tensor, settings: StackSettings, *parameters: Tensor) -> Tensor:
+        slope, dtype = settings.leaky_slope, settings.hidden_dtype
+        weights, biases = _halves(parameters)
+        hidden = _channels_last(weights[1:-1], dtype)
+        hidden_biases = [bias.to(dtype) for bias in biases[1:-1]]
+        learns = any(ctx.needs_input_grad[2:])
+        keeps = learns or ctx.needs_input_grad[0]
+        kept_dtype = settings.adjoint_dtype if learns else torch.bfloat16
+        halo = 2 * len(weights)
         out = field.new_empty((len(field), 1, field.shape[-2] - halo, field.shape[-1] - halo))
-        signs: list[Tensor] = []
-        for rows, columns in _tiles(out.shape[-2], out.shape[-1]):
-            tile = field[..., rows.start : rows.stop + halo, columns.start : columns.stop + halo]
-            features = _from_one_channel(tile, stack.weights[0], stack.biases[0])
-            features = functional.leaky_relu_(features, stack.leaky_slope).to(stack.hidden_dtype)
-            kept = [_signs(features)] if keep else []
-            for weight, bias in zip(hidden, biases, strict=True):
-                features = functional.leaky_relu_(
-                    functional.conv2d(features, weight, bias), stack.leaky_slope
-                )
-                if keep:
-                    kept.append(_signs(features))
-            signs += kept
-            out[..., rows, columns] = _onto_one_channel(features.to(field.dtype), stack.weights[-1])
-        out += stack.biases[-1]
-        ctx.save_for_backward(*signs)
+        kept: list[Tensor] = []
+        for inside, around in _tiles(out, halo):
+            features = _from_one_channel(field[around], weights[0], biases[0])
+            features = functional.leaky_relu_(features, slope).to(dtype)
+            values = [features]
+            for weight, bias in zip(hidden, hidden_biases, strict=True):
+                features = functional.leaky_relu_(functional.conv2d(features, weight, bias), slope)
+                values.append(features)
+            if keeps:
+                kept += [value.to(kept_dtype) for value in values]
+            out[inside] = _onto_one_channel(features.to(field.dtype), weights[-1])
+        out += biases[-1]
+        ctx.settings, ctx.learns = settings, learns
+        ctx.save_for_backward(field, *parameters, *kept)
         return out
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        stack: FixedStack = ctx.stack
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        settings: StackSettings = ctx.settings
+        dtype, learns = settings.adjoint_dtype, ctx.learns
+        count = len(ctx.needs_input_grad) - 2
+        field, *saved = ctx.saved_tensors
+        parameters, kept = saved[:count], saved[count:]
+        weights = parameters[: count // 2]
+        hidden = _channels_last(weights[1:-1], dtype)
         # The adjoint of a convolution is the convolution with the kernel turned round, on a wider frame.
-        turned = [weight.flip(2, 3).transpose(0, 1) for weight in stack.weights]
-        hidden = _channels_last(turned[1:-1], stack.adjoint_dtype)
-        last = turned[-1].contiguous(memory_format=torch.channels_last)
-        halo, layers = 2 * stack.halo_px, len(stack.weights) - 1
-        total = gradient.new_zeros(ctx.shape)
-        for index, (rows, columns) in enumerate(_tiles(gradient.shape[-2], gradient.shape[-1])):
-            signs = ctx.saved_tensors[index * layers : (index + 1) * layers]
-            tile = gradient[..., rows, columns].contiguous(memory_format=torch.channels_last)
-            slope = functional.conv2d(tile, last, padding=2).to(stack.adjoint_dtype)
-            for weight, sign in zip(reversed(hidden), reversed(signs[1:]), strict=True):
-                slope = functional.conv2d(_through_relu(slope, sign, stack.leaky_slope), weight, padding=2)
-            slope = _through_relu(slope.to(gradient.dtype), signs[0], stack.leaky_slope)
-            inside = total[..., rows.start : rows.stop + halo, columns.start : columns.stop + halo]
-            _add_onto_one_channel(slope, stack.weights[0], inside)
-        return total, None
+        last = weights[-1].flip(2, 3).transpose(0, 1)
+        halo, layers = 2 * len(weights), len(weights) - 1
+        total = torch.zeros_like(field)
+        sums = [torch.zeros_like(parameter) for parameter in parameters]
+        weight_sums, bias_sums = _halves(sums)
+        for index, (inside, around) in enumerate(_tiles(gradient, halo)):
+            values = [value.to(dtype) for value in kept[index * layers : (index + 1) * layers]]
+            above = functional.pad(gradient[inside], (2, 2, 2, 2))
+            slope = _from_one_channel(above, last).to(dtype)
+            if learns:
+                weight_sums[-1] += _correlation(above, values[-1]).transpose(0, 1).flip(2, 3)
+            for layer in range(layers - 1, 0, -1):
+                _through_relu_(slope, values[layer], settings.leaky_slope)
+                slope, by_weight, by_bias = _convolution_backward(
+                    slope, values[layer - 1], hidden[layer - 1], learns
+                )
+                if learns:
+                    weight_sums[layer] += by_weight
+                    bias_sums[layer] += by_bias
+            _through_relu_(slope, values[0], settings.leaky_slope)
+            if learns:
+                weight_sums[0] += _correlation(field[around], slope)
+                bias_sums[0] += slope.sum((0, 2, 3), dtype=field.dtype)
+            if ctx.needs_input_grad[0]:
+                _add_onto_one_channel(slope.to(gradient.dtype), weights[0], total[around])
+        bias_sums[-1] += gradient.sum()
+        return total, None, *(sums if learns else [None] * count)
 
 
-def _from_one_channel(tile: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """Convolution 1 -> channels as a matrix product, which leaves channels last: (b, c, y - 2, x - 2)."""
-    batch, _, ny, nx = tile.shape
-    patches = functional.unfold(tile, 3).transpose(1, 2).reshape(-1, 9)
-    features = torch.addmm(bias, patches, weight.reshape(-1, 9).T)
-    return features.view(batch, ny - 2, nx - 2, -1).permute(0, 3, 1, 2)
+def _halves(items: Sequence[Tensor]) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
+    return items[: len(items) // 2], items[len(items) // 2 :]
+
+
+def _convolution_backward(
+    slope: Tensor, features: Tensor, weight: Tensor, learns: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Gradients of a convolution to its input, weight and bias; the last two only where it learns."""
+    return torch.ops.aten.convolution_backward(
+        slope,
+        features,
+        weight,
+        [len(weight)],
+        stride=[1, 1],
+        padding=[0, 0],
+        dilation=[1, 1],
+        transposed=False,
+        output_padding=[0, 0],
+        groups=1,
+        output_mask=[True, learns, learns],
+    )
+
+
+def _from_one_channel(tile: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+    """Convolution 1 -> channels as a matrix product, which leaves channels last: (1, c, y - 2, x - 2)."""
+    ny, nx = (length - 2 for length in tile.shape[-2:])
+    neighbours, kernel = _neighbours(tile).T, weight.reshape(-1, 9).T
+    product = neighbours @ kernel if bias is None else torch.addmm(bias, neighbours, kernel)
+    return product.view(1, ny, nx, -1).permute(0, 3, 1, 2)
+
+
+def _correlation(tile: Tensor, features: Tensor) -> Tensor:
+    """Gradient of ``_from_one_channel`` to its weight, (c, 1, 3, 3), for that of its result."""
+    neighbours = _neighbours(tile).to(features.dtype)
+    return (neighbours @ _pixels(features)).T.reshape(-1, 1, 3, 3).to(tile.dtype)
+
+
+def _neighbours(tile: Tensor) -> Tensor:
+    """(9, pixels): the 3 x 3 surroundings of each pixel of (1, 1, y, x) but the outermost."""
+    ny, nx = (length - 2 for length in tile.shape[-2:])
+    return torch.cat([tile[..., y : y + ny, x : x + nx] for y in range(3) for x in range(3)]).view(9, -1)
 
 
 def _onto_one_channel(features: Tensor, weight: Tensor) -> Tensor:
-    """Convolution channels -> 1: one product for all nine taps, then nine shifted sums."""
-    taps = _taps(features, weight.reshape(-1, 9))
+    """Convolution channels -> 1: one product for all nine taps, then nine shifted sums; (y - 2, x - 2)."""
+    taps = _taps(features, weight)
     ny, nx = (length - 2 for length in features.shape[-2:])
-    total = torch.zeros_like(taps[0, :, :ny, :nx])
+    total = torch.zeros_like(taps[0, :ny, :nx])
     for index, tap in enumerate(taps):
         y, x = divmod(index, 3)
-        total += tap[:, y : y + ny, x : x + nx]
-    return total[:, None]
+        total += tap[y : y + ny, x : x + nx]
+    return total
 
 
 def _add_onto_one_channel(slope: Tensor, weight: Tensor, total: Tensor) -> None:
     """Add the adjoint of ``_from_one_channel`` to ``total``, in place."""
     ny, nx = slope.shape[-2:]
-    for index, tap in enumerate(_taps(slope, weight.reshape(-1, 9))):
+    for index, tap in enumerate(_taps(slope, weight)):
         y, x = divmod(index, 3)
-        total[:, 0, y : y + ny, x : x + nx] += tap
+        total[..., y : y + ny, x : x + nx] += tap
 
 
 def _taps(features: Tensor, weight: Tensor) -> Tensor:
-    """(9, b, y, x): each of nine weightings of the channels; ``weight`` is (channels, 9)."""
-    batch, channels, ny, nx = features.shape
-    pixels = features.permute(0, 2, 3, 1).reshape(-1, channels)
-    return torch.mm(weight.T, pixels.T).view(9, batch, ny, nx)
+    """(9, y, x): each of nine weightings of the channels of (1, c, y, x)."""
+    by_tap = weight.reshape(-1, 9).T
+    return torch.mm(by_tap, _pixels(features).T).view(9, *features.shape[-2:])
 
 
-def _signs(features: Tensor) -> Tensor:
-    return features.to(torch.bfloat16)
+def _pixels(features: Tensor) -> Tensor:
+    """(y x, c) of (1, c, y, x)."""
+    return features.permute(0, 2, 3, 1).reshape(-1, features.shape[1])
 
 
-def _through_relu(slope: Tensor, sign: Tensor, leaky_slope: float) -> Tensor:
-    return torch.ops.aten.leaky_relu_backward(slope, sign.to(slope.dtype), leaky_slope, True)
+def _through_relu_(slope: Tensor, values: Tensor, leaky_slope: float) -> None:
+    torch.ops.aten.leaky_relu_backward.grad_input(slope, values, leaky_slope, True, grad_input=slope)
 
 
 def _channels_last(weights: Sequence[Tensor], dtype: torch.dtype) -> list[Tensor]:
     return [weight.to(dtype).contiguous(memory_format=torch.channels_last) for weight in weights]
 
 
-def _tiles(rows_px: int, columns_px: int) -> Iterator[tuple[slice, slice]]:
-    for rows in _equal_parts(rows_px):
-        for columns in _equal_parts(columns_px):
-            yield rows, columns
+def _tiles(out: Tensor, halo_px: int) -> Iterator[tuple[tuple[slice, ...], tuple[slice, ...]]]:
+    """Slices of each tile in the result (b, 1, y, x), and of what it depends on in the wider input."""
+    every = slice(None)
+    for sample in range(len(out)):
+        one = slice(sample, sample + 1)
+        for rows in _equal_parts(out.shape[-2]):
+            for columns in _equal_parts(out.shape[-1]):
+                wide = [slice(part.start, part.stop + halo_px) for part in (rows, columns)]
+                yield (one, every, rows, columns), (one, every, *wide)
 
 
 def _equal_parts(length_px: int) -> list[slice]:

@@ -16,7 +16,7 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
-from litho_models.areawise import FixedStack
+from litho_models.areawise import StackSettings, convolution_stack
 from litho_models.gaussian import Edge, blur_interior, kernel_radius_px, pad_field
 from litho_models.lookup import PointwiseNet
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
@@ -155,7 +155,7 @@ class AreawiseNet(nn.Module):
         self.hidden = nn.ModuleList(convolutions[:-1])
         self.last = convolutions[-1]
         self.leaky_slope = leaky_slope
-        # Of the hidden layers when a gradient is sent back through fixed weights; None: as forwards.
+        # Of the hidden layers when a gradient is sent back on a CPU; None: as forwards.
         self.adjoint_dtype: torch.dtype | None = None
         for convolution in convolutions:
             weight = convolution.weight
@@ -167,8 +167,9 @@ class AreawiseNet(nn.Module):
 
     def forward(self, height_um: Tensor, padding: int = 0) -> Tensor:
         """Interior of (b, 1, y, x) without padding; the same size with a zero padding of 1 per layer."""
-        if self._runs_fixed(height_um, padding):
-            return self._fixed(height_um)
+        # Small tiles are for the cache of a CPU; a GPU wants large ones.
+        if padding == 0 and height_um.device.type == "cpu" and self.leaky_slope > 0:
+            return self._in_tiles(height_um)
         features = height_um.contiguous(memory_format=torch.channels_last)
         for layer in cast(list[nn.Conv2d], list(self.hidden)):
             features = functional.conv2d(features, layer.weight, layer.bias, padding=padding)
@@ -179,25 +180,18 @@ class AreawiseNet(nn.Module):
                 features.to(self.last.weight.dtype), self.last.weight, self.last.bias, padding=padding
             )
 
-    def _runs_fixed(self, height_um: Tensor, padding: int) -> bool:
-        # Small tiles are for the cache of a CPU; a GPU wants large ones.
-        learning = torch.is_grad_enabled() and any(p.requires_grad for p in self.parameters())
-        return padding == 0 and height_um.device.type == "cpu" and self.leaky_slope > 0 and not learning
-
-    def _fixed(self, height_um: Tensor) -> Tensor:
+    def _in_tiles(self, height_um: Tensor) -> Tensor:
         layers = cast(list[nn.Conv2d], [*self.hidden, self.last])
         dtype = self.last.weight.dtype
-        reduced = torch.is_autocast_enabled("cpu")
-        hidden = torch.get_autocast_dtype("cpu") if reduced else dtype
+        hidden = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else dtype
+        settings = StackSettings(self.leaky_slope, hidden, self.adjoint_dtype or hidden)
         with torch.autocast(device_type="cpu", enabled=False):
-            stack = FixedStack(
-                [layer.weight.detach() for layer in layers],
-                [cast(Tensor, layer.bias).detach() for layer in layers],
-                self.leaky_slope,
-                hidden,
-                self.adjoint_dtype or hidden,
+            return convolution_stack(
+                height_um.to(dtype),
+                [layer.weight for layer in layers],
+                [cast(Tensor, layer.bias) for layer in layers],
+                settings,
             )
-            return stack(height_um.to(dtype))
 
     def start_at_zero(self) -> None:
         """Make the network the zero function, keeping its hidden layers random."""
