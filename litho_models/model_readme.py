@@ -22,7 +22,7 @@ model-index:
 
 _RESULT = """
   - task: {{type: image-to-image, name: layout to printed height}}
-    dataset: {{name: {dataset}, type: {dataset}, split: {split}, revision: {revision}}}
+    dataset: {{name: {dataset}, type: {dataset}, split: "{split}", revision: {revision}}}
     metrics:
     - {{type: {metric}, value: {value:.4f}, config: "nuisance policy {policy}, background {background}"}}"""
 
