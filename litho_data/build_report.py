@@ -45,7 +45,6 @@ _TABLE = {
     "noise_y_nm": "noise along y [nm]",
     "row_step_nm": "row steps [nm]",
     "removed_sd_nm": "levelled away, sd [nm]",
-    "warning": "warning",
 }
 
 
@@ -57,6 +56,7 @@ def write_report(result: BuildResult, store_path: Path, folder: Path) -> Path:
     )
     _summary(page, result, store)
     _left_out(page, result)
+    _warnings(page, store.quality)
     _quality(page, store.quality)
     _pictures(page, store)
     result.write(folder)
@@ -92,6 +92,12 @@ def _left_out(page: Page, result: BuildResult) -> None:
         page.heading("Not in the store")
         table = pd.DataFrame(rows, columns=["id", "status", "reason"])
         page.table(table, "Ids that are not in the store, and why", "left_out.csv")
+
+
+def _warnings(page: Page, quality: pd.DataFrame) -> None:
+    if "warning" in quality and (warned := quality["warning"].astype(bool)).any():
+        page.heading("Passed with a warning")
+        page.table(quality.loc[warned, ["scan", "warning"]], "What to know about a scan", "warnings.csv")
 
 
 def _quality(page: Page, quality: pd.DataFrame) -> None:

@@ -11,6 +11,8 @@ from litho_data.layouts.statistics import LayoutStatistics
 from litho_data.report import Page, new_figure
 
 _SHOWN = 4
+# Lower limit of the logarithmic axes: below it a share is rounding.
+_LEAST_SHARE = 1e-6
 
 
 def statistics_page(statistics: LayoutStatistics, files: Sequence[Path]) -> Page:
@@ -39,10 +41,12 @@ def statistics_page(statistics: LayoutStatistics, files: Sequence[Path]) -> Page
         2, 2, 2, xlabel="jump between neighbours, levels", ylabel="share of pairs", yscale="log"
     )
     axes.bar(levels, statistics.jump_share)
+    axes.set_ylim(_LEAST_SHARE, 1.5)
     axes = graphs.add_subplot(
         2, 2, 3, xlabel="spatial frequency, cycles/µm", ylabel="share of power", yscale="log"
     )
     axes.step(statistics.frequency_per_um, statistics.power_share, where="mid")
+    axes.set_ylim(_LEAST_SHARE, 1.5)
     axes = graphs.add_subplot(2, 2, 4, xlabel="lag, µm", ylabel="autocorrelation")
     axes.plot(statistics.lag_um, statistics.autocorrelation_x, label="along x")
     axes.plot(statistics.lag_um, statistics.autocorrelation_y, label="along y")

@@ -102,12 +102,38 @@ def decoded(array: zarr.Array, selection: Any, what: str) -> np.ndarray:
         ) from error
 
 
-def read_table(group: zarr.Group, first: str) -> pd.DataFrame:
-    """The one-dimensional arrays of a group as a table, the column ``first`` in front."""
-    import pandas as pd
+def groups_in(parent: zarr.Group) -> dict[str, zarr.Group]:
+    """All child groups by name.
 
-    names = sorted((name for name, _ in group.arrays()), key=lambda name: (name != first, name))
-    return pd.DataFrame({name: _plain(values_of(group, name)) for name in names})
+    Raises:
+        InputError: a child with damaged metadata.
+    """
+    import zarr
+
+    return {name: child for name, child in _children(parent).items() if isinstance(child, zarr.Group)}
+
+
+def read_table(group: zarr.Group, first: str) -> pd.DataFrame:
+    """The one-dimensional arrays of a group as a table, the column ``first`` in front.
+
+    Raises:
+        InputError: damaged metadata or chunks, or columns of different lengths.
+    """
+    import pandas as pd
+    import zarr
+
+    names = [name for name, child in _children(group).items() if isinstance(child, zarr.Array)]
+    columns = {name: _plain(values_of(group, name)) for name in sorted(names, key=lambda n: (n != first, n))}
+    if len({values.shape for values in columns.values()}) > 1:
+        raise InputError(f"table {group.store_path}", got="columns of different lengths", wanted="one length")
+    return pd.DataFrame(columns)
+
+
+def _children(parent: zarr.Group) -> dict[str, Any]:
+    try:
+        return dict(parent.members())
+    except Exception as error:  # zarr lets the errors of its metadata parsers through
+        raise InputError(f"metadata in {parent.store_path} is damaged", got=str(error)) from error
 
 
 def _child(parent: zarr.Group, name: str) -> Any:

@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from litho_data.errors import InputError
-from litho_data.store.access import array_of, decoded, group_of, has_child, open_root, read_table, values_of
+from litho_data.store.access import (
+    array_of,
+    decoded,
+    group_of,
+    groups_in,
+    has_child,
+    open_root,
+    read_table,
+    values_of,
+)
 from litho_data.store.schema import OPTIONAL_COLUMNS, SAMPLE_VARIABLES, dataset_sha256
 
 if TYPE_CHECKING:
@@ -156,7 +165,8 @@ class Store:
         """Scans outside the dataset: id and use (flat, substrate, steps); ``scan_frame`` has the heights."""
         if not has_child(self.root, "scans"):
             return {}
-        uses = {name: str(group.attrs["use"]) for name, group in group_of(self.root, "scans").groups()}
+        groups = groups_in(group_of(self.root, "scans"))
+        uses = {name: str(group.attrs["use"]) for name, group in groups.items()}
         return {name: use for name, use in sorted(uses.items()) if use != "dataset"}
 
     @cached_property

@@ -98,6 +98,24 @@ def test_a_changed_digit_of_metadata_is_named(own_campaign: Path, document: str)
 
 
 @pytest.mark.parametrize(
+    "document",
+    [
+        "mask_level/zarr.json",
+        "scans/P11/zarr.json",
+        "quality/ncc_after/zarr.json",
+        "manifest/sha256/zarr.json",
+        "provenance/record/zarr.json",
+    ],
+)
+@pytest.mark.parametrize("damage", ['{"a": ', '{"node_type": "sieve", "zarr_format": 3}'])
+def test_a_metadata_document_that_zarr_cannot_read_is_named(
+    own_campaign: Path, document: str, damage: str
+) -> None:
+    (own_campaign / "prints.zarr" / document).write_text(damage)
+    assert f"metadata {document}" in named(own_campaign)
+
+
+@pytest.mark.parametrize(
     ("key", "value"),
     [("pitch_um", 0.2), ("levels", 14), ("license", "none"), ("dataset_sha256", "0" * 64), ("more", 1)],
 )
