@@ -1,0 +1,260 @@
+"""Several implementations of one task, each in a process of its own, timed in turns.
+
+A process per side keeps their peak memories apart. All are started and warmed up first, then each
+does one repeat after the other, so that a slow minute of the machine hits them alike.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from benchmarks.record import publish, usable_cores, write_record
+from litho_data.results import software_versions
+from litho_models import zoo
+from litho_models.models.pbl import Pbl, PblConfig
+
+PAGE = Path(__file__).parents[1] / "docs" / "speed.md"
+RESULTS = PAGE.parent / "results" / "speed"
+SCHEMA = "litho-models/benchmark-speed/1"
+PLAIN = "plain"
+_MATRIX = 2048
+
+Arrays = Mapping[str, np.ndarray]
+Work = tuple[Callable[[], object], Callable[[], Arrays]]
+
+
+def parser(description: str | None, name: str, repeats: int, size_px: int) -> argparse.ArgumentParser:
+    """The options that all comparisons have."""
+    options = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    options.add_argument("--out", type=Path, default=RESULTS / f"{name}.json", help="JSON file to write")
+    options.add_argument(
+        "--model", type=Path, default=zoo.folder("pbl"), help="frozen PBL; default: the zoo's"
+    )
+    options.add_argument("--size-px", type=int, default=size_px)
+    options.add_argument("--repeats", type=int, default=repeats)
+    options.add_argument("--threads", type=int, default=usable_cores())
+    options.add_argument("--publish", action="store_true", help="write the table into docs/speed.md")
+    options.add_argument("--side", help=argparse.SUPPRESS)
+    options.add_argument("--arrays", type=Path, help=argparse.SUPPRESS)
+    return options
+
+
+def run(
+    module: str,
+    name: str,
+    arguments: argparse.Namespace,
+    sides: Sequence[str],
+    work: Callable[[str, argparse.Namespace], Work],
+    limit_gflop: Callable[[str, argparse.Namespace], Mapping[str, float]],
+    differences: Callable[[Arrays, Arrays], Mapping[str, float]],
+    **facts: Any,
+) -> None:
+    """Measure all sides, print, write, publish; or do the work of one side in this process.
+
+    Args:
+        module: what ``python -m`` runs.
+        name: of the record and of its place in the page.
+        arguments: of ``parser``.
+        sides: their names, the plain one among them.
+        work: of a side: a function that does the task once, and one that returns what it made.
+        limit_gflop: of a side: convolutions of one task per dtype, GFLOP, without margins.
+        differences: figures of what a side made, given what the plain one made.
+        facts: further entries of the record.
+    """
+    torch.set_num_threads(arguments.threads)
+    if arguments.side:
+        _serve(*work(arguments.side, arguments), arguments.arrays)
+        return
+    peaks = {str(dtype).split(".")[-1]: peak_gflops(dtype) for dtype in (torch.float32, torch.bfloat16)}
+    with tempfile.TemporaryDirectory() as folder:
+        measured = _in_turns(module, arguments, sides, Path(folder))
+        made = {side: dict(np.load(_arrays_file(Path(folder), side))) for side in sides}
+    plain = measured[PLAIN]
+    rows = []
+    for side, row in measured.items():
+        work_gflop = limit_gflop(side, arguments)
+        rows.append(
+            {
+                "side": side,
+                **row,
+                "faster": plain["median_s"] / row["median_s"],
+                "memory": row["peak_gib"] / plain["peak_gib"],
+                "gflop": sum(work_gflop.values()),
+                "limit_s": sum(gflop / peaks[dtype] for dtype, gflop in work_gflop.items()),
+                **differences(made[side], made[PLAIN]),
+            }
+        )
+    record = {
+        "schema": SCHEMA,
+        "size_px": arguments.size_px,
+        **facts,
+        "repeats": arguments.repeats,
+        "machine": {"cores": usable_cores(), "bfloat16_matrix_unit": _has_matrix_unit()},
+        "threads": arguments.threads,
+        "versions": software_versions(),
+        "peak_gflops": peaks,
+        "sides": rows,
+    }
+    write_record(arguments.out, record)
+    print(as_markdown(record))
+    if arguments.publish:
+        publish(PAGE, name, as_markdown(record))
+
+
+def as_markdown(record: Mapping[str, Any]) -> str:
+    """The measurement as a table, with what it was measured on."""
+    extra = [key for key in record["sides"][0] if key.endswith(("_nm", "_percent"))]
+    heads = ["", "median, s", "best, s", "faster", "peak, GiB", "of plain", "limit, s", "of limit"]
+    heads += [_head(key) for key in extra]
+    rows = []
+    for row in record["sides"]:
+        cells = [
+            row["side"],
+            f"{row['median_s']:.3f}",
+            f"{row['best_s']:.3f}",
+            f"{row['faster']:.1f} ×",
+            f"{row['peak_gib']:.2f}",
+            f"{row['memory']:.2f}",
+            f"{row['limit_s']:.3f}",
+            f"{100 * row['limit_s'] / row['best_s']:.0f} %",
+            *(f"{row[key]:.3g}" for key in extra),
+        ]
+        rows.append("| " + " | ".join(cells) + " |")
+    unit = "with" if record["machine"]["bfloat16_matrix_unit"] else "without"
+    peaks = ", ".join(f"{value:.0f} in {dtype}" for dtype, value in record["peak_gflops"].items())
+    return (
+        f"{record['size_px']} × {record['size_px']} px, {record['threads']} threads on "
+        f"{record['machine']['cores']} cores {unit} a bfloat16 matrix unit, {record['repeats']} repeats, "
+        f"torch {record['versions']['torch']}. Matrix products of {_MATRIX}² reach {peaks} GFLOP/s.\n\n"
+        f"| {' | '.join(heads)} |\n|{'---|' * len(heads)}\n" + "\n".join(rows)
+    )
+
+
+def areawise_gflop(config: PblConfig, pixels: int) -> float:
+    """Multiplications and additions of the 3 x 3 layers on so many pixels, one way, GFLOP."""
+    widths = (1, *config.areawise_channels, 1)
+    return 2 * 9 * sum(a * b for a, b in pairwise(widths)) * pixels / 1e9
+
+
+def peak_gflops(dtype: torch.dtype, repeats: int = 12) -> float:
+    """Best rate of a large matrix product on the threads in use, GFLOP/s."""
+    square = torch.ones(_MATRIX, _MATRIX, dtype=dtype)
+    seconds = []
+    for _ in range(repeats):
+        started = time.perf_counter()
+        square @ square
+        seconds.append(time.perf_counter() - started)
+    return 2 * _MATRIX**3 / min(seconds) / 1e9
+
+
+def load_pbl(folder: Path) -> Pbl:
+    """The trained PBL in a folder, with weights that learn."""
+    from litho_models.freeze import ModelCard, load_simulator
+
+    model = load_simulator(folder, ModelCard.read(folder))
+    assert isinstance(model, Pbl)
+    return model
+
+
+def random_layout(config: PblConfig, size_px: int, batch: int = 1) -> torch.Tensor:
+    """Random levels on squares of 4 px, heights in µm (batch, 1, size, size)."""
+    generator = torch.Generator().manual_seed(0)
+    cells = -(-size_px // 4)
+    level = torch.randint(0, config.levels, (batch, 1, cells, cells), generator=generator).float()
+    level = level.repeat_interleave(4, -1).repeat_interleave(4, -2)[..., :size_px, :size_px]
+    return (level * config.level_height_um).contiguous()
+
+
+def relative_percent(difference: np.ndarray, reference: np.ndarray) -> float:
+    """Root mean square of a difference in percent of that of a reference."""
+    return 100 * float(
+        np.sqrt(np.mean(difference.astype(float) ** 2) / np.mean(reference.astype(float) ** 2))
+    )
+
+
+def _in_turns(
+    module: str, arguments: argparse.Namespace, sides: Sequence[str], folder: Path
+) -> dict[str, dict[str, float]]:
+    workers = {side: _start(module, arguments, side, folder) for side in sides}
+    seconds: dict[str, list[float]] = {side: [] for side in sides}
+    try:
+        for turn in range(arguments.repeats + 1):
+            for side, worker in workers.items():
+                elapsed = float(_answer(worker, "repeat"))
+                # The first one warms up.
+                seconds[side] += [elapsed] if turn else []
+        peaks = {side: float(_answer(worker, "end")) for side, worker in workers.items()}
+    finally:
+        for worker in workers.values():
+            worker.kill()
+            worker.wait()
+    return {
+        side: {
+            "best_s": min(seconds[side]),
+            "median_s": statistics.median(seconds[side]),
+            "peak_gib": peaks[side],
+        }
+        for side in sides
+    }
+
+
+def _start(module: str, arguments: argparse.Namespace, side: str, folder: Path) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", module, "--side", side, "--arrays", str(_arrays_file(folder, side))]
+    for option in ("model", "size_px", "threads"):
+        command += [f"--{option.replace('_', '-')}", str(getattr(arguments, option))]
+    return subprocess.Popen(
+        command, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE, cwd=PAGE.parents[1]
+    )
+
+
+def _answer(worker: subprocess.Popen[str], request: str) -> str:
+    assert worker.stdin is not None
+    assert worker.stdout is not None
+    worker.stdin.write(request + "\n")
+    worker.stdin.flush()
+    answer = worker.stdout.readline()
+    if not answer:
+        raise SystemExit(f"one side ended early: {worker.args}")
+    return answer
+
+
+def _serve(once: Callable[[], object], made: Callable[[], Arrays], arrays: Path) -> None:
+    """Answer requests for one repeat each with its seconds; at the end with the peak memory, GiB."""
+    for request in sys.stdin:
+        if request.strip() == "end":
+            peak_gib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20)
+            np.savez(arrays, **made())
+            print(json.dumps(peak_gib), flush=True)
+            return
+        started = time.perf_counter()
+        once()
+        print(json.dumps(time.perf_counter() - started), flush=True)
+
+
+def _arrays_file(folder: Path, side: str) -> Path:
+    return folder / f"{side}.npz"
+
+
+def _has_matrix_unit() -> bool:
+    return bool(torch.cpu.get_capabilities().get("amx_bf16"))
+
+
+def _head(key: str) -> str:
+    words, _, unit = key.rpartition("_")
+    return f"{words.replace('_', ' ')}, {'nm' if unit == 'nm' else '%'}"
