@@ -96,7 +96,10 @@ def judge(figures: dict[str, Any], thresholds: Thresholds) -> tuple[bool, str, s
     if figures["tre_median_px"] > thresholds.max_tre_median_px:
         failures.append(f"target registration error {figures['tre_median_px']:.2f} px")
     if not figures["corner_sd_px"] <= thresholds.max_corner_sd_px:
-        failures.append(f"corners known to {figures['corner_sd_px']:.2f} px only")
+        spread = figures["corner_sd_px"]
+        failures.append(
+            f"corners known to {spread:.2f} px only" if spread == spread else "corners not determined"
+        )
 
     warnings = []
     low, high = thresholds.singular_warning_range

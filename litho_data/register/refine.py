@@ -147,9 +147,13 @@ def residual_energy(gram: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
 
 
 def corner_motion_px(coefficients: np.ndarray, shape: tuple[int, int], points: np.ndarray) -> np.ndarray:
-    """Displacement (…, n, 2) in layout pixels that fitted coefficients (…, k) ask for at points (n, 2)."""
+    """Displacement (…, n, 2) in layout pixels that fitted coefficients (…, k) ask for at points (n, 2).
+
+    Not finite where nothing of the topography was fitted (gain 0).
+    """
     normalise = _normalisation(shape)
-    warp = coefficients[..., NUISANCES:] / coefficients[..., :1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        warp = coefficients[..., NUISANCES:] / coefficients[..., :1]
     unit = apply_transform(normalise, points)
     flow = np.array([_flow(generator, *unit.T) for generator in _GENERATORS[: warp.shape[-1]]])
     return np.einsum("...k,kdn->...nd", warp, flow) / normalise[0, 0]
