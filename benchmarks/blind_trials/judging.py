@@ -68,8 +68,9 @@ def _judge_unnamed(named: Sequence[Named], result: CloseLoop) -> Judgement:
 def _judge_effect(
     effect: str, named: Sequence[Named], planted: Sequence[Planted], result: CloseLoop
 ) -> Judgement:
-    # All effects count here: a planted one may lie in the nuisance span.
+    # All effects count here: a planted one may lie in the nuisance span, or be seen without a model.
     sets = [{e.name, *e.confusable_with} for e in result.effects if e.verdict in _CAUSES]
+    sets += [{c.name} for c in result.candidates if c.verdict == "explained"]
     if {effect} in sets:
         return "right"
     if any(effect in members for members in sets):

@@ -54,6 +54,7 @@ class FieldContext:
         layout_um: nominal height (1, 1, y, x), µm.
         pitch_um: lateral sampling, µm.
         full_height_um: nominal height of the highest level, µm; scales the pointwise effects.
+        slice_um: height of one slice, which is one level, µm.
         field_centre_um: (y, x) of this field's centre in the write field, µm.
         field_radius_um: distance from the centre of the write field to its edge, µm.
         slow_axis: the axis along which the written lines follow each other.
@@ -67,6 +68,7 @@ class FieldContext:
     layout_um: Tensor
     pitch_um: float
     full_height_um: float
+    slice_um: float = 0.1
     field_centre_um: tuple[float, float] = (0.0, 0.0)
     field_radius_um: float | None = None
     slow_axis: Literal["y", "x"] = "y"
@@ -137,6 +139,7 @@ class Effect:
         separating: the experiment that tells it apart from what looks alike.
         needs: facts about the print without which it cannot be tested.
         per_scan: its parameters belong to one scan and have no value shared by all.
+        along_lines: it depends on the line alone, so offsets of single lines would hide it.
     """
 
     name: str
@@ -151,6 +154,7 @@ class Effect:
     trials: tuple[Mapping[str, float], ...] = ()
     needs: tuple[Literal["order", "levels"], ...] = ()
     per_scan: bool = False
+    along_lines: bool = False
     amplitudes: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -9,6 +11,8 @@ from litho_models.effects.effect import Effect, FieldContext, Parameter, Values
 from litho_models.effects.filters import add_filtered, centred_lag, trailing_response
 
 _TAIL_LENGTHS = 6
+# A slower wave is no ripple: maps of the field look like it.
+_SLOWEST_PER_UM = 0.19
 
 
 def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -35,6 +39,18 @@ def write_order_memory(layout: Tensor, values: Values, context: FieldContext) ->
 
     reach = _TAIL_LENGTHS * float(length.detach())
     return add_filtered(layout, transfer_minus_one, context.pitch_um, reach)
+
+
+def hatch_ripple(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """H + 1[M > 0] (a cos 2π f y + b sin 2π f y): ripples at the hatching pitch p, seen as their alias.
+
+    Sampled at the pixel dx, they show at f = |1/p - 1/dx|. The write field gives them their phase,
+    the same in every print.
+    """
+    y, x = context.centred_um()
+    phase = 2 * math.pi * values["frequency_per_um"] * (y if context.slow_axis == "y" else x)
+    ripple = values["cosine_um"] * torch.cos(phase) + values["sine_um"] * torch.sin(phase)
+    return height + (context.layout_um > 0).to(height.dtype) * ripple
 
 
 def line_roughness(height: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -81,6 +97,27 @@ EFFECTS = (
         ),
         source="oxygen and radical depletion along the slow writing axis, y unless the card says x",
         separating="print the same layout with the writing order reversed",
+    ),
+    Effect(
+        name="hatch-ripple",
+        title="ripples at the hatching pitch",
+        stage="exposure",
+        role="process",
+        acts_on="height",
+        parameters={
+            "cosine_um": Parameter("µm", -0.1, 0.1, 0.01),
+            "sine_um": Parameter("µm", -0.1, 0.1, 0.01),
+            "frequency_per_um": Parameter("1/µm", _SLOWEST_PER_UM, 0.7, 0.3, kind="shape"),
+        },
+        apply=hatch_ripple,
+        trials=tuple(
+            {part: 0.01, "frequency_per_um": round(0.2 + 0.02 * i, 2)}
+            for i in range(21)
+            for part in ("cosine_um", "sine_um")
+        ),
+        source="ripples of the paper's noise figure, at 0.1 µm pitch",
+        separating="rescan at 25 nm per pixel",
+        along_lines=True,
     ),
     Effect(
         name="line-roughness",

@@ -39,10 +39,14 @@ def scan_line_stripes(height: Tensor, values: Values, context: FieldContext) -> 
     return height + values["sd_um"] * draws[line]
 
 
+# Decay of the two parts of a creep, in scan times; what is slower still lies in the bow.
+CREEP_DECAYS = {"fast_creep_um": 0.05, "slow_creep_um": 0.2}
+
+
 def slow_drift(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H + c exp(-t / τ), t the scan line from 0 (first) to 1 (last): creep after the scan starts."""
+    """H + Σ c exp(-t / τ), t the scan line from 0 (first) to 1 (last): creep after the scan starts."""
     time = context.line().to(height.dtype) / max(context.whole_shape()[0] - 1, 1)
-    return height + values["creep_um"] * torch.exp(-time / values["decay"])
+    return height + sum(values[name] * torch.exp(-time / decay) for name, decay in CREEP_DECAYS.items())
 
 
 _STEP = "scan a step standard and a bare substrate before and after the print"
@@ -105,13 +109,10 @@ EFFECTS = (
         stage="measurement",
         role="measurement",
         acts_on="height",
-        parameters={
-            "creep_um": Parameter("µm", -0.3, 0.3, 0.03),
-            "decay": Parameter("scan time", 0.02, 0.4, 0.1, kind="shape"),
-        },
+        parameters={name: Parameter("µm", -1.0, 1.0, 0.03) for name in CREEP_DECAYS},
         apply=slow_drift,
-        trials=({"creep_um": 0.03, "decay": 0.05}, {"creep_um": 0.03, "decay": 0.2}),
         source="exponential creep of the scanner; its slow part lies in the bow",
         separating="scan the same field twice in a row, downwards and upwards",
+        per_scan=True,
     ),
 )

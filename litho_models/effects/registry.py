@@ -8,6 +8,7 @@ from litho_data.errors import InputError
 from litho_models.effects import (
     development,
     exposure_field,
+    exposure_layers,
     exposure_scanning,
     exposure_spot,
     measurement_height,
@@ -18,6 +19,7 @@ from litho_models.effects.effect import Effect
 
 _FORWARD_ORDER = (
     "interface-offset",
+    "layer-stacking",
     "dose-exponent",
     "elliptical-psf",
     "galvo-lag",
@@ -29,6 +31,7 @@ _FORWARD_ORDER = (
     "diffusion-blur",
     "height-saturation",
     "field-curvature",
+    "hatch-ripple",
     "vertical-shrinkage",
     "dose-dependent-shrinkage",
     "lateral-shrinkage",
@@ -50,6 +53,7 @@ _FORWARD_ORDER = (
 
 _FAMILIES = (
     exposure_spot,
+    exposure_layers,
     exposure_scanning,
     exposure_field,
     resist,
@@ -60,11 +64,9 @@ _FAMILIES = (
 
 # Named in the catalogue, but a residual map on the layout's grid cannot carry their signature.
 UNTESTABLE = {
-    "hatch-ripple": "the hatching pitch equals the pixel: it aliases; rescan at 25 nm/px",
-    "layer-stacking": "needs the printer's slice table, which the card does not hold",
     "min-to-zero-datum": "an order statistic per scan; what it leaves is carried by datum-offset",
-    "quantisation": "heights are floating point here; see the histogram of the raw file",
-    "scars-and-spikes": "a mask, not a term: masked pixels are counted in the dataset",
+    "quantisation": "the raw files are not in the store",
+    "scars-and-spikes": "a mask, not a term: looked for among the outliers",
 }
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,7 @@ from litho_models.loop.fitting import is_stiff, predict, set_vector
 from litho_models.loop.flexible import FoldedBase, Trainer, carry_over, same_for_all, train_folds
 from litho_models.loop.injecting import Planted, parse_injection, plant
 from litho_models.loop.measurement import MeasurementTest, measurement_tests
+from litho_models.loop.observed import Observed, observe
 from litho_models.loop.probes import Probed, probe_residual
 from litho_models.loop.scoring import DATUM_FREE, Score, Terms, names_to_terms, score
 from litho_models.loop.search import Search, search_effects
@@ -55,6 +56,7 @@ class Closed:
         floor_nm: lower bound of the noise, nm (root mean square, mean absolute).
         structure: covariate tests on what is left.
         locked_scores: (before, after) as pairs (no fit, datum free), if opened.
+        observed: what is seen without a model, by name.
         untestable: effect to reason; ``planted``: power of the screening, if asked for.
     """
 
@@ -71,6 +73,7 @@ class Closed:
     floor_nm: tuple[float, float]
     structure: list[CovariateTest]
     locked_scores: tuple[tuple[Score, Score], tuple[Score, Score]] | None
+    observed: dict[str, Observed]
     untestable: dict[str, str]
     planted: list[Planted]
     config: LoopConfig
@@ -95,6 +98,7 @@ def close_loop(
     config: LoopConfig | None = None,
     *,
     trainer: Trainer | None = None,
+    rounding_um: Mapping[str, float] | None = None,
     report: Callable[[str], None] = lambda message: None,
 ) -> Closed:
     """Find what the base model lacks on these scans, add it, and measure the error on held-out scans.
@@ -105,6 +109,7 @@ def close_loop(
         config: settings.
         trainer: makes a fresh base model from scans, for a base with many parameters: it is then
             trained once per fold, and effects are looked for on a Physics model first.
+        rounding_um: step of the heights in each scan's raw file, by id, if known.
         report: told what happens, a sentence at a time.
 
     Raises:
@@ -204,6 +209,7 @@ def close_loop(
         locked_scores=_locked_scores(locked, start, probed, accepted, config)
         if config.open_lock_box
         else None,
+        observed=observe(development, probed.defects, rounding_um),
         untestable=untestable,
         planted=planted,
         config=config,

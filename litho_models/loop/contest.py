@@ -17,7 +17,7 @@ from litho_models.loop.confirming import BINOMIAL_P, SMALLEST_SHARE, Confirmatio
 from litho_models.loop.fields import Field
 from litho_models.loop.fitting import FoldFits, effect_slots
 from litho_models.loop.linear import nuisance_columns, orthonormal
-from litho_models.loop.scoring import Score, Terms, score
+from litho_models.loop.scoring import LINE_TERMS, Score, Terms, score
 from litho_models.loop.screening import (
     FAMILY_P,
     SAME_COSINE,
@@ -101,6 +101,8 @@ def hold_contest(
         holder: a candidate that takes part whatever its screening says, and the fitted model with it.
         report: told in a sentence what happens.
     """
+    if not candidates:
+        return Contest([])
     windows = [f.window for f in fields]
     residuals = held_out_residuals(state, windows, fold_of)
     fits = state.fits
@@ -172,10 +174,13 @@ def terms_for(terms: Terms, screened: Sequence[Screened]) -> Terms:
     """Per-scan terms of the comparison without and with effects: those that the fit leaves free.
 
     Registration has already taken the mean shift and magnification out of every scan, so an effect that
-    has them must not be charged for them; what acts as a gain must not be hidden by the scans' own gain.
+    has them must not be charged for them; what acts as a gain, or line by line, must not be hidden by
+    the scans' own gain or lines.
     """
     free = terms | {"warp"}
-    return free - {"gain"} if any(s.projection == "no-gain" for s in screened) else free
+    if any(s.projection == "no-gain" for s in screened):
+        free -= {"gain"}
+    return free - LINE_TERMS if any(s.effect.along_lines for s in screened) else free
 
 
 def fold_amplitudes(fits: FoldFits, effect: Effect) -> dict[str, np.ndarray]:

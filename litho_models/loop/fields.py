@@ -131,6 +131,7 @@ def _prepare(scan: PrintedScan, order: float) -> Field:
         layout_um=layout,
         pitch_um=scan.pitch_um,
         full_height_um=(scan.levels - 1) * scan.level_height_um,
+        slice_um=scan.level_height_um,
         field_centre_um=(scan.field_y_um or 0.0, scan.field_x_um or 0.0),
         field_radius_um=write["field_um"] / 2 if "field_um" in write else None,
         slow_axis=write.get("slow_axis", "y"),

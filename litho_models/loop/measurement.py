@@ -19,7 +19,7 @@ from litho_models.metrics import NM_PER_UM, bootstrap_interval, paired_differenc
 from litho_models.nuisance import least_squares
 
 # Terms whose mean over scans could be a property of the process.
-_SHARED = {"gain", "bow"}
+_SHARED = {"gain", "bow", "drift"}
 _LINES = ("scan-line-stripes", "line-roughness")
 _FRAME = {"scan-line-stripes": "the scan lines", "line-roughness": "the layout's rows"}
 
@@ -86,7 +86,9 @@ def _test_term(
     if term in _SHARED:
         for i, prediction in enumerate(predictions):
             shared = coefficients[fold_of != fold_of[i]].mean(axis=0)[own]
-            reference[i] = prediction + np.tensordot(shared, term_maps(prediction, terms)[own], axes=1)
+            reference[i] = prediction + np.tensordot(
+                shared, term_maps(prediction, terms, fields[i].line)[own], axes=1
+            )
     before = score(fields, reference, accepted, seed)
     after = score(fields, predictions, terms, seed)
     spread = {}
@@ -173,14 +175,14 @@ def _confirm(before: Score, after: Score, floor_nm2: float, seed: int) -> Confir
 
 
 def _coefficients(field: Field, prediction: np.ndarray, terms: Terms) -> np.ndarray:
-    maps = term_maps(prediction, terms)
+    maps = term_maps(prediction, terms, field.line)
     design = np.stack([field.at_sample(m) for m in maps])
     return least_squares(design, field.height - field.at_sample(prediction))
 
 
 def _own_terms(terms: Terms, accepted: Terms) -> list[int]:
     """Columns of ``term_maps(…, terms)`` that ``accepted`` does not have."""
-    sizes = {"offset": 1, "gain": 1, "bow": 5, "warp": 6}
+    sizes = {"offset": 1, "gain": 1, "bow": 5, "drift": 2, "warp": 6}
     own, at = [], 0
     for name, size in sizes.items():
         if name in terms or (name == "offset" and terms):

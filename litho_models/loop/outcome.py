@@ -214,6 +214,17 @@ def _candidates(closed: Closed, added: set[str]) -> list[Candidate]:
     for name in [*CATALOGUE, *(n for n in closed.untestable if n not in CATALOGUE)]:
         if name in tests:
             rows.append(_measurement_candidate(closed, tests[name], name in added))
+        elif name in closed.observed:
+            seen = closed.observed[name]
+            rows.append(
+                Candidate(
+                    name=name,
+                    verdict="explained" if seen.seen else "below-noise",
+                    reason=seen.evidence,
+                    p_screen=None,
+                    gain_nm=None,
+                )
+            )
         elif name in closed.untestable:
             rows.append(
                 Candidate(

@@ -10,13 +10,14 @@ import numpy as np
 from litho_data.errors import InputError
 from litho_data.files import atomic_folder
 from litho_data.outputs import require_replaceable_folder
-from litho_data.store import Store, open_store
+from litho_data.store import PrintedScan, Store, open_store
 from litho_models.effects import get_effect
 from litho_models.freeze import save_frozen
 from litho_models.loop.closing import Closed, LoopConfig, close_loop, corrected_chain
 from litho_models.loop.exporting import exported_effects, write_measurement_model
 from litho_models.loop.fitting import is_stiff
 from litho_models.loop.flexible import Trainer
+from litho_models.loop.observed import rounding_step_um
 from litho_models.loop.outcome import summarise
 from litho_models.loop.reporting import write_report
 from litho_models.loop.result import CloseLoop
@@ -61,7 +62,9 @@ def close_loop_on_store(
     trainer = None
     if base in MODELS and not is_stiff(simulator):
         trainer = _trainer(base, config, steps, Path(cache or f"{out}-cache"))
-    closed = close_loop(usable, simulator, config, trainer=trainer, report=report)
+    closed = close_loop(
+        usable, simulator, config, trainer=trainer, rounding_um=_rounding_um(opened, usable), report=report
+    )
     result = summarise(closed, dataset=(opened.name, opened.sha256), base_name=name, dropped=dropped)
     with atomic_folder(out) as folder:
         result.write(folder)
@@ -85,6 +88,14 @@ def parse_priors(text: str | None) -> tuple[str, ...]:
     else:
         names = [part.strip() for part in text.split(",")]
     return tuple(get_effect(name).name for name in names if name)
+
+
+def _rounding_um(store: Store, scans: Sequence[PrintedScan]) -> dict[str, float] | None:
+    """Step of the heights in the raw file of each scan; None where the store has no raw files."""
+    try:
+        return {scan.id: rounding_step_um(store.scan_frame(scan.id, "raw_height_um")) for scan in scans}
+    except InputError:
+        return None
 
 
 def _trainer(base: str, config: LoopConfig | None, steps: int | None, cache: Path) -> Trainer:

@@ -8,6 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from litho_models.effects.measurement_height import CREEP_DECAYS
 from litho_models.loop.fields import Field
 from litho_models.metrics import NM_PER_UM, bootstrap_interval
 from litho_models.nuisance import (
@@ -25,6 +26,7 @@ TERMS_OF = {
     "datum-offset": "offset",
     "z-gain": "gain",
     "tilt-bow": "bow",
+    "slow-drift": "drift",
     "registration-residual": "warp",
     "scan-line-stripes": "rows",
     "line-roughness": "print-rows",
@@ -90,7 +92,7 @@ def cross_fit(
     """Residual (y, x) µm, NaN where not scored, with the terms fitted on the other half; and their number."""
     difference = np.where(field.usable, field.scan.height_um - prediction, 0.0).astype(np.float64)
     residual = np.full(difference.shape, np.nan)
-    basis = term_maps(prediction, terms)
+    basis = term_maps(prediction, terms, field.line)
     if not terms:
         residual[field.usable] = difference[field.usable]
         return residual, 0.0
@@ -114,14 +116,25 @@ def _halves(shape: tuple[int, int], seed: int, stripes: bool) -> tuple[Half, Hal
     return (calibration_stripes if stripes else calibration_blocks)(shape, seed=seed)
 
 
-def term_maps(prediction: np.ndarray, terms: Terms) -> np.ndarray:
-    """The smooth per-scan terms as maps (k, y, x)."""
+def term_maps(prediction: np.ndarray, terms: Terms, line: np.ndarray | None = None) -> np.ndarray:
+    """The smooth per-scan terms as maps (k, y, x).
+
+    Args:
+        prediction: predicted height (y, x), µm.
+        terms: which ones.
+        line: scan line of each pixel (y, x); the rows of the array by default.
+    """
     offset, gain, *bow = nuisance_basis(prediction, "full")
     chosen = [offset] if terms else []
     if "gain" in terms:
         chosen.append(gain)
     if "bow" in terms:
         chosen += bow
+    if "drift" in terms:
+        line = row_index(prediction.shape) if line is None else line
+        time = line / max(int(line.max()), 1)
+        creeps = [np.exp(-time / decay) for decay in CREEP_DECAYS.values()]
+        chosen += [creep - creep.mean() for creep in creeps]
     if "warp" in terms:
         x, y = bow[0], bow[1]
         for slope in np.gradient(prediction.astype(np.float64)):
@@ -141,6 +154,8 @@ def scan_parameter_names(terms: Terms) -> list[str]:
         names.append("gain")
     if "bow" in terms:
         names += [f"{power} (nm)" for power in ("x", "y", "x²", "xy", "y²")]
+    if "drift" in terms:
+        names += [f"creep over {decay:g} of the scan (nm)" for decay in CREEP_DECAYS.values()]
     if "warp" in terms:
         names += [f"shift {axis}{by} (px)" for axis in ("y", "x") for by in ("", " by y", " by x")]
     return names

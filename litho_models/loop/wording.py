@@ -39,6 +39,11 @@ def plain_words(closed: Closed, result: CloseLoop) -> str:
         )
         if e.separating_experiment and (e.confusable_with or e.role == "undetermined"):
             parts.append(f"To be sure: {e.separating_experiment}.")
+    parts += [
+        f"Seen without a model, and beyond what one can correct [{seen.name}]: {seen.evidence}."
+        for seen in closed.observed.values()
+        if seen.seen
+    ]
     if not causes:
         parts.append("No named effect of the printer is confirmed as missing from the model.")
     for e in traced:

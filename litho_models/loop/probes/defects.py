@@ -15,14 +15,14 @@ from litho_models.nuisance import least_squares
 
 FAR_SD = 5.0
 FEWEST_PX = 9
-# Scar-like: much longer along the scan lines than across.
-_ROW_LIMITED = 4.0
+# Scar-like: much longer along the scan lines than across; the other way round it is a control.
+_DRAWN_OUT = 4.0
 SUSPICIOUS_SHARE = 0.02
 
 
 @dataclass(frozen=True)
 class Defect:
-    """One blob: scan, centre and area on the layout's grid, signed peak, whether it follows scan lines."""
+    """One blob: scan, centre and area on the layout's grid, signed peak, whether it is drawn out."""
 
     scan: str
     y_um: float
@@ -30,6 +30,7 @@ class Defect:
     area_um2: float
     peak_nm: float
     row_limited: bool
+    column_limited: bool
 
 
 @dataclass(frozen=True)
@@ -96,5 +97,6 @@ def _describe(
         x_um=float(x.mean() * pitch),
         area_um2=float(blob.sum() * pitch**2),
         peak_nm=float(values[np.argmax(np.abs(values))] * NM_PER_UM),
-        row_limited=width >= _ROW_LIMITED * height,
+        row_limited=width >= _DRAWN_OUT * height,
+        column_limited=height >= _DRAWN_OUT * width,
     )

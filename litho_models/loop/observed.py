@@ -1,0 +1,84 @@
+"""Effects that are seen directly, in the raw files or as marks in a scan: no model foretells them.
+
+They lower no held-out error, so they are not added to a model; they have a verdict and its evidence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from litho_models.loop.confirming import BINOMIAL_P, SMALLEST_RMSE_NM, one_sided_flip_p
+from litho_models.loop.fields import Field
+from litho_models.loop.probes.defects import Defects
+from litho_models.metrics import NM_PER_UM
+
+# Heights closer than this are one value of a file that rounds in single precision.
+_SAME_VALUE = 1e-6
+_OFF_COMB, _ON_COMB_SHARE = 0.05, 0.99
+_FEWEST_SCARS = 10
+
+
+@dataclass(frozen=True)
+class Observed:
+    """Whether an effect is seen, and the evidence in a sentence."""
+
+    name: str
+    seen: bool
+    evidence: str
+
+
+def rounding_step_um(raw_height_um: np.ndarray) -> float:
+    """Step of which all heights of a raw scan are multiples, up to one offset; 0 where there is none."""
+    heights = np.unique(raw_height_um[np.isfinite(raw_height_um)].astype(np.float64))
+    if len(heights) < 3:
+        return 0.0
+    steps = np.diff(heights)
+    steps = steps[steps > _SAME_VALUE * (heights[-1] - heights[0])]
+    if not len(steps):
+        return 0.0
+    step = float(np.median(steps[steps < 1.5 * steps.min()]))
+    places = (heights - heights[0]) / step
+    off = np.abs(places - np.round(places))
+    return step if np.mean(off < _OFF_COMB) >= _ON_COMB_SHARE else 0.0
+
+
+def quantisation(rounding_um: Sequence[float]) -> Observed:
+    """Rounding of the raw files, from ``rounding_step_um`` of every scan: uniform noise of step / √12."""
+    steps_nm = np.array(rounding_um) * NM_PER_UM
+    noise_nm = float(np.sqrt(np.mean(steps_nm**2) / 12))
+    rounded = int((steps_nm > 0).sum())
+    if not rounded:
+        return Observed("quantisation", False, "the heights of the raw files are on no common step")
+    text = (
+        f"the raw heights of {rounded} of {len(steps_nm)} scans are multiples of "
+        f"{np.median(steps_nm[steps_nm > 0]):.3g} nm, which adds {noise_nm:.2g} nm rms"
+    )
+    return Observed("quantisation", noise_nm >= SMALLEST_RMSE_NM, text)
+
+
+def scars(fields: Sequence[Field], defects: Defects) -> Observed:
+    """Outliers drawn out along the scan lines, against those drawn out across them, scan by scan."""
+    along, across = (
+        np.array([sum(b.scan == f.id and getattr(b, kind) for b in defects.blobs) for f in fields])
+        for kind in ("row_limited", "column_limited")
+    )
+    p = one_sided_flip_p((along - across).astype(float))
+    text = (
+        f"{along.sum()} outliers drawn out along the lines and {across.sum()} across them "
+        f"(p = {p:.4f}); {100 * float(np.mean(defects.share_of_pixels)):.2f} % of the pixels in outliers"
+    )
+    seen = p <= BINOMIAL_P and along.sum() >= _FEWEST_SCARS
+    return Observed("scars-and-spikes", bool(seen), text)
+
+
+def observe(
+    fields: Sequence[Field], defects: Defects, rounding_um: Mapping[str, float] | None
+) -> dict[str, Observed]:
+    """All effects that are seen directly; without the raw files nothing is said about their rounding."""
+    seen = [scars(fields, defects)]
+    if rounding_um is not None:
+        seen.append(quantisation([rounding_um[f.id] for f in fields]))
+    return {one.name: one for one in seen}
