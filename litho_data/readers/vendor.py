@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 from litho_data.errors import InputError
 from litho_data.readers.channel import Channel, Loaded, with_unique_names
 from litho_data.readers.foreign import foreign_parser
-from litho_data.readers.vendor_headers import fast_axis, vendor_header
+from litho_data.readers.vendor_headers import fast_axis, layer_names, vendor_header
 from litho_data.units import is_length, um_per
 
 # Left out: formats with readers of our own, plain text, and two that have no signature and would
@@ -40,6 +41,9 @@ def read_channels(path: Path) -> list[Channel]:
             raise InputError(f"{path} ({kind})", got=got, wanted="more", hint="the file may be damaged")
     if not channels:
         raise InputError(f"{path} ({kind}) holds no two-dimensional channel")
+    names = layer_names(path, kind)
+    if len(names) == len(channels) == 1 and names[0]:
+        channels = [replace(channels[0], name=names[0])]
     return with_unique_names(channels)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 from litho_data.readers.foreign import foreign_parser
 from litho_data.scan import Axis
@@ -31,11 +32,22 @@ def fast_axis(header: dict[str, str]) -> Axis | None:
     return "x" if min(angle, 180 - angle) < _ANGLE_TOLERANCE_DEG else None
 
 
-def _igor_note(path: Path) -> dict[str, str]:
+def layer_names(path: Path, kind: str) -> list[str]:
+    """The labels of an Igor wave's layers: SurfaceTopography drops the label of a single one."""
+    if kind != "ibw":
+        return []
+    return [label.decode("utf-8", errors="replace").strip("\0 ") for label in _igor_wave(path)["labels"][2]]
+
+
+def _igor_wave(path: Path) -> dict[str, Any]:
     from igor2 import binarywave
 
     with foreign_parser(path, "ibw"):
-        text = binarywave.load(str(path))["wave"]["note"].decode("utf-8", errors="replace")
+        return {"note": b"", "labels": [[], [], [], []]} | binarywave.load(str(path))["wave"]
+
+
+def _igor_note(path: Path) -> dict[str, str]:
+    text = _igor_wave(path)["note"].decode("utf-8", errors="replace")
     note = {}
     for number, line in enumerate(text.splitlines(), start=1):
         key, colon, value = line.partition(":")

@@ -259,6 +259,7 @@ def test_fields_written_by_gwyddion(oracles: Path, suffix: str) -> None:
     # float32 rounds by at most 2^-24 of the value.
     np.testing.assert_allclose(scan.height_um, expected_um, rtol=2**-24, atol=0)
     assert scan.shape == (301, 200)
+    assert scan.channel == "Topography"
     assert scan.pitch_um == pytest.approx((3.6 / 301, 0.01), rel=1e-12)
     if suffix == "gwy":
         assert scan.mask is not None
