@@ -32,7 +32,7 @@ from litho_models.score_records import ModelScores, NuisanceProtocol, Prediction
 from litho_models.scores import NoiseFloor, noise_floor, protocol_for, score_model
 from litho_models.splits import ids_sha256
 from litho_models.tiles import predict_scan
-from litho_models.training import TrainingConfig, fit_in_cache
+from litho_models.training import Fitted, TrainingConfig, fit_in_cache
 from litho_models.training.fit import common_geometry, run_key
 
 BASELINES = ("identity", "affine", "affine-mtf", "blur-table", "linear")
@@ -42,7 +42,7 @@ DEFAULT_MODELS = (*BASELINES, "physics", "pbl", "fno")
 class FitRecord(Record):
     """One fit: what it saw and what it cost; errors are nm, None where the model has no rounds.
 
-    Only results of before they were made have no ``diagnostics``.
+    ``diagnostics`` are None in results of before they were made.
     """
 
     model: str
@@ -185,46 +185,50 @@ def _fit_or_load(
     name: str, fold: Fold, config: TrainingConfig, cache: Path, background: BackgroundUse
 ) -> tuple[FitRecord, dict[str, Prediction]]:
     untrained = build_model(name, config.variant, **common_geometry(fold.training))
-    held_out_ids = [scan.id for scan in fold.held_out]
-    key = run_key(untrained, fold.training, config, held_out_ids)
+    key = run_key(untrained, fold.training, config, [scan.id for scan in fold.held_out])
     folder = cache / f"{name}-{key[:16]}"
-    fitted = None
-    if not (folder / "fit.json").exists():
+    fit_file, diagnostics_file = folder / "fit.json", folder / "diagnostics.json"
+    if not (fit_file.exists() and diagnostics_file.exists()):
+        # A finished training is read from its checkpoint; a small model is fitted again.
         fitted = fit_in_cache(name, fold.training, config, cache)
-        record = FitRecord(
-            model=name,
-            fold=fold.number,
-            key=key,
-            training_ids=fitted.training_ids,
-            validation_ids=fitted.validation_ids,
-            held_out_ids=held_out_ids,
-            parameters=fitted.model.parameter_count,
-            seconds=fitted.seconds,
-            steps=[entry.step for entry in fitted.history],
-            training_mae_nm=[entry.training_mae_nm for entry in fitted.history],
-            validation_mae_datum_free_nm=[entry.validation_mae_datum_free_nm for entry in fitted.history],
-        )
-        with atomic_folder(folder) as temporary:
-            for number, scan in enumerate(fold.held_out):
-                np.save(temporary / f"prediction_{number:03d}.npy", predict_scan(fitted.model, scan))
-            (temporary / "fit.json").write_text(record.model_dump_json(indent=1), encoding="utf-8")
-    record = FitRecord.model_validate_json((folder / "fit.json").read_text(encoding="utf-8"))
-    heights = [np.load(file, allow_pickle=False) for file in sorted(folder.glob("prediction_*.npy"))]
-    if not (folder / "diagnostics.json").exists():
-        # An interrupted call: a finished training is read from its checkpoint, a small model fitted again.
-        fitted = fitted or fit_in_cache(name, fold.training, config, cache)
-        found = diagnose(fitted.model, fold.training, record.validation_ids, fold.held_out, heights)
-        with atomic_file(folder / "diagnostics.json") as temporary:
+        if not fit_file.exists():
+            _keep_fit(folder, fitted, fold, key)
+        heights = _kept_heights(folder)
+        found = diagnose(fitted.model, fold.training, fitted.validation_ids, fold.held_out, heights)
+        with atomic_file(diagnostics_file) as temporary:
             temporary.write_text(found.model_dump_json(indent=1), encoding="utf-8")
-    diagnostics = FitDiagnostics.model_validate_json(
-        (folder / "diagnostics.json").read_text(encoding="utf-8")
-    )
+    record = FitRecord.model_validate_json(fit_file.read_text(encoding="utf-8"))
+    diagnostics = FitDiagnostics.model_validate_json(diagnostics_file.read_text(encoding="utf-8"))
     learned = diagnostics.background if background == "training" else None
     predictions = {
         scan.id: Prediction(height, learned.map_um(scan.shape) if learned else None)
-        for scan, height in zip(fold.held_out, heights, strict=True)
+        for scan, height in zip(fold.held_out, _kept_heights(folder), strict=True)
     }
     return record.model_copy(update={"diagnostics": diagnostics}), predictions
+
+
+def _keep_fit(folder: Path, fitted: Fitted, fold: Fold, key: str) -> None:
+    record = FitRecord(
+        model=fitted.model.name,
+        fold=fold.number,
+        key=key,
+        training_ids=fitted.training_ids,
+        validation_ids=fitted.validation_ids,
+        held_out_ids=[scan.id for scan in fold.held_out],
+        parameters=fitted.model.parameter_count,
+        seconds=fitted.seconds,
+        steps=[entry.step for entry in fitted.history],
+        training_mae_nm=[entry.training_mae_nm for entry in fitted.history],
+        validation_mae_datum_free_nm=[entry.validation_mae_datum_free_nm for entry in fitted.history],
+    )
+    with atomic_folder(folder) as temporary:
+        for number, scan in enumerate(fold.held_out):
+            np.save(temporary / f"prediction_{number:03d}.npy", predict_scan(fitted.model, scan))
+        (temporary / "fit.json").write_text(record.model_dump_json(indent=1), encoding="utf-8")
+
+
+def _kept_heights(folder: Path) -> list[np.ndarray]:
+    return [np.load(file, allow_pickle=False) for file in sorted(folder.glob("prediction_*.npy"))]
 
 
 def _all_pairs(scores: Sequence[ModelScores], seed: int) -> list[Paired]:

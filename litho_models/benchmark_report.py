@@ -88,6 +88,7 @@ def write_benchmark_report(
         "background (policy offset), so that over-fitting shows; the largest and the RMS difference of the "
         "same pixels in another crop; what training and predicting a scan cost on the machine at hand.",
         "fits.csv",
+        digits=3,
     )
     curves = [fit for fit in result.fits if len(fit.steps) > 1]
     if curves:
