@@ -1,0 +1,65 @@
+"""Which candidate is chosen, and what may not be taken for it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from litho_models.effects import FieldContext, get_effect
+from litho_models.loop import LoopConfig, close_loop
+from litho_models.loop.screening import blocks_of
+from litho_models.models import build_model
+from tests.litho_models.loop_scans import printed_scans
+
+
+def added_to(scans) -> dict[str, list[str]]:
+    start = build_model("physics", sigma_diffusion_init_um=0.4)
+    closed = close_loop(scans, start, LoopConfig())
+    return {entry.effect.name: entry.confusable_with for entry in closed.search.added}
+
+
+def test_an_elliptical_spot_is_not_taken_for_diffusion() -> None:
+    # Along one diagonal 0.3 µm wider in quadrature: more than half of it is plain blur.
+    scans = printed_scans({"elliptical-psf": {"shear_um2": 0.09}}, count=12, size_px=96, seed=2)
+    assert added_to(scans) == {"elliptical-psf": []}
+
+
+def test_a_print_that_lost_its_foot_is_not_called_shrunk() -> None:
+    scans = printed_scans({"interface-offset": {"offset_um": -0.25}}, count=12, size_px=96, seed=3)
+    assert "interface-offset" in {name for own, others in added_to(scans).items() for name in (own, *others)}
+
+
+def test_ripples_are_found_though_offsets_of_lines_could_hide_them() -> None:
+    ripple = {"cosine_um": 0.006, "sine_um": 0.004, "frequency_per_um": 0.31}
+    scans = printed_scans({"hatch-ripple": ripple}, count=12, size_px=96, seed=4)
+    assert added_to(scans) == {"hatch-ripple": []}
+
+
+def test_sizes_of_one_direction_are_alternatives_and_directions_are_fitted_together() -> None:
+    blocks = blocks_of([get_effect("elliptical-psf"), get_effect("slope-thinning")])
+    sizes = [len(block.trials) for block in blocks]
+    # Three sizes of (stretch, shear); one block of slopes along x, along y, and along both.
+    assert sizes == [2, 2, 2, 3]
+    columns = [column for block in blocks for column in block.columns]
+    assert columns == list(range(len(columns)))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_slices_set_alike_in_wide_areas_and_differ_where_narrower_than_the_spot(share) -> None:
+    layout = torch.zeros(1, 1, 60, 60)
+    layout[..., 30:] = 0.5
+    layout[..., 20:40, 12] = 0.5
+    context = FieldContext(layout, 0.1, 1.2)
+    effect = get_effect("layer-stacking")
+    changed = effect(layout, effect.with_values({"share": share}), context) - layout
+    # Wide areas: 0 and 1 are fixed points of the step. A line of one pixel is below the threshold: it is lost.
+    assert float(changed[..., 50].abs().max()) < 1e-4
+    line = float(changed[..., 30, 12])
+    assert line < -0.05 if share else line == 0.0
+
+
+def test_the_interface_cuts_the_layout_from_below() -> None:
+    layout = torch.tensor(np.linspace(0, 1.2, 13), dtype=torch.float32).reshape(1, 1, 1, 13)
+    cut = get_effect("interface-offset")(layout, {"offset_um": -0.25}, FieldContext(layout, 0.1, 1.2))
+    assert torch.allclose(cut, torch.clamp(layout - 0.25, min=0), atol=1e-6)

@@ -1,0 +1,57 @@
+"""What is seen in raw files and as marks in scans, without a model."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from litho_models.loop.fields import prepare_fields
+from litho_models.loop.observed import observe, quantisation, rounding_step_um, scars
+from litho_models.loop.probes.defects import find_defects
+from tests.litho_models.loop_scans import printed_scans
+
+HEIGHTS = np.random.default_rng(0).normal(0.5, 0.1, size=(80, 90))
+
+
+@pytest.mark.parametrize("step_um", [0.001, 0.0268])
+def test_the_step_of_rounded_heights_is_read_off(step_um) -> None:
+    rounded = (np.floor(HEIGHTS / step_um) * step_um + 0.0123).astype(np.float32)
+    # Single precision at 1 µm: 6e-8 µm, so the step is known to 1e-4 of 1 nm and better.
+    assert rounding_step_um(rounded) == pytest.approx(step_um, rel=1e-3)
+
+
+def test_heights_that_were_not_rounded_have_no_step() -> None:
+    assert rounding_step_um(HEIGHTS.astype(np.float32)) == 0.0
+    assert rounding_step_um(np.full((4, 4), np.nan)) == 0.0
+    assert rounding_step_um(np.zeros((4, 4))) == 0.0
+
+
+def test_rounding_counts_by_the_noise_it_adds() -> None:
+    # Uniform noise of a step q has the variance q² / 12.
+    coarse = quantisation([0.012 * np.sqrt(12)] * 3)
+    assert coarse.seen and "12 nm rms" in coarse.evidence
+    assert not quantisation([0.0001 * np.sqrt(12)] * 3).seen
+    assert not quantisation([0.0, 0.0]).seen
+
+
+def test_scars_are_told_from_marks_across_the_lines() -> None:
+    fields = prepare_fields(printed_scans(count=10))
+    predictions = [f.scan.height_um.copy() for f in fields]
+
+    def marked(axis: int):
+        for field in fields:
+            field.scan.height_um[:] = predictions[0] * 0 + 0.005 * HEIGHTS[:64, :64]
+            for start in (12, 30, 44):
+                along, across = slice(start, start + 14), slice(start, start + 1)
+                field.scan.height_um[(across, along) if axis else (along, across)] += 0.2
+        return scars(fields, find_defects(fields, [0 * p for p in predictions]))
+
+    assert marked(axis=1).seen
+    assert not marked(axis=0).seen
+
+
+def test_without_raw_files_nothing_is_said_about_rounding() -> None:
+    fields = prepare_fields(printed_scans(count=2))
+    defects = find_defects(fields, [f.scan.height_um for f in fields])
+    assert set(observe(fields, defects, None)) == {"scars-and-spikes"}
+    assert "quantisation" in observe(fields, defects, {f.id: 0.0 for f in fields})
