@@ -10,7 +10,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from litho_data.errors import InputError
-from litho_models.gaussian import gaussian_blur, kernel_radius_px
+from litho_models.gaussian import blur_interior, gaussian_blur, kernel_radius_px
 
 PITCH = 0.1
 
@@ -87,3 +87,23 @@ def test_uniform_fields_and_zero_width_are_left_alone():
 def test_bad_pitch_is_refused():
     with pytest.raises(InputError):
         gaussian_blur(torch.zeros(8, 8), 0.1, 0.0)
+
+
+@pytest.mark.parametrize("sigma_px", [(1.3, 9.0), (17.0, 4.0)])
+def test_a_wide_field_blurs_like_a_narrow_one(sigma_px):
+    # The whole field runs in blocks, the strip of it at once; both sides of block borders are in it.
+    radii = tuple(kernel_radius_px(sigma) for sigma in sigma_px)
+    field = torch.rand(2, 1, 800, 830, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    strip = field[..., 100:500, 150:600]
+    sigmas = tuple(torch.tensor(sigma, dtype=torch.float64, requires_grad=True) for sigma in sigma_px)
+    field, strip = field.requires_grad_(), strip.clone().requires_grad_()
+    wide, narrow = blur_interior(field, sigmas, radii), blur_interior(strip, sigmas, radii)
+    assert wide.shape == (2, 1, 800 - 2 * radii[0], 830 - 2 * radii[1])
+    part = wide[..., 100 : 100 + narrow.shape[-2], 150 : 150 + narrow.shape[-1]]
+    # Sums of at most 137 terms of at most 1 in double precision.
+    assert torch.allclose(part, narrow, rtol=0, atol=1e-14)
+    of_part = torch.autograd.grad(part.square().sum(), [field, *sigmas])
+    of_narrow = torch.autograd.grad(narrow.square().sum(), [strip, *sigmas])
+    assert torch.allclose(of_part[0][..., 100:500, 150:600], of_narrow[0], rtol=0, atol=1e-12)
+    for a, b in zip(of_part[1:], of_narrow[1:], strict=True):
+        assert torch.allclose(a, b, rtol=1e-10)
