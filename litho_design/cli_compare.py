@@ -8,6 +8,7 @@ import typer
 
 from litho_design.cli_options import (
     TARGET_HELP,
+    DefocusSdUm,
     Device,
     Extrapolate,
     Iterations,
@@ -55,6 +56,7 @@ def compare(
     learning_rate: LearningRate = None,
     precision: SearchPrecision = "float32",
     robust_samples: RobustSamples = None,
+    defocus_sd_um: DefocusSdUm = None,
     spread_of: SpreadOf = None,
     seeds: Annotated[int, typer.Option(help="Number of seeds, 0, 1, 2 …")] = 3,
     device: Device = "cpu",
@@ -77,6 +79,7 @@ def compare(
         "learning_rate": learning_rate,
         "precision": precision,
         "samples": robust_samples,
+        "defocus_sd_um": defocus_sd_um,
         "spread_of": spread_of,
     }
 

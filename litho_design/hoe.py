@@ -19,7 +19,7 @@ from litho_design.metrics import HologramScore, si_psnr_db
 from litho_design.parametrise import CellMap, LayoutSettings, Parametrisation, nearest_levels
 from litho_design.printer import Printer
 from litho_design.report_design import write_hologram_report
-from litho_design.robust import Draw, draws, windowed_loss
+from litho_design.robust import Draw, check_draws, draws, windowed_loss
 from litho_design.settings import HoeSettings
 from litho_design.targets import TargetRecord
 from litho_design.task import run_design
@@ -80,6 +80,8 @@ class HoeTask:
         self.notes = [f"target {record.adaptation}"] if record.adaptation else []
         self.cells = CellMap(settings.layout).to(device)
         self.bench = HologramBench(settings.layout, settings.optics).to(device)
+        count = max(_WINDOW_DRAWS, settings.window.samples)
+        check_draws(settings.window, settings.optics, count, self.bench.grid, self.bench.grid)
         self.target = torch.from_numpy(target).to(device)
         self.scenes: list[tuple[Draw | None, HologramBench]] = [
             (draw, HologramBench(settings.layout, draw.optics).to(device))

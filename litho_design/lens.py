@@ -27,7 +27,7 @@ from litho_design.optics import Optics
 from litho_design.parametrise import CellMap, Parametrisation, nearest_levels
 from litho_design.printer import Printer
 from litho_design.report_lens import write_lens_report
-from litho_design.robust import Draw, draws, windowed_loss
+from litho_design.robust import Draw, check_draws, draws, windowed_loss
 from litho_design.settings import LensSettings
 from litho_design.targets import TargetRecord
 from litho_design.task import run_design
@@ -75,10 +75,14 @@ class LensTask:
         device = printer.device
         self.cells = CellMap(settings.layout).to(device)
         self.bench = LensBench(settings.layout, settings.optics, settings.view).to(device)
+        count = max(_WINDOW_DRAWS, settings.window.samples)
+        check_draws(settings.window, settings.optics, count, self.bench.grid, self.bench.window)
         rings, placed = settings.view.path == "radial", any(p.depends_on_position for p in self.printers)
         self.radial = rings and not placed
         self.notes = [_PLANE_NOTE] if rings and placed else []
-        self.strips = [_strip_rings(self.cells, p.halo_px) for p in self.printers] if self.radial else []
+        self.strips = (
+            [_strip_rings(self.cells, p.strip_halo_px) for p in self.printers] if self.radial else []
+        )
         self.scenes: list[tuple[Draw | None, LensBench | RadialLensBench]] = [
             (draw, self._search_bench(draw.optics))
             for draw in draws(settings.window, settings.optics, settings.window.samples)
@@ -171,7 +175,9 @@ class LensTask:
         The strip continues the rings beyond the aperture, as the layout's corners do.
         """
         rings = self.cells.average(level[0, 0])
-        return self.printers[printer].print_patch(rings[self.strips[printer]][None, None])[0, 0].mean(0)
+        press = self.printers[printer]
+        strip = rings[self.strips[printer]][None, None]
+        return press.print_patch(strip, press.strip_halo_px)[0, 0].mean(0)
 
 
 def _strip_rings(cells: CellMap, halo_px: int) -> Tensor:

@@ -79,6 +79,7 @@ class Printer(nn.Module):
         # The reach is a whole number of pixels times the pitch, give or take a rounding.
         self.guard_px = 0 if simulator is None else math.ceil(_guard_um(simulator) / layout.pitch_um - 1e-6)
         self.halo_px = 0 if simulator is None else _halo_px(simulator, self.guard_px)
+        self.strip_halo_px = 0 if simulator is None else _strip_halo_px(simulator, self.guard_px)
         # What lies in the guard ring is cut off again: a model that can leave it out need not compute it.
         self._interior: Callable[..., Tensor] | None = None
         if getattr(simulator, "has_interior", False):
@@ -113,10 +114,13 @@ class Printer(nn.Module):
             return height_um
         return self._inside(F.pad(height_um, (self.guard_px,) * 4), self.guard_px)
 
-    def print_patch(self, level: Tensor) -> Tensor:
-        """Printed height, µm, of a patch cut out of a layout (b, 1, y, x), without its outer ``halo_px``."""
+    def print_patch(self, level: Tensor, halo_px: int | None = None) -> Tensor:
+        """Printed height, µm, of a patch cut out of a layout (b, 1, y, x), without its outer ``halo_px``.
+
+        ``halo_px`` is that of the printer by default; ``strip_halo_px`` serves for two rows of pixels.
+        """
         height_um = level * self.layout.level_height_um
-        return self._inside(height_um, self.halo_px)
+        return self._inside(height_um, self.halo_px if halo_px is None else halo_px)
 
     @torch.no_grad()
     def tiling_check(self, level: Tensor, tile_px: int = 256) -> TilingCheck | None:
@@ -290,3 +294,14 @@ def _halo_px(simulator: nn.Module, guard_px: int) -> int:
     """What a patch needs around it: the guard, or a whole tile where the model runs on tiles."""
     tile = getattr(getattr(simulator, "simulator", None), "tile", None)
     return guard_px if tile is None else max(guard_px, tile.size_px)
+
+
+def _strip_halo_px(simulator: nn.Module, guard_px: int) -> int:
+    """What two rows of pixels need around them: the guard, or what makes the strip two rows of tiles high.
+
+    A whole tile around them would only add tiles whose print is cut off again.
+    """
+    tile = getattr(getattr(simulator, "simulator", None), "tile", None)
+    if tile is None:
+        return guard_px
+    return max(guard_px, (2 * tile.size_px - 3 * tile.overlap_px) // 2 - 1)

@@ -13,8 +13,9 @@ from pydantic import Field
 from torch import Tensor
 
 from litho_data.errors import InputError
+from litho_data.grid import PixelGrid
 from litho_data.results import Record
-from litho_design.optics import Optics
+from litho_design.optics import Optics, sampling_limit_um
 
 _NARROWEST_BLUR_PX = 0.2
 
@@ -83,6 +84,26 @@ def draws(window: ProcessWindow, optics: Optics, count: int) -> list[Draw]:
         )
         for gain, offset, blur, defocus, wavelength in normal
     ]
+
+
+def check_draws(
+    window: ProcessWindow, optics: Optics, count: int, source: PixelGrid, target: PixelGrid
+) -> None:
+    """Refuse a defocus spread that carries one of ``count`` draws too close to the element.
+
+    Raises:
+        InputError: a draw below the sampling limit of the propagator between ``source`` and ``target``.
+    """
+    drawn = draws(window, optics, count)
+    nearest_um = min(draw.optics.distance_um for draw in drawn)
+    limit_um = max(sampling_limit_um(source, target, draw.optics.wavelength_um) for draw in drawn)
+    if nearest_um < limit_um:
+        raise InputError(
+            f"distance {optics.distance_um:g} µm with a defocus spread of {window.defocus_sd_um:g} µm",
+            got=f"{nearest_um:.4g} µm in a draw of the process window",
+            wanted=f"at least {limit_um:.4g} µm",
+            hint="lower --defocus-sd-um",
+        )
 
 
 Loss = Callable[[Tensor, Any], tuple[Tensor, dict[str, float]]]

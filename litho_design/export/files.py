@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -43,8 +44,12 @@ def export_design(
         Path of the exported file.
 
     Raises:
-        InputError: an incomplete design, or a format that cannot hold it.
+        InputError: an incomplete design, a format that cannot hold it, or job settings below zero.
     """
+    job = {"pedestal_um": pedestal_um, "slicing_um": slicing_um, "hatching_um": hatching_um}
+    for setting, value in job.items():
+        if not 0 <= value < math.inf or (value == 0 and setting != "pedestal_um"):
+            raise InputError(setting, got=f"{value:g} µm", wanted="a positive length")
     if kind not in _SUFFIX:
         raise InputError("format", got=repr(kind), wanted=", ".join(_SUFFIX))
     design = Design.read(folder)

@@ -48,7 +48,7 @@ def check_distance(distance_um: float, source: PixelGrid, target: PixelGrid, wav
     if not math.isfinite(distance_um) or distance_um <= 0 or distance_um < limit:
         raise InputError(
             "propagation distance",
-            got=f"{distance_um} µm",
+            got=f"{distance_um:.4g} µm",
             wanted=f"at least {limit:.4g} µm for a pitch of {source.pitch_um[1]:g} µm",
             hint="use the angular spectrum method or a finer pitch",
         )

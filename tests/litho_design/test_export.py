@@ -68,6 +68,12 @@ def test_a_changed_or_lonely_file_is_refused(tmp_path, design, kind):
         import_levels(file)
 
 
+@pytest.mark.parametrize("job", [{"slicing_um": -0.1}, {"hatching_um": 0.0}, {"pedestal_um": float("nan")}])
+def test_job_settings_that_no_printer_has_are_refused(tmp_path, design, job):
+    with pytest.raises(InputError, match=next(iter(job))):
+        export_design(design, "png16", tmp_path / "out", **job)
+
+
 def test_grey_is_linear_in_height(tmp_path, design):
     file = export_design(design, "bmp", tmp_path / "bmp")
     grey = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from litho_data.errors import InputError
 from litho_design.design import HEIGHT_FILE
 from litho_design.hoe import HoeTask, design_hoe
 from litho_design.optics import Optics
@@ -38,6 +39,18 @@ def test_extra_blur_keeps_the_mean_and_damps_a_wave_by_its_gaussian():
     expected = np.exp(-2 * np.pi**2 * 0.2**2 / 1.6**2)
     middle = slice(32, 96)
     assert torch.allclose(blurred[middle, middle], expected * wave[middle, middle], atol=1e-3)
+
+
+def test_a_spread_that_reaches_the_element_is_refused_before_the_search(
+    tmp_path, small_settings, make_printer
+):
+    # The nearest of the 16 draws is 1.18 standard deviations off: 1 µm - 3.55 µm is behind the element.
+    settings = small_settings.model_copy(update={"optics": Optics(distance_um=1.0)})
+    with pytest.raises(InputError, match=r"defocus spread of 3 µm.*defocus-sd-um"):
+        design_hoe(settings, make_printer(settings.layout), *make_target("ring", 128), tmp_path / "near")
+    assert not (tmp_path / "near").exists()
+    calm = settings.model_copy(update={"window": ProcessWindow(defocus_sd_um=0.1)})
+    HoeTask(calm, make_printer(settings.layout), *make_target("ring", 128))
 
 
 def test_a_robust_search_lowers_the_risk_it_minimises(tmp_path, small_settings, make_printer):
