@@ -22,18 +22,20 @@ class Budget(Record):
     seconds_per_evaluation: float
     peak_memory_gib: float
 
-    def total_seconds(self, search: SearchSettings) -> float:
-        """Expected time of the search and its polish."""
-        evaluations = search.iterations / search.evaluate_every
+    def total_seconds(self, search: SearchSettings, done: int = 0) -> float:
+        """Expected time of the search after ``done`` iterations, and of its polish."""
+        left = search.iterations - done
+        evaluations = left / search.evaluate_every
         return (
-            search.iterations + search.polish_rounds
+            left + search.polish_rounds
         ) * self.seconds_per_iteration + evaluations * self.seconds_per_evaluation
 
-    def sentence(self, search: SearchSettings) -> str:
-        """The estimate in one line."""
-        minutes = self.total_seconds(search) / 60
+    def sentence(self, search: SearchSettings, done: int = 0) -> str:
+        """The estimate in one line; ``done`` iterations of an interrupted run need not be repeated."""
+        minutes = self.total_seconds(search, done) / 60
+        what = f"{search.iterations - done} more iterations" if done else f"{search.iterations} iterations"
         return (
-            f"estimate: {search.iterations} iterations of {self.seconds_per_iteration:.2f} s, "
+            f"estimate: {what} of {self.seconds_per_iteration:.2f} s, "
             f"about {minutes:.1f} min; peak memory {self.peak_memory_gib:.2f} GiB"
         )
 

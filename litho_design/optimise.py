@@ -110,6 +110,12 @@ def search_layout(
     return state
 
 
+def finished_iterations(folder: Path) -> int:
+    """How many iterations an interrupted run in ``folder`` has behind it; 0 where there is none."""
+    path = folder / _CHECKPOINT
+    return int(torch.load(path, weights_only=True, map_location="cpu")["iteration"]) if path.exists() else 0
+
+
 def remove_checkpoint(folder: Path) -> None:
     """A finished design needs none."""
     (folder / _CHECKPOINT).unlink(missing_ok=True)

@@ -34,6 +34,7 @@ from litho_design.optics import Optics
 from litho_design.optimise import (
     SearchSettings,
     SearchState,
+    finished_iterations,
     make_parametrisation,
     remove_checkpoint,
     search_layout,
@@ -239,7 +240,7 @@ def _optimise(
     if announce:
         for note in task.notes:
             print(note, file=sys.stderr)
-        print(budget.sentence(search), file=sys.stderr)
+        print(budget.sentence(search, finished_iterations(folder)), file=sys.stderr)
     state = search_layout(parameters, task.objective, search, folder=folder, fingerprint=fingerprint)
     levels, polished = state.best_levels, state.best_loss
     assert levels is not None

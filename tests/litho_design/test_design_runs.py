@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from litho_data.errors import InputError
+from litho_design.budget import Budget
 from litho_design.design import Design, read_array
 from litho_design.hoe import HoeTask, design_hoe
 from litho_design.optics import Optics, RSPropagator, centred_grid, element_field, intensity_share
@@ -93,9 +94,24 @@ def test_a_killed_command_resumes_to_the_same_layout(tmp_path):
     cut.send_signal(signal.SIGKILL)
     cut.wait()
     assert checkpoint.exists()
-    for name in ("cut", "whole"):
-        subprocess.run(command(tmp_path / name), env=environment, check=True, capture_output=True)
+    told = {
+        name: subprocess.run(
+            command(tmp_path / name), env=environment, check=True, capture_output=True
+        ).stderr
+        for name in ("cut", "whole")
+    }
+    assert b"estimate: 250 iterations" in told["whole"]
+    assert b"more iterations" in told["cut"]
     assert Design.read(tmp_path / "cut").files == Design.read(tmp_path / "whole").files
+
+
+def test_the_estimate_of_a_resumed_run_leaves_out_what_is_done():
+    budget = Budget(seconds_per_iteration=2.0, seconds_per_evaluation=1.0, peak_memory_gib=0.5)
+    search = SearchSettings(iterations=100, polish_rounds=5, evaluate_every=10)
+    # 40 iterations and 5 rounds of polish of 2 s, 4 evaluations of 1 s
+    assert budget.total_seconds(search, done=60) == 94
+    assert "40 more iterations" in budget.sentence(search, done=60)
+    assert "100 iterations" in budget.sentence(search)
 
 
 def test_a_finished_folder_is_reused_and_a_foreign_one_refused(
