@@ -119,7 +119,11 @@ def _best(
     tests: dict[str, ProbeTest],
     report: Callable[[str], None],
 ) -> tuple[AddedProbe, State] | None:
-    """The probe with the largest held-out gain that passes every rule, and the state with it."""
+    """The probe with the largest held-out gain that passes every rule, and the state with it.
+
+    Probes are estimated free of each scan's own gain and bow, so they are judged free of them too.
+    """
+    terms = terms | {"gain", "bow"}
     before = score(fields, state.predictions, terms, seed)
     estimates = [(probe, probe.held_out(fold_of)) for probe in candidates]
     for probe, estimate in sorted(estimates, key=lambda e: -e[1].mean_gain_nm2):
