@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 PACKAGE = Path(__file__).parent
 Arrays = dict[str, np.ndarray]
 Facts = dict[str, Any]
+# Beyond it a failed registration asks whether rows are missing.
+_OBLONG = 0.01
 
 
 @dataclass(frozen=True)
@@ -184,7 +186,10 @@ def _register(
 ) -> tuple[Arrays, Facts]:
     found = _registration(arrays["levelled_height_um"], arrays["mask_level"], params)
     if not found.quality.passed:
-        raise InputError(f"registration failed: {found.quality.reason}")
+        pitch_y_um, pitch_x_um = params["scan_pitch_um"]
+        oblong = abs(pitch_y_um / pitch_x_um - 1) > _OBLONG
+        pixels = f"pixels of {pitch_y_um:.4g} × {pitch_x_um:.4g} µm (y × x): are rows missing?"
+        raise InputError(f"registration failed: {found.quality.reason}", hint=pixels if oblong else "")
     return {"scan_to_layout": found.scan_to_layout}, asdict(found.quality)
 
 

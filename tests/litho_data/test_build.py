@@ -94,6 +94,7 @@ def test_bad_scans_are_skipped_with_their_reason(tmp_path: Path, capsys: pytest.
         "P33": "\n".join(good.splitlines()[:125]),  # readable, but rows are missing
         "P34": "\x00\x01 no heights",
         "P35": good,  # its layout has too many levels
+        "P37": "\n".join(good.splitlines()[:64]),  # half the rows: no longer to be registered
     }
     for scan_id, text in bad.items():
         shutil.copy(tmp_path / "layouts" / "P11.tif", tmp_path / "layouts" / f"{scan_id}.tif")
@@ -108,6 +109,7 @@ def test_bad_scans_are_skipped_with_their_reason(tmp_path: Path, capsys: pytest.
     assert "finite" in skipped["P32"]
     assert "rows or columns are missing" in skipped["P33"]
     assert "highest level" in skipped["P35"]
+    assert skipped["P37"].endswith("pixels of 0.2 × 0.1 µm (y × x): are rows missing?")
     assert [one.id for one in result.unpaired] == ["P36"]
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("skipped ")]
     assert sorted(line.split()[1].rstrip(":") for line in lines) == sorted(bad)
@@ -119,7 +121,7 @@ def test_bad_scans_are_skipped_with_their_reason(tmp_path: Path, capsys: pytest.
     assert status["scans/P11.txt"] == ("ok", False)
     assert BuildResult.read(report_folder(tmp_path / "prints.zarr")) == result
 
-    with pytest.raises(InputError, match="5 scans cannot be used"):
+    with pytest.raises(InputError, match="6 scans cannot be used"):
         build(card, tmp_path / "strict.zarr", strict=True)
     assert not [path for path in tmp_path.iterdir() if "strict" in path.name]
 
