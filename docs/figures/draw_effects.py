@@ -28,7 +28,13 @@ def main() -> None:
     layout = torch.from_numpy((level * LEVEL_HEIGHT_UM).astype(np.float32))[None, None]
     # Away from the middle of the write field and late in the order, where place and time show.
     context = FieldContext(
-        layout, PITCH_UM, LEVEL_HEIGHT_UM * (LEVELS - 1), (_CORNER_UM, _CORNER_UM), 24.0, order=_LAST_IN_ORDER
+        layout,
+        PITCH_UM,
+        full_height_um=LEVEL_HEIGHT_UM * (LEVELS - 1),
+        slice_um=LEVEL_HEIGHT_UM,
+        field_centre_um=(_CORNER_UM, _CORNER_UM),
+        field_radius_um=24.0,
+        order=_LAST_IN_ORDER,
     )
     base = build_model("physics", pitch_um=PITCH_UM, level_height_um=LEVEL_HEIGHT_UM, levels=LEVELS)
     rows = -(-(len(CATALOGUE) + 1) // COLUMNS)

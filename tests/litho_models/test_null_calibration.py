@@ -1,0 +1,33 @@
+"""The null calibration plants nothing, and the page says what came out."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+
+from benchmarks import null_calibration
+from benchmarks.record import NOT_MEASURED, published
+
+
+def test_the_page_quotes_the_committed_calibration() -> None:
+    text = published(null_calibration.PAGE, null_calibration.NAME)
+    if not null_calibration.RESULT.exists():
+        assert text == NOT_MEASURED
+        return
+    record = json.loads(null_calibration.RESULT.read_text(encoding="utf-8"))
+    assert text == null_calibration.as_markdown(record)
+    false = sum(bool(store["effects"] or store["probes"]) for store in record["stores"])
+    assert false <= null_calibration.ALLOWED
+
+
+def test_scans_of_one_store_share_the_model_and_nothing_else() -> None:
+    scans = null_calibration.null_scans(1)
+    assert len(scans) == null_calibration.SCANS
+    heights = np.stack([scan.height_um for scan in scans]).astype(np.float64)
+    # Roughness of 16 nm has correlations of under 1 µm; between scans nothing is shared but the layout's
+    # statistics, so the correlation of two maps stays within a few of 1 / sqrt(places of 2 µm in 19 µm).
+    maps = heights - heights.mean(axis=(1, 2), keepdims=True)
+    cosine = np.corrcoef(maps.reshape(len(maps), -1))
+    assert np.abs(cosine - np.eye(len(maps))).max() < 5 / np.sqrt(9.6**2)
+    assert np.array_equal(scans[0].height_um, null_calibration.null_scans(1)[0].height_um)
