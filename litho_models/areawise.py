@@ -27,7 +27,7 @@ class StackSettings(NamedTuple):
 
     Args:
         leaky_slope: slope below zero, above 0.
-        hidden_dtype: of the layers between the first and the last; these two keep that of the weights.
+        hidden_dtype: of the layers between the first and the last; forwards these two keep the field's.
         adjoint_dtype: of the same layers on the way back.
     """
 
@@ -67,12 +67,10 @@ class _Stack(torch.autograd.Function):
         for inside, around in _tiles(out, halo):
             features = _from_one_channel(field[around], weights[0], biases[0])
             features = functional.leaky_relu_(features, slope).to(dtype)
-            values = [features]
+            kept += [features.to(kept_dtype)] if keeps else []
             for weight, bias in zip(hidden, hidden_biases, strict=True):
                 features = functional.leaky_relu_(functional.conv2d(features, weight, bias), slope)
-                values.append(features)
-            if keeps:
-                kept += [value.to(kept_dtype) for value in values]
+                kept += [features.to(kept_dtype)] if keeps else []
             out[inside] = _onto_one_channel(features.to(field.dtype), weights[-1])
         out += biases[-1]
         ctx.settings, ctx.learns = settings, learns
@@ -91,6 +89,7 @@ class _Stack(torch.autograd.Function):
         hidden = _channels_last(weights[1:-1], dtype)
         # The adjoint of a convolution is the convolution with the kernel turned round, on a wider frame.
         last = weights[-1].flip(2, 3).transpose(0, 1)
+        no_bias = last.new_zeros(len(last))
         halo, layers = 2 * len(weights), len(weights) - 1
         total = torch.zeros_like(field)
         sums = [torch.zeros_like(parameter) for parameter in parameters]
@@ -98,9 +97,10 @@ class _Stack(torch.autograd.Function):
         for index, (inside, around) in enumerate(_tiles(gradient, halo)):
             values = [value.to(dtype) for value in kept[index * layers : (index + 1) * layers]]
             above = functional.pad(gradient[inside], (2, 2, 2, 2))
-            slope = _from_one_channel(above, last).to(dtype)
+            slope = _from_one_channel(above, last, no_bias).to(dtype)
             if learns:
-                weight_sums[-1] += _correlation(above, values[-1]).transpose(0, 1).flip(2, 3)
+                by_weight, _ = _correlation(above, values[-1])
+                weight_sums[-1] += by_weight.transpose(0, 1).flip(2, 3)
             for layer in range(layers - 1, 0, -1):
                 _through_relu_(slope, values[layer], settings.leaky_slope)
                 slope, by_weight, by_bias = _convolution_backward(
@@ -111,10 +111,11 @@ class _Stack(torch.autograd.Function):
                     bias_sums[layer] += by_bias
             _through_relu_(slope, values[0], settings.leaky_slope)
             if learns:
-                weight_sums[0] += _correlation(field[around], slope)
-                bias_sums[0] += slope.sum((0, 2, 3), dtype=field.dtype)
+                by_weight, by_bias = _correlation(field[around], slope)
+                weight_sums[0] += by_weight
+                bias_sums[0] += by_bias
             if ctx.needs_input_grad[0]:
-                _add_onto_one_channel(slope.to(gradient.dtype), weights[0], total[around])
+                _add_onto_one_channel(slope, weights[0], total[around])
         bias_sums[-1] += gradient.sum()
         return total, None, *(sums if learns else [None] * count)
 
@@ -142,24 +143,24 @@ def _convolution_backward(
     )
 
 
-def _from_one_channel(tile: Tensor, weight: Tensor, bias: Tensor | None = None) -> Tensor:
+def _from_one_channel(tile: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """Convolution 1 -> channels as a matrix product, which leaves channels last: (1, c, y - 2, x - 2)."""
     ny, nx = (length - 2 for length in tile.shape[-2:])
-    neighbours, kernel = _neighbours(tile).T, weight.reshape(-1, 9).T
-    product = neighbours @ kernel if bias is None else torch.addmm(bias, neighbours, kernel)
-    return product.view(1, ny, nx, -1).permute(0, 3, 1, 2)
+    kernel = torch.cat([weight.reshape(-1, 9), bias[:, None]], dim=1)
+    return (_neighbours(tile).T @ kernel.T).view(1, ny, nx, -1).permute(0, 3, 1, 2)
 
 
-def _correlation(tile: Tensor, features: Tensor) -> Tensor:
-    """Gradient of ``_from_one_channel`` to its weight, (c, 1, 3, 3), for that of its result."""
-    neighbours = _neighbours(tile).to(features.dtype)
-    return (neighbours @ _pixels(features)).T.reshape(-1, 1, 3, 3).to(tile.dtype)
+def _correlation(tile: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradients of ``_from_one_channel`` to its weight (c, 1, 3, 3) and bias, for that of its result."""
+    sums = (_neighbours(tile).to(features.dtype) @ _pixels(features)).T.to(tile.dtype)
+    return sums[:, :9].reshape(-1, 1, 3, 3), sums[:, 9]
 
 
 def _neighbours(tile: Tensor) -> Tensor:
-    """(9, pixels): the 3 x 3 surroundings of each pixel of (1, 1, y, x) but the outermost."""
+    """(10, pixels): 3 x 3 surroundings of each pixel of (1, 1, y, x) but the outermost; ones for a bias."""
     ny, nx = (length - 2 for length in tile.shape[-2:])
-    return torch.cat([tile[..., y : y + ny, x : x + nx] for y in range(3) for x in range(3)]).view(9, -1)
+    shifted = [tile[..., y : y + ny, x : x + nx] for y in range(3) for x in range(3)]
+    return torch.cat([*shifted, torch.ones_like(shifted[0])]).view(10, -1)
 
 
 def _onto_one_channel(features: Tensor, weight: Tensor) -> Tensor:
@@ -176,7 +177,7 @@ def _onto_one_channel(features: Tensor, weight: Tensor) -> Tensor:
 def _add_onto_one_channel(slope: Tensor, weight: Tensor, total: Tensor) -> None:
     """Add the adjoint of ``_from_one_channel`` to ``total``, in place."""
     ny, nx = slope.shape[-2:]
-    for index, tap in enumerate(_taps(slope, weight)):
+    for index, tap in enumerate(_taps(slope, weight.to(slope.dtype)).to(total.dtype)):
         y, x = divmod(index, 3)
         total[..., y : y + ny, x : x + nx] += tap
 
