@@ -21,6 +21,7 @@ ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "results" / "neural-lithography"
 RESULTS = {
     "benchmark.json": "benchmark/benchmark.json",
+    "noise.json": "noise/noise.json",
     "close_loop.json": "close-loop/close_loop.json",
     "close_loop_pbl.json": "close-loop-pbl/close_loop.json",
     "close_loop_candidates.csv": "close-loop/candidates.csv",
@@ -28,23 +29,28 @@ RESULTS = {
     "score.json": "score/score.json",
 }
 NAMES = ("benchmark", "loop", "loop with PBL", "design")
-PAGES = {ROOT / "README.md": NAMES, FOLDER / "README.md": NAMES}
+PAGES = {
+    ROOT / "README.md": NAMES,
+    FOLDER / "README.md": (*NAMES, "further figures"),
+    ROOT / "docs" / "noise.md": ("noise",),
+}
 
 
 def benchmark_table(benchmark: dict[str, Any]) -> str:
     """Held-out errors of every model, one row each."""
     rows = [
-        "| model | datum-free error (zero of each scan free) | with tilt, bow and gain free "
-        "| absolute error | parameters |",
-        "|---|---|---|---|---|",
+        "| model | datum-free error (zero of each scan free) | the same without the shared background "
+        "| with tilt, bow and gain free | absolute error | parameters |",
+        "|---|---|---|---|---|---|",
     ]
     parameters = {fit["model"]: fit["parameters"] for fit in benchmark["fits"]}
     for score in benchmark["scores"]:
         policies = {entry["policy"]: entry["mae_nm"] for entry in score["by_policy"]}
+        bare = {entry["policy"]: entry["mae_nm"] for entry in score["without_background"]}
         free = _with_interval(score["mae_datum_free_nm"], score["mae_datum_free_ci95_nm"])
         absolute = _with_interval(score["mae_abs_nm"], score["mae_abs_ci95_nm"])
         rows.append(
-            f"| {score['model']} | {free} | {policies['full']:.2f} nm | {absolute} "
+            f"| {score['model']} | {free} | {bare['offset']:.2f} nm | {policies['full']:.2f} nm | {absolute} "
             f"| {parameters[score['model']]:,} |"
         )
     split = benchmark["split"]
@@ -53,7 +59,52 @@ def benchmark_table(benchmark: dict[str, Any]) -> str:
         f"\nMean absolute error on held-out scans ({len(split['scored_ids'])} scans, {split['folds']} folds "
         f"by scan, seed {split['seed']}, {len(split['lock_box'])} scans locked and not looked at; PBL: "
         f"{steps:,} steps), with 95 % bootstrap intervals over scans. Per-scan terms are fitted on pixels "
-        "that are not scored."
+        "that are not scored. The shared background is what levelling leaves in every map: five numbers from "
+        "the training scans, added to predictions of measured maps and to no design."
+    )
+    return "\n".join(rows)
+
+
+def further_table(benchmark: dict[str, Any]) -> str:
+    """Phase, similarity, edges, crops, and training against held-out error, one row per model."""
+    rows = [
+        "| model | phase | SSIM | edges, mean | edges, P95 | edges without partner | other crop, largest "
+        "| on training scans | on inner validation | held out |",
+        "|---" * 10 + "|",
+    ]
+    for score in benchmark["scores"]:
+        found = [fit["diagnostics"] for fit in benchmark["fits"] if fit["model"] == score["model"]]
+        lost = score["edge_unmatched"] / (score["edge_matched"] + score["edge_unmatched"])
+        crops = [entry["tiles"]["max_nm"] for entry in found if entry["tiles"]]
+        errors = [
+            _mean_nm([entry[key] for entry in found])
+            for key in ("training_nm", "inner_validation_nm", "held_out_nm")
+        ]
+        rows.append(
+            f"| {score['model']} | {score['phase_rms_waves']:.4f} waves | {score['ssim']:.3f} "
+            f"| {score['edge_mean_nm']:.0f} nm | {score['edge_p95_nm']:.0f} nm | {100 * lost:.1f} % "
+            f"| {f'{max(crops):.2g} nm' if crops else '–'} | {' | '.join(errors)} |"
+        )
+    rows.append(
+        "\nThe definitions are in [how models are judged](../../evaluation.md). The last three columns are "
+        "datum-free errors without the shared background, means over folds."
+    )
+    return "\n".join(rows)
+
+
+def noise_table(noise: dict[str, Any]) -> str:
+    """What bounds the noise of the measured prints, one row per figure."""
+    rows = ["| figure | of noise | errs as | σ | MAE |", "|---|---|---|---|---|"]
+    rows += [
+        f"| {bound['name']} | {bound['of']} | {bound['direction']} "
+        f"| {_with_interval(bound['sigma_nm'], bound['ci95_nm'])} | {bound['mae_nm']:.2f} nm |"
+        for bound in noise["bounds"]
+    ]
+    floor = noise["noise_floor"]
+    rows.append(
+        f"\n{noise['run']['n_scans']} development scans of the measured prints, 95 % intervals over scans. "
+        f"No flat and no repeated print is among them: the floor, MAE {floor['mae_nm']:.2f} nm, is a "
+        f"{floor['kind'].replace('-', ' ')}."
     )
     return "\n".join(rows)
 
@@ -117,6 +168,8 @@ def texts(folder: Path) -> dict[str, str]:
     """The text of each mark, from the result files in a folder."""
     makers = {
         "benchmark": (benchmark_table, "benchmark.json"),
+        "further figures": (further_table, "benchmark.json"),
+        "noise": (noise_table, "noise.json"),
         "loop": (loop_table, "close_loop.json"),
         "loop with PBL": (loop_table, "close_loop_pbl.json"),
         "design": (design_table, "gap.json"),
@@ -141,6 +194,11 @@ def main() -> None:
     for page, names in PAGES.items():
         for name in names:
             publish(page, name, texts(FOLDER)[name])
+
+
+def _mean_nm(values: list[float | None]) -> str:
+    known = [value for value in values if value is not None]
+    return f"{sum(known) / len(known):.2f} nm" if known else "–"
 
 
 def _with_interval(value: float, interval: list[float] | None) -> str:

@@ -29,6 +29,7 @@ ARMS = ("affine", "physics", "pbl")
 class Effort:
     """How much is trained and designed: enough to see every part, or what is quoted in the docs."""
 
+    models: str
     training_steps: int
     folds: int
     element_px: int
@@ -38,8 +39,24 @@ class Effort:
 
 
 # A quarter of the paper's element at a quarter of its distance keeps the diffraction angles.
-QUICK = Effort(training_steps=60, folds=3, element_px=256, distance_um=75, iterations=60, seeds=1)
-MEASURED = Effort(training_steps=2000, folds=5, element_px=256, distance_um=75, iterations=100, seeds=1)
+QUICK = Effort(
+    models="identity,affine,blur-table,physics,pbl",
+    training_steps=60,
+    folds=3,
+    element_px=256,
+    distance_um=75,
+    iterations=60,
+    seeds=1,
+)
+MEASURED = Effort(
+    models="identity,affine,affine-mtf,blur-table,linear,physics,pbl",
+    training_steps=2000,
+    folds=5,
+    element_px=256,
+    distance_um=75,
+    iterations=100,
+    seeds=1,
+)
 
 
 @dataclass(frozen=True)
@@ -91,7 +108,7 @@ def plan(out: Path, dataset: str) -> list[Step]:
         Step(
             "Compare the models on held-out scans",
             _models(
-                "benchmark", store, "--models", "identity,affine,blur-table,physics,pbl",
+                "benchmark", store, "--models", effort.models,
                 "--folds", effort.folds, *training, "--out", out / "benchmark",
             ),
             out / "benchmark" / "benchmark.json",
@@ -105,8 +122,14 @@ def plan(out: Path, dataset: str) -> list[Step]:
         ),
     ]  # fmt: skip
     if dataset:
-        network = out / "close-loop-pbl"
-        steps.append(
+        network, noise = out / "close-loop-pbl", out / "noise"
+        steps += [
+            Step(
+                "What no model can predict: the noise",
+                _models("noise", store, "--out", noise),
+                noise / "noise.json",
+                noise / "report.html",
+            ),
             Step(
                 "What does the network lack?",
                 _models(
@@ -115,8 +138,8 @@ def plan(out: Path, dataset: str) -> list[Step]:
                 ),
                 network / "close_loop.json",
                 network / "report.html",
-            )
-        )  # fmt: skip
+            ),
+        ]  # fmt: skip
     for model in ARMS:
         trained, frozen = out / "runs" / model, out / "models" / model
         steps += [

@@ -9,6 +9,7 @@ from benchmarks.record import published
 from litho_design.compare import GapResult
 from litho_models.benchmark import Benchmark
 from litho_models.loop.result import CloseLoop
+from litho_models.noise.result import NoiseAnalysis
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.parent.name)
@@ -21,11 +22,13 @@ def test_the_committed_results_are_of_the_published_schemas():
     loop = CloseLoop.read(FOLDER)
     benchmark = Benchmark.read(FOLDER)
     GapResult.read(FOLDER)
-    assert loop.dataset.sha256 == benchmark.dataset.sha256
+    noise = NoiseAnalysis.read(FOLDER)
+    assert loop.dataset.sha256 == benchmark.dataset.sha256 == noise.dataset.sha256
     # Nobody looked at the locked scans.
     assert loop.locked_after is None
     assert not benchmark.locked_scores
     assert not set(loop.split.lock_box) & set(benchmark.split.scored_ids)
+    assert noise.run.n_scans == len(benchmark.split.scored_ids)
 
 
 def test_every_result_is_there():
