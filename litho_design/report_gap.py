@@ -62,11 +62,13 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
     if result.task != "hoe":
         page.figure(
             _profiles(result, judged),
-            f"Seed {result.seeds[0]}: PSF across the centre and its spectrum, in design (thick) and printed.",
+            f"Seed {result.seeds[0]}: PSF across the centre and its Fourier spectrum along x (MTF × power); "
+            "thick in design, thin as printed.",
         )
     page.figure(
         _bars(result, "ssim" if result.task == "hoe" else headline[0]),
-        "Expected in design (hollow) and after each judge's print (filled).",
+        "Left: expected in design (circles) and after each judge's print (bars), means over seeds. Right: "
+        "design minus print, the gap.",
     )
     page.heading("Arm against arm")
     page.paragraph(
@@ -168,22 +170,26 @@ def _profiles(result: GapResult, judged: dict[str, tuple[Judging, dict[str, np.n
 
 
 def _bars(result: GapResult, name: str):
-    figure = new_figure(9, 3.6)
-    axis = figure.subplots()
+    """Left: one figure in design and after each judge's print; right: what the print cost of it."""
+    figure = new_figure(12, 3.8)
+    left, right = figure.subplots(1, 2)
     judges, arms = list(result.judges), list(result.arms)
     width = 0.8 / len(arms)
     for index, arm in enumerate(arms):
         items = [item for item in result.summary if item.arm == arm and item.figure == name]
         place = np.arange(len(judges)) + (index - (len(arms) - 1) / 2) * width
-        colour = f"C{index}"
-        values = [item.judged_mean for item in items]
         half = [0.0 if i.judged_ci95 is None else i.judged_ci95[1] - i.judged_mean for i in items]
-        axis.bar(place, values, width, color=colour, label=arm, yerr=half, capsize=2)
-        axis.plot(place, [item.designed_mean for item in items], "o", mfc="none", color="black", ms=4)
-    axis.set_xticks(range(len(judges)), judges)
-    axis.set_xlabel("printed by")
-    axis.set_ylabel(_LABELS[name])
-    axis.legend(title="designed with", ncols=len(arms), fontsize=8)
+        error = {"yerr": half, "capsize": 2} if any(half) else {}
+        left.bar(place, [item.judged_mean for item in items], width, color=f"C{index}", label=arm, **error)
+        left.plot(place, [item.designed_mean for item in items], "o", mfc="none", color="black", ms=4)
+        right.bar(place, [item.gap_mean for item in items], width, color=f"C{index}")
+    left.set_ylabel(_LABELS[name])
+    right.set_ylabel(f"Δ {_LABELS[name]}")
+    right.axhline(0, color="black", linewidth=0.8)
+    for axis in (left, right):
+        axis.set_xticks(range(len(judges)), judges, fontsize=8)
+        axis.set_xlabel("printed by")
+    figure.legend(title="designed with", ncols=len(arms), fontsize=8, loc="outside upper center")
     return figure
 
 
