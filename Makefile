@@ -9,7 +9,7 @@ STAMP := .venv/.installed
 # Two test processes on two cores: one thread each.
 PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
-.PHONY: help setup demo trials test test-fast check format clean
+.PHONY: help setup demo trials gap test test-fast check format clean
 
 help:              ## list the targets
 	@grep -hE '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1	/' | expand -t 14
@@ -26,6 +26,9 @@ demo: $(STAMP)     ## run the whole path: make demo, or make demo DATASET=neural
 
 trials: $(STAMP)   ## blind trials of the closed loop: make trials WORKERS=2, PUBLISH=1 writes them into docs/
 	$(BIN)/python -m benchmarks.blind_trials --out $(OUT)/blind-trials --workers $(WORKERS) $(if $(PUBLISH),--publish)
+
+gap: $(STAMP)      ## the design-to-manufacturing gap at full size, hours: make gap WORKERS=2 [PUBLISH=1]
+	$(BIN)/python -m benchmarks.gap --out $(OUT)/gap --workers $(WORKERS) $(if $(PUBLISH),--publish)
 
 test: $(STAMP)     ## pass all tests; the report is runs/tests/report.xml
 	$(PYTEST) --durations 15 --junitxml $(OUT)/tests/report.xml

@@ -1,0 +1,84 @@
+"""Figures of the comparison for the documentation: images in design and printed, PSFs and their spectra."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from litho_data.report import new_figure
+from litho_design.compare import GapResult, design_folder
+from litho_design.judging import Judging
+from litho_design.printer import Printer, load_printer
+
+_DETAIL_PX = 160
+
+
+def draw_images(folder: Path, gap: GapResult, judge: tuple[str, str] | None, path: Path) -> None:
+    """One column per arm: image in design, image after printing, print in the middle of the element."""
+    judged = _judged(folder, gap, judge)
+    figure = new_figure(2.4 * len(judged) + 0.4, 7.4)
+    axes = figure.subplots(3, len(judged), squeeze=False)
+    for column, (arm, (judging, printer)) in enumerate(judged.items()):
+        height = judging.printed_um(printer)
+        expected = judging.image(judging.expected_um)
+        pictures = [judging.display(expected), judging.display(judging.image(height))]
+        for row, picture in enumerate(pictures):
+            axes[row, column].imshow(picture, cmap="inferno", vmin=0, vmax=1.5)
+        axes[2, column].imshow(_middle(height.cpu().numpy()), cmap="viridis", vmin=0, vmax=1.2)
+        axes[0, column].set_title(f"designed with {arm}", fontsize=9)
+        axes[1, column].set_title(f"printed by {printer.name}", fontsize=9)
+        axes[2, column].set_title("its middle, 0 to 1.2 µm", fontsize=9)
+    for axis in axes.ravel():
+        axis.set_xticks([])
+        axis.set_yticks([])
+    axes[0, 0].set_ylabel("in design")
+    axes[1, 0].set_ylabel("after printing")
+    axes[2, 0].set_ylabel("print")
+    # Speckle does not compress without loss.
+    figure.savefig(path, dpi=90, pil_kwargs={"quality": 80})
+
+
+def draw_lens(folder: Path, gap: GapResult, judge: tuple[str, str] | None, path: Path) -> None:
+    """PSF through its peak and its spectrum, in design and after printing, one column per arm."""
+    judged = _judged(folder, gap, judge)
+    figure = new_figure(2.5 * len(judged) + 0.4, 4.8)
+    axes = figure.subplots(2, len(judged), squeeze=False, sharey="row")
+    pitch = gap.settings.layout.pitch_um
+    for column, (arm, (judging, printer)) in enumerate(judged.items()):
+        prints = {"in design": judging.expected_um, "printed": judging.printed_um(printer)}
+        for name, height in prints.items():
+            psf = judging.image(height)
+            x = (np.arange(psf.shape[0]) - (psf.shape[0] - 1) / 2) * pitch
+            axes[0, column].plot(x, 1e4 * psf[psf.shape[0] // 2], label=name)
+            spectrum = np.abs(np.fft.rfft(psf.sum(0)))
+            axes[1, column].plot(np.fft.rfftfreq(psf.shape[0], pitch), spectrum)
+        axes[0, column].set_title(f"designed with {arm}", fontsize=9)
+        axes[0, column].set_xlim(-6, 6)
+        axes[0, column].set_xlabel("x, µm")
+        axes[1, column].set_xlim(0, 0.6)
+        axes[1, column].set_xlabel("cycles/µm")
+    axes[0, 0].set_ylabel("share per pixel, 1e-4")
+    axes[1, 0].set_ylabel("|spectrum|")
+    axes[0, 0].legend(fontsize=7)
+    figure.savefig(path, dpi=80)
+
+
+def _judged(
+    folder: Path, gap: GapResult, judge: tuple[str, str] | None
+) -> dict[str, tuple[Judging, Printer]]:
+    """Every arm's first design with the printer that judges it; without a judge, the last other arm."""
+    names = list(gap.arms)
+    judged = {}
+    for arm in names:
+        other = [name for name in names if name not in (arm, "none")][-1]
+        name, source = judge or (other, gap.arms[other].source)
+        printer = load_printer(source, gap.settings.layout, name=name)
+        judged[arm] = (Judging(design_folder(folder, arm, gap.seeds[0])), printer)
+    return judged
+
+
+def _middle(height: np.ndarray) -> np.ndarray:
+    side = min(height.shape[0], _DETAIL_PX)
+    first = (height.shape[0] - side) // 2
+    return height[first : first + side, first : first + side]

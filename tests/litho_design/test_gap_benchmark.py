@@ -1,0 +1,125 @@
+"""The large comparison: its budgets are equal, its designs are found again, its claims about the fab hold."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from benchmarks.gap.cost import estimate
+from benchmarks.gap.document import as_markdown
+from benchmarks.gap.jobs import Job, run_jobs
+from benchmarks.gap.plan import ARMS, PRINT_KNOBS, Effort, Task, open_plan, tasks
+from litho_data.errors import InputError
+from litho_data.virtual_fab import KnobSetting, knob_rms_nm
+from litho_data.virtual_fab.settings import Printer
+from litho_data.virtual_fab.strength import default_fields
+from litho_design.cli import app
+from litho_models import save_frozen
+from litho_models.models import build_model
+
+TINY = Effort.small(64)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", PRINT_KNOBS)
+def test_every_hidden_effect_is_ten_nanometres(name):
+    rms = knob_rms_nm(KnobSetting(name, PRINT_KNOBS[name], 0), default_fields(Printer(), 0), policy="full")
+    # Strengths are stated with three digits and were searched to 1 %.
+    assert rms == pytest.approx(10.0, rel=0.02)
+
+
+def test_every_arm_has_the_same_budget(tmp_path):
+    for task in tasks(tmp_path, Effort(), {}, None):
+        settings = set()
+        for job in task.designs(tmp_path):
+            words = list(job.command)
+            for option in ("--model", "--out", "--seed"):
+                del words[(at := words.index(option)) : at + 2]
+            settings.add(tuple(words))
+        assert len(settings) == 1
+        assert len(task.designs(tmp_path)) == task.seeds * len(task.models)
+        assert task.iterations <= (300 if task.kind == "hoe" else 200)
+        assert task.name == "hoe-measured" or tuple(task.models) == ARMS
+
+
+@pytest.mark.parametrize("kind", ["hoe", "lens-computational"])
+def test_compare_judges_the_designs_that_single_commands_made(tmp_path, kind):
+    torch.manual_seed(0)
+    folder = save_frozen(build_model("affine"), tmp_path / "affine")
+    planned = next(task for task in tasks(tmp_path, TINY, {}, None) if task.name == kind)
+    models = {"none": "none", "affine": str(folder)}
+    task = Task(planned.name, planned.kind, planned.options, models, {}, seeds=1)
+
+    def call(job: Job) -> None:
+        result = CliRunner().invoke(app, list(job.command[1:]), catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+        assert job.done
+
+    for job in task.designs(tmp_path):
+        call(job)
+    written = {job.name: job.result.stat().st_mtime_ns for job in task.designs(tmp_path)}
+    call(task.compare(tmp_path))
+    assert {job.name: job.result.stat().st_mtime_ns for job in task.designs(tmp_path)} == written
+
+
+def test_a_folder_holds_one_comparison(tmp_path):
+    assert open_plan(tmp_path, TINY, None) == open_plan(tmp_path, TINY, None)
+    with pytest.raises(InputError, match="other settings"):
+        open_plan(tmp_path, Effort(), None)
+
+
+def test_finished_jobs_are_skipped_and_failed_ones_are_named(tmp_path):
+    def job(name, code):
+        return Job(name, (sys.executable, "-c", code), tmp_path / name)
+
+    touch = "import pathlib, sys; pathlib.Path({!r}).write_text(sys.argv[0])"
+    good = job("good", touch.format(str(tmp_path / "good")))
+    run_jobs([good], tmp_path / "logs", 2)
+    before = good.result.stat().st_mtime_ns
+    with pytest.raises(InputError, match="bad"):
+        run_jobs([good, job("bad", "raise SystemExit(1)")], tmp_path / "logs", 2)
+    assert good.result.stat().st_mtime_ns == before
+    with pytest.raises(InputError, match="silent"):
+        run_jobs([job("silent", "")], tmp_path / "logs", 1)
+
+
+def test_the_estimate_adds_up(tmp_path):
+    planned = [task for task in tasks(tmp_path, Effort(), {}, None) if task.name == "lens-direct"]
+    cost = {"iteration_s": 2.0, "evaluation_s": 1.0, "print_s": 3.0, "peak_gib": 1.0}
+    cost |= {"beside_s": 30.0, "score_s": 4.0}
+    records = dict.fromkeys([("direct", arm) for arm in ARMS], cost)
+    rows = estimate(records, planned, Effort())
+    # Search and polish, evaluations, what is beside the search; six prints, seven scores (also the fab's).
+    n, seeds = planned[0].iterations, planned[0].seeds
+    expected = seeds * ((n + 11) * 2.0 + n / 10 * 1.0 + 30.0 + 6 * 3.0 + 7 * 4.0) / 60
+    assert [row["minutes"] for row in rows[1:]] == pytest.approx([expected] * len(ARMS))
+
+
+def test_the_tables_name_the_winner_and_what_is_undecided():
+    def row(arm, designed, judged, half):
+        return {
+            "task": "hoe", "arm": arm, "judge": "fab", "figure": "si_psnr_db", "seeds": 3,
+            "designed": designed, "judged": judged, "low": judged - half, "high": judged + half,
+        }  # fmt: skip
+
+    rows = [row("none", 16.0, 12.0, 0.1), row("pbl", 15.0, 14.0, 0.2)]
+    rows += [{**item, "figure": name} for item in rows for name in ("ssim", "eff_signal")]
+    pair = {"judge": "fab", "figure": "si_psnr_db", "arm": "pbl", "against": "none", "mean": 2.0}
+    record = {
+        "plan": {"effort": Effort().model_dump(), "print_knobs": PRINT_KNOBS},
+        "models": {"pbl": {"offset": 20.0, "full": 17.0}},
+        "tasks": {
+            "hoe": {
+                "target": "text", "iterations": 100, "seeds": [0, 1, 2],
+                "minutes": {"none": 1.0, "pbl": 9.0}, "paired": [{**pair, "ci95": [-0.5, 4.5]}],
+            }
+        },
+        "summary": rows,
+    }  # fmt: skip
+    text = as_markdown(record)
+    assert "| none | 16.000 → 12.000 ± 0.100 |" in text
+    assert "pbl is best" in text
+    assert "none by +2.000 [-0.500, +4.500], undecided" in text
