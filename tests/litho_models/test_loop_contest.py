@@ -53,7 +53,7 @@ def test_slices_set_alike_in_wide_areas_and_differ_where_narrower_than_the_spot(
     context = FieldContext(layout, 0.1, 1.2)
     effect = get_effect("layer-stacking")
     changed = effect(layout, effect.with_values({"share": share}), context) - layout
-    # Wide areas: 0 and 1 are fixed points of the step. A line of one pixel is below the threshold: it is lost.
+    # Wide areas: 0 and 1 are fixed points of the step. A line of one pixel is below the threshold: lost.
     assert float(changed[..., 50].abs().max()) < 1e-4
     line = float(changed[..., 30, 12])
     assert line < -0.05 if share else line == 0.0

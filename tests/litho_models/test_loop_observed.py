@@ -29,7 +29,8 @@ def test_heights_that_were_not_rounded_have_no_step() -> None:
 def test_rounding_counts_by_the_noise_it_adds() -> None:
     # Uniform noise of a step q has the variance q² / 12.
     coarse = quantisation([0.012 * np.sqrt(12)] * 3)
-    assert coarse.seen and "12 nm rms" in coarse.evidence
+    assert coarse.seen
+    assert "12 nm rms" in coarse.evidence
     assert not quantisation([0.0001 * np.sqrt(12)] * 3).seen
     assert not quantisation([0.0, 0.0]).seen
 
