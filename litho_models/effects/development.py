@@ -76,6 +76,7 @@ EFFECTS = (
         trials=({"fraction": 0.05},),
         source="Meisel 2006, cited in the paper",
         separating="a step standard for the microscope, then a printed staircase",
+        linear=True,
     ),
     Effect(
         name="dose-dependent-shrinkage",

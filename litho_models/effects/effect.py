@@ -139,6 +139,7 @@ class Effect:
         separating: the experiment that tells it apart from what looks alike.
         needs: facts about the print without which it cannot be tested.
         per_scan: its parameters belong to one scan and have no value shared by all.
+        linear: a filter of layout or height, so that what it fails to explain is a filter too.
         along_lines: it depends on the line alone, so offsets of single lines would hide it.
     """
 
@@ -154,6 +155,7 @@ class Effect:
     trials: tuple[Mapping[str, float], ...] = ()
     needs: tuple[Literal["order", "levels"], ...] = ()
     per_scan: bool = False
+    linear: bool = False
     along_lines: bool = False
     amplitudes: tuple[str, ...] = field(init=False)
 

@@ -77,6 +77,7 @@ EFFECTS = (
         ),
         source="first-order lag of the deflection, l = speed x time constant",
         separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
+        linear=True,
     ),
     Effect(
         name="write-order-memory",
@@ -97,6 +98,7 @@ EFFECTS = (
         ),
         source="oxygen and radical depletion along the slow writing axis, y unless the card says x",
         separating="print the same layout with the writing order reversed",
+        linear=True,
     ),
     Effect(
         name="hatch-ripple",

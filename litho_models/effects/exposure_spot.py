@@ -70,6 +70,7 @@ EFFECTS = (
         ),
         source="Gaussian spot of the paper, with a full second-moment matrix",
         separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
+        linear=True,
     ),
     Effect(
         name="long-range-proximity",
@@ -85,6 +86,7 @@ EFFECTS = (
         trials=tuple({"weight": 0.1, "length_um": length} for length in (1.0, 2.0, 4.0, 8.0)),
         source="proximity sum of two Gaussians, as in electron-beam writing; weights signed",
         separating="print one feature alone and inside dense surroundings of three sizes",
+        linear=True,
     ),
     Effect(
         name="dose-exponent",

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from litho_models.effects.effect import Effect, FieldContext, Parameter, Values
-from litho_models.effects.filters import add_blur, add_filtered, add_warp, centred_lag, gradient
+from litho_models.effects.filters import add_blur, add_warp, gradient
 
-_TAIL_LENGTHS = 6
+_BLUR_REACH_UM = 4.0
 
 
 def tip_dilation(height: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -17,15 +18,24 @@ def tip_dilation(height: Tensor, values: Values, context: FieldContext) -> Tenso
 
 
 def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """The probe follows late: one-sided exponential of length l along the fast axis, mean delay taken out."""
-    length = values["length_um"]
+    """The probe follows late along the fast axis, mean delay taken out: z += (H - z) / (1 + l / dx).
+
+    The length l holds on the way down. On the way up, where the surface pushes, it is a part of it:
+    with 1 the probe is a linear filter, below 1 it parachutes off falling edges.
+    """
+    length, rising = values["length_um"], values["length_um"] * values["rising"]
     forward = float(values["direction"]) > 0
-
-    def transfer_minus_one(_: Tensor, fx: Tensor) -> Tensor:
-        return centred_lag(fx if forward else -fx, length, context.pitch_um) - 1
-
-    reach = _TAIL_LENGTHS * float(length.detach()) + context.pitch_um
-    return add_filtered(height, transfer_minus_one, context.pitch_um, reach)
+    gains = [1 / (1 + part / context.pitch_um) for part in (rising, length)]
+    columns = (height if forward else height.flip(-1)).unbind(-1)
+    followed = [columns[0]]
+    for column in columns[1:]:
+        error = column - followed[-1]
+        followed.append(followed[-1] + torch.where(error > 0, gains[0], gains[1]) * error)
+    late = torch.stack(followed, dim=-1)
+    delay = (length + rising) / 2
+    return add_warp(
+        late if forward else late.flip(-1), 0 * delay, delay if forward else -delay, context.pitch_um
+    )
 
 
 def registration_residual(height: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -49,8 +59,8 @@ def piezo_nonlinearity(height: Tensor, values: Values, context: FieldContext) ->
 
 
 def resampling_blur(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H blurred by the interpolation of the registration: Gaussian of a fraction of a pixel."""
-    return add_blur(height, values["variance_um2"], context.pitch_um, 1.0)
+    """The finished scan blurred by a Gaussian: by interpolation, or by the microscope's own low pass."""
+    return add_blur(height, values["variance_um2"], context.pitch_um, _BLUR_REACH_UM)
 
 
 EFFECTS = (
@@ -73,15 +83,20 @@ EFFECTS = (
         role="measurement",
         acts_on="height",
         parameters={
-            "length_um": Parameter("µm", 0.0, 0.8, 0.2),
+            "length_um": Parameter("µm", 0.0, 1.5, 0.2),
+            "rising": Parameter("1", 0.0, 1.0, 0.5, kind="shape"),
             "direction": Parameter("1", -1.0, 1.0, 1.0, kind="choice"),
         },
         apply=feedback_lag,
         trials=tuple(
-            {"length_um": length, "direction": sign} for length in (0.15, 0.4) for sign in (1.0, -1.0)
+            {"length_um": length, "rising": rising, "direction": sign}
+            for length in (0.15, 0.4)
+            for rising in (1.0, 0.4)
+            for sign in (1.0, -1.0)
         ),
-        source="first-order feedback loop, linear part",
+        source="first-order feedback loop; a probe that parachutes loses the surface on the way down",
         separating="compare trace and retrace; scan at 0 and 90 degrees",
+        linear=True,
     ),
     Effect(
         name="registration-residual",
@@ -112,14 +127,15 @@ EFFECTS = (
     ),
     Effect(
         name="resampling-blur",
-        title="interpolation in the registration",
+        title="blur of the finished scan",
         stage="measurement",
         role="measurement",
         acts_on="height",
-        parameters={"variance_um2": Parameter("µm²", 0.0, 0.0036, 0.0016)},
+        parameters={"variance_um2": Parameter("µm²", 0.0, 1.0, 0.0025)},
         apply=resampling_blur,
-        trials=({"variance_um2": 0.0016},),
-        source="width of the interpolation kernel, 0.03 to 0.06 µm at 0.1 µm per pixel",
+        trials=({"variance_um2": 0.0025}, {"variance_um2": 0.04}),
+        source="kernels are 0.03 to 0.06 µm wide at 0.1 µm per pixel; some microscopes are slower",
         separating="register with two interpolation kernels; scan with half the pixel size",
+        linear=True,
     ),
 )

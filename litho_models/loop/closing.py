@@ -54,7 +54,7 @@ class Closed:
         first_tests, last_tests: measurement tests before and after the process effects.
         accepted: measurement effects in force at the end.
         floor_nm: lower bound of the noise, nm (root mean square, mean absolute).
-        structure: covariate tests on what is left.
+        left_by_named, structure: covariate tests on what the named effects leave, and at last.
         locked_scores: (before, after) as pairs (no fit, datum free), if opened.
         observed: what is seen without a model, by name.
         untestable: effect to reason; ``planted``: power of the screening, if asked for.
@@ -71,6 +71,7 @@ class Closed:
     last_tests: list[MeasurementTest]
     accepted: list[str]
     floor_nm: tuple[float, float]
+    left_by_named: list[CovariateTest]
     structure: list[CovariateTest]
     locked_scores: tuple[tuple[Score, Score], tuple[Score, Score]] | None
     observed: dict[str, Observed]
@@ -205,6 +206,7 @@ def close_loop(
         last_tests=last_tests,
         accepted=accepted,
         floor_nm=noise_lower_bound_nm(development, final.predictions),
+        left_by_named=left,
         structure=covariate_tests(development, final.predictions) if probed.added else left,
         locked_scores=_locked_scores(locked, start, probed, accepted, config)
         if config.open_lock_box

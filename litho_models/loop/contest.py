@@ -32,8 +32,8 @@ from litho_models.loop.state import State, fit_state, held_out_residuals
 
 TRIES_PER_ROUND = 3
 # Promising this part of the best predicted gain is enough to be fitted.
-CONTENDER_SHARE = 0.3
-MOST_CONTENDERS, MOST_RELATIVES = 6, 3
+CONTENDER_SHARE = 0.5
+MOST_CONTENDERS, MOST_RELATIVES = 4, 3
 # A member of a confusable set that loses this part of the gain in nearly every scan is told apart.
 TOLD_APART_SHARE = 0.25
 # The score test predicts the gain of a full fit within a factor of two or so.

@@ -21,13 +21,15 @@ EffectValues = dict[str, dict[str, float]]
 def exported_effects(chain: EffectChain, result: CloseLoop) -> dict[str, EffectValues]:
     """The chain's effects as ``process``, ``measurement`` and ``undetermined`` (kept out of design).
 
-    A process effect that these data cannot tell from one of the microscope is undetermined.
+    A process effect that these data cannot tell from one of the microscope is undetermined, and so is
+    one that only comes near the cause.
     """
     alike = {e.name: e.confusable_with for e in result.effects}
+    doubtful = {e.name for e in result.effects if e.verdict == "traced-to-covariate"}
     groups: dict[str, EffectValues] = {"process": {}, "measurement": {}, "undetermined": {}}
     for name, values in chain.values().items():
         roles = {get_effect(other).role for other in (name, *alike.get(name, []))}
-        group = next(iter(roles)) if len(roles) == 1 else "undetermined"
+        group = next(iter(roles)) if len(roles) == 1 and name not in doubtful else "undetermined"
         groups[group if group in groups else "undetermined"][name] = values
     return groups
 

@@ -19,6 +19,7 @@ from litho_models.loop.result import (
     CandidateVerdict,
     CloseLoop,
     Dataset,
+    EffectVerdict,
     Errors,
     NoiseFloor,
     Nuisance,
@@ -31,12 +32,15 @@ from litho_models.loop.result import (
 from litho_models.loop.scoring import DATUM_FREE, Score
 from litho_models.loop.screening import FAMILY_P, SMALLEST_RETAINED, Screened
 from litho_models.loop.search import separating_experiment
+from litho_models.loop.structure import LINEAR_RESPONSE, is_structured
 from litho_models.metrics import NM_PER_UM
 from litho_models.nuisance import BLOCK_PX
 from litho_models.run_info import run_info
 
 # Their parameters lie in the span of what every scan may add: nested tests, error without other fits.
 _SPAN_EFFECTS = {"datum-offset", "z-gain", "tilt-bow"}
+# Of the squared error that is left.
+_DOUBTFUL_SHARE = 0.05
 _NO_TERMS: frozenset[str] = frozenset()
 
 
@@ -141,13 +145,21 @@ def _added_measurement(closed: Closed, test: MeasurementTest) -> AddedEffect:
     )
 
 
+def _is_doubtful(closed: Closed, effect: Effect) -> bool:
+    """A filter that leaves a good part of the error to another filter comes near the cause, and is not it."""
+    left = next((t for t in is_structured(closed.left_by_named) if t.name == LINEAR_RESPONSE), None)
+    return effect.linear and left is not None and left.share >= _DOUBTFUL_SHARE
+
+
 def _added_process(closed: Closed, entry: Added) -> AddedEffect:
     effect = entry.effect
+    verdict: EffectVerdict = "confusable" if entry.confusable_with else "explained"
+    doubtful = _is_doubtful(closed, effect)
     return AddedEffect(
         name=effect.name,
         stage=effect.stage,
-        role=effect.role,
-        verdict="confusable" if entry.confusable_with else "explained",
+        role="undetermined" if doubtful else effect.role,
+        verdict="traced-to-covariate" if doubtful else verdict,
         prior_hypothesis=effect.name in closed.config.prior_hypotheses,
         parameters=parameter_estimates(closed, effect),
         metric="mae_datum_free",
@@ -284,10 +296,13 @@ def _process_candidate(closed: Closed, name: str, added: set[str], sets: dict[st
     gain = predicted_gain_nm(closed, screened) if screened else None
     verdict: CandidateVerdict
     if entry is not None:
-        verdict = "confusable" if entry.confusable_with else "explained"
         better, count = entry.confirmation.improved
         reason = f"confirmed on {better} of {count} held-out scans"
         gain = entry.confirmation.gain_nm
+        verdict = "confusable" if entry.confusable_with else "explained"
+        if _is_doubtful(closed, entry.effect):
+            verdict = "traced-to-covariate"
+            reason += "; but what it leaves still follows the layout, so it is near the cause, not the cause"
     elif name in search.absorbed:
         verdict, reason = "absorbed", search.absorbed[name]
     elif name in sets:

@@ -21,6 +21,7 @@ BINS = 8
 STENCIL_PX = (-6, -3, 0, 3, 6)
 STRUCTURED_P = 0.05
 STRUCTURED_SHARE = 0.01
+LINEAR_RESPONSE = "layout displaced by up to 0.6 µm"
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,6 @@ def _stencil(
     fields: Sequence[Field], residuals: Sequence[np.ndarray], predictions: Sequence[np.ndarray]
 ) -> CovariateTest:
     """Linear response to the layout at a grid of displacements: a kernel that the model lacks."""
-    name = "layout displaced by up to 0.6 µm"
     offsets = [(dy, dx) for dy in STENCIL_PX for dx in STENCIL_PX]
     grams = []
     for field, residual, prediction in zip(fields, residuals, predictions, strict=True):
@@ -126,7 +126,7 @@ def _stencil(
         kernel = np.linalg.solve(normal - own[:-1, :-1], pooled[:-1, -1] - own[:-1, -1])
         gain += 2 * kernel @ own[:-1, -1] - kernel @ own[:-1, :-1] @ kernel
     share = max(0.0, float(gain / max(pooled[-1, -1], 1e-300))) if len(fields) > 1 else 0.0
-    return CovariateTest(name, np.empty(0), np.empty(0), np.empty(0), p, share)
+    return CovariateTest(LINEAR_RESPONSE, np.empty(0), np.empty(0), np.empty(0), p, share)
 
 
 def _joint_p(sums: np.ndarray) -> float:

@@ -16,6 +16,7 @@ from litho_models.loop.probes.probe import Estimate, Probe
 from litho_models.loop.probes.trend import OrderTrend, order_trends
 from litho_models.loop.scoring import Score, Terms, score
 from litho_models.loop.state import State
+from litho_models.nuisance import nuisance_basis
 
 CONTROLS = 199
 CONTROL_QUANTILE = 0.95
@@ -167,8 +168,14 @@ def _best(
 def _corrected(
     probe: Probe, parameters: np.ndarray, anchor: np.ndarray, field: Field, prediction: np.ndarray
 ) -> np.ndarray:
-    offset_um, gain = np.float32(anchor[0]), np.float32(anchor[1])
-    return prediction + probe.correction(parameters, field, prediction) + offset_um + gain * prediction
+    shared = np.tensordot(anchor, _shared_maps(prediction), axes=1).astype(np.float32)
+    return prediction + probe.correction(parameters, field, prediction) + shared
+
+
+def _shared_maps(prediction: np.ndarray) -> np.ndarray:
+    """1, the prediction, and plane and bow over the scan: (7, y, x)."""
+    offset, _, *bow = nuisance_basis(prediction, "full")
+    return np.stack([offset, prediction, *bow])
 
 
 def _anchor(
@@ -178,17 +185,18 @@ def _anchor(
     predictions: Sequence[np.ndarray],
     training: np.ndarray,
 ) -> np.ndarray:
-    """Offset and gain common to the training scans once the correction is made.
+    """Offset, gain, plane and bow common to the training scans once the correction is made.
 
-    A probe is estimated free of every scan's own datum and gain, so it says nothing about those that
-    all scans share; without this it would move the absolute height at random.
+    A probe is estimated free of what every scan may have of these, so it says nothing about what all
+    scans share of them; without this it would move the absolute height at random.
     """
-    normal, right = np.zeros((2, 2)), np.zeros(2)
+    count = len(_shared_maps(predictions[0]))
+    normal, right = np.zeros((count, count)), np.zeros(count)
     for i in np.flatnonzero(training).tolist():
         field, prediction = fields[i], predictions[i]
-        here = field.at_sample(prediction)
-        left = field.height - here - field.at_sample(probe.correction(parameters, field, prediction))
-        columns = np.stack([np.ones_like(here), here])
-        normal += columns @ columns.T / len(here)
-        right += columns @ left / len(here)
+        correction = field.at_sample(probe.correction(parameters, field, prediction))
+        left = field.height - field.at_sample(prediction) - correction
+        columns = np.stack([field.at_sample(shared) for shared in _shared_maps(prediction)])
+        normal += columns @ columns.T / len(left)
+        right += columns @ left / len(left)
     return np.linalg.lstsq(normal, right, rcond=1e-10)[0]
