@@ -42,10 +42,10 @@ class Effort:
 QUICK = Effort(
     models="identity,affine,blur-table,physics,pbl",
     training_steps=60,
-    folds=3,
+    folds=2,
     element_px=256,
     distance_um=75,
-    iterations=60,
+    iterations=50,
     seeds=1,
 )
 MEASURED = Effort(
