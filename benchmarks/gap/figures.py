@@ -71,8 +71,11 @@ def _judged(
     names = list(gap.arms)
     judged = {}
     for arm in names:
-        other = [name for name in names if name not in (arm, "none")][-1]
-        name, source = judge or (other, gap.arms[other].source)
+        if judge is None:
+            other = [name for name in names if name not in (arm, "none")][-1]
+            name, source = other, gap.arms[other].source
+        else:
+            name, source = judge
         printer = load_printer(source, gap.settings.layout, name=name)
         judged[arm] = (Judging(design_folder(folder, arm, gap.seeds[0])), printer)
     return judged
