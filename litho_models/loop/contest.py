@@ -121,8 +121,6 @@ def hold_contest(
     entrants = _fitted(state, shortlist, holder, found.screened, fields, fold_of, report)
     changes = {e.name: _changes(state, e.state, fields) for e in entrants}
     for attempt, entrant in enumerate(entrants[:TRIES_PER_ROUND]):
-        own = terms_for(terms, [entrant.screened])
-        before, after = (score(fields, s.predictions, own, seed) for s in (state, entrant.state))
         alike = [
             rival
             for rival in entrants
@@ -136,6 +134,8 @@ def hold_contest(
         if agreeing < folds - 1:
             found.failures[entrant.name] = f"the best in only {agreeing} of {folds} training sets"
             continue
+        own = terms_for(terms, [entrant.screened])
+        before, after = (score(fields, s.predictions, own, seed) for s in (state, entrant.state))
         confirmation = confirm(
             before.mse_nm2,
             after.mse_nm2,

@@ -151,15 +151,19 @@ def _is_doubtful(closed: Closed, effect: Effect) -> bool:
     return effect.linear and left is not None and left.share >= _DOUBTFUL_SHARE
 
 
+def _verdict_on(closed: Closed, entry: Added) -> EffectVerdict:
+    if _is_doubtful(closed, entry.effect):
+        return "traced-to-covariate"
+    return "confusable" if entry.confusable_with else "explained"
+
+
 def _added_process(closed: Closed, entry: Added) -> AddedEffect:
-    effect = entry.effect
-    verdict: EffectVerdict = "confusable" if entry.confusable_with else "explained"
-    doubtful = _is_doubtful(closed, effect)
+    effect, verdict = entry.effect, _verdict_on(closed, entry)
     return AddedEffect(
         name=effect.name,
         stage=effect.stage,
-        role="undetermined" if doubtful else effect.role,
-        verdict="traced-to-covariate" if doubtful else verdict,
+        role="undetermined" if verdict == "traced-to-covariate" else effect.role,
+        verdict=verdict,
         prior_hypothesis=effect.name in closed.config.prior_hypotheses,
         parameters=parameter_estimates(closed, effect),
         metric="mae_datum_free",
@@ -299,9 +303,8 @@ def _process_candidate(closed: Closed, name: str, added: set[str], sets: dict[st
         better, count = entry.confirmation.improved
         reason = f"confirmed on {better} of {count} held-out scans"
         gain = entry.confirmation.gain_nm
-        verdict = "confusable" if entry.confusable_with else "explained"
-        if _is_doubtful(closed, entry.effect):
-            verdict = "traced-to-covariate"
+        verdict = _verdict_on(closed, entry)
+        if verdict == "traced-to-covariate":
             reason += "; but what it leaves still follows the layout, so it is near the cause, not the cause"
     elif name in search.absorbed:
         verdict, reason = "absorbed", search.absorbed[name]
