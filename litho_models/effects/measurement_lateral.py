@@ -1,4 +1,4 @@
-"""Measurement: tip, feedback and lateral scanner; and the registration."""
+"""Measurement: feedback and lateral scanner; and the registration."""
 
 from __future__ import annotations
 
@@ -6,15 +6,9 @@ import torch
 from torch import Tensor
 
 from litho_models.effects.effect import Effect, FieldContext, Parameter, Values
-from litho_models.effects.filters import add_blur, add_warp, gradient
+from litho_models.effects.filters import add_blur, add_warp
 
 _BLUR_REACH_UM = 4.0
-
-
-def tip_dilation(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H + R |grad H|² / 2: dilation by a paraboloid u² / 2R, first order in R (Hopf-Lax)."""
-    along_y, along_x = gradient(height, context.pitch_um)
-    return height + values["radius_um"] / 2 * (along_y**2 + along_x**2)
 
 
 def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -64,18 +58,6 @@ def resampling_blur(height: Tensor, values: Values, context: FieldContext) -> Te
 
 
 EFFECTS = (
-    Effect(
-        name="tip-dilation",
-        title="tip of finite radius widening tops",
-        stage="measurement",
-        role="measurement",
-        acts_on="height",
-        parameters={"radius_um": Parameter("µm", 0.0, 0.5, 0.05)},
-        apply=tip_dilation,
-        trials=({"radius_um": 0.05},),
-        source="dilation by a paraboloid, expanded for radii small against the curvature of the print",
-        separating="scan again with a new tip; scan a tip characteriser",
-    ),
     Effect(
         name="feedback-lag",
         title="probe lagging behind the surface along the fast axis",

@@ -13,6 +13,7 @@ from litho_models.effects import (
     exposure_spot,
     measurement_height,
     measurement_lateral,
+    measurement_tip,
     resist,
 )
 from litho_models.effects.effect import Effect
@@ -60,6 +61,7 @@ _FAMILIES = (
     development,
     measurement_height,
     measurement_lateral,
+    measurement_tip,
 )
 
 # Named in the catalogue, but a residual map on the layout's grid cannot carry their signature.

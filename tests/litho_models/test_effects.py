@@ -231,8 +231,21 @@ def test_slope_thinning_and_tip_dilation_on_a_ramp() -> None:
     dilated = get_effect("tip-dilation")(ramp, {"radius_um": 0.2}, context)
     inner = (..., slice(1, -1), slice(1, -1))
     assert torch.allclose((thinned - ramp)[inner], torch.tensor(-0.2 * 0.25, dtype=torch.float64))
-    # A paraboloid of radius R on a plane of slope s rests R s² / 2 higher.
-    assert torch.allclose((dilated - ramp)[inner], torch.tensor(0.2 * 0.25 / 2, dtype=torch.float64))
+    # A paraboloid of radius R on a plane of slope s rests R s² / 2 higher; it touches R s = 1 px away.
+    touched = (..., slice(None), slice(3, -3))
+    assert torch.allclose((dilated - ramp)[touched], torch.tensor(0.2 * 0.25 / 2, dtype=torch.float64))
+
+
+def test_a_tip_on_a_hump_rests_as_the_closed_form_says() -> None:
+    # max over u of a (1 - (x - u)² / w²) - u² / 2R is a parabola again: its curvature 1/q becomes 1/(q + R),
+    # q = w² / 2a. Straight pieces of half a pixel lie below a parabola by (dx/2)² / 8q at most.
+    x = (torch.arange(61, dtype=torch.float64) - 30) * PITCH_UM
+    q, radius = 2.0, 0.7
+    hump = (-(x**2) / (2 * q)).expand(1, 1, 9, 61)
+    dilated = get_effect("tip-dilation")(hump, {"radius_um": radius}, FieldContext(hump, PITCH_UM, 1.2))
+    inner = slice(12, -12)
+    expected = -(x**2) / (2 * (q + radius))
+    assert float((dilated[0, 0, 4] - expected)[inner].abs().max()) <= (PITCH_UM / 2) ** 2 / (8 * q) + 1e-12
 
 
 def test_trench_residue_fills_narrow_pits_only() -> None:
