@@ -36,6 +36,7 @@ CONTENDER_SHARE = 0.5
 MOST_CONTENDERS, MOST_RELATIVES = 4, 3
 # A member of a confusable set that loses this part of the gain in nearly every scan is told apart.
 TOLD_APART_SHARE = 0.25
+_FREE_WITHOUT = {"no-gain": "gain", "no-bow": "bow"}
 # The score test predicts the gain of a full fit within a factor of two or so.
 WORTH_FITTING = 0.3
 
@@ -130,6 +131,9 @@ def hold_contest(
         untold += [
             s.effect.name for s in relatives if abs(cosine(directions, entrant.screened, s)) >= SAME_COSINE
         ]
+        if entrant.screened.projection == "no-bow":
+            # The same tilt and bow in all scans: what was printed so, or measured so.
+            untold.append("tilt-bow")
         agreeing, folds = _agreement(entrants[attempt:], {entrant.name, *untold})
         if agreeing < folds - 1:
             found.failures[entrant.name] = f"the best in only {agreeing} of {folds} training sets"
@@ -178,8 +182,7 @@ def terms_for(terms: Terms, screened: Sequence[Screened]) -> Terms:
     the scans' own gain or lines.
     """
     free = terms | {"warp"}
-    if any(s.projection == "no-gain" for s in screened):
-        free -= {"gain"}
+    free -= {_FREE_WITHOUT[s.projection] for s in screened if s.projection in _FREE_WITHOUT}
     return free - LINE_TERMS if any(s.effect.along_lines for s in screened) else free
 
 

@@ -15,17 +15,22 @@ _SMALLEST_EIGENVALUE = 1e-10
 _WEAKEST_INFLUENCE = 1e-8
 
 
-def nuisance_columns(field: Field, prediction: np.ndarray, *, gain: bool, warp: bool = True) -> np.ndarray:
+def nuisance_columns(
+    field: Field, prediction: np.ndarray, *, gain: bool, bow: bool = True, warp: bool = True
+) -> np.ndarray:
     """Per-scan terms at the sampled pixels: (n, k) of 1, x, y, x², xy, y², prediction, warp.
 
     Args:
         field: the scan.
         prediction: predicted height map (y, x), µm.
         gain: include the prediction itself.
+        bow: include x, y, x², xy, y².
         warp: include dH/dy and dH/dx, alone and times y and x: the registration's affine error.
     """
     y, x = field.position
-    columns = [np.ones_like(y), x, y, x * x, x * y, y * y]
+    columns = [np.ones_like(y)]
+    if bow:
+        columns += [x, y, x * x, x * y, y * y]
     if gain:
         columns.append(field.at_sample(prediction))
     if warp:

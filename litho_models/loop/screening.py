@@ -26,7 +26,13 @@ FAMILY_P = 0.05
 SAME_COSINE = 0.8
 # Of a direction's information, what must survive the projections for a test to mean anything.
 SMALLEST_RETAINED = 1e-5
-GAIN_LIKE = 0.05
+# An effect of which a term of single scans leaves less than this is tested without that term.
+SWALLOWED_SHARE = 0.05
+_PROJECTIONS: Mapping[str, Mapping[str, bool]] = {
+    "full": {"gain": True},
+    "no-gain": {"gain": False},
+    "no-bow": {"gain": True, "bow": False},
+}
 
 
 @dataclass(frozen=True)
@@ -54,7 +60,7 @@ class Directions:
 
     Attributes:
         blocks: trials by effect and shape; their columns count from 0.
-        grams: per projection (``full``, ``no-gain``, ``raw``) an array (scans, 1 + p + m, 1 + p + m):
+        grams: per projection, and ``raw`` without any, an array (scans, 1 + p + m, 1 + p + m):
             residual, parameters of the model, directions.
         parameters: p.
         pixels: (scans,) sampled pixels.
@@ -132,16 +138,15 @@ def measure_directions(
     blocks = blocks_of(effects)
     extended = [chain.with_effects(_with_trial(chain, b, t)) for b in blocks for t in b.trials]
     acts_on = [b.effect.acts_on for b in blocks for _ in b.trials]
-    stacked: dict[str, list[np.ndarray]] = {"full": [], "no-gain": [], "raw": []}
+    stacked: dict[str, list[np.ndarray]] = {name: [] for name in ("raw", *_PROJECTIONS)}
     for field, part, residual in zip(fields, linear, residuals, strict=True):
         prediction, secants = _secants(chain, extended, acts_on, field)
         columns = np.column_stack([residual, part.jacobian, *secants])
         raw = columns.T @ columns
-        without_gain = nuisance_columns(field, prediction, gain=False)
-        with_gain = np.column_stack([without_gain, field.at_sample(prediction)])
         stacked["raw"].append(raw)
-        stacked["no-gain"].append(raw - gram_inside(columns, orthonormal(without_gain)))
-        stacked["full"].append(raw - gram_inside(columns, orthonormal(with_gain)))
+        for name, terms in _PROJECTIONS.items():
+            basis = orthonormal(nuisance_columns(field, prediction, **terms))
+            stacked[name].append(raw - gram_inside(columns, basis))
     return Directions(
         blocks=blocks,
         grams={name: np.stack(grams) for name, grams in stacked.items()},
@@ -158,7 +163,7 @@ def screen(directions: Directions, fold_of: np.ndarray) -> list[Screened]:
         fold_of: (scans,) fold that holds each scan out.
     """
     everything = np.arange(len(fold_of))
-    free = {name: _freed(directions, name, everything) for name in ("full", "no-gain")}
+    free = {name: _freed(directions, name, everything) for name in _PROJECTIONS}
     projection = _projection_of_columns(directions, free)
     scores = np.stack([_scores(free[projection[c]], 1 + c) for c in range(len(projection))], axis=1)
     z, null_max = sign_flip_statistics(scores)
@@ -175,7 +180,7 @@ def best_by_fold(directions: Directions, screened: Sequence[Screened], fold_of: 
     winners = []
     for fold in range(int(fold_of.max()) + 1):
         training = np.flatnonzero(fold_of != fold)
-        freed = {name: _freed(directions, name, training) for name in ("full", "no-gain")}
+        freed = {name: _freed(directions, name, training) for name in _PROJECTIONS}
         gains = {}
         for entry in screened:
             own = [b for b in directions.blocks if b.effect.name == entry.effect.name]
@@ -187,7 +192,7 @@ def best_by_fold(directions: Directions, screened: Sequence[Screened], fold_of: 
 
 def cosine(directions: Directions, a: Screened, b: Screened) -> float:
     """Alignment of two effects' best signatures after the projections, pooled over scans."""
-    name = "no-gain" if "no-gain" in (a.projection, b.projection) else "full"
+    name = next((s.projection for s in (a, b) if s.projection != "full"), "full")
     freed = _freed(directions, name, np.arange(len(directions.pixels)))
     pooled = freed[:, 1:, 1:].sum(axis=0)
     inner = a.signature @ pooled @ b.signature
@@ -350,15 +355,14 @@ def _raw_information(directions: Directions) -> np.ndarray:
 
 
 def _projection_of_columns(directions: Directions, free: Mapping[str, np.ndarray]) -> list[str]:
-    """``full``, or ``no-gain`` for effects that the gain of a scan would swallow; one per effect."""
+    """``full``, or without the per-scan term that would swallow the effect; one per effect."""
     chosen = [""] * sum(len(b.columns) for b in directions.blocks)
     for name in {b.effect.name for b in directions.blocks}:
         own = [c for b in directions.blocks if b.effect.name == name for c in b.columns]
-        with_gain, without = (
-            sum(float(free[kind][:, 1 + c, 1 + c].sum()) for c in own) for kind in ("full", "no-gain")
-        )
+        left = {kind: sum(float(free[kind][:, 1 + c, 1 + c].sum()) for c in own) for kind in _PROJECTIONS}
+        most = max(left, key=lambda kind: left[kind])
         for c in own:
-            chosen[c] = "no-gain" if with_gain < GAIN_LIKE * without else "full"
+            chosen[c] = most if left["full"] < SWALLOWED_SHARE * left[most] else "full"
     return chosen
 
 
