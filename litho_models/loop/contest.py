@@ -31,6 +31,8 @@ from litho_models.loop.screening import (
 from litho_models.loop.state import State, fit_state, held_out_residuals
 
 TRIES_PER_ROUND = 3
+# Where none of the most promising is confirmed, the next ones are fitted.
+HEATS = 3
 # Promising this part of the best predicted gain is enough to be fitted.
 CONTENDER_SHARE = 0.5
 MOST_CONTENDERS, MOST_RELATIVES = 4, 3
@@ -116,47 +118,63 @@ def hold_contest(
     for s in eligible:
         if s.mean_gain_nm2 < worth:
             found.failures[s.effect.name] = "predicted gain on held-out scans too small to matter"
-    shortlist, relatives = _shortlist(
-        found.screened, [s for s in eligible if s.mean_gain_nm2 >= worth], directions
-    )
-    entrants = _fitted(state, shortlist, holder, found.screened, fields, fold_of, report)
-    changes = {e.name: _changes(state, e.state, fields) for e in entrants}
-    for attempt, entrant in enumerate(entrants[:TRIES_PER_ROUND]):
-        alike = [
-            rival
-            for rival in entrants
-            if rival is not entrant and _cosine(changes[entrant.name], changes[rival.name]) >= SAME_COSINE
-        ]
-        untold = [r.name for r in alike if not _told_apart(state, entrant, r, fields, terms, seed)]
-        untold += [
-            s.effect.name for s in relatives if abs(cosine(directions, entrant.screened, s)) >= SAME_COSINE
-        ]
-        if entrant.screened.projection == "no-bow":
-            # The same tilt and bow in all scans: what was printed so, or measured so.
-            untold.append("tilt-bow")
-        agreeing, folds = _agreement(entrants[attempt:], {entrant.name, *untold})
-        if agreeing < folds - 1:
-            found.failures[entrant.name] = f"the best in only {agreeing} of {folds} training sets"
-            continue
-        own = terms_for(terms, [entrant.screened])
-        before, after = (score(fields, s.predictions, own, seed) for s in (state, entrant.state))
-        confirmation = confirm(
-            before.mse_nm2,
-            after.mse_nm2,
-            before.mae_nm,
-            after.mae_nm,
-            floor_nm2=floor_nm2,
-            amplitudes=fold_amplitudes(entrant.state.fits, entrant.screened.effect),
-            seed=seed,
+    promising = [s for s in eligible if s.mean_gain_nm2 >= worth]
+    entrants, rejected = [], set()
+    if holder is not None:
+        entrants.append(Entrant(next(s for s in found.screened if s.effect.name == holder[0]), holder[1]))
+    for _ in range(HEATS):
+        entered = {e.name for e in entrants}
+        shortlist, relatives = _shortlist(
+            [s for s in found.screened if s.effect.name not in entered],
+            [s for s in promising if s.effect.name not in entered],
+            directions,
         )
-        if confirmation.passed:
-            added = Added(
-                entrant.screened.effect, sorted(untold), before, after, confirmation, entrant.screened.p
+        entrants += _fitted(state, shortlist, fields, fold_of, report)
+        standing = sorted(
+            (e for e in entrants if e.name not in rejected), key=lambda e: float(e.training_error.sum())
+        )
+        changes = {e.name: _changes(state, e.state, fields) for e in standing}
+        for attempt, entrant in enumerate(standing[:TRIES_PER_ROUND]):
+            alike = [
+                rival
+                for rival in standing
+                if rival is not entrant and _cosine(changes[entrant.name], changes[rival.name]) >= SAME_COSINE
+            ]
+            untold = [r.name for r in alike if not _told_apart(state, entrant, r, fields, terms, seed)]
+            untold += [
+                s.effect.name
+                for s in relatives
+                if abs(cosine(directions, entrant.screened, s)) >= SAME_COSINE
+            ]
+            if entrant.screened.projection == "no-bow":
+                # The same tilt and bow in all scans: what was printed so, or measured so.
+                untold.append("tilt-bow")
+            agreeing, folds = _agreement(standing[attempt:], {entrant.name, *untold})
+            if agreeing < folds - 1:
+                found.failures[entrant.name] = f"the best in only {agreeing} of {folds} training sets"
+                continue
+            own = terms_for(terms, [entrant.screened])
+            before, after = (score(fields, s.predictions, own, seed) for s in (state, entrant.state))
+            confirmation = confirm(
+                before.mse_nm2,
+                after.mse_nm2,
+                before.mae_nm,
+                after.mae_nm,
+                floor_nm2=floor_nm2,
+                amplitudes=fold_amplitudes(entrant.state.fits, entrant.screened.effect),
+                seed=seed,
             )
-            found.winner = added, entrant.state
-            found.failures.pop(entrant.name, None)
+            if confirmation.passed:
+                added = Added(
+                    entrant.screened.effect, sorted(untold), before, after, confirmation, entrant.screened.p
+                )
+                found.winner = added, entrant.state
+                found.failures.pop(entrant.name, None)
+                return found
+            found.failures[entrant.name] = confirmation.reason
+            rejected.add(entrant.name)
+        if not shortlist:
             break
-        found.failures[entrant.name] = confirmation.reason
     return found
 
 
@@ -217,24 +235,16 @@ def _shortlist(
 def _fitted(
     state: State,
     shortlist: Sequence[Screened],
-    holder: tuple[str, State] | None,
-    screened: Sequence[Screened],
     fields: Sequence[Field],
     fold_of: np.ndarray,
     report: Callable[[str], None],
 ) -> list[Entrant]:
-    """All entrants, the smallest error on the training sets first."""
-    entrants = []
-    if holder is not None:
-        entrants.append(Entrant(next(s for s in screened if s.effect.name == holder[0]), holder[1]))
-    chain = state.fits.chain
+    entrants, chain = [], state.fits.chain
     for s in shortlist:
-        if holder is not None and s.effect.name == holder[0]:
-            continue
         report(f"fitting {s.effect.name}")
         extended = chain.with_effects({**chain.values(), s.effect.name: s.values})
         entrants.append(Entrant(s, fit_state(extended, fields, fold_of)))
-    return sorted(entrants, key=lambda e: float(e.training_error.sum()))
+    return entrants
 
 
 def _agreement(entrants: Sequence[Entrant], names: set[str]) -> tuple[int, int]:
