@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MAPS = 3
+# Probes that are tables, and what they run along.
+_TABLES = {"level-table": "printed level", "slope-table": "steepness of the print (µm/µm)"}
 _BEFORE, _AFTER = "#9aa5b1", "#0b6aa2"
 
 
@@ -101,7 +103,7 @@ def probe_figure(entry: AddedProbe) -> Figure:
         kernel = probe.kernel_map(common) / probe.pitch_um**2
         shown = _half_um(probe.size, probe.pitch_um)
         return _image(kernel, shown, "height per layout height and µm²", min(5.5, shown[0]))
-    if probe.name == "level-table":
+    if probe.name in _TABLES:
         return _table_figure(entry)
     unit = "relative height" if probe.name == "position-gain-map" else "nm"
     scale = 1.0 if unit == "relative height" else NM_PER_UM
@@ -110,15 +112,15 @@ def probe_figure(entry: AddedProbe) -> Figure:
 
 def _table_figure(entry: AddedProbe) -> Figure:
     values = figures(entry.probe, entry.estimate)
-    levels = [int(name.removeprefix("level_")) for name in values]
+    places = [float(name.rpartition("_")[2]) for name in values]
     heights = np.array([value for value, _, _ in values.values()])
     intervals = np.array([interval for _, _, interval in values.values()])
     figure = new_figure(6, 3)
     axes = figure.subplots()
     axes.axhline(0, color="k", lw=0.6)
     errors = np.abs(intervals.T - heights)
-    axes.errorbar(levels, heights, errors, fmt="o-", color=_AFTER, ms=4, capsize=2)
-    axes.set_xlabel("printed level")
+    axes.errorbar(places, heights, errors, fmt="o-", color=_AFTER, ms=4, capsize=2)
+    axes.set_xlabel(_TABLES[entry.probe.name])
     axes.set_ylabel("missing height (nm)")
     axes.spines[["top", "right"]].set_visible(False)
     return figure

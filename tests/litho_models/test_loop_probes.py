@@ -99,6 +99,24 @@ def test_a_wrong_level_comes_back_at_its_level() -> None:
 
 
 @pytest.mark.slow
+def test_what_grows_with_the_slope_comes_back_as_a_table_over_the_slope() -> None:
+    """A bead of 20 nm per unit slope, on edges of any direction: no effect of the catalogue."""
+    fields, predictions = scene()
+    steepness = {
+        f.id: np.hypot(*np.gradient(p.astype(float), f.scan.pitch_um))
+        for f, p in zip(fields, predictions, strict=True)
+    }
+    found = probed(*scene(lambda f: 0.02 * steepness[f.id]))
+    entry = found.added[0]
+    assert entry.probe.name == "slope-table"
+    values = figures(entry.probe, entry.estimate)
+    slopes = np.array([float(name.removeprefix("slope_")) for name in values])
+    heights = np.array([value for value, _, _ in values.values()])
+    # Each scan's offset is free, so the table is known but for a constant; its rise is 20 nm.
+    assert np.polyfit(slopes, heights, 1)[0] == pytest.approx(20, rel=0.1)
+
+
+@pytest.mark.slow
 def test_a_map_that_all_scans_share_is_found_and_drawn() -> None:
     def ripple(field: Field) -> np.ndarray:
         y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in field.scan.shape), indexing="ij")

@@ -1,4 +1,4 @@
-"""Linear probes along the printed level and along the place in the field."""
+"""Linear probes along the printed level, the steepness and the place in the field."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from litho_models.metrics import NM_PER_UM
 # The level that reaches a pixel is spread by the printer's spot.
 SPOT_UM = 0.2
 SPLINES = 5
+SLOPE_KNOTS = 8
 _FEWEST_SCANS, _SMALLEST_SHARE = 5, 0.01
 _FLIPS: tuple[Callable[[np.ndarray], np.ndarray], ...] = tuple(
     partial(lambda grid, turns, mirror: np.rot90(grid.T if mirror else grid, turns), turns=t, mirror=m)
@@ -59,6 +60,34 @@ def estimated_levels(fields: Sequence[Field]) -> list[int]:
     shares = counts.sum(axis=0) / counts.sum()
     enough = (counts > 0).sum(axis=0) >= min(_FEWEST_SCANS, len(fields))
     return [int(level) for level in np.flatnonzero(enough & (shares >= _SMALLEST_SHARE))]
+
+
+def slope_table(
+    fields: Sequence[Field], predictions: Sequence[np.ndarray], kept: Sequence[np.ndarray]
+) -> LinearProbe:
+    """One height correction per steepness of the predicted print, linear in between.
+
+    The steepest knot is exceeded by 1 % of the pixels only, so that no knot rests on a few edges.
+    """
+    steepness = [
+        field.at_sample(_steepness(field, prediction))
+        for field, prediction in zip(fields, predictions, strict=True)
+    ]
+    steepest = float(np.quantile(np.concatenate(steepness), 0.99))
+    knots = np.linspace(0.0, max(steepest, np.finfo(float).tiny), SLOPE_KNOTS)
+    return linear_probe(
+        "slope-table",
+        partial(_slope_columns, knots=knots),
+        second_differences(SLOPE_KNOTS) + 1e-3 * np.eye(SLOPE_KNOTS),
+        lambda random, count: random.permutation(count),
+        lambda heights: {
+            f"slope_{knot:.2f}": (float(height) * NM_PER_UM, "nm")
+            for knot, height in zip(knots, heights, strict=True)
+        },
+        fields,
+        predictions,
+        kept,
+    )
 
 
 def position_map(
@@ -106,6 +135,18 @@ def _level_columns(field: Field, prediction: np.ndarray, levels: Sequence[int]) 
     return np.stack(
         [gaussian_filter((level == one).astype(np.float64), sigma, mode="nearest") for one in levels]
     )
+
+
+def _steepness(field: Field, prediction: np.ndarray) -> np.ndarray:
+    """|grad H| (y, x), µm/µm."""
+    along_y, along_x = np.gradient(prediction.astype(np.float64), field.scan.pitch_um)
+    return np.hypot(along_y, along_x)
+
+
+def _slope_columns(field: Field, prediction: np.ndarray, knots: np.ndarray) -> np.ndarray:
+    """Tents (knots, y, x): 1 at a knot, 0 at its neighbours, constant beyond the ends."""
+    place = np.interp(_steepness(field, prediction), knots, np.arange(len(knots)))
+    return np.maximum(0.0, 1.0 - np.abs(place - np.arange(len(knots))[:, None, None]))
 
 
 def _map_columns(field: Field, prediction: np.ndarray, times_height: bool) -> np.ndarray:

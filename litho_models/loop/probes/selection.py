@@ -9,7 +9,7 @@ import numpy as np
 
 from litho_models.loop.confirming import SMALLEST_SHARE, Confirmation, confirm
 from litho_models.loop.fields import Field
-from litho_models.loop.probes.covariates import level_table, position_map
+from litho_models.loop.probes.covariates import level_table, position_map, slope_table
 from litho_models.loop.probes.defects import Defects, find_defects
 from litho_models.loop.probes.kernel import missing_kernel
 from litho_models.loop.probes.probe import Estimate, Probe
@@ -106,7 +106,7 @@ def _probes(fields: Sequence[Field], predictions: Sequence[np.ndarray], defects:
     table = level_table(fields, predictions, kept)
     maps = [position_map(fields, predictions, kept, times_height=times) for times in (False, True)]
     kernel = missing_kernel(fields, predictions, defects.masks)
-    return [*([table] if table else []), *maps, kernel]
+    return [*([table] if table else []), slope_table(fields, predictions, kept), *maps, kernel]
 
 
 def _best(
