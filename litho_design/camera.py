@@ -69,6 +69,8 @@ def photographed_image(
         raise InputError("photograph", got="the design of a lens", wanted="the design of a hologram")
     if not pitch_um > 0:
         raise InputError("camera pitch", got=f"{pitch_um} µm", wanted="a positive number")
+    if not Path(photo_file).is_file():
+        raise InputError("photograph", got=f"{photo_file}, which is no file", wanted="an image file")
     raw = cv2.imread(str(photo_file), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     if raw is None:
         raise InputError("photograph", got=str(photo_file), wanted="an image file")

@@ -137,6 +137,8 @@ def load_printers(
     printers: dict[str, Printer] = {}
     for spec in specs:
         name, _, source = spec.strip().partition("=")
+        if not name:
+            raise InputError("models", got=f"{spec!r}", wanted="none, MODEL or NAME=MODEL")
         printer = load_printer(
             source or name, layout, name=name if source else "", device=device, extrapolate=extrapolate
         )

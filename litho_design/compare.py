@@ -17,6 +17,7 @@ from litho_design.design import Design, DesignTask
 from litho_design.judging import Judging
 from litho_design.printer import Printer, PrinterRecord
 from litho_design.report_gap import write_gap_report
+from litho_design.result_folder import require_own_folder
 from litho_design.settings import HoeSettings, LensSettings
 
 HEADLINE = {
@@ -111,10 +112,12 @@ def compare(
         The record written to ``out/gap.json``.
 
     Raises:
-        InputError: no arm or no seed, or a judge with the name of an arm.
+        InputError: no arm or no seed, a judge with the name of an arm, or an ``out`` that holds another
+            kind of result.
     """
     _check(arms, judges, seeds)
     folder = Path(out)
+    require_own_folder(folder, GapResult.FILE_NAME)
     everyone = {**arms, **judges}
     entries: list[GapEntry] = []
     for (arm, printer), seed in itertools.product(arms.items(), seeds):

@@ -15,17 +15,16 @@ from litho_design.design import HEIGHT_FILE, IMAGE_FILE, TARGET_FILE, Design, De
 from litho_design.ensemble import penalised
 from litho_design.hologram import HologramBench, image_error
 from litho_design.initialise import gerchberg_saxton, printed_phase
-from litho_design.metrics import HologramScore, si_psnr_db
+from litho_design.metrics import SSIM_WINDOW_PX, HologramScore, si_psnr_db
 from litho_design.parametrise import CellMap, LayoutSettings, Parametrisation, nearest_levels
 from litho_design.printer import Printer
 from litho_design.report_design import write_hologram_report
-from litho_design.robust import Draw, check_draws, draws, windowed_loss
+from litho_design.robust import YIELD_DRAWS, Draw, check_draws, draws, windowed_loss
 from litho_design.settings import HoeSettings
 from litho_design.targets import TargetRecord
 from litho_design.task import run_design
 
 _REFERENCE_ITERATIONS = 40
-_WINDOW_DRAWS = 16
 
 
 def design_hoe(
@@ -52,7 +51,8 @@ def design_hoe(
         The record written to ``out/design.json``.
 
     Raises:
-        InputError: a target of another size, or a folder that holds another design.
+        InputError: a target of another size or without dark and bright pixels, or a folder that holds
+            another design.
     """
     _check_target(target, settings.layout)
     task = HoeTask(settings, printer, target, target_record, ensemble)
@@ -80,8 +80,7 @@ class HoeTask:
         self.notes = [f"target {record.adaptation}"] if record.adaptation else []
         self.cells = CellMap(settings.layout).to(device)
         self.bench = HologramBench(settings.layout, settings.optics).to(device)
-        count = max(_WINDOW_DRAWS, settings.window.samples)
-        check_draws(settings.window, settings.optics, count, self.bench.grid, self.bench.grid)
+        check_draws(settings.window, settings.optics, self.bench.grid, self.bench.grid)
         self.target = torch.from_numpy(target).to(device)
         self.scenes: list[tuple[Draw | None, HologramBench]] = [
             (draw, HologramBench(settings.layout, draw.optics).to(device))
@@ -104,9 +103,9 @@ class HoeTask:
 
     @torch.no_grad()
     def window_scores(self, height_um: Tensor, count: int) -> list[dict[str, float]]:
-        """Loss, SI-PSNR and signal efficiency of a print (size, size) over ``count`` draws of the window."""
+        """Loss, SI-PSNR and signal efficiency of a print (size, size) over ``count`` unseen draws."""
         scores = []
-        for draw in draws(self.settings.window, self.settings.optics, count):
+        for draw in draws(self.settings.window, self.settings.optics, count, unseen=True):
             bench = HologramBench(self.settings.layout, draw.optics).to(height_um.device)
             changed = draw.apply(height_um, self.settings.layout.pitch_um)
             share = bench(changed)
@@ -170,12 +169,24 @@ class HoeTask:
     def report(self, folder: Path, design: Design, history: list[dict[str, float]]) -> None:
         """Write report.html."""
         height = torch.from_numpy(np.load(folder / HEIGHT_FILE)).to(self.target.device)
-        write_hologram_report(folder, design, history, self.window_scores(height, _WINDOW_DRAWS))
+        write_hologram_report(folder, design, history, self.window_scores(height, YIELD_DRAWS))
 
 
 def _check_target(target: np.ndarray, layout: LayoutSettings) -> None:
+    if layout.size_px < SSIM_WINDOW_PX:
+        raise InputError(
+            "size_px of a hologram", got=layout.size_px, wanted=f"at least {SSIM_WINDOW_PX}, the window of SSIM"
+        )
     wanted = (layout.size_px, layout.size_px)
     if target.shape != wanted:
         raise InputError("target", got=f"{target.shape} px", wanted=f"{wanted} px, the size of the element")
     if not np.isfinite(target).all() or target.min() < 0 or target.max() > 1 or target.max() == 0:
         raise InputError("target", got="values outside [0, 1] or no light", wanted="an image in [0, 1]")
+    # The scores compare the signal {T > 0.5} with what is around it.
+    share = float((target > 0.5).mean())
+    if share in (0.0, 1.0):
+        raise InputError(
+            "target",
+            got=f"{100 * share:.0f} % of its pixels above half brightness",
+            wanted="a bright image on a dark background",
+        )

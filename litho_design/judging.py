@@ -13,7 +13,7 @@ from litho_design.design import HEIGHT_FILE, LEVELS_FILE, TARGET_FILE, Design, r
 from litho_design.hologram import HologramBench
 from litho_design.lens import score_lens
 from litho_design.lens_bench import LensBench
-from litho_design.printer import Printer
+from litho_design.printer import Printer, check_device
 from litho_design.settings import HoeSettings, LensSettings
 
 
@@ -25,10 +25,11 @@ class Judging:
         device: where prints and waves are computed.
 
     Raises:
-        InputError: an incomplete or altered folder.
+        InputError: an incomplete or altered folder, or a device that this machine does not have.
     """
 
     def __init__(self, folder: str | Path, *, device: str | torch.device = "cpu"):
+        check_device(device)
         self.design = Design.read(folder)
         self.device = torch.device(device)
         self.level = self._load(folder, LEVELS_FILE)

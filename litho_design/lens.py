@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -27,14 +28,13 @@ from litho_design.optics import Optics
 from litho_design.parametrise import CellMap, Parametrisation, nearest_levels
 from litho_design.printer import Printer
 from litho_design.report_lens import write_lens_report
-from litho_design.robust import Draw, check_draws, draws, windowed_loss
+from litho_design.robust import YIELD_DRAWS, Draw, check_draws, draws, windowed_loss
 from litho_design.settings import LensSettings
 from litho_design.targets import TargetRecord
 from litho_design.task import run_design
 
 # The same noise in every iteration: the search compares layouts, not noise; the score draws its own.
 _DESIGN_NOISE_SEED = 0
-_WINDOW_DRAWS = 16
 _PLANE_NOTE = "searched on the whole plane, not along a radius: the printer's effects depend on the position"
 
 
@@ -75,11 +75,11 @@ class LensTask:
         device = printer.device
         self.cells = CellMap(settings.layout).to(device)
         self.bench = LensBench(settings.layout, settings.optics, settings.view).to(device)
-        count = max(_WINDOW_DRAWS, settings.window.samples)
-        check_draws(settings.window, settings.optics, count, self.bench.grid, self.bench.window)
+        check_draws(settings.window, settings.optics, self.bench.grid, self.bench.window)
         rings, placed = settings.view.path == "radial", any(p.depends_on_position for p in self.printers)
         self.radial = rings and not placed
         self.notes = [_PLANE_NOTE] if rings and placed else []
+        self.notes += _narrow_window(self.bench)
         self.strips = (
             [_strip_rings(self.cells, p.strip_halo_px) for p in self.printers] if self.radial else []
         )
@@ -150,15 +150,15 @@ class LensTask:
     def report(self, folder: Path, design: Design, history: list[dict[str, float]]) -> None:
         """Write report.html."""
         height = torch.from_numpy(np.load(folder / HEIGHT_FILE)).to(self.printer.device)
-        write_lens_report(folder, design, history, self.bench, self.window_scores(height, _WINDOW_DRAWS))
+        write_lens_report(folder, design, history, self.bench, self.window_scores(height, YIELD_DRAWS))
 
     @torch.no_grad()
     def window_scores(self, height_um: Tensor, count: int) -> list[dict[str, float]]:
-        """Strehl ratio and centre-to-background ratio of a print over draws of the window."""
+        """Strehl ratio and centre-to-background ratio of a print over ``count`` unseen draws of the window."""
         settings, scores = self.settings, []
         peak = float(self.bench(self.bench.ideal_height_um()).max())
         centre_px = round(settings.view.centre_um / settings.layout.pitch_um)
-        for draw in draws(settings.window, settings.optics, count):
+        for draw in draws(settings.window, settings.optics, count, unseen=True):
             bench = LensBench(settings.layout, draw.optics, settings.view).to(height_um.device)
             psf = bench(draw.apply(height_um, settings.layout.pitch_um))
             cbr = centre_to_background(psf, centre_px, settings.layout.size_px)
@@ -178,6 +178,20 @@ class LensTask:
         press = self.printers[printer]
         strip = rings[self.strips[printer]][None, None]
         return press.print_patch(strip, press.strip_halo_px)[0, 0].mean(0)
+
+
+def _narrow_window(bench: LensBench) -> list[str]:
+    """What a PSF window narrower than the focusing circle does to the focusing efficiency."""
+    # Airy disc: full width at half maximum 0.514 wavelength / NA; the circle's radius is three of them.
+    radius_um = 3 * 0.514 * bench.optics.wavelength_um / bench.numerical_aperture
+    window_um, pitch_um = bench.window.size_um[0], bench.layout.pitch_um
+    if window_um >= 2 * radius_um:
+        return []
+    return [
+        f"the PSF window of {window_um:.1f} µm cuts the focusing circle (radius {radius_um:.1f} µm): light "
+        f"beyond it is missing from the focusing efficiency; --window-px {math.ceil(2 * radius_um / pitch_um)} "
+        "holds the circle"
+    ]
 
 
 def _strip_rings(cells: CellMap, halo_px: int) -> Tensor:

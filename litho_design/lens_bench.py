@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
-from pydantic import Field, PositiveFloat
+from pydantic import Field, PositiveFloat, model_validator
 from torch import Tensor, nn
 
 from litho_data.results import Record
@@ -22,7 +22,7 @@ from litho_design.optics import (
 from litho_design.optics.deconvolve import richardson_lucy
 from litho_design.optics.imaging import Blur, bin_pixels
 from litho_design.parametrise import LayoutSettings
-from litho_design.targets import draw_target
+from litho_design.targets import DrawnTarget, draw_target
 
 
 class LensView(Record):
@@ -52,6 +52,18 @@ class ImagingSettings(Record):
     object_px: int = Field(default=128, ge=32)
     read_noise: float = Field(default=0.01, ge=0)
     iterations: int = Field(default=50, ge=1)
+
+    @model_validator(mode="after")
+    def _held_out(self) -> ImagingSettings:
+        unknown = sorted({*self.objects, *self.test_objects} - set(get_args(DrawnTarget)))
+        if unknown:
+            raise ValueError(f"object {unknown[0]!r} is none of {', '.join(get_args(DrawnTarget))}")
+        seen = sorted(set(self.objects) & set(self.test_objects))
+        if seen:
+            raise ValueError(f"object {seen[0]!r} is in the design and in the test")
+        if not self.objects or len(self.test_objects) < 2:
+            raise ValueError("one object for the design and two for the test are the least")
+        return self
 
 
 class LensBench(nn.Module):

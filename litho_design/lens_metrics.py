@@ -90,7 +90,9 @@ def half_maximum_width_um(psf: Tensor, pitch_um: float) -> float:
     spectrum = torch.fft.fftshift(torch.fft.fft2(psf))
     pad = (fine - 1) * psf.shape[-1] // 2
     image = torch.fft.ifft2(torch.fft.ifftshift(torch.nn.functional.pad(spectrum, (pad,) * 4))).real
-    area = float((image > image.max() / 2).sum()) * (pitch_um / fine) ** 2
+    # An odd side cannot be padded to exactly four times its length.
+    sample_um = pitch_um * psf.shape[-1] / image.shape[-1]
+    area = float((image > image.max() / 2).sum()) * sample_um**2
     return 2 * math.sqrt(area / math.pi)
 
 

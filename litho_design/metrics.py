@@ -12,7 +12,7 @@ from litho_data.grid import PixelGrid
 from litho_data.results import Record
 from litho_design.optics import Optics
 
-_SSIM_WINDOW = 11
+SSIM_WINDOW_PX = 11
 
 
 class CameraView(Record):
@@ -76,7 +76,7 @@ def hologram_score(
         ssim_camera=_camera_ssim(field, wanted, grid, optics, camera),
         speckle_contrast=float(lit.std(correction=0) / lit.mean()),
         uniformity=1 - (high - low) / (high + low),
-        background_ratio=float(lit.mean() / dark.mean()) if dark.numel() else math.nan,
+        background_ratio=float(lit.mean() / dark.mean()),
     )
 
 
@@ -105,12 +105,12 @@ def ssim(image: Tensor, target: Tensor) -> float:
         image[None, None].double(),
         target[None, None].double(),
         sigma=1.5,
-        kernel_size=_SSIM_WINDOW,
+        kernel_size=SSIM_WINDOW_PX,
         data_range=1.0,
         return_full_image=True,
     )
     # The library's mean includes windows that reach into its own reflected padding; the definition does not.
-    edge = _SSIM_WINDOW // 2
+    edge = SSIM_WINDOW_PX // 2
     return float(full[..., edge:-edge, edge:-edge].mean())
 
 
@@ -124,7 +124,7 @@ def _camera_ssim(field: Tensor, target: Tensor, grid: PixelGrid, optics: Optics,
     import cv2
 
     seen = through_aperture(field, grid, optics.wavelength_um, camera.numerical_aperture).abs().square()
-    pixels = tuple(max(11, round(size / camera.pitch_um)) for size in reversed(grid.size_um))
+    pixels = tuple(max(SSIM_WINDOW_PX, round(size / camera.pitch_um)) for size in reversed(grid.size_um))
 
     def sample(image: Tensor) -> Tensor:
         return torch.from_numpy(

@@ -6,6 +6,7 @@ import hashlib
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, Literal, cast
 
 import torch
@@ -18,6 +19,7 @@ from litho_design.fab_judge import FabSimulator, is_fab, load_fab
 from litho_design.parametrise import LayoutSettings
 
 _GUARD_UM = 6.4
+_ZOO_PREFIX = "zoo:"
 
 Precision = Literal["float32", "mixed", "bfloat16"]
 
@@ -232,7 +234,7 @@ def load_printer(
     device: str | torch.device = "cpu",
     extrapolate: bool = False,
 ) -> Printer:
-    """The printer for ``source``: a folder of a frozen model, or ``none`` for nominal heights.
+    """The printer for ``source``: a folder of a frozen model, ``zoo:NAME``, or ``none`` for nominal heights.
 
     The folder ``truth`` of a virtual fab is a printer that can only judge. ``name`` is what results
     call it; the model's own name by default.
@@ -241,16 +243,28 @@ def load_printer(
         InputError: no frozen model there, another pitch, levels the model was not calibrated for, or a
             device that this machine does not have.
     """
-    _check_device(device)
+    check_device(device)
     if source == "none":
         return Printer(None, layout, source=source, name=name).to(device)
     if is_fab(source):
         return Printer(load_fab(source, layout), layout, source=source, name=name).to(device)
-    from litho_models import load_frozen
-
-    simulator = load_frozen(source, device=device, extrapolate=extrapolate)
+    simulator = _load_simulator(source, device, extrapolate)
     _check_calibration(simulator.card, layout, extrapolate)
     return Printer(simulator, layout, source=str(source), name=name, extrapolate=extrapolate).to(device)
+
+
+def _load_simulator(source: str, device: str | torch.device, extrapolate: bool) -> Any:
+    from litho_models import load_frozen, zoo
+
+    if source.startswith(_ZOO_PREFIX):
+        return zoo.load(source.removeprefix(_ZOO_PREFIX), device, extrapolate)
+    if not Path(source).is_dir():
+        hint = f"{_ZOO_PREFIX}{source} comes with the package" if source in zoo.list() else ""
+        raise InputError(
+            "model", got=f"{source!r}, which is no folder",
+            wanted=f"the folder of a frozen model, {_ZOO_PREFIX}NAME, or none", hint=hint,
+        )  # fmt: skip
+    return load_frozen(source, device=device, extrapolate=extrapolate)
 
 
 def _check_calibration(card: Mapping[str, Any], layout: LayoutSettings, extrapolate: bool) -> None:
@@ -273,7 +287,12 @@ def _check_calibration(card: Mapping[str, Any], layout: LayoutSettings, extrapol
         )
 
 
-def _check_device(device: str | torch.device) -> None:
+def check_device(device: str | torch.device) -> None:
+    """Refuse a device that this machine does not have.
+
+    Raises:
+        InputError: no such device.
+    """
     try:
         wanted = torch.device(device)
         there = wanted.type != "cuda" or (wanted.index or 0) < torch.cuda.device_count()

@@ -54,15 +54,18 @@ def write_hologram_report(
             (f"{design.stroke.stroke_waves:.2f} waves", "stroke that the print reaches"),
         ]
     )
-    page.note(
-        "These figures are the design model's own opinion of its design. Judge the layout with another "
-        "model (litho-design score, litho-design compare) before printing it."
-    )
+    add_notes(page, design)
     page.heading("Layout, print and image")
     page.figure(
         _pictures(design, levels, height_um, image, target), "Rows are y (down), columns x; lengths in µm."
     )
     page.table(score_table(score), "Scores of the argmax layout", "scores.csv", digits=4)
+    if design.reference_efficiency:
+        page.paragraph(
+            f"A Gerchberg-Saxton element with the same cells and any phase puts "
+            f"{100 * design.reference_efficiency:.1f} % on the signal: the print reaches "
+            f"{score.eff_signal / design.reference_efficiency:.2f} of that."
+        )
     page.heading("Search")
     page.figure(
         progress_figure(history, design), "Loss of the sampled layout and of the printable (argmax) layout."
@@ -143,6 +146,16 @@ def progress_figure(history: list[dict[str, float]], design: Design):
     axis.set_ylabel("loss")
     axis.legend()
     return figure
+
+
+def add_notes(page: Page, design: Design) -> None:
+    """What a reader of any design must know first: whose figures these are, and what was adapted."""
+    page.note(
+        "These figures are the design model's own opinion of its design. Judge the layout with another "
+        "model (litho-design score, litho-design compare) before printing it."
+    )
+    for note in design.notes:
+        page.note(note[0].upper() + note[1:] + ".")
 
 
 def add_gauge(page: Page, design: Design) -> None:

@@ -12,7 +12,7 @@ from litho_data.report import Page, new_figure
 from litho_design.design import HEIGHT_FILE, IMAGE_FILE, LEVELS_FILE, Design
 from litho_design.lens_metrics import mtf
 from litho_design.process_window import focus_window
-from litho_design.report_design import add_gauge, progress_figure, stroke_advice, stroke_frame
+from litho_design.report_design import add_gauge, add_notes, progress_figure, stroke_advice, stroke_frame
 from litho_design.report_window import add_focus_window, add_yield
 from litho_design.robust import ProcessWindow
 
@@ -70,10 +70,7 @@ def write_lens_report(
             (f"{figures['cbr']:.0f}", f"centre to background (ceiling {figures['cbr_ceiling']:.0f})"),
         ]
     )
-    page.note(
-        "These figures are the design model's own opinion of its design. Judge the layout with another "
-        "model (litho-design score, litho-design compare) before printing it."
-    )
+    add_notes(page, design)
     page.heading("Layout, print and focus")
     page.figure(
         _pictures(design, levels, height, psf), "Layout, predicted print, and PSF (decibels below its peak)."
@@ -82,6 +79,11 @@ def write_lens_report(
         _curves(design, height, psf, ideal, bench), "Print along the central row, PSF profile, and MTF."
     )
     page.table(lens_table(figures), "Scores of the argmax layout", "scores.csv", digits=4)
+    if design.reference_efficiency:
+        page.paragraph(
+            f"A perfect lens of this aperture puts {100 * design.reference_efficiency:.1f} % within the same "
+            f"radius: the print reaches {figures['focusing_efficiency'] / design.reference_efficiency:.2f} of it."
+        )
     page.heading("Search")
     page.figure(
         progress_figure(history, design), "Loss of the sampled layout and of the printable (argmax) layout."

@@ -9,6 +9,8 @@ import numpy as np
 
 from litho_data.report import Page
 from litho_design.figures import image_grid
+from litho_design.report_design import SCORE_LABELS
+from litho_design.report_lens import LENS_LABELS
 
 if TYPE_CHECKING:
     from litho_design.score import ScoreResult
@@ -28,12 +30,20 @@ def write_score_report(
         page.note(
             "No judge is independent of the design: these figures repeat the design model's own opinion."
         )
-    rows = [{"printed by": f"{result.designed_with.name} (design)", "independent": "no", **result.designed}]
-    rows += [
-        {"printed by": score.judge.name, "independent": "yes" if score.independent else "no", **score.figures}
+    columns = {f"{result.designed_with.name} (design)": result.designed}
+    columns |= {
+        score.judge.name + ("" if score.independent else " (not independent)"): score.figures
         for score in result.scores
-    ]
-    page.table(pd.DataFrame(rows), "Figures by judge", "scores.csv", digits=3)
+    }
+    table = pd.DataFrame(
+        [
+            {"figure": name, **{judge: figures.get(name, np.nan) for judge, figures in columns.items()}}
+            for name in result.designed
+        ]
+    )
+    labels = SCORE_LABELS if result.task == "hoe" else LENS_LABELS
+    table["meaning"] = [labels[name] for name in result.designed]
+    page.table(table, "Figures by judge", "scores.csv", digits=3)
     page.figure(
         image_grid([list(pictures.values())], [list(pictures)], [""], side_um),
         "Behind each print: the image at matched scale, or the square root of the PSF.",

@@ -18,6 +18,8 @@ from litho_data.results import Record
 from litho_design.optics import Optics, sampling_limit_um
 
 _NARROWEST_BLUR_PX = 0.2
+_UNSEEN_STREAM = 1
+YIELD_DRAWS = 16
 
 
 class ProcessWindow(Record):
@@ -66,10 +68,14 @@ class Draw:
         return _blur(changed, sigma_px) if changed.dim() == 2 else _blur_rings(changed, sigma_px)
 
 
-def draws(window: ProcessWindow, optics: Optics, count: int) -> list[Draw]:
-    """``count`` draws from ``window.seed``; the first ``k`` of a longer list are those of a shorter one."""
+def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = False) -> list[Draw]:
+    """``count`` draws from ``window.seed``; the first ``k`` of a longer list are those of a shorter one.
+
+    ``unseen`` draws come from a stream of their own: a yield must hold for prints that no search saw.
+    """
     shared = window.gain_offset_correlation
-    normal = np.random.default_rng(window.seed).standard_normal((count, 5)).tolist()
+    seed = [window.seed, _UNSEEN_STREAM] if unseen else window.seed
+    normal = np.random.default_rng(seed).standard_normal((count, 5)).tolist()
     return [
         Draw(
             gain=1 + window.gain_sd * gain,
@@ -86,16 +92,23 @@ def draws(window: ProcessWindow, optics: Optics, count: int) -> list[Draw]:
     ]
 
 
-def check_draws(
-    window: ProcessWindow, optics: Optics, count: int, source: PixelGrid, target: PixelGrid
-) -> None:
-    """Refuse a defocus spread that carries one of ``count`` draws too close to the element.
+def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target: PixelGrid) -> None:
+    """Refuse spreads that carry a draw of the search or of the yield out of what can be propagated.
 
     Raises:
-        InputError: a draw below the sampling limit of the propagator between ``source`` and ``target``.
+        InputError: a draw below the sampling limit of the propagator between ``source`` and ``target``,
+            or without a positive wavelength.
     """
-    drawn = draws(window, optics, count)
+    drawn = draws(window, optics, window.samples) + draws(window, optics, YIELD_DRAWS, unseen=True)
     nearest_um = min(draw.optics.distance_um for draw in drawn)
+    shortest_um = min(draw.optics.wavelength_um for draw in drawn)
+    if shortest_um <= 0:
+        raise InputError(
+            f"wavelength {optics.wavelength_um:g} µm with a spread of {window.wavelength_sd_um:g} µm",
+            got=f"{shortest_um:.4g} µm in a draw of the process window",
+            wanted="a positive wavelength",
+            hint="lower --wavelength-sd-um",
+        )
     limit_um = max(sampling_limit_um(source, target, draw.optics.wavelength_um) for draw in drawn)
     if nearest_um < limit_um:
         raise InputError(

@@ -21,6 +21,7 @@ from litho_design.optics import Optics
 from litho_design.parametrise import LayoutSettings
 from litho_design.printer import Printer, PrinterRecord
 from litho_design.report_score import write_score_report
+from litho_design.result_folder import require_own_folder
 
 
 @dataclass(frozen=True)
@@ -93,8 +94,10 @@ def score_design(
         camera: a photograph of the printed hologram's image.
 
     Raises:
-        InputError: an incomplete or altered design folder, or a measurement that does not belong to it.
+        InputError: an incomplete or altered design folder, a measurement that does not belong to it, or
+            an ``out`` that holds another kind of result.
     """
+    require_own_folder(out, ScoreResult.FILE_NAME)
     judging = Judging(folder, device=device)
     design = judging.design
     scores, pictures = [], {"in design": judging.image(judging.expected_um)}

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from litho_data.errors import InputError
+from litho_data.files import writable
 from litho_data.results import Record, software_versions
 from litho_design.budget import Budget, measure_budget, peak_memory_gib
 from litho_design.design import (
@@ -42,6 +43,7 @@ from litho_design.optimise import (
 from litho_design.parametrise import LayoutSettings, Parametrisation
 from litho_design.polish import polish_levels
 from litho_design.printer import Printer
+from litho_design.result_folder import require_own_folder
 from litho_design.targets import TargetRecord
 
 
@@ -121,17 +123,19 @@ def run_design(
         announce: print the expected time and memory to stderr before starting.
 
     Raises:
-        InputError: ``out`` holds another design, or a printer that only judges.
+        InputError: ``out`` holds another design or result, or a printer that only judges.
     """
     _check_printers(task.printers)
     folder = Path(out)
+    require_own_folder(folder, Design.FILE_NAME)
     hashes_before = [printer.weights_sha256() for printer in task.printers]
     parts: list[Record | str] = [settings_record, *hashes_before, task.name]
     fingerprint = record_sha256(*parts, *([task.target_record] if task.target_record else []))
     finished = _finished(folder, fingerprint)
     if finished is not None:
         return finished
-    folder.mkdir(parents=True, exist_ok=True)
+    with writable(folder):
+        folder.mkdir(parents=True, exist_ok=True)
     heights = task.printer.level_heights_um()
     with ExitStack() as precisions:
         for printer in task.printers:

@@ -32,32 +32,42 @@ def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
     On a straight piece of slope s the tip touches at the distance R s from its axis, or at the end of
     the piece that is nearest to it.
     """
-    step_um = pitch_um / 2
-    fine = _with_middles(height)
-    slopes = fine.diff(dim=-1) / step_um
-    steepest = float(slopes.detach().abs().max())
-    reach = min(math.ceil(float(radius_um.detach()) * steepest / step_um) + 1, fine.shape[-1])
-    fine = functional.pad(fine, (reach, reach, 0, 0), mode="replicate")
-    slopes = functional.pad(slopes, (reach, reach))
-    last = 2 * (height.shape[-1] - 1)
+    half_um, size = pitch_um / 2, height.shape[-1]
+    middles = _middles(height)
+    # Pieces to the right of each pixel, then of each middle.
+    slopes = (middles - height) / half_um, (_next(height) - middles) / half_um
+    steepest = max(float(s.detach().abs().max()) for s in slopes)
+    reach_px = min(math.ceil(float(radius_um.detach()) * steepest / pitch_um) + 1, size)
+    pieces = [
+        (_continued(start, reach_px, "replicate"), _continued(slope, reach_px, "constant"))
+        for start, slope in zip((height, middles), slopes, strict=True)
+    ]
     highest = height
-    for offset in range(-reach, reach):
-        piece = slice(reach + offset, reach + offset + last + 1, 2)
-        near_um, far_um = offset * step_um, (offset + 1) * step_um
-        slope = slopes[..., piece]
-        touch_um = (radius_um * slope).clamp(near_um, far_um)
-        tip = fine[..., piece] + slope * (touch_um - near_um) - touch_um**2 / (2 * radius_um)
+    for offset in range(-2 * reach_px, 2 * reach_px):
+        away_px, middle = divmod(offset, 2)
+        start, slope = (part[..., reach_px + away_px :][..., :size] for part in pieces[middle])
+        near_um = offset * half_um
+        touch_um = (radius_um * slope).clamp(near_um, near_um + half_um)
+        tip = start + slope * (touch_um - near_um) - touch_um**2 / (2 * radius_um)
         highest = torch.maximum(highest, tip)
     return highest
 
 
-def _with_middles(rows: Tensor) -> Tensor:
-    """(..., x) -> (..., 2x - 1): the values and, between them, the cubic through their neighbours."""
+def _middles(rows: Tensor) -> Tensor:
+    """Values (..., x) half a pixel to the right of each: the cubic through four neighbours."""
     size = rows.shape[-1]
-    padded = torch.cat([rows[..., :1], rows, rows[..., -1:]], dim=-1)
-    shifted = [padded[..., start : start + size - 1] for start in range(len(_MIDDLE))]
+    padded = torch.cat([rows[..., :1], rows, rows[..., -1:], rows[..., -1:]], dim=-1)
+    shifted = [padded[..., start : start + size] for start in range(len(_MIDDLE))]
     middles = torch.tensordot(rows.new_tensor(_MIDDLE), torch.stack(shifted), dims=1)
-    return torch.cat([torch.stack([rows[..., :-1], middles], dim=-1).flatten(-2), rows[..., -1:]], dim=-1)
+    return torch.cat([middles[..., :-1], rows[..., -1:]], dim=-1)
+
+
+def _next(rows: Tensor) -> Tensor:
+    return torch.cat([rows[..., 1:], rows[..., -1:]], dim=-1)
+
+
+def _continued(rows: Tensor, by_px: int, mode: str) -> Tensor:
+    return functional.pad(rows, (by_px, by_px, 0, 0), mode=mode)
 
 
 EFFECTS = (
