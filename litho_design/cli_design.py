@@ -11,12 +11,14 @@ import typer
 from litho_design.cli_options import (
     TARGET_HELP,
     BlurSdUm,
+    CellUm,
     DefocusSdUm,
     Device,
     Ensemble,
     EnsembleWeight,
     Extrapolate,
     GainSd,
+    IndexStep,
     Iterations,
     LearningRate,
     LevelHeight,
@@ -35,6 +37,7 @@ from litho_design.cli_options import (
     Start,
     Variant,
     WavelengthSdUm,
+    WavelengthUm,
     WindowPx,
     command_line,
     headline,
@@ -46,7 +49,9 @@ from litho_design.cli_options import (
 if TYPE_CHECKING:
     from litho_design.design import Design
 
-Model = Annotated[str, typer.Option(help="Folder of a frozen model, or `none` for nominal heights.")]
+Model = Annotated[
+    str, typer.Option(help="Folder of a frozen model, zoo:NAME, or `none` for nominal heights.")
+]
 
 
 def hoe(
@@ -56,6 +61,9 @@ def hoe(
     variant: Variant = "default",
     size_px: SizePx = None,
     distance_um: Annotated[float | None, typer.Option(help="Distance to the image plane, µm.")] = None,
+    wavelength_um: WavelengthUm = None,
+    index_step: IndexStep = None,
+    cell_um: CellUm = None,
     levels: Levels = None,
     level_height_um: LevelHeight = None,
     iterations: Iterations = None,
@@ -84,7 +92,8 @@ def hoe(
     from litho_design.targets import make_target
 
     settings = hoe_settings(
-        variant, size_px=size_px, distance_um=distance_um, levels=levels, level_height_um=level_height_um,
+        variant, size_px=size_px, distance_um=distance_um, wavelength_um=wavelength_um,
+        index_step=index_step, cell_um=cell_um, levels=levels, level_height_um=level_height_um,
         iterations=iterations, start=start, parametrisation=parametrisation, learning_rate=learning_rate,
         precision=precision, samples=robust_samples, risk=risk, weight=risk_weight, tail=risk_tail,
         gain_sd=gain_sd, blur_sd_um=blur_sd_um, defocus_sd_um=defocus_sd_um,
@@ -109,6 +118,9 @@ def lens(
     variant: Variant = "default",
     size_px: SizePx = None,
     focal_length_um: Annotated[float | None, typer.Option(help="Focal length, µm.")] = None,
+    wavelength_um: WavelengthUm = None,
+    index_step: IndexStep = None,
+    cell_um: CellUm = None,
     levels: Levels = None,
     level_height_um: LevelHeight = None,
     window_px: WindowPx = None,
@@ -138,7 +150,8 @@ def lens(
     from litho_design.printer import load_printer
 
     settings = lens_settings(
-        variant, task, size_px=size_px, distance_um=focal_length_um, levels=levels,
+        variant, task, size_px=size_px, distance_um=focal_length_um, wavelength_um=wavelength_um,
+        index_step=index_step, cell_um=cell_um, levels=levels,
         level_height_um=level_height_um, window_px=window_px, object_px=object_px, iterations=iterations,
         start=start, parametrisation=parametrisation, learning_rate=learning_rate, precision=precision,
         samples=robust_samples, risk=risk, weight=risk_weight, tail=risk_tail, gain_sd=gain_sd,
@@ -152,6 +165,8 @@ def lens(
 
 
 def _tell(design: Design, out: Path) -> None:
+    from litho_design.report_design import stroke_advice
+
     gauge = design.out_of_distribution
     if gauge is not None and gauge.flagged:
         print(
@@ -159,4 +174,5 @@ def _tell(design: Design, out: Path) -> None:
             "pixels would have to change level to match them",
             file=sys.stderr,
         )
+    print(stroke_advice(design))
     print(f"{out / 'report.html'}: {headline(design.predicted)} (judged by its own model)")

@@ -33,6 +33,11 @@ Variant = Annotated[
 SizePx = Annotated[int | None, typer.Option(help="Side of the element in pixels of 0.1 µm.")]
 Levels = Annotated[int | None, typer.Option(help="Number of printable levels.")]
 LevelHeight = Annotated[float | None, typer.Option(help="Height of one level, µm.")]
+CellUm = Annotated[
+    float | None, typer.Option(help="Side of one free cell (hologram) or width of one ring (lens), µm.")
+]
+WavelengthUm = Annotated[float | None, typer.Option(help="Wavelength, µm.")]
+IndexStep = Annotated[float | None, typer.Option(help="Refractive index of the resist minus that around it.")]
 Iterations = Annotated[int | None, typer.Option(help="Iterations of the search.")]
 Start = Annotated[
     Literal["random", "gs", "wgs", "fresnel"] | None,
@@ -93,8 +98,8 @@ def lens_settings(variant: Any, task: Any, **options: Any) -> LensSettings:
 
 # Which part of the settings an option belongs to; options of the search are the rest.
 _PART = {
-    **dict.fromkeys(("size_px", "levels", "level_height_um"), "layout"),
-    "distance_um": "optics",
+    **dict.fromkeys(("size_px", "cell_um", "levels", "level_height_um"), "layout"),
+    **dict.fromkeys(("distance_um", "wavelength_um", "index_step"), "optics"),
     "window_px": "view",
     "object_px": "imaging",
     "ensemble_weight": "ensemble",

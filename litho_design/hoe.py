@@ -175,7 +175,9 @@ class HoeTask:
 def _check_target(target: np.ndarray, layout: LayoutSettings) -> None:
     if layout.size_px < SSIM_WINDOW_PX:
         raise InputError(
-            "size_px of a hologram", got=layout.size_px, wanted=f"at least {SSIM_WINDOW_PX}, the window of SSIM"
+            "size_px of a hologram",
+            got=layout.size_px,
+            wanted=f"at least {SSIM_WINDOW_PX}, the window of SSIM",
         )
     wanted = (layout.size_px, layout.size_px)
     if target.shape != wanted:

@@ -154,7 +154,7 @@ class LensTask:
 
     @torch.no_grad()
     def window_scores(self, height_um: Tensor, count: int) -> list[dict[str, float]]:
-        """Strehl ratio and centre-to-background ratio of a print over ``count`` unseen draws of the window."""
+        """Strehl ratio and centre-to-background ratio of a print over ``count`` unseen draws."""
         settings, scores = self.settings, []
         peak = float(self.bench(self.bench.ideal_height_um()).max())
         centre_px = round(settings.view.centre_um / settings.layout.pitch_um)
@@ -184,13 +184,12 @@ def _narrow_window(bench: LensBench) -> list[str]:
     """What a PSF window narrower than the focusing circle does to the focusing efficiency."""
     # Airy disc: full width at half maximum 0.514 wavelength / NA; the circle's radius is three of them.
     radius_um = 3 * 0.514 * bench.optics.wavelength_um / bench.numerical_aperture
-    window_um, pitch_um = bench.window.size_um[0], bench.layout.pitch_um
+    window_um, enough_px = bench.window.size_um[0], math.ceil(2 * radius_um / bench.layout.pitch_um)
     if window_um >= 2 * radius_um:
         return []
     return [
         f"the PSF window of {window_um:.1f} µm cuts the focusing circle (radius {radius_um:.1f} µm): light "
-        f"beyond it is missing from the focusing efficiency; --window-px {math.ceil(2 * radius_um / pitch_um)} "
-        "holds the circle"
+        f"beyond it is missing from the focusing efficiency; --window-px {enough_px} holds the circle"
     ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -183,8 +184,8 @@ def _bars(result: GapResult, name: str):
         left.bar(place, [item.judged_mean for item in items], width, color=f"C{index}", label=arm, **error)
         left.plot(place, [item.designed_mean for item in items], "o", mfc="none", color="black", ms=4)
         right.bar(place, [item.gap_mean for item in items], width, color=f"C{index}")
-    left.set_ylabel(_LABELS[name])
-    right.set_ylabel(f"Δ {_LABELS[name]}")
+    left.set_ylabel(textwrap.fill(_LABELS[name], 32))
+    right.set_ylabel(textwrap.fill(f"Δ {_LABELS[name]}", 32))
     right.axhline(0, color="black", linewidth=0.8)
     for axis in (left, right):
         axis.set_xticks(range(len(judges)), judges, fontsize=8)

@@ -80,9 +80,10 @@ def write_lens_report(
     )
     page.table(lens_table(figures), "Scores of the argmax layout", "scores.csv", digits=4)
     if design.reference_efficiency:
+        reached = figures["focusing_efficiency"] / design.reference_efficiency
         page.paragraph(
             f"A perfect lens of this aperture puts {100 * design.reference_efficiency:.1f} % within the same "
-            f"radius: the print reaches {figures['focusing_efficiency'] / design.reference_efficiency:.2f} of it."
+            f"radius: the print reaches {reached:.2f} of that."
         )
     page.heading("Search")
     page.figure(

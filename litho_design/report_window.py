@@ -30,8 +30,8 @@ def add_yield(
     page.paragraph(
         f"{len(draws)} prints drawn from gain ±{100 * window.gain_sd:.1f} %, extra blur of scale "
         f"{window.blur_sd_um:g} µm, defocus ±{window.defocus_sd_um:g} µm and wavelength "
-        f"±{1000 * window.wavelength_sd_um:g} nm (standard deviations; the window was {designed}; these draws were "
-        "in no search): the share of them that is at least as good as the abscissa."
+        f"±{1000 * window.wavelength_sd_um:g} nm (standard deviations; the window was {designed}; these "
+        "draws were in no search): the share of them that is at least as good as the abscissa."
     )
     figure = new_figure(8, 3)
     axes = figure.subplots(1, len(figures), sharey=True)

@@ -1,4 +1,4 @@
-"""A stack of 3 x 3 convolutions on a CPU, in tiles whose features lie in the cache.
+"""A stack of 3 x 3 convolutions on a CPU, in tiles whose features lie in the cache of one core.
 
 Of each tile is kept what the gradient needs, in as few bytes as will do: where the weights are fixed
 the sign of each hidden value and nothing else (as the value in bfloat16: rounding keeps a sign),
@@ -8,14 +8,17 @@ where they learn the values themselves.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from itertools import pairwise
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import chain, pairwise
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
+
+_Made = TypeVar("_Made")
 
 # 64 channels of 96 x 96 pixels are 1.1 MiB in bfloat16; larger tiles leave the cache, smaller ones repeat
 # more halo.
@@ -63,15 +66,20 @@ class _Stack(torch.autograd.Function):
         kept_dtype = settings.adjoint_dtype if learns else torch.bfloat16
         halo = 2 * len(weights)
         out = field.new_empty((len(field), 1, field.shape[-2] - halo, field.shape[-1] - halo))
-        kept: list[Tensor] = []
-        for inside, around in _tiles(out, halo):
+        tiles = list(_tiles(out, halo))
+
+        def compute(tile: int) -> list[Tensor]:
+            inside, around = tiles[tile]
             features = _from_one_channel(field[around], weights[0], biases[0])
             features = functional.leaky_relu_(features, slope).to(dtype)
-            kept += [features.to(kept_dtype)] if keeps else []
+            values = [features.to(kept_dtype)] if keeps else []
             for weight, bias in zip(hidden, hidden_biases, strict=True):
                 features = functional.leaky_relu_(functional.conv2d(features, weight, bias), slope)
-                kept += [features.to(kept_dtype)] if keeps else []
+                values += [features.to(kept_dtype)] if keeps else []
             out[inside] = _onto_one_channel(features.to(field.dtype), weights[-1])
+            return values
+
+        kept = list(chain.from_iterable(_one_thread_each(compute, len(tiles))))
         out += biases[-1]
         ctx.settings, ctx.learns = settings, learns
         ctx.save_for_backward(field, *parameters, *kept)
@@ -91,33 +99,57 @@ class _Stack(torch.autograd.Function):
         last = weights[-1].flip(2, 3).transpose(0, 1)
         no_bias = last.new_zeros(len(last))
         halo, layers = 2 * len(weights), len(weights) - 1
-        total = torch.zeros_like(field)
-        sums = [torch.zeros_like(parameter) for parameter in parameters]
-        weight_sums, bias_sums = _halves(sums)
-        for index, (inside, around) in enumerate(_tiles(gradient, halo)):
-            values = [value.to(dtype) for value in kept[index * layers : (index + 1) * layers]]
+        tiles = list(_tiles(gradient, halo))
+
+        def compute(tile: int) -> tuple[Tensor | None, list[tuple[Tensor, Tensor]]]:
+            inside, around = tiles[tile]
+            values = [value.to(dtype) for value in kept[tile * layers : (tile + 1) * layers]]
             above = functional.pad(gradient[inside], (2, 2, 2, 2))
             slope = _from_one_channel(above, last, no_bias).to(dtype)
+            shares: list[tuple[Tensor, Tensor]] = []
             if learns:
                 by_weight, _ = _correlation(above, values[-1])
-                weight_sums[-1] += by_weight.transpose(0, 1).flip(2, 3)
+                shares.append((by_weight.transpose(0, 1).flip(2, 3), gradient[inside].sum()))
             for layer in range(layers - 1, 0, -1):
                 _through_relu_(slope, values[layer], settings.leaky_slope)
                 slope, by_weight, by_bias = _convolution_backward(
                     slope, values[layer - 1], hidden[layer - 1], learns
                 )
-                if learns:
-                    weight_sums[layer] += by_weight
-                    bias_sums[layer] += by_bias
+                shares += [(by_weight, by_bias)] if learns else []
             _through_relu_(slope, values[0], settings.leaky_slope)
+            shares += [_correlation(field[around], slope)] if learns else []
+            wanted = ctx.needs_input_grad[0]
+            return _adjoint_onto_one_channel(slope, weights[0]) if wanted else None, shares[::-1]
+
+        total = torch.zeros_like(field)
+        sums = [torch.zeros_like(parameter) for parameter in parameters]
+        for (_, around), (by_field, shares) in zip(tiles, _one_thread_each(compute, len(tiles)), strict=True):
+            if by_field is not None:
+                total[around] += by_field
             if learns:
-                by_weight, by_bias = _correlation(field[around], slope)
-                weight_sums[0] += by_weight
-                bias_sums[0] += by_bias
-            if ctx.needs_input_grad[0]:
-                _add_onto_one_channel(slope, weights[0], total[around])
-        bias_sums[-1] += gradient.sum()
+                for parameter_sum, share in zip(sums, chain(*zip(*shares, strict=True)), strict=True):
+                    parameter_sum += share
         return total, None, *(sums if learns else [None] * count)
+
+
+def _one_thread_each(compute: Callable[[int], _Made], count: int) -> Iterator[_Made]:
+    """``compute(0)``, ``compute(1)``, ... in order, side by side on the threads that PyTorch may use.
+
+    A tile stays with one thread: shared out operation by operation, its features would move from one
+    core's cache to another's, and all threads would wait for the slowest after each.
+    """
+    threads = torch.get_num_threads()
+    if not 1 < threads <= count:
+        yield from map(compute, range(count))
+        return
+    # It holds for this thread and for those made from here on.
+    torch.set_num_threads(1)
+    try:
+        with ThreadPoolExecutor(threads) as pool:
+            # A new thread records gradients, whatever this one does.
+            yield from pool.map(torch.no_grad()(compute), range(count))
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _halves(items: Sequence[Tensor]) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
@@ -174,12 +206,14 @@ def _onto_one_channel(features: Tensor, weight: Tensor) -> Tensor:
     return total
 
 
-def _add_onto_one_channel(slope: Tensor, weight: Tensor, total: Tensor) -> None:
-    """Add the adjoint of ``_from_one_channel`` to ``total``, in place."""
+def _adjoint_onto_one_channel(slope: Tensor, weight: Tensor) -> Tensor:
+    """Adjoint of ``_from_one_channel`` for (1, c, y, x): (y + 2, x + 2)."""
     ny, nx = slope.shape[-2:]
+    total = weight.new_zeros((ny + 2, nx + 2))
     for index, tap in enumerate(_taps(slope, weight.to(slope.dtype)).to(total.dtype)):
         y, x = divmod(index, 3)
-        total[..., y : y + ny, x : x + nx] += tap
+        total[y : y + ny, x : x + nx] += tap
+    return total
 
 
 def _taps(features: Tensor, weight: Tensor) -> Tensor:

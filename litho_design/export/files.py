@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from litho_data.errors import InputError
-from litho_data.files import atomic_folder
+from litho_data.files import writable
 from litho_data.outputs import require_replaceable_folder
 from litho_design.design import LEVELS_FILE, Design, read_array
 from litho_design.export.gds import GdsLayers, read_gds_levels, write_gds
@@ -36,7 +37,7 @@ def export_design(
     Args:
         folder: design folder.
         kind: png16, bmp, tiff, stl or gds.
-        out: folder of the export; replaced as a whole.
+        out: folder of the export; exports in other formats stay in it.
         pedestal_um: base under level 0 (part of the STL; told to the operator otherwise).
         slicing_um, hatching_um: recorded for the job.
 
@@ -56,8 +57,11 @@ def export_design(
     levels = read_array(folder, LEVELS_FILE)
     name = f"layout{_SUFFIX[kind]}"
     require_replaceable_folder(out, "layout*")
-    with atomic_folder(out) as temporary:
-        file = temporary / name
+    place = Path(out)
+    with writable(place):
+        place.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix="layout.", suffix=".partial", dir=place) as temporary:
+        file = Path(temporary) / name
         step = _write(file, kind, levels, design, pedestal_um, gds_layers)
         sidecar = make_sidecar(
             Path(folder), design, file, kind, pedestal_um=pedestal_um, slicing_um=slicing_um,
@@ -67,7 +71,10 @@ def export_design(
         back, _ = import_levels(file)
         if not np.array_equal(back, levels):
             raise AssertionError(f"{kind} export does not read back as it was written")
-    return Path(out) / name
+        # The sidecar last: without it, or with an older one, the file is refused.
+        for part in sorted(Path(temporary).iterdir(), key=lambda part: part.suffix == ".json"):
+            part.replace(place / part.name)
+    return place / name
 
 
 def import_levels(file: str | Path) -> tuple[np.ndarray, Sidecar]:

@@ -118,16 +118,15 @@ def hold_contest(
     for s in eligible:
         if s.mean_gain_nm2 < worth:
             found.failures[s.effect.name] = "predicted gain on held-out scans too small to matter"
-    promising = [s for s in eligible if s.mean_gain_nm2 >= worth]
+    remaining = [s for s in eligible if s.mean_gain_nm2 >= worth]
     entrants, rejected = [], set()
     if holder is not None:
         entrants.append(Entrant(next(s for s in found.screened if s.effect.name == holder[0]), holder[1]))
     for _ in range(HEATS):
         entered = {e.name for e in entrants}
-        shortlist, relatives = _shortlist(
-            [s for s in found.screened if s.effect.name not in entered],
-            [s for s in promising if s.effect.name not in entered],
-            directions,
+        shortlist, relatives = (
+            [s for s in group if s.effect.name not in entered]
+            for group in _shortlist(found.screened, remaining, directions)
         )
         entrants += _fitted(state, shortlist, fields, fold_of, report)
         standing = sorted(
@@ -141,39 +140,21 @@ def hold_contest(
                 if rival is not entrant and _cosine(changes[entrant.name], changes[rival.name]) >= SAME_COSINE
             ]
             untold = [r.name for r in alike if not _told_apart(state, entrant, r, fields, terms, seed)]
-            untold += [
-                s.effect.name
-                for s in relatives
-                if abs(cosine(directions, entrant.screened, s)) >= SAME_COSINE
-            ]
-            if entrant.screened.projection == "no-bow":
-                # The same tilt and bow in all scans: what was printed so, or measured so.
-                untold.append("tilt-bow")
+            untold += _untold_unfitted(entrant.screened, relatives, directions)
             agreeing, folds = _agreement(standing[attempt:], {entrant.name, *untold})
             if agreeing < folds - 1:
                 found.failures[entrant.name] = f"the best in only {agreeing} of {folds} training sets"
                 continue
-            own = terms_for(terms, [entrant.screened])
-            before, after = (score(fields, s.predictions, own, seed) for s in (state, entrant.state))
-            confirmation = confirm(
-                before.mse_nm2,
-                after.mse_nm2,
-                before.mae_nm,
-                after.mae_nm,
-                floor_nm2=floor_nm2,
-                amplitudes=fold_amplitudes(entrant.state.fits, entrant.screened.effect),
-                seed=seed,
-            )
-            if confirmation.passed:
-                added = Added(
-                    entrant.screened.effect, sorted(untold), before, after, confirmation, entrant.screened.p
-                )
+            added = _judged(state, entrant, untold, fields, terms, floor_nm2, seed)
+            if added.confirmation.passed:
                 found.winner = added, entrant.state
                 found.failures.pop(entrant.name, None)
                 return found
-            found.failures[entrant.name] = confirmation.reason
+            found.failures[entrant.name] = added.confirmation.reason
             rejected.add(entrant.name)
-        if not shortlist:
+        fitted = {e.name for e in entrants}
+        remaining = [s for s in remaining if s.effect.name not in fitted]
+        if not remaining:
             break
     return found
 
@@ -245,6 +226,37 @@ def _fitted(
         extended = chain.with_effects({**chain.values(), s.effect.name: s.values})
         entrants.append(Entrant(s, fit_state(extended, fields, fold_of)))
     return entrants
+
+
+def _untold_unfitted(winner: Screened, relatives: Sequence[Screened], directions: Directions) -> list[str]:
+    """What cannot be told from the winner without having been fitted itself."""
+    untold = [s.effect.name for s in relatives if abs(cosine(directions, winner, s)) >= SAME_COSINE]
+    # The same tilt and bow in all scans: printed so, or measured so.
+    return [*untold, "tilt-bow"] if winner.projection == "no-bow" else untold
+
+
+def _judged(
+    state: State,
+    entrant: Entrant,
+    untold: Sequence[str],
+    fields: Sequence[Field],
+    terms: Terms,
+    floor_nm2: float,
+    seed: int,
+) -> Added:
+    """The entrant as it would be added, with its confirmation on the scans left out."""
+    effect, own = entrant.screened.effect, terms_for(terms, [entrant.screened])
+    before, after = (score(fields, s.predictions, own, seed) for s in (state, entrant.state))
+    confirmation = confirm(
+        before.mse_nm2,
+        after.mse_nm2,
+        before.mae_nm,
+        after.mae_nm,
+        floor_nm2=floor_nm2,
+        amplitudes=fold_amplitudes(entrant.state.fits, effect),
+        seed=seed,
+    )
+    return Added(effect, sorted(untold), before, after, confirmation, entrant.screened.p)
 
 
 def _agreement(entrants: Sequence[Entrant], names: set[str]) -> tuple[int, int]:

@@ -201,6 +201,8 @@ def test_none_prints_nominal_heights_and_a_guard_ring_isolates_the_element(small
         (lambda t: t * 0, "no light"),
         (lambda t: t * 2, r"\[0, 1\]"),
         (lambda t: np.where(t > 0, np.nan, t), r"\[0, 1\]"),
+        (lambda t: t * 0 + 1, "100 % of its pixels"),
+        (lambda t: t * 0.4, "0 % of its pixels"),
     ],
 )
 def test_bad_targets_are_refused_before_anything_is_written(tmp_path, small_settings, target, spoil, message):
@@ -209,3 +211,31 @@ def test_bad_targets_are_refused_before_anything_is_written(tmp_path, small_sett
     with pytest.raises(InputError, match=message):
         design_hoe(small_settings, printer, spoil(image), record, tmp_path / "out", announce=False)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_hologram_smaller_than_the_window_of_its_score_is_refused(small_settings):
+    settings = small_settings.model_copy(update={"layout": LayoutSettings(size_px=8)})
+    with pytest.raises(InputError, match="at least 11"):
+        design_hoe(
+            settings, Printer(None, settings.layout, source="none"), *make_target("ring", 8), "nowhere"
+        )
+
+
+def test_a_place_that_holds_something_else_is_refused(tmp_path, small_settings, make_printer, target):
+    search = small_settings.search.model_copy(update={"iterations": 1, "polish_rounds": 0})
+    settings = small_settings.model_copy(update={"search": search})
+    printer = make_printer(settings.layout)
+    (tmp_path / "file").write_text("mine")
+    with pytest.raises(InputError, match="which is a file"):
+        design_hoe(settings, printer, *target, tmp_path / "file", announce=False)
+    design_hoe(settings, printer, *target, tmp_path / "design", announce=False)
+    report = (tmp_path / "design" / "report.html").read_bytes()
+    # Both write a report.html: the score would replace that of the design.
+    with pytest.raises(InputError, match=r"which holds design\.json"):
+        score_design(tmp_path / "design", [printer], tmp_path / "design")
+    assert (tmp_path / "design" / "report.html").read_bytes() == report
+    score_design(tmp_path / "design", [printer], tmp_path / "design" / "score")
+    with pytest.raises(InputError, match=r"which holds score\.json"):
+        design_hoe(settings, printer, *target, tmp_path / "design" / "score", announce=False)
+    with pytest.raises(InputError, match="device"):
+        score_design(tmp_path / "design", [], tmp_path / "other", device="cuda:99")

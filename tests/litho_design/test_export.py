@@ -74,6 +74,16 @@ def test_job_settings_that_no_printer_has_are_refused(tmp_path, design, job):
         export_design(design, "png16", tmp_path / "out", **job)
 
 
+def test_exports_in_other_formats_stay(tmp_path, design):
+    first = export_design(design, "png16", tmp_path / "out")
+    second = export_design(design, "stl", tmp_path / "out")
+    again = export_design(design, "png16", tmp_path / "out")
+    levels = np.load(design / "layout_level.npy")
+    assert all(np.array_equal(import_levels(file)[0], levels) for file in (first, second, again))
+    names = sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert names == ["layout.png", "layout.png.json", "layout.stl", "layout.stl.json"]
+
+
 def test_grey_is_linear_in_height(tmp_path, design):
     file = export_design(design, "bmp", tmp_path / "bmp")
     grey = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)

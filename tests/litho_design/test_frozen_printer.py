@@ -79,6 +79,19 @@ def test_layouts_that_the_model_does_not_know_are_refused(affine_folder, change,
         load_printer(str(affine_folder), LayoutSettings(size_px=64, **change))
 
 
+def test_models_of_the_package_have_a_short_name():
+    from litho_models import zoo
+
+    layout = LayoutSettings(size_px=16)
+    (name, *_) = zoo.list()
+    printer = load_printer(f"zoo:{name}", layout)
+    assert printer.weights_sha256() == load_printer(str(zoo.folder(name)), layout).weights_sha256()
+    with pytest.raises(InputError, match=f"zoo:{name} comes with the package"):
+        load_printer(name, layout)
+    with pytest.raises(InputError, match="zoo model"):
+        load_printer("zoo:nothing", layout)
+
+
 def test_more_levels_are_a_stated_guess(affine_folder):
     layout = LayoutSettings(size_px=16, levels=16)
     printer = load_printer(str(affine_folder), layout, extrapolate=True)

@@ -6,11 +6,18 @@ import math
 
 import pytest
 import torch
+from pydantic import ValidationError
 
 from litho_data.errors import InputError
 from litho_design.judging import Judging
 from litho_design.lens import LensTask, design_lens
-from litho_design.lens_bench import LensBench, LensView, RadialLensBench, centre_to_background
+from litho_design.lens_bench import (
+    ImagingSettings,
+    LensBench,
+    LensView,
+    RadialLensBench,
+    centre_to_background,
+)
 from litho_design.lens_metrics import half_maximum_width_um, lens_score
 from litho_design.optics import Optics, blaze_efficiency
 from litho_design.parametrise import LayoutSettings
@@ -136,6 +143,40 @@ def test_width_of_a_gaussian():
     x = torch.arange(-40, 40).double() * 0.1
     psf = torch.exp(-(x[:, None] ** 2 + x[None, :] ** 2) / (2 * 0.8**2))
     assert half_maximum_width_um(psf, 0.1) == pytest.approx(2.3548 * 0.8, abs=0.02)
+
+
+def test_width_of_a_gaussian_in_an_odd_window():
+    # 17 px are padded to 65, not 68: a pitch of a quarter pixel would make it 4.6 % too narrow.
+    x = torch.arange(-8, 9).double() * 0.1
+    psf = torch.exp(-(x[:, None] ** 2 + x[None, :] ** 2) / (2 * 0.2**2))
+    # Half the samples along the rim of a circle of 0.24 µm radius: 2 % of its diameter.
+    assert half_maximum_width_um(psf, 0.1) == pytest.approx(2.3548 * 0.2, rel=0.02)
+
+
+def test_a_window_that_cuts_the_focus_is_said(settings, make_printer):
+    # Radius 3 * 0.514 * 0.6328 / NA = 6.6 µm at NA 0.148: 128 px are 12.8 µm, 133 hold the circle.
+    (note,) = LensTask(settings, make_printer(LAYOUT)).notes
+    assert "--window-px 132" in note
+    wide = settings.model_copy(update={"view": settings.view.model_copy(update={"window_px": 132})})
+    task = LensTask(wide, make_printer(LAYOUT))
+    assert task.notes == []
+    radius_um = lens_score(task.bench, task.bench.ideal_height_um()).focusing_radius_um
+    # The sampled width against the Airy formula of the note.
+    assert radius_um == pytest.approx(132 * 0.1 / 2, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("objects", "message"),
+    [
+        ({"objects": ("ring", "text")}, "in the design and in the test"),
+        ({"objects": ("face",)}, "none of"),
+        ({"objects": ()}, "the least"),
+        ({"test_objects": ("ring",)}, "the least"),
+    ],
+)
+def test_objects_of_the_score_are_held_out(objects, message):
+    with pytest.raises(ValidationError, match=message):
+        ImagingSettings(**objects)
 
 
 @pytest.mark.parametrize("task", ["direct", "computational"])

@@ -82,5 +82,7 @@ def test_a_photograph_of_something_else_is_refused(tmp_path, printed_design):
     cv2.imwrite(str(tmp_path / "flat.png"), np.random.default_rng(0).integers(0, 255, (90, 90), np.uint8))
     with pytest.raises(InputError, match="photograph"):
         score_design(printed_design, [], tmp_path / "s", camera=PhotoSource(tmp_path / "flat.png", 0.2))
+    with pytest.raises(InputError, match="which is no file"):
+        score_design(printed_design, [], tmp_path / "s", camera=PhotoSource(tmp_path / "none.png", 0.2))
     with pytest.raises(InputError, match="pitch"):
         score_design(printed_design, [], tmp_path / "s", camera=PhotoSource(tmp_path / "flat.png", 0.0))

@@ -9,6 +9,7 @@ import torch
 from litho_data.errors import InputError
 from litho_design.design import HEIGHT_FILE
 from litho_design.hoe import HoeTask, design_hoe
+from litho_design.hologram import HologramBench
 from litho_design.optics import Optics
 from litho_design.robust import Draw, ProcessWindow, draws, risk
 from litho_design.targets import make_target
@@ -22,6 +23,26 @@ def test_draws_have_their_spread_and_repeat():
     assert np.std([draw.gain for draw in many]) == pytest.approx(0.05, rel=0.05)
     assert np.std([draw.optics.distance_um for draw in many]) == pytest.approx(4.0, rel=0.05)
     assert np.std([draw.optics.wavelength_um for draw in many]) == pytest.approx(0.001, rel=0.05)
+
+
+def test_a_yield_is_of_prints_that_no_search_saw(small_settings, make_printer):
+    window = ProcessWindow(samples=16)
+    searched, unseen = draws(window, Optics(), 16), draws(window, Optics(), 16, unseen=True)
+    assert not {draw.gain for draw in searched} & {draw.gain for draw in unseen}
+    assert unseen[:3] == draws(window, Optics(), 3, unseen=True)
+    task = HoeTask(small_settings, make_printer(small_settings.layout), *make_target("ring", 128))
+    height = torch.rand(128, 128, generator=torch.Generator().manual_seed(0))
+    told = [score["eff_signal"] for score in task.window_scores(height, 2)]
+    seen_by_score = draws(small_settings.window, small_settings.optics, 2, unseen=True)
+    for share, draw in zip(told, seen_by_score, strict=True):
+        image = HologramBench(small_settings.layout, draw.optics)(draw.apply(height, 0.1))
+        assert share == pytest.approx(float(image[task.target > 0.5].sum()), rel=1e-6)
+
+
+def test_a_spread_without_a_positive_wavelength_is_refused(small_settings, make_printer):
+    wide = small_settings.model_copy(update={"window": ProcessWindow(wavelength_sd_um=1.0)})
+    with pytest.raises(InputError, match=r"spread of 1 µm.*wavelength-sd-um"):
+        HoeTask(wide, make_printer(wide.layout), *make_target("ring", 128))
 
 
 def test_risk_formulas():
@@ -44,7 +65,7 @@ def test_extra_blur_keeps_the_mean_and_damps_a_wave_by_its_gaussian():
 def test_a_spread_that_reaches_the_element_is_refused_before_the_search(
     tmp_path, small_settings, make_printer
 ):
-    # The nearest of the 16 draws is 1.18 standard deviations off: 1 µm - 3.55 µm is behind the element.
+    # A third of a standard deviation below 1 µm lies the element: some of 16 draws are behind it.
     settings = small_settings.model_copy(update={"optics": Optics(distance_um=1.0)})
     with pytest.raises(InputError, match=r"defocus spread of 3 µm.*defocus-sd-um"):
         design_hoe(settings, make_printer(settings.layout), *make_target("ring", 128), tmp_path / "near")

@@ -58,6 +58,37 @@ def test_it_is_the_plain_stack_and_its_gradients(shape, learns):
         assert float((ours - plain).abs().max()) < 1e-13 * max(1.0, float(plain.abs().max()))
 
 
+@pytest.fixture
+def threads():
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
+@pytest.mark.parametrize("learns", [False, True])
+def test_the_number_of_threads_changes_no_bit(learns, threads):
+    weights, biases = make_parameters(learns, torch.float32)
+    field = torch.randn(1, 1, 230, 310, generator=torch.Generator().manual_seed(4), requires_grad=True)
+    wanted = [field, *weights, *biases] if learns else [field]
+    settings = StackSettings(SLOPE, torch.float32, torch.bfloat16)
+    made = []
+    for count in (1, 3):
+        threads(count)
+        height = convolution_stack(field, weights, biases, settings)
+        made.append([height.detach(), *torch.autograd.grad(height.square().sum(), wanted)])
+        assert torch.get_num_threads() == count
+    assert all(torch.equal(a, b) for a, b in zip(*made, strict=True))
+
+
+def test_an_error_in_a_tile_is_raised_and_leaves_the_number_of_threads(threads):
+    threads(2)
+    weights, biases = make_parameters(learns=False)
+    weights[1] = weights[1][:, :-1]
+    with pytest.raises(RuntimeError, match="channels"):
+        convolution_stack(torch.zeros(1, 1, 300, 300, dtype=torch.float64), weights, biases, EXACT)
+    assert torch.get_num_threads() == 2
+
+
 def test_weights_learn_from_a_field_that_wants_no_gradient():
     weights, biases = make_parameters(learns=True)
     field = torch.randn(1, 1, 30, 30, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
