@@ -37,7 +37,7 @@ def export_design(
     Args:
         folder: design folder.
         kind: png16, bmp, tiff, stl or gds.
-        out: folder of the export; exports in other formats stay in it.
+        out: folder of the export; exports of the same layout in other formats stay in it.
         pedestal_um: base under level 0 (part of the STL; told to the operator otherwise).
         slicing_um, hatching_um: recorded for the job.
 
@@ -45,7 +45,8 @@ def export_design(
         Path of the exported file.
 
     Raises:
-        InputError: an incomplete design, a format that cannot hold it, or job settings below zero.
+        InputError: an incomplete design, a format that cannot hold it, job settings below zero, or a
+            folder that holds something else.
     """
     job = {"pedestal_um": pedestal_um, "slicing_um": slicing_um, "hatching_um": hatching_um}
     for setting, value in job.items():
@@ -58,6 +59,7 @@ def export_design(
     name = f"layout{_SUFFIX[kind]}"
     require_replaceable_folder(out, "layout*")
     place = Path(out)
+    _require_same_layout(place, name, design.files[LEVELS_FILE])
     with writable(place):
         place.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix="layout.", suffix=".partial", dir=place) as temporary:
@@ -97,6 +99,14 @@ def import_levels(file: str | Path) -> tuple[np.ndarray, Sidecar]:
         return read_gds_levels(path, sidecar.shape_px, sidecar.pitch_um, sidecar.gds_layers), sidecar
     assert sidecar.grey_per_level is not None
     return read_image_levels(path, sidecar.grey_per_level), sidecar
+
+
+def _require_same_layout(place: Path, name: str, layout_sha256: str) -> None:
+    for older in sorted(place.glob("layout.*.json")):
+        if older.name != f"{name}.json" and Sidecar.read(older).layout_sha256 != layout_sha256:
+            raise InputError(
+                "output", got=f"{older}, which is of another layout", wanted="a folder for this layout only"
+            )
 
 
 def _write(

@@ -82,6 +82,11 @@ def test_exports_in_other_formats_stay(tmp_path, design):
     assert all(np.array_equal(import_levels(file)[0], levels) for file in (first, second, again))
     names = sorted(path.name for path in (tmp_path / "out").iterdir())
     assert names == ["layout.png", "layout.png.json", "layout.stl", "layout.stl.json"]
+    # A print job must not mix two layouts: the sidecar of the other format names another one.
+    sidecar = sidecar_path(second)
+    sidecar.write_text(sidecar.read_text().replace(import_levels(first)[1].layout_sha256, "0" * 64))
+    with pytest.raises(InputError, match=r"layout\.stl\.json, which is of another layout"):
+        export_design(design, "png16", tmp_path / "out")
 
 
 def test_grey_is_linear_in_height(tmp_path, design):
