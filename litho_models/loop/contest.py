@@ -16,7 +16,7 @@ from litho_models.effects import Effect
 from litho_models.loop.confirming import BINOMIAL_P, SMALLEST_SHARE, Confirmation, confirm
 from litho_models.loop.fields import Field
 from litho_models.loop.fitting import FoldFits, effect_slots
-from litho_models.loop.linear import nuisance_columns, orthonormal
+from litho_models.loop.linear import nuisance_columns, orthonormal, pooled_cosine
 from litho_models.loop.scoring import LINE_TERMS, Score, Terms, score
 from litho_models.loop.screening import (
     FAMILY_P,
@@ -137,7 +137,8 @@ def hold_contest(
             alike = [
                 rival
                 for rival in standing
-                if rival is not entrant and _cosine(changes[entrant.name], changes[rival.name]) >= SAME_COSINE
+                if rival is not entrant
+                and pooled_cosine(changes[entrant.name], changes[rival.name]) >= SAME_COSINE
             ]
             untold = [r.name for r in alike if not _told_apart(state, entrant, r, fields, terms, seed)]
             untold += _untold_unfitted(entrant.screened, relatives, directions)
@@ -286,10 +287,3 @@ def _changes(before: State, after: State, fields: Sequence[Field]) -> list[np.nd
         basis = orthonormal(nuisance_columns(f, old, gain=False))
         changes.append(change - basis @ (basis.T @ change))
     return changes
-
-
-def _cosine(a: Sequence[np.ndarray], b: Sequence[np.ndarray]) -> float:
-    inner, own, other = (
-        sum(float(x @ y) for x, y in zip(*pair, strict=True)) for pair in ((a, b), (a, a), (b, b))
-    )
-    return inner / max(np.sqrt(own * other), np.finfo(float).tiny)

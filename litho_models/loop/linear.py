@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from scipy.optimize import lsq_linear
 
@@ -59,6 +61,14 @@ def gram_inside(columns: np.ndarray, basis: np.ndarray) -> np.ndarray:
     """Inner products (m, m) of the columns' parts inside an orthonormal basis (n, k)."""
     inside = basis.T @ columns
     return inside.T @ inside
+
+
+def pooled_cosine(a: Sequence[np.ndarray], b: Sequence[np.ndarray]) -> float:
+    """Cosine between two sets of vectors, their inner products summed over the sets."""
+    inner, own, other = (
+        sum(float(x @ y) for x, y in zip(*pair, strict=True)) for pair in ((a, b), (a, a), (b, b))
+    )
+    return inner / max(np.sqrt(own * other), np.finfo(float).tiny)
 
 
 def solve_damped(

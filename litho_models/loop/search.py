@@ -10,6 +10,7 @@ import numpy as np
 from litho_models.effects import get_effect, screened_effects
 from litho_models.loop.contest import Added, Contest, hold_contest
 from litho_models.loop.fields import Field
+from litho_models.loop.rivals import generic_rival
 from litho_models.loop.scoring import Terms
 from litho_models.loop.screening import Screened
 from litho_models.loop.state import State, fit_state
@@ -55,7 +56,7 @@ def search_effects(
     seed: int,
     report: Callable[[str], None] = lambda message: None,
 ) -> Search:
-    """Add effects one at a time while one is confirmed.
+    """Add effects one at a time while one is confirmed and no generic term does the same, and better.
 
     Args:
         start: the base model.
@@ -90,8 +91,13 @@ def search_effects(
         found.note(held)
         if held.winner is None:
             break
-        added, found.state = held.winner
+        added, state = held.winner
+        if rival := generic_rival(found.state, state, fields, fold_of):
+            # Smaller effects cannot be named while the largest part of what is missing has no name.
+            found.failures[added.effect.name] = f"{rival} does the same, and better, without a name"
+            break
         found.added.append(added)
+        found.state = state
     for entry in list(found.added[:-1]):
         report(f"deciding once more on {entry.effect.name}")
         _decide_again(found, entry, contest, fields, fold_of)

@@ -92,7 +92,7 @@ def probe_residual(
     tests: dict[str, ProbeTest] = {}
     while search:
         taken = {entry.probe.name for entry in added}
-        candidates = [p for p in _probes(fields, state.predictions, defects) if p.name not in taken]
+        candidates = [p for p in generic_terms(fields, state.predictions, defects) if p.name not in taken]
         found = _best(candidates, state, fields, fold_of, terms, floor_nm2, seed, tests, report)
         if found is None:
             break
@@ -101,7 +101,10 @@ def probe_residual(
     return Probed(state, added, list(tests.values()), defects, trends)
 
 
-def _probes(fields: Sequence[Field], predictions: Sequence[np.ndarray], defects: Defects) -> list[Probe]:
+def generic_terms(
+    fields: Sequence[Field], predictions: Sequence[np.ndarray], defects: Defects
+) -> list[Probe]:
+    """All probes, measured on the residual of these held-out predictions."""
     kept = [~mask.reshape(-1)[field.sample] for mask, field in zip(defects.masks, fields, strict=True)]
     table = level_table(fields, predictions, kept)
     maps = [position_map(fields, predictions, kept, times_height=times) for times in (False, True)]
