@@ -16,6 +16,9 @@ from litho_design.robust import ProcessWindow
 if TYPE_CHECKING:
     import pandas as pd
 
+# Below this share of the training pixels a model has hardly seen the lowest and the highest level.
+_SEEN_SHARE = 0.02
+
 SCORE_LABELS = {
     "eff_signal": "power on the signal (T > 0.5), share of incident",
     "eff_paper": "power where T > 0, share of incident",
@@ -201,12 +204,17 @@ def stroke_frame(design: Design) -> pd.DataFrame:
 
 def stroke_advice(design: Design) -> str:
     """The advisor in words."""
-    stroke = design.stroke
+    stroke, gauge = design.stroke, design.out_of_distribution
     text = (
         f"The full staircase prints {stroke.stroke_waves:.2f} waves high (gain {stroke.print_gain:.2f}); "
         f"as a blaze it would send {100 * stroke.blaze_order_1:.1f} % into the first order and "
         f"{100 * stroke.blaze_order_0:.1f} % straight on."
     )
+    if gauge is not None and gauge.training_extreme_level_share < _SEEN_SHARE:
+        text += (
+            f" Its two ends made up {100 * gauge.training_extreme_level_share:.2g} % of the layouts that the "
+            "model was trained on: there these heights are an extrapolation; compare models."
+        )
     if stroke.levels_for_one_wave is None or stroke.level_height_for_one_wave_um is None:
         return text
     return text + (

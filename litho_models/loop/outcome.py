@@ -39,8 +39,8 @@ from litho_models.run_info import run_info
 
 # Their parameters lie in the span of what every scan may add: nested tests, error without other fits.
 _SPAN_EFFECTS = {"datum-offset", "z-gain", "tilt-bow"}
-# Of the squared error that is left.
-_DOUBTFUL_SHARE = 0.05
+# Of what the effect gained.
+_DOUBTFUL_SHARE = 0.1
 _NO_TERMS: frozenset[str] = frozenset()
 
 
@@ -145,14 +145,18 @@ def _added_measurement(closed: Closed, test: MeasurementTest) -> AddedEffect:
     )
 
 
-def _is_doubtful(closed: Closed, effect: Effect) -> bool:
-    """A filter that leaves a good part of the error to another filter comes near the cause, and is not it."""
+def _is_doubtful(closed: Closed, entry: Added) -> bool:
+    """A filter that leaves another filter a good part of its own gain comes near the cause, and is not it."""
     left = next((t for t in is_structured(closed.left_by_named) if t.name == LINEAR_RESPONSE), None)
-    return effect.linear and left is not None and left.share >= _DOUBTFUL_SHARE
+    if left is None or not entry.effect.linear:
+        return False
+    left_nm2 = left.share * float(closed.errors(closed.search.state, closed.terms).mse_nm2.mean())
+    gain_nm2 = float(entry.before.mse_nm2.mean() - entry.after.mse_nm2.mean())
+    return left_nm2 >= _DOUBTFUL_SHARE * gain_nm2
 
 
 def _verdict_on(closed: Closed, entry: Added) -> EffectVerdict:
-    if _is_doubtful(closed, entry.effect):
+    if _is_doubtful(closed, entry):
         return "traced-to-covariate"
     return "confusable" if entry.confusable_with else "explained"
 
