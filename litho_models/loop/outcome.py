@@ -147,10 +147,12 @@ def _added_measurement(closed: Closed, test: MeasurementTest) -> AddedEffect:
 
 def _is_doubtful(closed: Closed, entry: Added) -> bool:
     """A filter that leaves another filter a good part of its own gain comes near the cause, and is not it."""
-    left = next((t for t in is_structured(closed.left_by_named) if t.name == LINEAR_RESPONSE), None)
-    if left is None or not entry.effect.linear:
+    # A kernel added as a generic term takes it away; a table added before may bring it out.
+    tests = [*is_structured(closed.left_by_named), *is_structured(closed.structure)]
+    left = max((t.share for t in tests if t.name == LINEAR_RESPONSE), default=0.0)
+    if not left or not entry.effect.linear:
         return False
-    left_nm2 = left.share * float(closed.errors(closed.search.state, closed.terms).mse_nm2.mean())
+    left_nm2 = left * float(closed.errors(closed.search.state, closed.terms).mse_nm2.mean())
     gain_nm2 = float(entry.before.mse_nm2.mean() - entry.after.mse_nm2.mean())
     return left_nm2 >= _DOUBTFUL_SHARE * gain_nm2
 
