@@ -10,7 +10,7 @@ import pandas as pd
 from litho_data.report import new_figure
 from litho_models.loop.closing import Closed
 from litho_models.loop.probes import AddedProbe, figures
-from litho_models.loop.probes.covariates import drawn
+from litho_models.loop.probes.covariates import drawn, drawn_profile
 from litho_models.loop.probes.kernel import MissingKernel
 from litho_models.loop.result import CloseLoop
 from litho_models.loop.scoring import Score
@@ -105,8 +105,10 @@ def probe_figure(entry: AddedProbe) -> Figure:
         return _image(kernel, shown, "height per layout height and µm²", min(5.5, shown[0]))
     if probe.name in _TABLES:
         return _table_figure(entry)
-    unit = "relative height" if probe.name == "position-gain-map" else "nm"
+    unit = "relative height" if "-gain-" in probe.name else "nm"
     scale = 1.0 if unit == "relative height" else NM_PER_UM
+    if probe.name.endswith("profile"):
+        return _profile_figure(drawn_profile(common) * scale, probe.name.partition("-")[0], unit)
     return _image(drawn(common) * scale, (1.0, 1.0), unit, 1.0)
 
 
@@ -122,6 +124,17 @@ def _table_figure(entry: AddedProbe) -> Figure:
     axes.errorbar(places, heights, errors, fmt="o-", color=_AFTER, ms=4, capsize=2)
     axes.set_xlabel(_TABLES[entry.probe.name])
     axes.set_ylabel("missing height (nm)")
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def _profile_figure(values: np.ndarray, along: str, unit: str) -> Figure:
+    figure = new_figure(6, 3)
+    axes = figure.subplots()
+    axes.axhline(0, color="k", lw=0.6)
+    axes.plot(np.linspace(0, 1, len(values)), values, color=_AFTER)
+    axes.set_xlabel(f"{along}s, from the first to the last")
+    axes.set_ylabel(unit)
     axes.spines[["top", "right"]].set_visible(False)
     return figure
 

@@ -61,7 +61,7 @@ def measurement_tests(
         # The datum is free in every later comparison, whatever this test says.
         if test.confirmation.passed or name == "datum-offset":
             accepted |= {term}
-    return tests + _test_lines(fields, predictions, accepted, floor_nm2, seed)
+    return tests + _test_lines(fields, predictions, fold_of, accepted, floor_nm2, seed)
 
 
 def scan_parameters(fields: Sequence[Field], predictions: Sequence[np.ndarray], terms: Terms) -> np.ndarray:
@@ -112,17 +112,24 @@ def _test_term(
 
 
 def _test_lines(
-    fields: Sequence[Field], predictions: Sequence[np.ndarray], accepted: Terms, floor_nm2: float, seed: int
+    fields: Sequence[Field],
+    predictions: Sequence[np.ndarray],
+    fold_of: np.ndarray,
+    accepted: Terms,
+    floor_nm2: float,
+    seed: int,
 ) -> list[MeasurementTest]:
     """Offsets of lines, along the scan and along the layout: against the columns, then against each other.
 
     Scans are turned a little against their layouts. Lines that follow the layout's rows better were
     written, lines that follow the scan's were measured; where no scan is turned nobody can tell.
     """
-    # A tilt or bow that all scans share was not accepted as a term of single ones, nor is it their lines'.
+    # A tilt, a bow or a profile that all scans share is no term of single ones, nor of their lines.
     accepted |= {"offset", "bow"}
+    turned = [_turned(field) for field in fields]
+    turned_predictions = _with_shared_profile(turned, [p.T for p in predictions], fold_of)
+    predictions = _with_shared_profile(fields, predictions, fold_of)
     before = score(fields, predictions, accepted, seed, stripes=True)
-    turned, turned_predictions = [_turned(field) for field in fields], [p.T for p in predictions]
     control_before = score(turned, turned_predictions, accepted, seed, stripes=True)
     control_after = score(turned, turned_predictions, accepted | {"rows"}, seed)
     columns = control_before.mse_nm2 - control_after.mse_nm2
@@ -163,6 +170,31 @@ def _test_lines(
             )
         )
     return tests
+
+
+def _with_shared_profile(
+    fields: Sequence[Field], predictions: Sequence[np.ndarray], fold_of: np.ndarray
+) -> list[np.ndarray]:
+    """Predictions with the mean residual of each row over the scans of the other folds added.
+
+    Scans of different heights have no rows in common: then nothing is added.
+    """
+    if len({p.shape[0] for p in predictions}) > 1:
+        return list(predictions)
+    sums, counts = [], []
+    for field, prediction in zip(fields, predictions, strict=True):
+        maps, use = term_maps(prediction, frozenset({"offset", "bow"})), field.usable
+        residual = np.where(use, field.scan.height_um - prediction, 0.0).astype(np.float64)
+        own = np.tensordot(least_squares(maps[:, use], residual[use]), maps, axes=1)
+        sums.append(np.where(use, residual - own, 0.0).sum(axis=1))
+        counts.append(use.sum(axis=1))
+    totals, seen = np.stack(sums), np.stack(counts)
+    shared = []
+    for fold, prediction in zip(fold_of, predictions, strict=True):
+        others = fold_of != fold
+        profile = totals[others].sum(axis=0) / np.maximum(seen[others].sum(axis=0), 1)
+        shared.append(prediction + profile[:, None].astype(prediction.dtype))
+    return shared
 
 
 def _confirm(before: Score, after: Score, floor_nm2: float, seed: int) -> Confirmation:

@@ -13,6 +13,7 @@ from litho_models.loop.figures import curve_figure, map_figure, probe_figure, st
 from litho_models.loop.measurement import scan_parameters
 from litho_models.loop.result import CloseLoop
 from litho_models.loop.scoring import DATUM_FREE, Score, Terms, names_to_terms, scan_parameter_names
+from litho_models.loop.structure import PLACE
 from litho_models.loop.wording import plain_words, warnings_for
 from litho_models.metrics import NM_PER_UM
 
@@ -240,7 +241,7 @@ def _rest_section(page: Page, closed: Closed, result: CloseLoop) -> None:
         "structure.csv",
         digits=4,
     )
-    curves = [t for t in closed.structure if len(t.curve_nm)]
+    curves = [t for t in closed.structure if len(t.curve_nm) and t.name != PLACE]
     if curves:
         page.figure(
             curve_figure(curves),

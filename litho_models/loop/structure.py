@@ -18,6 +18,8 @@ from litho_models.loop.screening import sign_flip_statistics
 from litho_models.metrics import NM_PER_UM
 
 BINS = 8
+# Cells of the scan along y and along x.
+_CELLS, PLACE = 8, "cell of the scan (8 × 8)"
 STENCIL_PX = (-6, -3, 0, 3, 6)
 STRUCTURED_P = 0.05
 STRUCTURED_SHARE = 0.01
@@ -79,11 +81,16 @@ def _covariates(field: Field, prediction: np.ndarray) -> dict[str, np.ndarray]:
         "mean layout within 3 µm (µm)": field.at_sample(far),
         "x over the scan": x,
         "y over the scan": y,
+        PLACE: np.floor((y + 1) / 2 * _CELLS).clip(0, _CELLS - 1) * _CELLS
+        + np.floor((x + 1) / 2 * _CELLS).clip(0, _CELLS - 1),
     }
 
 
 def _binned(name: str, covariate: list[np.ndarray], residuals: list[np.ndarray]) -> CovariateTest:
-    edges = np.unique(np.quantile(np.concatenate(covariate), np.linspace(0, 1, BINS + 1)))
+    if name == PLACE:
+        edges = np.arange(_CELLS**2 + 1) - 0.5
+    else:
+        edges = np.unique(np.quantile(np.concatenate(covariate), np.linspace(0, 1, BINS + 1)))
     if len(edges) < 3:
         return CovariateTest(name, np.empty(0), np.empty(0), np.empty(0), 1.0, 0.0)
     count = len(edges) - 1

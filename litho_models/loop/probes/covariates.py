@@ -1,9 +1,10 @@
-"""Linear probes along the printed level, the steepness and the place in the field."""
+"""Linear probes along the printed level, the steepness, the place in the field and its rows or columns."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Literal
 
 import numpy as np
 from scipy.interpolate import BSpline
@@ -17,6 +18,8 @@ from litho_models.metrics import NM_PER_UM
 SPOT_UM = 0.2
 SPLINES = 5
 SLOPE_KNOTS = 8
+# One per µm in a field of 25 µm: what is finer is one line's, not the field's.
+PROFILE_SPLINES = 24
 _FEWEST_SCANS, _SMALLEST_SHARE = 5, 0.01
 _FLIPS: tuple[Callable[[np.ndarray], np.ndarray], ...] = tuple(
     partial(lambda grid, turns, mirror: np.rot90(grid.T if mirror else grid, turns), turns=t, mirror=m)
@@ -113,6 +116,32 @@ def position_map(
     )
 
 
+def profile(
+    fields: Sequence[Field],
+    predictions: Sequence[np.ndarray],
+    kept: Sequence[np.ndarray],
+    *,
+    along: Literal["row", "column"],
+    times_height: bool,
+) -> LinearProbe:
+    """A profile over the rows, or the columns, that all scans share, finer than a map can be."""
+    return linear_probe(
+        f"{along}-gain-profile" if times_height else f"{along}-profile",
+        partial(_profile_columns, along=along, times_height=times_height),
+        second_differences(PROFILE_SPLINES) + 1e-2 * np.eye(PROFILE_SPLINES),
+        _rolled,
+        partial(_profile_size, times_height=times_height),
+        fields,
+        predictions,
+        kept,
+    )
+
+
+def drawn_profile(coefficients: np.ndarray, size: int = 201) -> np.ndarray:
+    """The profile (size,) that the splines' coefficients stand for, from one end to the other."""
+    return coefficients @ _splines(size, PROFILE_SPLINES)
+
+
 def drawn(coefficients: np.ndarray, size: int = 101) -> np.ndarray:
     """The map (size, size) that the splines' coefficients stand for; first axis y."""
     splines = _splines(size)
@@ -120,7 +149,14 @@ def drawn(coefficients: np.ndarray, size: int = 101) -> np.ndarray:
 
 
 def _size(coefficients: np.ndarray, times_height: bool) -> dict[str, tuple[float, str]]:
-    values = drawn(coefficients)
+    return _spread(drawn(coefficients), times_height)
+
+
+def _profile_size(coefficients: np.ndarray, times_height: bool) -> dict[str, tuple[float, str]]:
+    return _spread(drawn_profile(coefficients), times_height)
+
+
+def _spread(values: np.ndarray, times_height: bool) -> dict[str, tuple[float, str]]:
     scale, unit = (1.0, "1") if times_height else (NM_PER_UM, "nm")
     return {
         "rms": (float(values.std()) * scale, unit),
@@ -156,9 +192,19 @@ def _map_columns(field: Field, prediction: np.ndarray, times_height: bool) -> np
     return maps * prediction if times_height else maps
 
 
-def _splines(size: int) -> np.ndarray:
-    """Cubic splines (SPLINES, size) from one end of an axis to the other; they add up to 1."""
-    inner = np.linspace(-1, 1, SPLINES - 2)
+def _profile_columns(
+    field: Field, prediction: np.ndarray, along: Literal["row", "column"], times_height: bool
+) -> np.ndarray:
+    """Splines over the rows or the columns (24, y, x)."""
+    ny, nx = field.scan.shape
+    splines = _splines(ny if along == "row" else nx, PROFILE_SPLINES)
+    maps = splines[:, :, None] if along == "row" else splines[:, None, :]
+    return np.broadcast_to(maps, (PROFILE_SPLINES, ny, nx)) * (prediction if times_height else 1.0)
+
+
+def _splines(size: int, count: int = SPLINES) -> np.ndarray:
+    """Cubic splines (count, size) from one end of an axis to the other; they add up to 1."""
+    inner = np.linspace(-1, 1, count - 2)
     knots = np.concatenate([[-1.0] * 3, inner, [1.0] * 3])
     position = np.linspace(-1, 1, size)
     return BSpline.design_matrix(position, knots, 3).toarray().T
@@ -175,3 +221,9 @@ def _turned(random: np.random.Generator, count: int) -> np.ndarray:
     side = round(count**0.5)
     grid = np.arange(count).reshape(side, side)
     return _FLIPS[int(random.integers(len(_FLIPS)))](grid).ravel()
+
+
+def _rolled(random: np.random.Generator, count: int) -> np.ndarray:
+    """Order of the coefficients after a random shift, and half of the time a reversal, of the profile."""
+    order = np.roll(np.arange(count), int(random.integers(count)))
+    return order[::-1] if random.random() < 0.5 else order

@@ -9,7 +9,7 @@ import numpy as np
 
 from litho_models.loop.confirming import SMALLEST_SHARE, Confirmation, confirm
 from litho_models.loop.fields import Field
-from litho_models.loop.probes.covariates import level_table, position_map, slope_table
+from litho_models.loop.probes.covariates import level_table, position_map, profile, slope_table
 from litho_models.loop.probes.defects import Defects, find_defects
 from litho_models.loop.probes.kernel import missing_kernel
 from litho_models.loop.probes.probe import Estimate, Probe
@@ -107,9 +107,14 @@ def generic_terms(
     """All probes, measured on the residual of these held-out predictions."""
     kept = [~mask.reshape(-1)[field.sample] for mask, field in zip(defects.masks, fields, strict=True)]
     table = level_table(fields, predictions, kept)
-    maps = [position_map(fields, predictions, kept, times_height=times) for times in (False, True)]
+    places: list[Probe] = []
+    for times in (False, True):
+        places.append(position_map(fields, predictions, kept, times_height=times))
+        places += [
+            profile(fields, predictions, kept, along=along, times_height=times) for along in ("row", "column")
+        ]
     kernel = missing_kernel(fields, predictions, defects.masks)
-    return [*([table] if table else []), slope_table(fields, predictions, kept), *maps, kernel]
+    return [*([table] if table else []), slope_table(fields, predictions, kept), *places, kernel]
 
 
 def _best(
