@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter
 
 from litho_data.errors import InputError
 from litho_models.loop import LoopConfig, close_loop, parse_priors
@@ -129,6 +130,23 @@ def test_a_tip_that_narrows_is_contradicted() -> None:
     assert "slope-thinning" in {e.name for e in result.effects} | {
         other for e in result.effects for other in e.confusable_with
     }
+
+
+def test_a_profile_that_all_scans_share_is_not_put_down_to_their_lines() -> None:
+    rng = np.random.default_rng(8)
+    profile = 0.008 * gaussian_filter(rng.normal(size=(160, 1)), (2.0, 0.0))
+    profile *= 0.008 / profile.std()
+    fields = prepare_fields(
+        [
+            replace(scan, height_um=(scan.height_um + profile).astype(np.float32))
+            for scan in printed_scans(count=10, size_px=160, seed=3)
+        ]
+    )
+    predictions = [_truth(f) for f in fields]
+    tests = measurement_tests(fields, predictions, np.arange(10) % 5, floor_nm2=0, seed=0)
+    lines = [t for t in tests if t.effect.name in ("scan-line-stripes", "line-roughness")]
+    assert len(lines) == 2
+    assert not any(t.confirmation.passed for t in lines)
 
 
 def test_line_offsets_are_told_from_columns() -> None:

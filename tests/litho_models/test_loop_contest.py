@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from litho_models.effects import FieldContext, get_effect
 from litho_models.loop import LoopConfig, close_loop
+from litho_models.loop.fields import prepare_fields
+from litho_models.loop.fitting import FoldFits
+from litho_models.loop.rivals import generic_rival
 from litho_models.loop.screening import blocks_of
+from litho_models.loop.state import State
 from litho_models.models import build_model
-from tests.litho_models.loop_scans import printed_scans
+from tests.litho_models.loop_scans import printed_scans, true_model
 
 
 def added_to(scans) -> dict[str, list[str]]:
@@ -34,6 +40,35 @@ def test_ripples_are_found_though_offsets_of_lines_could_hide_them() -> None:
     ripple = {"cosine_um": 0.006, "sine_um": 0.004, "frequency_per_um": 0.31}
     scans = printed_scans({"hatch-ripple": ripple}, count=12, size_px=96, seed=4)
     assert added_to(scans) == {"hatch-ripple": []}
+
+
+def test_a_tilt_that_all_prints_share_is_found_though_every_scan_may_have_its_own() -> None:
+    tilt = {"tilt_x_um": 0.06, "tilt_y_um": -0.04}
+    scans = printed_scans({"field-curvature": tilt}, count=12, size_px=96, seed=5)
+    # Bare places are not tilted with the print: that tells it from a tilt of the microscope.
+    assert added_to(scans) == {"field-curvature": []}
+
+
+@pytest.mark.parametrize("planted", ["bead", "tip-dilation"])
+def test_a_tip_gives_way_to_a_table_over_the_slope_unless_it_is_the_cause(planted) -> None:
+    """A bead grows with the slope, the lift of a blunt tip with its square: near each other, not equal."""
+    tip, chain = get_effect("tip-dilation"), true_model({})
+    fields, before, after = prepare_fields(printed_scans(count=12, size_px=96, seed=6)), [], []
+    changed = []
+    for field in fields:
+        with torch.no_grad():
+            clean = chain(field.layout, field.context)
+            dilated = tip(clean, {"radius_um": 0.3}, field.context)
+        before.append(clean[0, 0].numpy())
+        after.append(dilated[0, 0].numpy())
+        bead = 0.06 * np.hypot(*np.gradient(before[-1], field.scan.pitch_um))
+        lift = after[-1] - before[-1] if planted == "tip-dilation" else bead
+        changed.append(replace(field.scan, height_um=(field.scan.height_um + lift).astype(np.float32)))
+    fields = prepare_fields(changed)
+    nothing = np.empty(0)
+    fits = FoldFits(chain, nothing, np.empty((4, 0)), np.zeros(4), np.empty((0, 0)), [])
+    rival = generic_rival(State(fits, before), State(fits, after), fields, np.arange(12) % 4)
+    assert rival == (None if planted == "tip-dilation" else "slope-table")
 
 
 def test_sizes_of_one_direction_are_alternatives_and_directions_are_fitted_together() -> None:

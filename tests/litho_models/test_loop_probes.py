@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 from litho_models.loop.fields import Field, prepare_fields
 from litho_models.loop.fitting import FoldFits
 from litho_models.loop.probes import Probed, figures, probe_residual
-from litho_models.loop.probes.covariates import SPOT_UM, drawn
+from litho_models.loop.probes.covariates import SPOT_UM, drawn, drawn_profile
 from litho_models.loop.probes.defects import find_defects
 from litho_models.loop.probes.kernel import off_centre_peak, resampled
 from litho_models.loop.probes.trend import order_trends
@@ -136,6 +136,30 @@ def test_a_map_that_all_scans_share_is_found_and_drawn() -> None:
 
     estimate = drawn(entry.estimate.common, size)
     assert np.corrcoef(fine(estimate), fine(planted))[0, 1] > 0.9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("along", ["row", "column"])
+def test_a_profile_of_the_dose_over_one_axis_is_found_and_drawn(along: str) -> None:
+    def wave(count: int) -> np.ndarray:
+        # Three periods: finer than a map of 5 splines, coarser than the profile's 24.
+        return 0.04 * np.sin(6 * np.pi * np.linspace(0, 1, count) + 0.5)
+
+    _, predictions = scene()
+    by_scan = {f.id: p for f, p in zip(scene()[0], predictions, strict=True)}
+
+    def uneven(field: Field) -> np.ndarray:
+        ny, nx = field.scan.shape
+        profile = wave(ny)[:, None] if along == "row" else wave(nx)[None, :]
+        return profile * by_scan[field.id]
+
+    found = probed(*scene(uneven))
+    entry = found.added[0]
+    assert entry.probe.name == f"{along}-gain-profile"
+    estimate, planted = drawn_profile(entry.estimate.common), wave(201)
+    # The cubic splines alone leave (π/8)⁴/384 of a wave of 8 knots per period: nothing.
+    assert np.corrcoef(estimate, planted)[0, 1] > 0.95
+    assert estimate.std() == pytest.approx(planted.std(), rel=0.15)
 
 
 def test_blobs_are_found_and_their_place_is_told() -> None:
