@@ -59,8 +59,8 @@ def benchmark_table(benchmark: dict[str, Any]) -> str:
         f"\nMean absolute error on held-out scans ({len(split['scored_ids'])} scans, {split['folds']} folds "
         f"by scan, seed {split['seed']}, {len(split['lock_box'])} scans locked and not looked at; "
         f"{_steps(benchmark)}), with 95 % bootstrap intervals over scans. Per-scan terms are fitted on "
-        "pixels that are not scored. The shared background is what levelling leaves in every map: five numbers from "
-        "the training scans, added to predictions of measured maps and to no design."
+        "pixels that are not scored. The shared background is what levelling leaves in every map: five "
+        "numbers from the training scans, added to predictions of measured maps and to no design."
     )
     return "\n".join(rows)
 
