@@ -78,7 +78,7 @@ def paired_table(benchmark: dict[str, Any]) -> str:
 
 
 def paper_table(benchmark: dict[str, Any]) -> str:
-    """Errors on the paper's split, one row each, with the paper's own figure."""
+    """Errors on the paper's split, one row each."""
     rows = ["| model | datum-free error (zero of each quadrant free) | absolute error |", "|---|---|---|"]
     rows += [
         f"| {score['model']} | {_with_interval(score['mae_datum_free_nm'], score['mae_datum_free_ci95_nm'])} "

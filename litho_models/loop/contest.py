@@ -16,7 +16,7 @@ from litho_models.effects import Effect
 from litho_models.loop.confirming import BINOMIAL_P, SMALLEST_SHARE, Confirmation, confirm
 from litho_models.loop.fields import Field
 from litho_models.loop.fitting import FoldFits, effect_slots
-from litho_models.loop.linear import nuisance_columns, orthonormal, pooled_cosine
+from litho_models.loop.linear import pooled_cosine, without_scan_terms
 from litho_models.loop.scoring import LINE_TERMS, Score, Terms, score
 from litho_models.loop.screening import (
     FAMILY_P,
@@ -146,7 +146,7 @@ def hold_contest(
             if agreeing < folds - 1:
                 found.failures[entrant.name] = f"the best in only {agreeing} of {folds} training sets"
                 continue
-            added = _judged(state, entrant, untold, fields, terms, floor_nm2, seed)
+            added = judged(state, entrant, untold, fields, terms, floor_nm2=floor_nm2, seed=seed)
             if added.confirmation.passed:
                 found.winner = added, entrant.state
                 found.failures.pop(entrant.name, None)
@@ -236,16 +236,17 @@ def _untold_unfitted(winner: Screened, relatives: Sequence[Screened], directions
     return [*untold, "tilt-bow"] if winner.projection == "no-bow" else untold
 
 
-def _judged(
+def judged(
     state: State,
     entrant: Entrant,
     untold: Sequence[str],
     fields: Sequence[Field],
     terms: Terms,
+    *,
     floor_nm2: float,
     seed: int,
 ) -> Added:
-    """The entrant as it would be added, with its confirmation on the scans left out."""
+    """The entrant as it would be added to ``state``, with its confirmation on the scans left out."""
     effect, own = entrant.screened.effect, terms_for(terms, [entrant.screened])
     before, after = (score(fields, s.predictions, own, seed) for s in (state, entrant.state))
     confirmation = confirm(
@@ -283,7 +284,5 @@ def _changes(before: State, after: State, fields: Sequence[Field]) -> list[np.nd
     """What a candidate changes in the held-out predictions, freed of what single scans may add, µm."""
     changes = []
     for f, old, new in zip(fields, before.predictions, after.predictions, strict=True):
-        change = f.at_sample(new - old)
-        basis = orthonormal(nuisance_columns(f, old, gain=False))
-        changes.append(change - basis @ (basis.T @ change))
+        changes.append(without_scan_terms(f.at_sample(new - old), f, old, gain=False))
     return changes

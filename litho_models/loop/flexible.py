@@ -7,17 +7,17 @@ effect found there must also lower the network's held-out error, otherwise the n
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from torch import Tensor, nn
 
 from litho_data.store.read import PrintedScan
 from litho_models.effects.chain import EffectChain
-from litho_models.loop.confirming import confirm
-from litho_models.loop.contest import Added, fold_amplitudes, terms_for
+from litho_models.loop.contest import Entrant, judged
 from litho_models.loop.fields import Field
 from litho_models.loop.fitting import effect_slots
-from litho_models.loop.scoring import Terms, score
+from litho_models.loop.scoring import Terms
 from litho_models.loop.search import Search
 from litho_models.loop.state import State, fit_state
 
@@ -90,23 +90,15 @@ def carry_over(
         }
         chain = carried.state.fits.chain
         extended = fit_state(chain.with_effects({**chain.values(), name: values}), fields, fold_of)
-        own_terms = terms_for(terms, [found.first[name]])
-        before = score(fields, carried.state.predictions, own_terms, seed)
-        after = score(fields, extended.predictions, own_terms, seed)
-        verdict = confirm(
-            before.mse_nm2,
-            after.mse_nm2,
-            before.mae_nm,
-            after.mae_nm,
-            floor_nm2=floor_nm2,
-            amplitudes=fold_amplitudes(extended.fits, entry.effect),
-            seed=seed,
+        entrant = Entrant(found.first[name], extended)
+        added = judged(
+            carried.state, entrant, entry.confusable_with, fields, terms, floor_nm2=floor_nm2, seed=seed
         )
-        if verdict.passed:
+        if added.confirmation.passed:
             carried.state = extended
-            carried.added.append(
-                Added(entry.effect, entry.confusable_with, before, after, verdict, entry.p_screen)
-            )
+            # It was screened where the stiff model chose it, after the effects added before it.
+            carried.added.append(replace(added, p_screen=entry.p_screen))
         else:
-            carried.absorbed[name] = f"confirmed on the stiff model, not on this one: {verdict.reason}"
+            reason = added.confirmation.reason
+            carried.absorbed[name] = f"confirmed on the stiff model, not on this one: {reason}"
     return bare, carried

@@ -63,6 +63,14 @@ def gram_inside(columns: np.ndarray, basis: np.ndarray) -> np.ndarray:
     return inside.T @ inside
 
 
+def without_scan_terms(
+    columns: np.ndarray, field: Field, prediction: np.ndarray, *, gain: bool
+) -> np.ndarray:
+    """Columns (n,) or (n, m) at the sampled pixels, freed of what a single scan may add."""
+    basis = orthonormal(nuisance_columns(field, prediction, gain=gain))
+    return columns - basis @ (basis.T @ columns)
+
+
 def pooled_cosine(a: Sequence[np.ndarray], b: Sequence[np.ndarray]) -> float:
     """Cosine between two sets of vectors, their inner products summed over the sets."""
     inner, own, other = (

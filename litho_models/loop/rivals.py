@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from litho_models.loop.fields import Field
-from litho_models.loop.linear import nuisance_columns, orthonormal
+from litho_models.loop.linear import without_scan_terms
 from litho_models.loop.probes.defects import find_defects
 from litho_models.loop.probes.selection import generic_terms
 from litho_models.loop.state import State
@@ -69,6 +69,5 @@ def _freed(state: State, changes: Sequence[np.ndarray], fields: Sequence[Field])
     freed = []
     for field, prediction, change in zip(fields, state.predictions, changes, strict=True):
         columns = np.column_stack([field.at_sample(change), field.height - field.at_sample(prediction)])
-        basis = orthonormal(nuisance_columns(field, prediction, gain=True))
-        freed.append(columns - basis @ (basis.T @ columns))
+        freed.append(without_scan_terms(columns, field, prediction, gain=True))
     return freed

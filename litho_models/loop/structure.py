@@ -13,7 +13,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from litho_models.loop.fields import Field
-from litho_models.loop.linear import nuisance_columns, orthonormal
+from litho_models.loop.linear import without_scan_terms
 from litho_models.loop.screening import sign_flip_statistics
 from litho_models.metrics import NM_PER_UM
 
@@ -48,13 +48,13 @@ def covariate_tests(fields: Sequence[Field], predictions: Sequence[np.ndarray]) 
     cleaned = []
     for field, prediction in zip(fields, predictions, strict=True):
         residual = field.height - field.at_sample(prediction)
-        basis = orthonormal(nuisance_columns(field, prediction, gain=True))
-        cleaned.append(residual - basis @ (basis.T @ residual))
+        cleaned.append(without_scan_terms(residual, field, prediction, gain=True))
     covariates = [_covariates(f, p) for f, p in zip(fields, predictions, strict=True)]
-    tests = [
-        _binned(name, [c[name] for c in covariates], cleaned)
-        for name in (covariates[0] if covariates else ())
-    ]
+    tests = []
+    for name in covariates[0] if covariates else ():
+        values = [c[name] for c in covariates]
+        tests.append(_binned(name, values, _quantiles(values), cleaned))
+    tests.append(_binned(PLACE, [_cell(f) for f in fields], np.arange(_CELLS**2 + 1) - 0.5, cleaned))
     tests.append(_stencil(fields, cleaned, predictions))
     return tests
 
@@ -81,16 +81,23 @@ def _covariates(field: Field, prediction: np.ndarray) -> dict[str, np.ndarray]:
         "mean layout within 3 µm (µm)": field.at_sample(far),
         "x over the scan": x,
         "y over the scan": y,
-        PLACE: np.floor((y + 1) / 2 * _CELLS).clip(0, _CELLS - 1) * _CELLS
-        + np.floor((x + 1) / 2 * _CELLS).clip(0, _CELLS - 1),
     }
 
 
-def _binned(name: str, covariate: list[np.ndarray], residuals: list[np.ndarray]) -> CovariateTest:
-    if name == PLACE:
-        edges = np.arange(_CELLS**2 + 1) - 0.5
-    else:
-        edges = np.unique(np.quantile(np.concatenate(covariate), np.linspace(0, 1, BINS + 1)))
+def _cell(field: Field) -> np.ndarray:
+    """Number of the cell of the scan that holds each sampled pixel, row by row."""
+    row, column = np.floor((field.position + 1) / 2 * _CELLS).clip(0, _CELLS - 1)
+    return row * _CELLS + column
+
+
+def _quantiles(covariate: list[np.ndarray]) -> np.ndarray:
+    """Edges of bins that hold about as many pixels each."""
+    return np.unique(np.quantile(np.concatenate(covariate), np.linspace(0, 1, BINS + 1)))
+
+
+def _binned(
+    name: str, covariate: list[np.ndarray], edges: np.ndarray, residuals: list[np.ndarray]
+) -> CovariateTest:
     if len(edges) < 3:
         return CovariateTest(name, np.empty(0), np.empty(0), np.empty(0), 1.0, 0.0)
     count = len(edges) - 1
@@ -120,8 +127,7 @@ def _stencil(
         columns = np.stack(
             [field.at_sample(np.roll(layout, (-dy, -dx), (0, 1))) for dy, dx in offsets] + [residual], axis=1
         )
-        basis = orthonormal(nuisance_columns(field, prediction, gain=True))
-        columns -= basis @ (basis.T @ columns)
+        columns = without_scan_terms(columns, field, prediction, gain=True)
         grams.append(columns.T @ columns)
     stacked = np.stack(grams)
     p = _joint_p(stacked[:, :-1, -1])

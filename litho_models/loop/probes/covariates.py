@@ -11,7 +11,7 @@ from scipy.interpolate import BSpline
 from scipy.ndimage import gaussian_filter
 
 from litho_models.loop.fields import Field
-from litho_models.loop.probes.linear import LinearProbe, linear_probe, second_differences
+from litho_models.loop.probes.linear import ColumnsOf, LinearProbe, linear_probe, second_differences
 from litho_models.metrics import NM_PER_UM
 
 # The level that reaches a pixel is spread by the printer's spot.
@@ -39,19 +39,9 @@ def level_table(
     levels = estimated_levels(fields)
     if len(levels) < 4:
         return None
-    return linear_probe(
-        "level-table",
-        partial(_level_columns, levels=levels),
-        second_differences(len(levels)) + 1e-3 * np.eye(len(levels)),
-        lambda random, count: random.permutation(count),
-        lambda heights: {
-            f"level_{level}": (float(height) * NM_PER_UM, "nm")
-            for level, height in zip(levels, heights, strict=True)
-        },
-        fields,
-        predictions,
-        kept,
-    )
+    entries = [f"level_{level}" for level in levels]
+    columns_of = partial(_level_columns, levels=levels)
+    return _table("level-table", entries, columns_of, fields, predictions, kept)
 
 
 def estimated_levels(fields: Sequence[Field]) -> list[int]:
@@ -78,14 +68,26 @@ def slope_table(
     ]
     steepest = float(np.quantile(np.concatenate(steepness), 0.99))
     knots = np.linspace(0.0, max(steepest, np.finfo(float).tiny), SLOPE_KNOTS)
+    entries = [f"slope_{knot:.2f}" for knot in knots]
+    return _table("slope-table", entries, partial(_slope_columns, knots=knots), fields, predictions, kept)
+
+
+def _table(
+    name: str,
+    entries: Sequence[str],
+    columns_of: ColumnsOf,
+    fields: Sequence[Field],
+    predictions: Sequence[np.ndarray],
+    kept: Sequence[np.ndarray],
+) -> LinearProbe:
+    """One height per entry along an ordered covariate, bends kept small."""
     return linear_probe(
-        "slope-table",
-        partial(_slope_columns, knots=knots),
-        second_differences(SLOPE_KNOTS) + 1e-3 * np.eye(SLOPE_KNOTS),
+        name,
+        columns_of,
+        second_differences(len(entries)) + 1e-3 * np.eye(len(entries)),
         lambda random, count: random.permutation(count),
         lambda heights: {
-            f"slope_{knot:.2f}": (float(height) * NM_PER_UM, "nm")
-            for knot, height in zip(knots, heights, strict=True)
+            entry: (float(height) * NM_PER_UM, "nm") for entry, height in zip(entries, heights, strict=True)
         },
         fields,
         predictions,
