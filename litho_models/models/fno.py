@@ -8,6 +8,7 @@ image, so it answers differently for another image size: ``default`` runs it on 
 
 from __future__ import annotations
 
+import math
 from typing import Any, ClassVar
 
 import torch
@@ -65,10 +66,7 @@ class Fno(Simulator):
         width, local = config.width, config.local_px
         self.lift = nn.Conv2d(3 if config.coordinates else 1, width, 1)
         self.spectral = nn.ModuleList(SpectralConvolution(width, config.modes) for _ in range(config.layers))
-        self.local = nn.ModuleList(
-            nn.Conv2d(width, width, local, padding=local // 2, padding_mode="circular")
-            for _ in range(config.layers)
-        )
+        self.local = nn.ModuleList(nn.Conv2d(width, width, local) for _ in range(config.layers))
         self.hidden = nn.Conv2d(width, config.projection_channels, 1)
         self.last = nn.Conv2d(config.projection_channels, 1, 1)
         if config.starts_as_layout:
@@ -89,19 +87,23 @@ class Fno(Simulator):
         """Height of an image taken as a whole, the same size, (batch, 1, y, x) µm."""
         config = self.config
         ny, nx = layout_um.shape[-2:]
-        # Heights need full precision where they enter and leave, also under autocast.
+        # Heights need full precision where they enter and leave, also under autocast. Channels last:
+        # products over channels and over frequencies are then plain matrix products.
         with torch.autocast(device_type=layout_um.device.type, enabled=False):
             inputs = torch.cat([layout_um, _coordinates(layout_um)], 1) if config.coordinates else layout_um
-            features = self.lift(inputs)
+            features = _pointwise(self.lift, inputs.permute(0, 2, 3, 1))
         padding = [round(config.padding_fraction * size) for size in (nx, ny)]
-        features = functional.pad(features, (0, padding[0], 0, padding[1]))
+        if any(padding):
+            features = functional.pad(features, (0, 0, 0, padding[0], 0, padding[1]))
         for number, (spectral, local) in enumerate(zip(self.spectral, self.local, strict=True)):
-            features = spectral(features) + local(features)
+            features = spectral(features) + _periodic_convolution(local, features)
             if number < config.layers - 1:
                 features = functional.gelu(features)
-        features = functional.gelu(self.hidden(features[..., :ny, :nx]))
+        if any(padding):
+            features = features[:, :ny, :nx]
+        features = functional.gelu(_pointwise(self.hidden, features))
         with torch.autocast(device_type=layout_um.device.type, enabled=False):
-            height = self.last(features.to(self.last.weight.dtype))
+            height = _pointwise(self.last, features.to(self.last.weight.dtype)).permute(0, 3, 1, 2)
         return layout_um + height if config.starts_as_layout else height
 
     def forward(self, layout_um: Tensor) -> Tensor:
@@ -123,24 +125,62 @@ class SpectralConvolution(nn.Module):
         self.weight = nn.Parameter(torch.rand(2, channels, channels, *modes, 2) / channels**2)
 
     def forward(self, field: Tensor) -> Tensor:
-        """(b, channels, y, x) to the same shape; an image smaller than the modes keeps those it has."""
-        ny, nx = field.shape[-2:]
+        """(b, y, x, channels) to the same shape; an image smaller than the modes keeps those it has.
+
+        So few frequencies are kept that products with the matrices of the discrete Fourier transform
+        cost less than fast transforms, which compute them all.
+        """
+        ny, nx, channels = field.shape[1:]
         kept_y = min(self.weight.shape[3], ny // 2)
         kept_x = min(self.weight.shape[4], nx // 2 + 1)
         with torch.autocast(device_type=field.device.type, enabled=False):
             field = field.to(self.weight.dtype)
+            cos_y, sin_y = _waves(torch.cat([torch.arange(kept_y), torch.arange(-kept_y, 0)]), ny, field)
+            cos_x, sin_x = _waves(torch.arange(kept_x), nx, field)
+
+            along_y = torch.cat([cos_y, -sin_y]) @ field.reshape(-1, ny, nx * channels)
+            along_x = torch.cat([cos_x, sin_x]) @ along_y.reshape(-1, 2, 2 * kept_y, nx, channels)
+            cosine, sine = along_x.split(kept_x, dim=-2)
+            spectrum = torch.complex(cosine[:, 0] + sine[:, 1], cosine[:, 1] - sine[:, 0])
+
             weight = torch.view_as_complex(self.weight)[..., :kept_x]
-            # rfft2 and irfft2, with the transform along y for the kept columns only.
-            spectrum = torch.fft.fft(torch.fft.rfft(field, dim=-1)[..., :kept_x], dim=-2)
-            low = _mix(spectrum[..., :kept_y, :], weight[0][..., :kept_y, :])
-            high = _mix(spectrum[..., ny - kept_y :, :], weight[1][..., -kept_y:, :])
-            between = low.new_zeros(*low.shape[:2], ny - 2 * kept_y, kept_x)
-            mixed = torch.cat([low, between, high], dim=-2)
-            return torch.fft.irfft(torch.fft.ifft(mixed, dim=-2), n=nx, dim=-1)
+            weight = torch.cat([weight[0][:, :, :kept_y], weight[1][:, :, -kept_y:]], dim=2)
+            mixed = torch.einsum("byxi,ioyx->byxo", spectrum, weight)
+
+            # Every frequency along x but the first and the last possible one stands for its negative too.
+            shares = torch.full((kept_x, 1), 2.0 / (ny * nx), dtype=field.dtype, device=field.device)
+            shares[0] /= 2
+            if 2 * (kept_x - 1) == nx:
+                shares[-1] /= 2
+            parts = torch.cat([mixed.real * shares, mixed.imag * shares], dim=-2)
+            back_x = torch.cat([torch.cat([cos_x, -sin_x]), torch.cat([sin_x, cos_x])], dim=1).T
+            rows = (back_x @ parts).reshape(-1, 2 * kept_y, 2, nx * channels).transpose(1, 2)
+            back_y = torch.cat([cos_y, -sin_y]).T
+            return (back_y @ rows.reshape(-1, 4 * kept_y, nx * channels)).reshape(-1, ny, nx, channels)
 
 
-def _mix(spectrum: Tensor, weight: Tensor) -> Tensor:
-    return torch.einsum("biyx,ioyx->boyx", spectrum, weight)
+def _waves(frequencies: Tensor, size: int, like: Tensor) -> tuple[Tensor, Tensor]:
+    """cos and sin of 2π k n / N, (frequencies, N), of the dtype and device of ``like``."""
+    # The product is reduced to one period as whole numbers: angles stay exact at any size.
+    turns = torch.outer(frequencies, torch.arange(size)) % size
+    angle = turns.double() * (2 * math.pi / size)
+    return angle.cos().to(like), angle.sin().to(like)
+
+
+def _pointwise(convolution: nn.Conv2d, features: Tensor) -> Tensor:
+    """A 1 x 1 convolution with the channels last."""
+    return functional.linear(features, convolution.weight[:, :, 0, 0], convolution.bias)
+
+
+def _periodic_convolution(convolution: nn.Conv2d, features: Tensor) -> Tensor:
+    """A convolution of a periodic image, (b, y, x, channels)."""
+    margin = convolution.kernel_size[0] // 2
+    if margin == 0:
+        return _pointwise(convolution, features)
+    wide = torch.cat([features[:, -margin:], features, features[:, :margin]], dim=1)
+    wide = torch.cat([wide[:, :, -margin:], wide, wide[:, :, :margin]], dim=2)
+    convolved = functional.conv2d(wide.permute(0, 3, 1, 2), convolution.weight, convolution.bias)
+    return convolved.permute(0, 2, 3, 1)
 
 
 def _coordinates(layout: Tensor) -> Tensor:
