@@ -42,7 +42,8 @@ def run_trial(out: Path, task: Task, arm: str) -> None:
     design, settings = _task(task, source)
     parameters = make_parametrisation(settings.layout, settings.search)
     parameters.start_random(0)
-    iteration_s = min(_cpu_s(lambda: _iterate(design, parameters)) for _ in range(_TRIALS))
+    with design.printer.at_precision(settings.search.precision):
+        iteration_s = min(_cpu_s(lambda: _iterate(design, parameters)) for _ in range(_TRIALS))
     level = design.cells(parameters.best_levels())[None, None].float()
     with torch.no_grad():
         record = {

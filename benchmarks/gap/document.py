@@ -103,7 +103,8 @@ def as_markdown(record: Mapping[str, Any]) -> str:
     knobs = ", ".join(f"`{name}` {value:g}" for name, value in record["plan"]["print_knobs"].items())
     parts = [
         f"The fab holds {knobs} (10 nm rms each); the models saw {effort['scans']} scans of its prints, "
-        f"{effort['scan_px']} px; the networks were trained for {effort['training_steps']:,} steps.\n\n"
+        f"{effort['scan_px']} px; the networks were trained for {effort['training_steps']:,} steps and "
+        f"searched through in {effort['search_precision']}; what is printed and judged is float32.\n\n"
         + _model_table(record["models"])
     ]
     for name, task in record["tasks"].items():

@@ -39,6 +39,8 @@ class Effort(Record):
     lens_px: int = _FULL_LENS_PX
     hoe_iterations: int = 80
     lens_iterations: int = 100
+    # Of the networks during the search; prints, judges and scores are float32 for every arm.
+    search_precision: str = "bfloat16"
     seeds: int = 3
     zoo_seeds: int = 1
     scans: int = 24
@@ -221,11 +223,11 @@ def tasks(out: Path, effort: Effort, zoo: Mapping[str, str], judge: str | None) 
     hoe = _options(
         "--target", "text", "--size-px", effort.hoe_px,
         "--distance-um", round(300 * effort.hoe_px / _FULL_HOE_PX, 3), "--iterations", effort.hoe_iterations,
-        "--start", "gs",
+        "--start", "gs", "--precision", effort.search_precision,
     )  # fmt: skip
     lens = _options(
         "--size-px", effort.lens_px, "--distance-um", round(400 * effort.lens_px / _FULL_LENS_PX, 3),
-        "--iterations", effort.lens_iterations,
+        "--iterations", effort.lens_iterations, "--precision", effort.search_precision,
     )  # fmt: skip
     camera = _options("--window-px", effort.window_px, "--object-px", effort.object_px)
     measured = {arm: zoo.get(arm, "none") for arm in ZOO_ARMS}
@@ -244,7 +246,8 @@ def proof_jobs(out: Path, effort: Effort) -> list[Job]:
     folder = out / "proof" / "design"
     design = design_command(
         "hoe", "--model", model(out, "pbl"), "--target", "text", "--size-px", size,
-        "--distance-um", distance_um, "--iterations", 1000, "--out", folder,
+        "--distance-um", distance_um, "--iterations", 1000, "--precision", effort.search_precision,
+        "--out", folder,
     )  # fmt: skip
     judge = ("--judge", f"fab={out / 'fab' / 'truth'}")
     score = design_command("score", folder, *judge, "--out", out / "proof" / "score")

@@ -66,7 +66,7 @@ class Fno(Simulator):
         width, local = config.width, config.local_px
         self.lift = nn.Conv2d(3 if config.coordinates else 1, width, 1)
         self.spectral = nn.ModuleList(SpectralConvolution(width, config.modes) for _ in range(config.layers))
-        self.local = nn.ModuleList(nn.Conv2d(width, width, local) for _ in range(config.layers))
+        self.local = nn.ModuleList(PeriodicConvolution(width, width, local) for _ in range(config.layers))
         self.hidden = nn.Conv2d(width, config.projection_channels, 1)
         self.last = nn.Conv2d(config.projection_channels, 1, 1)
         if config.starts_as_layout:
@@ -96,7 +96,7 @@ class Fno(Simulator):
         if any(padding):
             features = functional.pad(features, (0, 0, 0, padding[0], 0, padding[1]))
         for number, (spectral, local) in enumerate(zip(self.spectral, self.local, strict=True)):
-            features = spectral(features) + _periodic_convolution(local, features)
+            features = spectral(features) + local(features)
             if number < config.layers - 1:
                 features = functional.gelu(features)
         if any(padding):
@@ -111,6 +111,17 @@ class Fno(Simulator):
         if self.tile is None:
             return self.interior(layout_um)
         return blend_tiles(self.interior, layout_um, self.tile)
+
+
+class PeriodicConvolution(nn.Conv2d):
+    """A convolution of a periodic image, (b, y, x, channels) to the same shape."""
+
+    def forward(self, features: Tensor) -> Tensor:
+        margin = self.kernel_size[0] // 2
+        if margin:
+            features = torch.cat([features[:, -margin:], features, features[:, :margin]], dim=1)
+            features = torch.cat([features[:, :, -margin:], features, features[:, :, :margin]], dim=2)
+        return super().forward(features.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
 
 
 class SpectralConvolution(nn.Module):
@@ -170,17 +181,6 @@ def _waves(frequencies: Tensor, size: int, like: Tensor) -> tuple[Tensor, Tensor
 def _pointwise(convolution: nn.Conv2d, features: Tensor) -> Tensor:
     """A 1 x 1 convolution with the channels last."""
     return functional.linear(features, convolution.weight[:, :, 0, 0], convolution.bias)
-
-
-def _periodic_convolution(convolution: nn.Conv2d, features: Tensor) -> Tensor:
-    """A convolution of a periodic image, (b, y, x, channels)."""
-    margin = convolution.kernel_size[0] // 2
-    if margin == 0:
-        return _pointwise(convolution, features)
-    wide = torch.cat([features[:, -margin:], features, features[:, :margin]], dim=1)
-    wide = torch.cat([wide[:, :, -margin:], wide, wide[:, :, :margin]], dim=2)
-    convolved = functional.conv2d(wide.permute(0, 3, 1, 2), convolution.weight, convolution.bias)
-    return convolved.permute(0, 2, 3, 1)
 
 
 def _coordinates(layout: Tensor) -> Tensor:
