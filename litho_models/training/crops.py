@@ -11,6 +11,9 @@ from torch import Tensor
 
 from litho_models.training.config import TrainingConfig
 
+# What a network remembers of a crop for its gradient is hundreds of bytes per pixel.
+_PASS_PX = 256**2
+
 
 @dataclass(frozen=True)
 class Window:
@@ -54,6 +57,17 @@ def plan_batch(shapes: Sequence[tuple[int, int]], config: TrainingConfig, step: 
         flip = (bool(random.integers(2)), bool(random.integers(2))) if config.flips else (False, False)
         windows.append(Window(scan, y, x, size, flip))
     return windows
+
+
+def in_passes(windows: Sequence[Window], device: torch.device) -> list[list[Window]]:
+    """The windows of a step in groups that go through the network one after the other.
+
+    On a CPU at most ``_PASS_PX`` pixels at a time, which bounds the memory and costs no time; elsewhere all.
+    """
+    per_pass = len(windows)
+    if device.type == "cpu":
+        per_pass = max(1, _PASS_PX // max(window.size_px**2 for window in windows))
+    return [list(windows[start : start + per_pass]) for start in range(0, len(windows), per_pass)]
 
 
 def quadrants(shapes: Sequence[tuple[int, int]], size_px: int) -> list[Window]:

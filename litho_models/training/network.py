@@ -12,7 +12,7 @@ import os
 import time
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
@@ -26,7 +26,7 @@ from litho_models.simulator import Simulator
 from litho_models.tiles import blending_window, predict_scan
 from litho_models.training.checkpoint import CheckpointFolder, RoundRecord, TrainingState
 from litho_models.training.config import TrainingConfig
-from litho_models.training.crops import Window, plan_batch, stack
+from litho_models.training.crops import Window, in_passes, plan_batch, stack
 from litho_models.training.nuisances import estimate_nuisances
 
 if TYPE_CHECKING:
@@ -115,6 +115,25 @@ def _step(
     for group in optimiser.param_groups:
         group["lr"] = learning_rate(config, step)
     windows = plan_batch(targets.shapes, config, step)[fabric.global_rank :: fabric.world_size]
+    passes = in_passes(windows, fabric.device)
+    optimiser.zero_grad(set_to_none=True)
+    sums = torch.zeros(2, device=fabric.device)
+    for number, some in enumerate(passes, 1):
+        share = len(some) / len(windows)
+        # Processes add their gradients once, with the last pass.
+        with fabric.no_backward_sync(cast(Any, module), enabled=number < len(passes)):
+            loss, means = _losses(fabric, module, targets, some, config)
+            fabric.backward(share * loss)
+        sums += share * means
+    optimiser.step()
+    absolute, counted = cast(Tensor, fabric.all_reduce(sums)).tolist()
+    return absolute / counted
+
+
+def _losses(
+    fabric: Fabric, module: Simulator, targets: _Targets, windows: list[Window], config: TrainingConfig
+) -> tuple[Tensor, Tensor]:
+    """Loss of some windows, and for the record the weighted absolute error, µm, and the weight, (2,)."""
     prediction = _predict_windows(fabric, module, targets, windows, config)
     height = fabric.to_device(stack(targets.heights_um, windows))
     weight = fabric.to_device(stack(targets.weights, windows))
@@ -124,12 +143,7 @@ def _step(
         weight = weight * (window / window.mean())
     # The count of pixels is fixed, so that the mean over processes is the loss of one process.
     loss = (weight * _error(prediction, height, config)).mean()
-    optimiser.zero_grad(set_to_none=True)
-    fabric.backward(loss)
-    optimiser.step()
-    sums = torch.stack([(weight * (prediction - height).abs()).mean().detach(), weight.mean()])
-    absolute, counted = cast(Tensor, fabric.all_reduce(sums)).tolist()
-    return absolute / counted
+    return loss, torch.stack([(weight * (prediction - height).abs()).mean().detach(), weight.mean()])
 
 
 def _predict_windows(

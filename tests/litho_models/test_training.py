@@ -178,6 +178,22 @@ def test_crops_carry_their_surroundings_and_continue_the_edge():
     assert np.array_equal(flipped, inside[::-1])
 
 
+def test_passes_change_the_memory_and_not_the_step(monkeypatch):
+    config = TrainingConfig(**{**QUICK, "steps": 4, "rounds": 1})
+
+    def trained():
+        return fit_with_record("pbl", make_scans(4, size_px=64), config, model_fields=SMALL_NETS)
+
+    together = trained()
+    monkeypatch.setattr("litho_models.training.crops._PASS_PX", 1)
+    apart = trained()
+    # Sums in another order: rounding of float32 and no more, a few 1e-6 after four steps.
+    for name, value in together.model.state_dict().items():
+        torch.testing.assert_close(apart.model.state_dict()[name], value, rtol=1e-4, atol=1e-4)
+    assert apart.history[0].training_mae_nm == pytest.approx(together.history[0].training_mae_nm, rel=1e-4)
+    assert apart.history[0].training_mae_nm != together.history[0].training_mae_nm
+
+
 def test_an_epoch_of_quadrants_sees_each_once():
     config = TrainingConfig(crops="quadrants", crop_px=32, batch=4)
     shapes = [(64, 64)] * 4
@@ -234,7 +250,10 @@ def test_two_processes_give_the_loss_curve_of_one(tmp_path):
     script.write_text(
         "import sys\n"
         "from litho_models.runs import train\n"
-        "settings = dict(steps=4, rounds=2, batch=2, crop_px=32, precision='32-true', nuisance='offset')\n"
+        "from litho_models.training import crops\n"
+        # A pass per crop: processes must add their gradients once per step all the same.
+        "crops._PASS_PX = 1\n"
+        "settings = dict(steps=4, rounds=2, batch=4, crop_px=32, precision='32-true', nuisance='offset')\n"
         f"train({str(store)!r}, 'pbl', sys.argv[1], settings=settings)\n"
     )
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
