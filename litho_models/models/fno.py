@@ -118,10 +118,32 @@ class PeriodicConvolution(nn.Conv2d):
 
     def forward(self, features: Tensor) -> Tensor:
         margin = self.kernel_size[0] // 2
-        if margin:
-            features = torch.cat([features[:, -margin:], features, features[:, :margin]], dim=1)
-            features = torch.cat([features[:, :, -margin:], features, features[:, :, :margin]], dim=2)
-        return super().forward(features.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
+        wide = _Continued.apply(features, margin) if margin else features
+        return super().forward(wide.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
+
+
+class _Continued(torch.autograd.Function):
+    """A periodic image (b, y, x, channels) continued by a margin on all sides.
+
+    PyTorch's own way back, slice by slice, makes a field of zeros for each of the four.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, features: Tensor, margin: int) -> Tensor:
+        ctx.margin = margin
+        tall = torch.cat([features[:, -margin:], features, features[:, :margin]], dim=1)
+        return torch.cat([tall[:, :, -margin:], tall, tall[:, :, :margin]], dim=2)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        margin: int = ctx.margin
+        tall = gradient[:, :, margin:-margin].clone()
+        tall[:, :, -margin:] += gradient[:, :, :margin]
+        tall[:, :, :margin] += gradient[:, :, -margin:]
+        inner = tall[:, margin:-margin]
+        inner[:, -margin:] += tall[:, :margin]
+        inner[:, :margin] += tall[:, -margin:]
+        return inner, None
 
 
 class SpectralConvolution(nn.Module):
