@@ -71,7 +71,10 @@ DefocusSdUm = Annotated[float | None, typer.Option(help="Spread of the distance,
 WavelengthSdUm = Annotated[float | None, typer.Option(help="Spread of the wavelength, µm.")]
 SpreadOf = Annotated[
     Path | None,
-    typer.Option(help="Dataset store: take the spread of gain and offset from its measured prints."),
+    typer.Option(
+        help="Dataset store: take the spread of gain and offset from its measured prints, the locked "
+        "scans left out."
+    ),
 ]
 Ensemble = Annotated[
     list[str] | None,

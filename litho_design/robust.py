@@ -167,21 +167,32 @@ def measured_window(store: Any, window: ProcessWindow) -> ProcessWindow:
 
     Each scan is fitted as height = gain * nominal + offset; the spread between scans is that of the
     process, of the microscope's own scale from scan to scan, and of what else the fit leaves in:
-    an upper bound of what one print differs from another.
+    an upper bound of what one print differs from another. The locked scans are left out: whatever a
+    design is judged by later, its search has not seen them.
 
     Args:
-        store: a ``litho_data`` store of at least three scans.
+        store: a ``litho_data`` store with at least three scans outside its lock box.
 
     Raises:
         InputError: fewer scans, or layouts without structure.
     """
+    from litho_models.splits import locked_ids
+
+    scans = store.scans()
+    locked = locked_ids(scans)
     fits = []
-    for scan in store.scans():
+    for scan in scans:
+        if scan.id in locked:
+            continue
         nominal, height = scan.layout_um[scan.valid], scan.height_um[scan.valid]
         if nominal.std() > 0:
             fits.append(np.polyfit(nominal.astype(float), height.astype(float), 1))
     if len(fits) < 3:
-        raise InputError("process window", got=f"{len(fits)} scans with structure", wanted="three at least")
+        raise InputError(
+            "process window",
+            got=f"{len(fits)} scans with structure, {len(locked)} locked ones left out",
+            wanted="three at least",
+        )
     gain, offset = np.array(fits).T
     return window.model_copy(
         update={

@@ -16,7 +16,7 @@ from litho_data.store import PrintedScan, open_store
 from litho_models.freeze import CARD_FILE, DatasetName, ModelCard, load_simulator, save_frozen
 from litho_models.run_info import RunInfo, run_info
 from litho_models.simulator import Variant
-from litho_models.splits import ids_sha256, lock_box, lock_box_size
+from litho_models.splits import ids_sha256, locked_ids
 from litho_models.tiles import predict_scan
 from litho_models.training import TrainingConfig, fit_with_record
 from litho_models.training.checkpoint import RoundRecord
@@ -174,12 +174,6 @@ def training_config(recipe: Recipe, model: str, settings: dict[str, Any]) -> Tra
         raise InputError(
             "training settings", got=first_error(error), wanted="fields of TrainingConfig"
         ) from error
-
-
-def locked_ids(scans: Sequence[PrintedScan], seed: int = 0) -> list[str]:
-    """The lock box of a dataset: a sixth of its scans, from different prints."""
-    ids, prints = [scan.id for scan in scans], [scan.print_id for scan in scans]
-    return lock_box(ids, prints, lock_box_size(len(ids)), seed)
 
 
 def level_share(scans: Sequence[PrintedScan]) -> list[float]:

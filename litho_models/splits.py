@@ -10,8 +10,12 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from litho_data.errors import InputError
+
+if TYPE_CHECKING:
+    from litho_data.store import PrintedScan
 
 QUADRANTS = (0, 1, 2, 3)
 
@@ -62,6 +66,12 @@ def lock_box(ids: Sequence[str], print_ids: Sequence[str], n: int, seed: int = 0
     for turn in range(len(ids)):
         chosen += [by_print[name][turn] for name in prints if turn < len(by_print[name])]
     return sorted(chosen[:n])
+
+
+def locked_ids(scans: Sequence[PrintedScan], seed: int = 0) -> list[str]:
+    """The lock box of a dataset: a sixth of its scans, from different prints."""
+    ids, prints = [scan.id for scan in scans], [scan.print_id for scan in scans]
+    return lock_box(ids, prints, lock_box_size(len(ids)), seed)
 
 
 def grouped_folds(ids: Sequence[str], k: int = 5, seed: int = 0) -> list[list[str]]:

@@ -12,6 +12,7 @@ from litho_design.optics import Optics
 from litho_design.parametrise import LayoutSettings
 from litho_design.process_window import focus_window, range_above
 from litho_design.robust import Draw, ProcessWindow, draws, measured_window
+from litho_models.splits import locked_ids
 
 
 def test_range_above_a_limit_is_linear_between_samples():
@@ -47,7 +48,8 @@ def test_rings_are_blurred_like_a_plane_wave_of_their_radius():
 
 
 class _Scan:
-    def __init__(self, gain: float, offset_um: float):
+    def __init__(self, name: str, gain: float, offset_um: float):
+        self.id = self.print_id = name
         generator = np.random.default_rng(0)
         self.layout_um = generator.integers(0, 13, (32, 32)) * 0.1
         self.height_um = gain * self.layout_um + offset_um
@@ -62,16 +64,32 @@ class _Store:
         return self._scans
 
 
-def test_spreads_of_measured_prints_come_back():
-    gains, offsets = np.array([0.5, 0.6, 0.7, 0.6]), np.array([0.12, 0.2, 0.16, 0.16])
-    store = _Store(*(_Scan(gain, offset) for gain, offset in zip(gains, offsets, strict=True)))
+def _store(gains: np.ndarray, offsets: np.ndarray) -> _Store:
+    return _Store(*(_Scan(f"scan{i}", g, o) for i, (g, o) in enumerate(zip(gains, offsets, strict=True))))
+
+
+def test_spreads_of_measured_prints_come_back_without_the_locked_ones():
+    gains, offsets = np.array([0.5, 0.6, 0.7, 0.6, 0.65]), np.array([0.12, 0.2, 0.16, 0.16, 0.19])
+    store = _store(gains, offsets)
+    locked = [int(name.removeprefix("scan")) for name in locked_ids(store.scans())]
+    assert len(locked) == 1
+    kept_gains, kept_offsets = np.delete(gains, locked), np.delete(offsets, locked)
     window = measured_window(store, ProcessWindow(samples=4))
     assert window.samples == 4
-    assert window.gain_sd == pytest.approx(gains.std(ddof=1) / gains.mean(), rel=1e-6)
-    assert window.offset_sd_um == pytest.approx(offsets.std(ddof=1), rel=1e-6)
-    assert window.gain_offset_correlation == pytest.approx(np.corrcoef(gains, offsets)[0, 1], rel=1e-6)
-    with pytest.raises(InputError, match="three"):
-        measured_window(_Store(_Scan(0.6, 0.1)), ProcessWindow())
+    assert window.gain_sd == pytest.approx(kept_gains.std(ddof=1) / kept_gains.mean(), rel=1e-6)
+    assert window.offset_sd_um == pytest.approx(kept_offsets.std(ddof=1), rel=1e-6)
+    together = np.corrcoef(kept_gains, kept_offsets)[0, 1]
+    assert window.gain_offset_correlation == pytest.approx(together, rel=1e-6)
+    # Whatever the locked print measures changes nothing.
+    gains[locked], offsets[locked] = 40.0, -3.0
+    assert measured_window(_store(gains, offsets), ProcessWindow(samples=4)) == window
+
+
+def test_a_spread_needs_three_scans_outside_the_lock_box():
+    gains, offsets = np.array([0.5, 0.6, 0.7, 0.6]), np.array([0.12, 0.2, 0.16, 0.16])
+    assert measured_window(_store(gains, offsets), ProcessWindow()).gain_sd > 0
+    with pytest.raises(InputError, match=r"got 2 scans .* 1 locked .* three"):
+        measured_window(_store(gains[:3], offsets[:3]), ProcessWindow())
 
 
 def test_gain_and_offset_are_drawn_together():
