@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+from litho_data.errors import InputError
 from litho_design.cli_options import (
     TARGET_HELP,
     BlurSdUm,
@@ -14,12 +15,14 @@ from litho_design.cli_options import (
     Device,
     Extrapolate,
     GainSd,
+    HeldOutObjects,
     IndexStep,
     Iterations,
     LearningRate,
     LevelHeight,
     Levels,
     ObjectPx,
+    Objects,
     Out,
     Risk,
     RiskTail,
@@ -65,6 +68,8 @@ def compare(
     level_height_um: LevelHeight = None,
     window_px: WindowPx = None,
     object_px: ObjectPx = None,
+    objects: Objects = None,
+    held_out_objects: HeldOutObjects = None,
     iterations: Iterations = None,
     start: Start = None,
     learning_rate: LearningRate = None,
@@ -87,6 +92,7 @@ def compare(
     from litho_design.compare import compare as run_comparison
     from litho_design.hoe import design_hoe
     from litho_design.lens import design_lens
+    from litho_design.objects import bring_objects
     from litho_design.targets import make_target
 
     options: dict[str, Any] = {
@@ -116,8 +122,13 @@ def compare(
         sources = (models.split(","), judge or [])
         return [load_printers(specs, layout, device, extrapolate) for specs in sources]
 
+    brought = (objects or [], held_out_objects or [])
     # Printers first: what is wrong with them is told before a target is drawn.
     if task == "hoe":
+        if any(brought):
+            raise InputError(
+                "objects", got="the hoe task, which has a target", wanted="a lens", hint="--target"
+            )
         settings: Any = hoe_settings(variant, **options)
         arms, judges = printers(settings.layout)
         image, record = make_target(target, settings.layout.size_px)
@@ -128,9 +139,10 @@ def compare(
         kind = "direct" if task == "lens-direct" else "computational"
         settings = lens_settings(variant, kind, window_px=window_px, object_px=object_px, **options)
         arms, judges = printers(settings.layout)
+        settings, pictures = bring_objects(settings, *brought)
 
         def designer(settings, printer, place):
-            return design_lens(settings, printer, place, command=command_line())
+            return design_lens(settings, printer, place, pictures=pictures, command=command_line())
 
     result = run_comparison(settings, designer, arms, judges, out, seeds=range(seeds), command=command_line())
     for item in result.summary:

@@ -18,12 +18,14 @@ from litho_design.cli_options import (
     EnsembleWeight,
     Extrapolate,
     GainSd,
+    HeldOutObjects,
     IndexStep,
     Iterations,
     LearningRate,
     LevelHeight,
     Levels,
     ObjectPx,
+    Objects,
     Out,
     Parametrisation,
     Risk,
@@ -125,6 +127,8 @@ def lens(
     level_height_um: LevelHeight = None,
     window_px: WindowPx = None,
     object_px: ObjectPx = None,
+    objects: Objects = None,
+    held_out_objects: HeldOutObjects = None,
     iterations: Iterations = None,
     start: Start = None,
     parametrisation: Parametrisation = None,
@@ -147,6 +151,7 @@ def lens(
 ) -> None:
     """Design a multi-level diffractive lens; an interrupted run in OUT is continued."""
     from litho_design.lens import design_lens
+    from litho_design.objects import bring_objects
     from litho_design.printer import load_printer
 
     settings = lens_settings(
@@ -160,7 +165,10 @@ def lens(
     )  # fmt: skip
     printer = load_printer(model, settings.layout, device=device, extrapolate=extrapolate)
     others = load_printers(ensemble or [], settings.layout, device, extrapolate)
-    design = design_lens(settings, printer, out, ensemble=list(others.values()), command=command_line())
+    settings, pictures = bring_objects(settings, objects or [], held_out_objects or [])
+    design = design_lens(
+        settings, printer, out, ensemble=list(others.values()), pictures=pictures, command=command_line()
+    )
     _tell(design, out)
 
 

@@ -55,6 +55,19 @@ SearchPrecision = Annotated[
 Seed = Annotated[int, typer.Option(help="Seed of start and sampling.")]
 WindowPx = Annotated[int | None, typer.Option(help="Lens: side of the PSF window, pixels.")]
 ObjectPx = Annotated[int | None, typer.Option(help="Computational lens: side of the objects, sensor pixels.")]
+Objects = Annotated[
+    list[Path] | None,
+    typer.Option(
+        help="Computational lens: picture, or folder of pictures, to image instead of the drawings; may be "
+        "repeated. Without --held-out-objects the last quarter by name, two at least, is held out."
+    ),
+]
+HeldOutObjects = Annotated[
+    list[Path] | None,
+    typer.Option(
+        help="Computational lens: picture or folder of pictures that is only scored; may be repeated."
+    ),
+]
 RobustSamples = Annotated[
     int | None,
     typer.Option(help="Draws of the process window in the loss; 0 designs for the print as modelled."),

@@ -23,6 +23,7 @@ LEVELS_FILE = "layout_level.npy"
 HEIGHT_FILE = "predicted_height_um.npy"
 IMAGE_FILE = "image_share.npy"
 TARGET_FILE = "target.npy"
+PICTURES_FILE = "object_pictures.npy"
 
 
 DesignTask = Literal["hoe", "lens-direct", "lens-computational"]

@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 
 from litho_data.results import Record
-from litho_design.design import HEIGHT_FILE, LEVELS_FILE, TARGET_FILE, Design, read_array
+from litho_design.design import HEIGHT_FILE, LEVELS_FILE, PICTURES_FILE, TARGET_FILE, Design, read_array
 from litho_design.hologram import HologramBench
-from litho_design.lens import score_lens
-from litho_design.lens_bench import LensBench
+from litho_design.lens_bench import ImagingSettings, LensBench
+from litho_design.lens_metrics import score_lens
+from litho_design.objects import picture_records
 from litho_design.printer import Printer, check_device
 from litho_design.settings import HoeSettings, LensSettings
 
@@ -41,6 +42,7 @@ class Judging:
         else:
             self._lens = LensSettings.model_validate(self.design.settings)
             self.bench = LensBench(self.design.layout, self.design.optics, self._lens.view)
+            self.pictures = self._read_pictures(folder, self._lens.imaging)
         self.bench.to(self.device)
 
     @torch.no_grad()
@@ -56,7 +58,7 @@ class Judging:
     def figures(self, height_um: Tensor) -> Record:
         """All figures of a print."""
         if isinstance(self.bench, LensBench):
-            return score_lens(self._lens, self.bench, height_um, self.expected_um)
+            return score_lens(self._lens, self.bench, height_um, self.expected_um, self.pictures)
         assert self.target is not None
         return self.bench.score(height_um, self.target, self._hoe.camera)
 
@@ -71,6 +73,13 @@ class Judging:
     def window_um(self) -> float:
         """Side of the image or of the PSF window, µm."""
         return (self.bench.window if isinstance(self.bench, LensBench) else self.bench.grid).size_um[0]
+
+    def _read_pictures(self, folder: str | Path, imaging: ImagingSettings) -> dict[str, np.ndarray]:
+        records = picture_records((*imaging.objects, *imaging.test_objects))
+        if not records:
+            return {}
+        pixels = read_array(folder, PICTURES_FILE)
+        return {record.sha256: picture for record, picture in zip(records, pixels, strict=True)}
 
     def _load(self, folder: str | Path, name: str) -> Tensor:
         return torch.from_numpy(read_array(folder, name)).to(self.device)

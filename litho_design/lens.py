@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,19 +11,19 @@ import torch
 from torch import Tensor
 
 from litho_data.errors import InputError
-from litho_design.design import HEIGHT_FILE, IMAGE_FILE, Design, DesignTask
+from litho_design.design import HEIGHT_FILE, IMAGE_FILE, PICTURES_FILE, Design, DesignTask
 from litho_design.ensemble import penalised
 from litho_design.initialise import fresnel_lens_phase, printed_phase
 from litho_design.lens_bench import (
     LensBench,
     RadialLensBench,
     centre_to_background,
-    object_stack,
     reconstruct,
     record,
     sensor_psf,
 )
-from litho_design.lens_metrics import ImagingScore, LensScore, imaging_score, lens_score
+from litho_design.lens_metrics import ImagingLensScore, LensScore, lens_score, score_lens
+from litho_design.objects import object_stack, picture_records, pictures_note
 from litho_design.optics import Optics
 from litho_design.parametrise import CellMap, Parametrisation, nearest_levels
 from litho_design.printer import Printer
@@ -44,6 +44,7 @@ def design_lens(
     out: str | Path,
     *,
     ensemble: Sequence[Printer] = (),
+    pictures: Mapping[str, np.ndarray] | None = None,
     command: str = "",
     announce: bool = True,
 ) -> Design:
@@ -54,11 +55,13 @@ def design_lens(
         printer: frozen model, or nominal heights.
         out: folder of the design; an interrupted run in it is continued.
         ensemble: further models: the loss is the mean over all, plus what they disagree by.
+        pictures: pixels of the objects that are pictures (see ``bring_objects``).
 
     Raises:
-        InputError: a radial search of a layout without rings or with a square aperture.
+        InputError: a radial search of a layout without rings or with a square aperture, or an object
+            without its pixels.
     """
-    task = LensTask(settings, printer, ensemble)
+    task = LensTask(settings, printer, ensemble, pictures)
     return run_design(task, settings, settings, out, command=command, announce=announce)
 
 
@@ -67,7 +70,13 @@ class LensTask:
 
     target_record: TargetRecord | None = None
 
-    def __init__(self, settings: LensSettings, printer: Printer, ensemble: Sequence[Printer] = ()):
+    def __init__(
+        self,
+        settings: LensSettings,
+        printer: Printer,
+        ensemble: Sequence[Printer] = (),
+        pictures: Mapping[str, np.ndarray] | None = None,
+    ):
         _check(settings)
         self.settings, self.printer = settings, printer
         self.printers = [printer, *ensemble]
@@ -87,7 +96,10 @@ class LensTask:
             (draw, self._search_bench(draw.optics))
             for draw in draws(settings.window, settings.optics, settings.window.samples)
         ] or [(None, self._search_bench(settings.optics))]
-        self.objects = object_stack(settings.imaging.objects, settings.imaging.object_px).to(device)
+        imaging = settings.imaging
+        self.pictures = dict(pictures or {})
+        self.objects = object_stack(imaging.objects, imaging.object_px, self.pictures).to(device)
+        self.notes += pictures_note(imaging.objects, imaging.test_objects)
 
     def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
         """-log(centre-to-background ratio), or the mean absolute error after Richardson-Lucy.
@@ -136,12 +148,17 @@ class LensTask:
 
     def score(self, height_um: Tensor) -> LensScore | ImagingLensScore:
         """Score of a print, expected PSF and printed PSF being the same."""
-        return score_lens(self.settings, self.bench, height_um, height_um)
+        return score_lens(self.settings, self.bench, height_um, height_um, self.pictures)
 
     @torch.no_grad()
     def arrays(self, height_um: Tensor) -> dict[str, np.ndarray]:
-        """The PSF."""
-        return {IMAGE_FILE: self.bench(height_um).cpu().numpy()}
+        """The PSF, and the pictures (n, object, object) in the order of ``picture_records``."""
+        arrays = {IMAGE_FILE: self.bench(height_um).cpu().numpy()}
+        imaging = self.settings.imaging
+        records = picture_records((*imaging.objects, *imaging.test_objects))
+        if records:
+            arrays[PICTURES_FILE] = object_stack(records, imaging.object_px, self.pictures).numpy()
+        return arrays
 
     def reference_efficiency(self) -> float:
         """Focusing efficiency of a perfect lens of this aperture."""
@@ -200,22 +217,6 @@ def _strip_rings(cells: CellMap, halo_px: int) -> Tensor:
     across = torch.arange(-halo_px - 1, halo_px + 1, dtype=torch.float64) + 0.5
     ring = (torch.hypot(across[:, None], along[None, :]) / cells.cell_px).floor().long()
     return ring.clamp(max=cells.cells[0] - 1).to(cells.ring.device)
-
-
-class ImagingLensScore(LensScore, ImagingScore):
-    """PSF and imaging figures of a computational lens."""
-
-
-@torch.no_grad()
-def score_lens(
-    settings: LensSettings, bench: LensBench, height_um: Tensor, design_height_um: Tensor
-) -> LensScore | ImagingLensScore:
-    """Figures of a printed lens whose design expected ``design_height_um``."""
-    score = lens_score(bench, height_um)
-    if settings.task == "direct":
-        return score
-    imaging = imaging_score(bench(height_um), bench(design_height_um), settings.imaging)
-    return ImagingLensScore(**score.model_dump(), **imaging.model_dump())
 
 
 def _best_offset(phase: Tensor, level_phase: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ from pydantic import Field, PositiveFloat, model_validator
 from torch import Tensor, nn
 
 from litho_data.results import Record
+from litho_design.objects import ImagedObject, object_name
 from litho_design.optics import (
     Optics,
     RadialPropagator,
@@ -22,7 +23,7 @@ from litho_design.optics import (
 from litho_design.optics.deconvolve import richardson_lucy
 from litho_design.optics.imaging import Blur, bin_pixels
 from litho_design.parametrise import LayoutSettings
-from litho_design.targets import DrawnTarget, draw_target
+from litho_design.targets import DrawnTarget
 
 
 class LensView(Record):
@@ -42,23 +43,25 @@ class LensView(Record):
 class ImagingSettings(Record):
     """Computational imaging: sensor, noise, reconstruction and the objects of design and test.
 
+    An object is the name of a drawing or the record of a picture (see ``bring_objects``).
     ``read_noise`` is the standard deviation relative to a white object behind a lens that focuses
     all light; the paper does not state its own.
     """
 
     pixel_px: int = Field(default=2, ge=1)
-    objects: tuple[str, ...] = ("text", "chart", "spots")
-    test_objects: tuple[str, ...] = ("ring", "letters")
+    objects: tuple[ImagedObject, ...] = ("text", "chart", "spots")
+    test_objects: tuple[ImagedObject, ...] = ("ring", "letters")
     object_px: int = Field(default=128, ge=32)
     read_noise: float = Field(default=0.01, ge=0)
     iterations: int = Field(default=50, ge=1)
 
     @model_validator(mode="after")
     def _held_out(self) -> ImagingSettings:
-        unknown = sorted({*self.objects, *self.test_objects} - set(get_args(DrawnTarget)))
+        drawn = {item for item in (*self.objects, *self.test_objects) if isinstance(item, str)}
+        unknown = sorted(drawn - set(get_args(DrawnTarget)))
         if unknown:
             raise ValueError(f"object {unknown[0]!r} is none of {', '.join(get_args(DrawnTarget))}")
-        seen = sorted(set(self.objects) & set(self.test_objects))
+        seen = sorted(object_name(item) for item in set(self.objects) & set(self.test_objects))
         if seen:
             raise ValueError(f"object {seen[0]!r} is in the design and in the test")
         if not self.objects or len(self.test_objects) < 2:
@@ -151,14 +154,6 @@ def sensor_psf(psf: Tensor, pixel_px: int) -> Tensor:
     first = (psf.shape[-1] - pixels * pixel_px) // 2
     last = first + pixels * pixel_px
     return bin_pixels(psf[..., first:last, first:last], pixel_px)
-
-
-def object_stack(names: tuple[str, ...], size_px: int) -> Tensor:
-    """Objects (n, size, size) in [0, 1], drawn by code, with a dark border of one eighth."""
-    border = size_px // 8
-    inner = size_px - 2 * border
-    drawn = torch.stack([torch.from_numpy(draw_target(name, inner)) for name in names])
-    return torch.nn.functional.pad(drawn, (border, border, border, border))
 
 
 def record(objects: Tensor, psf: Tensor, read_noise: float, seed: int) -> Tensor:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -12,12 +14,13 @@ from litho_design.lens_bench import (
     ImagingSettings,
     LensBench,
     centre_to_background,
-    object_stack,
     reconstruct,
     record,
     sensor_psf,
 )
 from litho_design.metrics import ssim
+from litho_design.objects import object_stack
+from litho_design.settings import LensSettings
 
 _TEST_SEEDS = range(1000, 1003)
 
@@ -113,10 +116,20 @@ def mtf_at(psf: Tensor, frequency_per_um: float, pitch_um: float) -> float:
 
 
 @torch.no_grad()
-def imaging_score(psf: Tensor, design_psf: Tensor, settings: ImagingSettings) -> ImagingScore:
-    """Image the test objects through ``psf`` and reconstruct with both PSFs."""
+def imaging_score(
+    psf: Tensor,
+    design_psf: Tensor,
+    settings: ImagingSettings,
+    pictures: Mapping[str, np.ndarray] | None = None,
+) -> ImagingScore:
+    """Image the test objects through ``psf`` and reconstruct with both PSFs.
+
+    Args:
+        psf, design_psf: (window, window), share of the incident power per window pixel.
+        pictures: pixels of the test objects that are pictures, see ``object_stack``.
+    """
     real, expected = (sensor_psf(p, settings.pixel_px).float() for p in (psf, design_psf))
-    objects = object_stack(settings.test_objects, settings.object_px).to(psf.device)
+    objects = object_stack(settings.test_objects, settings.object_px, pictures).to(psf.device)
     rows: dict[str, list[float]] = {}
 
     def add(name: str, estimates: Tensor) -> None:
@@ -147,3 +160,23 @@ def imaging_score(psf: Tensor, design_psf: Tensor, settings: ImagingSettings) ->
         ssim_calibrated=means["ssim_calibrated"],
         ssim_calibrated_sd=spread["ssim_calibrated"],
     )
+
+
+class ImagingLensScore(LensScore, ImagingScore):
+    """PSF and imaging figures of a computational lens."""
+
+
+@torch.no_grad()
+def score_lens(
+    settings: LensSettings,
+    bench: LensBench,
+    height_um: Tensor,
+    design_height_um: Tensor,
+    pictures: Mapping[str, np.ndarray] | None = None,
+) -> LensScore | ImagingLensScore:
+    """Figures of a printed lens whose design expected ``design_height_um``."""
+    score = lens_score(bench, height_um)
+    if settings.task == "direct":
+        return score
+    imaging = imaging_score(bench(height_um), bench(design_height_um), settings.imaging, pictures)
+    return ImagingLensScore(**score.model_dump(), **imaging.model_dump())

@@ -39,8 +39,8 @@ def make_target(name: str, size_px: int) -> tuple[np.ndarray, TargetRecord]:
     if not Path(name).is_file():
         drawings = ", ".join(get_args(DrawnTarget))
         raise InputError("target", got=repr(name), wanted=f"an image file, or one of {drawings}")
-    target, adaptation = _read_image(Path(name), size_px)
-    return target, TargetRecord(name=Path(name).name, sha256=file_sha256(name), adaptation=adaptation)
+    target, notes = read_image(Path(name), size_px, "target")
+    return target, TargetRecord(name=Path(name).name, sha256=file_sha256(name), adaptation="; ".join(notes))
 
 
 def draw_target(name: str, size_px: int) -> np.ndarray:
@@ -111,20 +111,34 @@ def _spots(y: np.ndarray, x: np.ndarray) -> np.ndarray:
     return picture
 
 
-def _read_image(path: Path, size_px: int) -> tuple[np.ndarray, str]:
+def read_image(path: Path, size_px: int, what: str) -> tuple[np.ndarray, list[str]]:
+    """A picture in grey on a black square, divided by its brightest value.
+
+    Args:
+        path: any format and bit depth that OpenCV reads; grey values are taken as brightness.
+        size_px: side of the square.
+        what: what the errors call it.
+
+    Returns:
+        float32 (size, size) in [0, 1], and what was done to fit it, one phrase each.
+
+    Raises:
+        InputError: not a readable image, values that are no numbers, or no light.
+    """
     import cv2
 
-    picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) if path.is_file() else None
     if picture is None:
-        raise InputError(
-            "target", got=str(path), wanted="an image that OpenCV can read (PNG, TIFF, JPEG, BMP)"
-        )
+        raise InputError(what, got=str(path), wanted="an image that OpenCV can read (PNG, TIFF, JPEG, BMP)")
     grey: np.ndarray = picture.astype(np.float32)
     if not np.isfinite(grey).all():
-        raise InputError("target", got=f"{path} with values that are no numbers", wanted="finite brightness")
+        raise InputError(what, got=f"{path} with values that are no numbers", wanted="finite brightness")
     if grey.max() <= 0:
-        raise InputError("target", got=f"{path} without any light", wanted="an image with bright pixels")
+        raise InputError(what, got=f"{path} without any light", wanted="an image with bright pixels")
     notes = []
+    stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if stored is not None and stored.ndim == 3:
+        notes.append("colour to grey (ITU-R BT.601 luma)")
     height, width = grey.shape
     if height != width:
         side = max(height, width)
@@ -138,4 +152,4 @@ def _read_image(path: Path, size_px: int) -> tuple[np.ndarray, str]:
         method = cv2.INTER_AREA if shrink else cv2.INTER_LINEAR
         notes.append(f"resampled from {grey.shape[0]} to {size_px} px")
         grey = cv2.resize(grey, (size_px, size_px), interpolation=method)
-    return np.clip(grey / grey.max(), 0, 1).astype(np.float32), "; ".join(notes)
+    return np.clip(grey / grey.max(), 0, 1).astype(np.float32), notes

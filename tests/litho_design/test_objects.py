@@ -1,0 +1,219 @@
+"""Objects of a lens that the user brings: conversion, split, identity, and what is refused."""
+
+from __future__ import annotations
+
+import sys
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from litho_data.errors import InputError
+from litho_data.files import file_sha256
+from litho_design.cli import main
+from litho_design.compare import GapResult
+from litho_design.design import HEIGHT_FILE, Design, read_array
+from litho_design.lens import LensTask, design_lens
+from litho_design.objects import bring_objects, object_name, object_stack, picture_records
+from litho_design.optics import Optics
+from litho_design.parametrise import LayoutSettings
+from litho_design.score import score_design
+from litho_design.settings import lens_preset
+from litho_design.targets import draw_target
+
+SMALL = (
+    *("--size-px", "128", "--window-px", "64", "--object-px", "32", "--iterations", "2"),
+    *("--model", "none", "--task", "computational", "--focal-length-um", "40"),
+)
+
+
+@pytest.fixture
+def settings():
+    default = lens_preset("default", "computational")
+    return default.model_copy(
+        update={
+            "layout": LayoutSettings(size_px=128, cell_um=0.1, symmetry="radial"),
+            "optics": Optics(distance_um=40.0),
+            "search": default.search.model_copy(
+                update={"iterations": 3, "checkpoint_every": 1, "polish_rounds": 0}
+            ),
+            "view": default.view.model_copy(update={"window_px": 64}),
+            "imaging": default.imaging.model_copy(update={"object_px": 32, "iterations": 5}),
+        }
+    )
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Five pictures whose names are not in the order in which they were written."""
+    place = tmp_path / "pictures"
+    place.mkdir()
+    for seed, name in enumerate("cebda"):
+        picture = np.random.default_rng(seed).integers(20, 200, (24, 24)).astype(np.uint8)
+        cv2.imwrite(str(place / f"{name}.png"), picture)
+    (place / ".hidden").write_text("not a picture")
+    return place
+
+
+def test_drawings_and_pictures_stand_inside_a_dark_border(folder, settings):
+    brought, pictures = bring_objects(settings, [folder / "a.png"], [folder / "b.png", folder / "c.png"])
+    (record,) = picture_records(("ring", *brought.imaging.objects))
+    ring, picture = object_stack(("ring", record), 32, pictures)
+    inside = slice(4, 28)
+    assert torch.equal(ring[inside, inside], torch.from_numpy(draw_target("ring", 24)))
+    grey = cv2.imread(str(folder / "a.png"), cv2.IMREAD_GRAYSCALE).astype(np.float32)
+    assert torch.equal(picture[inside, inside], torch.from_numpy(grey / grey.max()))
+    for whole in (ring, picture):
+        assert torch.count_nonzero(whole) == torch.count_nonzero(whole[inside, inside])
+
+
+def test_a_picture_is_converted_as_its_record_says(tmp_path, settings):
+    # Red and twice as wide as high: a square of 48 px with dark bands above and below, then 24 px.
+    colour = np.zeros((24, 48, 3), np.uint8)
+    colour[:, :24, 2], colour[:, 24:, 2] = 200, 100
+    cv2.imwrite(str(tmp_path / "wide.png"), colour)
+    grey = np.full((24, 24), 7, np.uint16)
+    grey[0, 0] = 70
+    cv2.imwrite(str(tmp_path / "deep.png"), grey)
+    brought, pictures = bring_objects(settings, [], [tmp_path / "wide.png", tmp_path / "deep.png"])
+    wide, deep = brought.imaging.test_objects
+    assert brought.imaging.objects == settings.imaging.objects
+    assert (wide.name, wide.sha256) == ("wide.png", file_sha256(tmp_path / "wide.png"))
+    assert wide.adaptation == (
+        "colour to grey (ITU-R BT.601 luma); 24 x 48 px centred on a black square; resampled from 48 to "
+        "24 px; divided by its brightest value; dark border of 4 px"
+    )
+    assert deep.adaptation == "divided by its brightest value; dark border of 4 px"
+    seen = pictures[wide.sha256]
+    assert seen.shape == (32, 32)
+    # 12 of the 24 rows are light: full on the left, half on the right. Luma is 59.8 against 29.9, and a
+    # decoder may round or cut its counts: one in 59.
+    assert np.allclose(seen[10:22, 4:16], 1)
+    assert np.allclose(seen[10:22, 16:28], 0.5, atol=1 / 59)
+    assert seen.sum() == pytest.approx(seen[10:22, 4:28].sum())
+    assert pictures[deep.sha256][4, 4] == 1
+    assert np.allclose(pictures[deep.sha256][10:20, 10:20], 0.1)
+
+
+@pytest.mark.parametrize(("count", "held_out"), [(3, 2), (5, 2), (8, 2), (12, 3)])
+def test_the_last_quarter_by_name_is_held_out(tmp_path, settings, count, held_out):
+    for index in reversed(range(count)):
+        picture = np.random.default_rng(index).integers(0, 255, (24, 24)).astype(np.uint8)
+        cv2.imwrite(str(tmp_path / f"{index:02d}.png"), picture)
+    imaging = bring_objects(settings, [tmp_path], [])[0].imaging
+    names = [f"{index:02d}.png" for index in range(count)]
+    assert [object_name(item) for item in imaging.objects] == names[:-held_out]
+    assert [object_name(item) for item in imaging.test_objects] == names[-held_out:]
+
+
+def test_a_design_with_pictures_is_scored_without_their_files(tmp_path, folder, settings, make_printer):
+    brought, pictures = bring_objects(settings, [folder], [])
+    printer = make_printer(settings.layout)
+    design = design_lens(brought, printer, tmp_path / "d", pictures=pictures, announce=False)
+    assert "held out: d.png, e.png" in design.notes[-1]
+    told = design.settings["imaging"]
+    assert [item["name"] for item in told["objects"]] == ["a.png", "b.png", "c.png"]
+    assert [item["sha256"] for item in told["test_objects"]] == [
+        file_sha256(folder / "d.png"), file_sha256(folder / "e.png")
+    ]  # fmt: skip
+    for file in folder.iterdir():
+        file.unlink()
+    own = score_design(tmp_path / "d", [printer], tmp_path / "score").scores[0]
+    assert own.figures == pytest.approx(design.predicted, rel=1e-5)
+    # The same print images the drawings with another error.
+    drawn = LensTask(settings, printer).score(torch.from_numpy(read_array(tmp_path / "d", HEIGHT_FILE)))
+    assert drawn.mae_calibrated != pytest.approx(design.predicted["mae_calibrated"], rel=0.01)
+
+
+def test_another_set_of_objects_is_another_design(tmp_path, folder, settings, make_printer, monkeypatch):
+    printer = make_printer(settings.layout)
+    every, one_less = [folder], [folder / f"{name}.png" for name in "abde"]
+    brought, pictures = bring_objects(settings, every, [])
+    other, other_pictures = bring_objects(settings, one_less, [])
+    design_lens(brought, printer, tmp_path / "done", pictures=pictures, announce=False)
+    with pytest.raises(InputError, match="other settings"):
+        design_lens(other, printer, tmp_path / "done", pictures=other_pictures, announce=False)
+    # The same name with other pixels is another object too.
+    cv2.imwrite(str(folder / "a.png"), np.eye(24, dtype=np.uint8))
+    changed, changed_pictures = bring_objects(settings, every, [])
+    with pytest.raises(InputError, match="other settings"):
+        design_lens(changed, printer, tmp_path / "done", pictures=changed_pictures, announce=False)
+
+    def stop(self, height_um):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as cut:
+        cut.setattr(LensTask, "arrays", stop)
+        with pytest.raises(KeyboardInterrupt):
+            design_lens(brought, printer, tmp_path / "cut", pictures=pictures, announce=False)
+    with pytest.raises(InputError, match="checkpoint"):
+        design_lens(other, printer, tmp_path / "cut", pictures=other_pictures, announce=False)
+
+
+def test_pixels_must_belong_to_the_settings(folder, settings, make_printer):
+    brought, pictures = bring_objects(settings, [folder], [])
+    with pytest.raises(InputError, match=r"object a\.png, got no pixels"):
+        LensTask(brought, make_printer(settings.layout))
+    wider = brought.model_copy(update={"imaging": brought.imaging.model_copy(update={"object_px": 48})})
+    with pytest.raises(InputError, match=r"pixels of shape \(32, 32\)"):
+        LensTask(wider, make_printer(settings.layout), pictures=pictures)
+
+
+def test_commands_take_objects(tmp_path, folder, monkeypatch, capsys):
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", ["litho-design", *map(str, words)])
+        with pytest.raises(SystemExit) as stop:
+            main()
+        assert stop.value.code == 0
+        return capsys.readouterr()
+
+    split = ("--objects", folder / "c.png", "--objects", folder / "a.png", "--held-out-objects")
+    split = (*split, folder / "b.png", "--held-out-objects", folder / "d.png")
+    told = run("lens", *SMALL, *split, "--out", tmp_path / "d")
+    assert "objects of the design: c.png, a.png; held out: b.png, d.png" in told.err
+    assert "MAE" in told.out
+    imaging = Design.read(tmp_path / "d").settings["imaging"]
+    run(
+        "compare", "--models", "none", "--task", "lens-computational", "--seeds", "1", *SMALL[:8],
+        "--distance-um", "40", *split, "--out", tmp_path / "gap",
+    )  # fmt: skip
+    compared = GapResult.read(tmp_path / "gap").settings.imaging
+    assert compared.model_dump(mode="json") == imaging
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (("--objects", "note.txt"), "note.txt"),
+        (("--objects", "nowhere"), "nowhere"),
+        (("--objects", "empty"), "without a file"),
+        (("--objects", "mixed"), "note.txt"),
+        (("--objects", "pictures/a.png"), "got 0 for the design"),
+        (("--objects", "pictures/a.png", "--objects", "pictures/b.png"), "0 for the design and 2 held out"),
+        (("--objects", "pictures", "--held-out-objects", "extra.png"), "1 held out"),
+        (("--objects", "pictures", "--held-out-objects", "pictures/a.png"), "there already"),
+        (("--objects", "black.png"), "without any light"),
+        (("--objects", "pictures", "--task", "direct"), "images none"),
+        (("--objects", "pictures", "compare"), "the hoe task"),
+    ],
+)  # fmt: skip
+def test_bad_objects_are_one_line_and_exit_code_2(tmp_path, folder, monkeypatch, capsys, words, complaint):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "note.txt").write_text("words")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "mixed").mkdir()
+    (tmp_path / "mixed" / "note.txt").write_text("words")
+    cv2.imwrite("black.png", np.zeros((24, 24), np.uint8))
+    cv2.imwrite("extra.png", np.eye(24, dtype=np.uint8) * 200)
+    command = ["lens", *SMALL, *words]
+    if words[-1] == "compare":
+        command = ["compare", "--models", "none", "--size-px", "128", *words[:-1]]
+    monkeypatch.setattr(sys, "argv", ["litho-design", *command, "--out", "out"])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 2
+    said = capsys.readouterr().err.strip()
+    assert len(said.splitlines()) == 1
+    assert complaint in said
+    assert not (tmp_path / "out").exists()
