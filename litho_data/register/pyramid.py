@@ -11,7 +11,7 @@ from litho_data.register.refine import LADDER, Model, Refinement, refine
 from litho_data.register.topography import fill_gaps, pearson, predicted_topography, smooth_measured
 
 SCAN_BLUR_PX = 1.0
-BLURS_PX = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0)
+BLURS_PX = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 15.0)
 LEVELS = (4, 2)
 SMALLEST_LEVEL_PX = 48
 

@@ -58,8 +58,11 @@ class Thresholds:
 
     min_overlap: float = 0.5
     min_ecc: float = 0.7
-    max_tre_median_px: float = 1.0
+    tre_median_warning_px: float = 1.0
+    max_tre_median_px: float = 1.5
     max_corner_sd_px: float = 1.5
+    # Beyond this blur of the print (sigma) the two limits above grow with it.
+    blur_of_limits_px: float = 8.0
     singular_range: tuple[float, float] = (0.90, 1.10)
     singular_warning_range: tuple[float, float] = (0.95, 1.05)
     max_layout_repeats: float = 0.9
@@ -67,14 +70,21 @@ class Thresholds:
     min_orientation_margin: float = 0.1
 
 
-def judge(figures: dict[str, Any], thresholds: Thresholds) -> tuple[bool, str, str]:
-    """(passed, reason, warning) for the figures of one registration; every failure is named."""
+def judge(figures: dict[str, Any], thresholds: Thresholds, blur_px: float) -> tuple[bool, str, str]:
+    """(passed, reason, warning) for the figures of one registration; every failure is named.
+
+    Args:
+        figures: of the fit, the warp and the evidence.
+        thresholds: limits of a pass.
+        blur_px: sigma of the blur that makes the layout most like the scan, layout pixels.
+    """
     low, high = thresholds.singular_range
     smallest, largest = figures["singular_min"], figures["singular_max"]
     margin = figures["ecc"] - figures["second_orientation"]
     upright = figures["dihedral"] == "identity" and figures["polarity"] == 1
     tied = margin < thresholds.min_orientation_margin
     by_points = figures["method"] in ("orb", "sift")
+    softness = max(1.0, blur_px / thresholds.blur_of_limits_px)
 
     fits = figures["ecc"] >= thresholds.min_ecc
     failures = []
@@ -93,9 +103,9 @@ def judge(figures: dict[str, Any], thresholds: Thresholds) -> tuple[bool, str, s
         failures.append(f"overlap {figures['overlap']:.2f}, at least {thresholds.min_overlap} wanted")
     if not low <= smallest <= largest <= high:
         failures.append(f"scale {smallest:.3f} to {largest:.3f}, {low} to {high} wanted; is the pitch right?")
-    if figures["tre_median_px"] > thresholds.max_tre_median_px:
+    if figures["tre_median_px"] > softness * thresholds.max_tre_median_px:
         failures.append(f"target registration error {figures['tre_median_px']:.2f} px")
-    if not figures["corner_sd_px"] <= thresholds.max_corner_sd_px:
+    if not figures["corner_sd_px"] <= softness * thresholds.max_corner_sd_px:
         spread = figures["corner_sd_px"]
         failures.append(
             f"corners known to {spread:.2f} px only" if spread == spread else "corners not determined"
@@ -107,6 +117,8 @@ def judge(figures: dict[str, Any], thresholds: Thresholds) -> tuple[bool, str, s
         warnings.append(f"scale {smallest:.3f} to {largest:.3f}; is the pitch right?")
     if fits and tied and upright:
         warnings.append("layout looks alike in another orientation; upright assumed")
+    if figures["tre_median_px"] > thresholds.tre_median_warning_px:
+        warnings.append(f"target registration error {figures['tre_median_px']:.2f} px")
     if figures["polarity"] == -1:
         warnings.append("inverted contrast")
     if not by_points:

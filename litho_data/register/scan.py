@@ -120,7 +120,7 @@ def register_scan(
         "mutual_information_after_bit": mutual_information_bit(after, layout),
         "noise_variance_factor": noise_variance_factor(scan_pitch_um, layout_pitch_um),
     }
-    passed, reason, warning = judge(figures, limits)
+    passed, reason, warning = judge(figures, limits, fine.blur_px)
     quality = RegistrationQuality(passed=passed, reason=reason, warning=warning, **figures)
     return Registration(scan_to_layout, quality)
 

@@ -178,10 +178,10 @@ def terms_for(terms: Terms, screened: Sequence[Screened]) -> Terms:
     """Per-scan terms of the comparison without and with effects: those that the fit leaves free.
 
     Registration has already taken the mean shift and magnification out of every scan, so an effect that
-    has them must not be charged for them; what acts as a gain, or line by line, must not be hidden by
-    the scans' own gain or lines.
+    has them must not be charged for them; what acts as a gain, as a distortion, or line by line, must not
+    be hidden by the scans' own.
     """
-    free = terms | {"warp"}
+    free = (terms | {"warp"}) - {"distortion"}
     free -= {_FREE_WITHOUT[s.projection] for s in screened if s.projection in _FREE_WITHOUT}
     return free - LINE_TERMS if any(s.effect.along_lines for s in screened) else free
 

@@ -19,7 +19,7 @@ from litho_models.metrics import NM_PER_UM, bootstrap_interval, paired_differenc
 from litho_models.nuisance import least_squares
 
 # Terms whose mean over scans could be a property of the process.
-_SHARED = {"gain", "bow", "drift"}
+_SHARED: Terms = frozenset({"gain", "bow", "drift", "distortion"})
 _LINES = ("scan-line-stripes", "line-roughness")
 _FRAME = {"scan-line-stripes": "the scan lines", "line-roughness": "the layout's rows"}
 
@@ -53,14 +53,14 @@ def measurement_tests(
     """Test each per-scan effect given those accepted before it; line offsets against the columns."""
     accepted: Terms = frozenset()
     tests = []
-    for name, term in TERMS_OF.items():
-        if term in LINE_TERMS:
+    for name, terms in TERMS_OF.items():
+        if terms <= LINE_TERMS:
             continue
-        test = _test_term(name, term, fields, predictions, fold_of, accepted, floor_nm2, seed)
+        test = _test_terms(name, fields, predictions, fold_of, accepted, floor_nm2, seed)
         tests.append(test)
         # The datum is free in every later comparison, whatever this test says.
         if test.confirmation.passed or name == "datum-offset":
-            accepted |= {term}
+            accepted |= terms
     return tests + _test_lines(fields, predictions, fold_of, accepted, floor_nm2, seed)
 
 
@@ -69,9 +69,8 @@ def scan_parameters(fields: Sequence[Field], predictions: Sequence[np.ndarray], 
     return np.stack([_coefficients(f, p, terms) for f, p in zip(fields, predictions, strict=True)])
 
 
-def _test_term(
+def _test_terms(
     name: str,
-    term: str,
     fields: Sequence[Field],
     predictions: Sequence[np.ndarray],
     fold_of: np.ndarray,
@@ -79,18 +78,21 @@ def _test_term(
     floor_nm2: float,
     seed: int,
 ) -> MeasurementTest:
-    effect, terms = get_effect(name), accepted | {term}
+    effect, terms = get_effect(name), accepted | TERMS_OF[name]
     coefficients = scan_parameters(fields, predictions, terms)
-    own = _own_terms(terms, accepted)
+    own = _own_columns(terms, accepted)
+    shared = _own_columns(terms, terms - (_SHARED - accepted))
     reference = list(predictions)
-    if term in _SHARED:
+    if shared:
         for i, prediction in enumerate(predictions):
-            shared = coefficients[fold_of != fold_of[i]].mean(axis=0)[own]
-            reference[i] = prediction + np.tensordot(
-                shared, term_maps(prediction, terms, fields[i].line)[own], axes=1
-            )
+            mean = coefficients[fold_of != fold_of[i]].mean(axis=0)[shared]
+            maps = term_maps(prediction, terms, fields[i].line)[shared]
+            reference[i] = prediction + np.tensordot(mean, maps, axes=1)
     before = score(fields, reference, accepted, seed)
     after = score(fields, predictions, terms, seed)
+    # The slopes are those from pixel to pixel, so that displacements come in pixels.
+    displacements = _own_columns(terms, terms - {"warp", "distortion"})
+    coefficients[:, displacements] *= [[field.context.pitch_um] for field in fields]
     spread = {}
     for parameter, column in zip(effect.parameters, own, strict=True):
         values = coefficients[:, column]
@@ -133,7 +135,7 @@ def _test_lines(
     control_before = score(turned, turned_predictions, accepted, seed, stripes=True)
     control_after = score(turned, turned_predictions, accepted | {"rows"}, seed)
     columns = control_before.mse_nm2 - control_after.mse_nm2
-    after = {name: score(fields, predictions, accepted | {TERMS_OF[name]}, seed) for name in _LINES}
+    after = {name: score(fields, predictions, accepted | TERMS_OF[name], seed) for name in _LINES}
     gains = {name: before.mse_nm2 - own.mse_nm2 for name, own in after.items()}
     tests = []
     for name, other in (_LINES, _LINES[::-1]):
@@ -214,9 +216,9 @@ def _coefficients(field: Field, prediction: np.ndarray, terms: Terms) -> np.ndar
     return least_squares(design, field.height - field.at_sample(prediction))
 
 
-def _own_terms(terms: Terms, accepted: Terms) -> list[int]:
+def _own_columns(terms: Terms, accepted: Terms) -> list[int]:
     """Columns of ``term_maps(…, terms)`` that ``accepted`` does not have."""
-    sizes = {"offset": 1, "gain": 1, "bow": 5, "drift": 2, "warp": 6}
+    sizes = {"offset": 1, "gain": 1, "bow": 5, "drift": 2, "warp": 6, "distortion": 6}
     own, at = [], 0
     for name, size in sizes.items():
         if name in terms or (name == "offset" and terms):

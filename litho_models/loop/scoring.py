@@ -21,20 +21,19 @@ from litho_models.nuisance import (
     shrunk_line_offsets,
 )
 
+Terms = frozenset[str]
 # Per-scan terms by the measurement effect that they stand for, in the order in which they are tested.
-TERMS_OF = {
-    "datum-offset": "offset",
-    "z-gain": "gain",
-    "tilt-bow": "bow",
-    "slow-drift": "drift",
-    "registration-residual": "warp",
-    "scan-line-stripes": "rows",
-    "line-roughness": "print-rows",
+TERMS_OF: dict[str, Terms] = {
+    "datum-offset": frozenset({"offset"}),
+    "z-gain": frozenset({"gain"}),
+    "tilt-bow": frozenset({"bow"}),
+    "slow-drift": frozenset({"drift"}),
+    "registration-residual": frozenset({"warp", "distortion"}),
+    "scan-line-stripes": frozenset({"rows"}),
+    "line-roughness": frozenset({"print-rows"}),
 }
 # Offsets of lines, along the scan or along the layout; their halves are stripes of columns.
 LINE_TERMS = frozenset({"rows", "print-rows"})
-
-Terms = frozenset[str]
 DATUM_FREE: Terms = frozenset({"offset"})
 
 
@@ -135,16 +134,20 @@ def term_maps(prediction: np.ndarray, terms: Terms, line: np.ndarray | None = No
         time = line / max(int(line.max()), 1)
         creeps = [np.exp(-time / decay) for decay in CREEP_DECAYS.values()]
         chosen += [creep - creep.mean() for creep in creeps]
-    if "warp" in terms:
+    if {"warp", "distortion"} & terms:
         x, y = bow[0], bow[1]
-        for slope in np.gradient(prediction.astype(np.float64)):
-            chosen += [slope, slope * y, slope * x]
+        slopes = np.gradient(prediction.astype(np.float64))
+        if "warp" in terms:
+            chosen += [slope * by for slope in slopes for by in (1.0, y, x)]
+        if "distortion" in terms:
+            # Centred: a distortion that all scans have in common then brings no shift along.
+            chosen += [slope * by for slope in slopes for by in (y * y - 1 / 3, x * y, x * x - 1 / 3)]
     return np.stack(chosen) if chosen else np.empty((0, *prediction.shape))
 
 
 def names_to_terms(effects: Sequence[str]) -> Terms:
     """Per-scan terms that the accepted measurement effects stand for."""
-    return frozenset(TERMS_OF[name] for name in effects if name in TERMS_OF)
+    return frozenset().union(*(TERMS_OF[name] for name in effects if name in TERMS_OF))
 
 
 def scan_parameter_names(terms: Terms) -> list[str]:
@@ -158,4 +161,6 @@ def scan_parameter_names(terms: Terms) -> list[str]:
         names += [f"creep over {decay:g} of the scan (nm)" for decay in CREEP_DECAYS.values()]
     if "warp" in terms:
         names += [f"shift {axis}{by} (px)" for axis in ("y", "x") for by in ("", " by y", " by x")]
+    if "distortion" in terms:
+        names += [f"shift {axis} by {by} (px)" for axis in ("y", "x") for by in ("y²", "xy", "x²")]
     return names

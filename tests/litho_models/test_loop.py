@@ -8,9 +8,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from scipy.ndimage import gaussian_filter
 
 from litho_data.errors import InputError
+from litho_models.effects import get_effect
 from litho_models.loop import LoopConfig, close_loop, parse_priors
 from litho_models.loop.closing import Closed
 from litho_models.loop.exporting import exported_effects
@@ -167,6 +169,28 @@ def test_line_offsets_are_told_from_columns() -> None:
     plain = prepare_fields(printed_scans(count=10, size_px=160, seed=4))
     without = measurement_tests(plain, [_truth(f) for f in plain], fold_of, floor_nm2=0, seed=0)
     assert not {t.effect.name: t for t in without}["scan-line-stripes"].confirmation.passed
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_a_distortion_belongs_to_the_registration_where_it_differs_between_scans(shared: bool) -> None:
+    effect, random = get_effect("registration-residual"), np.random.default_rng(2)
+    bent = []
+    for field in prepare_fields(printed_scans(count=10, size_px=96, seed=6)):
+        # 0.1 µm at the rim against the middle, freed of its mean; one sign for all, or one for each.
+        size_um = 0.1 if shared else 0.1 * random.choice([-1, 1])
+        values = {name: torch.zeros(()) for name in effect.parameters}
+        values |= {"x_by_xx_um": torch.tensor(size_um), "shift_x_um": torch.tensor(-size_um / 3)}
+        height = torch.from_numpy(field.scan.height_um)[None, None]
+        moved = effect.apply(height, values, field.context)[0, 0].numpy()
+        bent.append(replace(field.scan, height_um=moved))
+    fields = prepare_fields(bent)
+    found = measurement_tests(fields, [_truth(f) for f in fields], np.arange(10) % 5, floor_nm2=0, seed=0)
+    test = {t.effect.name: t for t in found}["registration-residual"]
+    assert test.confirmation.passed is not shared
+    # The random signs of ten scans have a standard deviation of about one.
+    sd_um, _, unit = test.spread["x_by_xx_um"]
+    assert unit == "µm"
+    assert (sd_um < 0.01) if shared else (0.08 < sd_um < 0.12)
 
 
 @pytest.mark.parametrize("written", [True, False])
