@@ -1,4 +1,4 @@
-"""A photographed holographic image as the judge: cleaned, registered, and scored without a power scale."""
+"""A photograph as the judge: cleaned, registered on the expected image, and scored without a power scale."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from litho_data.errors import InputError
 from litho_data.files import file_sha256
 from litho_data.results import Record
-from litho_design.judging import Judging
 from litho_design.metrics import si_psnr_db, ssim
+from litho_design.objects import ImagedObject
 
 _HOT_SIGMAS = 6.0
 _SMALLEST_CORRELATION = 0.45
@@ -20,7 +21,7 @@ _LARGEST_STRETCH = 1.2
 
 
 class CameraRecord(Record):
-    """Which photograph, and what was done to it."""
+    """Which photograph, and what was done to it; ``imaged`` is the object in front of a lens."""
 
     name: str
     sha256: str
@@ -30,6 +31,7 @@ class CameraRecord(Record):
     saturated_share: float
     correlation: float
     photo_to_window: list[list[float]]
+    imaged: ImagedObject | None = None
 
 
 class PhotoScore(Record):
@@ -43,30 +45,33 @@ class PhotoScore(Record):
 
 
 def photographed_image(
-    judging: Judging, photo_file: str | Path, pitch_um: float, *, dark_level: float | None = None
+    wanted: np.ndarray,
+    wanted_pitch_um: float,
+    photo_file: str | Path,
+    pitch_um: float,
+    *,
+    dark_level: float | None = None,
 ) -> tuple[np.ndarray, CameraRecord]:
-    """A photograph of a hologram's image on the window of its design.
+    """A photograph of what a print shows, on the pixels of the image that its design expects.
 
     Dark level subtracted (the 1st percentile where none is given), single hot or dead pixels
-    replaced by their neighbours' median, then shifted, rotated and scaled onto the designed image:
+    replaced by their neighbours' median, then shifted, rotated and scaled onto the expected image:
     the shift by cross-correlation, the rest by maximising the correlation coefficient (Evangelidis
     and Psarakis 2008). One interpolation.
 
     Args:
-        judging: a hologram's design.
+        wanted: expected image (m, m), any scale; ``wanted_pitch_um`` its pixel, µm.
         photo_file: grey image of any bit depth.
-        pitch_um: camera pixel in object space, µm.
+        pitch_um: camera pixel in the plane of the image, µm.
 
     Returns:
         Image (m, m) in counts, and its record.
 
     Raises:
-        InputError: no hologram, no image, or a photograph that does not resemble the design.
+        InputError: no image, no positive pitch, or a photograph that does not resemble the expected image.
     """
     import cv2
 
-    if judging.target is None:
-        raise InputError("photograph", got="the design of a lens", wanted="the design of a hologram")
     if not pitch_um > 0:
         raise InputError("camera pitch", got=f"{pitch_um} µm", wanted="a positive number")
     if not Path(photo_file).is_file():
@@ -77,13 +82,11 @@ def photographed_image(
     photo = raw.astype(np.float32)
     dark = float(np.percentile(photo, 1)) if dark_level is None else dark_level
     cleaned, replaced = _replace_outliers(np.clip(photo - dark, 0, None))
-    wanted = judging.image(judging.expected_um).astype(np.float32)
-    window_pitch = judging.design.layout.pitch_um
-    warp, correlation = _register(cleaned, wanted, pitch_um / window_pitch)
+    warp, correlation = _register(cleaned, wanted.astype(np.float32), pitch_um / wanted_pitch_um)
     if correlation < _SMALLEST_CORRELATION:
         raise InputError(
             f"photograph {photo_file}",
-            got=f"correlation {correlation:.2f} with the designed image",
+            got=f"correlation {correlation:.2f} with the expected image",
             wanted=f"at least {_SMALLEST_CORRELATION}",
             hint="check the camera pitch and the orientation",
         )
@@ -103,10 +106,9 @@ def photographed_image(
     return image, record
 
 
-def photo_score(judging: Judging, image: np.ndarray) -> PhotoScore:
-    """Figures of a registered photograph (m, m) against the target."""
-    assert judging.target is not None
-    share, wanted = torch.from_numpy(image).double(), judging.target.cpu().double()
+def photo_score(image: np.ndarray, target: Tensor) -> PhotoScore:
+    """Figures of a registered photograph (m, m) of a hologram against its target (m, m)."""
+    share, wanted = torch.from_numpy(image).double(), target.cpu().double()
     lit, dark = share[wanted > 0.5], share[wanted <= 0.5]
     low, high = (float(torch.quantile(lit, q)) for q in (0.05, 0.95))
     scale = (share * wanted).sum() / share.square().sum()

@@ -32,9 +32,16 @@ def score(
     scan: Annotated[Path | None, typer.Option(help="AFM height map of the printed part.")] = None,
     scan_unit: Annotated[str | None, typer.Option(help="Unit of its heights, if the file has none.")] = None,
     scan_size_um: Annotated[float | None, typer.Option(help="Its side, µm, if the file has none.")] = None,
-    camera: Annotated[Path | None, typer.Option(help="Photograph of the printed hologram's image.")] = None,
-    camera_pitch_um: Annotated[float | None, typer.Option(help="Its pixel in object space, µm.")] = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option(help="Photograph of the printed hologram's image, or through the printed lens."),
+    ] = None,
+    camera_pitch_um: Annotated[float | None, typer.Option(help="Its pixel in the image plane, µm.")] = None,
     camera_dark_level: Annotated[float | None, typer.Option(help="Its dark level, counts.")] = None,
+    camera_object: Annotated[
+        str | None,
+        typer.Option(help="What the lens looked at: one of the design's objects by name, or a picture."),
+    ] = None,
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
@@ -46,8 +53,10 @@ def score(
         raise InputError("score", got="nothing to judge with", wanted="--judge, --scan or --camera")
     if camera is not None and camera_pitch_um is None:
         raise InputError(
-            "--camera", got="no --camera-pitch-um", wanted="the camera's pixel in object space, µm"
+            "--camera", got="no --camera-pitch-um", wanted="the camera's pixel in the image plane, µm"
         )
+    if camera is None and camera_object is not None:
+        raise InputError("--camera-object", got="no --camera", wanted="the photograph of it")
     layout = Design.read(design).layout
     judges = list(load_printers(judge or [], layout, device, extrapolate).values())
     size = None if scan_size_um is None else (scan_size_um, scan_size_um)
@@ -56,7 +65,9 @@ def score(
         judges,
         out,
         scan=None if scan is None else MeasuredSource(scan, scan_unit, size),
-        camera=None if camera is None else PhotoSource(camera, camera_pitch_um or 0.0, camera_dark_level),
+        camera=None
+        if camera is None
+        else PhotoSource(camera, camera_pitch_um or 0.0, camera_dark_level, camera_object),
         command=command_line(),
         device=device,
     )

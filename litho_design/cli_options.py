@@ -180,6 +180,9 @@ def headline(figures: dict[str, float]) -> str:
         )
     if "speckle_contrast" in figures:
         return f"{figures['si_psnr_db']:.2f} dB, SSIM {figures['ssim']:.3f}"
+    if "focusing_efficiency" not in figures:
+        told = {name: figures.get(f"mae_{name}") for name in ("direct", "design", "calibrated")}
+        return "MAE " + ", ".join(f"{name} {mae:.4f}" for name, mae in told.items() if mae is not None)
     text = f"{100 * figures['focusing_efficiency']:.1f} % in the focus, Strehl {figures['strehl']:.3f}"
     return text + (f", MAE {figures['mae_calibrated']:.4f}" if "mae_calibrated" in figures else "")
 

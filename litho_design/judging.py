@@ -40,9 +40,9 @@ class Judging:
             self._hoe = HoeSettings.model_validate(self.design.settings)
             self.bench: HologramBench | LensBench = HologramBench(self.design.layout, self.design.optics)
         else:
-            self._lens = LensSettings.model_validate(self.design.settings)
-            self.bench = LensBench(self.design.layout, self.design.optics, self._lens.view)
-            self.pictures = self._read_pictures(folder, self._lens.imaging)
+            self.lens = LensSettings.model_validate(self.design.settings)
+            self.bench = LensBench(self.design.layout, self.design.optics, self.lens.view)
+            self.pictures = self._read_pictures(folder, self.lens.imaging)
         self.bench.to(self.device)
 
     @torch.no_grad()
@@ -58,7 +58,7 @@ class Judging:
     def figures(self, height_um: Tensor) -> Record:
         """All figures of a print."""
         if isinstance(self.bench, LensBench):
-            return score_lens(self._lens, self.bench, height_um, self.expected_um, self.pictures)
+            return score_lens(self.lens, self.bench, height_um, self.expected_um, self.pictures)
         assert self.target is not None
         return self.bench.score(height_um, self.target, self._hoe.camera)
 
@@ -73,6 +73,14 @@ class Judging:
     def window_um(self) -> float:
         """Side of the image or of the PSF window, µm."""
         return (self.bench.window if isinstance(self.bench, LensBench) else self.bench.grid).size_um[0]
+
+    @property
+    def frame_um(self) -> float:
+        """Side of what a lens images, or of the image of a hologram, µm."""
+        if self.target is not None:
+            return self.window_um
+        imaging = self.lens.imaging
+        return imaging.object_px * imaging.pixel_px * self.design.layout.pitch_um
 
     def _read_pictures(self, folder: str | Path, imaging: ImagingSettings) -> dict[str, np.ndarray]:
         records = picture_records((*imaging.objects, *imaging.test_objects))

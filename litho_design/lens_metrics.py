@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -115,6 +116,26 @@ def mtf_at(psf: Tensor, frequency_per_um: float, pitch_um: float) -> float:
     return float(sum(axis[index] * (1 - part) + axis[index + 1] * part for axis in axes) / 2)
 
 
+@dataclass(frozen=True)
+class ImageFigures:
+    """How far an estimate is from the object: mean absolute error, PSNR in dB, SSIM."""
+
+    mae: float
+    psnr_db: float
+    ssim: float
+
+
+def image_figures(estimate: Tensor, wanted: Tensor) -> ImageFigures:
+    """Figures of an estimate (n, n) of an object (n, n) in [0, 1]; PSNR and SSIM clip it to that range."""
+    clipped = estimate.clamp(0, 1)
+    error = (clipped - wanted).square().mean().clamp(min=1e-12)
+    return ImageFigures(
+        mae=float((estimate - wanted).abs().mean()),
+        psnr_db=float(-10 * torch.log10(error)),
+        ssim=ssim(clipped, wanted),
+    )
+
+
 @torch.no_grad()
 def imaging_score(
     psf: Tensor,
@@ -134,11 +155,10 @@ def imaging_score(
 
     def add(name: str, estimates: Tensor) -> None:
         for estimate, wanted in zip(estimates, objects, strict=True):
-            clipped = estimate.clamp(0, 1)
-            error = (clipped - wanted).square().mean().clamp(min=1e-12)
-            rows.setdefault(f"mae_{name}", []).append(float((estimate - wanted).abs().mean()))
-            rows.setdefault(f"psnr_{name}", []).append(float(-10 * torch.log10(error)))
-            rows.setdefault(f"ssim_{name}", []).append(ssim(clipped, wanted))
+            found = image_figures(estimate, wanted)
+            rows.setdefault(f"mae_{name}", []).append(found.mae)
+            rows.setdefault(f"psnr_{name}", []).append(found.psnr_db)
+            rows.setdefault(f"ssim_{name}", []).append(found.ssim)
 
     for seed in _TEST_SEEDS:
         seen = record(objects, real, settings.read_noise, seed)

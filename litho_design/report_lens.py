@@ -36,6 +36,7 @@ LENS_LABELS = {
     "mae_design": "test objects: MAE, deconvolved with the designed PSF",
     "mae_calibrated": "test objects: MAE, deconvolved with the print's own PSF",
     "mae_calibrated_sd": "its standard deviation over objects and noise seeds",
+    "psnr_direct_db": "PSNR of the sensor image, best scale, dB",
     "psnr_design_db": "PSNR with the designed PSF, dB",
     "psnr_calibrated_db": "PSNR with the print's own PSF, dB",
     "ssim_direct": "SSIM of the sensor image",

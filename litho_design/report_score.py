@@ -17,9 +17,19 @@ if TYPE_CHECKING:
 
 
 def write_score_report(
-    folder: Path, result: ScoreResult, pictures: dict[str, np.ndarray], side_um: float
+    folder: Path,
+    result: ScoreResult,
+    pictures: dict[str, np.ndarray],
+    side_um: float,
+    photos: dict[str, np.ndarray],
+    frame_um: float,
 ) -> Path:
-    """Write ``report.html`` and ``scores.csv``."""
+    """Write ``report.html`` and ``scores.csv``.
+
+    Args:
+        pictures: image or PSF (m, m) behind each print, ``side_um`` wide.
+        photos: what was photographed through a lens and what became of it, (n, n), ``frame_um`` wide.
+    """
     import pandas as pd
 
     page = Page(
@@ -35,19 +45,26 @@ def write_score_report(
         score.judge.name + ("" if score.independent else " (not independent)"): score.figures
         for score in result.scores
     }
+    names = list(dict.fromkeys(name for figures in columns.values() for name in figures))
     table = pd.DataFrame(
         [
             {"figure": name, **{judge: figures.get(name, np.nan) for judge, figures in columns.items()}}
-            for name in result.designed
+            for name in names
         ]
     )
     labels = SCORE_LABELS if result.task == "hoe" else LENS_LABELS
-    table["meaning"] = [labels[name] for name in result.designed]
+    table["meaning"] = [labels[name] for name in names]
     page.table(table, "Figures by judge", "scores.csv", digits=3)
     page.figure(
         image_grid([list(pictures.values())], [list(pictures)], [""], side_um),
         "Behind each print: the image at matched scale, or the square root of the PSF.",
     )
+    if photos:
+        page.figure(
+            image_grid([list(photos.values())], [list(photos)], [""], frame_um),
+            "Photograph through the printed lens, each image at the scale of least error; its figures are "
+            "those of this one object.",
+        )
     heights = pd.DataFrame(
         [
             {

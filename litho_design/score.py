@@ -7,15 +7,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
+import numpy as np
 import torch
 from pydantic import Field
 from torch import Tensor
 
+from litho_data.errors import InputError
 from litho_data.files import file_sha256
 from litho_data.results import Record, Result, software_versions
 from litho_design.camera import CameraRecord, photo_score, photographed_image
 from litho_design.design import LEVELS_FILE, Design
 from litho_design.judging import Judging
+from litho_design.lens_photo import score_lens_photo
 from litho_design.measured import MeasuredRecord, measured_print
 from litho_design.optics import Optics
 from litho_design.parametrise import LayoutSettings
@@ -35,11 +38,15 @@ class MeasuredSource:
 
 @dataclass(frozen=True)
 class PhotoSource:
-    """A photograph of the image, its pixel in object space, and its dark level if it is known."""
+    """A photograph of the image, its pixel in the image plane, its dark level if it is known.
+
+    ``imaged`` is the object in front of a lens: a name of the design's objects, or a picture's path.
+    """
 
     path: Path
     pitch_um: float
     dark_level: float | None = None
+    imaged: str | None = None
 
 
 class JudgedScore(Record):
@@ -91,12 +98,15 @@ def score_design(
         folder: design folder.
         judges: printers; those with the weights of the design's own model are marked as not independent.
         scan: a measured height map of the printed part.
-        camera: a photograph of the printed hologram's image.
+        camera: a photograph of the printed hologram's image, or of an object through the printed lens;
+            with ``scan`` it is deconvolved with the PSF of the measured print too.
 
     Raises:
         InputError: an incomplete or altered design folder, a measurement that does not belong to it, or
             an ``out`` that holds another kind of result.
     """
+    printed_um: Tensor | None = None
+    photos: dict[str, np.ndarray] = {}
     require_own_folder(out, ScoreResult.FILE_NAME)
     judging = Judging(folder, device=device)
     design = judging.design
@@ -107,23 +117,20 @@ def score_design(
         scores.append(_height_score(judging, "model", record, independent, height))
         pictures[f"printed by {record.name}"] = judging.image(height)
     if scan is not None:
-        height, measured = measured_print(judging, scan.path, unit=scan.unit, size_um=scan.size_um)
-        scores.append(_height_score(judging, "scan", measured, True, height))
-        pictures[f"measured print {measured.name}"] = judging.image(height)
+        printed_um, measured = measured_print(judging, scan.path, unit=scan.unit, size_um=scan.size_um)
+        scores.append(_height_score(judging, "scan", measured, True, printed_um))
+        pictures[f"measured print {measured.name}"] = judging.image(printed_um)
     if camera is not None:
-        image, photo = photographed_image(judging, camera.path, camera.pitch_um, dark_level=camera.dark_level)
-        figures = photo_score(judging, image).model_dump()
-        scores.append(
-            JudgedScore(
-                kind="camera",
-                judge=photo,
-                independent=True,
-                mean_height_difference_um=None,
-                rms_height_difference_um=None,
-                figures=figures,
-            )
-        )
-        pictures[f"photograph {photo.name}"] = image
+        if judging.target is None:
+            lens_figures, photo, photos = score_lens_photo(
+                judging, camera.path, camera.pitch_um, camera.imaged,
+                dark_level=camera.dark_level, printed_um=printed_um,
+            )  # fmt: skip
+            scores.append(_camera_score(photo, lens_figures))
+        else:
+            image, photo = _hologram_photo(judging, camera)
+            scores.append(_camera_score(photo, photo_score(image, judging.target)))
+            pictures[f"photograph {photo.name}"] = image
     result = ScoreResult(
         command=command,
         versions=software_versions(),
@@ -140,9 +147,29 @@ def score_design(
         scores=scores,
     )
     shown = {name: judging.display(image) for name, image in pictures.items()}
-    write_score_report(Path(out), result, shown, judging.window_um)
+    write_score_report(Path(out), result, shown, judging.window_um, photos, judging.frame_um)
     result.write(out)
     return result
+
+
+def _hologram_photo(judging: Judging, camera: PhotoSource) -> tuple[np.ndarray, CameraRecord]:
+    if camera.imaged is not None:
+        raise InputError(
+            "photographed object", got="the design of a hologram", wanted="a lens", hint="no --camera-object"
+        )
+    wanted, pitch_um = judging.image(judging.expected_um), judging.design.layout.pitch_um
+    return photographed_image(wanted, pitch_um, camera.path, camera.pitch_um, dark_level=camera.dark_level)
+
+
+def _camera_score(photo: CameraRecord, figures: Record) -> JudgedScore:
+    return JudgedScore(
+        kind="camera",
+        judge=photo,
+        independent=True,
+        mean_height_difference_um=None,
+        rms_height_difference_um=None,
+        figures=figures.model_dump(exclude_none=True),
+    )
 
 
 def _height_score(

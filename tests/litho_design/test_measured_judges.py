@@ -84,5 +84,8 @@ def test_a_photograph_of_something_else_is_refused(tmp_path, printed_design):
         score_design(printed_design, [], tmp_path / "s", camera=PhotoSource(tmp_path / "flat.png", 0.2))
     with pytest.raises(InputError, match="which is no file"):
         score_design(printed_design, [], tmp_path / "s", camera=PhotoSource(tmp_path / "none.png", 0.2))
+    named = PhotoSource(tmp_path / "flat.png", 0.2, imaged="text")
+    with pytest.raises(InputError, match=r"hologram.*--camera-object"):
+        score_design(printed_design, [], tmp_path / "s", camera=named)
     with pytest.raises(InputError, match="pitch"):
         score_design(printed_design, [], tmp_path / "s", camera=PhotoSource(tmp_path / "flat.png", 0.0))

@@ -1,0 +1,199 @@
+"""A photograph through a printed lens: simulated from a known PSF, it must come back."""
+
+from __future__ import annotations
+
+import sys
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import map_coordinates
+
+from litho_data.errors import InputError
+from litho_data.files import file_sha256
+from litho_design.cli import main
+from litho_design.judging import Judging
+from litho_design.lens import design_lens
+from litho_design.lens_bench import reconstruct, sensor_psf
+from litho_design.lens_metrics import image_figures
+from litho_design.lens_photo import score_lens_photo
+from litho_design.metrics import matched_scale
+from litho_design.objects import object_stack, read_object
+from litho_design.optics import Optics
+from litho_design.optics.imaging import Blur
+from litho_design.parametrise import LayoutSettings
+from litho_design.printer import Printer
+from litho_design.score import MeasuredSource, PhotoSource, ScoreResult, score_design
+from litho_design.settings import lens_preset
+
+SENSOR_UM, CAMERA_UM, DARK, WHITE, NOISE = 0.2, 0.15, 300.0, 30000.0, 100.0
+OBJECT_PX, PHOTO_PX = 96, 160
+# Camera pixels that count nothing, by the window pixel (x, y) on the L that they see; and hot ones (y, x).
+DEAD, HOT = ((23, 40), (23, 60), (40, 73)), ((10, 12), (80, 140), (61, 90))
+
+
+@pytest.fixture(scope="module")
+def lens(tmp_path_factory):
+    """A lens of 20 µm, f = 40 µm: full width at half maximum 1.4 µm, seven sensor pixels."""
+    layout = LayoutSettings(size_px=200, cell_um=0.1, symmetry="radial")
+    default = lens_preset("default", "direct")
+    settings = default.model_copy(
+        update={
+            "layout": layout,
+            "optics": Optics(distance_um=40.0),
+            "search": default.search.model_copy(update={"iterations": 3, "polish_rounds": 0}),
+            "view": default.view.model_copy(update={"window_px": 128}),
+            "imaging": default.imaging.model_copy(update={"object_px": OBJECT_PX}),
+        }
+    )
+    folder = tmp_path_factory.mktemp("lens") / "design"
+    design_lens(settings, Printer(None, layout, source="none"), folder, announce=False)
+    return folder
+
+
+@pytest.fixture
+def picture(tmp_path):
+    """An object without symmetry: an L, a grey bar and a bright dot."""
+    drawn = np.zeros((72, 72), np.uint8)
+    drawn[6:66, 6:16] = drawn[56:66, 16:50] = 220
+    drawn[10:20, 40:60] = 120
+    drawn[30:40, 30:40] = 255
+    cv2.imwrite(str(tmp_path / "object.png"), drawn)
+    return tmp_path / "object.png"
+
+
+def photographed(path, judging, height_um, wanted, *, turn_degrees=2.0, scale=1.03, shift_um=(1.1, -0.7)):
+    """Write the photograph of ``wanted`` (n, n) behind a print; returns the PSF and photo-to-window map."""
+    psf = sensor_psf(judging.bench(height_um), 2)
+    seen = Blur(psf, (OBJECT_PX, OBJECT_PX)).forward(wanted).double().numpy()
+    turn = np.deg2rad(turn_degrees)
+    linear = scale * CAMERA_UM / SENSOR_UM * np.array(
+        [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+    )  # fmt: skip
+    middle = np.full(2, (OBJECT_PX - 1) / 2) + np.array(shift_um) / SENSOR_UM
+    offset = middle - linear @ np.full(2, (PHOTO_PX - 1) / 2)
+    y, x = np.mgrid[0:PHOTO_PX, 0:PHOTO_PX]
+    window_x, window_y = np.einsum("ij,jyx->iyx", linear, np.stack([x, y])) + offset[:, None, None]
+    image = map_coordinates(seen, [window_y, window_x], order=5, mode="constant")
+    noise = np.random.default_rng(0).normal(0, NOISE, image.shape)
+    counts = WHITE * image / image.max() + DARK + noise
+    dead_x, dead_y = np.linalg.solve(linear, np.transpose(DEAD) - offset[:, None]).round().astype(int)
+    counts[dead_y, dead_x] = 0
+    counts[tuple(np.transpose(HOT))] = 65535
+    cv2.imwrite(str(path), counts.clip(0, 65535).round().astype(np.uint16))
+    return psf, np.hstack([linear, offset[:, None]])
+
+
+def estimate(judging, recorded, psf, wanted):
+    """What deconvolution makes of an image that needs no registration, at the scale of least error."""
+    found = reconstruct(recorded, psf, judging.lens.imaging.iterations)
+    return found * matched_scale(found, wanted)
+
+
+@torch.no_grad()
+def test_a_photograph_is_deconvolved_with_the_designed_and_the_measured_psf(tmp_path, lens, picture):
+    judging = Judging(lens)
+    wanted = torch.from_numpy(read_object(picture, OBJECT_PX)[0])
+    # The print is too low towards its rim, so that its PSF is wider and lower than the designed one.
+    radius = torch.from_numpy(np.hypot(*np.mgrid[-99.5:100, -99.5:100]) / 100).float()
+    printed = judging.expected_um * (1 - 0.5 * radius.square())
+    np.savetxt(tmp_path / "scan.txt", (printed.double().numpy() + 0.2) * 1e-6)
+    psf, to_window = photographed(tmp_path / "photo.png", judging, printed, wanted)
+    photo = PhotoSource(tmp_path / "photo.png", CAMERA_UM, DARK, str(picture))
+    scan = MeasuredSource(tmp_path / "scan.txt", "m", (20.0, 20.0))
+    measured, score = score_design(lens, [], tmp_path / "score", scan=scan, camera=photo).scores
+    assert (measured.kind, score.kind) == ("scan", "camera")
+    assert ScoreResult.read(tmp_path / "score").scores[1] == score
+    assert score.judge.imaged.sha256 == file_sha256(picture)
+    # Dead pixels lie on the L, where they are far from their neighbours; hot ones are so everywhere.
+    assert score.judge.replaced_pixels >= len(DEAD) + len(HOT)
+    assert score.judge.dark_level == DARK
+    assert score.judge.saturated_share == pytest.approx(len(HOT) / PHOTO_PX**2)
+
+    # Registration: corners of the lit part go to the photograph and back. The images are compared after a
+    # blur of 2 px, and a quarter of a pixel is 0.05 µm, a 28th of the PSF's width.
+    displaced_px = 0.25
+    corners = np.array([[12, 84, 12, 84], [12, 12, 84, 84], [1, 1, 1, 1]])
+    found = np.vstack([score.judge.photo_to_window, [0, 0, 1]])
+    assert np.hypot(*(to_window @ found @ corners - corners[:2])).max() < displaced_px
+
+    # A displacement by d changes an image by at most d times its gradient, and so its mean absolute
+    # error and its root of the mean square, whose distances obey the triangle inequality. The noise, 0.3 %
+    # of white, is taken as it is: deconvolution amplifies it, more camera than sensor pixels average it.
+    seen = Blur(psf, (OBJECT_PX, OBJECT_PX)).forward(wanted)
+    design_psf = sensor_psf(judging.bench(judging.expected_um), 2)
+    for name, image in {
+        "direct": seen * matched_scale(seen, wanted),
+        "design": estimate(judging, seen, design_psf, wanted),
+        "calibrated": estimate(judging, seen, psf, wanted),
+    }.items():
+        gradient = np.hypot(*np.gradient(image.numpy()))
+        ideal = image_figures(image, wanted)
+        change = float(displaced_px * gradient.mean() + NOISE / WHITE)
+        assert score.figures[f"mae_{name}"] == pytest.approx(ideal.mae, abs=change)
+        rms, rms_ideal = (10 ** (-db / 20) for db in (score.figures[f"psnr_{name}_db"], ideal.psnr_db))
+        change = float(displaced_px * np.sqrt(np.square(gradient).mean()) + NOISE / WHITE)
+        assert rms == pytest.approx(rms_ideal, abs=change)
+    # Only calibration knows the PSF that made the photograph.
+    assert score.figures["mae_calibrated"] < score.figures["mae_design"] < score.figures["mae_direct"]
+    assert score.figures["ssim_calibrated"] > score.figures["ssim_design"] > score.figures["ssim_direct"]
+
+
+@torch.no_grad()
+def test_an_object_of_the_design_is_known_by_name(tmp_path, lens):
+    judging = Judging(lens)
+    wanted = object_stack(["text"], OBJECT_PX)[0]
+    photographed(tmp_path / "photo.png", judging, judging.expected_um, wanted)
+    score, record, shown = score_lens_photo(judging, tmp_path / "photo.png", CAMERA_UM, "text")
+    assert record.imaged == "text"
+    # The percentile of a dark surround with noise: two or three of its standard deviations below the level.
+    assert DARK - 3 * NOISE < record.dark_level < DARK + NOISE
+    assert score.mae_calibrated is None
+    assert list(shown) == ["object text", "photograph", "deconvolved, design PSF"]
+    assert score.mae_design < score.mae_direct
+    # It is this object that was photographed: another one does not match, or is further off.
+    with pytest.raises(InputError, match="correlation"):
+        score_lens_photo(judging, tmp_path / "photo.png", CAMERA_UM, "spots")
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (("--camera", "flat.png", "--camera-pitch-um", "0.15"), "no --camera-object"),
+        (("--camera", "flat.png", "--camera-pitch-um", "0.15", "--camera-object", "face"), "'face'"),
+        (("--camera", "flat.png", "--camera-pitch-um", "0.15", "--camera-object", "text"), "correlation"),
+        (("--camera", "none.png", "--camera-pitch-um", "0.15", "--camera-object", "text"), "no file"),
+        (("--camera", "flat.png", "--camera-object", "text"), "--camera-pitch-um"),
+        (("--judge", "none", "--camera-object", "text"), "no --camera"),
+    ],
+)
+def test_bad_photographs_are_one_line_and_exit_code_2(tmp_path, lens, monkeypatch, capsys, words, complaint):
+    monkeypatch.chdir(tmp_path)
+    cv2.imwrite("flat.png", np.random.default_rng(0).integers(0, 255, (160, 160)).astype(np.uint8))
+    monkeypatch.setattr(sys, "argv", ["litho-design", "score", str(lens), *words, "--out", "out"])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 2
+    said = capsys.readouterr().err.strip()
+    assert len(said.splitlines()) == 1
+    assert complaint in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_command_tells_the_errors(tmp_path, lens, picture, monkeypatch, capsys):
+    judging = Judging(lens)
+    wanted = torch.from_numpy(read_object(picture, OBJECT_PX)[0])
+    with torch.no_grad():
+        photographed(tmp_path / "photo.png", judging, judging.expected_um, wanted)
+    words = ("--camera", tmp_path / "photo.png", "--camera-pitch-um", CAMERA_UM, "--camera-object", picture)
+    arguments = map(str, ("score", lens, *words, "--out", tmp_path / "score"))
+    monkeypatch.setattr(sys, "argv", ["litho-design", *arguments])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 0
+    figures = ScoreResult.read(tmp_path / "score").scores[0].figures
+    told = f"camera photo.png: MAE direct {figures['mae_direct']:.4f}, design {figures['mae_design']:.4f}"
+    assert told in capsys.readouterr().out
+    table = (tmp_path / "score" / "scores.csv").read_text()
+    assert "psnr_direct_db" in table
