@@ -42,7 +42,7 @@ def close_loop(
         Path | None,
         typer.Option("--cache", help="folder of trained folds, e.g. of a benchmark; beside --out by default"),
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="folds, locked scans, bootstrap")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="folds and bootstrap, not the lock box")] = 0,
 ) -> None:
     """Find what a model lacks on measured prints, add it, and report the error on held-out scans (nm)."""
     from litho_models.loop import LoopConfig, close_loop_on_store, parse_priors

@@ -28,7 +28,7 @@ from litho_models.loop.state import State, fit_state
 from litho_models.loop.structure import CovariateTest, covariate_tests, is_structured
 from litho_models.metrics import NM_PER_UM
 from litho_models.models import build_model
-from litho_models.splits import grouped_folds, lock_box, lock_box_size
+from litho_models.splits import grouped_folds, locked_ids
 
 
 class LoopConfig(BaseModel):
@@ -37,7 +37,7 @@ class LoopConfig(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     folds: int = Setting(6, ge=2, description="outer folds by scan")
-    seed: int = Setting(0, ge=0, description="folds, locked scans, calibration blocks, bootstrap")
+    seed: int = Setting(0, ge=0, description="folds, calibration blocks, bootstrap")
     open_lock_box: bool = False
     prior_hypotheses: tuple[str, ...] = ()
     inject: tuple[str, ...] = ()
@@ -49,6 +49,7 @@ class Closed:
 
     Attributes:
         development, locked: prepared scans; ``fold_of``: fold of each development scan.
+        lock_box: ids of the locked scans, those that cannot be used among them.
         base, final: fitted states before and after; ``search``: how it got there.
         probed: generic terms where no named effect won; ``final`` predicts with them.
         first_tests, last_tests: measurement tests before and after the process effects.
@@ -62,6 +63,7 @@ class Closed:
 
     development: list[Field]
     locked: list[Field]
+    lock_box: list[str]
     fold_of: np.ndarray
     base: State
     final: State
@@ -100,6 +102,7 @@ def close_loop(
     *,
     trainer: Trainer | None = None,
     rounding_um: Mapping[str, float] | None = None,
+    lock_box: Sequence[str] | None = None,
     report: Callable[[str], None] = lambda message: None,
 ) -> Closed:
     """Find what the base model lacks on these scans, add it, and measure the error on held-out scans.
@@ -111,10 +114,13 @@ def close_loop(
         trainer: makes a fresh base model from scans, for a base with many parameters: it is then
             trained once per fold, and effects are looked for on a Physics model first.
         rounding_um: step of the heights in each scan's raw file, by id, if known.
+        lock_box: ids of the locked scans; ``locked_ids`` of ``scans`` if None. Neither the seed nor the
+            scans left out of ``scans`` may change it: whoever holds them all says which are locked.
         report: told what happens, a sentence at a time.
 
     Raises:
-        InputError: fewer than two usable scans, or an unknown effect among the prior hypotheses.
+        InputError: fewer than two usable scans outside the lock box, or an unknown effect among the prior
+            hypotheses.
     """
     config = config or LoopConfig.model_validate({})
     for name in config.prior_hypotheses:
@@ -122,9 +128,15 @@ def close_loop(
     for text in config.inject:
         parse_injection(text)
     fields = [field for field in prepare_fields(scans) if len(field.sample) >= 64]
-    if len(fields) < 2:
-        raise InputError("scans to close the loop on", got=f"{len(fields)} usable", wanted="at least 2")
-    development, locked = _split(fields, config.seed)
+    lock_box = locked_ids(scans) if lock_box is None else list(lock_box)
+    development = [field for field in fields if field.id not in lock_box]
+    locked = [field for field in fields if field.id in lock_box]
+    if len(development) < 2:
+        raise InputError(
+            "scans to close the loop on",
+            got=f"{len(development)} usable and not locked",
+            wanted="at least 2",
+        )
     fold_of = _folds(development, config)
     first = development[0]
     stiff = is_stiff(base)
@@ -197,6 +209,7 @@ def close_loop(
     return Closed(
         development=development,
         locked=locked,
+        lock_box=lock_box,
         fold_of=fold_of,
         base=start,
         final=final,
@@ -242,12 +255,6 @@ def _stiff_guide(scan: PrintedScan) -> nn.Module:
     return build_model(
         "physics", pitch_um=scan.pitch_um, level_height_um=scan.level_height_um, levels=scan.levels
     )
-
-
-def _split(fields: list[Field], seed: int) -> tuple[list[Field], list[Field]]:
-    ids, prints = [f.id for f in fields], [f.scan.print_id for f in fields]
-    chosen = set(lock_box(ids, prints, lock_box_size(len(ids)), seed))
-    return [f for f in fields if f.id not in chosen], [f for f in fields if f.id in chosen]
 
 
 def _folds(fields: Sequence[Field], config: LoopConfig) -> np.ndarray:

@@ -63,7 +63,7 @@ def summarise(closed: Closed, *, dataset: tuple[str, str], base_name: str, dropp
         run=run_info([closed.config.seed], len(closed.development) + len(closed.locked), dropped),
         dataset=Dataset(name=dataset[0], sha256=dataset[1]),
         base_model=base_name,
-        split=Split(folds=int(closed.fold_of.max()) + 1, lock_box=[f.id for f in closed.locked]),
+        split=Split(folds=int(closed.fold_of.max()) + 1, lock_box=closed.lock_box),
         nuisance=Nuisance(block_px=BLOCK_PX, seed=closed.config.seed),
         prior_hypotheses=list(closed.config.prior_hypotheses),
         noise_floor=NoiseFloor(

@@ -23,6 +23,7 @@ from litho_models.loop.reporting import write_report
 from litho_models.loop.result import CloseLoop
 from litho_models.models import MODELS, build_model
 from litho_models.simulator import Simulator
+from litho_models.splits import locked_ids
 
 MODEL_FOLDER, MEASUREMENT_FILE = "model", "measurement_model.json"
 
@@ -63,7 +64,13 @@ def close_loop_on_store(
     if base in MODELS and not is_stiff(simulator):
         trainer = _trainer(base, config, steps, Path(cache or f"{out}-cache"))
     closed = close_loop(
-        usable, simulator, config, trainer=trainer, rounding_um=_rounding_um(opened, usable), report=report
+        usable,
+        simulator,
+        config,
+        trainer=trainer,
+        rounding_um=_rounding_um(opened, usable),
+        lock_box=locked_ids(scans),
+        report=report,
     )
     result = summarise(closed, dataset=(opened.name, opened.sha256), base_name=name, dropped=dropped)
     with atomic_folder(out) as folder:

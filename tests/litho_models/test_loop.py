@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 
 from litho_data.errors import InputError
 from litho_models.effects import get_effect
-from litho_models.loop import LoopConfig, close_loop, parse_priors
+from litho_models.loop import LoopConfig, close_loop, close_loop_on_store, parse_priors
 from litho_models.loop.closing import Closed
 from litho_models.loop.exporting import exported_effects
 from litho_models.loop.fields import LARGE_PX, prepare_fields
@@ -24,7 +24,10 @@ from litho_models.loop.outcome import summarise
 from litho_models.loop.result import CloseLoop
 from litho_models.loop.structure import covariate_tests, is_structured
 from litho_models.models import build_model
+from litho_models.runs import train
+from litho_models.splits import lock_box, locked_ids
 from tests.litho_models.loop_scans import printed_scans, true_model
+from tests.litho_models.prints import write_store
 
 
 def closed_on(scans, **config) -> tuple[Closed, CloseLoop]:
@@ -222,6 +225,20 @@ def test_too_few_scans_confirm_nothing_and_say_so() -> None:
     assert found["vignetting"].verdict == "not-testable"
     assert "2 scans" in found["vignetting"].reason
     assert np.isfinite(result.after.mae_datum_free_nm)
+
+
+def test_the_loop_locks_what_training_locks_whatever_its_seed_and_what_was_dropped(tmp_path) -> None:
+    scans = printed_scans(count=6, size_px=48, seed=3)
+    locked = locked_ids(scans)
+    # Drawn with this seed, or from the scans that are left, the box would be another.
+    assert lock_box([s.id for s in scans], [s.print_id for s in scans], 1, seed=2) != locked
+    empty = [replace(s, height_um=np.full_like(s.height_um, np.nan)) if s.id in locked else s for s in scans]
+    for number, given in enumerate((scans, empty)):
+        store = write_store(tmp_path / f"{number}.zarr", given)
+        found = close_loop_on_store(store, tmp_path / f"loop{number}", config=LoopConfig(seed=2, folds=2))
+        assert found.split.lock_box == locked
+        assert train(store, "identity", tmp_path / f"run{number}").lock_box == locked
+        assert found.run.n_scans + len(found.run.dropped) == len(scans)
 
 
 def test_one_scan_is_refused() -> None:
