@@ -81,14 +81,30 @@ def evaluate(
     extrapolate: Annotated[
         bool, typer.Option("--extrapolate", help="accept layouts beyond the calibrated range")
     ] = False,
+    open_lock_box: Annotated[
+        bool,
+        typer.Option(
+            "--open-lock-box",
+            help="score the locked scans of the dataset that the model was trained on too; once per release",
+        ),
+    ] = False,
 ) -> None:
-    """Score one frozen model on all scans of a store."""
+    """Score one frozen model on a store; on the dataset it was trained on, without the locked scans."""
     from litho_models.evaluate import evaluate as evaluate_model
+    from litho_models.evaluation_report import lock_box_text
 
     result = evaluate_model(
-        model, store, out, policy=policy, background=background, noise=noise, extrapolate=extrapolate
+        model,
+        store,
+        out,
+        policy=policy,
+        background=background,
+        noise=noise,
+        extrapolate=extrapolate,
+        open_lock_box=open_lock_box,
     )
     scores = result.scores
+    typer.echo(lock_box_text(result.split))
     typer.echo(
         f"{scores.model}: mae_datum_free {scores.mae_datum_free_nm:.2f} nm, "
         f"mae_abs {scores.mae_abs_nm:.2f} nm; "

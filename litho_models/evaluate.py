@@ -22,11 +22,14 @@ from litho_models.nuisance import Policy
 from litho_models.run_info import RunInfo, run_info
 from litho_models.score_records import ModelScores, NuisanceProtocol, Prediction
 from litho_models.scores import NoiseFloor, noise_floor, protocol_for, score_model
-from litho_models.splits import ids_sha256
+from litho_models.splits import ids_sha256, locked_ids
 
 
 class SplitRecord(Record):
-    """Which scans were scored, and how that set came about."""
+    """Which scans were scored, and how that set came about.
+
+    ``lock_box``: the locked scans of the dataset, scored or not; ``lock_box_opened``: whether any was scored.
+    """
 
     kind: str
     folds: int = 0
@@ -75,9 +78,14 @@ def evaluate(
     noise: str | Path | None = None,
     scan_ids: Sequence[str] | None = None,
     extrapolate: bool = False,
+    open_lock_box: bool = False,
     device: str = "cpu",
 ) -> Evaluation:
     """Score a frozen model on the scans of a store and write the result and its report.
+
+    The locked scans are kept for models of this dataset: one that was trained on it is not scored on them
+    unless asked for. A model of another dataset is scored on all scans. The result says which were locked,
+    and whether any of them was scored.
 
     Args:
         model: folder of a frozen model.
@@ -87,8 +95,9 @@ def evaluate(
         background: whether the background in the model's card is added to the predictions; a card without
             one, or with one of fields of another size, adds none, and the result says so.
         noise: ``noise.json`` of this dataset, or its folder: the floor beside the errors is the one in it.
-        scan_ids: only these scans; all if None.
+        scan_ids: exactly these scans, locked ones among them too.
         extrapolate: accept layouts beyond the model's calibrated range.
+        open_lock_box: score the locked scans also of the dataset that the model was trained on.
 
     Raises:
         InputError: a model or store that cannot be read, geometries that differ, or a noise analysis of
@@ -98,10 +107,16 @@ def evaluate(
     floor = noise_floor(dataset.name, noise)
     frozen = load_frozen(model, device=device, extrapolate=extrapolate)
     frozen.check_geometry(dataset.pitch_um, dataset.level_height_um)
-    ids = list(scan_ids) if scan_ids is not None else dataset.ids
-    if not ids:
+    every = dataset.scans()
+    locked = locked_ids(every)
+    if scan_ids is not None:
+        scans = [dataset.scan(scan_id) for scan_id in scan_ids]
+    else:
+        own = (frozen.card["dataset"] or {}).get("sha256") == dataset.sha256
+        scans = [scan for scan in every if open_lock_box or not own or scan.id not in locked]
+    if not scans:
         raise InputError(f"scans of {store}", got="none", wanted="at least one to score")
-    scans = [dataset.scan(scan_id) for scan_id in ids]
+    ids = [scan.id for scan in scans]
     learned = card_background(frozen, scans) if background == "training" else None
     heights, cost = measured_predictions(lambda scan: predict_frozen(frozen, scan), scans, device_of(frozen))
     predictions = [
@@ -122,7 +137,13 @@ def evaluate(
             tiles=tile_consistency(frozen.simulator, scans[0]),
             cost=cost,
         ),
-        split=SplitRecord(kind="given", scored_ids=ids, scored_ids_sha256=ids_sha256(ids)),
+        split=SplitRecord(
+            kind="given",
+            scored_ids=ids,
+            scored_ids_sha256=ids_sha256(ids),
+            lock_box=locked,
+            lock_box_opened=not set(locked).isdisjoint(ids),
+        ),
         nuisance=protocol,
         noise_floor=floor,
         trained_on_scored_scans=sorted(trained_on),

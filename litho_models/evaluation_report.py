@@ -15,7 +15,7 @@ from litho_models import figures, score_tables
 if TYPE_CHECKING:
     import pandas as pd
 
-    from litho_models.evaluate import Evaluation, ModelRecord
+    from litho_models.evaluate import Evaluation, ModelRecord, SplitRecord
 
 
 def write_evaluation_report(
@@ -37,6 +37,7 @@ def write_evaluation_report(
     if result.trained_on_scored_scans:
         count = len(result.trained_on_scored_scans)
         page.note(f"{count} of the scored scans were used in training: this is not a held-out error.")
+    page.note(lock_box_text(result.split))
     if result.model.extrapolated:
         page.note("Layouts beyond the calibrated range were accepted (extrapolate).")
     page.paragraph(score_tables.protocol_text(result.nuisance))
@@ -71,6 +72,16 @@ def write_evaluation_report(
         page.paragraph(note)
     page.code(result.run.command)
     return page.write(out)
+
+
+def lock_box_text(split: SplitRecord) -> str:
+    """What was done with the locked scans of the dataset."""
+    if not split.lock_box:
+        return "The dataset is too small for locked scans."
+    scored = [scan_id for scan_id in split.lock_box if scan_id in split.scored_ids]
+    if not scored:
+        return f"The {len(split.lock_box)} locked scans of the dataset were left out."
+    return f"Locked scans of the dataset are among the scored ones: {', '.join(scored)}."
 
 
 def _model(model: ModelRecord) -> pd.DataFrame:

@@ -130,6 +130,29 @@ def test_train_evaluate_and_freeze_agree_bit_for_bit(store, tmp_path):
     assert table["difference_nm"].tolist() == [0.0]
 
 
+def test_a_model_of_the_same_prints_is_not_scored_on_locked_scans_unless_asked(store, tmp_path):
+    run = train(store, "affine", tmp_path / "run", settings=SETTINGS)
+    model = tmp_path / "run" / "model"
+    shut = evaluate(model, store, tmp_path / "shut")
+    assert (shut.split.lock_box, shut.split.lock_box_opened) == (run.lock_box, False)
+    assert not set(run.lock_box) & {*shut.split.scored_ids, *(row.scan for row in shut.scores.scans)}
+    opened = evaluate(model, store, tmp_path / "opened", open_lock_box=True)
+    assert (opened.split.lock_box, opened.split.lock_box_opened) == (run.lock_box, True)
+    assert len(opened.scores.scans) == len(shut.scores.scans) + len(run.lock_box) == 8
+    given = evaluate(model, store, tmp_path / "given", scan_ids=run.lock_box)
+    assert given.split.lock_box_opened
+
+
+def test_a_model_of_other_prints_is_scored_on_all_scans_and_the_opened_box_is_recorded(store, tmp_path):
+    other = write_store(tmp_path / "other.zarr", make_scans(4, size_px=64))
+    train(other, "identity", tmp_path / "run")
+    scored = evaluate(tmp_path / "run" / "model", store, tmp_path / "out")
+    assert len(scored.scores.scans) == 8
+    assert len(scored.split.lock_box) == 1
+    assert scored.split.lock_box_opened
+    assert f"scored ones: {scored.split.lock_box[0]}." in (tmp_path / "out" / "report.html").read_text()
+
+
 def test_comparing_different_protocols_is_refused(store, tmp_path):
     train(store, "identity", tmp_path / "run")
     evaluate(tmp_path / "run" / "model", store, tmp_path / "offset")
