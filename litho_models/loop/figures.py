@@ -10,8 +10,8 @@ import pandas as pd
 from litho_data.report import new_figure
 from litho_models.loop.closing import Closed
 from litho_models.loop.probes import AddedProbe, figures
-from litho_models.loop.probes.covariates import drawn, drawn_profile
 from litho_models.loop.probes.kernel import MissingKernel
+from litho_models.loop.probes.places import drawn, drawn_profile
 from litho_models.loop.result import CloseLoop
 from litho_models.loop.scoring import Score
 from litho_models.loop.structure import CovariateTest
@@ -22,7 +22,11 @@ if TYPE_CHECKING:
 
 _MAPS = 3
 # Probes that are tables, and what they run along.
-_TABLES = {"level-table": "printed level", "slope-table": "steepness of the print (µm/µm)"}
+_TABLES = {
+    "level-table": "printed level",
+    "slope-table": "steepness of the print (µm/µm)",
+    "axis-slope-table": "steepness along the axis (µm/µm)",
+}
 _BEFORE, _AFTER = "#9aa5b1", "#0b6aa2"
 
 
@@ -113,15 +117,23 @@ def probe_figure(entry: AddedProbe) -> Figure:
 
 
 def _table_figure(entry: AddedProbe) -> Figure:
-    values = figures(entry.probe, entry.estimate)
-    places = [float(name.rpartition("_")[2]) for name in values]
-    heights = np.array([value for value, _, _ in values.values()])
-    intervals = np.array([interval for _, _, interval in values.values()])
+    found = figures(entry.probe, entry.estimate)
+    values = pd.DataFrame(
+        [(*name.rpartition("_")[::2], value, *interval) for name, (value, _, interval) in found.items()],
+        columns=["covariate", "place", "height", "low", "high"],
+    )
     figure = new_figure(6, 3)
     axes = figure.subplots()
     axes.axhline(0, color="k", lw=0.6)
-    errors = np.abs(intervals.T - heights)
-    axes.errorbar(places, heights, errors, fmt="o-", color=_AFTER, ms=4, capsize=2)
+    for colour, (covariate, table) in zip(
+        (_AFTER, "#c05621"), values.groupby("covariate", sort=False), strict=False
+    ):
+        errors = np.abs(table[["low", "high"]].to_numpy().T - table["height"].to_numpy())
+        label = str(covariate).replace("_", " ")
+        places = table["place"].astype(float)
+        axes.errorbar(places, table["height"], errors, fmt="o-", color=colour, ms=4, capsize=2, label=label)
+    if len(axes.containers) > 1:
+        axes.legend(frameon=False)
     axes.set_xlabel(_TABLES[entry.probe.name])
     axes.set_ylabel("missing height (nm)")
     axes.spines[["top", "right"]].set_visible(False)

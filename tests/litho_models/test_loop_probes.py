@@ -13,9 +13,10 @@ from scipy.ndimage import gaussian_filter
 from litho_models.loop.fields import Field, prepare_fields
 from litho_models.loop.fitting import FoldFits
 from litho_models.loop.probes import Probed, figures, probe_residual
-from litho_models.loop.probes.covariates import SPOT_UM, drawn, drawn_profile
 from litho_models.loop.probes.defects import find_defects
 from litho_models.loop.probes.kernel import off_centre_peak, resampled
+from litho_models.loop.probes.places import drawn, drawn_profile
+from litho_models.loop.probes.tables import SPOT_UM
 from litho_models.loop.probes.trend import order_trends
 from litho_models.loop.state import State
 from tests.litho_models.loop_scans import printed_scans, true_model
@@ -96,6 +97,28 @@ def test_a_wrong_level_comes_back_at_its_level() -> None:
     assert abs(after) <= abs(before) + 1e-3
     # The second difference at the level is what no datum, gain or slope over levels can carry.
     assert own == pytest.approx(50, rel=0.2)
+
+
+@pytest.mark.slow
+def test_what_grows_with_the_slope_along_one_axis_comes_back_as_a_table_of_that_axis() -> None:
+    """Lost heights of 40 nm per unit slope along x, none along y."""
+    fields, predictions = scene()
+    along_x = {
+        f.id: np.abs(np.gradient(p.astype(float), f.scan.pitch_um, axis=1))
+        for f, p in zip(fields, predictions, strict=True)
+    }
+    found = probed(*scene(lambda f: -0.04 * along_x[f.id]))
+    entry = found.added[0]
+    assert entry.probe.name == "axis-slope-table"
+    values = figures(entry.probe, entry.estimate)
+    rise_nm = {}
+    for axis in ("y", "x"):
+        table = {name: value for name, (value, _, _) in values.items() if name.startswith(f"along_{axis}_")}
+        slopes = [float(name.rpartition("_")[2]) for name in table]
+        rise_nm[axis] = np.polyfit(slopes, list(table.values()), 1)[0]
+    # As below: a tenth for the ridge; what is seen along y is of the same size at most.
+    assert rise_nm["x"] == pytest.approx(-40, rel=0.1)
+    assert abs(rise_nm["y"]) < 4
 
 
 @pytest.mark.slow

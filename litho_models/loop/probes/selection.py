@@ -9,10 +9,11 @@ import numpy as np
 
 from litho_models.loop.confirming import SMALLEST_SHARE, Confirmation, confirm
 from litho_models.loop.fields import Field
-from litho_models.loop.probes.covariates import level_table, position_map, profile, slope_table
 from litho_models.loop.probes.defects import Defects, find_defects
 from litho_models.loop.probes.kernel import missing_kernel
+from litho_models.loop.probes.places import position_map, profile
 from litho_models.loop.probes.probe import Estimate, Probe
+from litho_models.loop.probes.tables import axis_slope_table, level_table, slope_table
 from litho_models.loop.probes.trend import OrderTrend, order_trends
 from litho_models.loop.scoring import Score, Terms, score
 from litho_models.loop.state import State
@@ -114,7 +115,8 @@ def generic_terms(
             profile(fields, predictions, kept, along=along, times_height=times) for along in ("row", "column")
         ]
     kernel = missing_kernel(fields, predictions, defects.masks)
-    return [*([table] if table else []), slope_table(fields, predictions, kept), *places, kernel]
+    slopes = [make(fields, predictions, kept) for make in (slope_table, axis_slope_table)]
+    return [*([table] if table else []), *slopes, *places, kernel]
 
 
 def _best(

@@ -1,4 +1,4 @@
-"""Linear probes along the printed level, the steepness, the place in the field and its rows or columns."""
+"""Places: a smooth map over the field, or a profile over its rows or columns, added or times the height."""
 
 from __future__ import annotations
 
@@ -8,91 +8,19 @@ from typing import Literal
 
 import numpy as np
 from scipy.interpolate import BSpline
-from scipy.ndimage import gaussian_filter
 
 from litho_models.loop.fields import Field
-from litho_models.loop.probes.linear import ColumnsOf, LinearProbe, linear_probe, second_differences
+from litho_models.loop.probes.linear import LinearProbe, linear_probe, second_differences
 from litho_models.metrics import NM_PER_UM
 
-# The level that reaches a pixel is spread by the printer's spot.
-SPOT_UM = 0.2
 SPLINES = 5
-SLOPE_KNOTS = 8
 # One per µm in a field of 25 µm: what is finer is one line's, not the field's.
 PROFILE_SPLINES = 24
-_FEWEST_SCANS, _SMALLEST_SHARE = 5, 0.01
 _FLIPS: tuple[Callable[[np.ndarray], np.ndarray], ...] = tuple(
     partial(lambda grid, turns, mirror: np.rot90(grid.T if mirror else grid, turns), turns=t, mirror=m)
     for t in range(4)
     for m in (False, True)
 )
-
-
-def level_table(
-    fields: Sequence[Field], predictions: Sequence[np.ndarray], kept: Sequence[np.ndarray]
-) -> LinearProbe | None:
-    """One height correction per printed level; None where fewer than four levels can be estimated.
-
-    Offset and slope over the levels belong to each scan's datum and gain and are projected out with them.
-    Levels in fewer than 5 scans or 1 % of the pixels are left alone.
-    """
-    levels = estimated_levels(fields)
-    if len(levels) < 4:
-        return None
-    entries = [f"level_{level}" for level in levels]
-    columns_of = partial(_level_columns, levels=levels)
-    return _table("level-table", entries, columns_of, fields, predictions, kept)
-
-
-def estimated_levels(fields: Sequence[Field]) -> list[int]:
-    """Levels that enough scans and pixels hold."""
-    highest = max(int(field.scan.levels) for field in fields)
-    counts = np.stack(
-        [np.bincount(field.scan.mask_level.ravel().astype(int), minlength=highest) for field in fields]
-    )
-    shares = counts.sum(axis=0) / counts.sum()
-    enough = (counts > 0).sum(axis=0) >= min(_FEWEST_SCANS, len(fields))
-    return [int(level) for level in np.flatnonzero(enough & (shares >= _SMALLEST_SHARE))]
-
-
-def slope_table(
-    fields: Sequence[Field], predictions: Sequence[np.ndarray], kept: Sequence[np.ndarray]
-) -> LinearProbe:
-    """One height correction per steepness of the predicted print, linear in between.
-
-    The steepest knot is exceeded by 1 % of the pixels only, so that no knot rests on a few edges.
-    """
-    steepness = [
-        field.at_sample(_steepness(field, prediction))
-        for field, prediction in zip(fields, predictions, strict=True)
-    ]
-    steepest = float(np.quantile(np.concatenate(steepness), 0.99))
-    knots = np.linspace(0.0, max(steepest, np.finfo(float).tiny), SLOPE_KNOTS)
-    entries = [f"slope_{knot:.2f}" for knot in knots]
-    return _table("slope-table", entries, partial(_slope_columns, knots=knots), fields, predictions, kept)
-
-
-def _table(
-    name: str,
-    entries: Sequence[str],
-    columns_of: ColumnsOf,
-    fields: Sequence[Field],
-    predictions: Sequence[np.ndarray],
-    kept: Sequence[np.ndarray],
-) -> LinearProbe:
-    """One height per entry along an ordered covariate, bends kept small."""
-    return linear_probe(
-        name,
-        columns_of,
-        second_differences(len(entries)) + 1e-3 * np.eye(len(entries)),
-        lambda random, count: random.permutation(count),
-        lambda heights: {
-            entry: (float(height) * NM_PER_UM, "nm") for entry, height in zip(entries, heights, strict=True)
-        },
-        fields,
-        predictions,
-        kept,
-    )
 
 
 def position_map(
@@ -164,27 +92,6 @@ def _spread(values: np.ndarray, times_height: bool) -> dict[str, tuple[float, st
         "rms": (float(values.std()) * scale, unit),
         "peak_to_valley": (float(np.ptp(values)) * scale, unit),
     }
-
-
-def _level_columns(field: Field, prediction: np.ndarray, levels: Sequence[int]) -> np.ndarray:
-    """Blurred indicators (levels, y, x)."""
-    sigma = SPOT_UM / field.scan.pitch_um
-    level = field.scan.mask_level
-    return np.stack(
-        [gaussian_filter((level == one).astype(np.float64), sigma, mode="nearest") for one in levels]
-    )
-
-
-def _steepness(field: Field, prediction: np.ndarray) -> np.ndarray:
-    """|grad H| (y, x), µm/µm."""
-    along_y, along_x = np.gradient(prediction.astype(np.float64), field.scan.pitch_um)
-    return np.hypot(along_y, along_x)
-
-
-def _slope_columns(field: Field, prediction: np.ndarray, knots: np.ndarray) -> np.ndarray:
-    """Tents (knots, y, x): 1 at a knot, 0 at its neighbours, constant beyond the ends."""
-    place = np.interp(_steepness(field, prediction), knots, np.arange(len(knots)))
-    return np.maximum(0.0, 1.0 - np.abs(place - np.arange(len(knots))[:, None, None]))
 
 
 def _map_columns(field: Field, prediction: np.ndarray, times_height: bool) -> np.ndarray:
