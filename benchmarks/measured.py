@@ -57,10 +57,11 @@ def benchmark_table(benchmark: dict[str, Any]) -> str:
     split = benchmark["split"]
     rows.append(
         f"\nMean absolute error on held-out scans ({len(split['scored_ids'])} scans, {split['folds']} folds "
-        f"by scan, seed {split['seed']}, {len(split['lock_box'])} scans locked and not looked at; "
-        f"{_steps(benchmark)}), with 95 % bootstrap intervals over scans. Per-scan terms are fitted on "
-        "pixels that are not scored. The shared background is what levelling leaves in every map: five "
-        "numbers from the training scans, added to predictions of measured maps and to no design."
+        f"by scan, seed {split['seed']}; {len(split['lock_box'])} locked scans are in no fold and in no "
+        f"figure of this table; {_steps(benchmark)}), with 95 % bootstrap intervals over scans. Per-scan "
+        "terms are fitted on pixels that are not scored. The shared background is what levelling leaves in "
+        "every map: five numbers from the training scans, added to predictions of measured maps and to no "
+        "design."
     )
     return "\n".join(rows)
 
@@ -88,7 +89,8 @@ def paper_table(benchmark: dict[str, Any]) -> str:
     split = benchmark["split"]
     rows.append(
         f"\n{len(split['scored_ids'])} of 96 quadrants drawn at random (seed {split['seed']}), the others "
-        f"for training ({_steps(benchmark)}): one draw of the split, leaky as the paper's is."
+        f"for training ({_steps(benchmark)}): one draw of the split, leaky as the paper's is. Quadrants of "
+        f"the {len(split['lock_box'])} locked scans take part, in training and in the errors."
     )
     return "\n".join(rows)
 

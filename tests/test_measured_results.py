@@ -24,11 +24,25 @@ def test_the_committed_results_are_of_the_published_schemas():
     GapResult.read(FOLDER)
     noise = NoiseAnalysis.read(FOLDER)
     assert loop.dataset.sha256 == benchmark.dataset.sha256 == noise.dataset.sha256
-    # Nobody looked at the locked scans.
+    # No locked scan is in these figures.
     assert loop.locked_after is None
     assert not benchmark.locked_scores
+    assert not benchmark.split.lock_box_opened
     assert not set(loop.split.lock_box) & set(benchmark.split.scored_ids)
     assert noise.run.n_scans == len(benchmark.split.scored_ids)
+
+
+def test_the_pages_say_where_the_locked_scans_take_part():
+    paper = Benchmark.read(FOLDER / "benchmark_paper.json")
+    trained_on = {part for fit in paper.fits for part in (*fit.training_ids, *fit.validation_ids)}
+    locked = set(paper.split.lock_box)
+    for parts in (trained_on, paper.split.scored_ids):
+        assert locked & {part.split("/")[0] for part in parts}
+    assert paper.split.lock_box_opened
+    written = texts(FOLDER)
+    assert "4 locked scans take part, in training and in the errors" in written["paper split"]
+    assert "4 locked scans are in no fold and in no figure of this table" in written["benchmark"]
+    assert not any("not looked at" in text for text in written.values())
 
 
 def test_every_result_is_there():
