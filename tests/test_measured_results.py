@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.measured import FOLDER, PAGES, RESULTS, texts
+from benchmarks.measured import FOLDER, PAGES, RESULTS, loop_table, texts
 from benchmarks.record import published
 from litho_design.compare import GapResult
 from litho_models.benchmark import Benchmark
@@ -43,6 +43,28 @@ def test_the_pages_say_where_the_locked_scans_take_part():
     assert "4 locked scans take part, in training and in the errors" in written["paper split"]
     assert "4 locked scans are in no fold and in no figure of this table" in written["benchmark"]
     assert not any("not looked at" in text for text in written.values())
+
+
+def test_only_what_the_loop_on_physics_confirms_is_said_to_be_found_there():
+    network = CloseLoop.read(FOLDER / "close_loop_pbl.json").model_dump(mode="json")
+    physics = CloseLoop.read(FOLDER).model_dump(mode="json")
+    screened = network["candidates"][0]
+    network["candidates"] = [
+        {**screened, "name": name, "verdict": "absorbed"} for name in ("a", "b", "c", "d")
+    ]
+    found = physics["effects"][0]
+    physics["effects"] = [
+        {**found, "name": "a", "verdict": "confusable", "confusable_with": ["b"]},
+        {**found, "name": "c", "verdict": "traced-to-covariate", "confusable_with": []},
+    ]
+    physics["candidates"] = [
+        {**screened, "name": "c", "verdict": "traced-to-covariate", "reason": "near the cause"},
+        {**screened, "name": "d", "verdict": "below-noise", "reason": "a table does the same"},
+    ]
+    said = loop_table(network, physics)
+    assert "Found on Physics and already carried by the network: a, b.\n" in said
+    assert "c. The loop on Physics itself calls it traced-to-covariate: near the cause." in said
+    assert "d. The loop on Physics itself calls it below-noise: a table does the same." in said
 
 
 def test_every_result_is_there():
