@@ -6,8 +6,8 @@
 Prints fields in a fab whose effects no model was told of, trains six arms on the scans, designs one
 hologram and two lenses through each of them with equal budgets, and lets the fab print the designs; then
 the same hologram through the models of measured prints that come with the package. Time and memory are
-measured on trial iterations and told before the long part. Every step is skipped where its result exists,
-and a killed design goes on from its checkpoint.
+measured on trial iterations and told before the long part; ``--tasks`` does some of the tasks. Every step
+is skipped where its result exists, and a killed design goes on from its checkpoint.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 from benchmarks.gap.cost import as_text, estimate, read_records, run_trial, trial_job
 from benchmarks.gap.document import publish_results, write_results
 from benchmarks.gap.jobs import run_jobs
-from benchmarks.gap.plan import Effort, Plan, Task, fab_jobs, model_jobs, open_plan, proof_jobs, tasks
+from benchmarks.gap.plan import Effort, Plan, Task, chosen, fab_jobs, model_jobs, open_plan, proof_jobs, tasks
 from litho_data.errors import InputError
 from litho_models import zoo
 
@@ -44,7 +44,7 @@ def _run(given: argparse.Namespace) -> None:
     out, workers, logs = given.out, given.workers, given.out / "logs"
     effort = _effort(given)
     plan = open_plan(out, effort, None if given.judge is None else str(given.judge.resolve()))
-    todo = _tasks(out, plan)
+    todo = chosen(_tasks(out, plan), given.tasks)
     print("trial iterations", flush=True)
     # One at a time: what is timed should not share its memory bus.
     trials = {
@@ -97,6 +97,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--zoo-seeds", type=int, help="of the designs through models of measured prints")
     parser.add_argument("--training-steps", type=int, help="of the two networks")
     parser.add_argument("--judge", type=Path, help="further frozen model of the measured prints")
+    parser.add_argument("--tasks", metavar="NAMES", help="only these, separated by commas; all by default")
     parser.add_argument("--estimate", action="store_true", help="trial iterations and estimate only")
     parser.add_argument("--proof", action="store_true", help="then one hologram with 1,000 iterations of PBL")
     parser.add_argument("--publish", action="store_true", help="write tables and figures into docs/optics.md")

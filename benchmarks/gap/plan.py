@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -238,6 +238,20 @@ def tasks(out: Path, effort: Effort, zoo: Mapping[str, str], judge: str | None) 
         Task("lens-computational", "computational", lens + camera, models, fab, effort.seeds),
         Task("hoe-measured", "hoe", hoe, measured, further, effort.zoo_seeds),
     ]
+
+
+def chosen(every: Sequence[Task], names: str | None) -> list[Task]:
+    """The tasks of these names, separated by commas; all if None.
+
+    Raises:
+        InputError: a name that no task has.
+    """
+    if names is None:
+        return list(every)
+    wanted, known = names.split(","), [task.name for task in every]
+    if unknown := [name for name in wanted if name not in known]:
+        raise InputError("tasks", got=", ".join(unknown), wanted=f"some of {', '.join(known)}")
+    return [task for task in every if task.name in wanted]
 
 
 def proof_jobs(out: Path, effort: Effort) -> list[Job]:

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from benchmarks.gap.cost import estimate
 from benchmarks.gap.document import as_markdown
 from benchmarks.gap.jobs import Job, run_jobs
-from benchmarks.gap.plan import ARMS, PRINT_KNOBS, Effort, Task, open_plan, tasks
+from benchmarks.gap.plan import ARMS, PRINT_KNOBS, Effort, Task, chosen, open_plan, tasks
 from litho_data.errors import InputError
 from litho_data.virtual_fab import KnobSetting, knob_rms_nm
 from litho_data.virtual_fab.settings import Printer
@@ -43,6 +43,14 @@ def test_every_arm_has_the_same_budget(tmp_path):
         assert len(task.designs(tmp_path)) == task.seeds * len(task.models)
         assert task.iterations <= (300 if task.kind == "hoe" else 200)
         assert task.name == "hoe-measured" or tuple(task.models) == ARMS
+
+
+def test_tasks_are_chosen_by_name(tmp_path):
+    every = tasks(tmp_path, TINY, {}, None)
+    assert chosen(every, None) == every
+    assert [task.name for task in chosen(every, "lens-direct,hoe")] == ["hoe", "lens-direct"]
+    with pytest.raises(InputError, match="lens-direct"):
+        chosen(every, "lens")
 
 
 @pytest.mark.parametrize("kind", ["hoe", "lens-computational"])
