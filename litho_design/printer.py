@@ -6,7 +6,6 @@ import hashlib
 import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, Literal, cast
 
 import torch
@@ -19,7 +18,6 @@ from litho_design.fab_judge import FabSimulator, is_fab, load_fab
 from litho_design.parametrise import LayoutSettings
 
 _GUARD_UM = 6.4
-_ZOO_PREFIX = "zoo:"
 
 Precision = Literal["float32", "mixed", "bfloat16"]
 
@@ -256,15 +254,7 @@ def load_printer(
 def _load_simulator(source: str, device: str | torch.device, extrapolate: bool) -> Any:
     from litho_models import load_frozen, zoo
 
-    if source.startswith(_ZOO_PREFIX):
-        return zoo.load(source.removeprefix(_ZOO_PREFIX), device, extrapolate)
-    if not Path(source).is_dir():
-        hint = f"{_ZOO_PREFIX}{source} comes with the package" if source in zoo.list() else ""
-        raise InputError(
-            "model", got=f"{source!r}, which is no folder",
-            wanted=f"the folder of a frozen model, {_ZOO_PREFIX}NAME, or none", hint=hint,
-        )  # fmt: skip
-    return load_frozen(source, device=device, extrapolate=extrapolate)
+    return load_frozen(zoo.model_folder(source, other="or none"), device=device, extrapolate=extrapolate)
 
 
 def _check_calibration(card: Mapping[str, Any], layout: LayoutSettings, extrapolate: bool) -> None:

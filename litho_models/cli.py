@@ -72,7 +72,7 @@ def train(
 
 @app.command()
 def evaluate(
-    model: Annotated[Path, typer.Argument(help="folder of a frozen model")],
+    model: Annotated[str, typer.Argument(help="folder of a frozen model, or zoo:NAME")],
     store: StorePath,
     out: Out,
     policy: PolicyOption = "offset",
@@ -168,7 +168,9 @@ def compare(
 
 @app.command()
 def freeze(
-    run: Annotated[Path, typer.Argument(help="folder of `train` or `close-loop`, or a frozen model")],
+    run: Annotated[
+        str, typer.Argument(help="folder of `train` or `close-loop`, or a frozen model (a folder, zoo:NAME)")
+    ],
     out: Out,
     declare_process: Annotated[
         list[str] | None,

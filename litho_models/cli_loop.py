@@ -15,7 +15,7 @@ def close_loop(
         Path, typer.Option("--out", help="folder for result, report, tables and the corrected model")
     ],
     base: Annotated[
-        str, typer.Option("--base", help="model to correct: its name, or the folder of a frozen model")
+        str, typer.Option("--base", help="model to correct: its name, or a frozen model (a folder, zoo:NAME)")
     ] = "physics",
     prior: Annotated[
         str | None,

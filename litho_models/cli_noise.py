@@ -27,8 +27,11 @@ def noise(
     ] = None,
     level_height_um: Annotated[float, typer.Option(help="nominal step of the step print, µm")] = 0.1,
     residuals: Annotated[
-        list[Path] | None,
-        typer.Option(help="folder of `benchmark`, or a frozen model: adds σ(x) and calibration; repeatable"),
+        list[str] | None,
+        typer.Option(
+            help="folder of `benchmark`, or a frozen model (a folder, zoo:NAME): adds σ(x) and calibration; "
+            "repeatable"
+        ),
     ] = None,
     model: Annotated[
         str | None, typer.Option(help="which model of the benchmark; its best one by default")

@@ -13,6 +13,7 @@ from pydantic import Field
 from litho_data.errors import InputError
 from litho_data.results import Record, Result
 from litho_data.store import PrintedScan, open_store
+from litho_models import zoo
 from litho_models.background import Background, BackgroundUse
 from litho_models.cost import PredictionCost, measured_predictions
 from litho_models.diagnostics import TileConsistency, device_of, tile_consistency
@@ -88,7 +89,7 @@ def evaluate(
     and whether any of them was scored.
 
     Args:
-        model: folder of a frozen model.
+        model: folder of a frozen model, or ``zoo:NAME``.
         store: dataset store.
         out: folder for ``evaluation.json``, ``report.html`` and the CSV tables.
         policy: nuisances that a scan may be freed of.
@@ -105,7 +106,7 @@ def evaluate(
     """
     dataset = open_store(store)
     floor = noise_floor(dataset.name, noise)
-    frozen = load_frozen(model, device=device, extrapolate=extrapolate)
+    frozen = load_frozen(zoo.model_folder(model), device=device, extrapolate=extrapolate)
     frozen.check_geometry(dataset.pitch_um, dataset.level_height_um)
     every = dataset.scans()
     locked = locked_ids(every)

@@ -13,6 +13,7 @@ from litho_data.errors import InputError
 from litho_data.files import atomic_file
 from litho_data.results import Result, first_error
 from litho_data.store import PrintedScan, open_store
+from litho_models import zoo
 from litho_models.freeze import CARD_FILE, DatasetName, ModelCard, load_simulator, save_frozen
 from litho_models.run_info import RunInfo, run_info
 from litho_models.simulator import Variant
@@ -114,7 +115,7 @@ def freeze(source: str | Path, out: str | Path, declare_process: Sequence[str] =
     """Write the process model of a run folder, or of a model folder, as a frozen model.
 
     Args:
-        source: what ``train`` or ``close-loop`` wrote, or a frozen model.
+        source: what ``train`` or ``close-loop`` wrote, or a frozen model (a folder, ``zoo:NAME``).
         out: folder of the frozen model.
         declare_process: effects of undetermined role that the user declares part of the printer; the
             card records the declaration.
@@ -122,7 +123,7 @@ def freeze(source: str | Path, out: str | Path, declare_process: Sequence[str] =
     Raises:
         InputError: no model there, or an effect that is not among the undetermined ones.
     """
-    folder = Path(source)
+    folder = zoo.model_folder(source)
     folder = folder if (folder / CARD_FILE).exists() else folder / MODEL_FOLDER
     if not (folder / CARD_FILE).exists():
         raise InputError(f"no model in {source}", wanted="a folder of `litho-models train` or a frozen model")

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 ZOO_FOLDER = Path(__file__).parent / "zoo_data"
 LARGEST_ZOO_BYTES = 8_000_000
+PREFIX = "zoo:"
 _CARD_FILE = "card.json"
 
 
@@ -38,6 +39,30 @@ def folder(name: str, root: str | Path = ZOO_FOLDER) -> Path:
             hint="" if known else "examples/make_zoo.py trains it",
         )
     return Path(root) / name
+
+
+def model_folder(source: str | Path, root: str | Path = ZOO_FOLDER, other: str = "") -> Path:
+    """The folder that a command is given: one that is there, or ``zoo:NAME`` for a model of the zoo.
+
+    Args:
+        source: what the user typed.
+        root: the zoo.
+        other: what else the caller takes, for the message.
+
+    Raises:
+        InputError: no such folder, or no such model in the zoo.
+    """
+    text = str(source)
+    if text.startswith(PREFIX):
+        return folder(text.removeprefix(PREFIX), root)
+    if not Path(source).is_dir():
+        raise InputError(
+            "model",
+            got=f"{text!r}, which is no folder",
+            wanted=", ".join(["the folder of a model", f"{PREFIX}NAME", *([other] if other else [])]),
+            hint=f"{PREFIX}{text} comes with the package" if text in list(root) else "",
+        )
+    return Path(source)
 
 
 def load(

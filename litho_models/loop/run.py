@@ -11,6 +11,7 @@ from litho_data.errors import InputError
 from litho_data.files import atomic_folder
 from litho_data.outputs import require_replaceable_folder
 from litho_data.store import PrintedScan, Store, open_store
+from litho_models import zoo
 from litho_models.effects import get_effect
 from litho_models.freeze import save_frozen
 from litho_models.loop.closing import Closed, LoopConfig, close_loop, corrected_chain
@@ -42,7 +43,7 @@ def close_loop_on_store(
 
     Args:
         store: a store made by ``litho-data build``.
-        base: name of a model, or the folder of a frozen one.
+        base: name of a model, or a frozen one (its folder, ``zoo:NAME``).
         config: settings; ``report`` is told what happens, a sentence at a time.
         steps: optimiser steps of a base that is trained per fold; the recipe's by default.
         cache: folder where such trainings are kept and continued, by default beside ``out``; that of a
@@ -119,9 +120,7 @@ def _base_model(base: str, store: Store) -> tuple[Simulator, str]:
             base, pitch_um=store.pitch_um, level_height_um=store.level_height_um, levels=store.levels
         )
         return model, base
-    folder = Path(base)
-    if not folder.is_dir():
-        raise InputError("base model", got=repr(base), wanted=f"a model folder or one of {', '.join(MODELS)}")
+    folder = zoo.model_folder(base, other=f"or one of {', '.join(MODELS)}")
     from litho_models.freeze import ModelCard, load_simulator
 
     card = ModelCard.read(folder)

@@ -48,8 +48,8 @@ def noise(
     Args:
         store: dataset store, with or without scans of use substrate, flat and steps, with or without doses.
         out: result folder.
-        residuals: folders of ``litho-models benchmark`` (out of fold) or of frozen models: adds σ(x) and its
-            calibration; several of one kind are taken as an ensemble.
+        residuals: folders of ``litho-models benchmark`` (out of fold), or frozen models (folders,
+            ``zoo:NAME``): adds σ(x) and its calibration; several of one kind are taken as an ensemble.
         model: which model of the benchmarks; their best one by default.
         seed: of the pixels drawn.
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from litho_data.errors import InputError
 from litho_data.store import PrintedScan, Store
+from litho_models import zoo
 from litho_models.evaluate import predict_frozen
 from litho_models.freeze import CARD_FILE, load_frozen
 from litho_models.noise.calibration import Residuals
@@ -28,14 +29,15 @@ def read_residuals(
     Args:
         store: the store that the sources were made from.
         sources: result folders of ``litho-models benchmark``, whose cache holds predictions of scans that
-            the fit never saw, or folders of frozen models; not both kinds at once. The lock box is left out.
+            the fit never saw, or frozen models (folders, ``zoo:NAME``); not both kinds at once. The lock box
+            is left out.
         model: which model of a benchmark; its best one by default.
         policy: nuisances.
 
     Raises:
         InputError: a folder that is neither, sources of another dataset, or no scan that all predict.
     """
-    folders = [Path(source) for source in sources]
+    folders = [zoo.model_folder(source, other="or that of a benchmark") for source in sources]
     frozen = [(folder / CARD_FILE).exists() for folder in folders]
     if any(frozen) and not all(frozen):
         raise InputError("residuals", got="benchmarks and frozen models", wanted="one kind of source")

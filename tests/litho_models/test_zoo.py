@@ -9,9 +9,11 @@ import sys
 import pytest
 import torch
 from prints import make_scans, write_store
+from typer.testing import CliRunner
 
 from litho_data.errors import InputError
 from litho_models import save_frozen, zoo
+from litho_models.cli import app
 from litho_models.freeze import ModelCard
 from litho_models.models import build_model
 from litho_models.zoo_making import HELD_OUT, OUT_OF_FOLD, TRAINED_ON, differing_metrics, make_zoo
@@ -91,6 +93,27 @@ def test_unknown_names_and_paths_are_refused(small_zoo):
     for name in ("resnet", "../pbl", ""):
         with pytest.raises(InputError, match="fno, pbl, physics"):
             zoo.load(name, root=small_zoo)
+
+
+def test_every_command_that_takes_a_frozen_model_takes_it_from_the_zoo(store, tmp_path):
+    from litho_data.store import open_store
+    from litho_models.evaluate import Evaluation
+    from litho_models.loop.run import _base_model
+    from litho_models.noise.residuals import read_residuals
+    from litho_models.runs import freeze
+
+    name = zoo.list()[-1]
+    named, there = f"zoo:{name}", zoo.folder(name)
+    assert zoo.model_folder(named) == zoo.model_folder(str(there)) == there
+    command = ["evaluate", named, str(store), "--out", str(tmp_path / "out")]
+    assert CliRunner().invoke(app, command, catch_exceptions=False).exit_code == 0
+    assert Evaluation.read(tmp_path / "out").model.name == name
+    assert freeze(named, tmp_path / "frozen").weights_sha256 == ModelCard.read(there).weights_sha256
+    assert _base_model(named, open_store(store))[1] == name
+    assert read_residuals(open_store(store), [named]).model == name
+    for wrong, said in (("zoo:resnet", name), (name, f"{named} comes with the package")):
+        with pytest.raises(InputError, match=said):
+            zoo.model_folder(wrong)
 
 
 def test_listing_the_zoo_loads_no_torch():
