@@ -22,10 +22,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.record import publish, usable_cores, write_record
+from benchmarks.record import origin, publish, usable_cores, write_record
 from litho_data.layouts import random_layout
 from litho_data.layouts.card_text import write_layout
-from litho_data.results import software_versions
 
 PAGE = Path(__file__).parents[1] / "docs" / "dataset_store.md"
 RESULT = PAGE.parent / "results" / "build" / "build.json"
@@ -74,7 +73,7 @@ def main() -> None:
     record = {
         "schema": "litho-data/benchmark-build/1",
         "machine": {"cores": usable_cores()},
-        "versions": software_versions(),
+        **origin(),
         "goal": {"wall_s": GOAL_WALL_S, "peak_mib": GOAL_PEAK_MIB},
         "generator": "blurred random layouts with white noise, .npy",
         "runs": runs,

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.record import publish, usable_cores, write_record
+from benchmarks.record import origin, publish, usable_cores, write_record
 from litho_data.level import (
     align_rows,
     level_facet,
@@ -30,7 +30,6 @@ from litho_data.level import (
 )
 from litho_data.level.facet import facet_pass
 from litho_data.readers import read_scan
-from litho_data.results import software_versions
 
 PAGE = Path(__file__).parents[1] / "docs" / "levelling.md"
 RESULT = PAGE.parent / "results" / "levelling" / "levelling.json"
@@ -71,7 +70,7 @@ def main() -> None:
         "repeats": arguments.repeats,
         "machine": {"cores": usable_cores()},
         "threads": os.environ.get("OMP_NUM_THREADS", "as many as there are cores"),
-        "versions": software_versions(),
+        **origin(),
         "goal": GOAL,
         "methods": measure(height_um, arguments.repeats),
     }

@@ -23,9 +23,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.record import publish, write_record
+from benchmarks.record import origin, publish, write_record
 from litho_data.layouts import random_layout
-from litho_data.results import software_versions
 from litho_data.store import PrintedScan
 from litho_data.virtual_fab.random_curves import line_roughness
 from litho_models.loop import close_loop
@@ -63,7 +62,7 @@ def main() -> None:
         "size_px": SIZE_PX,
         "noise": f"Gaussian, {1000 * ROUGHNESS_UM:g} nm, spectrum of a flat print of the virtual fab",
         "allowed": ALLOWED,
-        "versions": software_versions(),
+        **origin(),
         "stores": _run_all(arguments.cache, arguments.stores, arguments.workers),
     }
     write_record(arguments.out, record)

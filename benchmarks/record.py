@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from litho_data.errors import InputError
 from litho_data.files import atomic_file
+from litho_data.provenance import code_commit
+from litho_data.results import software_versions
 
 NOT_MEASURED = "Not measured yet."
 
@@ -17,6 +21,17 @@ NOT_MEASURED = "Not measured yet."
 def usable_cores() -> int:
     """Cores that this process may run on."""
     return len(os.sched_getaffinity(0))
+
+
+def origin() -> dict[str, Any]:
+    """Command line, commit and versions behind a result."""
+    module = sys.modules["__main__"].__spec__
+    started = ["python", "-m", module.name.removesuffix(".__main__")] if module else [Path(sys.argv[0]).name]
+    return {
+        "command": shlex.join([*started, *sys.argv[1:]]),
+        "commit": code_commit(),
+        "versions": software_versions(),
+    }
 
 
 def write_record(path: Path, record: Mapping[str, Any]) -> None:

@@ -22,8 +22,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.record import publish, usable_cores, write_record
-from litho_data.results import software_versions
+from benchmarks.record import origin, publish, usable_cores, write_record
 from litho_models import zoo
 from litho_models.models.pbl import Pbl, PblConfig
 
@@ -107,7 +106,7 @@ def run(
         "repeats": arguments.repeats,
         "machine": {"cores": usable_cores(), "bfloat16_matrix_unit": _has_matrix_unit()},
         "threads": arguments.threads,
-        "versions": software_versions(),
+        **origin(),
         "peak_gflops": peaks,
         "sides": rows,
     }

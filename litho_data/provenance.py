@@ -100,6 +100,11 @@ def code_record() -> dict[str, Any]:
     return {"versions": versions, **_checkout(Path(__file__).parents[1])}
 
 
+def code_commit() -> str:
+    """Commit of the source checkout that runs; empty for an installed wheel."""
+    return code_record()["commit"] or ""
+
+
 def _checkout(folder: Path) -> dict[str, Any]:
     """Commit and cleanliness of the checkout that the packages lie in; nothing for an installed wheel."""
     if not (folder / ".git").exists():

@@ -12,8 +12,7 @@ import pandas as pd
 
 from benchmarks.gap.figures import draw_images, draw_lens
 from benchmarks.gap.plan import ARMS, Plan, Task
-from benchmarks.record import publish, usable_cores, write_record
-from litho_data.results import software_versions
+from benchmarks.record import origin, publish, usable_cores, write_record
 from litho_design.compare import HEADLINE, GapResult
 from litho_design.design import Design
 
@@ -63,7 +62,7 @@ def write_results(
         "schema": "litho-design/benchmark-gap/1",
         "plan": plan.model_dump(mode="json", by_alias=True, exclude={"judge"}),
         "machine": {"cores": usable_cores(), "threads_per_process": 1},
-        "versions": software_versions(),
+        **origin(),
         "models": _models(out),
         "tasks": {
             name: {

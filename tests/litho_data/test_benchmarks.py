@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -14,6 +16,7 @@ from benchmarks import build as build_benchmark
 from benchmarks import levelling as levelling_benchmark
 from benchmarks.record import NOT_MEASURED, publish, published
 from litho_data.errors import InputError
+from litho_data.provenance import code_commit
 
 
 @pytest.mark.parametrize("benchmark", [build_benchmark, levelling_benchmark])
@@ -35,6 +38,28 @@ def test_publishing_replaces_what_stands_between_the_marks(tmp_path):
     assert page.read_text().endswith("-->\nbottom\n")
     with pytest.raises(InputError, match="marks"):
         publish(page, "b", "x")
+
+
+def test_a_record_says_by_which_command_and_commit_it_was_made(tmp_path, monkeypatch):
+    file = tmp_path / "levelling.json"
+    options = ["--scan", str(tmp_path / "scan.npy"), "--unit", "um", "--repeats", "1", "--out", str(file)]
+    monkeypatch.setattr("sys.argv", ["levelling.py", *options])
+    monkeypatch.setattr(levelling_benchmark, "measure", lambda height_um, repeats: [])
+    np.save(tmp_path / "scan.npy", np.zeros((64, 64)))
+    levelling_benchmark.main()
+    record = json.loads(file.read_text())
+    assert record["command"].endswith(" ".join(options))
+    assert record["commit"] == code_commit()
+    assert record["versions"]["numpy"] == np.__version__
+    # A module is named as it is started.
+    asked = "from benchmarks.record import origin; print(origin()['command'])"
+    (tmp_path / "asked.py").write_text(asked)
+    places = os.pathsep.join([str(Path(__file__).parents[2]), str(tmp_path)])
+    said = subprocess.run(
+        [sys.executable, "-m", "asked", "--size", "3"],
+        env=os.environ | {"PYTHONPATH": places}, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert said.stdout.strip() == "python -m asked --size 3"
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is read from /proc")
