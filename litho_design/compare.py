@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from litho_data.errors import InputError
+from litho_data.provenance import code_commit
 from litho_data.results import Record, Result, software_versions
 from litho_design.design import Design, DesignTask
 from litho_design.judging import Judging
@@ -72,6 +73,7 @@ class GapResult(Result):
     schema_: Literal["litho-design/gap/1"] = Field(default="litho-design/gap/1", alias="schema")
     task: DesignTask
     command: str
+    commit: str = ""
     versions: dict[str, str]
     settings: HoeSettings | LensSettings
     target: str
@@ -142,6 +144,7 @@ def compare(
     result = GapResult(
         task=design.task,
         command=command,
+        commit=code_commit(),
         versions=software_versions(),
         settings=settings,
         target=design.target.name if design.target else "",

@@ -30,9 +30,10 @@ DesignTask = Literal["hoe", "lens-direct", "lens-computational"]
 
 
 class RunRecord(Record):
-    """What was run, with what, and how long it took."""
+    """What was run, with what, and how long it took; results of before commits were kept have none."""
 
     command: str
+    commit: str = ""
     versions: dict[str, str]
     device: str
     threads: int

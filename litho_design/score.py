@@ -14,6 +14,7 @@ from torch import Tensor
 
 from litho_data.errors import InputError
 from litho_data.files import file_sha256
+from litho_data.provenance import code_commit
 from litho_data.results import Record, Result, software_versions
 from litho_design.camera import CameraRecord, photo_score, photographed_image
 from litho_design.design import LEVELS_FILE, Design
@@ -68,6 +69,7 @@ class ScoreResult(Result):
 
     schema_: Literal["litho-design/score/1"] = Field(default="litho-design/score/1", alias="schema")
     command: str
+    commit: str = ""
     versions: dict[str, str]
     design: str
     design_sha256: str
@@ -133,6 +135,7 @@ def score_design(
             pictures[f"photograph {photo.name}"] = image
     result = ScoreResult(
         command=command,
+        commit=code_commit(),
         versions=software_versions(),
         design=str(folder),
         design_sha256=file_sha256(Path(folder) / Design.FILE_NAME),

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from litho_data.errors import InputError
 from litho_data.files import writable
+from litho_data.provenance import code_commit
 from litho_data.results import Record, software_versions
 from litho_design.budget import Budget, measure_budget, peak_memory_gib
 from litho_design.design import (
@@ -155,6 +156,7 @@ def run_design(
         fingerprint=fingerprint,
         run=RunRecord(
             command=command,
+            commit=code_commit(),
             versions=software_versions(),
             device=str(height.device),
             threads=torch.get_num_threads(),

@@ -7,6 +7,7 @@ import pytest
 from benchmarks.measured import FOLDER, PAGES, RESULTS, loop_table, texts
 from benchmarks.record import published
 from litho_design.compare import GapResult
+from litho_design.score import ScoreResult
 from litho_models.benchmark import Benchmark
 from litho_models.loop.result import CloseLoop
 from litho_models.noise.result import NoiseAnalysis
@@ -22,6 +23,7 @@ def test_the_committed_results_are_of_the_published_schemas():
     loop = CloseLoop.read(FOLDER)
     benchmark = Benchmark.read(FOLDER)
     GapResult.read(FOLDER)
+    ScoreResult.read(FOLDER)
     noise = NoiseAnalysis.read(FOLDER)
     assert loop.dataset.sha256 == benchmark.dataset.sha256 == noise.dataset.sha256
     # No locked scan is in these figures.

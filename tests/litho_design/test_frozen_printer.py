@@ -12,6 +12,7 @@ import tifffile
 import torch
 
 from litho_data.errors import InputError
+from litho_data.provenance import code_commit
 from litho_design.cli import app, main
 from litho_design.design import Design
 from litho_design.gauge import OutOfDistribution
@@ -126,13 +127,15 @@ def test_commands_design_score_and_compare(tmp_path, affine_folder):
     assert levels.shape == (128, 128)
     assert (design / "report.html").stat().st_size > 50_000
     call("score", design, "--judge", "none", "--judge", f"twin={affine_folder}", "--out", tmp_path / "score")
-    scores = json.loads((tmp_path / "score" / "score.json").read_text())["scores"]
+    score = json.loads((tmp_path / "score" / "score.json").read_text())
+    scores = score["scores"]
     assert [(s["judge"]["name"], s["independent"]) for s in scores] == [("none", True), ("twin", False)]
     models = f"none,affine={affine_folder}"
     call("compare", "--models", models, "--target", "ring", "--seeds", "1", "--out", tmp_path / "gap", *SMALL)
     gap = json.loads((tmp_path / "gap" / "gap.json").read_text())
     assert gap["schema"] == "litho-design/gap/1"
     assert {entry["arm"] for entry in gap["entries"]} == {"none", "affine"}
+    assert {record.run.commit, score["commit"], gap["commit"]} == {code_commit()}
 
 
 def test_an_odd_picture_is_adapted_and_the_adaptation_is_told(tmp_path, capsys, monkeypatch):
