@@ -86,6 +86,7 @@ def summarise(closed: Closed, *, dataset: tuple[str, str], base_name: str, dropp
         candidates=_candidates(closed, {e.name for e in effects}),
         shares=_shares(closed),
         residual=Residual(
+            # Only a measured floor can show that it is reached; the loop has a lower bound: never at-floor.
             state="unexplained" if structured else "undecided",
             signature="; ".join(
                 f"follows {t.name} (p = {t.p:.4f}, {100 * t.share:.1f} % of the squared error)"
