@@ -91,17 +91,8 @@ class Closed:
         return DATUM_FREE | names_to_terms(self.accepted)
 
     def errors(self, state: State, terms: Terms) -> Score:
-        """Held-out errors of a state over the development scans.
-
-        Effects are fitted with the datum of every scan free, so nothing holds the height that all scans
-        share. Where nothing is fitted to a scan, it is given: as the other folds have it.
-        """
-        predictions = state.predictions
-        if not terms:
-            datum = _data_um(self.development, predictions)
-            shared = [datum[self.fold_of != fold].mean() for fold in self.fold_of]
-            predictions = [p + d for p, d in zip(predictions, shared, strict=True)]
-        return score(self.development, predictions, terms, self.config.seed)
+        """Held-out errors of a state over the development scans."""
+        return score(self.development, state.predictions, terms, self.config.seed)
 
 
 def close_loop(
@@ -230,7 +221,7 @@ def close_loop(
         floor_nm=noise_lower_bound_nm(development, final.predictions),
         left_by_named=left,
         structure=covariate_tests(development, final.predictions) if probed.added else left,
-        locked_scores=_locked_scores(development, locked, start, probed, accepted, config)
+        locked_scores=_locked_scores(locked, start, probed, accepted, config)
         if config.open_lock_box
         else None,
         observed=observe(development, probed.defects, rounding_um),
@@ -287,34 +278,16 @@ def _untestable(fields: Sequence[Field]) -> dict[str, str]:
 
 
 def _locked_scores(
-    development: Sequence[Field],
-    locked: Sequence[Field],
-    start: State,
-    probed: Probed,
-    accepted: Sequence[str],
-    config: LoopConfig,
+    locked: Sequence[Field], start: State, probed: Probed, accepted: Sequence[str], config: LoopConfig
 ) -> tuple[tuple[Score, Score], tuple[Score, Score]] | None:
     if not locked:
         return None
     before, after = ([predict(s.fits.chain, s.fits.common, f) for f in locked] for s in (start, probed.state))
     after = [probed.apply(f, p) for f, p in zip(locked, after, strict=True)]
     terms = DATUM_FREE | names_to_terms(accepted)
-
-    def pair(predictions: list[np.ndarray], state: State, terms: Terms) -> tuple[Score, Score]:
-        shared = _data_um(development, state.predictions).mean()
-        without_fit = [prediction + shared for prediction in predictions]
-        return (
-            score(locked, without_fit, frozenset(), config.seed),
-            score(locked, predictions, terms, config.seed),
-        )
-
-    return pair(before, start, DATUM_FREE), pair(after, probed.state, terms)
-
-
-def _data_um(fields: Sequence[Field], predictions: Sequence[np.ndarray]) -> np.ndarray:
-    """Mean height of each scan above its prediction, (scans,) µm."""
-    return np.array(
-        [float(np.mean(f.height - f.at_sample(p))) for f, p in zip(fields, predictions, strict=True)]
+    return (
+        (score(locked, before, frozenset(), config.seed), score(locked, before, DATUM_FREE, config.seed)),
+        (score(locked, after, frozenset(), config.seed), score(locked, after, terms, config.seed)),
     )
 
 

@@ -148,10 +148,7 @@ def _best(
         controls = np.array([probe.control(fold_of, random) for _ in range(CONTROLS)])
         limit = float(np.quantile(controls, CONTROL_QUANTILE))
         agreement = probe.agreement()
-        anchors = [
-            _anchor(probe, own, fields, state.predictions, fold_of != fold)
-            for fold, own in enumerate(estimate.per_fold)
-        ]
+        anchors = [_anchor(probe, own, fields, state.predictions) for own in estimate.per_fold]
         corrected = [
             _corrected(probe, estimate.per_fold[fold], anchors[fold], field, p)
             for field, p, fold in zip(fields, state.predictions, fold_of, strict=True)
@@ -168,8 +165,7 @@ def _best(
         tests[probe.name] = ProbeTest(probe.name, gain, limit, agreement, "; ".join(reasons))
         if not reasons:
             p_control = float((1 + (controls >= gain).sum()) / (CONTROLS + 1))
-            everything = np.ones(len(fields), bool)
-            anchor = _anchor(probe, estimate.common, fields, state.predictions, everything)
+            anchor = _anchor(probe, estimate.common, fields, state.predictions)
             entry = AddedProbe(probe, estimate, anchor, before, after, confirmation, p_control)
             return entry, State(state.fits, corrected)
     return None
@@ -189,24 +185,18 @@ def _shared_maps(prediction: np.ndarray) -> np.ndarray:
 
 
 def _anchor(
-    probe: Probe,
-    parameters: np.ndarray,
-    fields: Sequence[Field],
-    predictions: Sequence[np.ndarray],
-    training: np.ndarray,
+    probe: Probe, parameters: np.ndarray, fields: Sequence[Field], predictions: Sequence[np.ndarray]
 ) -> np.ndarray:
-    """Offset, gain, plane and bow common to the training scans once the correction is made.
+    """Minus the offset, gain, plane and bow that the correction has in the mean over scans.
 
     A probe is estimated free of what every scan may have of these, so it says nothing about what all
     scans share of them; without this it would move the absolute height at random.
     """
     count = len(_shared_maps(predictions[0]))
     normal, right = np.zeros((count, count)), np.zeros(count)
-    for i in np.flatnonzero(training).tolist():
-        field, prediction = fields[i], predictions[i]
+    for field, prediction in zip(fields, predictions, strict=True):
         correction = field.at_sample(probe.correction(parameters, field, prediction))
-        left = field.height - field.at_sample(prediction) - correction
         columns = np.stack([field.at_sample(shared) for shared in _shared_maps(prediction)])
-        normal += columns @ columns.T / len(left)
-        right += columns @ left / len(left)
+        normal += columns @ columns.T / len(correction)
+        right -= columns @ correction / len(correction)
     return np.linalg.lstsq(normal, right, rcond=1e-10)[0]
