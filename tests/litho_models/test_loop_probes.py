@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +18,7 @@ from litho_models.loop.probes import Probed, figures, probe_residual
 from litho_models.loop.probes.defects import find_defects
 from litho_models.loop.probes.kernel import off_centre_peak, resampled
 from litho_models.loop.probes.places import drawn, drawn_profile
+from litho_models.loop.probes.selection import _anchor, _corrected
 from litho_models.loop.probes.tables import SPOT_UM
 from litho_models.loop.probes.trend import order_trends
 from litho_models.loop.state import State
@@ -50,6 +53,35 @@ def probed(fields: list[Field], predictions: list[np.ndarray]) -> Probed:
         State(fits, predictions), fields, FOLD_OF, frozenset({"offset", "bow"}),
         floor_nm2=(1e3 * NOISE_UM) ** 2, seed=0, search=True,
     )  # fmt: skip
+
+
+def test_a_correction_moves_no_offset_gain_tilt_or_bow_that_all_scans_share() -> None:
+    fields = prepare_fields(printed_scans(count=3, size_px=64, seed=3))
+    random = np.random.default_rng(0)
+    y, x = np.meshgrid(*2 * [np.linspace(-1, 1, 64)], indexing="ij")
+    predictions = [gaussian_filter(random.random((64, 64)), 3).astype(np.float32) for _ in fields]
+    shared = [np.stack([np.ones_like(p), p, x, y, x * x, x * y, y * y]).reshape(7, -1) for p in predictions]
+    amounts = np.array([0.3, -0.2, 0.1, 0.4, -0.3, 0.2, 0.1])
+    own = {f.id: random.normal(size=(64, 64)) for f in fields}
+    of = {f.id: (amounts @ s).reshape(64, 64) for f, s in zip(fields, shared, strict=True)}
+    changes: list[list[np.ndarray]] = []
+    for scale in (0.0, 1.0):
+        probe: Any = SimpleNamespace(
+            correction=lambda parameters, field, prediction: parameters * own[field.id] + of[field.id]
+        )
+        parameters = np.array(scale)
+        anchor = _anchor(probe, parameters, fields, predictions)
+        both = zip(fields, predictions, strict=True)
+        changes.append([_corrected(probe, parameters, anchor, f, p) - p for f, p in both])
+    # What is shared alone vanishes, to the float32 of a prediction.
+    assert max(np.abs(change).max() for change in changes[0]) < 1e-5
+    # Of anything else nothing shared is left where the probe is estimated.
+    left = sum(
+        np.stack([f.at_sample(row.reshape(64, 64)) for row in s]) @ f.at_sample(change) / len(f.sample)
+        for f, s, change in zip(fields, shared, changes[1], strict=True)
+    )
+    assert np.abs(left).max() < 1e-5
+    assert all(change.std() > 0.5 for change in changes[1])
 
 
 @pytest.mark.slow
