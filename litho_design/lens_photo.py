@@ -58,7 +58,7 @@ def score_lens_photo(
         judging: a lens's design.
         photo_file: grey image of any bit depth, upright (a lens turns its image by half a turn).
         pitch_um: camera pixel in the focal plane of the lens, µm.
-        imaged: name of one of the design's objects, name of a drawing, or path of a picture.
+        imaged: name of one of the design's objects, or path of a picture.
         dark_level: counts; the 1st percentile where None.
         printed_um: measured height (size, size) of the print, µm, for the calibrated PSF.
 
@@ -67,12 +67,13 @@ def score_lens_photo(
         estimates.
 
     Raises:
-        InputError: no object or an unknown one, no image, or a photograph that does not resemble it.
+        InputError: no object, an unknown one or a name that two have, no image, or a photograph that does
+            not resemble it.
     """
     wanted, which = _object(judging, imaged)
     settings = judging.lens.imaging
-    psfs = {"design": judging.expected_um} | ({} if printed_um is None else {"calibrated": printed_um})
-    kernels = {name: sensor_psf(judging.bench(height), settings.pixel_px) for name, height in psfs.items()}
+    heights = {"design": judging.expected_um} | ({} if printed_um is None else {"calibrated": printed_um})
+    kernels = {name: sensor_psf(judging.bench(um), settings.pixel_px) for name, um in heights.items()}
     expected = Blur(kernels["design"], (settings.object_px, settings.object_px)).forward(wanted)
     pixel_um = settings.pixel_px * judging.design.layout.pitch_um
     image, record = photographed_image(
@@ -96,7 +97,8 @@ def score_lens_photo(
 def _object(judging: Judging, imaged: str | None) -> tuple[Tensor, ImagedObject]:
     """The object of a photograph, (n, n) in [0, 1], and its name or record."""
     settings = judging.lens.imaging
-    own = {object_name(item): item for item in (*settings.objects, *settings.test_objects)}
+    items = (*settings.objects, *settings.test_objects)
+    own = {object_name(item): item for item in items}
     if imaged is None or (imaged not in own and not Path(imaged).is_file()):
         raise InputError(
             "photographed object",
@@ -104,6 +106,12 @@ def _object(judging: Judging, imaged: str | None) -> tuple[Tensor, ImagedObject]
             wanted=f"a picture's path, or one of {', '.join(own)}",
         )
     if imaged in own:
+        if [object_name(item) for item in items].count(imaged) > 1:
+            raise InputError(
+                "photographed object",
+                got=f"{imaged!r}, the name of two objects of the design",
+                wanted="the path of its picture, with a folder in front",
+            )
         stack = object_stack([own[imaged]], settings.object_px, judging.pictures)
         return stack[0].to(judging.device), own[imaged]
     pixels, record = read_object(Path(imaged), settings.object_px)

@@ -26,6 +26,7 @@ from litho_design.parametrise import LayoutSettings
 from litho_design.printer import Printer
 from litho_design.score import MeasuredSource, PhotoSource, ScoreResult, score_design
 from litho_design.settings import lens_preset
+from litho_design.targets import TargetRecord
 
 SENSOR_UM, CAMERA_UM, DARK, WHITE, NOISE = 0.2, 0.15, 300.0, 30000.0, 100.0
 OBJECT_PX, PHOTO_PX = 96, 160
@@ -155,6 +156,15 @@ def test_an_object_of_the_design_is_known_by_name(tmp_path, lens):
     # It is this object that was photographed: another one does not match, or is further off.
     with pytest.raises(InputError, match="correlation"):
         score_lens_photo(judging, tmp_path / "photo.png", CAMERA_UM, "spots")
+
+
+def test_a_name_that_two_objects_have_is_refused(lens):
+    judging = Judging(lens)
+    one, other = (TargetRecord(name="a.png", sha256=sha256, adaptation="") for sha256 in ("1" * 64, "2" * 64))
+    imaging = judging.lens.imaging.model_copy(update={"objects": (one,), "test_objects": (other, "ring")})
+    judging.lens = judging.lens.model_copy(update={"imaging": imaging})
+    with pytest.raises(InputError, match="two objects"):
+        score_lens_photo(judging, "photo.png", CAMERA_UM, "a.png")
 
 
 @pytest.mark.parametrize(
