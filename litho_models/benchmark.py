@@ -27,10 +27,10 @@ from litho_models.metrics import paired_difference
 from litho_models.models import build_model, model_class
 from litho_models.nuisance import Policy
 from litho_models.run_info import RunInfo, run_info
-from litho_models.runs import locked_ids, training_config
+from litho_models.runs import training_config
 from litho_models.score_records import ModelScores, NuisanceProtocol, Prediction
 from litho_models.scores import NoiseFloor, noise_floor, protocol_for, score_model
-from litho_models.splits import ids_sha256
+from litho_models.splits import ids_sha256, locked_ids
 from litho_models.tiles import predict_scan
 from litho_models.training import Fitted, TrainingConfig, fit_in_cache
 from litho_models.training.fit import common_geometry, run_key

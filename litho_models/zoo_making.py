@@ -14,10 +14,11 @@ from litho_models.background import BackgroundUse
 from litho_models.evaluate import card_background, predict_frozen
 from litho_models.freeze import Metric, ModelCard, load_frozen
 from litho_models.nuisance import Policy
-from litho_models.runs import MODEL_FOLDER, freeze, locked_ids, train
+from litho_models.runs import MODEL_FOLDER, freeze, train
 from litho_models.score_records import ModelScores, Prediction
 from litho_models.scores import noise_floor, protocol_for, score_model
 from litho_models.simulator import Variant
+from litho_models.splits import locked_ids
 from litho_models.training.config import Recipe
 
 ZOO_MODELS = ("physics", "pbl", "fno")

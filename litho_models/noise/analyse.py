@@ -21,8 +21,8 @@ from litho_models.noise.result import NoiseAnalysis, ReferencePrints
 from litho_models.noise.staircase import step_print
 from litho_models.noise.surface import BACKGROUNDS, SurfaceNoise, print_noise, surface_noise
 from litho_models.run_info import run_info
-from litho_models.runs import locked_ids
 from litho_models.scores import NoiseFloor
+from litho_models.splits import locked_ids
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from litho_models.freeze import CARD_FILE, load_frozen
 from litho_models.noise.calibration import Residuals
 from litho_models.noise.surface import NM_PER_UM
 from litho_models.nuisance import Policy, cross_fitted_residual
-from litho_models.runs import locked_ids
+from litho_models.splits import locked_ids
 
 Predictions = dict[str, list[np.ndarray]]
 

@@ -62,7 +62,8 @@ def plan_batch(shapes: Sequence[tuple[int, int]], config: TrainingConfig, step: 
 def in_passes(windows: Sequence[Window], device: torch.device) -> list[list[Window]]:
     """The windows of a step in groups that go through the network one after the other.
 
-    On a CPU at most ``_PASS_PX`` pixels at a time, which bounds the memory and costs no time; elsewhere all.
+    On a CPU as many as have ``_PASS_PX`` pixels together, one at least, which bounds the memory and costs no
+    time; elsewhere all at once.
     """
     per_pass = len(windows)
     if device.type == "cpu":
