@@ -19,7 +19,7 @@ from benchmarks.measured_figures import draw_prediction, draw_steps
 from benchmarks.record import publish
 from litho_models import zoo
 from litho_models.freeze import ModelCard
-from litho_models.zoo_making import HELD_OUT
+from litho_models.zoo_making import HELD_OUT, ZOO_MODELS
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "results" / "neural-lithography"
@@ -156,7 +156,7 @@ def loop_table(loop: dict[str, Any], on_physics: dict[str, Any] | None = None) -
     for effect in loop["effects"]:
         alike = f" or {', '.join(effect['confusable_with'])}" if effect["confusable_with"] else ""
         known = ", known before" if effect["prior_hypothesis"] else ""
-        figure = "absolute" if effect["metric"] == "mae_abs" else "datum-free"
+        figure = "absolute" if effect["name"] == "datum-offset" else "datum-free"
         better, count = effect["scans_improved"]
         rows.append(
             f"| `{effect['name']}`{alike} | {effect['role']}, {effect['verdict']}{known} "
@@ -164,7 +164,8 @@ def loop_table(loop: dict[str, Any], on_physics: dict[str, Any] | None = None) -
         )
     rows.append(
         "\nA row need not begin where the last one ended: both sides of a process effect leave each scan's "
-        "registration free, and both sides of one that acts as a gain go without the gain of single scans."
+        "shift, turn and stretch free, and both sides of one that acts as a gain go without the gain of single "
+        "scans."
     )
     rows += [f"\n{sentence}" for sentence in _absorbed(loop, on_physics)]
     rows.append(
@@ -205,25 +206,29 @@ def _absorbed(loop: dict[str, Any], on_physics: dict[str, Any] | None) -> list[s
 
 def locked_table(loops: Sequence[dict[str, Any]], cards: Sequence[ModelCard]) -> str:
     """The errors on the locked scans: the models of the zoo, and both loops before and after."""
-    rows = ["| | datum-free error | with tilt, bow and gain free | absolute error |", "|---|---|---|---|"]
+    rows = [
+        "| | zero of each scan free | tilt, bow, gain and lines free too | absolute error |",
+        "|---|---|---|---|",
+    ]
     for card in cards:
-        errors = {
-            (metric.name, metric.policy): metric.value
-            for metric in reversed(card.metrics)
-            if metric.split == HELD_OUT
-        }
-        figures = [("mae_datum_free", "offset"), ("mae_datum_free", "full"), ("mae_abs", "none")]
+        # The first of a name and policy is the one with the background.
+        held_out = [metric for metric in reversed(card.metrics) if metric.split == HELD_OUT]
+        errors = {(metric.name, metric.policy): metric.value for metric in held_out}
+        figures = [("mae_datum_free", "offset"), ("mae_datum_free", "full+rows"), ("mae_abs", "none")]
         rows.append(f"| {card.name} | " + " | ".join(f"{errors[key]:.2f} nm" for key in figures) + " |")
     for loop in loops:
-        for when, state in (("before", loop["locked_before"]), ("after", loop["locked_after"])):
-            own = _with_interval(state["mae_datum_free_nm"], state["mae_datum_free_ci95_nm"])
-            name = f"loop on {loop['base_model']}, {when}"
-            rows.append(f"| {name} | {own} | – | {state['mae_abs_nm']:.2f} nm |")
+        before, after = (
+            (_with_interval(state["mae_datum_free_nm"], state["mae_datum_free_ci95_nm"]), state["mae_abs_nm"])
+            for state in (loop["locked_before"], loop["locked_after"])
+        )
+        rows.append(f"| loop on {loop['base_model']}, before | {before[0]} | – | {before[1]:.2f} nm |")
+        rows.append(f"| loop on {loop['base_model']}, after | – | {after[0]} | {after[1]:.2f} nm |")
     locked = loops[0]["split"]["lock_box"]
+    others = loops[0]["run"]["n_scans"] - len(locked)
     rows.append(
-        f"\nThe {len(locked)} locked scans ({', '.join(locked)}) were scored once, when all of this had been "
-        "settled. All fits saw the same 20 scans. Models: those of the package, with the background of their "
-        "training scans. Loops: per-scan terms as in their own tables, fitted on pixels that are not scored."
+        f"\nThe {len(locked)} locked scans ({', '.join(locked)}), scored once, when model, recipe and loop "
+        f"had been settled; all was fitted to the other {others}. Models: those of the package, with the background of their training scans. The loops on Physics and on PBL free what "
+        "they accepted of single scans, on pixels that are not scored, the first the registration too."
     )
     return "\n".join(rows)
 
@@ -252,7 +257,7 @@ def design_table(gap: dict[str, Any]) -> str:
 
 
 def texts(folder: Path) -> dict[str, str]:
-    """The text of each mark, from the result files in a folder."""
+    """The text of each mark, from the result files in a folder and the cards of the zoo."""
 
     def found(file: str) -> dict[str, Any]:
         return json.loads((folder / file).read_text(encoding="utf-8"))
@@ -267,7 +272,7 @@ def texts(folder: Path) -> dict[str, str]:
         "loop with PBL": loop_table(found("close_loop_pbl.json"), found("close_loop.json")),
         "locked scans": locked_table(
             [found("close_loop.json"), found("close_loop_pbl.json")],
-            [ModelCard.read(zoo.folder(name)) for name in ("physics", "pbl", "fno")],
+            [ModelCard.read(zoo.folder(name)) for name in ZOO_MODELS],
         ),
         "design": design_table(found("gap.json")),
     }

@@ -162,5 +162,7 @@ def scan_parameter_names(terms: Terms) -> list[str]:
     if "warp" in terms:
         names += [f"shift {axis}{by} (px)" for axis in ("y", "x") for by in ("", " by y", " by x")]
     if "distortion" in terms:
-        names += [f"shift {axis} by {by} (px)" for axis in ("y", "x") for by in ("y²", "xy", "x²")]
+        names += [
+            f"shift {axis} by {by} (px)" for axis in ("y", "x") for by in ("y² - 1/3", "xy", "x² - 1/3")
+        ]
     return names

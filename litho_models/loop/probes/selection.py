@@ -39,7 +39,7 @@ class ProbeTest:
 class AddedProbe:
     """A probe taken into the prediction, with its estimate and held-out errors before and after.
 
-    ``anchor``: (offset µm, relative gain) that go with the correction on all development scans.
+    ``anchor``: (7,) offset µm, relative gain, plane and bow µm that go with the correction.
     """
 
     probe: Probe
