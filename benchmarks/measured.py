@@ -164,8 +164,8 @@ def loop_table(loop: dict[str, Any], on_physics: dict[str, Any] | None = None) -
         )
     rows.append(
         "\nA row need not begin where the last one ended: both sides of a process effect leave each scan's "
-        "shift, turn and stretch free, and both sides of one that acts as a gain go without the gain of single "
-        "scans."
+        "shift, turn and stretch free, and both sides of one that acts as a gain go without the gain of "
+        "single scans."
     )
     rows += [f"\n{sentence}" for sentence in _absorbed(loop, on_physics)]
     rows.append(
@@ -227,8 +227,9 @@ def locked_table(loops: Sequence[dict[str, Any]], cards: Sequence[ModelCard]) ->
     others = loops[0]["run"]["n_scans"] - len(locked)
     rows.append(
         f"\nThe {len(locked)} locked scans ({', '.join(locked)}), scored once, when model, recipe and loop "
-        f"had been settled; all was fitted to the other {others}. Models: those of the package, with the background of their training scans. The loops on Physics and on PBL free what "
-        "they accepted of single scans, on pixels that are not scored, the first the registration too."
+        f"had been settled; all was fitted to the other {others}. Models: those of the package, with the "
+        "background of their training scans. The loops on Physics and on PBL free what they accepted of "
+        "single scans, on pixels that are not scored, the first the registration too."
     )
     return "\n".join(rows)
 
