@@ -69,7 +69,7 @@ def write_results(
                 "target": gap.target,
                 "iterations": gap.settings.search.iterations,
                 "seeds": gap.seeds,
-                "minutes": _minutes(out / name),
+                "minutes": _minutes(out / name, gap.seeds),
                 "paired": [item.model_dump(mode="json") for item in gap.paired if item.judge not in gap.arms],
             }
             for name, gap in gaps.items()
@@ -203,10 +203,10 @@ def _models(out: Path) -> dict[str, dict[str, float]]:
     return errors
 
 
-def _minutes(folder: Path) -> dict[str, float]:
-    """Minutes of search per arm, over its seeds, as the designs recorded them."""
+def _minutes(folder: Path, seeds: Sequence[int]) -> dict[str, float]:
+    """Minutes of search per arm, over the judged seeds, as the designs recorded them."""
     minutes: dict[str, float] = {}
-    for place in sorted((folder / "designs").glob("*/seed*")):
+    for place in sorted(place for seed in seeds for place in (folder / "designs").glob(f"*/seed{seed}")):
         arm = place.parent.name
         minutes[arm] = minutes.get(arm, 0.0) + Design.read(place).run.seconds / 60
     return {arm: round(value, 2) for arm, value in minutes.items()}
