@@ -14,7 +14,15 @@ import numpy as np
 from litho_models.effects import Effect, get_effect
 from litho_models.loop.confirming import BINOMIAL_P, Confirmation, confirm_variance, one_sided_flip_p
 from litho_models.loop.fields import Field
-from litho_models.loop.scoring import LINE_TERMS, TERMS_OF, Score, Terms, score, term_maps
+from litho_models.loop.scoring import (
+    LINE_TERMS,
+    TERMS_OF,
+    Score,
+    Terms,
+    scan_parameter_names,
+    score,
+    term_maps,
+)
 from litho_models.metrics import NM_PER_UM, bootstrap_interval, paired_difference
 from litho_models.nuisance import least_squares
 
@@ -218,14 +226,8 @@ def _coefficients(field: Field, prediction: np.ndarray, terms: Terms) -> np.ndar
 
 def _own_columns(terms: Terms, accepted: Terms) -> list[int]:
     """Columns of ``term_maps(…, terms)`` that ``accepted`` does not have."""
-    sizes = {"offset": 1, "gain": 1, "bow": 5, "drift": 2, "warp": 6, "distortion": 6}
-    own, at = [], 0
-    for name, size in sizes.items():
-        if name in terms or (name == "offset" and terms):
-            if name not in accepted and name in terms:
-                own += list(range(at, at + size))
-            at += size
-    return own
+    known = scan_parameter_names(accepted)
+    return [at for at, name in enumerate(scan_parameter_names(terms)) if name not in known]
 
 
 def _spread_interval(values: np.ndarray, seed: int) -> tuple[float, float]:
