@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import sys
 
 import pytest
 import torch
 import torch.nn.functional as F
 from torch import nn
 
+from litho_design.cli import main
 from litho_design.optics import Optics
 from litho_design.parametrise import LayoutSettings
 from litho_design.printer import Printer
@@ -66,3 +68,19 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture
+def refused(monkeypatch, capsys):
+    """What ``litho-design`` says to arguments that it has to refuse: one line, with exit code 2."""
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["litho-design", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stop:
+            main()
+        assert stop.value.code == 2
+        said = capsys.readouterr().err.strip()
+        assert len(said.splitlines()) == 1
+        return said
+
+    return call

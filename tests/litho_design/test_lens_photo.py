@@ -178,16 +178,10 @@ def test_a_name_that_two_objects_have_is_refused(lens):
         (("--judge", "none", "--camera-object", "text"), "no --camera"),
     ],
 )
-def test_bad_photographs_are_one_line_and_exit_code_2(tmp_path, lens, monkeypatch, capsys, words, complaint):
+def test_bad_photographs_are_one_line_and_exit_code_2(tmp_path, lens, monkeypatch, refused, words, complaint):
     monkeypatch.chdir(tmp_path)
     cv2.imwrite("flat.png", np.random.default_rng(0).integers(0, 255, (160, 160)).astype(np.uint8))
-    monkeypatch.setattr(sys, "argv", ["litho-design", "score", str(lens), *words, "--out", "out"])
-    with pytest.raises(SystemExit) as stop:
-        main()
-    assert stop.value.code == 2
-    said = capsys.readouterr().err.strip()
-    assert len(said.splitlines()) == 1
-    assert complaint in said
+    assert complaint in refused("score", lens, *words, "--out", "out")
     assert not (tmp_path / "out").exists()
 
 
