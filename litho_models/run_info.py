@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from litho_data.provenance import code_record
+from litho_data.provenance import code_commit, code_record
 from litho_data.results import Record
 
 
@@ -24,12 +24,11 @@ class RunInfo(Record):
 
 def run_info(seeds: Sequence[int], n_scans: int, dropped: Sequence[str] = ()) -> RunInfo:
     """The current run; ``dropped`` lists scans left out, with the reason."""
-    code = code_record()
     program = Path(sys.argv[0]).name if sys.argv and sys.argv[0] else "python"
     return RunInfo(
         command=shlex.join([program, *sys.argv[1:]]),
-        commit=code["commit"] or "",
-        versions=code["versions"],
+        commit=code_commit(),
+        versions=code_record()["versions"],
         seeds=list(seeds),
         n_scans=n_scans,
         dropped=list(dropped),
