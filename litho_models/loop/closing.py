@@ -224,7 +224,14 @@ def close_loop(
         locked_scores=_locked_scores(locked, start, probed, accepted, config)
         if config.open_lock_box
         else None,
-        observed=observe(development, probed.defects, rounding_um),
+        observed=observe(
+            development,
+            final.predictions,
+            DATUM_FREE | names_to_terms(accepted),
+            probed.defects,
+            rounding_um,
+            config.seed,
+        ),
         untestable=untestable,
         planted=planted,
         config=config,

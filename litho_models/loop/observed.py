@@ -13,12 +13,15 @@ import numpy as np
 from litho_models.loop.confirming import BINOMIAL_P, SMALLEST_RMSE_NM, one_sided_flip_p
 from litho_models.loop.fields import Field
 from litho_models.loop.probes.defects import Defects
+from litho_models.loop.scoring import LINE_TERMS, Terms, score
 from litho_models.metrics import NM_PER_UM
 
 # Heights closer than this are one value of a file that rounds in single precision.
 _SAME_VALUE = 1e-6
 _OFF_COMB, _ON_COMB_SHARE = 0.05, 0.99
 _FEWEST_SCARS = 10
+# Beyond the sharpness of tip and spot, and within the length of a line-shaped feature.
+_LINE_LAGS_UM = (0.3, 0.8)
 
 
 @dataclass(frozen=True)
@@ -74,11 +77,63 @@ def scars(fields: Sequence[Field], defects: Defects) -> Observed:
     return Observed("scars-and-spikes", bool(seen), text)
 
 
+def line_roughness(
+    fields: Sequence[Field], predictions: Sequence[np.ndarray], terms: Terms, seed: int
+) -> Observed:
+    """Residual that neighbours along a row share and neighbours across the rows do not, in flat places.
+
+    Offsets of whole lines are taken out first: they are a term of single scans. Slopes are
+    left out: what a model misses there is not noise.
+    """
+    residuals = score(fields, predictions, terms | LINE_TERMS, seed).residual_um
+    shared = np.array(
+        [_shared_nm2(f, p, r) for f, p, r in zip(fields, predictions, residuals, strict=True)]
+    )
+    along, across = shared.T
+    p = one_sided_flip_p(along - across)
+    rms_nm = float(np.sqrt(max((along - across).mean(), 0.0)))
+    text = (
+        f"flat places {_LINE_LAGS_UM[0]:g} to {_LINE_LAGS_UM[1]:g} µm apart share {along.mean():.1f} nm² along "
+        f"the rows and {across.mean():.1f} nm² across them (p = {p:.4f}): line-shaped roughness of "
+        f"{rms_nm:.1f} nm rms or more, of the print or of the microscope"
+    )
+    return Observed("line-roughness", bool(p <= BINOMIAL_P and rms_nm >= SMALLEST_RMSE_NM), text)
+
+
+def _shared_nm2(field: Field, prediction: np.ndarray, residual_um: np.ndarray) -> tuple[float, float]:
+    """Mean product of residuals some lags apart, along the rows and across them, nm²."""
+    slope = np.hypot(*np.gradient(prediction))
+    flat = np.isfinite(residual_um) & (slope <= np.median(slope))
+    values, weight = np.where(flat, residual_um, 0.0) * NM_PER_UM, flat.astype(float)
+    first, last = (max(1, round(lag / field.context.pitch_um)) for lag in _LINE_LAGS_UM)
+    lags = range(first, last + 1)
+
+    def mean_product(v: np.ndarray, w: np.ndarray) -> float:
+        products = sum(float((v[:, lag:] * v[:, :-lag]).sum()) for lag in lags)
+        pairs = sum(float((w[:, lag:] * w[:, :-lag]).sum()) for lag in lags)
+        return products / max(pairs, 1.0)
+
+    return mean_product(values, weight), mean_product(values.T, weight.T)
+
+
 def observe(
-    fields: Sequence[Field], defects: Defects, rounding_um: Mapping[str, float] | None
+    fields: Sequence[Field],
+    predictions: Sequence[np.ndarray],
+    terms: Terms,
+    defects: Defects,
+    rounding_um: Mapping[str, float] | None,
+    seed: int,
 ) -> dict[str, Observed]:
-    """All effects that are seen directly; without the raw files nothing is said about their rounding."""
-    seen = [scars(fields, defects)]
+    """All effects that are seen directly; without the raw files nothing is said about their rounding.
+
+    Args:
+        fields: development scans; ``predictions``: held-out heights (y, x), µm, of the final model.
+        terms: per-scan terms that were accepted.
+        defects: outliers of the scans.
+        rounding_um: step of the heights in each scan's raw file, by id, if known.
+        seed: of the halves on which per-scan terms are fitted and scored.
+    """
+    seen = [scars(fields, defects), line_roughness(fields, predictions, terms, seed)]
     if rounding_um is not None:
         seen.append(quantisation([rounding_um[f.id] for f in fields]))
     return {one.name: one for one in seen}

@@ -235,10 +235,11 @@ def _candidates(closed: Closed, added: set[str]) -> list[Candidate]:
     tests = {t.effect.name: t for t in closed.first_tests} | {t.effect.name: t for t in closed.last_tests}
     sets = {name: entry for entry in closed.search.added for name in entry.confusable_with}
     for name in [*CATALOGUE, *(n for n in closed.untestable if n not in CATALOGUE)]:
-        if name in tests:
+        seen = closed.observed.get(name)
+        # Offsets of whole lines are one form of line-shaped roughness; what is shorter is seen only.
+        if name in tests and (name in added or seen is None or not seen.seen):
             rows.append(_measurement_candidate(closed, tests[name], name in added))
-        elif name in closed.observed:
-            seen = closed.observed[name]
+        elif seen is not None:
             rows.append(
                 Candidate(
                     name=name,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from litho_models.loop.fields import prepare_fields
-from litho_models.loop.observed import observe, quantisation, rounding_step_um, scars
+from litho_models.loop.observed import line_roughness, observe, quantisation, rounding_step_um, scars
 from litho_models.loop.probes.defects import find_defects
 from tests.litho_models.loop_scans import printed_scans
 
@@ -54,5 +54,31 @@ def test_scars_are_told_from_marks_across_the_lines() -> None:
 def test_without_raw_files_nothing_is_said_about_rounding() -> None:
     fields = prepare_fields(printed_scans(count=2))
     defects = find_defects(fields, [f.scan.height_um for f in fields])
-    assert set(observe(fields, defects, None)) == {"scars-and-spikes"}
-    assert "quantisation" in observe(fields, defects, {f.id: 0.0 for f in fields})
+    terms = frozenset({"offset"})
+    predictions = [f.scan.height_um for f in fields]
+    assert set(observe(fields, predictions, terms, defects, None, 0)) == {"scars-and-spikes", "line-roughness"}
+    assert "quantisation" in observe(fields, predictions, terms, defects, {f.id: 0.0 for f in fields}, 0)
+
+
+def test_line_shaped_roughness_is_told_from_grain_and_from_offsets_of_whole_lines() -> None:
+    fields = prepare_fields(printed_scans(count=9, size_px=192))
+    flat = [np.zeros_like(f.scan.height_um) for f in fields]
+    random = np.random.default_rng(3)
+    white = [random.normal(0, 0.02, size=p.shape) for p in flat]
+    kernel = np.ones(15) / np.sqrt(15)
+    lines = [np.apply_along_axis(np.convolve, 1, w, kernel, mode="same") for w in white]
+
+    def seen(added: list[np.ndarray]):
+        for field, extra in zip(fields, added, strict=True):
+            field.scan.height_um[:] = extra
+        return line_roughness(fields, flat, frozenset({"offset"}), 0)
+
+    long = seen(lines)
+    assert long.seen
+    # A mean of 15 pixels keeps 1 - lag/15 of its variance: 3 to 8 pixels apart 0.63 of 400 nm² remain, less
+    # what offsets of whole lines take along (15 of 192 pixels, a tenth at most); across there is nothing.
+    shared = float(long.evidence.split("share ")[1].split(" nm²")[0])
+    assert 0.9 * 0.63 * 400 * 0.9 < shared < 0.63 * 400 * 1.1
+    assert not seen([e.T for e in lines]).seen
+    assert not seen(white).seen
+    assert not seen([np.broadcast_to(w[:, :1], w.shape) for w in white]).seen
