@@ -142,8 +142,8 @@ EFFECTS = (
         role="undetermined",
         acts_on="height",
         parameters={
-            "along_x_um": Parameter("µm", 0.0, 1.0, 0.1),
-            "along_y_um": Parameter("µm", 0.0, 1.0, 0.1),
+            "along_x_um": Parameter("µm", 0.0, 2.0, 0.1),
+            "along_y_um": Parameter("µm", 0.0, 2.0, 0.1),
         },
         apply=slope_thinning,
         trials=(

@@ -56,9 +56,9 @@ EFFECTS = (
         role="process",
         acts_on="height",
         parameters={
-            "tilt_x_um": Parameter("µm", -0.3, 0.3, 0.05),
-            "tilt_y_um": Parameter("µm", -0.3, 0.3, 0.05),
-            "curvature_um": Parameter("µm", -0.3, 0.3, 0.05),
+            "tilt_x_um": Parameter("µm", -0.6, 0.6, 0.05),
+            "tilt_y_um": Parameter("µm", -0.6, 0.6, 0.05),
+            "curvature_um": Parameter("µm", -0.6, 0.6, 0.05),
         },
         apply=field_curvature,
         trials=({"tilt_x_um": 0.05}, {"tilt_y_um": 0.05}, {"curvature_um": 0.05}),

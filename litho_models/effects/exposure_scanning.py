@@ -68,7 +68,7 @@ EFFECTS = (
         role="process",
         acts_on="layout",
         parameters={
-            "length_um": Parameter("µm", 0.0, 0.8, 0.2),
+            "length_um": Parameter("µm", 0.0, 1.5, 0.2),
             "direction": Parameter("1", -1.0, 1.0, 1.0, kind="choice"),
         },
         apply=galvo_lag,
@@ -86,7 +86,7 @@ EFFECTS = (
         role="process",
         acts_on="layout",
         parameters={
-            "strength": Parameter("1", -0.3, 0.3, 0.05),
+            "strength": Parameter("1", -0.6, 0.6, 0.05),
             "length_um": Parameter("µm", 0.4, 20.0, 3.0, kind="shape"),
             "direction": Parameter("1", -1.0, 1.0, 1.0, kind="choice"),
         },

@@ -13,7 +13,7 @@ from litho_models.effects.filters import add_filtered
 # Below this difference of variances the spot is sharpened along one axis as much as it is widened
 # along the other; above it only widened, so that the filter never amplifies without bound.
 _SHARPENING_UM2 = 0.02
-_SPOT_REACH_UM = 1.5
+_SPOT_REACH_UM = 2.0
 
 
 def elliptical_psf(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -56,8 +56,8 @@ EFFECTS = (
         role="process",
         acts_on="layout",
         parameters={
-            "stretch_um2": Parameter("µm²", -0.3, 0.3, 0.02),
-            "shear_um2": Parameter("µm²", -0.3, 0.3, 0.02),
+            "stretch_um2": Parameter("µm²", -0.4, 0.4, 0.02),
+            "shear_um2": Parameter("µm²", -0.4, 0.4, 0.02),
         },
         apply=elliptical_psf,
         trials=(

@@ -86,15 +86,13 @@ def line_roughness(
     left out: what a model misses there is not noise.
     """
     residuals = score(fields, predictions, terms | LINE_TERMS, seed).residual_um
-    shared = np.array(
-        [_shared_nm2(f, p, r) for f, p, r in zip(fields, predictions, residuals, strict=True)]
-    )
+    shared = np.array([_shared_nm2(f, p, r) for f, p, r in zip(fields, predictions, residuals, strict=True)])
     along, across = shared.T
     p = one_sided_flip_p(along - across)
     rms_nm = float(np.sqrt(max((along - across).mean(), 0.0)))
     text = (
-        f"flat places {_LINE_LAGS_UM[0]:g} to {_LINE_LAGS_UM[1]:g} µm apart share {along.mean():.1f} nm² along "
-        f"the rows and {across.mean():.1f} nm² across them (p = {p:.4f}): line-shaped roughness of "
+        f"flat places {_LINE_LAGS_UM[0]:g} to {_LINE_LAGS_UM[1]:g} µm apart share {along.mean():.1f} nm² "
+        f"along the rows and {across.mean():.1f} nm² across them (p = {p:.4f}): line-shaped roughness of "
         f"{rms_nm:.1f} nm rms or more, of the print or of the microscope"
     )
     return Observed("line-roughness", bool(p <= BINOMIAL_P and rms_nm >= SMALLEST_RMSE_NM), text)

@@ -146,20 +146,26 @@ def _added_measurement(closed: Closed, test: MeasurementTest) -> AddedEffect:
     )
 
 
-def _is_doubtful(closed: Closed, entry: Added) -> bool:
-    """A filter that leaves another filter a good part of its own gain comes near the cause, and is not it."""
+def doubtful_effects(closed: Closed) -> set[str]:
+    """Names of added filters that leave another filter a good part of their own gain: near the cause, not it.
+
+    What a doubtful effect took up was left by those before it.
+    """
     # A kernel added as a generic term takes it away; a table added before may bring it out.
     tests = [*is_structured(closed.left_by_named), *is_structured(closed.structure)]
     left = max((t.share for t in tests if t.name == LINEAR_RESPONSE), default=0.0)
-    if not left or not entry.effect.linear:
-        return False
     left_nm2 = left * float(closed.errors(closed.search.state, closed.terms).mse_nm2.mean())
-    gain_nm2 = float(entry.before.mse_nm2.mean() - entry.after.mse_nm2.mean())
-    return left_nm2 >= _DOUBTFUL_SHARE * gain_nm2
+    doubtful: set[str] = set()
+    for entry in reversed(closed.search.added):
+        gain_nm2 = float(entry.before.mse_nm2.mean() - entry.after.mse_nm2.mean())
+        if left_nm2 and entry.effect.linear and left_nm2 >= _DOUBTFUL_SHARE * gain_nm2:
+            doubtful.add(entry.effect.name)
+            left_nm2 += gain_nm2
+    return doubtful
 
 
 def _verdict_on(closed: Closed, entry: Added) -> EffectVerdict:
-    if _is_doubtful(closed, entry):
+    if entry.effect.name in doubtful_effects(closed):
         return "traced-to-covariate"
     return "confusable" if entry.confusable_with else "explained"
 

@@ -1,8 +1,9 @@
-"""A named effect must do better than a generic term that does the same without a name.
+"""A named effect must do better than what does the same without a name.
 
 A table or a kernel that was fitted on the training scans follows whatever its covariate carries. The
 effect that is the cause has the right shape with fewer numbers and does better on the scans left out;
-one that only resembles the cause does not.
+one that only resembles the cause does not. And where a large effect has been named, the catalogue's form
+of it is not exactly the machine's: what a further effect does must not be what that form leaves over.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from litho_models.loop.fields import Field
 from litho_models.loop.linear import without_scan_terms
@@ -22,6 +24,9 @@ from litho_models.metrics import NM_PER_UM
 _BETTER = 1.05
 # Beside the generic term an effect that it contains keeps no more than this part of its gain.
 _CONTAINED = 0.25
+# Of a further effect's gain, what a change named before may do in another shape.
+_REMAINDER = 0.5
+_RESHAPING_BLURS_UM = (0.2, 0.6)
 
 
 def generic_rival(before: State, after: State, fields: Sequence[Field], fold_of: np.ndarray) -> str | None:
@@ -46,14 +51,52 @@ def generic_rival(before: State, after: State, fields: Sequence[Field], fold_of:
     return None
 
 
+def is_remainder(
+    named: tuple[State, State], before: State, after: State, fields: Sequence[Field]
+) -> bool:
+    """Whether a further effect does what an effect named before does in another shape.
+
+    Another shape: the change by the first effect scaled, squared, growing with the height, blurred,
+    displaced. If these do half of what the further effect does, and leave it no more than half of its
+    gain, it may be no more than the error in the form of the first.
+
+    Args:
+        named: the model without and with the effect named before.
+        before, after: the model without and with the further effect.
+        fields: development scans.
+    """
+    grams = []
+    for at, field in enumerate(fields):
+        prediction = before.predictions[at]
+        change = named[1].predictions[at] - named[0].predictions[at]
+        maps = [*_reshaped(change, prediction, field.context.pitch_um), after.predictions[at] - prediction]
+        columns = [*map(field.at_sample, maps), field.height - field.at_sample(prediction)]
+        freed = without_scan_terms(np.column_stack(columns), field, prediction, gain=True)
+        grams.append(freed.T @ freed)
+    gram = np.sum(grams, axis=0)
+    both = np.arange(len(gram) - 1)
+    alone, reshaped, together = (_gain_of(gram, columns) for columns in (both[-1:], both[:-1], both))
+    return bool(reshaped >= _REMAINDER * alone and together - reshaped <= _REMAINDER * alone)
+
+
+def _reshaped(change: np.ndarray, prediction: np.ndarray, pitch_um: float) -> list[np.ndarray]:
+    blurred = [gaussian_filter(change, sigma_um / pitch_um) for sigma_um in _RESHAPING_BLURS_UM]
+    products = [change * prediction, change * change, blurred[0] * prediction]
+    return [change, *products, *blurred, *np.gradient(change)]
+
+
+def _gain_of(gram: np.ndarray, columns: np.ndarray) -> float:
+    """What the best combination of these columns takes from the squares of the last one."""
+    right = gram[columns, -1]
+    return float(right @ np.linalg.lstsq(gram[np.ix_(columns, columns)], right, rcond=1e-10)[0])
+
+
 def _is_contained(own: Sequence[np.ndarray], generic: Sequence[np.ndarray]) -> bool:
     """Whether the effect, at its best multiple, adds little to the generic term at its best multiple."""
     columns = [np.column_stack([a[:, 0], b]) for a, b in zip(own, generic, strict=True)]
-    gram = sum((c.T @ c for c in columns), np.zeros((3, 3)))
-    right = gram[:2, 2]
-    alone = right**2 / np.diag(gram)[:2]
-    together = right @ np.linalg.lstsq(gram[:2, :2], right, rcond=1e-12)[0]
-    return bool(together - alone[1] <= _CONTAINED * alone[0])
+    gram = np.sum([c.T @ c for c in columns], axis=0)
+    alone, beside, together = (_gain_of(gram, np.array(which)) for which in ([0], [1], [0, 1]))
+    return together - beside <= _CONTAINED * alone
 
 
 def _gain(freed: Sequence[np.ndarray]) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 from litho_models.effects import get_effect, screened_effects
 from litho_models.loop.contest import Added, Contest, hold_contest
 from litho_models.loop.fields import Field
-from litho_models.loop.rivals import generic_rival
+from litho_models.loop.rivals import generic_rival, is_remainder
 from litho_models.loop.scoring import Terms
 from litho_models.loop.screening import Screened
 from litho_models.loop.state import State, fit_state
@@ -67,12 +67,14 @@ def search_effects(
         report: told in a sentence what happens.
     """
     found = Search(start)
+    steps: dict[str, tuple[State, State]] = {}
+    remainders: set[str] = set()
 
     def contest(state: State, holder: tuple[str, State] | None = None) -> Contest:
         candidates = [
             effect
             for effect in screened_effects()
-            if effect.name not in exclude and effect.name not in state.fits.chain.names
+            if effect.name not in {*exclude, *remainders, *state.fits.chain.names}
         ]
         return hold_contest(
             state,
@@ -86,17 +88,24 @@ def search_effects(
             report=report,
         )
 
-    while len(found.added) < MOST_EFFECTS:
+    while len(found.added) + len(remainders) < MOST_EFFECTS:
         held = contest(found.state)
         found.note(held)
         if held.winner is None:
             break
         added, state = held.winner
+        name = added.effect.name
+        alike = (n for n, step in steps.items() if is_remainder(step, found.state, state, fields))
+        if first := next(alike, None):
+            found.failures[name] = f"does what {first} does in another shape: may be the error of its form"
+            remainders.add(name)
+            continue
         if rival := generic_rival(found.state, state, fields, fold_of):
             # Smaller effects cannot be named while the largest part of what is missing has no name.
-            found.failures[added.effect.name] = f"{rival} does the same, and better, without a name"
+            found.failures[name] = f"{rival} does the same, and better, without a name"
             break
         found.added.append(added)
+        steps[name] = (found.state, state)
         found.state = state
     for entry in list(found.added[:-1]):
         report(f"deciding once more on {entry.effect.name}")

@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter
 
 from litho_models.effects import FieldContext, get_effect
 from litho_models.loop import LoopConfig, close_loop
 from litho_models.loop.fields import prepare_fields
 from litho_models.loop.fitting import FoldFits
-from litho_models.loop.rivals import generic_rival
+from litho_models.loop.rivals import generic_rival, is_remainder
 from litho_models.loop.screening import blocks_of
 from litho_models.loop.state import State
 from litho_models.models import build_model
@@ -69,6 +70,28 @@ def test_a_tip_gives_way_to_a_table_over_the_slope_unless_it_is_the_cause(plante
     fits = FoldFits(chain, nothing, np.empty((4, 0)), np.zeros(4), np.empty((0, 0)), [])
     rival = generic_rival(State(fits, before), State(fits, after), fields, np.arange(12) % 4)
     assert rival == (None if planted == "tip-dilation" else "slope-table")
+
+
+@pytest.mark.parametrize("left_over", [True, False])
+def test_what_the_form_of_a_named_effect_leaves_over_is_no_further_effect(left_over: bool) -> None:
+    fields = prepare_fields(printed_scans(count=8))
+    fits = FoldFits(true_model({}), np.empty(0), np.empty((4, 0)), np.zeros(4), np.empty((0, 0)), [])
+    random = np.random.default_rng(5)
+    plain, named, further = [], [], []
+    for field in fields:
+        base = gaussian_filter(field.scan.layout_um, 3.0)
+        slope_y, slope_x = np.gradient(base)
+        change = -8 * slope_x**2
+        plain.append(base)
+        named.append(base + change)
+        # The machine blurs what the catalogue does not, or heights are lost along the other axis too.
+        missing = gaussian_filter(change, 3.0) - change if left_over else -2 * slope_y**2
+        field.scan.height_um[:] = base + change + missing + random.normal(0, 1e-4, size=base.shape)
+        # A candidate that is near what is missing, and not quite the same.
+        further.append(base + change + 0.8 * gaussian_filter(missing, 1.0))
+    fields = prepare_fields([f.scan for f in fields])
+    states = [State(fits, p) for p in (plain, named, further)]
+    assert is_remainder((states[0], states[1]), states[1], states[2], fields) == left_over
 
 
 def test_sizes_of_one_direction_are_alternatives_and_directions_are_fitted_together() -> None:
