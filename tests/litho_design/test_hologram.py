@@ -11,10 +11,12 @@ import torch
 
 from litho_design.hologram import HologramBench, image_error
 from litho_design.initialise import fresnel_lens_phase, gerchberg_saxton
+from litho_design.lens_metrics import image_figures
 from litho_design.metrics import (
     SSIM_WINDOW_PX,
     CameraView,
     hologram_score,
+    matched_scale,
     si_psnr_db,
     ssim,
     through_aperture,
@@ -93,18 +95,36 @@ def test_si_psnr_ignores_scale():
 
 
 @pytest.mark.parametrize("kind", ["noise", "smooth", "constant", "edges", "dark"])
-def test_ssim_equals_torchmetrics(kind):
-    from torchmetrics.functional.image import structural_similarity_index_measure
+def test_psnr_equals_scikit_image(kind):
+    from skimage.metrics import peak_signal_noise_ratio
 
-    rng = np.random.default_rng(1)
-    image = {
-        "noise": rng.random((48, 48)),
+    image = example_image(kind)
+    other = np.clip(image + 0.1 * np.random.default_rng(1).standard_normal(image.shape), 0, 1)
+    target, seen = torch.from_numpy(image), torch.from_numpy(other)
+    scaled = (matched_scale(seen, target) * seen).numpy()
+    reference = peak_signal_noise_ratio(image, scaled, data_range=1.0) if image.any() else 300.0
+    # A dark target is met exactly by the scale 0: the error's floor of 1e-30 is 300 dB.
+    assert si_psnr_db(seen, target) == pytest.approx(reference, abs=1e-6)
+    figures = image_figures(seen, target)
+    assert figures.psnr_db == pytest.approx(peak_signal_noise_ratio(image, other, data_range=1.0), abs=1e-6)
+
+
+def example_image(kind: str) -> np.ndarray:
+    return {
+        "noise": np.random.default_rng(0).random((48, 48)),
         "smooth": np.sin(np.linspace(0, 3, 48))[:, None] * np.ones((48, 48)) * 0.5 + 0.5,
         "constant": np.full((48, 48), 0.4),
         "edges": (np.indices((48, 48)).sum(0) // 9 % 2).astype(float),
         "dark": np.zeros((48, 48)),
     }[kind]
-    other = np.clip(image + 0.1 * rng.standard_normal(image.shape), 0, 1)
+
+
+@pytest.mark.parametrize("kind", ["noise", "smooth", "constant", "edges", "dark"])
+def test_ssim_equals_torchmetrics(kind):
+    from torchmetrics.functional.image import structural_similarity_index_measure
+
+    image = example_image(kind)
+    other = np.clip(image + 0.1 * np.random.default_rng(1).standard_normal(image.shape), 0, 1)
     for second in (image, other):
         pair = [torch.from_numpy(array) for array in (image, second)]
         _, similarity = structural_similarity_index_measure(

@@ -47,8 +47,9 @@ def test_richardson_lucy_finds_the_object_for_any_psf_energy(energy, size):
     assert float(Blur(psf, (size, size)).forward(estimate).sum()) == pytest.approx(
         float(seen.sum()), rel=1e-4
     )
-    assert float(estimate.sum()) == pytest.approx(float(wanted.sum()), rel=1e-3)
-    assert float((estimate - wanted).abs().max()) < 0.2
+    assert float(estimate.sum()) == pytest.approx(float(wanted.sum()), rel=1e-4)
+    # 2000 steps leave a thousandth of the brightest pixel, whatever the energy.
+    assert float((estimate - wanted).abs().max()) < 0.01
     rows = torch.arange(size).double()
     for axis in (0, 1):
         centroid = [(image.sum(1 - axis) * rows).sum() / image.sum() for image in (estimate, wanted)]
