@@ -44,8 +44,9 @@ def test_simple_models_print_their_closed_form(tmp_path, name):
             parameter.fill_(value)
     printer = load_printer(str(save_frozen(simulator, tmp_path / name)), LayoutSettings(size_px=32))
     level = torch.randint(0, 13, (1, 1, 32, 32)).float()
-    expected = level * 0.1 if name == "identity" else 0.62 * (level * 0.1) + 0.164
-    assert torch.allclose(printer(level), expected, atol=1e-7)
+    gain, offset_um = torch.tensor([0.62, 0.164])
+    expected = level * 0.1 if name == "identity" else gain * (level * 0.1) + offset_um
+    assert torch.equal(printer(level), expected)
     assert printer.level_heights_um() == pytest.approx(expected.new_tensor(
         [0.1 * n if name == "identity" else 0.062 * n + 0.164 for n in range(13)]
     ).tolist(), abs=1e-6)  # fmt: skip
