@@ -48,12 +48,14 @@ def export_design(
         InputError: an incomplete design, a format that cannot hold it, job settings below zero, or a
             folder that holds something else.
     """
-    job = {"pedestal_um": pedestal_um, "slicing_um": slicing_um, "hatching_um": hatching_um}
-    for setting, value in job.items():
-        if not 0 <= value < math.inf or (value == 0 and setting != "pedestal_um"):
-            raise InputError(setting, got=f"{value:g} µm", wanted="a positive length")
     if kind not in _SUFFIX:
         raise InputError("format", got=repr(kind), wanted=", ".join(_SUFFIX))
+    job = {"pedestal_um": pedestal_um, "slicing_um": slicing_um, "hatching_um": hatching_um}
+    for setting, value in job.items():
+        # Only a closed solid needs a base.
+        may_be_zero = setting == "pedestal_um" and kind != "stl"
+        if not 0 <= value < math.inf or (value == 0 and not may_be_zero):
+            raise InputError(setting, got=f"{value:g} µm", wanted="a positive length")
     design = Design.read(folder)
     levels = read_array(folder, LEVELS_FILE)
     name = f"layout{_SUFFIX[kind]}"

@@ -7,12 +7,13 @@ import json
 import cv2
 import numpy as np
 import pytest
+import tifffile
 
 from litho_data.errors import InputError
 from litho_design.design import Design
 from litho_design.export import export_design, import_levels, sidecar_path
-from litho_design.export.gds import rectangles
-from litho_design.export.image import read_published_bmp
+from litho_design.export.gds import rectangles, write_gds
+from litho_design.export.image import read_published_bmp, write_bmp, write_png16, write_tiff
 from litho_design.export.stl import read_stl_triangles, write_stl
 from litho_design.gauge import out_of_distribution, printability
 from litho_design.hoe import design_hoe
@@ -56,6 +57,42 @@ def test_round_trip_is_exact_and_has_its_size(tmp_path, design, kind):
     assert {"wavelength_um", "settings", "printability", "predicted_height_um", "polarity"} <= raw.keys()
 
 
+@pytest.mark.parametrize(("suffix", "step"), [(".png", 65535 // 12), (".bmp", 255 // 12)])
+def test_images_are_upright_for_another_reader(tmp_path, suffix, step):
+    write = write_png16 if suffix == ".png" else write_bmp
+    write(tmp_path / f"f{suffix}", LETTER * 7, LayoutSettings())
+    grey = cv2.imread(str(tmp_path / f"f{suffix}"), cv2.IMREAD_UNCHANGED)
+    assert np.array_equal(grey, LETTER.astype(int) * 7 * step)
+
+
+def test_tiff_is_upright_and_has_its_size_for_another_reader(tmp_path):
+    levels = np.kron(LETTER * 7, np.ones((200, 200), np.uint8))
+    write_tiff(tmp_path / "f.tif", levels, LayoutSettings(pitch_um=0.13))
+    with tifffile.TiffFile(tmp_path / "f.tif") as file:
+        pages = [page.asarray() for page in file.pages]
+        per_cm = [file.pages[0].tags[name].value for name in ("XResolution", "YResolution")]
+        assert file.pages[0].tags["ResolutionUnit"].value == tifffile.RESUNIT.CENTIMETER
+    assert np.array_equal(pages[0], levels)
+    assert pages[1] == pytest.approx(levels * 0.1)
+    # 1e-9 m over the whole side.
+    for pixels, (count, centimetres) in zip((800, 1000), per_cm, strict=True):
+        assert pixels * 0.01 * centimetres / count == pytest.approx(pixels * 0.13e-6, abs=1e-9)
+
+
+@pytest.mark.parametrize("layers", ["cumulative", "exclusive"])
+def test_gds_is_upright_and_has_its_size_for_another_reader(tmp_path, layers):
+    gdstk = pytest.importorskip("gdstk")
+    write_gds(tmp_path / "f.gds", LETTER * 2, 0.13, layers)
+    library = gdstk.read_gds(tmp_path / "f.gds")
+    (cell,) = library.cells
+    # The F reaches all four sides; in ``exclusive`` level 0 fills the rest.
+    corners = np.array(cell.bounding_box()) * library.unit
+    assert corners == pytest.approx(np.array([[0, 0], [4 * 0.13e-6, 5 * 0.13e-6]]), abs=1e-9)
+    centres = [((x + 0.5) * 0.13, (4.5 - y) * 0.13) for y in range(5) for x in range(4)]
+    highest = [polygon for polygon in cell.polygons if polygon.layer == 2]
+    assert np.array_equal(np.reshape(gdstk.inside(centres, highest), (5, 4)), LETTER > 0)
+
+
 @pytest.mark.parametrize("kind", ["png16", "bmp"])
 def test_a_changed_or_lonely_file_is_refused(tmp_path, design, kind):
     file = export_design(design, kind, tmp_path / kind)
@@ -72,6 +109,15 @@ def test_a_changed_or_lonely_file_is_refused(tmp_path, design, kind):
 def test_job_settings_that_no_printer_has_are_refused(tmp_path, design, job):
     with pytest.raises(InputError, match=next(iter(job))):
         export_design(design, "png16", tmp_path / "out", **job)
+
+
+def test_a_solid_without_a_base_is_refused_before_anything_is_written(tmp_path, design):
+    with pytest.raises(InputError, match="pedestal_um"):
+        export_design(design, "stl", tmp_path / "out", pedestal_um=0.0)
+    assert not (tmp_path / "out").exists()
+    assert (
+        import_levels(export_design(design, "png16", tmp_path / "out", pedestal_um=0.0))[1].pedestal_um == 0
+    )
 
 
 def test_exports_in_other_formats_stay(tmp_path, design):
@@ -112,6 +158,9 @@ def test_stl_is_closed_upright_and_has_the_volume_of_its_columns(tmp_path):
     forward, backward = (np.hstack(pair) for pair in ((starts, ends), (ends, starts)))
     assert np.array_equal(*(np.unique(edges, axis=0, return_counts=True)[1] for edges in (forward, backward)))
     assert np.array_equal(*(np.unique(edges, axis=0) for edges in (forward, backward)))
+    # 8 x 10 cells of 0.4 µm, to 1e-9 m.
+    assert triangles.reshape(-1, 3).min(0) == pytest.approx((0, 0, 0), abs=1e-3)
+    assert triangles.reshape(-1, 3).max(0)[:2] == pytest.approx((3.2, 4.0), abs=1e-3)
     # Row 0 is at the top: the bar of the F lies at high y.
     high = triangles[triangles[:, :, 2].min(1) > 1.25]
     assert high[..., 1].max() == pytest.approx(4.0)
