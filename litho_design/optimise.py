@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from pydantic import Field, PositiveFloat
@@ -113,7 +113,7 @@ def search_layout(
 def finished_iterations(folder: Path) -> int:
     """How many iterations an interrupted run in ``folder`` has behind it; 0 where there is none."""
     path = folder / _CHECKPOINT
-    return int(torch.load(path, weights_only=True, map_location="cpu")["iteration"]) if path.exists() else 0
+    return int(_load(path, "cpu")["iteration"]) if path.exists() else 0
 
 
 def remove_checkpoint(folder: Path) -> None:
@@ -187,7 +187,7 @@ def _save(
 def _resume(
     path: Path, parameters: Parametrisation, optimiser: torch.optim.Optimizer, fingerprint: str
 ) -> SearchState:
-    content = torch.load(path, weights_only=True, map_location=next(parameters.parameters()).device)
+    content = _load(path, next(parameters.parameters()).device)
     if content["fingerprint"] != fingerprint:
         raise InputError(
             f"checkpoint {path}",
@@ -198,3 +198,17 @@ def _resume(
     parameters.load_state_dict(content["parameters"])
     optimiser.load_state_dict(content["optimiser"])
     return SearchState(content["iteration"], content["best_loss"], content["best_levels"], content["history"])
+
+
+def _load(path: Path, device: str | torch.device) -> dict[str, Any]:
+    try:
+        content: dict[str, Any] = torch.load(path, weights_only=True, map_location=device)
+    # What torch raises for a damaged file depends on the place of the damage.
+    except Exception:
+        raise InputError(
+            f"checkpoint {path}",
+            got="a damaged file",
+            wanted="what an interrupted run left",
+            hint="delete it to start again",
+        ) from None
+    return content

@@ -118,7 +118,7 @@ def run_design(
 
     The folder may hold an interrupted run of the same task (it goes on and ends as if it had never
     stopped) or a finished one (it is returned as it is). The weights of every model are hashed before
-    and after.
+    and after; a model that changed leaves no design.
 
     Args:
         announce: print the expected time and memory to stderr before starting.
@@ -147,6 +147,8 @@ def run_design(
     level = layout_level[None, None].float()
     with torch.no_grad():
         height = task.printer(level)[0, 0]
+    if [printer.weights_sha256() for printer in task.printers] != hashes_before:
+        raise AssertionError("a printer model changed while a layout was designed through it")
     layout_array = layout_level.cpu().numpy().astype(np.uint8)
     arrays = {LEVELS_FILE: layout_array, HEIGHT_FILE: height.cpu().numpy(), **task.arrays(height)}
     files = write_arrays(folder, arrays) | write_level_image(folder, layout_array)
@@ -169,7 +171,7 @@ def run_design(
         optics=settings.optics,
         target=task.target_record,
         printer=task.printer.record(),
-        printer_unchanged=[p.weights_sha256() for p in task.printers] == hashes_before,
+        printer_unchanged=True,
         tiling=task.printer.tiling_check(level),
         ensemble=_ensemble(task.printers, level, settings.optics),
         stroke=make_stroke(heights, settings.optics, settings.layout),
