@@ -126,7 +126,7 @@ def _prepare(scan: PrintedScan, order: float) -> Field:
     ny, nx = scan.shape
     layout = torch.from_numpy(scan.layout_um)[None, None]
     write = scan.write or {}
-    line = scan_line_index(scan.shape, scan.scan_to_layout, scan.pitch_um)
+    line = scan_line_index(scan.shape, scan.scan_to_layout, scan.pitch_um, scan.bend_um)
     context = FieldContext(
         layout_um=layout,
         pitch_um=scan.pitch_um,

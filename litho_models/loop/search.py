@@ -16,6 +16,8 @@ from litho_models.loop.screening import Screened
 from litho_models.loop.state import State, fit_state
 
 MOST_EFFECTS = 8
+# Of the amplitude of an effect: as well as a formula of the catalogue can be trusted.
+FORM_ERROR = 0.1
 
 
 @dataclass
@@ -95,9 +97,8 @@ def search_effects(
             break
         added, state = held.winner
         name = added.effect.name
-        alike = (n for n, step in steps.items() if is_remainder(step, found.state, state, fields))
-        if first := next(alike, None):
-            found.failures[name] = f"does what {first} does in another shape: may be the error of its form"
+        if reason := _may_be_remainder(held.winner, found, steps, fields):
+            found.failures[name] = reason
             remainders.add(name)
             continue
         if rival := generic_rival(found.state, state, fields, fold_of):
@@ -111,6 +112,27 @@ def search_effects(
         report(f"deciding once more on {entry.effect.name}")
         _decide_again(found, entry, contest, fields, fold_of)
     return found
+
+
+def _may_be_remainder(
+    winner: tuple[Added, State],
+    found: Search,
+    steps: Mapping[str, tuple[State, State]],
+    fields: Sequence[Field],
+) -> str:
+    """Why a further effect may be no more than the error in the form of one that was added; empty if not."""
+    added, state = winner
+    for earlier in found.added:
+        name = earlier.effect.name
+        if _gain_nm2(added) < FORM_ERROR**2 * _gain_nm2(earlier):
+            return f"small beside {name}, whose form no catalogue knows to {100 * FORM_ERROR:.0f} %"
+        if is_remainder(steps[name], found.state, state, fields):
+            return f"does what {name} does in another shape: may be the error of its form"
+    return ""
+
+
+def _gain_nm2(added: Added) -> float:
+    return float((added.before.mse_nm2 - added.after.mse_nm2).mean())
 
 
 def _decide_again(
