@@ -51,9 +51,7 @@ def generic_rival(before: State, after: State, fields: Sequence[Field], fold_of:
     return None
 
 
-def is_remainder(
-    named: tuple[State, State], before: State, after: State, fields: Sequence[Field]
-) -> bool:
+def is_remainder(named: tuple[State, State], before: State, after: State, fields: Sequence[Field]) -> bool:
     """Whether a further effect does what an effect named before does in another shape.
 
     Another shape: the change by the first effect scaled, squared, growing with the height, blurred,
