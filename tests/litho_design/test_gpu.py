@@ -1,0 +1,90 @@
+"""The same on a GPU as on the processor: waves, whole designs, scores."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from litho_data.grid import PixelGrid
+from litho_design.hoe import design_hoe
+from litho_design.lens import design_lens
+from litho_design.optics import ASMPropagator, RadialPropagator, RSPropagator, centred_grid
+from litho_design.parametrise import LayoutSettings
+from litho_design.score import score_design
+from litho_design.settings import lens_preset
+from litho_design.targets import make_target
+
+GPU = "cuda"
+pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU on this machine")
+
+GRID = centred_grid((32, 32), 0.1)
+TARGETS = {
+    "same": GRID,
+    "rational": centred_grid((20, 33), 0.15, (5.0, 0.0)),
+    "dense": PixelGrid((13, 21), (0.1 * 2**0.5, 0.1), (-3.0, 1.0)),
+}
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.complex64, 1e-5), (torch.complex128, 1e-10)])
+@pytest.mark.parametrize("name", [*TARGETS, "asm", "radial"])
+def test_waves_are_the_same(name, dtype, tolerance):
+    if name == "asm":
+        propagate = ASMPropagator(GRID, GRID, 10.0, 0.6328, dtype=dtype)
+    elif name == "radial":
+        propagate = RadialPropagator(32, 0.1, torch.linspace(0, 5, 20), 30.0, 0.6328, dtype=dtype)
+    else:
+        propagate = RSPropagator(GRID, TARGETS[name], 30.0, 0.6328, dtype=dtype)
+    shape = (32,) if name == "radial" else (32, 32)
+    field = torch.randn(shape, dtype=dtype, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    wave = propagate(field)
+    (slope,) = torch.autograd.grad(wave.abs().square().sum(), field)
+    there = field.detach().to(GPU).requires_grad_()
+    wave_there = propagate.to(GPU)(there)
+    (slope_there,) = torch.autograd.grad(wave_there.abs().square().sum(), there)
+    for one, other in ((wave, wave_there), (slope, slope_there)):
+        assert (one - other.cpu()).abs().max() < tolerance * one.abs().max()
+
+
+@pytest.mark.parametrize("parametrisation", ["direct", "gumbel"])
+@pytest.mark.parametrize("start", ["random", "wgs"])
+def test_a_hologram_is_designed_and_scores_the_same(
+    tmp_path, small_settings, make_printer, parametrisation, start
+):
+    changes = {"parametrisation": parametrisation, "start": start, "iterations": 10}
+    settings = small_settings.model_copy(
+        update={
+            "search": small_settings.search.model_copy(update=changes),
+            "window": small_settings.window.model_copy(update={"samples": 2}),
+        }
+    )
+    printer = make_printer(settings.layout).to(GPU)
+    other = make_printer(settings.layout, sigma_um=0.3, name="wide").to(GPU)
+    design = design_hoe(
+        settings, printer, *make_target("ring", 128), tmp_path / "d", ensemble=[other], announce=False
+    )
+    assert design.run.device.startswith(GPU)
+    assert design.polished_loss < design.start_loss
+    # Convolutions on a GPU may round their factors to 10 bits: a nanometre of height, a per cent of a figure.
+    (score,) = score_design(tmp_path / "d", [make_printer(settings.layout)], tmp_path / "s").scores
+    assert score.figures == pytest.approx(design.predicted, rel=1e-2, abs=1e-3)
+
+
+@pytest.mark.parametrize("path", ["radial", "plane"])
+def test_a_lens_is_designed_and_scores_the_same(tmp_path, make_printer, path):
+    layout = LayoutSettings(size_px=128, cell_um=0.1, symmetry="radial")
+    default = lens_preset("default", "computational")
+    settings = default.model_copy(
+        update={
+            "layout": layout,
+            "optics": default.optics.model_copy(update={"distance_um": 40.0}),
+            "search": default.search.model_copy(update={"iterations": 4, "polish_rounds": 1}),
+            "view": default.view.model_copy(update={"window_px": 64, "path": path}),
+            "imaging": default.imaging.model_copy(update={"object_px": 32, "iterations": 10}),
+        }
+    )
+    design = design_lens(settings, make_printer(layout).to(GPU), tmp_path / "d", announce=False)
+    assert design.run.device.startswith(GPU)
+    assert design.polished_loss <= design.start_loss
+    # As above.
+    (score,) = score_design(tmp_path / "d", [make_printer(layout)], tmp_path / "s").scores
+    assert score.figures == pytest.approx(design.predicted, rel=1e-2, abs=1e-3)
