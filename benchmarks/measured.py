@@ -18,7 +18,7 @@ from typing import Any
 from benchmarks.measured_figures import draw_prediction, draw_steps
 from benchmarks.record import publish
 from litho_models import zoo
-from litho_models.freeze import ModelCard
+from litho_models.model_card import ModelCard
 from litho_models.zoo_making import HELD_OUT, ZOO_MODELS
 
 ROOT = Path(__file__).parents[1]

@@ -164,7 +164,8 @@ def peak_gflops(dtype: torch.dtype, repeats: int = 12) -> float:
 
 def load_pbl(folder: Path) -> Pbl:
     """The trained PBL in a folder, with weights that learn."""
-    from litho_models.freeze import ModelCard, load_simulator
+    from litho_models.freeze import load_simulator
+    from litho_models.model_card import ModelCard
 
     model = load_simulator(folder, ModelCard.read(folder))
     assert isinstance(model, Pbl)

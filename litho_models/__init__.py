@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from litho_models import zoo
-    from litho_models.freeze import FrozenSimulator, load_frozen, save_frozen
+    from litho_models.freeze import load_frozen, save_frozen
+    from litho_models.frozen_simulator import FrozenSimulator
 
 __all__ = ["FrozenSimulator", "load_frozen", "save_frozen", "zoo"]
 
@@ -16,8 +17,8 @@ def __getattr__(name: str) -> Any:
     """Load torch only when a model is asked for."""
     if name == "zoo":
         return importlib.import_module("litho_models.zoo")
+    if name == "FrozenSimulator":
+        return importlib.import_module("litho_models.frozen_simulator").FrozenSimulator
     if name in __all__:
-        from litho_models import freeze
-
-        return getattr(freeze, name)
+        return getattr(importlib.import_module("litho_models.freeze"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

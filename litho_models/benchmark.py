@@ -22,8 +22,8 @@ from litho_models.benchmark_report import write_benchmark_report
 from litho_models.diagnostics import FitDiagnostics, diagnose
 from litho_models.evaluate import SplitRecord
 from litho_models.folds import GROUPED_FOLDS, Fold, SplitKind, plan_folds
-from litho_models.freeze import DatasetName
 from litho_models.metrics import paired_difference
+from litho_models.model_card import DatasetName
 from litho_models.models import build_model, model_class
 from litho_models.nuisance import Policy
 from litho_models.run_info import RunInfo, run_info

@@ -18,7 +18,9 @@ from litho_models.background import Background, BackgroundUse
 from litho_models.cost import PredictionCost, measured_predictions
 from litho_models.diagnostics import TileConsistency, device_of, tile_consistency
 from litho_models.evaluation_report import write_evaluation_report
-from litho_models.freeze import DatasetName, FrozenSimulator, load_frozen
+from litho_models.freeze import load_frozen
+from litho_models.frozen_simulator import FrozenSimulator
+from litho_models.model_card import DatasetName
 from litho_models.nuisance import Policy
 from litho_models.run_info import RunInfo, run_info
 from litho_models.score_records import ModelScores, NuisanceProtocol, Prediction

@@ -6,194 +6,26 @@ people. Only numbers and names of known classes are read: nothing is unpickled.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any
 
 import torch
-from pydantic import Field, ValidationError
+from pydantic import ValidationError
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
-from torch import Tensor, nn
+from torch import nn
 
 from litho_data.errors import InputError
 from litho_data.files import atomic_folder, file_sha256
 from litho_data.outputs import require_replaceable_folder
-from litho_data.results import Record, Result, first_error, software_versions
-from litho_models.background import Background, BackgroundUse
+from litho_data.results import first_error, software_versions
+from litho_models.frozen_simulator import FrozenSimulator
+from litho_models.model_card import CARD_FILE, EffectValues, ModelCard
 from litho_models.model_readme import model_readme
 from litho_models.models import model_class
 from litho_models.simulator import Simulator
-from litho_models.tiles import predict_field, predict_interior
 
-WEIGHTS_FILE, CARD_FILE, README_FILE = "model.safetensors", "card.json", "README.md"
-# A level's height in float32 may exceed the range by rounding; a level off it differs by 100 nm.
-_ROUNDING_UM = 1e-5
-
-EffectValues = dict[str, dict[str, float]]
-
-
-class DatasetName(Record):
-    """A dataset by name and content hash."""
-
-    name: str
-    sha256: str
-
-
-class Metric(Record):
-    """One reported figure: what, how much, on which scans, with which nuisances and background."""
-
-    name: str
-    value: float
-    unit: str = "nm"
-    split: str
-    policy: str
-    background: BackgroundUse = "none"
-
-
-class ModelCard(Result):
-    """All that is needed to load, use and judge a frozen model.
-
-    ``background`` is what the microscope added to the training scans on average; only a comparison with
-    measured maps uses it, the model's height never contains it.
-    """
-
-    SCHEMA: ClassVar[str] = "litho-models/frozen/1"
-    FILE_NAME: ClassVar[str] = CARD_FILE
-
-    schema_: Literal["litho-models/frozen/1"] = Field("litho-models/frozen/1", alias="schema")
-    name: str
-    model: str
-    variant: str
-    hyper_parameters: dict[str, Any]
-    parameters: int
-    weights_sha256: str
-    pitch_um: float
-    level_height_um: float
-    levels: int
-    calibrated_range_um: tuple[float, float]
-    training_level_share: list[float] = Field(default_factory=list)
-    receptive_radius_um: float | None
-    dataset: DatasetName | None = None
-    training: dict[str, Any] = Field(default_factory=dict)
-    command: str = ""
-    split: dict[str, Any] = Field(default_factory=dict)
-    nuisance: dict[str, Any] = Field(default_factory=dict)
-    background: Background | None = None
-    metrics: list[Metric] = Field(default_factory=list)
-    noise_floor: dict[str, Any] | None = None
-    process_effects: EffectValues = Field(default_factory=dict)
-    measurement_effects: EffectValues = Field(default_factory=dict)
-    undetermined_effects: EffectValues = Field(default_factory=dict)
-    declared_processes: list[str] = Field(default_factory=list)
-    confusable_sets: list[list[str]] = Field(default_factory=list)
-    unexplained_fraction: float | None = None
-    fabrication_batch: str = ""
-    optimiser_gap: float | None = None
-    limitations: list[str] = Field(default_factory=list)
-    versions: dict[str, str] = Field(default_factory=dict)
-
-
-class FrozenSimulator(nn.Module):
-    """A process model for design: fixed weights, gradients to its input only.
-
-    ``model(layout_um, pitch_um=0.1)`` maps a layout (b, 1, y, x) in µm to its printed height.
-    """
-
-    def __init__(self, simulator: nn.Module, card: ModelCard, sha256: str, extrapolate: bool):
-        super().__init__()
-        self.simulator = simulator
-        self.card: Mapping[str, Any] = card.model_dump(mode="json", by_alias=True)
-        self.sha256 = sha256
-        self.extrapolate = extrapolate
-        self._lowest_um, self._highest_um = card.calibrated_range_um
-        self.eval().requires_grad_(False)
-
-    @property
-    def name(self) -> str:
-        """Name in the card."""
-        return self.card["name"]
-
-    @property
-    def pitch_um(self) -> float:
-        """Lateral sampling that the model is made for, µm."""
-        return self.card["pitch_um"]
-
-    @property
-    def reach_um(self) -> float | None:
-        """Receptive radius, µm; None where a pixel depends on the whole image."""
-        return self.card["receptive_radius_um"]
-
-    def train(self, mode: bool = True) -> FrozenSimulator:
-        """Frozen models stay in eval mode."""
-        return super().train(False)
-
-    def forward(
-        self, layout_um: Tensor, pitch_um: float | None = None, level_height_um: float | None = None
-    ) -> Tensor:
-        """Printed height (b, 1, y, x), µm.
-
-        Args:
-            layout_um: nominal height (b, 1, y, x), µm, float.
-            pitch_um: sampling of the layout, if the caller wants it checked; so is ``level_height_um``.
-
-        Raises:
-            InputError: another pitch or level height, another shape, or heights beyond the calibrated
-                range without ``extrapolate``.
-        """
-        self._check_layout(layout_um, pitch_um, level_height_um)
-        if isinstance(self.simulator, Simulator):
-            return predict_field(self.simulator, layout_um)
-        return self.simulator(layout_um)
-
-    @property
-    def has_interior(self) -> bool:
-        """Whether ``interior`` can be asked for: a finite receptive radius, no effects behind the model."""
-        return isinstance(self.simulator, Simulator) and self.simulator.reach_px is not None
-
-    def interior(self, layout_um: Tensor, pitch_um: float | None = None) -> Tensor:
-        """As ``forward``, of the pixels farther than the receptive radius r from the edge only.
-
-        Nothing beyond the edge is assumed, and nothing is computed there: (b, 1, y - 2r, x - 2r), µm.
-
-        Raises:
-            InputError: as ``forward``, or a model without ``has_interior``.
-        """
-        self._check_layout(layout_um, pitch_um, None)
-        if not isinstance(self.simulator, Simulator):
-            raise InputError(f"interior of a print by {self.name}", wanted="a model without added effects")
-        return predict_interior(self.simulator, layout_um)
-
-    def _check_layout(self, layout_um: Tensor, pitch_um: float | None, level_height_um: float | None) -> None:
-        self.check_geometry(pitch_um, level_height_um)
-        if layout_um.ndim != 4 or layout_um.shape[1] != 1:
-            raise InputError("layout", got=f"shape {tuple(layout_um.shape)}", wanted="(batch, 1, y, x)")
-        if not self.extrapolate:
-            self._check_range(layout_um)
-
-    def check_geometry(self, pitch_um: float | None, level_height_um: float | None = None) -> None:
-        """Refuse another pitch or level height than the model's; None is not checked.
-
-        Raises:
-            InputError: they differ.
-        """
-        for name, given in (("pitch_um", pitch_um), ("level_height_um", level_height_um)):
-            wanted = self.card[name]
-            if given is not None and abs(given - wanted) > 1e-9:
-                raise InputError(
-                    f"{name} for model {self.name}", got=f"{given:g} µm", wanted=f"{wanted:g} µm"
-                )
-
-    def _check_range(self, layout_um: Tensor) -> None:
-        lowest, highest = (float(v) for v in torch.aminmax(layout_um.detach()))
-        inside = lowest >= self._lowest_um - _ROUNDING_UM and highest <= self._highest_um + _ROUNDING_UM
-        if not inside:
-            raise InputError(
-                f"layout for model {self.name}",
-                got=f"heights from {lowest:g} to {highest:g} µm",
-                wanted=f"{self._lowest_um:g} to {self._highest_um:g} µm, the calibrated range",
-                hint="load it with extrapolate=True to accept a guess",
-            )
+WEIGHTS_FILE, README_FILE = "model.safetensors", "README.md"
 
 
 def save_frozen(

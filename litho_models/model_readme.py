@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from litho_models.freeze import ModelCard
+    from litho_models.model_card import ModelCard
 
 _HEADER = """---
 license: apache-2.0

@@ -14,7 +14,8 @@ from litho_data.files import atomic_file
 from litho_data.results import Result, first_error
 from litho_data.store import PrintedScan, open_store
 from litho_models import zoo
-from litho_models.freeze import CARD_FILE, DatasetName, ModelCard, load_simulator, save_frozen
+from litho_models.freeze import load_simulator, save_frozen
+from litho_models.model_card import CARD_FILE, DatasetName, ModelCard
 from litho_models.run_info import RunInfo, run_info
 from litho_models.simulator import Variant
 from litho_models.splits import ids_sha256, locked_ids

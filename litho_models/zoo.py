@@ -11,7 +11,7 @@ from litho_data.errors import InputError
 if TYPE_CHECKING:
     import torch
 
-    from litho_models.freeze import FrozenSimulator
+    from litho_models.frozen_simulator import FrozenSimulator
 
 ZOO_FOLDER = Path(__file__).parent / "zoo_data"
 LARGEST_ZOO_BYTES = 8_000_000

@@ -12,7 +12,8 @@ from litho_data.store import PrintedScan, Store, open_store
 from litho_models import zoo
 from litho_models.background import BackgroundUse
 from litho_models.evaluate import card_background, predict_frozen
-from litho_models.freeze import Metric, ModelCard, load_frozen
+from litho_models.freeze import load_frozen
+from litho_models.model_card import Metric, ModelCard
 from litho_models.nuisance import Policy
 from litho_models.runs import MODEL_FOLDER, freeze, train
 from litho_models.score_records import ModelScores, Prediction

@@ -121,7 +121,8 @@ def _base_model(base: str, store: Store) -> tuple[Simulator, str]:
         )
         return model, base
     folder = zoo.model_folder(base, other=f"or one of {', '.join(MODELS)}")
-    from litho_models.freeze import ModelCard, load_simulator
+    from litho_models.freeze import load_simulator
+    from litho_models.model_card import ModelCard
 
     card = ModelCard.read(folder)
     if abs(card.pitch_um - store.pitch_um) > 1e-9:

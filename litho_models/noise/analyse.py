@@ -11,7 +11,7 @@ import numpy as np
 
 from litho_data.readers import read_scan
 from litho_data.store import PrintedScan, Store, open_store
-from litho_models.freeze import DatasetName
+from litho_models.model_card import DatasetName
 from litho_models.noise.bounds import NoiseBound, noise_bounds
 from litho_models.noise.calibration import analyse_spread
 from litho_models.noise.dose import dose_matrix

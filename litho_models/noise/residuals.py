@@ -12,7 +12,8 @@ from litho_data.errors import InputError
 from litho_data.store import PrintedScan, Store
 from litho_models import zoo
 from litho_models.evaluate import predict_frozen
-from litho_models.freeze import CARD_FILE, load_frozen
+from litho_models.freeze import load_frozen
+from litho_models.model_card import CARD_FILE
 from litho_models.noise.calibration import Residuals
 from litho_models.noise.surface import NM_PER_UM
 from litho_models.nuisance import Policy, cross_fitted_residual

@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 from pydantic import Field
 
 from litho_data.results import Record, Result
-from litho_models.freeze import DatasetName
+from litho_models.model_card import DatasetName
 from litho_models.noise.bounds import NoiseBound
 from litho_models.noise.calibration import SpreadAnalysis
 from litho_models.noise.dose import DoseMatrix

@@ -15,7 +15,7 @@ from litho_models.benchmark import benchmark
 from litho_models.compare import compare
 from litho_models.evaluate import evaluate
 from litho_models.folds import plan_folds
-from litho_models.freeze import ModelCard
+from litho_models.model_card import ModelCard
 from litho_models.models import build_model
 from litho_models.nuisance import TERM_COUNT
 from litho_models.runs import freeze, train

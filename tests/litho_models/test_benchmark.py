@@ -14,7 +14,7 @@ from litho_models.benchmark import Benchmark, benchmark
 from litho_models.compare import compare
 from litho_models.evaluate import Evaluation, evaluate
 from litho_models.folds import plan_folds
-from litho_models.freeze import DatasetName
+from litho_models.model_card import DatasetName
 from litho_models.runs import TrainingRun, freeze, train
 
 MODELS = ("identity", "affine", "linear")

@@ -13,7 +13,8 @@ from safetensors.torch import save_file
 
 from litho_data.errors import InputError
 from litho_models import load_frozen, save_frozen
-from litho_models.freeze import CARD_FILE, README_FILE, WEIGHTS_FILE, ModelCard
+from litho_models.freeze import README_FILE, WEIGHTS_FILE
+from litho_models.model_card import CARD_FILE, ModelCard
 from litho_models.models import build_model
 from litho_models.runs import freeze
 

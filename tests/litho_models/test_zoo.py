@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from litho_data.errors import InputError
 from litho_models import save_frozen, zoo
 from litho_models.cli import app
-from litho_models.freeze import ModelCard
+from litho_models.model_card import ModelCard
 from litho_models.models import build_model
 from litho_models.zoo_making import HELD_OUT, OUT_OF_FOLD, TRAINED_ON, differing_metrics, make_zoo
 

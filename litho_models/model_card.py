@@ -1,0 +1,75 @@
+"""The card of a frozen model: what it is for, what it was made from, and how well it does."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field
+
+from litho_data.results import Record, Result
+from litho_models.background import Background, BackgroundUse
+
+CARD_FILE = "card.json"
+
+EffectValues = dict[str, dict[str, float]]
+
+
+class DatasetName(Record):
+    """A dataset by name and content hash."""
+
+    name: str
+    sha256: str
+
+
+class Metric(Record):
+    """One reported figure: what, how much, on which scans, with which nuisances and background."""
+
+    name: str
+    value: float
+    unit: str = "nm"
+    split: str
+    policy: str
+    background: BackgroundUse = "none"
+
+
+class ModelCard(Result):
+    """All that is needed to load, use and judge a frozen model.
+
+    ``background`` is what the microscope added to the training scans on average; only a comparison with
+    measured maps uses it, the model's height never contains it.
+    """
+
+    SCHEMA: ClassVar[str] = "litho-models/frozen/1"
+    FILE_NAME: ClassVar[str] = CARD_FILE
+
+    schema_: Literal["litho-models/frozen/1"] = Field("litho-models/frozen/1", alias="schema")
+    name: str
+    model: str
+    variant: str
+    hyper_parameters: dict[str, Any]
+    parameters: int
+    weights_sha256: str
+    pitch_um: float
+    level_height_um: float
+    levels: int
+    calibrated_range_um: tuple[float, float]
+    training_level_share: list[float] = Field(default_factory=list)
+    receptive_radius_um: float | None
+    dataset: DatasetName | None = None
+    training: dict[str, Any] = Field(default_factory=dict)
+    command: str = ""
+    split: dict[str, Any] = Field(default_factory=dict)
+    nuisance: dict[str, Any] = Field(default_factory=dict)
+    background: Background | None = None
+    metrics: list[Metric] = Field(default_factory=list)
+    noise_floor: dict[str, Any] | None = None
+    process_effects: EffectValues = Field(default_factory=dict)
+    measurement_effects: EffectValues = Field(default_factory=dict)
+    undetermined_effects: EffectValues = Field(default_factory=dict)
+    declared_processes: list[str] = Field(default_factory=list)
+    confusable_sets: list[list[str]] = Field(default_factory=list)
+    unexplained_fraction: float | None = None
+    fabrication_batch: str = ""
+    optimiser_gap: float | None = None
+    limitations: list[str] = Field(default_factory=list)
+    versions: dict[str, str] = Field(default_factory=dict)
