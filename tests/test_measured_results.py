@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from benchmarks.measured import FOLDER, PAGES, RESULTS, loop_table, texts
+from benchmarks.measured import FOLDER, PAGES, RESULTS, texts
+from benchmarks.measured_loop import loop_table
 from benchmarks.record import published
 from litho_design.compare import GapResult
 from litho_design.score import ScoreResult
