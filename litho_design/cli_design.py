@@ -173,14 +173,10 @@ def lens(
 
 
 def _tell(design: Design, out: Path) -> None:
-    from litho_design.report_design import stroke_advice
+    from litho_design.report_design import distribution_warning, stroke_advice
 
-    gauge = design.out_of_distribution
-    if gauge is not None and gauge.flagged:
-        print(
-            f"the layout is unlike the model's training layouts: {100 * gauge.level_distance:.0f} % of its "
-            "pixels would have to change level to match them",
-            file=sys.stderr,
-        )
+    warning = distribution_warning(design)
+    if warning:
+        print(warning, file=sys.stderr)
     print(stroke_advice(design))
     print(f"{out / 'report.html'}: {headline(design.predicted)} (judged by its own model)")

@@ -166,12 +166,10 @@ def add_gauge(page: Page, design: Design) -> None:
     import pandas as pd
 
     page.heading("What the layout asks of the printer")
+    warning = distribution_warning(design)
+    if warning:
+        page.note(warning[0].upper() + warning[1:] + ".")
     gauge = design.out_of_distribution
-    if gauge is not None and gauge.flagged:
-        page.note(
-            f"Out of distribution: {100 * gauge.level_distance:.0f} % of the pixels would have to change "
-            "level to match the layouts that the model was trained on; its prediction is an extrapolation."
-        )
     tiling, ensemble = design.tiling, design.ensemble
     if tiling is not None:
         page.paragraph(
@@ -188,6 +186,24 @@ def add_gauge(page: Page, design: Design) -> None:
     given = {name: float(value) for name, value in figures.items() if value is not None}
     frame = pd.DataFrame({"name": list(given), "value": list(given.values())})
     page.table(frame, "Lengths in µm; shares of pixel pairs or runs", "printability.csv", digits=3)
+
+
+def distribution_warning(design: Design) -> str:
+    """What to know about the layout's distance to the model's training layouts; empty if all is well."""
+    gauge = design.out_of_distribution
+    if gauge is None:
+        if design.printer.source == "none":
+            return ""
+        return (
+            f"the card of the model {design.printer.name} does not say what layouts it was trained on: how "
+            "far this one is from them is not known"
+        )
+    if not gauge.flagged:
+        return ""
+    return (
+        f"out of distribution: {100 * gauge.level_distance:.0f} % of the pixels would have to change level "
+        "to match the layouts that the model was trained on; its prediction is an extrapolation"
+    )
 
 
 def stroke_frame(design: Design) -> pd.DataFrame:

@@ -18,7 +18,7 @@ from litho_design.design import Design
 from litho_design.gauge import OutOfDistribution
 from litho_design.parametrise import LayoutSettings
 from litho_design.printer import load_printer
-from litho_design.report_design import stroke_advice
+from litho_design.report_design import distribution_warning, stroke_advice
 from litho_models import save_frozen
 from litho_models.models import model_class
 
@@ -119,11 +119,15 @@ def test_commands_design_score_and_compare(tmp_path, affine_folder):
     assert record.printer_unchanged
     # The card of this model names no training levels: nothing can be said about its extrapolation.
     assert "extrapolation" not in stroke_advice(record)
+    assert "the card of the model affine does not say" in distribution_warning(record)
     seen = OutOfDistribution(
         level_distance=0.6, flagged=True, extreme_level_share=0.4, training_extreme_level_share=0.001
     )
     rarely = record.model_copy(update={"out_of_distribution": seen})
     assert "0.1 % of the layouts" in stroke_advice(rarely)
+    assert "60 % of the pixels" in distribution_warning(rarely)
+    usual = record.model_copy(update={"out_of_distribution": seen.model_copy(update={"flagged": False})})
+    assert distribution_warning(usual) == ""
     levels = np.load(design / "layout_level.npy")
     assert levels.shape == (128, 128)
     assert (design / "report.html").stat().st_size > 50_000
