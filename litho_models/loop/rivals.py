@@ -55,8 +55,8 @@ def is_remainder(named: tuple[State, State], before: State, after: State, fields
     """Whether a further effect does what an effect named before does in another shape.
 
     Another shape: the change by the first effect scaled, squared, growing with the height, blurred,
-    displaced. If these do half of what the further effect does, and leave it no more than half of its
-    gain, it may be no more than the error in the form of the first.
+    displaced. If these do more than the further effect, or do half of what it does and leave it no more
+    than half of its gain, it may be no more than the error in the form of the first.
 
     Args:
         named: the model without and with the effect named before.
@@ -74,7 +74,8 @@ def is_remainder(named: tuple[State, State], before: State, after: State, fields
     gram = np.sum(grams, axis=0)
     both = np.arange(len(gram) - 1)
     alone, reshaped, together = (_gain_of(gram, columns) for columns in (both[-1:], both[:-1], both))
-    return bool(reshaped >= _REMAINDER * alone and together - reshaped <= _REMAINDER * alone)
+    contained = reshaped >= _REMAINDER * alone and together - reshaped <= _REMAINDER * alone
+    return bool(reshaped >= alone or contained)
 
 
 def _reshaped(change: np.ndarray, prediction: np.ndarray, pitch_um: float) -> list[np.ndarray]:

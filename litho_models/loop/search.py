@@ -70,13 +70,12 @@ def search_effects(
     """
     found = Search(start)
     steps: dict[str, tuple[State, State]] = {}
-    remainders: set[str] = set()
 
     def contest(state: State, holder: tuple[str, State] | None = None) -> Contest:
         candidates = [
             effect
             for effect in screened_effects()
-            if effect.name not in {*exclude, *remainders, *state.fits.chain.names}
+            if effect.name not in {*exclude, *state.fits.chain.names}
         ]
         return hold_contest(
             state,
@@ -90,20 +89,19 @@ def search_effects(
             report=report,
         )
 
-    while len(found.added) + len(remainders) < MOST_EFFECTS:
+    while len(found.added) < MOST_EFFECTS:
         held = contest(found.state)
         found.note(held)
         if held.winner is None:
             break
         added, state = held.winner
         name = added.effect.name
-        if reason := _may_be_remainder(held.winner, found, steps, fields):
-            found.failures[name] = reason
-            remainders.add(name)
-            continue
-        if rival := generic_rival(found.state, state, fields, fold_of):
+        nameless = _may_be_remainder(held.winner, found, steps, fields)
+        if not nameless and (rival := generic_rival(found.state, state, fields, fold_of)):
+            nameless = f"{rival} does the same, and better, without a name"
+        if nameless:
             # Smaller effects cannot be named while the largest part of what is missing has no name.
-            found.failures[name] = f"{rival} does the same, and better, without a name"
+            found.failures[name] = nameless
             break
         found.added.append(added)
         steps[name] = (found.state, state)
