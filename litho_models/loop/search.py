@@ -73,9 +73,7 @@ def search_effects(
 
     def contest(state: State, holder: tuple[str, State] | None = None) -> Contest:
         candidates = [
-            effect
-            for effect in screened_effects()
-            if effect.name not in {*exclude, *state.fits.chain.names}
+            effect for effect in screened_effects() if effect.name not in {*exclude, *state.fits.chain.names}
         ]
         return hold_contest(
             state,
