@@ -25,7 +25,8 @@ from torch import Tensor
 from benchmarks import side_by_side
 from benchmarks.plain_pbl import PlainPbl
 from benchmarks.predict import SIDES, gradient_gflop
-from benchmarks.side_by_side import Arrays, Work, load_pbl
+from benchmarks.side_by_side import Arrays, Work
+from benchmarks.trained_pbl import load_pbl
 from litho_design.hoe import HoeTask
 from litho_design.hologram import image_error
 from litho_design.optimise import make_parametrisation

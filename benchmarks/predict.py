@@ -17,7 +17,8 @@ import torch
 
 from benchmarks import side_by_side
 from benchmarks.plain_pbl import PlainPbl
-from benchmarks.side_by_side import Arrays, Work, areawise_gflop, load_pbl, random_layout
+from benchmarks.side_by_side import Arrays, Work
+from benchmarks.trained_pbl import areawise_gflop, load_pbl, random_layout
 from litho_models import load_frozen
 from litho_models.models.pbl import PblConfig
 

@@ -15,7 +15,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,6 @@ import torch
 
 from benchmarks.record import origin, publish, usable_cores, write_record
 from litho_models import zoo
-from litho_models.models.pbl import Pbl, PblConfig
 
 PAGE = Path(__file__).parents[1] / "docs" / "speed.md"
 RESULTS = PAGE.parent / "results" / "speed"
@@ -145,12 +143,6 @@ def as_markdown(record: Mapping[str, Any]) -> str:
     )
 
 
-def areawise_gflop(config: PblConfig, pixels: int) -> float:
-    """Multiplications and additions of the 3 x 3 layers on so many pixels, one way, GFLOP."""
-    widths = (1, *config.areawise_channels, 1)
-    return 2 * 9 * sum(a * b for a, b in pairwise(widths)) * pixels / 1e9
-
-
 def peak_gflops(dtype: torch.dtype, repeats: int = 12) -> float:
     """Best rate of a large matrix product on the threads in use, GFLOP/s."""
     square = torch.ones(_MATRIX, _MATRIX, dtype=dtype)
@@ -160,25 +152,6 @@ def peak_gflops(dtype: torch.dtype, repeats: int = 12) -> float:
         square @ square
         seconds.append(time.perf_counter() - started)
     return 2 * _MATRIX**3 / min(seconds) / 1e9
-
-
-def load_pbl(folder: Path) -> Pbl:
-    """The trained PBL in a folder, with weights that learn."""
-    from litho_models.freeze import load_simulator
-    from litho_models.model_card import ModelCard
-
-    model = load_simulator(folder, ModelCard.read(folder))
-    assert isinstance(model, Pbl)
-    return model
-
-
-def random_layout(config: PblConfig, size_px: int, batch: int = 1) -> torch.Tensor:
-    """Random levels on squares of 4 px, heights in µm (batch, 1, size, size)."""
-    generator = torch.Generator().manual_seed(0)
-    cells = -(-size_px // 4)
-    level = torch.randint(0, config.levels, (batch, 1, cells, cells), generator=generator).float()
-    level = level.repeat_interleave(4, -1).repeat_interleave(4, -2)[..., :size_px, :size_px]
-    return (level * config.level_height_um).contiguous()
 
 
 def relative_percent(difference: np.ndarray, reference: np.ndarray) -> float:

@@ -18,7 +18,8 @@ import torch
 
 from benchmarks import side_by_side
 from benchmarks.plain_pbl import PlainPbl
-from benchmarks.side_by_side import Arrays, Work, areawise_gflop, load_pbl, random_layout
+from benchmarks.side_by_side import Arrays, Work
+from benchmarks.trained_pbl import areawise_gflop, load_pbl, random_layout
 from litho_models.models.pbl import PblConfig
 from litho_models.simulator import crop_border
 from litho_models.training.crops import Window, in_passes

@@ -11,14 +11,8 @@ import torch
 from benchmarks import hoe_iteration, predict, train_step
 from benchmarks.plain_pbl import PlainPbl
 from benchmarks.record import NOT_MEASURED, published
-from benchmarks.side_by_side import (
-    PAGE,
-    RESULTS,
-    areawise_gflop,
-    as_markdown,
-    random_layout,
-    relative_percent,
-)
+from benchmarks.side_by_side import PAGE, RESULTS, as_markdown, relative_percent
+from benchmarks.trained_pbl import areawise_gflop, random_layout
 from litho_models.freeze import save_frozen
 from litho_models.models import build_model
 from litho_models.simulator import crop_border

@@ -1,0 +1,34 @@
+"""The trained PBL whose speed is measured: its weights, a layout for it, the work in its layers."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import torch
+
+from litho_models.freeze import load_simulator
+from litho_models.model_card import ModelCard
+from litho_models.models.pbl import Pbl, PblConfig
+
+
+def load_pbl(folder: Path) -> Pbl:
+    """The trained PBL in a folder, with weights that learn."""
+    model = load_simulator(folder, ModelCard.read(folder))
+    assert isinstance(model, Pbl)
+    return model
+
+
+def random_layout(config: PblConfig, size_px: int, batch: int = 1) -> torch.Tensor:
+    """Random levels on squares of 4 px, heights in µm (batch, 1, size, size)."""
+    generator = torch.Generator().manual_seed(0)
+    cells = -(-size_px // 4)
+    level = torch.randint(0, config.levels, (batch, 1, cells, cells), generator=generator).float()
+    level = level.repeat_interleave(4, -1).repeat_interleave(4, -2)[..., :size_px, :size_px]
+    return (level * config.level_height_um).contiguous()
+
+
+def areawise_gflop(config: PblConfig, pixels: int) -> float:
+    """Multiplications and additions of the 3 x 3 layers on so many pixels, one way, GFLOP."""
+    widths = (1, *config.areawise_channels, 1)
+    return 2 * 9 * sum(a * b for a, b in pairwise(widths)) * pixels / 1e9
