@@ -14,8 +14,8 @@ from litho_data.files import file_sha256
 if TYPE_CHECKING:
     import pooch
 
-CARDS = Path(__file__).parents[1] / "datasets"
-"""The cards that come with the project: they lie beside the packages in a source checkout."""
+CARDS = Path(__file__).parent / "datasets"
+"""The cards that come with the package; in a source checkout a link to the folder beside the packages."""
 
 
 def fetch(dataset: str | Path, into: str | Path | None = None) -> Path:

@@ -6,11 +6,13 @@ import functools
 import hashlib
 import http.server
 import threading
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+import litho_data
 from litho_data.errors import InputError
 from litho_data.fetch import CARDS, fetch
 
@@ -130,6 +132,16 @@ def test_unknown_names_and_bad_registries(served: Served, tmp_path: Path) -> Non
     served.card.write_text(served.card.read_text(encoding="utf-8").split("[source]")[0], encoding="utf-8")
     with pytest.raises(InputError, match="no \\[source\\]"):
         fetch(served.card, tmp_path / "into")
+
+
+def test_the_cards_are_part_of_an_installed_package() -> None:
+    package = Path(litho_data.__file__).parent
+    settings = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))
+    shipped = settings["tool"]["setuptools"]["package-data"]["*"]
+    assert CARDS.parent == package
+    files = list(CARDS.iterdir())
+    assert {file.suffix for file in files} >= {".toml", ".sha256"}
+    assert all(any(file.match(pattern) for pattern in shipped) for file in files)
 
 
 @pytest.mark.measured
