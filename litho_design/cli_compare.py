@@ -24,6 +24,7 @@ from litho_design.cli_options import (
     ObjectPx,
     Objects,
     Out,
+    PitchUm,
     Risk,
     RiskTail,
     RiskWeight,
@@ -60,6 +61,7 @@ def compare(
     target: Annotated[str, typer.Option(help=f"For hoe: {TARGET_HELP}")] = "text",
     variant: Variant = "default",
     size_px: SizePx = None,
+    pitch_um: PitchUm = None,
     distance_um: Annotated[float | None, typer.Option(help="Image distance or focal length, µm.")] = None,
     wavelength_um: WavelengthUm = None,
     index_step: IndexStep = None,
@@ -97,6 +99,7 @@ def compare(
 
     options: dict[str, Any] = {
         "size_px": size_px,
+        "pitch_um": pitch_um,
         "distance_um": distance_um,
         "wavelength_um": wavelength_um,
         "index_step": index_step,

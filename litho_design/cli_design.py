@@ -28,6 +28,7 @@ from litho_design.cli_options import (
     Objects,
     Out,
     Parametrisation,
+    PitchUm,
     Risk,
     RiskTail,
     RiskWeight,
@@ -62,6 +63,7 @@ def hoe(
     target: Annotated[str, typer.Option(help=TARGET_HELP)] = "text",
     variant: Variant = "default",
     size_px: SizePx = None,
+    pitch_um: PitchUm = None,
     distance_um: Annotated[float | None, typer.Option(help="Distance to the image plane, µm.")] = None,
     wavelength_um: WavelengthUm = None,
     index_step: IndexStep = None,
@@ -94,7 +96,7 @@ def hoe(
     from litho_design.targets import make_target
 
     settings = hoe_settings(
-        variant, size_px=size_px, distance_um=distance_um, wavelength_um=wavelength_um,
+        variant, size_px=size_px, pitch_um=pitch_um, distance_um=distance_um, wavelength_um=wavelength_um,
         index_step=index_step, cell_um=cell_um, levels=levels, level_height_um=level_height_um,
         iterations=iterations, start=start, parametrisation=parametrisation, learning_rate=learning_rate,
         precision=precision, samples=robust_samples, risk=risk, weight=risk_weight, tail=risk_tail,
@@ -119,6 +121,7 @@ def lens(
     ] = "direct",
     variant: Variant = "default",
     size_px: SizePx = None,
+    pitch_um: PitchUm = None,
     focal_length_um: Annotated[float | None, typer.Option(help="Focal length, µm.")] = None,
     wavelength_um: WavelengthUm = None,
     index_step: IndexStep = None,
@@ -155,8 +158,8 @@ def lens(
     from litho_design.printer import load_printer
 
     settings = lens_settings(
-        variant, task, size_px=size_px, distance_um=focal_length_um, wavelength_um=wavelength_um,
-        index_step=index_step, cell_um=cell_um, levels=levels,
+        variant, task, size_px=size_px, pitch_um=pitch_um, distance_um=focal_length_um,
+        wavelength_um=wavelength_um, index_step=index_step, cell_um=cell_um, levels=levels,
         level_height_um=level_height_um, window_px=window_px, object_px=object_px, iterations=iterations,
         start=start, parametrisation=parametrisation, learning_rate=learning_rate, precision=precision,
         samples=robust_samples, risk=risk, weight=risk_weight, tail=risk_tail, gain_sd=gain_sd,

@@ -30,7 +30,10 @@ Variant = Annotated[
     Literal["default", "paper", "authors"],
     typer.Option(help="Preset: ours, as printed in the paper, or as in the authors' code."),
 ]
-SizePx = Annotated[int | None, typer.Option(help="Side of the element in pixels of 0.1 µm.")]
+SizePx = Annotated[int | None, typer.Option(help="Side of the element, pixels.")]
+PitchUm = Annotated[
+    float | None, typer.Option(help="Side of a pixel, µm: that of the model; 0.1 by default.")
+]
 Levels = Annotated[int | None, typer.Option(help="Number of printable levels.")]
 LevelHeight = Annotated[float | None, typer.Option(help="Height of one level, µm.")]
 CellUm = Annotated[
@@ -114,7 +117,7 @@ def lens_settings(variant: Any, task: Any, **options: Any) -> LensSettings:
 
 # Which part of the settings an option belongs to; options of the search are the rest.
 _PART = {
-    **dict.fromkeys(("size_px", "cell_um", "levels", "level_height_um"), "layout"),
+    **dict.fromkeys(("size_px", "pitch_um", "cell_um", "levels", "level_height_um"), "layout"),
     **dict.fromkeys(("distance_um", "wavelength_um", "index_step"), "optics"),
     "window_px": "view",
     "object_px": "imaging",

@@ -143,6 +143,40 @@ def test_commands_design_score_and_compare(tmp_path, affine_folder):
     assert {record.run.commit, score["commit"], gap["commit"]} == {code_commit()}
 
 
+@pytest.mark.parametrize(
+    "task",
+    [
+        ("hoe", "--distance-um", "30"),
+        ("lens", "--focal-length-um", "60", "--window-px", "64", "--cell-um", "0.2"),
+    ],
+)
+def test_a_model_of_another_pitch_designs_on_its_own(tmp_path, monkeypatch, task):
+    simulator_class = model_class("affine")
+    coarse = save_frozen(simulator_class(simulator_class.Config(pitch_um=0.2)), tmp_path / "coarse")
+    common = (
+        "--model",
+        coarse,
+        "--out",
+        tmp_path / "d",
+        "--size-px",
+        96,
+        "--pitch-um",
+        0.2,
+        "--iterations",
+        2,
+    )
+    monkeypatch.setattr(sys, "argv", ["litho-design", *task, *map(str, common)])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 0
+    layout = Design.read(tmp_path / "d").layout
+    assert (layout.pitch_um, layout.size_um) == (0.2, pytest.approx(19.2))
+    levels = np.load(tmp_path / "d" / "layout_level.npy")
+    # A hologram's free cell of 0.4 µm is two of these pixels wide, a lens has its symmetry.
+    same = (levels[::2, ::2], levels[1::2, 1::2]) if task[0] == "hoe" else (levels, levels[::-1].T)
+    assert np.array_equal(*same)
+
+
 def test_an_odd_picture_is_adapted_and_the_adaptation_is_told(tmp_path, capsys, monkeypatch):
     picture = np.zeros((40, 90), np.uint8)
     picture[10:30, 20:70] = 200
