@@ -27,21 +27,26 @@ class EnsembleRecord(Record):
     disagreement_waves: float
 
 
-def disagreement_um(heights_um: Tensor) -> Tensor:
-    """RMS over the pixels of the standard deviation between models, µm; differentiable.
+def disagreement_um(heights_um: Tensor, area: Tensor | None = None) -> Tensor:
+    """RMS over the area of the standard deviation between models, µm; differentiable.
 
     A constant height is a constant phase, so every print is first freed of its mean.
 
     Args:
         heights_um: prints of one layout by k models, (k, ...).
+        area: what each height stands for, (...), in any unit: rings grow outwards; None for pixels.
     """
     flat = heights_um.flatten(1)
-    free = flat - flat.mean(1, keepdim=True)
-    return (free.var(0, correction=0).mean() + _SMALLEST_VARIANCE_UM2).sqrt()
+    share = torch.ones_like(flat[0]) if area is None else area.flatten()
+    share = share / share.sum()
+    free = flat - (flat * share).sum(1, keepdim=True)
+    return ((free.var(0, correction=0) * share).sum() + _SMALLEST_VARIANCE_UM2).sqrt()
 
 
-def penalised(loss: Tensor, heights_um: list[Tensor], weight: float, wave_height_um: float) -> Tensor:
+def penalised(
+    loss: Tensor, heights_um: list[Tensor], weight: float, wave_height_um: float, area: Tensor | None = None
+) -> Tensor:
     """``loss`` + weight * disagreement in waves; the loss itself where there is one model only."""
     if len(heights_um) == 1 or weight == 0:
         return loss
-    return loss + weight * disagreement_um(torch.stack(heights_um)) / wave_height_um
+    return loss + weight * disagreement_um(torch.stack(heights_um), area) / wave_height_um

@@ -116,7 +116,10 @@ class LensTask:
         loss, parts = windowed_loss(
             prints, self.scenes, self._loss, settings.window, settings.layout.pitch_um
         )
-        return penalised(loss, prints, settings.ensemble.weight, settings.optics.wave_height_um), parts
+        bench = self.scenes[0][1]
+        area = bench.propagator.ring_area_um2.to(loss) if isinstance(bench, RadialLensBench) else None
+        wave_um = settings.optics.wave_height_um
+        return penalised(loss, prints, settings.ensemble.weight, wave_um, area), parts
 
     def _loss(self, height_um: Tensor, bench: LensBench | RadialLensBench) -> tuple[Tensor, dict[str, float]]:
         psf = bench(height_um)

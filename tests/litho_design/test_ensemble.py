@@ -10,7 +10,9 @@ from litho_design.design import LEVELS_FILE, Design
 from litho_design.ensemble import disagreement_um, penalised
 from litho_design.hoe import HoeTask, design_hoe
 from litho_design.lens import design_lens
-from litho_design.parametrise import LayoutSettings
+from litho_design.lens_bench import LensView, RadialLensBench
+from litho_design.optics import Optics
+from litho_design.parametrise import CellMap, LayoutSettings
 from litho_design.printer import Printer
 from litho_design.settings import lens_preset
 from litho_design.targets import make_target
@@ -24,6 +26,20 @@ def test_disagreement_is_the_rms_spread_without_the_datum():
     loss = torch.tensor(2.0)
     assert float(penalised(loss, list(apart), 3.0, 0.5)) == pytest.approx(2 + 3 * 0.1 / 0.5, rel=1e-5)
     assert penalised(loss, [pattern], 3.0, 0.5) is loss
+
+
+def test_rings_count_by_their_area():
+    layout = LayoutSettings(size_px=200, cell_um=0.1, symmetry="radial")
+    rings = torch.stack([torch.linspace(0, 1, 100), torch.linspace(0, 1, 100) ** 3])
+    bench = RadialLensBench(layout, Optics(distance_um=40.0), LensView(window_px=64))
+    plane = CellMap(layout)
+    inside = plane(torch.arange(plane.cells[0])) < 100
+    spread = torch.nn.functional.pad(rings, (0, plane.cells[0] - 100))
+    pixels = torch.stack([plane(profile)[inside] for profile in spread])
+    weighted = disagreement_um(rings, bench.propagator.ring_area_um2.float())
+    # Rings of whole pixels: the outermost ones hold a per cent more or less than their area.
+    assert float(weighted) == pytest.approx(float(disagreement_um(pixels)), rel=0.01)
+    assert abs(float(disagreement_um(rings)) / float(weighted) - 1) > 0.05
 
 
 def test_where_all_models_agree_there_is_no_penalty_and_a_finite_gradient():
