@@ -20,7 +20,9 @@ from pathlib import Path
 from benchmarks.gap.cost import as_text, estimate, read_records, run_trial, trial_job
 from benchmarks.gap.document import publish_results, write_results
 from benchmarks.gap.jobs import run_jobs
-from benchmarks.gap.plan import Effort, Plan, Task, chosen, fab_jobs, model_jobs, open_plan, proof_jobs, tasks
+from benchmarks.gap.plan import Effort, Plan, open_plan
+from benchmarks.gap.steps import fab_jobs, model_jobs, proof_jobs
+from benchmarks.gap.tasks import Task, chosen, tasks
 from litho_data.errors import InputError
 from litho_models import zoo
 

@@ -11,8 +11,9 @@ from typing import Any
 
 import torch
 
-from benchmarks.gap.jobs import Job
-from benchmarks.gap.plan import Effort, Task, module_command
+from benchmarks.gap.jobs import Job, module_command
+from benchmarks.gap.plan import Effort
+from benchmarks.gap.tasks import Task
 from benchmarks.record import write_record
 
 # A step of training takes about this long on one core (24 fields of 512 x 512 px); the rest is small.

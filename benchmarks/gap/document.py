@@ -11,7 +11,8 @@ from typing import Any
 import pandas as pd
 
 from benchmarks.gap.figures import draw_images, draw_lens
-from benchmarks.gap.plan import ARMS, Plan, Task
+from benchmarks.gap.plan import ARMS, Plan
+from benchmarks.gap.tasks import Task
 from benchmarks.record import origin, publish, usable_cores, write_record
 from litho_design.compare import HEADLINE, GapResult
 from litho_design.design import Design

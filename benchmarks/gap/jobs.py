@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import subprocess
+import sys
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -13,6 +14,7 @@ from pathlib import Path
 
 from litho_data.errors import InputError
 
+_BIN = Path(sys.executable).parent
 # One thread per process: processes side by side use the cores better than threads within one.
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
@@ -50,6 +52,21 @@ def run_jobs(jobs: Sequence[Job], logs: Path, workers: int) -> None:
         raise InputError(
             f"step {failed[0]}", got="a failed command", hint=f"its output is in {_log(logs, failed[0])}"
         )
+
+
+def command(program: str, *words: object) -> tuple[str, ...]:
+    """A program of this environment as a command."""
+    return (str(_BIN / program), *map(str, words))
+
+
+def design_command(*words: object) -> tuple[str, ...]:
+    """A command of ``litho-design``."""
+    return command("litho-design", *words)
+
+
+def module_command(*words: object) -> tuple[str, ...]:
+    """This benchmark itself as a command."""
+    return (sys.executable, "-m", "benchmarks.gap", *map(str, words))
 
 
 def _run(job: Job, logs: Path, failed: list[str]) -> float:

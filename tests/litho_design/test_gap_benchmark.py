@@ -11,7 +11,8 @@ from typer.testing import CliRunner
 from benchmarks.gap.cost import estimate
 from benchmarks.gap.document import as_markdown
 from benchmarks.gap.jobs import Job, run_jobs
-from benchmarks.gap.plan import ARMS, PRINT_KNOBS, Effort, Task, chosen, open_plan, tasks
+from benchmarks.gap.plan import ARMS, PRINT_KNOBS, Effort, open_plan
+from benchmarks.gap.tasks import Task, chosen, tasks
 from litho_data.errors import InputError
 from litho_data.virtual_fab import KnobSetting, knob_rms_nm
 from litho_data.virtual_fab.settings import Printer

@@ -1,0 +1,94 @@
+"""What is done around the designs: the fab prints, every arm is trained and tested, one proof at the end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from benchmarks.gap.jobs import Job, command, design_command
+from benchmarks.gap.plan import ARMS, PRINT_KNOBS, SCAN_KNOBS, Effort, model, store
+
+# The machine is one and the same in training and test prints: its draws have a seed of their own.
+_MACHINE_SEED = 0
+
+
+def fab_jobs(out: Path, effort: Effort) -> list[list[Job]]:
+    """Print and scan training and test fields, build their stores: stages of jobs that may run together."""
+    prints = [("fab", effort.scans, 0), ("test-fab", max(2, effort.scans // 4), 1)]
+    simulate = [
+        Job(
+            name,
+            command(
+                "litho-data", "simulate", "--out", out / name, "--count", count, "--size", effort.scan_px,
+                "--seed", seed, *_knob_options(),
+            ),
+            out / name / "truth" / "truth.json",
+        )
+        for name, count, seed in prints
+    ]  # fmt: skip
+    build = [
+        Job(
+            f"{name}-store",
+            command("litho-data", "build", out / name / "raw" / "card.toml", "--out", store(out, name)),
+            store(out, name),
+        )
+        for name, _, _ in prints
+    ]
+    return [simulate, build]
+
+
+def model_jobs(out: Path, effort: Effort) -> list[list[Job]]:
+    """Train, freeze and test every arm; the longest training first."""
+    names = [arm for arm in reversed(ARMS) if arm != "none"]
+    train = [
+        Job(
+            f"train-{name}",
+            command(
+                "litho-models", "train", store(out, "fab"), "--model", name,
+                "--steps", effort.training_steps, "--out", out / "runs" / name,
+            ),
+            out / "runs" / name / "run.json",
+        )
+        for name in names
+    ]  # fmt: skip
+    freeze = [
+        Job(
+            f"freeze-{name}",
+            command("litho-models", "freeze", out / "runs" / name, "--out", model(out, name)),
+            model(out, name) / "card.json",
+        )
+        for name in names
+    ]
+    test = [
+        Job(
+            f"test-{name}",
+            command(
+                "litho-models", "evaluate", model(out, name), store(out, "test-fab"),
+                "--out", out / "test" / name,
+            ),
+            out / "test" / name / "evaluation.json",
+        )
+        for name in names
+    ]  # fmt: skip
+    return [train, freeze, test]
+
+
+def proof_jobs(out: Path, effort: Effort) -> list[Job]:
+    """One hologram through PBL with the 1,000 iterations of the paper, and what the fab prints of it."""
+    folder = out / "proof" / "design"
+    design = design_command(
+        "hoe", "--model", model(out, "pbl"), "--target", "text", "--size-px", effort.hoe_px,
+        "--distance-um", effort.hoe_distance_um, "--iterations", 1000, "--precision", effort.search_precision,
+        "--out", folder,
+    )  # fmt: skip
+    judge = ("--judge", f"fab={out / 'fab' / 'truth'}")
+    score = design_command("score", folder, *judge, "--out", out / "proof" / "score")
+    return [
+        Job("proof", design, folder / "design.json"),
+        Job("proof-score", score, out / "proof" / "score" / "score.json"),
+    ]
+
+
+def _knob_options() -> list[str]:
+    settings = [f"{name}={value}@{_MACHINE_SEED}" for name, value in PRINT_KNOBS.items()]
+    settings += [f"{name}={value}" for name, value in SCAN_KNOBS.items()]
+    return [word for setting in settings for word in ("--knob", setting)]
