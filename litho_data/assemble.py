@@ -167,7 +167,8 @@ def _row(record: Record) -> dict[str, Any]:
 
 def _identity(record: Record) -> dict[str, Any]:
     hashes = {output["name"]: output["sha256"] for step in record["steps"] for output in step["outputs"]}
-    arrays = {variable.name: hashes[variable.name] for variable in SAMPLE_VARIABLES}
+    names = [*(variable.name for variable in SAMPLE_VARIABLES), "bend_um"]
+    arrays = {name: hashes[name] for name in names if name in hashes}
     return {**{key: record[key] for key in ("id", "print", "order")}, **record["columns"], "arrays": arrays}
 
 

@@ -38,6 +38,7 @@ _TABLE = {
     "tre_p95_nm": "held-out error, p95 [nm]",
     "corner_sd_nm": "corner spread [nm]",
     "overlap": "overlap",
+    "bend_um": "bend [µm]",
     "rotation_deg": "rotation [deg]",
     "singular_min": "scale, least",
     "singular_max": "scale, most",

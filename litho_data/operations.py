@@ -162,7 +162,9 @@ def _locate(
     if not found.quality.passed:
         raise InputError(f"registration before levelling failed: {found.quality.reason}")
     shape, pitch_um = (raw.shape[0], raw.shape[1]), tuple(params["scan_pitch_um"])
-    level = layout_in_scan_frame(layout, found.scan_to_layout, shape, pitch_um, params["layout_pitch_um"])
+    level = layout_in_scan_frame(
+        layout, found.scan_to_layout, shape, pitch_um, params["layout_pitch_um"], found.bend_um
+    )
     return {"layout_in_scan": level.astype(np.float32)}, {}
 
 
@@ -190,7 +192,10 @@ def _register(
         oblong = abs(pitch_y_um / pitch_x_um - 1) > _OBLONG
         pixels = f"pixels of {pitch_y_um:.4g} × {pitch_x_um:.4g} µm (y × x): are rows missing?"
         raise InputError(f"registration failed: {found.quality.reason}", hint=pixels if oblong else "")
-    return {"scan_to_layout": found.scan_to_layout}, asdict(found.quality)
+    if found.bend_um is None:
+        return {"scan_to_layout": found.scan_to_layout}, asdict(found.quality)
+    arrays_found = {"scan_to_layout": found.scan_to_layout, "bend_um": found.bend_um.amount}
+    return arrays_found, asdict(found.quality) | found.bend_um.figures
 
 
 def _registration(height_um: np.ndarray, layout_level: np.ndarray, params: Mapping[str, Any]) -> Registration:
@@ -209,14 +214,17 @@ def _registration(height_um: np.ndarray, layout_level: np.ndarray, params: Mappi
 def _resample(
     params: Mapping[str, Any], _: Sequence[Path], arrays: Mapping[str, np.ndarray]
 ) -> tuple[Arrays, Facts]:
-    from litho_data.register import resample_to_layout
+    from litho_data.register import Bend, resample_to_layout
 
+    levelled, pitch_um = arrays["levelled_height_um"], tuple(params["scan_pitch_um"])
+    bent = "bend_um" in arrays
     height, valid = resample_to_layout(
-        arrays["levelled_height_um"].astype(np.float64),
+        levelled.astype(np.float64),
         arrays["scan_to_layout"],
         tuple(params["layout_shape"]),
-        scan_pitch_um=tuple(params["scan_pitch_um"]),
+        scan_pitch_um=pitch_um,
         layout_pitch_um=params["layout_pitch_um"],
+        bend_um=Bend.of_scan(arrays["bend_um"], levelled.shape, pitch_um) if bent else None,
     )
     return {"height_um": height, "valid": valid}, {}
 

@@ -71,6 +71,7 @@ def measured_print(
         levels.shape,
         scan_pitch_um=pitch,
         layout_pitch_um=layout.pitch_um,
+        bend_um=registration.bend_um,
     )
     coverage = float(valid.mean())
     if coverage < _SMALLEST_COVERAGE:

@@ -9,12 +9,15 @@ one residual correlation length, so every pixel is scored once and never near a 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from litho_data.errors import InputError
+
+if TYPE_CHECKING:
+    from litho_data.register import Bend
 
 Policy = Literal["none", "offset", "offset-gain", "full", "full+rows"]
 POLICIES: tuple[Policy, ...] = get_args(Policy)
@@ -183,19 +186,28 @@ def shrunk_line_offsets(
     return weight * (line_mean - line_mean[seen].mean()), weight, variance
 
 
-def scan_line_index(shape: tuple[int, int], scan_to_layout: np.ndarray, pitch_um: float) -> NDArray[np.intp]:
+def scan_line_index(
+    shape: tuple[int, int], scan_to_layout: np.ndarray, pitch_um: float, bend_um: Bend | None = None
+) -> NDArray[np.intp]:
     """Index of the scan line (constant y in the scan's frame) under each layout pixel, (ny, nx), from 0.
 
     Args:
         shape: (ny, nx) of the layout.
         scan_to_layout: 3 x 3, maps (x_um, y_um, 1) of the scan frame to the layout frame.
         pitch_um: layout pitch; lines are counted in the same steps.
+        bend_um: of a bent scan, which ``scan_to_layout`` does not contain.
     """
     y, x = np.meshgrid(*((np.arange(n) + 0.5) * pitch_um for n in shape), indexing="ij")
     inverse = np.linalg.inv(np.asarray(scan_to_layout, np.float64))
     scan_y = (inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]) / (
         inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2]
     )
+    if bend_um is not None:
+        scan_x = (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2]) / (
+            inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2]
+        )
+        # What the scan does not show is given to its first or last line.
+        scan_y = np.clip(bend_um.undo(scan_x, scan_y)[1], 0, 2 * bend_um.half[1])
     line = np.floor(scan_y / pitch_um).astype(np.intp)
     return line - line.min()
 

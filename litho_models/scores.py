@@ -76,7 +76,7 @@ def score_model(
     for scan, expected in zip(scans, maps, strict=True):
         arrays = (scan.height_um, expected, scan.valid)
         residuals.append(cross_fitted_residual(*arrays, protocol.policy, **geometry).residual_um)
-        line = scan_line_index(scan.shape, scan.scan_to_layout, scan.pitch_um)
+        line = scan_line_index(scan.shape, scan.scan_to_layout, scan.pitch_um, scan.bend_um)
         rows.append(cross_fitted_residual(*arrays, "full+rows", **geometry).row_sd_um)
         lines.append(cross_fitted_residual(*arrays, "full+rows", scan_line=line, **geometry).row_sd_um)
     shapes = [

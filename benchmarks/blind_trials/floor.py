@@ -26,8 +26,8 @@ _UNFORESEEABLE = {"scan-line-stripes", "quantisation"}
 def true_floor(truth: Truth, jobs: Sequence[Job], store: Store, result: CloseLoop) -> ErrorPair:
     """Held-out error of the noise-free scans with every effect in place, nm.
 
-    They are brought onto the layout by the transform that the store has for each scan, and scored as
-    the loop scores its final model: development scans, same pixels, same terms per scan.
+    They are brought onto the layout by the transform (and bend) that the store has for each scan, and
+    scored as the loop scores its final model: development scans, same pixels, same terms per scan.
     """
     fab = _without_noise(truth)
     by_id = {job.id: job for job in jobs}
@@ -42,6 +42,7 @@ def true_floor(truth: Truth, jobs: Sequence[Job], store: Store, result: CloseLoo
             scan.shape,
             scan_pitch_um=(found.frame.pitch_um, found.frame.pitch_um),
             layout_pitch_um=scan.pitch_um,
+            bend_um=scan.bend_um,
         )
         predictions.append(np.where(valid, height, np.float32(np.nanmean(height))))
     stripes = any(knob.name == "scan-line-stripes" for knob in truth.knobs)

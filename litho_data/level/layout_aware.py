@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy import ndimage
 
 from litho_data.errors import InputError
 from litho_data.level.polynomial import Terms, evaluate, polynomial_terms
 from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
+
+if TYPE_CHECKING:
+    from litho_data.register.bend import Bend
 
 # Below it background and structure cannot be told apart in double precision with noise on top.
 _SINGULAR = 1e-9
@@ -66,12 +71,14 @@ def layout_in_scan_frame(
     scan_shape: tuple[int, int],
     scan_pitch_um: tuple[float, float],
     layout_pitch_um: float,
+    bend_um: Bend | None = None,
 ) -> np.ndarray:
     """The level of the layout pixel under each scan pixel; NaN outside the layout.
 
     Args:
         layout_level: (ny, nx) levels.
         scan_to_layout: 3 x 3, maps (x_um, y_um, 1) of the scan's frame to the layout's.
+        bend_um: of a bent scan; ``scan_to_layout`` then acts on the straightened places.
 
     Returns:
         float64 of ``scan_shape``. Nearest pixel: levels are labels and must not be mixed.
@@ -79,6 +86,9 @@ def layout_in_scan_frame(
     y_um = (np.arange(scan_shape[0]) + 0.5) * scan_pitch_um[0]
     x_um = (np.arange(scan_shape[1]) + 0.5) * scan_pitch_um[1]
     grid_y, grid_x = np.meshgrid(y_um, x_um, indexing="ij")
+    if bend_um is not None:
+        shift_x, shift_y = bend_um.shift(grid_x, grid_y)
+        grid_x, grid_y = grid_x + shift_x, grid_y + shift_y
     mapped = np.tensordot(scan_to_layout, np.stack([grid_x, grid_y, np.ones_like(grid_x)]), axes=1)
     column = np.floor(mapped[0] / mapped[2] / layout_pitch_um).astype(int)
     row = np.floor(mapped[1] / mapped[2] / layout_pitch_um).astype(int)

@@ -1,5 +1,6 @@
 """Registration of AFM scans onto the layouts they were printed from."""
 
+from litho_data.register.bend import Bend
 from litho_data.register.geometry import apply_transform
 from litho_data.register.quality import RegistrationQuality, Thresholds
 from litho_data.register.resample import resample_to_layout
@@ -7,6 +8,7 @@ from litho_data.register.scan import Registration, centred_placement, register_s
 from litho_data.register.topography import predicted_topography, smooth_measured
 
 __all__ = [
+    "Bend",
     "Registration",
     "RegistrationQuality",
     "Thresholds",

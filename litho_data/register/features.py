@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from litho_data.register.bend import Bend
 from litho_data.register.geometry import apply_transform
 from litho_data.register.topography import fill_gaps, predicted_topography, smooth_measured
 
@@ -41,10 +42,12 @@ class Correspondence:
         """Area spanned by the inliers as a share of the pixels where scan and layout overlap."""
         return self.hull_px2 / max(float(overlap.sum()), 1.0)
 
-    def reprojection_px(self, layout_to_scan: np.ndarray) -> float:
-        """Root mean square distance of the inliers from a warp, scan pixels."""
+    def reprojection_px(self, layout_to_scan: np.ndarray, bend: Bend | None = None) -> float:
+        """Root mean square distance of the inliers from a warp, scan pixels; of a bent scan, straightened."""
         moved = apply_transform(layout_to_scan, self.layout_points[self.inlier])
-        return float(np.sqrt(((moved - self.scan_points[self.inlier]) ** 2).sum(axis=1).mean()))
+        found = self.scan_points[self.inlier]
+        found = found if bend is None else bend.straighten(found)
+        return float(np.sqrt(((moved - found) ** 2).sum(axis=1).mean()))
 
 
 def match_features(

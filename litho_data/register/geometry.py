@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from litho_data.register.bend import Bend
+
 # name: (transpose, then flip rows, then flip columns); the operation that turns the scan onto the layout.
 ORIENTATIONS: dict[str, tuple[bool, bool, bool]] = {
     "identity": (False, False, False),
@@ -66,17 +68,26 @@ def apply_transform(matrix: np.ndarray, points: np.ndarray) -> np.ndarray:
     return homogeneous[:, :2] / homogeneous[:, 2:]
 
 
-def warped_grid(matrix: np.ndarray, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """(rows, columns) that a 3×3 index matrix assigns to every pixel of an image."""
+def warped_grid(
+    matrix: np.ndarray, shape: tuple[int, int], bend: Bend | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """(rows, columns) that a 3×3 index matrix assigns to every pixel of an image.
+
+    With a bend of the image that the matrix leads to: the places that really are where the matrix points.
+    """
     y = np.arange(shape[0], dtype=np.float64)[:, None]
     x = np.arange(shape[1], dtype=np.float64)[None, :]
     mapped_x, mapped_y, weight = (row[0] * x + row[1] * y + row[2] for row in matrix)
-    return mapped_y / weight, mapped_x / weight
+    if bend is None:
+        return mapped_y / weight, mapped_x / weight
+    return bend.undo(mapped_x / weight, mapped_y / weight)[::-1]
 
 
-def overlap_of(layout_to_scan: np.ndarray, layout_shape: tuple[int, int], measured: np.ndarray) -> np.ndarray:
+def overlap_of(
+    layout_to_scan: np.ndarray, layout_shape: tuple[int, int], measured: np.ndarray, bend: Bend | None = None
+) -> np.ndarray:
     """Which layout pixels have their centre inside the measured part of the scan, bool (ny, nx)."""
-    rows, columns = warped_grid(layout_to_scan, layout_shape)
+    rows, columns = warped_grid(layout_to_scan, layout_shape, bend)
     ny, nx = measured.shape
     inside = (rows >= 0) & (rows <= ny - 1) & (columns >= 0) & (columns <= nx - 1)
     if measured.all():

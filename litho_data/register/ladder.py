@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from litho_data.register.flows import LADDER
 from litho_data.register.pyramid import FineFit, project_to_model
-from litho_data.register.refine import LADDER, Refinement, refine, residual_energy, solve_gram
+from litho_data.register.refine import Refinement, refine, residual_energy, solve_gram
 
 STANDARD_ERRORS = 3.0
 

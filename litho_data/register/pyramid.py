@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from litho_data.register.bend import Bend
+from litho_data.register.flows import LADDER, Model
 from litho_data.register.geometry import apply_transform, corners, linear_part, warped_grid
-from litho_data.register.refine import LADDER, Model, Refinement, refine
+from litho_data.register.refine import Refinement, refine
 from litho_data.register.topography import fill_gaps, pearson, predicted_topography, smooth_measured
 
 SCAN_BLUR_PX = 1.0
@@ -39,7 +41,37 @@ def refine_pyramid(scan: np.ndarray, layout_level: np.ndarray, start: np.ndarray
     """
     low_model: Model = "affine" if model == "homography" else model
     coarse = project_to_model(start, low_model, (layout_level.shape[0], layout_level.shape[1]))
-    matrix = coarse
+    matrix, _ = _from_coarse_to_fine(scan, layout_level, coarse, low_model, None)
+    smooth_scan = _smooth(scan, SCAN_BLUR_PX)
+    blur_px = match_blur(smooth_scan, layout_level, matrix)
+    topography = predicted_topography(layout_level, blur_px)
+    refinement = refine(smooth_scan, topography, matrix, model)
+    if not refinement.converged:
+        refinement = refine(smooth_scan, topography, coarse, model, max_iterations=0)
+    return FineFit(refinement, smooth_scan, topography, blur_px)
+
+
+def refine_bent(scan: np.ndarray, layout_level: np.ndarray, straight: FineFit) -> FineFit:
+    """Refines the best straight warp once more, as an affine and a bend of the scan.
+
+    Args:
+        scan, layout_level: as in ``refine_pyramid``.
+        straight: what it returned; it may miss by as much as the structures at a quarter resolution are wide.
+    """
+    shape = (layout_level.shape[0], layout_level.shape[1])
+    matrix = project_to_model(straight.refinement.layout_to_scan, "affine", shape)
+    bend: Bend | None = Bend.none_yet((scan.shape[0], scan.shape[1]))
+    matrix, bend = _from_coarse_to_fine(scan, layout_level, matrix, "affine", bend)
+    blur_px = match_blur(straight.scan, layout_level, matrix, bend)
+    topography = predicted_topography(layout_level, blur_px)
+    refinement = refine(straight.scan, topography, matrix, "affine", bend=bend)
+    return FineFit(refinement, straight.scan, topography, blur_px)
+
+
+def _from_coarse_to_fine(
+    scan: np.ndarray, layout_level: np.ndarray, matrix: np.ndarray, model: Model, bend: Bend | None
+) -> tuple[np.ndarray, Bend | None]:
+    """Warp and bend, refined at a quarter and at half resolution."""
     for factor in LEVELS:
         if min(*layout_level.shape, *scan.shape) < factor * SMALLEST_LEVEL_PX:
             continue
@@ -51,25 +83,23 @@ def refine_pyramid(scan: np.ndarray, layout_level: np.ndarray, start: np.ndarray
             small_scan,
             small_topography,
             scale @ matrix @ np.linalg.inv(scale),
-            low_model,
+            model,
+            bend=None if bend is None else bend.scaled(1 / factor),
             tolerance_px=0.02,
         )
         if found.converged:
             matrix = np.linalg.inv(scale) @ found.layout_to_scan @ scale
-    smooth_scan = _smooth(scan, SCAN_BLUR_PX)
-    blur_px = match_blur(smooth_scan, layout_level, matrix)
-    topography = predicted_topography(layout_level, blur_px)
-    refinement = refine(smooth_scan, topography, matrix, model)
-    if not refinement.converged:
-        refinement = refine(smooth_scan, topography, coarse, model, max_iterations=0)
-    return FineFit(refinement, smooth_scan, topography, blur_px)
+            bend = None if found.bend is None else found.bend.scaled(factor)
+    return matrix, bend
 
 
-def match_blur(smooth_scan: np.ndarray, layout_level: np.ndarray, layout_to_scan: np.ndarray) -> float:
+def match_blur(
+    smooth_scan: np.ndarray, layout_level: np.ndarray, layout_to_scan: np.ndarray, bend: Bend | None = None
+) -> float:
     """The Gaussian sigma, layout pixels, whose topography correlates best with an aligned scan."""
     from scipy.ndimage import map_coordinates
 
-    grid = warped_grid(layout_to_scan, (layout_level.shape[0], layout_level.shape[1]))
+    grid = warped_grid(layout_to_scan, (layout_level.shape[0], layout_level.shape[1]), bend)
     # Every other pixel is enough to rank blurs of half a pixel and more.
     rows, columns = grid[0][::2, ::2], grid[1][::2, ::2]
     warped = map_coordinates(fill_gaps(smooth_scan), (rows, columns), order=1, cval=np.nan)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from typing import Any
 
+from litho_data.register.bend import Bend
+
 
 @dataclass(frozen=True)
 class RegistrationQuality:
@@ -68,15 +70,20 @@ class Thresholds:
     max_layout_repeats: float = 0.9
     max_second_alignment: float = 0.9
     min_orientation_margin: float = 0.1
+    # From a slope of 1 on, two points of the scan may show the same place.
+    max_bend_slope: float = 1.0
 
 
-def judge(figures: dict[str, Any], thresholds: Thresholds, blur_px: float) -> tuple[bool, str, str]:
+def judge(
+    figures: dict[str, Any], thresholds: Thresholds, blur_px: float, bend_um: Bend | None = None
+) -> tuple[bool, str, str]:
     """(passed, reason, warning) for the figures of one registration; every failure is named.
 
     Args:
         figures: of the fit, the warp and the evidence.
         thresholds: limits of a pass.
         blur_px: sigma of the blur that makes the layout most like the scan, layout pixels.
+        bend_um: of the scan, in its own frame, if one was fitted.
     """
     low, high = thresholds.singular_range
     smallest, largest = figures["singular_min"], figures["singular_max"]
@@ -111,7 +118,13 @@ def judge(figures: dict[str, Any], thresholds: Thresholds, blur_px: float) -> tu
             f"corners known to {spread:.2f} px only" if spread == spread else "corners not determined"
         )
 
+    if bend_um is not None and not bend_um.slope < thresholds.max_bend_slope:
+        failures.append(f"bent by up to {bend_um.largest:.2f} µm, which may fold the scan")
+
     warnings = []
+    if bend_um is not None:
+        size = f"{bend_um.largest:.2f} µm"
+        warnings.append(f"scan bent by up to {size}: registered with a quadratic distortion")
     low, high = thresholds.singular_warning_range
     if not low <= smallest <= largest <= high:
         warnings.append(f"scale {smallest:.3f} to {largest:.3f}; is the pitch right?")

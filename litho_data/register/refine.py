@@ -10,39 +10,32 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 
+from litho_data.register.bend import Bend, fit_bent_affine
+from litho_data.register.flows import BENT_COUNT, GENERATORS, LADDER, Model, flows, normalisation
 from litho_data.register.geometry import apply_transform, corners, warped_grid
 from litho_data.register.topography import fill_gaps, quadratic_basis
 
-Model = Literal["translation", "euclidean", "similarity", "affine", "homography"]
-# Every rung owns the first so many generators below: the ladder is nested by construction.
-LADDER: dict[Model, int] = {"translation": 2, "euclidean": 3, "similarity": 4, "affine": 6, "homography": 8}
-_GENERATORS = np.zeros((8, 3, 3))
-_GENERATORS[0, 0, 2] = _GENERATORS[1, 1, 2] = 1.0
-_GENERATORS[2, 0, 1], _GENERATORS[2, 1, 0] = -1.0, 1.0
-_GENERATORS[3, 0, 0] = _GENERATORS[3, 1, 1] = 1.0
-_GENERATORS[4, 0, 0], _GENERATORS[4, 1, 1] = 1.0, -1.0
-_GENERATORS[5, 0, 1] = _GENERATORS[5, 1, 0] = 1.0
-_GENERATORS[6, 2, 0] = _GENERATORS[7, 2, 1] = 1.0
 NUISANCES = 7  # gain of the topography, then the six quadratic terms
 _BACKGROUND_AND_SCAN = [1, 2, 3, 4, 5, 6, -1]
 CELL_PX = 32
 # What surrounds the print is unknown (bare, or its neighbour) and blurs across the layout's border.
 BORDER_PX = 8
 TOLERANCE_PX = 1e-3
+# A bend folds from a slope of 1 on; an early step may overshoot that, but not by twice.
+HOPELESS_SLOPE = 2.0
 
 
 @dataclass(frozen=True)
 class Refinement:
     """A converged warp with what is needed to ask how well it is known.
 
-    ``layout_to_scan`` is the 3×3 index matrix; ``warped`` (ny, nx) float32 is the scan on the layout's
-    pixels, gaps filled. ``gram`` (cells_y, cells_x, k, k) holds, per cell of ``CELL_PX`` pixels, the inner
-    products of the regressors (gain, background, warp) and, last, the scan: every sub-sample of the field
-    can be refitted from it without touching a pixel.
+    ``layout_to_scan`` is the 3×3 index matrix; of a scan with a ``bend`` it leads to the straightened one.
+    ``warped`` (ny, nx) float32 is the scan on the layout's pixels, gaps filled. ``gram`` (cells_y, cells_x,
+    k, k) holds, per cell of ``CELL_PX`` pixels, the inner products of the regressors (gain, background, warp)
+    and, last, the scan: every sub-sample of the field can be refitted from it without touching a pixel.
     """
 
     model: Model
@@ -50,6 +43,7 @@ class Refinement:
     warped: np.ndarray
     gram: np.ndarray
     converged: bool
+    bend: Bend | None = None
 
     def blocks(self) -> np.ndarray:
         """``gram`` summed over blocks of two by two cells, (blocks_y, blocks_x, k, k).
@@ -82,6 +76,7 @@ def refine(
     start: np.ndarray,
     model: Model,
     *,
+    bend: Bend | None = None,
     max_iterations: int = 30,
     tolerance_px: float = TOLERANCE_PX,
 ) -> Refinement:
@@ -91,6 +86,7 @@ def refine(
         scan: (ny, nx) smoothed heights, NaN where not measured.
         topography: (ny, nx) predicted topography.
         start: 3×3 index matrix, layout to scan; it must already belong to ``model``.
+        bend: of the scan, to start from; with one the warp is an affine and a bend, whatever the model.
         max_iterations: Gauss-Newton steps at most; 0 only evaluates the start.
         tolerance_px: a step that would move no corner by more ends the iteration.
     """
@@ -98,9 +94,9 @@ def refine(
     from scipy.ndimage import map_coordinates, spline_filter
 
     shape = (topography.shape[0], topography.shape[1])
-    normalise = _normalisation(shape)
+    normalise = normalisation(shape)
     denormalise = np.linalg.inv(normalise)
-    regressors = _regressors(topography, LADDER[model])
+    regressors = _regressors(topography, LADDER[model] if bend is None else BENT_COUNT)
     border = min(BORDER_PX, min(shape) // 16)
     interior = np.pad(np.ones([n - 2 * border for n in shape], bool), border)
     measured = np.isfinite(scan)
@@ -109,7 +105,7 @@ def refine(
     matrix, converged, step_px = np.array(start, dtype=np.float64), False, np.inf
     sums = _Sums(regressors)
     for iteration in range(max_iterations + 1):
-        rows, columns = warped_grid(matrix, shape)
+        rows, columns = warped_grid(matrix, shape, bend)
         inside = interior & (rows > 0) & (rows < scan.shape[0] - 1)
         inside &= (columns > 0) & (columns < scan.shape[1] - 1)
         if not complete:
@@ -118,17 +114,27 @@ def refine(
         coefficients = solve_gram(sums.gram(warped, inside))
         if coefficients[0] <= 0:
             break
-        warp = coefficients[NUISANCES:] / coefficients[0]
-        increment = denormalise @ expm(np.einsum("k,kij->ij", warp, _GENERATORS[: len(warp)])) @ normalise
+        if bend is None:
+            warp = coefficients[NUISANCES:] / coefficients[0]
+            increment = denormalise @ expm(np.einsum("k,kij->ij", warp, GENERATORS[: len(warp)])) @ normalise
+            motion_px = apply_transform(increment, corners(shape)) - corners(shape)
+        else:
+            motion_px = corner_motion_px(coefficients, shape, corners(shape))
         previous_px = step_px
-        step_px = float(np.abs(apply_transform(increment, corners(shape)) - corners(shape)).max())
+        step_px = float(np.abs(motion_px).max())
         converged = step_px < tolerance_px
         diverges = not step_px < 0.5 * max(shape) or (iteration > 5 and step_px > 2 * previous_px)
         if converged or diverges or iteration == max_iterations:
             break
-        matrix = matrix @ np.linalg.inv(increment)
-        matrix /= matrix[2, 2]
-    return Refinement(model, matrix, warped, _cell_grams(regressors, warped, inside), converged)
+        if bend is None:
+            matrix = matrix @ np.linalg.inv(increment)
+            matrix /= matrix[2, 2]
+        else:
+            moved, further_bent = _moved_on(matrix, bend, coefficients, shape)
+            if not further_bent.slope < HOPELESS_SLOPE:
+                break
+            matrix, bend = moved, further_bent
+    return Refinement(model, matrix, warped, _cell_grams(regressors, warped, inside), converged, bend)
 
 
 def solve_gram(gram: np.ndarray) -> np.ndarray:
@@ -151,40 +157,38 @@ def corner_motion_px(coefficients: np.ndarray, shape: tuple[int, int], points: n
 
     Not finite where nothing of the topography was fitted (gain 0).
     """
-    normalise = _normalisation(shape)
+    normalise = normalisation(shape)
     with np.errstate(divide="ignore", invalid="ignore"):
         warp = coefficients[..., NUISANCES:] / coefficients[..., :1]
     unit = apply_transform(normalise, points)
-    flow = np.array([_flow(generator, *unit.T) for generator in _GENERATORS[: warp.shape[-1]]])
+    flow = np.array([np.broadcast_arrays(*one) for one in flows(warp.shape[-1], *unit.T)])
     return np.einsum("...k,kdn->...nd", warp, flow) / normalise[0, 0]
 
 
-def _normalisation(shape: tuple[int, int]) -> np.ndarray:
-    """Index coordinates to coordinates of order one about the middle, the same scale along both axes."""
-    scale = 2.0 / (max(shape) - 1)
-    ny, nx = shape
-    return np.array([[scale, 0, -scale * (nx - 1) / 2], [0, scale, -scale * (ny - 1) / 2], [0, 0, 1]])
-
-
-def _flow(generator: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity along x and y that a generator gives to normalised points; x and y broadcast."""
-    coordinates = (x, y, np.ones(1, dtype=x.dtype))
-    zero = np.zeros(1, dtype=x.dtype)
-    moved_x, moved_y, weight = (
-        sum((float(row[k]) * coordinates[k] for k in np.flatnonzero(row)), start=zero) for row in generator
-    )
-    return moved_x - weight * x, moved_y - weight * y
+def _moved_on(
+    matrix: np.ndarray, bend: Bend, coefficients: np.ndarray, shape: tuple[int, int]
+) -> tuple[np.ndarray, Bend]:
+    """The warp after a step, again as an affine and a bend: higher orders vanish with the step."""
+    y, x = (np.linspace(0, n - 1, 17) for n in shape)
+    layout = np.stack([one.ravel() for one in np.meshgrid(x, y)], axis=1)
+    scan = np.stack(bend.undo(*apply_transform(matrix, layout).T), axis=1)
+    reached = (np.abs(scan - bend.middle) < 2 * bend.half).all(axis=1)
+    moved = layout + corner_motion_px(coefficients, shape, layout)
+    to_layout, bend = fit_bent_affine(scan[reached], moved[reached], bend.middle, bend.half)
+    return np.linalg.inv(to_layout), bend
 
 
 def _regressors(topography: np.ndarray, count: int) -> np.ndarray:
     """(7 + count, ny, nx): topography, quadratic background, change of the topography per generator."""
     shape = (topography.shape[0], topography.shape[1])
-    scale = _normalisation(shape)[0, 0]
+    scale = normalisation(shape)[0, 0]
     gradient_y, gradient_x = np.gradient(topography.astype(np.float32))
     y = ((np.arange(shape[0]) - (shape[0] - 1) / 2) * scale).astype(np.float32)[:, None]
     x = ((np.arange(shape[1]) - (shape[1] - 1) / 2) * scale).astype(np.float32)[None, :]
-    flow = (_flow(generator, x, y) for generator in _GENERATORS[:count])
-    change = [(along_x * gradient_x + along_y * gradient_y) / np.float32(scale) for along_x, along_y in flow]
+    change = [
+        (along_x * gradient_x + along_y * gradient_y) / np.float32(scale)
+        for along_x, along_y in flows(count, x, y)
+    ]
     centred = topography.astype(np.float32) - topography.mean()
     return np.stack([centred, *quadratic_basis(shape).astype(np.float32), *change])
 

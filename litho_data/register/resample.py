@@ -7,6 +7,7 @@ from functools import lru_cache
 import numpy as np
 
 from litho_data.errors import InputError
+from litho_data.register.bend import Bend
 from litho_data.register.geometry import index_to_um, warped_grid
 from litho_data.register.topography import fill_gaps
 
@@ -20,6 +21,7 @@ def resample_to_layout(
     *,
     scan_pitch_um: tuple[float, float],
     layout_pitch_um: float,
+    bend_um: Bend | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Heights of a scan at the pixel centres of the layout, in one cubic-spline interpolation.
 
@@ -29,6 +31,7 @@ def resample_to_layout(
         layout_shape: (ny, nx) of the result.
         scan_pitch_um: (y, x) pitch of the scan.
         layout_pitch_um: pitch of the layout.
+        bend_um: of a bent scan, in µm of its frame; it changes where the one interpolation looks.
 
     Returns:
         ``height_um`` float32 (NaN where not valid) and ``valid`` bool, both of ``layout_shape``. A pixel is
@@ -42,7 +45,7 @@ def resample_to_layout(
     the missing width), since plain interpolation would alias its noise.
     """
     resampler = Resampler(height_um, scan_pitch_um=scan_pitch_um, layout_pitch_um=layout_pitch_um)
-    return resampler.at(scan_to_layout, layout_shape)
+    return resampler.at(scan_to_layout, layout_shape, bend_um)
 
 
 class Resampler:
@@ -55,20 +58,24 @@ class Resampler:
         self._measured = np.isfinite(height)
         if not self._measured.any():
             raise InputError("scan", got="no measured pixel", wanted="finite heights")
+        self._pitch_um = scan_pitch_um
         self._um_to_index = np.linalg.inv(index_to_um(scan_pitch_um))
         self._layout_to_um = index_to_um((layout_pitch_um, layout_pitch_um))
         filled = _average_over_layout_pixel(fill_gaps(height), scan_pitch_um, layout_pitch_um)
         self._spline = spline_filter(filled, SPLINE_ORDER, mode="mirror")
 
-    def at(self, scan_to_layout: np.ndarray, layout_shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-        """Height and validity under a transform, on a layout of this shape."""
+    def at(
+        self, scan_to_layout: np.ndarray, layout_shape: tuple[int, int], bend_um: Bend | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Height and validity under a transform (of the straightened scan), on a layout of this shape."""
         from scipy.ndimage import binary_dilation, map_coordinates
 
         matrix = np.asarray(scan_to_layout, dtype=np.float64)
         if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or abs(np.linalg.det(matrix)) < 1e-12:
             raise InputError("scan_to_layout", got=matrix.tolist(), wanted="an invertible 3x3 matrix")
         to_scan = self._um_to_index @ np.linalg.inv(matrix) @ self._layout_to_um
-        rows, columns = warped_grid(to_scan, layout_shape)
+        bend = None if bend_um is None else bend_um.in_pixels(self._pitch_um)
+        rows, columns = warped_grid(to_scan, layout_shape, bend)
         places = (rows, columns)
         values = map_coordinates(self._spline, places, order=SPLINE_ORDER, mode="mirror", prefilter=False)
         ny, nx = self._measured.shape

@@ -2,38 +2,33 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
 from litho_data.errors import InputError
+from litho_data.register.bend import Bend, fit_bent_affine
 from litho_data.register.coarse import SEARCH_BLUR_PX, CoarseFit, find_coarse
-from litho_data.register.evidence import (
-    bootstrap_corner_sd_px,
-    height_correlation,
-    match_blocks_of_field,
-    mutual_information_bit,
-)
-from litho_data.register.geometry import (
-    centre,
-    index_to_um,
-    linear_part,
-    orient,
-    orientation_matrix,
-    overlap_of,
-)
+from litho_data.register.evidence import height_correlation, mutual_information_bit
+from litho_data.register.figures import figures_of_evidence, figures_of_fit, figures_of_warp
+from litho_data.register.flows import Model
+from litho_data.register.geometry import apply_transform, index_to_um, orient, orientation_matrix
 from litho_data.register.ladder import climb
-from litho_data.register.orientation import rival_alignment, rival_orientation
-from litho_data.register.pyramid import FineFit, refine_pyramid
+from litho_data.register.orientation import rival_alignment
+from litho_data.register.pyramid import FineFit, refine_bent, refine_pyramid
 from litho_data.register.quality import RegistrationQuality, Thresholds, judge, unregistered_quality
-from litho_data.register.refine import Model
+from litho_data.register.refine import Refinement
 from litho_data.register.resample import Resampler, noise_variance_factor, resample_to_layout
-from litho_data.register.topography import predicted_topography, quadratic_basis, remove_bow
+from litho_data.register.topography import predicted_topography, remove_bow
 
 MIN_SIZE_PX = 32
 # A picometre: below any instrument, above rounding.
 SMALLEST_STRUCTURE_UM = 1e-6
+# A bend has an affine part: a model that is stiffer by choice does not bend.
+BENDABLE = ("affine", "homography", "ladder")
+# A bend that is one accounts for nearly all of the displacement; half is far from both outcomes.
+BENT_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -43,10 +38,14 @@ class Registration:
     ``scan_to_layout`` is 3×3 and maps (x_um, y_um, 1) of the scan's frame to the layout's; both frames
     have pixel centres at ``(i + 0.5) * pitch``. If ``quality.passed`` is false it is the best guess, or the
     centred placement where there was none.
+
+    ``bend_um`` is there if the scanner has bent the scan: a place (x_um, y_um) of the scan really is at
+    ``bend_um.straighten``, and ``scan_to_layout`` acts on that. It is the affine closest to the whole map.
     """
 
     scan_to_layout: np.ndarray
     quality: RegistrationQuality
+    bend_um: Bend | None = None
 
 
 def register_scan(
@@ -101,28 +100,76 @@ def register_scan(
     )
     if model == "ladder":
         fine = climb(fine)
-    to_scan = np.linalg.inv(orientation_matrix(coarse.orientation, _shape(scan)))
-    frame = index_to_um((layout_pitch_um, layout_pitch_um))
-    layout_to_scan = frame @ to_scan @ fine.refinement.layout_to_scan @ np.linalg.inv(frame)
-    scan_to_layout = _rounded(np.linalg.inv(layout_to_scan))
+    case = _Case(height, layout, scan_pitch_um, layout_pitch_um, centred, layout_repeats, limits, seed)
+    straight = case.registration(coarse, fine)
+    if straight.quality.passed or model not in BENDABLE or not features:
+        return straight
+    bent = case.registration(coarse, refine_bent(oriented, layout, fine))
+    return bent if _explains(bent.quality, straight.quality) else straight
 
-    resampler = Resampler(height, scan_pitch_um=scan_pitch_um, layout_pitch_um=layout_pitch_um)
-    before, after = (resampler.at(place, _shape(layout))[0] for place in (centred, scan_to_layout))
-    figures = {
-        **_figures_of_fit(coarse, fine, layout_pitch_um),
-        **_figures_of_warp(layout_to_scan, _shape(layout), layout_pitch_um),
-        **_figures_of_evidence(fine, layout_pitch_um, seed),
-        "layout_repeats": layout_repeats,
-        "overlap": float(np.isfinite(after).mean()),
-        "ncc_before": height_correlation(before, layout),
-        "ncc_after": height_correlation(after, layout),
-        "mutual_information_before_bit": mutual_information_bit(before, layout),
-        "mutual_information_after_bit": mutual_information_bit(after, layout),
-        "noise_variance_factor": noise_variance_factor(scan_pitch_um, layout_pitch_um),
-    }
-    passed, reason, warning = judge(figures, limits, fine.blur_px)
-    quality = RegistrationQuality(passed=passed, reason=reason, warning=warning, **figures)
-    return Registration(scan_to_layout, quality)
+
+def _explains(bent: RegistrationQuality, straight: RegistrationQuality) -> bool:
+    """Whether a bend accounts for what the straight warp missed: within all limits, on blocks held out."""
+    return bent.passed and bent.converged and bent.tre_median_px <= BENT_SHARE * straight.tre_median_px
+
+
+@dataclass(frozen=True)
+class _Case:
+    """One scan and its layout, with what any warp between them is judged by."""
+
+    height_um: np.ndarray
+    layout: np.ndarray
+    scan_pitch_um: tuple[float, float]
+    layout_pitch_um: float
+    centred: np.ndarray
+    layout_repeats: float
+    limits: Thresholds
+    seed: int
+
+    def registration(self, coarse: CoarseFit, fine: FineFit) -> Registration:
+        """The fit in µm of both frames, with its figures and the verdict."""
+        height, layout, pitch_um = self.height_um, self.layout, self.layout_pitch_um
+        layout_to_scan, bend_um = self._in_um(coarse, fine.refinement)
+        scan_to_layout = _rounded(np.linalg.inv(layout_to_scan))
+        resampler = Resampler(height, scan_pitch_um=self.scan_pitch_um, layout_pitch_um=pitch_um)
+        before, _ = resampler.at(self.centred, _shape(layout))
+        after, _ = resampler.at(scan_to_layout, _shape(layout), bend_um)
+        figures = {
+            **figures_of_fit(coarse, fine, pitch_um),
+            **figures_of_warp(layout_to_scan, _shape(layout), pitch_um),
+            **figures_of_evidence(fine, pitch_um, self.seed),
+            "layout_repeats": self.layout_repeats,
+            "overlap": float(np.isfinite(after).mean()),
+            "ncc_before": height_correlation(before, layout),
+            "ncc_after": height_correlation(after, layout),
+            "mutual_information_before_bit": mutual_information_bit(before, layout),
+            "mutual_information_after_bit": mutual_information_bit(after, layout),
+            "noise_variance_factor": noise_variance_factor(self.scan_pitch_um, pitch_um),
+        }
+        passed, reason, warning = judge(figures, self.limits, fine.blur_px, bend_um)
+        quality = RegistrationQuality(passed=passed, reason=reason, warning=warning, **figures)
+        return Registration(scan_to_layout, quality, bend_um)
+
+    def _in_um(self, coarse: CoarseFit, found: Refinement) -> tuple[np.ndarray, Bend | None]:
+        """The layout's µm to the (straightened) scan's, and the bend in the scan's own frame."""
+        frame = index_to_um((self.layout_pitch_um, self.layout_pitch_um))
+        ny, nx = self.height_um.shape
+        size_um = np.array([nx * self.scan_pitch_um[1], ny * self.scan_pitch_um[0]])
+        shape = _shape_at(self.layout_pitch_um, self.height_um.shape, self.scan_pitch_um)
+        to_oriented = orientation_matrix(coarse.orientation, shape)
+        if found.bend is None:
+            to_scan = np.linalg.inv(to_oriented)
+            return frame @ to_scan @ found.layout_to_scan @ np.linalg.inv(frame), None
+        # A turned polynomial of second degree is one: points of the scan and where they go determine it.
+        u, v = (one.ravel() for one in np.meshgrid(*[np.linspace(0, 1, 9)] * 2))
+        points_um = np.stack([u, v], axis=1) * size_um
+        oriented = apply_transform(to_oriented @ np.linalg.inv(frame), points_um)
+        to_layout = frame @ np.linalg.inv(found.layout_to_scan)
+        images_um = apply_transform(to_layout, found.bend.straighten(oriented))
+        scan_to_layout, bend_um = fit_bent_affine(points_um, images_um, size_um / 2, size_um / 2)
+        # As the matrix: no digit below any physical meaning.
+        bend_um = replace(bend_um, amount=np.round(bend_um.amount, 6) + 0.0)
+        return np.linalg.inv(scan_to_layout), bend_um
 
 
 def centred_placement(
@@ -155,13 +202,19 @@ def _at_layout_pitch(
     """A copy to compare with; the heights that are kept are resampled once, from the original."""
     if np.allclose(scan_pitch_um, layout_pitch_um, rtol=1e-6):
         return height
-    ny, nx = (
-        max(1, round(n * p / layout_pitch_um)) for n, p in zip(height.shape, scan_pitch_um, strict=True)
-    )
+    shape = _shape_at(layout_pitch_um, height.shape, scan_pitch_um)
     resampled, _ = resample_to_layout(
-        height, np.eye(3), (ny, nx), scan_pitch_um=scan_pitch_um, layout_pitch_um=layout_pitch_um
+        height, np.eye(3), shape, scan_pitch_um=scan_pitch_um, layout_pitch_um=layout_pitch_um
     )
     return resampled.astype(np.float64)
+
+
+def _shape_at(
+    layout_pitch_um: float, scan_shape: tuple[int, ...], scan_pitch_um: tuple[float, float]
+) -> tuple[int, int]:
+    """Size of a scan at the layout's pitch, whole pixels."""
+    ny, nx = (max(1, round(n * p / layout_pitch_um)) for n, p in zip(scan_shape, scan_pitch_um, strict=True))
+    return ny, nx
 
 
 def _rounded(matrix: np.ndarray) -> np.ndarray:
@@ -171,67 +224,6 @@ def _rounded(matrix: np.ndarray) -> np.ndarray:
     rounded[:2, 2] = np.round(matrix[:2, 2], 6)
     rounded[2, :2] = np.round(matrix[2, :2], 10)
     return rounded + 0.0  # no negative zeros
-
-
-def _figures_of_fit(coarse: CoarseFit, fine: FineFit, pitch_um: float) -> dict[str, Any]:
-    points, warp = coarse.points, fine.refinement.layout_to_scan
-    figures: dict[str, Any] = {
-        "model": fine.refinement.model,
-        "method": coarse.method,
-        "dihedral": coarse.orientation,
-        "polarity": coarse.polarity,
-        "converged": fine.refinement.converged,
-        "ecc": fine.refinement.correlation,
-        "blur_um": fine.blur_px * pitch_um,
-        "keypoints": points.keypoints if points else 0,
-        "matches": len(points.inlier) if points else 0,
-        "inlier_ratio": float(points.inlier.mean()) if points else float("nan"),
-        "reprojection_px": points.reprojection_px(warp) if points else float("nan"),
-        "coverage": float("nan"),
-    }
-    if points:
-        overlap = overlap_of(warp, _shape(fine.topography), np.isfinite(fine.scan))
-        figures["coverage"] = points.coverage(overlap)
-    figures["reprojection_nm"] = figures["reprojection_px"] * pitch_um * 1e3
-    return figures
-
-
-def _figures_of_warp(
-    layout_to_scan: np.ndarray, layout_shape: tuple[int, int], pitch_um: float
-) -> dict[str, Any]:
-    linear = np.linalg.inv(linear_part(layout_to_scan, (centre(layout_shape) + 0.5) * pitch_um))
-    left, singular, right = np.linalg.svd(linear)
-    turn = left @ right
-    return {
-        "singular_max": float(singular[0]),
-        "singular_min": float(singular[1]),
-        "rotation_deg": float(np.degrees(np.arctan2(turn[1, 0], turn[0, 0]))),
-    }
-
-
-def _figures_of_evidence(fine: FineFit, pitch_um: float, seed: int) -> dict[str, Any]:
-    warp, shape = fine.refinement.layout_to_scan, _shape(fine.topography)
-    background = np.einsum("k,kyx->yx", fine.refinement.background, quadratic_basis(shape))
-    aligned = fine.refinement.warped - background
-    measured = overlap_of(warp, shape, np.isfinite(fine.scan))
-    registered = np.where(measured, aligned, np.nan)
-    blocks = match_blocks_of_field(fine.refinement, aligned, measured, fine.topography)
-    median, p95 = blocks.held_out_error_percentiles_px(50, 95)
-    corner_sd = bootstrap_corner_sd_px(fine.refinement, shape, seed)
-    nm_per_px = pitch_um * 1e3
-    return {
-        "tre_windows": len(blocks.shift_px),
-        "tre_median_px": median,
-        "tre_p95_px": p95,
-        "tre_median_nm": median * nm_per_px,
-        "tre_p95_nm": p95 * nm_per_px,
-        "curve_x_px": blocks.curve_px(axis=0),
-        "curve_y_px": blocks.curve_px(axis=1),
-        "corner_sd_px": corner_sd,
-        "corner_sd_nm": corner_sd * nm_per_px,
-        "second_alignment": rival_alignment(registered, fine.topography),
-        "second_orientation": rival_orientation(registered, fine.topography),
-    }
 
 
 def _shape(image: np.ndarray) -> tuple[int, int]:

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from litho_data.errors import InputError
+from litho_data.register.bend import Bend
 from litho_data.store.access import (
-    array_of,
     decoded,
     group_of,
     groups_in,
@@ -22,7 +22,8 @@ from litho_data.store.access import (
     read_table,
     values_of,
 )
-from litho_data.store.schema import OPTIONAL_COLUMNS, SAMPLE_VARIABLES, dataset_sha256
+from litho_data.store.contract import checked_arrays, checked_attributes, true_shapes
+from litho_data.store.schema import OPTIONAL_COLUMNS, SAMPLE_VARIABLES, VARIABLES, dataset_sha256
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -44,6 +45,7 @@ class PrintedScan:
         write: the card's ``[write]`` table, None where the card has none.
         field_x_um, field_y_um: position of the scan in its write field, µm; ``dose``: relative dose;
             None where the card does not say.
+        bend_um: of a scan that the scanner has bent; ``scan_to_layout`` then acts on its straightened places.
     """
 
     id: str
@@ -60,6 +62,7 @@ class PrintedScan:
     field_x_um: float | None = None
     field_y_um: float | None = None
     dose: float | None = None
+    bend_um: Bend | None = None
 
     @property
     def layout_um(self) -> np.ndarray:
@@ -87,20 +90,20 @@ class Store:
     def __init__(self, root: zarr.Group, path: Path):
         self.path = path
         self.root = root
-        attributes = _checked_attributes(root, path)
+        attributes = checked_attributes(root, path)
         self.name: str = attributes["name"]
         self.pitch_um: float = attributes["pitch_um"]
         self.level_height_um: float = attributes["level_height_um"]
         self.levels: int = attributes["levels"]
         self.write: dict[str, Any] | None = attributes["write"]
-        self._arrays = _checked_arrays(root, path)
+        self._arrays = checked_arrays(root, path)
         self.ids: list[str] = [str(value) for value in values_of(root, "scan")]
         if len(set(self.ids)) != len(self.ids):
             raise InputError(f"scan ids of {path}", got="duplicates", wanted="unique ids")
         self._print_ids = [str(value) for value in values_of(root, "print")]
         self._order = [int(value) for value in values_of(root, "order")]
         self._columns = {name: values_of(root, name) for name in OPTIONAL_COLUMNS if has_child(root, name)}
-        self.shapes = _true_shapes(root, len(self.ids), self._arrays["mask_level"].shape[1:])
+        self.shapes = true_shapes(root, len(self.ids), self._arrays["mask_level"].shape[1:])
         self._row = {scan_id: row for row, scan_id in enumerate(self.ids)}
 
     def __len__(self) -> int:
@@ -135,6 +138,7 @@ class Store:
             field_x_um=self._column("field_x_um", row),
             field_y_um=self._column("field_y_um", row),
             dose=self._column("dose", row),
+            bend_um=self._bend_um(row),
         )
 
     def scans(self) -> list[PrintedScan]:
@@ -210,48 +214,21 @@ class Store:
             if value is not None:
                 identity[name] = value
         hashes = {v.name: v.sample_sha256(self.sample(v.name, row)) for v in SAMPLE_VARIABLES}
+        bend_um = self._bend_um(row)
+        if bend_um is not None:
+            hashes["bend_um"] = VARIABLES["bend_um"].sample_sha256(bend_um.amount)
         return {**identity, "arrays": hashes}
+
+    def _bend_um(self, row: int) -> Bend | None:
+        """The bend of a scan in its own frame; None where none is stored."""
+        scan_id = self.ids[row]
+        if not has_child(self.root, f"scans/{scan_id}/bend_um"):
+            return None
+        one = self.quality.iloc[row]
+        shape = int(one["scan_ny"]), int(one["scan_nx"])
+        pitch_um = float(one["scan_pitch_y_um"]), float(one["scan_pitch_x_um"])
+        return Bend.of_scan(self.scan_frame(scan_id, "bend_um"), shape, pitch_um)
 
     def _column(self, name: str, row: int) -> float | None:
         value = float(self._columns[name][row]) if name in self._columns else math.nan
         return None if math.isnan(value) else value
-
-
-def _checked_attributes(root: zarr.Group, path: Path) -> dict[str, Any]:
-    attributes = dict(root.attrs)
-    checked: dict[str, Any] = {
-        "name": str(attributes.get("name", path.stem)),
-        "write": attributes.get("write"),
-    }
-    for key in ("pitch_um", "level_height_um"):
-        value = attributes.get(key)
-        if not isinstance(value, int | float) or not math.isfinite(value) or value <= 0:
-            raise InputError(f"attribute {key} of {path}", got=repr(value), wanted="a positive number in µm")
-        checked[key] = float(value)
-    levels = attributes.get("levels")
-    if not isinstance(levels, int) or not 2 <= levels <= 256:
-        raise InputError(
-            f"attribute levels of {path}", got=repr(levels), wanted="a whole number from 2 to 256"
-        )
-    return {**checked, "levels": levels}
-
-
-def _checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array]:
-    names = (*(variable.name for variable in SAMPLE_VARIABLES), "scan", "print", "order")
-    arrays = {name: array_of(root, name) for name in names}
-    count, field = arrays["scan"].shape[0], arrays["mask_level"].shape[1:]
-    for variable in SAMPLE_VARIABLES:
-        array = arrays[variable.name]
-        wanted = (count, 3, 3) if variable.name == "scan_to_layout" else (count, *field)
-        if array.shape != wanted or array.dtype != np.dtype(variable.dtype):
-            got, wanted_text = f"{array.dtype} {array.shape}", f"{variable.dtype} {wanted}"
-            raise InputError(f"array {variable.name} of {path}", got=got, wanted=wanted_text)
-    return arrays
-
-
-def _true_shapes(root: zarr.Group, count: int, padded: tuple[int, ...]) -> list[tuple[int, int]]:
-    if not has_child(root, "quality"):
-        return [(padded[0], padded[1])] * count
-    quality = group_of(root, "quality")
-    rows, columns = values_of(quality, "layout_ny"), values_of(quality, "layout_nx")
-    return [(int(ny), int(nx)) for ny, nx in zip(rows, columns, strict=True)]

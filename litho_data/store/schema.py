@@ -47,8 +47,10 @@ SCAN_VARIABLES = (
     Variable(
         "layout_in_scan", ("y", "x"), "float32", "1", "layout level under each scan pixel; only where needed"
     ),
+    Variable("bend_um", ("axis", "term"), "float64", "um",
+             "displacement along x, y per u² - 1/3, uv, v² - 1/3 of the scan frame; only of a bent scan"),
     Variable("vendor_mask", ("y", "x"), "bool", "1", "mask kept in the raw file; only where there is one"),
-)
+)  # fmt: skip
 VARIABLES = {variable.name: variable for variable in (*SAMPLE_VARIABLES, *SCAN_VARIABLES)}
 OPTIONAL_COLUMNS = ("field_x_um", "field_y_um", "dose")
 """Numbers per scan from the card's table; coordinates where the card has them, NaN where a row has not."""

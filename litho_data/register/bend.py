@@ -1,0 +1,137 @@
+"""A bent scan: the smooth quadratic distance between where a scanner was and where it says it was."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+_ITERATIONS = 30
+# Of the half width of the scan: far below a thousandth of a pixel.
+_SETTLED = 1e-9
+
+
+@dataclass(frozen=True)
+class Bend:
+    """Displacement of the points of a scan, quadratic in u and v, which run from -1 to 1 over the frame.
+
+    ``amount`` is (2, 3): along x and y, for u² - 1/3, uv and v² - 1/3. These terms are centred: over the
+    frame the best affine part of a bend is zero. ``middle`` and ``half`` are the frame's centre and half its
+    size (x, y), in the unit of ``amount``; u = (x - middle) / half.
+    """
+
+    amount: np.ndarray
+    middle: np.ndarray
+    half: np.ndarray
+
+    @classmethod
+    def of_scan(
+        cls, amount_um: np.ndarray, scan_shape: tuple[int, ...], scan_pitch_um: tuple[float, float]
+    ) -> Bend:
+        """The bend of a scan of (ny, nx) pixels of a (y, x) pitch, in µm of its own frame."""
+        half_um = np.array([scan_shape[1] * scan_pitch_um[1], scan_shape[0] * scan_pitch_um[0]]) / 2
+        return cls(np.asarray(amount_um, dtype=np.float64), half_um, half_um)
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """The bend as it enters the quality record: its largest displacement and its six coefficients, µm.
+
+        ``bend_x_by_xx_um`` is the displacement along x per u² - 1/3, and so on.
+        """
+        names = [f"bend_{axis}_by_{term}_um" for axis in "xy" for term in ("xx", "xy", "yy")]
+        values = (float(value) for value in self.amount.ravel())
+        return {"bend_um": self.largest, **dict(zip(names, values, strict=True))}
+
+    @classmethod
+    def none_yet(cls, shape: tuple[int, int]) -> Bend:
+        """A straight scan of this (ny, nx) shape, in its index frame."""
+        ny, nx = shape
+        return cls(np.zeros((2, 3)), np.array([nx - 1, ny - 1]) / 2, np.array([nx, ny]) / 2)
+
+    def in_pixels(self, pitch_um: tuple[float, float]) -> Bend:
+        """A bend in µm as one in the index frame of a scan of this (y, x) pitch."""
+        pitch_x_y = np.array(pitch_um[::-1])
+        return Bend(self.amount / pitch_x_y[:, None], self.middle / pitch_x_y - 0.5, self.half / pitch_x_y)
+
+    def scaled(self, factor: float) -> Bend:
+        """The same bend in a unit that is ``1 / factor`` as long."""
+        return Bend(self.amount * factor, self.middle * factor, self.half * factor)
+
+    def shift(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How far (along x, along y) a point of the scan is from where it was meant to be."""
+        u, v = self._unit(x, y)
+        terms = (u * u - 1 / 3, u * v, v * v - 1 / 3)
+        along_x, along_y = (sum(a * term for a, term in zip(row, terms, strict=True)) for row in self.amount)
+        return along_x, along_y
+
+    def straighten(self, points: np.ndarray) -> np.ndarray:
+        """Where points (n, 2) of the scan really are."""
+        return points + np.stack(self.shift(*points.T), axis=1)
+
+    def undo(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The points of the scan that really are at (x, y): Newton's method, all points at once.
+
+        A place that no point reaches comes back far outside of the frame.
+        """
+        at_x, at_y = (np.array(one, dtype=np.float64) for one in np.broadcast_arrays(x, y))
+        for _ in range(_ITERATIONS):
+            shift_x, shift_y = self.shift(at_x, at_y)
+            miss_x, miss_y = x - at_x - shift_x, y - at_y - shift_y
+            (xx, xy), (yx, yy) = self._gradient(at_x, at_y)
+            determinant = (1 + xx) * (1 + yy) - xy * yx
+            with np.errstate(all="ignore"):
+                step_x = ((1 + yy) * miss_x - xy * miss_y) / determinant
+                step_y = ((1 + xx) * miss_y - yx * miss_x) / determinant
+            open_ = ~((np.abs(step_x) < _SETTLED * self.half[0]) & (np.abs(step_y) < _SETTLED * self.half[1]))
+            # Half a frame per step: further than any bend that is accepted, too short to run away.
+            at_x += np.clip(np.nan_to_num(step_x), -self.half[0], self.half[0])
+            at_y += np.clip(np.nan_to_num(step_y), -self.half[1], self.half[1])
+            if not open_.any():
+                break
+        outside = self.middle - 1e3 * self.half
+        return np.where(open_, outside[0], at_x), np.where(open_, outside[1], at_y)
+
+    @property
+    def largest(self) -> float:
+        """The longest displacement in the frame."""
+        x, y = self._grid(33)
+        return float(np.hypot(*self.shift(x, y)).max())
+
+    @property
+    def slope(self) -> float:
+        """The largest local stretch or turn that the bend brings, as a share; from 1 on it may fold."""
+        # The gradient is linear in u and v, its norm convex: it is largest in a corner.
+        gradient = np.array(self._gradient(*self._grid(2)))
+        return float(np.linalg.norm(np.moveaxis(gradient, (0, 1), (-2, -1)), ord=2, axis=(-2, -1)).max())
+
+    def _grid(self, count: int) -> np.ndarray:
+        unit = np.linspace(-1, 1, count)
+        u, v = (one.ravel() for one in np.meshgrid(unit, unit))
+        return self.middle[:, None] + self.half[:, None] * np.stack([u, v])
+
+    def _unit(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return (x - self.middle[0]) / self.half[0], (y - self.middle[1]) / self.half[1]
+
+    def _gradient(self, x: np.ndarray, y: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+        """d(shift x)/dx, d(shift x)/dy; d(shift y)/dx, d(shift y)/dy."""
+        u, v = self._unit(x, y)
+        return tuple(
+            ((2 * a * u + b * v) / self.half[0], (b * u + 2 * c * v) / self.half[1])
+            for a, b, c in self.amount
+        )
+
+
+def fit_bent_affine(
+    points: np.ndarray, images: np.ndarray, middle: np.ndarray, half: np.ndarray
+) -> tuple[np.ndarray, Bend]:
+    """The affine (3×3) and the bend that take points (n, 2) to their images, by least squares.
+
+    ``images`` ≈ affine(``points`` + bend(``points``)); ``middle`` and ``half`` are those of the bend's frame.
+    """
+    u, v = ((points - middle) / half).T
+    basis = np.stack([np.ones_like(u), u, v, u * u - 1 / 3, u * v, v * v - 1 / 3], axis=1)
+    coefficients, *_ = np.linalg.lstsq(basis, images, rcond=None)
+    matrix = np.eye(3)
+    matrix[:2, :2] = coefficients[1:3].T / half
+    matrix[:2, 2] = coefficients[0] - matrix[:2, :2] @ middle
+    return matrix, Bend(np.linalg.solve(matrix[:2, :2], coefficients[3:].T), middle, half)

@@ -1,0 +1,82 @@
+"""The figures of one registration, from the fit and the images it compared."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from litho_data.register.coarse import CoarseFit
+from litho_data.register.evidence import bootstrap_corner_sd_px, match_blocks_of_field
+from litho_data.register.geometry import centre, linear_part, overlap_of
+from litho_data.register.orientation import rival_alignment, rival_orientation
+from litho_data.register.pyramid import FineFit
+from litho_data.register.topography import quadratic_basis
+
+
+def figures_of_fit(coarse: CoarseFit, fine: FineFit, pitch_um: float) -> dict[str, Any]:
+    """How the warp was found, and how well it explains the matches and the heights."""
+    points, warp, bend = coarse.points, fine.refinement.layout_to_scan, fine.refinement.bend
+    figures: dict[str, Any] = {
+        "model": fine.refinement.model if bend is None else "quadratic",
+        "method": coarse.method,
+        "dihedral": coarse.orientation,
+        "polarity": coarse.polarity,
+        "converged": fine.refinement.converged,
+        "ecc": fine.refinement.correlation,
+        "blur_um": fine.blur_px * pitch_um,
+        "keypoints": points.keypoints if points else 0,
+        "matches": len(points.inlier) if points else 0,
+        "inlier_ratio": float(points.inlier.mean()) if points else float("nan"),
+        "reprojection_px": points.reprojection_px(warp, bend) if points else float("nan"),
+        "coverage": float("nan"),
+    }
+    if points:
+        overlap = overlap_of(warp, _shape(fine.topography), np.isfinite(fine.scan), bend)
+        figures["coverage"] = points.coverage(overlap)
+    figures["reprojection_nm"] = figures["reprojection_px"] * pitch_um * 1e3
+    return figures
+
+
+def figures_of_warp(
+    layout_to_scan: np.ndarray, layout_shape: tuple[int, int], pitch_um: float
+) -> dict[str, Any]:
+    """Scale and rotation at the layout's middle; of a bent scan, those of the closest affine."""
+    linear = np.linalg.inv(linear_part(layout_to_scan, (centre(layout_shape) + 0.5) * pitch_um))
+    left, singular, right = np.linalg.svd(linear)
+    turn = left @ right
+    return {
+        "singular_max": float(singular[0]),
+        "singular_min": float(singular[1]),
+        "rotation_deg": float(np.degrees(np.arctan2(turn[1, 0], turn[0, 0]))),
+    }
+
+
+def figures_of_evidence(fine: FineFit, pitch_um: float, seed: int) -> dict[str, Any]:
+    """How well the warp is known: held-out blocks, bootstrap, rivals."""
+    warp, shape = fine.refinement.layout_to_scan, _shape(fine.topography)
+    background = np.einsum("k,kyx->yx", fine.refinement.background, quadratic_basis(shape))
+    aligned = fine.refinement.warped - background
+    measured = overlap_of(warp, shape, np.isfinite(fine.scan), fine.refinement.bend)
+    registered = np.where(measured, aligned, np.nan)
+    blocks = match_blocks_of_field(fine.refinement, aligned, measured, fine.topography)
+    median, p95 = blocks.held_out_error_percentiles_px(50, 95)
+    corner_sd = bootstrap_corner_sd_px(fine.refinement, shape, seed)
+    nm_per_px = pitch_um * 1e3
+    return {
+        "tre_windows": len(blocks.shift_px),
+        "tre_median_px": median,
+        "tre_p95_px": p95,
+        "tre_median_nm": median * nm_per_px,
+        "tre_p95_nm": p95 * nm_per_px,
+        "curve_x_px": blocks.curve_px(axis=0),
+        "curve_y_px": blocks.curve_px(axis=1),
+        "corner_sd_px": corner_sd,
+        "corner_sd_nm": corner_sd * nm_per_px,
+        "second_alignment": rival_alignment(registered, fine.topography),
+        "second_orientation": rival_orientation(registered, fine.topography),
+    }
+
+
+def _shape(image: np.ndarray) -> tuple[int, int]:
+    return image.shape[0], image.shape[1]
