@@ -12,7 +12,7 @@ from pydantic import Field
 
 from litho_data.errors import InputError
 from litho_data.results import Record, Result
-from litho_data.store import PrintedScan, open_store
+from litho_data.store import PrintedScan, Store, open_store
 from litho_models import zoo
 from litho_models.background import Background, BackgroundUse
 from litho_models.cost import PredictionCost, measured_predictions
@@ -25,7 +25,7 @@ from litho_models.nuisance import Policy
 from litho_models.run_info import RunInfo, run_info
 from litho_models.score_records import ModelScores, NuisanceProtocol, Prediction
 from litho_models.scores import NoiseFloor, noise_floor, protocol_for, score_model
-from litho_models.splits import ids_sha256, locked_ids
+from litho_models.splits import files_sha256, ids_sha256, locked_ids
 
 
 class SplitRecord(Record):
@@ -86,9 +86,9 @@ def evaluate(
 ) -> Evaluation:
     """Score a frozen model on the scans of a store and write the result and its report.
 
-    The locked scans are kept for models of this dataset: one that was trained on it is not scored on them
-    unless asked for. A model of another dataset is scored on all scans. The result says which were locked,
-    and whether any of them was scored.
+    The locked scans are kept for models of these prints: one that was trained on them, in this store or in
+    another one built from the same raw files, is not scored on the locked ones unless asked for. A model of
+    other prints is scored on all scans. The result says which were locked, and whether any was scored.
 
     Args:
         model: folder of a frozen model, or ``zoo:NAME``.
@@ -100,7 +100,7 @@ def evaluate(
         noise: ``noise.json`` of this dataset, or its folder: the floor beside the errors is the one in it.
         scan_ids: exactly these scans, locked ones among them too.
         extrapolate: accept layouts beyond the model's calibrated range.
-        open_lock_box: score the locked scans also of the dataset that the model was trained on.
+        open_lock_box: score the locked scans also of the prints that the model was trained on.
 
     Raises:
         InputError: a model or store that cannot be read, geometries that differ, or a noise analysis of
@@ -115,7 +115,7 @@ def evaluate(
     if scan_ids is not None:
         scans = [dataset.scan(scan_id) for scan_id in scan_ids]
     else:
-        own = (frozen.card["dataset"] or {}).get("sha256") == dataset.sha256
+        own = _of_these_prints(frozen, dataset, locked)
         scans = [scan for scan in every if open_lock_box or not own or scan.id not in locked]
     if not scans:
         raise InputError(f"scans of {store}", got="none", wanted="at least one to score")
@@ -155,6 +155,17 @@ def evaluate(
     result.write(out)
     write_evaluation_report(result, scans, [prediction.map_um for prediction in predictions], out)
     return result
+
+
+def _of_these_prints(model: FrozenSimulator, dataset: Store, locked: Sequence[str]) -> bool:
+    """Whether a model was made from this dataset, or from another one built from the same prints.
+
+    Another recipe or registration changes every height of a store, but not the raw files of its lock box.
+    """
+    if (model.card["dataset"] or {}).get("sha256") == dataset.sha256:
+        return True
+    files = files_sha256(dataset, locked)
+    return files is not None and model.card["split"].get("lock_box_files_sha256") == files
 
 
 def card_background(model: FrozenSimulator, scans: Sequence[PrintedScan]) -> Background | None:

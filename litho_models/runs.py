@@ -18,7 +18,7 @@ from litho_models.freeze import load_simulator, save_frozen
 from litho_models.model_card import CARD_FILE, DatasetName, ModelCard
 from litho_models.run_info import RunInfo, run_info
 from litho_models.simulator import Variant
-from litho_models.splits import ids_sha256, locked_ids
+from litho_models.splits import files_sha256, ids_sha256, locked_ids
 from litho_models.tiles import predict_scan
 from litho_models.training import TrainingConfig, fit_with_record
 from litho_models.training.checkpoint import RoundRecord
@@ -72,7 +72,8 @@ def train(
     config = training_config(recipe, model, {"variant": variant, **(settings or {})})
     dataset = open_store(store)
     scans = dataset.scans()
-    locked = [] if use_lock_box else locked_ids(scans)
+    lock_box = locked_ids(scans)
+    locked = [] if use_lock_box else lock_box
     used = [scan for scan in scans if scan.id not in locked]
     folder = Path(out)
     fitted = fit_with_record(model, used, config, checkpoint=folder / CHECKPOINT_FOLDER)
@@ -104,7 +105,12 @@ def train(
         training_level_share=level_share(used),
         background=learn_background(used, [predict_scan(fitted.model, scan) for scan in used]),
         command=record.run.command,
-        split={"kind": "development", "lock_box": locked, "lock_box_sha256": ids_sha256(locked)},
+        split={
+            "kind": "development",
+            "lock_box": locked,
+            "lock_box_sha256": ids_sha256(locked),
+            "lock_box_files_sha256": files_sha256(dataset, lock_box),
+        },
         limitations=["Not evaluated yet: see the evaluation of this model for its error."],
     )
     _write_history(record, folder)

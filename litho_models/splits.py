@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from litho_data.errors import InputError
 
 if TYPE_CHECKING:
-    from litho_data.store import PrintedScan
+    from litho_data.store import PrintedScan, Store
 
 QUADRANTS = (0, 1, 2, 3)
 
@@ -126,6 +126,16 @@ def inner_validation(ids: Sequence[str], count: int, seed: int = 0) -> list[str]
 def ids_sha256(ids: Sequence[str]) -> str:
     """Hex SHA-256 of a set of ids: sorted, one per line."""
     return hashlib.sha256("\n".join(sorted(ids)).encode()).hexdigest()
+
+
+def files_sha256(store: Store, ids: Sequence[str]) -> str | None:
+    """Hash of the raw files behind some scans, however they were levelled and registered.
+
+    None where the store does not list the files of these scans.
+    """
+    wanted = set(ids)
+    files = [row["sha256"] for row in store.manifest.get("files", []) if row["scan"] in wanted]
+    return ids_sha256(files) if files else None
 
 
 def _order(name: str, seed: int) -> str:

@@ -24,7 +24,7 @@ from litho_models.loop.reporting import write_report
 from litho_models.loop.result import CloseLoop
 from litho_models.models import MODELS, build_model
 from litho_models.simulator import Simulator
-from litho_models.splits import locked_ids
+from litho_models.splits import files_sha256, locked_ids
 
 MODEL_FOLDER, MEASUREMENT_FILE = "model", "measurement_model.json"
 
@@ -77,7 +77,7 @@ def close_loop_on_store(
     with atomic_folder(out) as folder:
         result.write(folder)
         write_report(closed, result, folder)
-        _save_process_model(closed, result, folder / MODEL_FOLDER)
+        _save_process_model(closed, result, opened, folder / MODEL_FOLDER)
         write_measurement_model(closed, result, folder / MEASUREMENT_FILE)
     return result
 
@@ -130,7 +130,7 @@ def _base_model(base: str, store: Store) -> tuple[Simulator, str]:
     return load_simulator(folder, card), card.name
 
 
-def _save_process_model(closed: Closed, result: CloseLoop, folder: Path) -> None:
+def _save_process_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) -> None:
     chain = corrected_chain(closed)
     groups = exported_effects(chain, result)
     assert isinstance(chain.base, Simulator)
@@ -143,7 +143,10 @@ def _save_process_model(closed: Closed, result: CloseLoop, folder: Path) -> None
         undetermined_effects=groups["undetermined"],
         dataset=result.dataset.model_dump(),
         command=result.run.command,
-        split=result.split.model_dump(),
+        split={
+            **result.split.model_dump(),
+            "lock_box_files_sha256": files_sha256(store, closed.lock_box),
+        },
         nuisance=result.nuisance.model_dump(),
         noise_floor=result.noise_floor.model_dump(),
         confusable_sets=[[e.name, *e.confusable_with] for e in result.effects if e.confusable_with],

@@ -9,7 +9,10 @@ import pandas as pd
 import pytest
 from prints import make_scans, write_store
 
+from litho_data.build import build
 from litho_data.errors import InputError
+from litho_data.store import open_store
+from litho_data.virtual_fab import simulate
 from litho_models.benchmark import Benchmark, benchmark
 from litho_models.compare import compare
 from litho_models.evaluate import Evaluation, evaluate
@@ -151,6 +154,29 @@ def test_a_model_of_other_prints_is_scored_on_all_scans_and_the_opened_box_is_re
     assert len(scored.split.lock_box) == 1
     assert scored.split.lock_box_opened
     assert f"scored ones: {scored.split.lock_box[0]}." in (tmp_path / "out" / "report.html").read_text()
+
+
+@pytest.mark.slow
+def test_a_store_built_anew_from_the_same_files_keeps_its_lock_box_and_other_files_of_the_same_names_do_not(
+    tmp_path,
+):
+    def built(name, seed, registration):
+        card = simulate(tmp_path / name, count=3, size_px=192, seed=seed, microscope="aligned")
+        with card.open("a", encoding="utf-8") as stream:
+            stream.write(f'\n[process]\nregistration = "{registration}"\n')
+        build(card, tmp_path / f"{name}.zarr")
+        return tmp_path / f"{name}.zarr"
+
+    first, anew = built("first", 0, "affine"), built("anew", 0, "homography")
+    assert open_store(first).sha256 != open_store(anew).sha256
+    run = train(first, "identity", tmp_path / "run")
+    assert run.lock_box
+    shut = evaluate(tmp_path / "run" / "model", anew, tmp_path / "shut")
+    assert not set(run.lock_box) & set(shut.split.scored_ids)
+    assert not shut.split.lock_box_opened
+    others = built("others", 1, "affine")
+    scored = evaluate(tmp_path / "run" / "model", others, tmp_path / "scored")
+    assert set(run.lock_box) <= set(scored.split.scored_ids)
 
 
 def test_comparing_different_protocols_is_refused(store, tmp_path):
