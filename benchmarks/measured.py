@@ -38,6 +38,7 @@ RESULTS = {
     "close_loop.json": "close-loop/close_loop.json",
     "close_loop_pbl.json": "close-loop-pbl/close_loop.json",
     "close_loop_candidates.csv": "close-loop/candidates.csv",
+    "close_loop_errors.csv": "close-loop/errors.csv",
     "gap.json": "compare/gap.json",
     "score.json": "score/score.json",
 }
@@ -80,7 +81,7 @@ def main() -> None:
     runs = parser.parse_args().runs
     for name, source in RESULTS.items():
         shutil.copyfile(runs / source, FOLDER / name)
-    draw_steps(runs / "close-loop" / "errors.csv", FOLDER / "loop_steps.png")
+    draw_steps(FOLDER / "close_loop_errors.csv", FOLDER / "loop_steps.png")
     draw_prediction(runs / "store.zarr", runs / "benchmark", FOLDER / "prediction.jpg")
     for page, names in PAGES.items():
         for name in names:
