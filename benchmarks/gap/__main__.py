@@ -45,7 +45,7 @@ def main() -> None:
 def _run(given: argparse.Namespace) -> None:
     out, workers, logs = given.out, given.workers, given.out / "logs"
     effort = _effort(given)
-    plan = open_plan(out, effort, None if given.judge is None else str(given.judge.resolve()))
+    plan = open_plan(out, effort, None if given.corrected is None else str(given.corrected.resolve()))
     todo = chosen(_tasks(out, plan), given.tasks)
     print("trial iterations", flush=True)
     # One at a time: what is timed should not share its memory bus.
@@ -74,7 +74,7 @@ def _run(given: argparse.Namespace) -> None:
 
 
 def _tasks(out: Path, plan: Plan) -> list[Task]:
-    return tasks(out, plan.effort, {name: str(zoo.folder(name)) for name in zoo.list()}, plan.judge)
+    return tasks(out, plan.effort, {name: str(zoo.folder(name)) for name in zoo.list()}, plan.corrected)
 
 
 def _effort(given: argparse.Namespace) -> Effort:
@@ -98,7 +98,9 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, help="of the designs judged by the fab")
     parser.add_argument("--zoo-seeds", type=int, help="of the designs through models of measured prints")
     parser.add_argument("--training-steps", type=int, help="of the two networks")
-    parser.add_argument("--judge", type=Path, help="further frozen model of the measured prints")
+    parser.add_argument(
+        "--corrected", type=Path, help="model of a closed loop on the measured prints: one arm more"
+    )
     parser.add_argument("--tasks", metavar="NAMES", help="only these, separated by commas; all by default")
     parser.add_argument("--estimate", action="store_true", help="trial iterations and estimate only")
     parser.add_argument("--proof", action="store_true", help="then one hologram with 1,000 iterations of PBL")

@@ -61,7 +61,7 @@ def write_results(
     summary.to_csv(folder / TABLE_FILE, index=False, float_format="%.6g")
     record = {
         "schema": "litho-design/benchmark-gap/1",
-        "plan": plan.model_dump(mode="json", by_alias=True, exclude={"judge"}),
+        "plan": plan.model_dump(mode="json", by_alias=True, exclude={"corrected"}),
         "machine": {"cores": usable_cores(), "threads_per_process": 1},
         **origin(),
         "models": _models(out),

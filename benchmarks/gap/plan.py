@@ -80,16 +80,16 @@ class Plan(Result):
     effort: Effort
     print_knobs: dict[str, float] = PRINT_KNOBS
     scan_knobs: dict[str, float] = SCAN_KNOBS
-    judge: str | None = None
+    corrected: str | None = None
 
 
-def open_plan(out: Path, effort: Effort, judge: str | None) -> Plan:
+def open_plan(out: Path, effort: Effort, corrected: str | None) -> Plan:
     """Write the plan, or check that the folder holds the same one.
 
     Raises:
         InputError: the folder holds a comparison of other settings.
     """
-    plan = Plan(effort=effort, judge=judge)
+    plan = Plan(effort=effort, corrected=corrected)
     if not (out / Plan.FILE_NAME).exists():
         plan.write(out)
     elif Plan.read(out) != plan:

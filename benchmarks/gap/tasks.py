@@ -61,12 +61,12 @@ class Task:
         )  # fmt: skip
 
 
-def tasks(out: Path, effort: Effort, zoo: Mapping[str, str], judge: str | None) -> list[Task]:
+def tasks(out: Path, effort: Effort, zoo: Mapping[str, str], corrected: str | None) -> list[Task]:
     """The three tasks on the fab, and the hologram through models of measured prints.
 
     Args:
         zoo: name to folder of the frozen models that come with the package.
-        judge: a further frozen model of the measured prints, such as a closed loop's; None for none.
+        corrected: the model that a closed loop on the measured prints ended with; None for none.
     """
     models = {arm: "none" if arm == "none" else str(model(out, arm)) for arm in ARMS}
     fab = {"fab": str(out / "fab" / "truth")}
@@ -80,13 +80,14 @@ def tasks(out: Path, effort: Effort, zoo: Mapping[str, str], judge: str | None) 
         "--iterations", effort.lens_iterations, "--precision", effort.search_precision,
     )  # fmt: skip
     camera = _options("--window-px", effort.window_px, "--object-px", effort.object_px)
+    # No fab knows the measured printer: every arm's model judges the others' designs.
     measured = {arm: zoo.get(arm, "none") for arm in ZOO_ARMS}
-    further = {} if judge is None else {"closed-loop": judge}
+    measured |= {} if corrected is None else {"closed-loop": corrected}
     return [
         Task("hoe", "hoe", hoe, models, fab, effort.seeds),
         Task("lens-direct", "direct", lens, models, fab, effort.seeds),
         Task("lens-computational", "computational", lens + camera, models, fab, effort.seeds),
-        Task("hoe-measured", "hoe", hoe, measured, further, effort.zoo_seeds),
+        Task("hoe-measured", "hoe", hoe, measured, {}, effort.zoo_seeds),
     ]
 
 
