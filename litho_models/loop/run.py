@@ -23,6 +23,7 @@ from litho_models.loop.outcome import summarise
 from litho_models.loop.reporting import write_report
 from litho_models.loop.result import CloseLoop
 from litho_models.models import MODELS, build_model
+from litho_models.runs import level_share
 from litho_models.simulator import Simulator
 from litho_models.splits import files_sha256, locked_ids
 
@@ -149,6 +150,7 @@ def _save_process_model(closed: Closed, result: CloseLoop, store: Store, folder:
         },
         nuisance=result.nuisance.model_dump(),
         noise_floor=result.noise_floor.model_dump(),
+        training_level_share=level_share([field.scan for field in closed.development]),
         confusable_sets=[[e.name, *e.confusable_with] for e in result.effects if e.confusable_with],
         unexplained_fraction=result.shares.unexplained_structured,
         metrics=[

@@ -23,6 +23,7 @@ from litho_models.loop.measurement import measurement_tests
 from litho_models.loop.outcome import summarise
 from litho_models.loop.result import CloseLoop
 from litho_models.loop.structure import covariate_tests, is_structured
+from litho_models.model_card import ModelCard
 from litho_models.models import build_model
 from litho_models.runs import train
 from litho_models.splits import lock_box, locked_ids
@@ -240,6 +241,10 @@ def test_the_loop_locks_what_training_locks_whatever_its_seed_and_what_was_dropp
         assert found.split.lock_box == locked
         assert train(store, "identity", tmp_path / f"run{number}").lock_box == locked
         assert found.run.n_scans + len(found.run.dropped) == len(scans)
+        # Design flags layouts outside what the model was fitted on by the shares of the levels there.
+        used = np.concatenate([s.mask_level.ravel() for s in scans if s.id not in locked])
+        shares = ModelCard.read(tmp_path / f"loop{number}" / "model").training_level_share
+        assert shares == pytest.approx(np.bincount(used, minlength=len(shares)) / used.size, abs=1e-12)
 
 
 def test_one_scan_is_refused() -> None:
