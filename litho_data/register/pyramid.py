@@ -10,7 +10,13 @@ from litho_data.register.bend import Bend
 from litho_data.register.flows import LADDER, Model
 from litho_data.register.geometry import apply_transform, corners, linear_part, warped_grid
 from litho_data.register.refine import Refinement, refine
-from litho_data.register.topography import fill_gaps, pearson, predicted_topography, smooth_measured
+from litho_data.register.topography import (
+    fill_gaps,
+    pearson,
+    predicted_topography,
+    quadratic_basis,
+    smooth_measured,
+)
 
 SCAN_BLUR_PX = 1.0
 BLURS_PX = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0, 12.0, 15.0)
@@ -64,8 +70,29 @@ def refine_bent(scan: np.ndarray, layout_level: np.ndarray, straight: FineFit) -
     matrix, bend = _from_coarse_to_fine(scan, layout_level, matrix, "affine", bend)
     blur_px = match_blur(straight.scan, layout_level, matrix, bend)
     topography = predicted_topography(layout_level, blur_px)
-    refinement = refine(straight.scan, topography, matrix, "affine", bend=bend)
-    return FineFit(refinement, straight.scan, topography, blur_px)
+    level = _without_own_bow(straight.scan, topography, warped_grid(matrix, shape, bend))
+    refinement = refine(level, topography, matrix, "affine", bend=bend)
+    return FineFit(refinement, level, topography, blur_px)
+
+
+def _without_own_bow(
+    scan: np.ndarray, topography: np.ndarray, grid: tuple[np.ndarray, np.ndarray]
+) -> np.ndarray:
+    """The scan minus the quadratic surface that the topography does not explain.
+
+    A surface quadratic in the scan's frame, the print's own share of it included, is not quadratic in the
+    layout's once the scan is straightened, and would pull at the bend.
+    """
+    from scipy.ndimage import map_coordinates
+
+    basis = quadratic_basis((scan.shape[0], scan.shape[1]))
+    places = tuple(one[::3, ::3] for one in grid)
+    warped = map_coordinates(fill_gaps(scan), places, order=1, cval=np.nan)
+    seen = np.isfinite(warped)
+    surfaces = [map_coordinates(one, places, order=1)[seen] for one in basis]
+    design = np.stack([topography[::3, ::3][seen], *surfaces], axis=1)
+    coefficients, *_ = np.linalg.lstsq(design, warped[seen], rcond=None)
+    return scan - np.einsum("k,kyx->yx", coefficients[1:], basis)
 
 
 def _from_coarse_to_fine(

@@ -1,0 +1,247 @@
+"""Scans that the scanner has bent: recovered, stored, replayed; and nothing is bent that is not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from register_phantoms import LEVEL_HEIGHT_UM, PITCH_UM, PRINT_BLUR_PX, random_layout, warp_about_centre
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from litho_data.build import build
+from litho_data.level import layout_in_scan_frame
+from litho_data.records import read_steps
+from litho_data.register import Bend, Registration, apply_transform, register_scan, resample_to_layout
+from litho_data.register.bend import fit_bent_affine
+from litho_data.register.geometry import index_to_um, orient, orientation_matrix
+from litho_data.register.quality import Thresholds, judge
+from litho_data.release import export_zip
+from litho_data.replay import replay
+from litho_data.store import open_store
+from litho_data.verify import verify
+from litho_data.virtual_fab import KnobSetting, Truth, simulate
+from litho_data.virtual_fab.canvas import GUARD_PX
+from litho_data.virtual_fab.geometry import ScanFrame, sample_surface
+from litho_data.virtual_fab.knobs import KnobBoard
+
+SHAPE, SCAN_SHAPE = (320, 352), (390, 430)
+AMOUNT_UM = np.array([[0.66, -0.45, 0.54], [-0.6, 0.72, 0.39]])
+# The target of a straight scan, too. White noise at SNR 5 alone moves a corner by about 0.02 px under an
+# affine; twelve numbers know it (26 / 7)**0.5 times worse: the squares of the basis functions, of unit mean
+# square, add up to 1 + 3 + 3 there, and with the quadratic ones to 5 + 9 + 5 more.
+CORNER_PX = 0.3
+PITCHES = {"scan_pitch_um": (PITCH_UM, PITCH_UM), "layout_pitch_um": PITCH_UM}
+
+
+def bend_of(factor: float = 1.0, shape: tuple[int, int] = SCAN_SHAPE) -> Bend:
+    return Bend.of_scan(factor * AMOUNT_UM, shape, (PITCH_UM, PITCH_UM))
+
+
+def true_map() -> np.ndarray:
+    """Straightened scan to layout, µm."""
+    frame = index_to_um((PITCH_UM, PITCH_UM))
+    warp = warp_about_centre(SHAPE, rotation_deg=0.8, scale=(1.01, 0.99), margin_px=(39.0, 35.0))
+    return frame @ np.linalg.inv(warp) @ np.linalg.inv(frame)
+
+
+def places_um(shape: tuple[int, int]) -> np.ndarray:
+    """(x, y) of all pixel centres of a scan, row by row."""
+    y, x = (PITCH_UM * (one.ravel() + 0.5) for one in np.indices(shape))
+    return np.stack([x, y], axis=1)
+
+
+def bent_scan(layout: np.ndarray, bend: Bend, snr: float = 5.0) -> np.ndarray:
+    """The blurred print where each pixel of a bent scan really was, and white noise."""
+    print_um = LEVEL_HEIGHT_UM * gaussian_filter(layout.astype(float), PRINT_BLUR_PX, mode="constant")
+    x, y = apply_transform(true_map(), bend.straighten(places_um(SCAN_SHAPE))).T / PITCH_UM - 0.5
+    scan = map_coordinates(print_um, (y, x), order=5, mode="constant").reshape(SCAN_SHAPE)
+    return scan + np.random.default_rng(0).standard_normal(SCAN_SHAPE) * print_um.std() / snr
+
+
+def register(scan: np.ndarray, layout: np.ndarray, **options) -> Registration:
+    return register_scan(scan, layout, **PITCHES, **options)
+
+
+def layout_places_um(found: Registration, points_um: np.ndarray) -> np.ndarray:
+    bend = found.bend_um
+    return apply_transform(found.scan_to_layout, points_um if bend is None else bend.straighten(points_um))
+
+
+@pytest.mark.parametrize(
+    ("orientation", "factor", "model"),
+    [("identity", 1.0, "affine"), ("rotate-90", 2.0, "affine"), ("flip-y", 1.0, "ladder")],
+)
+def test_a_known_bend_is_recovered_in_any_orientation(orientation, factor, model):
+    layout, bend = random_layout(SHAPE, seed=2), bend_of(factor)
+    upright = bent_scan(layout, bend)
+    back = {"rotate-90": "rotate-270"}.get(orientation, orientation)
+    found = register(np.ascontiguousarray(orient(upright, back)), layout, model=model)
+    assert found.quality.passed, found.quality.reason
+    assert found.quality.model == "quadratic"
+    assert found.quality.dihedral == orientation
+    # Every pixel of the scan that shows the layout: where the record puts it, against where it was.
+    upright_um = places_um(SCAN_SHAPE)
+    truth_um = apply_transform(true_map(), bend.straighten(upright_um))
+    turn = orientation_matrix(back, SCAN_SHAPE)
+    turned_um = PITCH_UM * (apply_transform(turn, upright_um / PITCH_UM - 0.5) + 0.5)
+    seen = ((truth_um > 0) & (truth_um < PITCH_UM * np.array(SHAPE[::-1]))).all(axis=1)
+    error_px = np.hypot(*(layout_places_um(found, turned_um) - truth_um)[seen].T) / PITCH_UM
+    assert error_px.max() < CORNER_PX
+    # The record's own claim: no corner further off than six of its standard deviations.
+    assert error_px.max() < 6 * found.quality.corner_sd_px + 0.02
+    # The largest displacement is at the frame's corner, beyond the layout's by up to (430 / 352)².
+    assert found.bend_um.largest == pytest.approx(bend.largest, abs=CORNER_PX * PITCH_UM * (430 / 352) ** 2)
+    assert f"scan bent by up to {found.bend_um.largest:.2f} µm" in found.quality.warning
+
+
+def test_the_straight_warp_alone_misses_its_limits_where_the_bend_is_needed():
+    layout = random_layout(SHAPE, seed=2)
+    scan = bent_scan(layout, bend_of())
+    # A model that is stiffer by choice does not bend, and shows what an affine would leave.
+    stiff = register(scan, layout, model="similarity")
+    assert stiff.bend_um is None
+    assert "target registration error" in stiff.quality.reason
+    # The limit of a pass is 1.5 px; a block's shift is known to a tenth of a pixel at SNR 5.
+    assert register(scan, layout).quality.tre_median_px < 0.3 < 1.5 < stiff.quality.tre_median_px
+
+
+def test_a_straight_scan_is_not_bent():
+    layout = random_layout(SHAPE, seed=3)
+    found = register(bent_scan(layout, bend_of(0.0)), layout)
+    assert (found.quality.passed, found.quality.warning, found.quality.model) == (True, "", "affine")
+    assert found.bend_um is None
+
+
+def test_a_bend_that_the_straight_warp_can_live_with_stays_out():
+    # At most 0.15 µm, 1.5 px, at a corner, and less elsewhere: within the limits of an affine.
+    layout = random_layout(SHAPE, seed=3)
+    found = register(bent_scan(layout, bend_of(0.1)), layout)
+    assert bend_of(0.1).largest < 0.16
+    assert found.quality.passed
+    assert found.bend_um is None
+
+
+@pytest.mark.parametrize("case", ["layout of another", "noise", "grating", "wrong pitch"])
+def test_no_bend_makes_a_wrong_scan_pass(case):
+    layout = random_layout(SHAPE, seed=4, blob_px=12.0)
+    scan = bent_scan(layout, bend_of(), snr=20)
+    pitches = dict(PITCHES)
+    if case == "layout of another":
+        layout = random_layout(SHAPE, seed=5, blob_px=12.0)
+    elif case == "noise":
+        scan = gaussian_filter(np.random.default_rng(1).standard_normal(SCAN_SHAPE), 3)
+    elif case == "grating":
+        layout = np.broadcast_to(6 * (np.arange(SHAPE[1]) % 24 < 12), SHAPE).astype(np.uint8)
+        scan = bent_scan(layout, bend_of())
+    else:
+        pitches["scan_pitch_um"] = (0.1, 0.125)
+    found = register_scan(scan, layout, **pitches)
+    assert not found.quality.passed
+    assert found.bend_um is None
+    assert found.quality.reason
+
+
+def test_a_bend_that_may_fold_the_scan_is_refused():
+    figures = {
+        **{"ecc": 0.95, "second_orientation": 0.3, "layout_repeats": 0.2, "second_alignment": 0.3},
+        **{"singular_min": 1.0, "singular_max": 1.0, "overlap": 1.0, "tre_median_px": 0.3},
+        **{"corner_sd_px": 0.2, "dihedral": "identity", "polarity": 1, "method": "orb", "converged": True},
+    }
+    # d(shift)/dx is 2 a u / half: at u = 1 it reaches 1 for a = half / 2.
+    half_um = bend_of().half[0]
+    for share, passed in ((0.99, True), (1.01, False)):
+        bend = Bend(np.array([[share * half_um / 2, 0, 0], [0, 0, 0]]), bend_of().middle, bend_of().half)
+        assert bend.slope == pytest.approx(share, rel=1e-12)
+        assert judge(figures, Thresholds(), 2.0, bend)[0] is passed
+
+
+def test_undo_is_the_inverse_of_straighten_up_to_the_fold():
+    unit = np.random.default_rng(6).uniform(-1, 1, (500, 2))
+    bend = bend_of(6.0)
+    assert 0.5 < bend.slope < 1
+    points = bend.middle + bend.half * unit
+    back = np.stack(bend.undo(*bend.straighten(points).T), axis=1)
+    # Newton ends with a step below 1e-9 half widths, 2e-8 µm, and converges quadratically.
+    np.testing.assert_allclose(back, points, atol=2e-8)
+
+
+def test_a_bend_is_centred_turns_into_pixels_and_is_found_from_its_points():
+    bend = bend_of()
+    # The terms are orthogonal to 1, u, v over the frame: nothing affine is left in a dense average.
+    u, v = np.meshgrid(*[(np.arange(400) + 0.5) / 200 - 1] * 2)
+    shift = np.array(bend.shift(bend.middle[0] + bend.half[0] * u, bend.middle[1] + bend.half[1] * v))
+    for basis in (np.ones_like(u), u, v):
+        # The midpoint rule of 400 cells misses the mean of u² by 1 / (3 · 400²) = 2.1e-6; the amounts per u²
+        # and v² add up to 1.2 µm at most.
+        np.testing.assert_allclose((shift * basis).mean(axis=(1, 2)), 0, atol=2.6e-6)
+    points = places_um((40, 50)) * 8
+    in_pixels = bend.in_pixels((PITCH_UM, PITCH_UM)).straighten(points / PITCH_UM - 0.5)
+    np.testing.assert_allclose(PITCH_UM * (in_pixels + 0.5), bend.straighten(points), atol=1e-12)
+    images = apply_transform(true_map(), bend.straighten(points))
+    matrix, found = fit_bent_affine(points, images, bend.middle, bend.half)
+    np.testing.assert_allclose(matrix, true_map(), atol=1e-10)
+    np.testing.assert_allclose(found.amount, bend.amount, atol=1e-10)
+
+
+def test_resampling_looks_where_the_bend_says():
+    # A cubic spline reproduces a ramp: the registered height tells which place of the scan was taken.
+    y_um, x_um = (one.reshape(SCAN_SHAPE) for one in places_um(SCAN_SHAPE).T[::-1])
+    bend, origin_um = bend_of(), true_map()
+    taken = [resample_to_layout(ramp, origin_um, SHAPE, **PITCHES, bend_um=bend)[0] for ramp in (x_um, y_um)]
+    landed_um = apply_transform(origin_um, bend.straighten(np.stack([one.ravel() for one in taken], axis=1)))
+    inner = np.pad(np.ones((SHAPE[0] - 40, SHAPE[1] - 40), bool), 20).ravel()
+    # float32 of 40 µm is good to 4e-6 µm.
+    np.testing.assert_allclose(landed_um[inner], places_um(SHAPE)[inner], atol=1e-5)
+
+
+def test_the_layout_under_a_bent_scan_is_the_layout_where_it_really_was():
+    layout = random_layout(SHAPE, seed=7)
+    pitch_um = (PITCH_UM, PITCH_UM)
+    level = layout_in_scan_frame(layout, true_map(), SCAN_SHAPE, pitch_um, PITCH_UM, bend_of())
+    column, row = np.floor(
+        apply_transform(true_map(), bend_of().straighten(places_um(SCAN_SHAPE))).T / PITCH_UM
+    ).astype(int)
+    inside = (row >= 0) & (row < SHAPE[0]) & (column >= 0) & (column < SHAPE[1])
+    assert np.isnan(level.ravel()[~inside]).all()
+    np.testing.assert_array_equal(level.ravel()[inside], layout[row[inside], column[inside]])
+
+
+def test_a_bent_campaign_is_built_verified_and_replayed_from_its_raw_files(tmp_path: Path):
+    strength_um = 0.4
+    knobs = [KnobSetting("registration-residual", strength_um)]
+    card = simulate(tmp_path / "fab", count=3, size_px=256, seed=5, knobs=knobs)
+    result = build(card, tmp_path / "bent.zarr", strict=True)
+    store = open_store(tmp_path / "bent.zarr")
+    assert (result.n_scans, len(store)) == (3, 3)
+    truth = Truth.read(tmp_path / "fab" / "truth")
+    board = KnobBoard(knobs, truth.seed)
+    y_px, x_px = np.indices([n + 2 * GUARD_PX for n in (256, 256)]) - float(GUARD_PX)
+    for index, scan in enumerate(store.scans()):
+        row = store.quality.set_index("scan").loc[scan.id]
+        assert f"scan bent by up to {row['bend_um']:.2f} µm" in row["warning"]
+        assert scan.bend_um is not None
+        np.testing.assert_array_equal(scan.bend_um.amount[0, 0], row["bend_x_by_xx_um"])
+        shape = store.scan_frame(scan.id, "raw_height_um").shape
+        frame = ScanFrame(shape, 0.1, np.array(truth.scans[index].scan_to_layout))
+        # The fab itself says where each pixel was: it is made to scan ramps.
+        true_px = np.stack([sample_surface(r, frame, board, index).ravel() for r in (x_px, y_px)], axis=1)
+        found_um = apply_transform(scan.scan_to_layout, scan.bend_um.straighten(places_um(shape)))
+        seen = ((true_px > 0) & (true_px < 255)).all(axis=1)
+        error_px = np.hypot(*(found_um / 0.1 - 0.5 - true_px)[seen].T)
+        assert error_px.max() < 6 * row["corner_sd_px"] + 0.02
+        # Its limit of a pass is 1.5 px at the worst corner; over the field a third of that.
+        assert np.sqrt((error_px**2).mean()) < 0.5
+        assert row["tre_median_px"] < 1.0
+    step = {one.op: one for _, one in read_steps(store)[store.ids[0]]}
+    assert [one["name"] for one in step["register"].outputs] == ["scan_to_layout", "bend_um"]
+    assert "bend_um" in {one["name"] for one in step["resample"].inputs}
+    assert verify(tmp_path / "bent.zarr").findings == ()
+    again = replay(tmp_path / "bent.zarr", [store.ids[0]])
+    assert again["same_hash"].all()
+    assert "bend_um" in set(again["array"])
+    packed = open_store(export_zip(tmp_path / "bent.zarr", tmp_path / "bent.zarr.zip"))
+    assert packed.computed_sha256() == store.sha256
+    np.testing.assert_array_equal(
+        packed.scan(store.ids[1]).bend_um.amount, store.scan(store.ids[1]).bend_um.amount
+    )
