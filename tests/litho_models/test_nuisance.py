@@ -7,6 +7,7 @@ import pytest
 from scipy.ndimage import distance_transform_cdt
 
 from litho_data.errors import InputError
+from litho_data.register import Bend, resample_to_layout
 from litho_models.nuisance import (
     POLICIES,
     TERM_COUNT,
@@ -116,6 +117,22 @@ def test_scan_lines_of_a_rotated_scan_are_tilted_rows():
     # along one layout row the index falls by that.
     assert line[256, 0] - line[256, -1] in (4, 5)
     assert scan_line_index((8, 8), np.eye(3), 0.1).tolist() == [[row] * 8 for row in range(8)]
+
+
+def test_scan_lines_of_a_bent_scan_are_the_lines_it_was_scanned_in():
+    shape, pitch_um = (120, 140), (0.1, 0.1)
+    bend = Bend.of_scan(np.array([[0.1, -0.05, 0.1], [0.15, 0.1, -0.2]]), shape, pitch_um)
+    line = scan_line_index(shape, np.eye(3), 0.1, bend)
+    # A scan whose height is its place across the lines, in pixels, registered. A spline reproduces a ramp
+    # but for its mirrored ends, which decay by 0.27 per pixel: 1e-5 after 9; float32 is good to 1e-5.
+    ramp = np.broadcast_to(np.arange(shape[0])[:, None] + 0.5, shape)
+    height, valid = resample_to_layout(
+        ramp, np.eye(3), shape, scan_pitch_um=pitch_um, layout_pitch_um=0.1, bend_um=bend
+    )
+    clear = valid & (np.abs(height - np.rint(height)) > 1e-4) & (height > 9) & (height < shape[0] - 9)
+    assert np.ptp(np.floor(height[clear]) - line[clear]) == 0
+    # Without the bend the lines would be rows; it moves places by up to 0.4 µm.
+    assert np.ptp(line - np.arange(shape[0])[:, None]) > 2
 
 
 def test_nan_pixels_neither_count_nor_are_fitted(scan):
