@@ -98,6 +98,15 @@ def line_roughness(
     return Observed("line-roughness", bool(p <= BINOMIAL_P and rms_nm >= SMALLEST_RMSE_NM), text)
 
 
+def bends(fields: Sequence[Field]) -> Observed:
+    """Scans that registration found bent, and straightened: the loop sees them without their bend."""
+    found_um = [f.scan.bend_um.largest for f in fields if f.scan.bend_um is not None]
+    text = f"registration straightened {len(found_um)} of {len(fields)} scans"
+    if found_um:
+        text += f", bent by up to {max(found_um):.2f} µm (median {np.median(found_um):.2f} µm)"
+    return Observed("registration-residual", bool(found_um), text)
+
+
 def _shared_nm2(field: Field, prediction: np.ndarray, residual_um: np.ndarray) -> tuple[float, float]:
     """Mean product of residuals some lags apart, along the rows and across them, nm²."""
     slope = np.hypot(*np.gradient(prediction))
@@ -131,7 +140,7 @@ def observe(
         rounding_um: step of the heights in each scan's raw file, by id, if known.
         seed: of the halves on which per-scan terms are fitted and scored.
     """
-    seen = [scars(fields, defects), line_roughness(fields, predictions, terms, seed)]
+    seen = [scars(fields, defects), line_roughness(fields, predictions, terms, seed), bends(fields)]
     if rounding_um is not None:
         seen.append(quantisation([rounding_um[f.id] for f in fields]))
     return {one.name: one for one in seen}

@@ -242,7 +242,7 @@ def _candidates(closed: Closed, added: set[str]) -> list[Candidate]:
     sets = {name: entry for entry in closed.search.added for name in entry.confusable_with}
     for name in [*CATALOGUE, *(n for n in closed.untestable if n not in CATALOGUE)]:
         seen = closed.observed.get(name)
-        # Offsets of whole lines are one form of line-shaped roughness; what is shorter is seen only.
+        # A term of single scans is one form of an effect; what is shorter, or already mended, is seen only.
         if name in tests and (name in added or seen is None or not seen.seen):
             rows.append(_measurement_candidate(closed, tests[name], name in added))
         elif seen is not None:

@@ -40,7 +40,7 @@ def plain_words(closed: Closed, result: CloseLoop) -> str:
         if e.separating_experiment and (e.confusable_with or e.role == "undetermined"):
             parts.append(f"To be sure: {e.separating_experiment}.")
     parts += [
-        f"Seen without a model, and beyond what one can correct [{seen.name}]: {seen.evidence}."
+        f"Seen without a model [{seen.name}]: {seen.evidence}."
         for seen in closed.observed.values()
         if seen.seen
     ]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from litho_data.register.bend import Bend
 from litho_models.loop.fields import prepare_fields
-from litho_models.loop.observed import line_roughness, observe, quantisation, rounding_step_um, scars
+from litho_models.loop.observed import bends, line_roughness, observe, quantisation, rounding_step_um, scars
 from litho_models.loop.probes.defects import find_defects
 from tests.litho_models.loop_scans import printed_scans
 
@@ -57,7 +60,7 @@ def test_without_raw_files_nothing_is_said_about_rounding() -> None:
     terms = frozenset({"offset"})
     predictions = [f.scan.height_um for f in fields]
     without = observe(fields, predictions, terms, defects, None, 0)
-    assert set(without) == {"scars-and-spikes", "line-roughness"}
+    assert set(without) == {"scars-and-spikes", "line-roughness", "registration-residual"}
     assert "quantisation" in observe(fields, predictions, terms, defects, {f.id: 0.0 for f in fields}, 0)
 
 
@@ -83,3 +86,14 @@ def test_line_shaped_roughness_is_told_from_grain_and_from_offsets_of_whole_line
     assert not seen([e.T for e in lines]).seen
     assert not seen(white).seen
     assert not seen([np.broadcast_to(w[:, :1], w.shape) for w in white]).seen
+
+
+def test_what_registration_straightened_is_told() -> None:
+    scans = printed_scans(count=3)
+    bend = Bend.of_scan(np.array([[0.3, 0, 0], [0, 0, 0]]), (64, 64), (0.1, 0.1))
+    bent = [replace(scans[0], bend_um=bend), *scans[1:]]
+    assert not bends(prepare_fields(scans)).seen
+    seen = bends(prepare_fields(bent))
+    assert seen.seen
+    # Along x, 0.3 (u² - 1/3): largest at u = 1, two thirds of it.
+    assert "1 of 3 scans, bent by up to 0.20 µm" in seen.evidence
