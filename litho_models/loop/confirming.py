@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from litho_models.loop.sign_flips import one_sided_flip_p
 from litho_models.metrics import bootstrap_interval
 
 BINOMIAL_P = 0.005
@@ -16,8 +17,6 @@ FEWEST_SCANS = 8
 SMALLEST_SHARE = 0.01
 SMALLEST_RMSE_NM = 0.5
 LARGEST_SPREAD = 0.5
-SIGN_FLIPS = 9999
-EXACT_SCANS = 13
 
 
 @dataclass(frozen=True)
@@ -125,20 +124,6 @@ def confirm_variance(
     if len(products) >= FEWEST_SCANS and p > BINOMIAL_P:
         failures.append(f"the two halves of the scans do not agree on it (p = {p:.3f})")
     return replace(plain, passed=not failures, reason="; ".join(failures), p=p)
-
-
-def one_sided_flip_p(values: np.ndarray, seed: int = 0) -> float:
-    """Share of sign flips of the scans' values whose sum reaches the observed one."""
-    signs = sign_flips(len(values), seed)
-    return float(np.mean(signs @ values >= values.sum() * (1 - 1e-12)))
-
-
-def sign_flips(count: int, seed: int = 0) -> np.ndarray:
-    """Signs (draws, count), the observed ones first: all of them up to 13 scans, 10,000 beyond."""
-    if count <= EXACT_SCANS:
-        return 1.0 - 2.0 * ((np.arange(2**count)[:, None] >> np.arange(count)) & 1)
-    drawn = np.random.default_rng(seed).choice([-1.0, 1.0], size=(SIGN_FLIPS, count))
-    return np.vstack([np.ones(count), drawn])
 
 
 def _unstable(amplitudes: Mapping[str, np.ndarray]) -> list[str]:

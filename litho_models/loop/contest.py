@@ -14,6 +14,7 @@ import numpy as np
 
 from litho_models.effects import Effect
 from litho_models.loop.confirming import BINOMIAL_P, SMALLEST_SHARE, Confirmation, confirm
+from litho_models.loop.directions import Directions, measure_directions
 from litho_models.loop.fields import Field
 from litho_models.loop.fitting import FoldFits, effect_slots
 from litho_models.loop.linear import pooled_cosine, without_scan_terms
@@ -22,10 +23,8 @@ from litho_models.loop.screening import (
     FAMILY_P,
     SAME_COSINE,
     SMALLEST_RETAINED,
-    Directions,
     Screened,
     cosine,
-    measure_directions,
     screen,
 )
 from litho_models.loop.state import State, fit_state, held_out_residuals

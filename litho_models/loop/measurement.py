@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from litho_models.effects import Effect, get_effect
-from litho_models.loop.confirming import BINOMIAL_P, Confirmation, confirm_variance, one_sided_flip_p
+from litho_models.loop.confirming import BINOMIAL_P, Confirmation, confirm_variance
 from litho_models.loop.fields import Field
 from litho_models.loop.scoring import (
     LINE_TERMS,
@@ -23,6 +23,7 @@ from litho_models.loop.scoring import (
     score,
     term_maps,
 )
+from litho_models.loop.sign_flips import one_sided_flip_p
 from litho_models.metrics import NM_PER_UM, bootstrap_interval, paired_difference
 from litho_models.nuisance import least_squares
 

@@ -10,10 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from litho_models.loop.confirming import BINOMIAL_P, SMALLEST_RMSE_NM, one_sided_flip_p
+from litho_models.loop.confirming import BINOMIAL_P, SMALLEST_RMSE_NM
 from litho_models.loop.fields import Field
 from litho_models.loop.probes.defects import Defects
 from litho_models.loop.scoring import LINE_TERMS, Terms, score
+from litho_models.loop.sign_flips import one_sided_flip_p
 from litho_models.metrics import NM_PER_UM
 
 # Heights closer than this are one value of a file that rounds in single precision.

@@ -12,15 +12,11 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import torch
 
 from litho_models.effects import Effect
-from litho_models.effects.chain import EffectChain
 from litho_models.effects.effect import Parameter
-from litho_models.loop.confirming import sign_flips
-from litho_models.loop.fields import Field
-from litho_models.loop.fitting import Linearisation, set_vector
-from litho_models.loop.linear import gram_inside, nuisance_columns, orthonormal
+from litho_models.loop.directions import PROJECTIONS, Block, Directions, freed_grams, raw_information
+from litho_models.loop.sign_flips import family_wise_p, sign_flip_statistics
 
 FAMILY_P = 0.05
 SAME_COSINE = 0.8
@@ -28,48 +24,6 @@ SAME_COSINE = 0.8
 SMALLEST_RETAINED = 1e-5
 # An effect of which a term of single scans leaves less than this is tested without that term.
 SWALLOWED_SHARE = 0.05
-_PROJECTIONS: Mapping[str, Mapping[str, bool]] = {
-    "full": {"gain": True},
-    "no-gain": {"gain": False},
-    "no-bow": {"gain": True, "bow": False},
-}
-
-
-@dataclass(frozen=True)
-class Block:
-    """Trials of one effect that share shape and size; their amplitudes are fitted jointly."""
-
-    effect: Effect
-    shape: Mapping[str, float]
-    columns: tuple[int, ...]
-    trials: tuple[Mapping[str, float], ...]
-
-    def values(self, multiples: np.ndarray) -> dict[str, float]:
-        """Parameter values for the given multiples of the trials' amplitudes."""
-        values = {**self.effect.off_values(), **self.shape}
-        for multiple, trial in zip(multiples, self.trials, strict=True):
-            for name in self.effect.amplitudes:
-                if name in trial:
-                    values[name] += float(multiple) * (trial[name] - self.effect.parameters[name].null)
-        return values
-
-
-@dataclass(frozen=True)
-class Directions:
-    """Inner products of all scans, ready for any subset of them.
-
-    Attributes:
-        blocks: trials by effect and shape; their columns count from 0.
-        grams: per projection, and ``raw`` without any, an array (scans, 1 + p + m, 1 + p + m):
-            residual, parameters of the model, directions.
-        parameters: p.
-        pixels: (scans,) sampled pixels.
-    """
-
-    blocks: list[Block]
-    grams: dict[str, np.ndarray]
-    parameters: int
-    pixels: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -97,64 +51,6 @@ class Screened:
         return float(self.gain_nm2.mean())
 
 
-def blocks_of(effects: Sequence[Effect]) -> list[Block]:
-    """Group the trials of the effects by shape and by size; number the columns.
-
-    A second trial of the same amplitudes at the same shape is another size: what an effect does
-    when it is large need not be a multiple of what it does when it is small.
-    """
-    blocks, column = [], 0
-    for effect in effects:
-        grouped: dict[tuple, list[Mapping[str, float]]] = {}
-        for trial in effect.trials:
-            shape = tuple(sorted((k, v) for k, v in trial.items() if k not in effect.amplitudes))
-            names, size = set(trial), 0
-            while any(set(other) == names for other in grouped.get((shape, size), [])):
-                size += 1
-            grouped.setdefault((shape, size), []).append(trial)
-        for (shape, _), trials in grouped.items():
-            columns = tuple(range(column, column + len(trials)))
-            blocks.append(Block(effect, dict(shape), columns, tuple(trials)))
-            column += len(trials)
-    return blocks
-
-
-def measure_directions(
-    chain: EffectChain,
-    vector: np.ndarray,
-    linear: Sequence[Linearisation],
-    fields: Sequence[Field],
-    residuals: Sequence[np.ndarray],
-    effects: Sequence[Effect],
-) -> Directions:
-    """Secants of all trials and their inner products with the residual, for each scan.
-
-    Args:
-        chain, vector: the model so far; ``linear``: its derivatives per scan.
-        fields: scans; ``residuals``: out-of-fold residual (n,) µm at the sampled pixels.
-        effects: candidates, none of them in the chain.
-    """
-    set_vector(chain, vector)
-    blocks = blocks_of(effects)
-    extended = [chain.with_effects(_with_trial(chain, b, t)) for b in blocks for t in b.trials]
-    acts_on = [b.effect.acts_on for b in blocks for _ in b.trials]
-    stacked: dict[str, list[np.ndarray]] = {name: [] for name in ("raw", *_PROJECTIONS)}
-    for field, part, residual in zip(fields, linear, residuals, strict=True):
-        prediction, secants = _secants(chain, extended, acts_on, field)
-        columns = np.column_stack([residual, part.jacobian, *secants])
-        raw = columns.T @ columns
-        stacked["raw"].append(raw)
-        for name, terms in _PROJECTIONS.items():
-            basis = orthonormal(nuisance_columns(field, prediction, **terms))
-            stacked[name].append(raw - gram_inside(columns, basis))
-    return Directions(
-        blocks=blocks,
-        grams={name: np.stack(grams) for name, grams in stacked.items()},
-        parameters=linear[0].jacobian.shape[1],
-        pixels=np.array([len(field.sample) for field in fields]),
-    )
-
-
 def screen(directions: Directions, fold_of: np.ndarray) -> list[Screened]:
     """Test every effect, best predicted gain first.
 
@@ -163,7 +59,7 @@ def screen(directions: Directions, fold_of: np.ndarray) -> list[Screened]:
         fold_of: (scans,) fold that holds each scan out.
     """
     everything = np.arange(len(fold_of))
-    free = {name: _freed(directions, name, everything) for name in _PROJECTIONS}
+    free = {name: freed_grams(directions, name, everything) for name in PROJECTIONS}
     projection = _projection_of_columns(directions, free)
     scores = np.stack([_scores(free[projection[c]], 1 + c) for c in range(len(projection))], axis=1)
     z, null_max = sign_flip_statistics(scores)
@@ -180,7 +76,7 @@ def best_by_fold(directions: Directions, screened: Sequence[Screened], fold_of: 
     winners = []
     for fold in range(int(fold_of.max()) + 1):
         training = np.flatnonzero(fold_of != fold)
-        freed = {name: _freed(directions, name, training) for name in _PROJECTIONS}
+        freed = {name: freed_grams(directions, name, training) for name in PROJECTIONS}
         gains = {}
         for entry in screened:
             own = [b for b in directions.blocks if b.effect.name == entry.effect.name]
@@ -193,31 +89,10 @@ def best_by_fold(directions: Directions, screened: Sequence[Screened], fold_of: 
 def cosine(directions: Directions, a: Screened, b: Screened) -> float:
     """Alignment of two effects' best signatures after the projections, pooled over scans."""
     name = next((s.projection for s in (a, b) if s.projection != "full"), "full")
-    freed = _freed(directions, name, np.arange(len(directions.pixels)))
+    freed = freed_grams(directions, name, np.arange(len(directions.pixels)))
     pooled = freed[:, 1:, 1:].sum(axis=0)
     inner = a.signature @ pooled @ b.signature
     return float(inner / np.sqrt((a.signature @ pooled @ a.signature) * (b.signature @ pooled @ b.signature)))
-
-
-def sign_flip_statistics(scores: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
-    """Cluster-robust z of each column of (scans, columns), and the null distribution of max |z|.
-
-    z = sum s / sqrt(F/(F-1) sum (s - mean)²). The null flips scans, the same flip for all columns:
-    see ``sign_flips``.
-    """
-    count = len(scores)
-    signs = sign_flips(count, seed)
-    sums = signs @ scores
-    squares = (scores**2).sum(axis=0)
-    # A column of equal scores would divide by zero; z is capped where the spread vanishes.
-    spread = np.maximum(squares - sums**2 / count, 1e-6 * squares + np.finfo(float).tiny)
-    z = sums / np.sqrt(count / max(count - 1, 1) * spread)
-    return z[0], np.abs(z).max(axis=1)
-
-
-def family_wise_p(z: float, null_max: np.ndarray) -> float:
-    """Share of sign flips whose largest |z| reaches this one."""
-    return float(np.mean(null_max >= abs(z) * (1 - 1e-9)))
 
 
 def _scores(freed: np.ndarray, column: int) -> np.ndarray:
@@ -246,7 +121,7 @@ def _screen_one(
     strongest = float(z[max(columns, key=lambda c: abs(z[c]))])
     signature = np.zeros(free[chosen].shape[1] - 1)
     signature[list(block.columns)] = multiples
-    raw = _raw_information(directions)
+    raw = raw_information(directions)
     retained = max(float(free[chosen][:, 1 + c, 1 + c].sum() / max(raw[c], 1e-300)) for c in block.columns)
     return Screened(
         effect=effect,
@@ -269,7 +144,7 @@ def _held_out_gain(
     gain = np.zeros(len(fold_of))
     for fold in range(int(fold_of.max()) + 1):
         training, held_out = np.flatnonzero(fold_of != fold), np.flatnonzero(fold_of == fold)
-        freed = _freed(directions, projection, training)
+        freed = freed_grams(directions, projection, training)
         estimates = [_estimate(freed, block, training) for block in own]
         allowed = [i for i in range(len(own)) if estimates[i].physical]
         if not allowed:
@@ -331,35 +206,12 @@ def _amplitudes(block: Block) -> dict[str, Parameter]:
     return {n: block.effect.parameters[n] for n in block.effect.amplitudes if n in named}
 
 
-def _freed(directions: Directions, projection: str, scans: np.ndarray) -> np.ndarray:
-    """Grams (scans, 1 + m, 1 + m) of residual and directions, freed of the model's own parameters."""
-    grams, p = directions.grams[projection], directions.parameters
-    if not p:
-        return grams
-    pooled = grams[scans].sum(axis=0)
-    own, rest = slice(1, 1 + p), np.r_[0, 1 + p : grams.shape[1]]
-    scale = np.sqrt(np.maximum(np.diag(pooled)[own], 1e-300))
-    normal = pooled[own, own] / np.outer(scale, scale)
-    coefficients = (
-        np.linalg.lstsq(normal, pooled[own][:, rest] / scale[:, None], rcond=1e-7)[0] / scale[:, None]
-    )
-    transform = np.zeros((grams.shape[1], len(rest)))
-    transform[rest, np.arange(len(rest))] = 1
-    transform[own] = -coefficients
-    return transform.T @ grams @ transform
-
-
-def _raw_information(directions: Directions) -> np.ndarray:
-    start = 1 + directions.parameters
-    return np.einsum("fii->i", directions.grams["raw"])[start:]
-
-
 def _projection_of_columns(directions: Directions, free: Mapping[str, np.ndarray]) -> list[str]:
     """``full``, or without the per-scan term that would swallow the effect; one per effect."""
     chosen = [""] * sum(len(b.columns) for b in directions.blocks)
     for name in {b.effect.name for b in directions.blocks}:
         own = [c for b in directions.blocks if b.effect.name == name for c in b.columns]
-        left = {kind: sum(float(free[kind][:, 1 + c, 1 + c].sum()) for c in own) for kind in _PROJECTIONS}
+        left = {kind: sum(float(free[kind][:, 1 + c, 1 + c].sum()) for c in own) for kind in PROJECTIONS}
         most = max(left, key=lambda kind: left[kind])
         for c in own:
             chosen[c] = most if left["full"] < SWALLOWED_SHARE * left[most] else "full"
@@ -374,25 +226,3 @@ def _detectable(block: Block, freed: np.ndarray, critical: float) -> str:
     parameter = block.effect.parameters[name]
     size = critical * spread / max(information, 1e-300) * abs(block.trials[0][name] - parameter.null)
     return f"{name} {size:.2g} {parameter.unit}".removesuffix(" 1")
-
-
-def _with_trial(
-    chain: EffectChain, block: Block, trial: Mapping[str, float]
-) -> dict[str, Mapping[str, float]]:
-    return {**chain.values(), block.effect.name: block.effect.with_values(trial)}
-
-
-def _secants(
-    chain: EffectChain, extended: Sequence[EffectChain], acts_on: Sequence[str], field: Field
-) -> tuple[np.ndarray, list[np.ndarray]]:
-    with torch.no_grad():
-        before = chain.base(chain.before_base(field.layout, field.context))
-        here = chain.after_base(before, field.context)
-        secants = []
-        for other, where in zip(extended, acts_on, strict=True):
-            if where == "height":
-                moved = other.after_base(before, field.context)
-            else:
-                moved = other(field.layout, field.context)
-            secants.append(field.at_sample(moved - here))
-    return here[0, 0].numpy(), secants

@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 
 from litho_models.loop.fields import Field
 from litho_models.loop.linear import without_scan_terms
-from litho_models.loop.screening import sign_flip_statistics
+from litho_models.loop.sign_flips import sign_flip_statistics
 from litho_models.metrics import NM_PER_UM
 
 BINS = 8

@@ -7,9 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from litho_models.loop.confirming import binomial_p, confirm, confirm_variance, one_sided_flip_p, sign_flips
+from litho_models.loop.confirming import binomial_p, confirm, confirm_variance
 from litho_models.loop.linear import gram, orthonormal, solve_damped
-from litho_models.loop.screening import family_wise_p, sign_flip_statistics
+from litho_models.loop.sign_flips import (
+    family_wise_p,
+    one_sided_flip_p,
+    sign_flip_statistics,
+    sign_flips,
+)
 
 
 @pytest.mark.parametrize(("needed", "count"), [(19, 24), (17, 20), (11, 12), (10, 10), (8, 8)])
