@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from litho_models.effects import Effect
-from litho_models.loop.closing import Closed
+from litho_models.loop.closed import Closed
 from litho_models.loop.contest import Added
 from litho_models.loop.fitting import effect_slots
 from litho_models.loop.measurement import MeasurementTest

@@ -6,7 +6,7 @@ import math
 
 from litho_models.effects import CATALOGUE
 from litho_models.loop.added_effects import verdict_on
-from litho_models.loop.closing import Closed
+from litho_models.loop.closed import Closed
 from litho_models.loop.confirming import FEWEST_SCANS
 from litho_models.loop.contest import Added
 from litho_models.loop.measurement import MeasurementTest

@@ -4,95 +4,29 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
-from pydantic import Field as Setting
 from torch import nn
 
 from litho_data.errors import InputError
 from litho_data.store.read import PrintedScan
 from litho_models.effects import CATALOGUE, UNTESTABLE, get_effect
 from litho_models.effects.chain import EffectChain
+from litho_models.loop.closed import Closed, LoopConfig
 from litho_models.loop.fields import Field, prepare_fields
-from litho_models.loop.fitting import is_stiff, predict, set_vector
-from litho_models.loop.flexible import FoldedBase, Trainer, carry_over, same_for_all, train_folds
-from litho_models.loop.injecting import Planted, parse_injection, plant
+from litho_models.loop.fitting import is_stiff, predict
+from litho_models.loop.flexible import Trainer, carry_over, same_for_all, train_folds
+from litho_models.loop.injecting import parse_injection, plant
 from litho_models.loop.measurement import MeasurementTest, measurement_tests
-from litho_models.loop.observed import Observed, observe
+from litho_models.loop.observed import observe
 from litho_models.loop.probes import Probed, probe_residual
-from litho_models.loop.scoring import DATUM_FREE, Score, Terms, names_to_terms, score
-from litho_models.loop.search import Search, search_effects
+from litho_models.loop.scoring import DATUM_FREE, Score, names_to_terms, score
+from litho_models.loop.search import search_effects
 from litho_models.loop.state import State, fit_state
-from litho_models.loop.structure import CovariateTest, covariate_tests, is_structured
+from litho_models.loop.structure import covariate_tests, is_structured
 from litho_models.metrics import NM_PER_UM
 from litho_models.models import build_model
 from litho_models.splits import grouped_folds, locked_ids
-
-
-class LoopConfig(BaseModel):
-    """Settings of one run; the defaults are the reference."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    folds: int = Setting(6, ge=2, description="outer folds by scan")
-    seed: int = Setting(0, ge=0, description="folds, calibration blocks, bootstrap")
-    open_lock_box: bool = False
-    prior_hypotheses: tuple[str, ...] = ()
-    inject: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class Closed:
-    """Everything that the report and ``close_loop.json`` are made from.
-
-    Attributes:
-        development, locked: prepared scans; ``fold_of``: fold of each development scan.
-        lock_box: ids of the locked scans, those that cannot be used among them.
-        base, final: fitted states before and after; ``search``: how it got there.
-        probed: generic terms where no named effect won; ``final`` predicts with them.
-        first_tests, last_tests: measurement tests before and after the process effects.
-        accepted: measurement effects in force at the end.
-        floor_nm: lower bound of the noise, nm (root mean square, mean absolute).
-        left_by_named, structure: covariate tests on what the named effects leave, and at last.
-        locked_scores: (before, after) as pairs (no fit, datum free), if opened.
-        observed: what is seen without a model, by name.
-        untestable: effect to reason; ``planted``: power of the screening, if asked for.
-    """
-
-    development: list[Field]
-    locked: list[Field]
-    lock_box: list[str]
-    fold_of: np.ndarray
-    base: State
-    final: State
-    search: Search
-    probed: Probed
-    first_tests: list[MeasurementTest]
-    last_tests: list[MeasurementTest]
-    accepted: list[str]
-    floor_nm: tuple[float, float]
-    left_by_named: list[CovariateTest]
-    structure: list[CovariateTest]
-    locked_scores: tuple[tuple[Score, Score], tuple[Score, Score]] | None
-    observed: dict[str, Observed]
-    untestable: dict[str, str]
-    planted: list[Planted]
-    config: LoopConfig
-
-    @property
-    def structured(self) -> list[CovariateTest]:
-        return is_structured(self.structure)
-
-    @property
-    def terms(self) -> Terms:
-        """Per-scan terms of the final error: the datum and the accepted measurement effects."""
-        return DATUM_FREE | names_to_terms(self.accepted)
-
-    def errors(self, state: State, terms: Terms) -> Score:
-        """Held-out errors of a state over the development scans."""
-        return score(self.development, state.predictions, terms, self.config.seed)
 
 
 def close_loop(
@@ -296,14 +230,3 @@ def _locked_scores(
         (score(locked, before, frozenset(), config.seed), score(locked, before, DATUM_FREE, config.seed)),
         (score(locked, after, frozenset(), config.seed), score(locked, after, terms, config.seed)),
     )
-
-
-def corrected_chain(closed: Closed) -> EffectChain:
-    """The final model at the parameters fitted on all development scans, a copy."""
-    chain = copy.deepcopy(closed.final.fits.chain)
-    set_vector(chain, closed.final.fits.common)
-    if isinstance(chain.base, FoldedBase):
-        effects, common = chain.values(), chain.base.common
-        geometry = {"full_height_um": chain.full_height_um, "pitch_um": chain.pitch_um}
-        return EffectChain(common, effects, **geometry)
-    return chain

@@ -10,7 +10,7 @@ import numpy as np
 from litho_data.files import atomic_file
 from litho_models.effects import get_effect
 from litho_models.effects.chain import EffectChain
-from litho_models.loop.closing import Closed
+from litho_models.loop.closed import Closed
 from litho_models.loop.measurement import scan_parameters
 from litho_models.loop.result import CloseLoop
 from litho_models.loop.scoring import scan_parameter_names

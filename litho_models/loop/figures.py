@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from litho_data.report import new_figure
-from litho_models.loop.closing import Closed
+from litho_models.loop.closed import Closed
 from litho_models.loop.probes import AddedProbe, figures
 from litho_models.loop.probes.kernel import MissingKernel
 from litho_models.loop.probes.places import drawn, drawn_profile

@@ -7,7 +7,7 @@ import numpy as np
 from litho_models.effects import CATALOGUE
 from litho_models.loop.added_effects import added_effects
 from litho_models.loop.candidates import all_candidates
-from litho_models.loop.closing import Closed
+from litho_models.loop.closed import Closed
 from litho_models.loop.result import (
     CloseLoop,
     Dataset,

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 
 from litho_data.report import Page
-from litho_models.loop.closing import Closed
+from litho_models.loop.closed import Closed
 from litho_models.loop.figures import curve_figure, map_figure, probe_figure, staircase_figure
 from litho_models.loop.measurement import scan_parameters
 from litho_models.loop.result import CloseLoop

@@ -14,7 +14,8 @@ from litho_data.store import PrintedScan, Store, open_store
 from litho_models import zoo
 from litho_models.effects import get_effect
 from litho_models.freeze import save_frozen
-from litho_models.loop.closing import Closed, LoopConfig, close_loop, corrected_chain
+from litho_models.loop.closed import Closed, LoopConfig, corrected_chain
+from litho_models.loop.closing import close_loop
 from litho_models.loop.exporting import exported_effects, write_measurement_model
 from litho_models.loop.fitting import is_stiff
 from litho_models.loop.flexible import Trainer

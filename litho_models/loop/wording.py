@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from litho_models.effects import get_effect
-from litho_models.loop.closing import Closed
+from litho_models.loop.closed import Closed
 from litho_models.loop.confirming import FEWEST_SCANS
 from litho_models.loop.result import AddedEffect, CloseLoop
 

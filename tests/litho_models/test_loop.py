@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 from litho_data.errors import InputError
 from litho_models.effects import get_effect
 from litho_models.loop import LoopConfig, close_loop, close_loop_on_store, parse_priors
-from litho_models.loop.closing import Closed
+from litho_models.loop.closed import Closed
 from litho_models.loop.exporting import exported_effects
 from litho_models.loop.fields import LARGE_PX, prepare_fields
 from litho_models.loop.fitting import fit_folds, get_vector, predict
