@@ -13,6 +13,7 @@ from litho_models.effects.chain import EffectChain
 from litho_models.loop.fields import Field
 from litho_models.loop.fitting import set_vector
 from litho_models.loop.flexible import FoldedBase
+from litho_models.loop.identifiability import Identifiability, Profile
 from litho_models.loop.injecting import Planted
 from litho_models.loop.measurement import MeasurementTest
 from litho_models.loop.observed import Observed
@@ -50,6 +51,7 @@ class Closed:
         left_by_named, structure: covariate tests on what the named effects leave, and at last.
         locked_scores: (before, after) as pairs (no fit, datum free), if opened.
         observed: what is seen without a model, by name.
+        identifiability, profiles: how well the scans pin down what was fitted to name the causes.
         untestable: effect to reason; ``planted``: power of the screening, if asked for.
     """
 
@@ -69,6 +71,8 @@ class Closed:
     structure: list[CovariateTest]
     locked_scores: tuple[tuple[Score, Score], tuple[Score, Score]] | None
     observed: dict[str, Observed]
+    identifiability: Identifiability | None
+    profiles: list[Profile]
     untestable: dict[str, str]
     planted: list[Planted]
     config: LoopConfig

@@ -16,6 +16,7 @@ from litho_models.loop.closed import Closed, LoopConfig
 from litho_models.loop.fields import Field, prepare_fields
 from litho_models.loop.fitting import is_stiff, predict
 from litho_models.loop.flexible import Trainer, carry_over, same_for_all, train_folds
+from litho_models.loop.identifiability import identifiability, profiles
 from litho_models.loop.injecting import parse_injection, plant
 from litho_models.loop.measurement import MeasurementTest, measurement_tests
 from litho_models.loop.observed import observe
@@ -166,6 +167,8 @@ def close_loop(
             rounding_um,
             config.seed,
         ),
+        identifiability=identifiability(search.state.fits),
+        profiles=profiles(search.state.fits, [field.window for field in development]),
         untestable=untestable,
         planted=planted,
         config=config,

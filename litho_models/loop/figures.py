@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,6 +10,7 @@ import pandas as pd
 
 from litho_data.report import new_figure
 from litho_models.loop.closed import Closed
+from litho_models.loop.identifiability import Profile
 from litho_models.loop.probes import AddedProbe, figures
 from litho_models.loop.probes.kernel import MissingKernel
 from litho_models.loop.probes.places import drawn, drawn_profile
@@ -166,4 +168,27 @@ def _image(values: np.ndarray, half: tuple[float, float], label: str, shown: flo
     axes.set_xlim(-shown, shown)
     axes.set_ylim(shown, -shown)
     figure.colorbar(picture, ax=axes, label=label)
+    return figure
+
+
+def profile_figure(profiles: Sequence[Profile]) -> Figure:
+    """Root mean square residual against each number, the fitted value marked."""
+    columns = min(len(profiles), 3)
+    rows = -(-len(profiles) // columns)
+    figure = new_figure(3.4 * columns, 2.6 * rows)
+    axes = figure.subplots(rows, columns, squeeze=False)
+    for one, own in zip(profiles, axes.flat, strict=False):
+        own.plot(one.held, one.rmse_nm, "o-", color=_AFTER, ms=3, lw=1.2)
+        own.axvline(one.fitted, color=_BEFORE, lw=1)
+        unit = f" ({one.unit})" if one.unit != "1" else ""
+        own.set_title(one.effect, fontsize=9)
+        own.set_xlabel(f"{one.parameter}{unit}", fontsize=8)
+        own.ticklabel_format(axis="both", useOffset=False)
+        own.locator_params(axis="x", nbins=4)
+        own.tick_params(labelsize=7)
+        own.spines[["top", "right"]].set_visible(False)
+    for own in axes.flat[len(profiles) :]:
+        own.set_visible(False)
+    for first in axes[:, 0]:
+        first.set_ylabel("RMSE (nm)", fontsize=8)
     return figure

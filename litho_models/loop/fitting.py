@@ -160,7 +160,7 @@ def _fit_common(chain: EffectChain, fields: Sequence[Field]) -> tuple[np.ndarray
         normal, right = np.sum([p[0] for p in parts], axis=0), np.sum([p[1] for p in parts], axis=0)
         before = sum(p[2] for p in parts)
         for _ in range(_DAMPING_TRIES):
-            trial = vector + solve_damped(normal, right, damping, _room(chain, vector))
+            trial = vector + solve_damped(normal, right, damping, room(chain, vector))
             after = sum(
                 _sum_of_squares(part, field, predict(chain, trial, field))
                 for part, field in zip(linear, fields, strict=True)
@@ -194,7 +194,7 @@ def _fit_without(
     start = best = sum(p[2] for p in parts)
     vector = common
     for _ in range(_FOLD_STEPS):
-        moved = vector + solve_damped(normal, right, _FOLD_DAMPING, _room(chain, vector))
+        moved = vector + solve_damped(normal, right, _FOLD_DAMPING, room(chain, vector))
         right, total = np.zeros(len(vector)), 0.0
         for i in training:
             residual = fields[i].height - fields[i].at_sample(predict(chain, moved, fields[i]))
@@ -228,8 +228,8 @@ def _robust_covariance(linear: Sequence[Linearisation]) -> np.ndarray:
     return inverse @ (scores.T @ scores) @ inverse * count / max(count - 1, 1)
 
 
-def _room(chain: EffectChain, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Smallest and largest step allowed from here: effects within their range, the base not too far."""
+def room(chain: EffectChain, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Smallest and largest step (p,) allowed from here: effects within their range, the base not too far."""
     lowest = np.maximum(-_LONGEST_STEP, -_LARGEST_VALUE - vector)
     highest = np.minimum(_LONGEST_STEP, _LARGEST_VALUE - vector)
     for (name, parameter), slot in effect_slots(chain).items():
@@ -240,7 +240,7 @@ def _room(chain: EffectChain, vector: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 def _within_bounds(chain: EffectChain, vector: np.ndarray) -> np.ndarray:
     """True for parameters (p,) with room on both sides."""
-    lowest, highest = _room(chain, vector)
+    lowest, highest = room(chain, vector)
     return (lowest < -_AT_BOUND) & (highest > _AT_BOUND)
 
 

@@ -11,6 +11,7 @@ from litho_data.report import Page
 from litho_models.loop.closed import Closed
 from litho_models.loop.figures import curve_figure, map_figure, probe_figure, staircase_figure
 from litho_models.loop.measurement import scan_parameters
+from litho_models.loop.report_power import identifiability_section, power_section
 from litho_models.loop.result import CloseLoop
 from litho_models.loop.scoring import DATUM_FREE, Score, Terms, names_to_terms, scan_parameter_names
 from litho_models.loop.structure import PLACE
@@ -56,7 +57,8 @@ def write_report(closed: Closed, result: CloseLoop, folder: Path) -> Path:
     )
     _probe_section(page, closed)
     _rest_section(page, closed, result)
-    _power_section(page, closed)
+    identifiability_section(page, closed)
+    power_section(page, closed)
     _scan_section(page, closed, before, after)
     page.heading("How it was run")
     page.code(result.run.command or "litho_models.loop.close_loop")
@@ -247,28 +249,6 @@ def _rest_section(page: Page, closed: Closed, result: CloseLoop) -> None:
             curve_figure(curves),
             "Mean residual along each covariate; bars are two standard errors over development scans.",
         )
-
-
-def _power_section(page: Page, closed: Closed) -> None:
-    if not closed.planted:
-        return
-    page.heading("How small an effect would have been found")
-    for name in dict.fromkeys(p.name for p in closed.planted):
-        found = [p for p in closed.planted if p.name == name and p.found]
-        smallest = min(found, key=lambda p: p.rms_nm, default=None)
-        page.paragraph(
-            f"{name}: found from {smallest.amount:.3g} {smallest.unit} ({smallest.rms_nm:.1f} nm rms) "
-            "upwards."
-            if smallest
-            else f"{name}: not found at any of the planted amounts."
-        )
-    page.table(
-        pd.DataFrame([vars(p) for p in closed.planted]),
-        "The effect planted in copies of the development scans. Power: share of the training sets whose best "
-        "candidate it is, or one with the same signature.",
-        "power.csv",
-        digits=3,
-    )
 
 
 def _scan_section(page: Page, closed: Closed, before: Score, after: Score) -> None:
