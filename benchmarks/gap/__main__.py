@@ -64,11 +64,11 @@ def _run(given: argparse.Namespace) -> None:
         print(f"{task.name}: {len(task.designs(out))} designs", flush=True)
         run_jobs(task.designs(out), logs, workers)
     run_jobs([task.compare(out) for task in todo], logs, workers)
-    results = write_results(out, plan, todo, rows)
-    print(f"{results} ({(time.monotonic() - started) / 3600:.2f} h in this run)")
     if given.proof:
         for job in proof_jobs(out, effort):
             run_jobs([job], logs, 1)
+    results = write_results(out, plan, todo, rows)
+    print(f"{results} ({(time.monotonic() - started) / 3600:.2f} h in this run)")
     if given.publish:
         publish_results(out)
 

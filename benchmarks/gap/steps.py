@@ -74,18 +74,23 @@ def model_jobs(out: Path, effort: Effort) -> list[list[Job]]:
 
 def proof_jobs(out: Path, effort: Effort) -> list[Job]:
     """One hologram through PBL with the 1,000 iterations of the paper, and what the fab prints of it."""
-    folder = out / "proof" / "design"
+    folder, score_folder = proof_folders(out)
     design = design_command(
         "hoe", "--model", model(out, "pbl"), "--target", "text", "--size-px", effort.hoe_px,
         "--distance-um", effort.hoe_distance_um, "--iterations", 1000, "--precision", effort.search_precision,
         "--out", folder,
     )  # fmt: skip
     judge = ("--judge", f"fab={out / 'fab' / 'truth'}")
-    score = design_command("score", folder, *judge, "--out", out / "proof" / "score")
+    score = design_command("score", folder, *judge, "--out", score_folder)
     return [
         Job("proof", design, folder / "design.json"),
-        Job("proof-score", score, out / "proof" / "score" / "score.json"),
+        Job("proof-score", score, score_folder / "score.json"),
     ]
+
+
+def proof_folders(out: Path) -> tuple[Path, Path]:
+    """Where the proof's design and its score go."""
+    return out / "proof" / "design", out / "proof" / "score"
 
 
 def _knob_options() -> list[str]:

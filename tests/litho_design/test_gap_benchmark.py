@@ -9,9 +9,9 @@ import torch
 from typer.testing import CliRunner
 
 from benchmarks.gap.cost import estimate
-from benchmarks.gap.document import as_markdown
 from benchmarks.gap.jobs import Job, run_jobs
 from benchmarks.gap.plan import ARMS, PRINT_KNOBS, Effort, open_plan
+from benchmarks.gap.tables import as_markdown
 from benchmarks.gap.tasks import Task, chosen, tasks
 from litho_data.errors import InputError
 from litho_data.virtual_fab import KnobSetting, knob_rms_nm
@@ -128,7 +128,14 @@ def test_the_tables_name_the_winner_and_what_is_undecided():
         },
         "summary": rows,
     }  # fmt: skip
+    figures = {"si_psnr_db": 15.5, "ssim": 0.5, "eff_signal": 0.4}
+    record["proof"] = {
+        "designed_with": "pbl", "iterations": 1000, "start": "random", "minutes": 35.0,
+        "designed": figures, "judged": figures | {"si_psnr_db": 14.5},
+    }  # fmt: skip
     text = as_markdown(record)
+    assert "1,000 iterations" in text
+    assert "SI-PSNR, dB 15.500 → 14.500" in text
     assert "| none | 16.000 → 12.000 ± 0.100 |" in text
     assert "pbl is best" in text
     assert "none by +2.000 [-0.500, +4.500], undecided" in text
