@@ -93,8 +93,8 @@ def _proof_part(proof: Mapping[str, Any]) -> str:
     )
     return (
         f"### The paper's {proof['iterations']:,} iterations\n\n"
-        f"One hologram through {proof['designed_with']}, start {proof['start']}, {proof['minutes']:.0f} min on "
-        f"one core, in design → by fab: {figures}."
+        f"One hologram through {proof['designed_with']}, start {proof['start']}, {proof['minutes']:.0f} min "
+        f"on one core, in design → by fab: {figures}."
     )
 
 
