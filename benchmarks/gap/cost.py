@@ -15,6 +15,7 @@ from benchmarks.gap.jobs import Job, module_command
 from benchmarks.gap.plan import Effort
 from benchmarks.gap.tasks import Task
 from benchmarks.record import write_record
+from litho_models.model_card import ModelCard
 
 # A step of training takes about this long on one core (24 fields of 512 x 512 px); the rest is small.
 TRAINING_S = {"pbl": 0.45, "fno": 0.6}
@@ -33,13 +34,15 @@ def trial_job(out: Path, task: Task, arm: str) -> Job:
 def run_trial(out: Path, task: Task, arm: str) -> None:
     """Time the iterations of one arm at one task, CPU seconds on one thread.
 
-    Weights do not change the time: an untrained model stands for the arm. What a design costs beside
+    Weights do not change the time: an untrained model stands for an arm that is not trained yet. What a design costs beside
     its iterations is the same optics for every arm, and is timed with the arm ``none``.
     """
     from litho_design.optimise import make_parametrisation
 
     torch.set_num_threads(1)
-    source = "none" if arm == "none" else str(_untrained(arm, out / "cost" / "models" / arm))
+    source = task.models[arm]
+    if arm != "none" and not (Path(source) / ModelCard.FILE_NAME).exists():
+        source = str(_untrained(arm, out / "cost" / "models" / arm))
     design, settings = _task(task, source)
     parameters = make_parametrisation(settings.layout, settings.search)
     parameters.start_random(0)

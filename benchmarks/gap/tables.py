@@ -74,7 +74,7 @@ def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, A
         "|---" * (1 + len(judges) * len(shown)) + "|",
     ]
     for arm in arms:
-        cells = [_cell(values[arm, judge, figure]) for judge in judges for figure in shown]
+        cells = [_cell(values[arm, judge, figure], _digits(figure)) for judge in judges for figure in shown]
         lines.append(f"| {arm} | {' | '.join(cells)} |")
     seeds = len(task["seeds"])
     head = f"### {_TITLES[name]}\n\n{task['iterations']} iterations for every arm, {seeds} seed(s).\n\n"
@@ -103,11 +103,16 @@ def figure_file(name: str) -> str:
     return f"{name}.{'jpg' if name.startswith('hoe') else 'png'}"
 
 
-def _cell(row: Mapping[str, Any]) -> str:
-    text = f"{row['designed']:.3f} → {row['judged']:.3f}"
+def _digits(figure: str) -> int:
+    """Decimals: an error of an image is a few hundredths, and arms differ by a hundredth of that."""
+    return 5 if figure.startswith("mae") else 3
+
+
+def _cell(row: Mapping[str, Any], digits: int) -> str:
+    text = f"{row['designed']:.{digits}f} → {row['judged']:.{digits}f}"
     if row["low"] is None:
         return text
-    return f"{text} ± {(row['high'] - row['low']) / 2:.3f}"
+    return f"{text} ± {(row['high'] - row['low']) / 2:.{digits}f}"
 
 
 def _verdict(
@@ -119,6 +124,7 @@ def _verdict(
 ) -> str:
     """Who wins by the first figure, and by how much against every other arm, paired by seed."""
     figure, sign = figure_sign
+    digits = _digits(figure)
     best = max(arms, key=lambda arm: sign * values[arm, judge, figure]["judged"])
     against = []
     for other in arms:
@@ -128,7 +134,8 @@ def _verdict(
                 turn = 1 if item["arm"] == best else -1
                 low, high = sorted(turn * end for end in item["ci95"])
                 open_ = "" if low * high > 0 else ", undecided"
-                against.append(f"{other} by {turn * item['mean']:+.3f} [{low:+.3f}, {high:+.3f}]{open_}")
+                interval = f"[{low:+.{digits}f}, {high:+.{digits}f}]"
+                against.append(f"{other} by {turn * item['mean']:+.{digits}f} {interval}{open_}")
     return f"Printed by {judge}, {best} is best in {_LABELS[figure]}; it beats " + "; ".join(against) + "."
 
 
