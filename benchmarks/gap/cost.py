@@ -34,8 +34,8 @@ def trial_job(out: Path, task: Task, arm: str) -> Job:
 def run_trial(out: Path, task: Task, arm: str) -> None:
     """Time the iterations of one arm at one task, CPU seconds on one thread.
 
-    Weights do not change the time: an untrained model stands for an arm that is not trained yet. What a design costs beside
-    its iterations is the same optics for every arm, and is timed with the arm ``none``.
+    Weights do not change the time: an untrained model stands for an arm that is not trained yet. What a
+    design costs beside its iterations is the same optics for every arm, and is timed with the arm ``none``.
     """
     from litho_design.optimise import make_parametrisation
 
