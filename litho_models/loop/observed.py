@@ -16,6 +16,7 @@ from litho_models.loop.probes.defects import Defects
 from litho_models.loop.scoring import LINE_TERMS, Terms, score
 from litho_models.loop.sign_flips import one_sided_flip_p
 from litho_models.metrics import NM_PER_UM
+from litho_models.nuisance import row_index
 
 # Heights closer than this are one value of a file that rounds in single precision.
 _SAME_VALUE = 1e-6
@@ -81,19 +82,19 @@ def scars(fields: Sequence[Field], defects: Defects) -> Observed:
 def line_roughness(
     fields: Sequence[Field], predictions: Sequence[np.ndarray], terms: Terms, seed: int
 ) -> Observed:
-    """Residual that neighbours along a row share and neighbours across the rows do not, in flat places.
+    """Residual that neighbours along a scan line share and neighbours across do not, in flat places.
 
-    Offsets of whole lines are taken out first: they are a term of single scans. Slopes are
-    left out: what a model misses there is not noise.
+    The mean of every line, of the scan and of the layout, is taken out first: offsets of whole lines are
+    a term of single scans. Slopes are left out: what a model misses there is not noise.
     """
-    residuals = score(fields, predictions, terms | LINE_TERMS, seed).residual_um
+    residuals = score(fields, predictions, terms - LINE_TERMS, seed).residual_um
     shared = np.array([_shared_nm2(f, p, r) for f, p, r in zip(fields, predictions, residuals, strict=True)])
     along, across = shared.T
     p = one_sided_flip_p(along - across)
     rms_nm = float(np.sqrt(max((along - across).mean(), 0.0)))
     text = (
         f"flat places {_LINE_LAGS_UM[0]:g} to {_LINE_LAGS_UM[1]:g} µm apart share {along.mean():.1f} nm² "
-        f"along the rows and {across.mean():.1f} nm² across them (p = {p:.4f}): line-shaped roughness of "
+        f"along the lines and {across.mean():.1f} nm² across them (p = {p:.4f}): line-shaped roughness of "
         f"{rms_nm:.1f} nm rms or more, of the print or of the microscope"
     )
     return Observed("line-roughness", bool(p <= BINOMIAL_P and rms_nm >= SMALLEST_RMSE_NM), text)
@@ -109,10 +110,16 @@ def bends(fields: Sequence[Field]) -> Observed:
 
 
 def _shared_nm2(field: Field, prediction: np.ndarray, residual_um: np.ndarray) -> tuple[float, float]:
-    """Mean product of residuals some lags apart, along the rows and across them, nm²."""
+    """Mean product of residuals some lags apart, along the lines and across them, nm²."""
     slope = np.hypot(*np.gradient(prediction))
     flat = np.isfinite(residual_um) & (slope <= np.median(slope))
-    values, weight = np.where(flat, residual_um, 0.0) * NM_PER_UM, flat.astype(float)
+    values = np.where(flat, residual_um, 0.0) * NM_PER_UM
+    for line in (field.line, row_index(flat.shape)):
+        # In the sample: what this takes off too much makes neighbours along a line share less, not more.
+        total, count = (
+            np.bincount(line[flat], weights=w, minlength=line.max() + 1) for w in (values[flat], None)
+        )
+        values = np.where(flat, values - (total / np.maximum(count, 1))[line], 0.0)
     first, last = (max(1, round(lag / field.context.pitch_um)) for lag in _LINE_LAGS_UM)
     lags = range(first, last + 1)
 
@@ -121,7 +128,11 @@ def _shared_nm2(field: Field, prediction: np.ndarray, residual_um: np.ndarray) -
         pairs = sum(float((w[:, lag:] * w[:, :-lag]).sum()) for lag in lags)
         return products / max(pairs, 1.0)
 
-    return mean_product(values, weight), mean_product(values.T, weight.T)
+    weight = flat.astype(float)
+    by_axis = mean_product(values.T, weight.T), mean_product(values, weight)
+    # A scan turned by 90 degrees has its lines along y.
+    steps = [float(np.abs(np.diff(field.line, axis=axis)).mean()) for axis in (0, 1)]
+    return (by_axis[1], by_axis[0]) if steps[0] >= steps[1] else by_axis
 
 
 def observe(
