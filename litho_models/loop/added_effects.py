@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from litho_models.effects import Effect
 from litho_models.loop.closed import Closed
@@ -56,17 +57,17 @@ def _added_measurement(closed: Closed, test: MeasurementTest) -> AddedEffect:
     )
 
 
-def _doubtful_effects(closed: Closed) -> set[str]:
+def doubtful_effects(added: Sequence[Added], left_nm2: float) -> set[str]:
     """Names of added filters that leave another filter a good part of their own gain: near the cause, not it.
 
     What a doubtful effect took up was left by those before it.
+
+    Args:
+        added: effects in the order in which they were added.
+        left_nm2: what a linear response to the layout would still gain.
     """
-    # A kernel added as a generic term takes it away; a table added before may bring it out.
-    tests = [*is_structured(closed.left_by_named), *is_structured(closed.structure)]
-    left = max((t.share for t in tests if t.name == LINEAR_RESPONSE), default=0.0)
-    left_nm2 = left * float(closed.errors(closed.search.state, closed.terms).mse_nm2.mean())
     doubtful: set[str] = set()
-    for entry in reversed(closed.search.added):
+    for entry in reversed(added):
         gain_nm2 = float(entry.before.mse_nm2.mean() - entry.after.mse_nm2.mean())
         if left_nm2 and entry.effect.linear and left_nm2 >= _DOUBTFUL_SHARE * gain_nm2:
             doubtful.add(entry.effect.name)
@@ -74,8 +75,18 @@ def _doubtful_effects(closed: Closed) -> set[str]:
     return doubtful
 
 
+def _left_for_a_filter_nm2(closed: Closed) -> float:
+    # A kernel added as a generic term takes it away; a table added before may bring it out.
+    left = [0.0]
+    for tests, state in ((closed.left_by_named, closed.search.state), (closed.structure, closed.final)):
+        share = sum(t.share for t in is_structured(tests) if t.name == LINEAR_RESPONSE)
+        left.append(share * float(closed.errors(state, closed.terms).mse_nm2.mean()))
+    return max(left)
+
+
 def verdict_on(closed: Closed, entry: Added) -> EffectVerdict:
-    if entry.effect.name in _doubtful_effects(closed):
+    """Of an added effect: a cause, one of a set, or near the cause."""
+    if entry.effect.name in doubtful_effects(closed.search.added, _left_for_a_filter_nm2(closed)):
         return "traced-to-covariate"
     return "confusable" if entry.confusable_with else "explained"
 

@@ -38,18 +38,21 @@ class Identifiability:
         inflation: name to variance inflation: by how much its variance grows because others are fitted too.
         condition: ratio of the largest to the smallest singular value of the derivatives.
         weakest: the combination that the scans say least about, by name; parts of 0.3 and more.
-        at_bound: names of numbers that ran against their bounds, and have no derivative there.
+        without_slope: names of numbers that change nothing here: at a bound, or acting through one at zero.
     """
 
     inflation: dict[str, float]
     condition: float
     weakest: dict[str, float]
-    at_bound: tuple[str, ...]
+    without_slope: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Profile:
-    """Root mean square residual, nm, with one number ``held`` at each value and all others fitted again."""
+    """Root mean square residual, nm, with one number ``held`` at each value and all others fitted again.
+
+    The residual is that of the fit: datum, tilt, bow and warp of single scans count next to nothing.
+    """
 
     effect: str
     parameter: str
@@ -75,12 +78,12 @@ def identifiability(fits: FoldFits) -> Identifiability | None:
         inflation=dict(zip(known, (directions**2 / sizes).sum(axis=1).tolist(), strict=True)),
         condition=float(np.sqrt(sizes[-1] / sizes[0])),
         weakest={n: float(part) for n, part in zip(known, weak, strict=True) if abs(part) >= _NAMED_PART},
-        at_bound=tuple(name for name, is_free in zip(names, free, strict=True) if not is_free),
+        without_slope=tuple(name for name, is_free in zip(names, free, strict=True) if not is_free),
     )
 
 
 def profiles(fits: FoldFits, fields: Sequence[Field]) -> list[Profile]:
-    """Profile likelihood of every fitted number of every effect, nine values within its range.
+    """Profile likelihood of every fitted number of every effect, up to nine values within its range.
 
     Args:
         fits: the fitted chain.

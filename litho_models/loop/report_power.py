@@ -16,7 +16,8 @@ def identifiability_section(page: Page, closed: Closed) -> None:
         return
     page.heading("How well these scans pin the fit down")
     weakest = ", ".join(f"{part:+.2f} {name}" for name, part in found.weakest.items())
-    bounds = f" At a bound: {', '.join(found.at_bound)}." if found.at_bound else ""
+    idle = ", ".join(found.without_slope)
+    bounds = f" At a bound, or without influence: {idle}." if idle else ""
     page.paragraph(
         f"Condition number of all fitted numbers together: {found.condition:.0f} (1: each has a signature of "
         f"its own). The combination that the scans say least about: {weakest}.{bounds}"

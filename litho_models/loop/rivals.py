@@ -51,12 +51,13 @@ def generic_rival(before: State, after: State, fields: Sequence[Field], fold_of:
     return None
 
 
-def is_remainder(named: tuple[State, State], before: State, after: State, fields: Sequence[Field]) -> bool:
-    """Whether a further effect does what an effect named before does in another shape.
+def remainder_of(named: tuple[State, State], before: State, after: State, fields: Sequence[Field]) -> str:
+    """Why a further effect may be no more than the error in the form of one named before; empty if not.
 
     Another shape: the change by the first effect scaled, squared, growing with the height, blurred,
-    displaced. If these do more than the further effect, or do half of what it does and leave it no more
-    than half of its gain, it may be no more than the error in the form of the first.
+    displaced. If these do half of what the further effect does and leave it no more than half of its
+    gain, it may be that error. If they do more than the further effect, the larger part of what is
+    missing is there and has no name.
 
     Args:
         named: the model without and with the effect named before.
@@ -74,8 +75,9 @@ def is_remainder(named: tuple[State, State], before: State, after: State, fields
     gram = np.sum(grams, axis=0)
     both = np.arange(len(gram) - 1)
     alone, reshaped, together = (_gain_of(gram, columns) for columns in (both[-1:], both[:-1], both))
-    contained = reshaped >= _REMAINDER * alone and together - reshaped <= _REMAINDER * alone
-    return bool(reshaped >= alone or contained)
+    if reshaped >= _REMAINDER * alone and together - reshaped <= _REMAINDER * alone:
+        return "does what {} does in another shape: may be the error of its form"
+    return "more is missing in the form of {} than this would gain" if reshaped >= alone else ""
 
 
 def _reshaped(change: np.ndarray, prediction: np.ndarray, pitch_um: float) -> list[np.ndarray]:

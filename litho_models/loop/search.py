@@ -10,7 +10,7 @@ import numpy as np
 from litho_models.effects import get_effect, screened_effects
 from litho_models.loop.contest import Added, Contest, hold_contest
 from litho_models.loop.fields import Field
-from litho_models.loop.rivals import generic_rival, is_remainder
+from litho_models.loop.rivals import generic_rival, remainder_of
 from litho_models.loop.scoring import Terms
 from litho_models.loop.screening import Screened
 from litho_models.loop.state import State, fit_state
@@ -24,6 +24,7 @@ FORM_ERROR = 0.1
 class Search:
     """What the selection found.
 
+    ``steps``: effect to the model without and with it, when it was added.
     ``first``, ``last``: first and latest screening of every candidate.
     ``failures``: effect to why it was not confirmed.
     ``dropped``: added and not needed later; ``absorbed``: only the stiff model lacks it.
@@ -31,11 +32,22 @@ class Search:
 
     state: State
     added: list[Added] = field(default_factory=list)
+    steps: dict[str, tuple[State, State]] = field(default_factory=dict)
     first: dict[str, Screened] = field(default_factory=dict)
     last: dict[str, Screened] = field(default_factory=dict)
     failures: dict[str, str] = field(default_factory=dict)
     dropped: dict[str, str] = field(default_factory=dict)
     absorbed: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def names(self) -> list[str]:
+        return [entry.effect.name for entry in self.added]
+
+    def add(self, added: Added, state: State, *, before: State) -> None:
+        """Take a winner into the model."""
+        self.added.append(added)
+        self.steps[added.effect.name] = (before, state)
+        self.state = state
 
     def note(self, contest: Contest) -> None:
         """Keep the screenings of a contest, and why candidates were not confirmed."""
@@ -69,7 +81,6 @@ def search_effects(
         report: told in a sentence what happens.
     """
     found = Search(start)
-    steps: dict[str, tuple[State, State]] = {}
 
     def contest(state: State, holder: tuple[str, State] | None = None) -> Contest:
         candidates = [
@@ -87,44 +98,50 @@ def search_effects(
             report=report,
         )
 
-    while len(found.added) < MOST_EFFECTS:
-        held = contest(found.state)
-        found.note(held)
-        if held.winner is None:
-            break
-        added, state = held.winner
-        name = added.effect.name
-        nameless = _may_be_remainder(held.winner, found, steps, fields)
-        if not nameless and (rival := generic_rival(found.state, state, fields, fold_of)):
-            nameless = f"{rival} does the same, and better, without a name"
-        if nameless:
-            # Smaller effects cannot be named while the largest part of what is missing has no name.
-            found.failures[name] = nameless
-            break
-        found.added.append(added)
-        steps[name] = (found.state, state)
-        found.state = state
+    def select() -> bool:
+        """Add winners while they earn a name; whether the last one was refused."""
+        while len(found.added) < MOST_EFFECTS:
+            held = contest(found.state)
+            found.note(held)
+            if held.winner is None:
+                return False
+            if nameless := why_nameless(held.winner, found.state, found, fields, fold_of):
+                # Smaller effects cannot be named while the largest part of what is missing has no name.
+                found.failures[held.winner[0].effect.name] = nameless
+                return True
+            found.add(*held.winner, before=found.state)
+        return False
+
+    refused = select()
+    chosen = found.names
     for entry in list(found.added[:-1]):
         report(f"deciding once more on {entry.effect.name}")
         _decide_again(found, entry, contest, fields, fold_of)
+    if refused and found.names != chosen:
+        # What it was refused for may be gone.
+        select()
     return found
 
 
-def _may_be_remainder(
+def why_nameless(
     winner: tuple[Added, State],
+    before: State,
     found: Search,
-    steps: Mapping[str, tuple[State, State]],
     fields: Sequence[Field],
+    fold_of: np.ndarray,
 ) -> str:
-    """Why a further effect may be no more than the error in the form of one that was added; empty if not."""
+    """Why a winner gets no name: a generic term, or the error in an earlier one's form, does as much."""
     added, state = winner
     for earlier in found.added:
         name = earlier.effect.name
+        if name not in before.fits.chain.names:
+            continue
         if _gain_nm2(added) < FORM_ERROR**2 * _gain_nm2(earlier):
             return f"small beside {name}, whose form no catalogue knows to {100 * FORM_ERROR:.0f} %"
-        if is_remainder(steps[name], found.state, state, fields):
-            return f"does what {name} does in another shape: may be the error of its form"
-    return ""
+        if reason := remainder_of(found.steps[name], before, state, fields):
+            return reason.format(name)
+    rival = generic_rival(before, state, fields, fold_of)
+    return f"{rival} does the same, and better, without a name" if rival else ""
 
 
 def _gain_nm2(added: Added) -> float:
@@ -148,16 +165,16 @@ def _decide_again(
         found.dropped[name] = f"not needed once the others were added: {held.failures.get(name, '')}"
         found.state = without
         return
-    added, state = held.winner
-    place = found.added.index(entry)
+    added, _ = held.winner
     if added.effect.name == name:
         # Where it stands in the order stays; with what it can be confused is known better now.
-        found.added[place] = replace(entry, confusable_with=added.confusable_with)
+        found.added[found.added.index(entry)] = replace(entry, confusable_with=added.confusable_with)
+        return
+    if why_nameless(held.winner, without, found, fields, fold_of):
         return
     found.dropped[name] = f"{added.effect.name} does better once the others were added"
-    found.state = state
-    del found.added[place]
-    found.added.append(added)
+    found.added.remove(entry)
+    found.add(*held.winner, before=without)
 
 
 def separating_experiment(names: Sequence[str]) -> str:
