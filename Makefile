@@ -27,8 +27,9 @@ demo: $(STAMP)     ## run the whole path: make demo, or make demo DATASET=neural
 trials: $(STAMP)   ## blind trials of the closed loop: make trials WORKERS=2, PUBLISH=1 writes them into docs/
 	$(BIN)/python -m benchmarks.blind_trials --out $(OUT)/blind-trials --workers $(WORKERS) $(if $(PUBLISH),--publish)
 
-gap: $(STAMP)      ## the design-to-manufacturing gap at full size, hours: make gap WORKERS=2 [PUBLISH=1]
-	$(BIN)/python -m benchmarks.gap --out $(OUT)/gap --workers $(WORKERS) $(if $(PUBLISH),--publish)
+gap: $(STAMP)      ## the design-to-manufacturing gap at full size, hours: make gap WORKERS=2 [CORRECTED=DIR] [PROOF=1] [PUBLISH=1]
+	$(BIN)/python -m benchmarks.gap --out $(OUT)/gap --workers $(WORKERS) $(if $(CORRECTED),--corrected $(CORRECTED)) \
+		$(if $(PROOF),--proof) $(if $(PUBLISH),--publish)
 
 test: $(STAMP)     ## pass all tests; the report is runs/tests/report.xml
 	$(PYTEST) --durations 15 --junitxml $(OUT)/tests/report.xml

@@ -44,6 +44,8 @@ def main() -> None:
 
 def _run(given: argparse.Namespace) -> None:
     out, workers, logs = given.out, given.workers, given.out / "logs"
+    if given.publish and given.tasks:
+        raise InputError("--publish", got="with --tasks", wanted="all tasks: the page shows all of them")
     effort = _effort(given)
     plan = open_plan(out, effort, None if given.corrected is None else str(given.corrected.resolve()))
     todo = chosen(_tasks(out, plan), given.tasks)

@@ -46,6 +46,7 @@ def write_results(
                 "target": gap.target,
                 "iterations": gap.settings.search.iterations,
                 "seeds": gap.seeds,
+                "printers": {arm: used.sha256 for arm, used in gap.arms.items()},
                 "minutes": _minutes(out / name, gap.seeds),
                 "paired": [item.model_dump(mode="json") for item in gap.paired if item.judge not in gap.arms],
             }

@@ -131,7 +131,8 @@ def _verdict(
         for item in paired:
             pair = {item["arm"], item["against"]}
             if item["judge"] == judge and item["figure"] == figure and pair == {best, other}:
-                turn = 1 if item["arm"] == best else -1
+                # Better counts upwards, also where less of a figure is better.
+                turn = sign if item["arm"] == best else -sign
                 low, high = sorted(turn * end for end in item["ci95"])
                 open_ = "" if low * high > 0 else ", undecided"
                 interval = f"[{low:+.{digits}f}, {high:+.{digits}f}]"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 
 import pytest
@@ -105,6 +106,23 @@ def test_the_estimate_adds_up(tmp_path):
     n, seeds = planned[0].iterations, planned[0].seeds
     expected = seeds * ((n + 11) * 2.0 + n / 10 * 1.0 + 30.0 + 6 * 3.0 + 7 * 4.0) / 60
     assert [row["minutes"] for row in rows[1:]] == pytest.approx([expected] * len(ARMS))
+
+
+def test_the_model_of_a_closed_loop_is_an_arm_of_the_measured_task_only(tmp_path):
+    zoo = {name: f"zoo/{name}" for name in ("physics", "fno", "pbl")}
+    *others, measured = tasks(tmp_path, TINY, zoo, "loop/model")
+    assert dict(measured.models) == {"none": "none", **zoo, "closed-loop": "loop/model"}
+    assert all("closed-loop" not in task.models for task in others)
+    assert "closed-loop" not in tasks(tmp_path, TINY, zoo, None)[-1].models
+
+
+def test_a_page_with_some_of_the_tasks_is_not_published(tmp_path):
+    options = ["--out", str(tmp_path / "gap"), "--tasks", "hoe", "--publish"]
+    command = [sys.executable, "-m", "benchmarks.gap", *options]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert "--publish" in done.stderr
+    assert not (tmp_path / "gap").exists()
 
 
 def test_the_tables_name_the_winner_and_what_is_undecided():
