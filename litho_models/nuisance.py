@@ -206,8 +206,9 @@ def scan_line_index(
         scan_x = (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2]) / (
             inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2]
         )
-        # What the scan does not show is given to its first or last line.
-        scan_y = np.clip(bend_um.undo(scan_x, scan_y)[1], 0, 2 * bend_um.half[1])
+        # What the scan does not show is given to its first or last line; the end itself is beyond the last.
+        end = 2 * bend_um.half[1] * (1 - 1e-9)
+        scan_y = np.clip(bend_um.undo(scan_x, scan_y)[1], 0, end)
     line = np.floor(scan_y / pitch_um).astype(np.intp)
     return line - line.min()
 

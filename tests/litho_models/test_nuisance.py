@@ -135,6 +135,17 @@ def test_scan_lines_of_a_bent_scan_are_the_lines_it_was_scanned_in():
     assert np.ptp(line - np.arange(shape[0])[:, None]) > 2
 
 
+def test_what_a_bent_scan_does_not_show_is_in_its_first_or_last_line():
+    bend = Bend.of_scan(np.zeros((2, 3)), (40, 40), (0.1, 0.1))
+    # The layout begins 10 px above the scan's first line and ends 10 px below its last.
+    ten_px_down = np.array([[1, 0, 0], [0, 1, 1.0], [0, 0, 1]])
+    line = scan_line_index((60, 40), ten_px_down, 0.1, bend)
+    # A place on the border of two lines may round into either, so it is the number of lines that is exact.
+    assert line.max() == 39
+    assert (line[:10] == 0).all()
+    assert (line[50:] == 39).all()
+
+
 def test_nan_pixels_neither_count_nor_are_fitted(scan):
     prediction, valid, _ = scan
     height = prediction + 0.03
