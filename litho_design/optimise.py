@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import math
+import pickle
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +22,16 @@ from litho_design.parametrise import DirectLevels, GumbelLevels, LayoutSettings,
 
 Objective = Callable[[Tensor], tuple[Tensor, dict[str, float]]]
 _CHECKPOINT = "checkpoint.pt"
+# What torch raises for a damaged file depends on the place of the damage.
+_DAMAGED = (
+    RuntimeError,
+    pickle.UnpicklingError,
+    EOFError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+)
 
 
 class SearchSettings(Record):
@@ -113,7 +125,7 @@ def search_layout(
 def finished_iterations(folder: Path) -> int:
     """How many iterations an interrupted run in ``folder`` has behind it; 0 where there is none."""
     path = folder / _CHECKPOINT
-    return int(_load(path, "cpu")["iteration"]) if path.exists() else 0
+    return int(_load(path)["iteration"]) if path.exists() else 0
 
 
 def remove_checkpoint(folder: Path) -> None:
@@ -187,7 +199,7 @@ def _save(
 def _resume(
     path: Path, parameters: Parametrisation, optimiser: torch.optim.Optimizer, fingerprint: str
 ) -> SearchState:
-    content = _load(path, next(parameters.parameters()).device)
+    content = _load(path)
     if content["fingerprint"] != fingerprint:
         raise InputError(
             f"checkpoint {path}",
@@ -197,14 +209,18 @@ def _resume(
         )
     parameters.load_state_dict(content["parameters"])
     optimiser.load_state_dict(content["optimiser"])
-    return SearchState(content["iteration"], content["best_loss"], content["best_levels"], content["history"])
+    best_levels = content["best_levels"]
+    if best_levels is not None:
+        best_levels = best_levels.to(next(parameters.parameters()).device)
+    return SearchState(content["iteration"], content["best_loss"], best_levels, content["history"])
 
 
-def _load(path: Path, device: str | torch.device) -> dict[str, Any]:
+def _load(path: Path) -> dict[str, Any]:
+    """A checkpoint on the CPU: neither a full GPU nor a file that may not be read is a damaged one."""
+    stored = path.read_bytes()
     try:
-        content: dict[str, Any] = torch.load(path, weights_only=True, map_location=device)
-    # What torch raises for a damaged file depends on the place of the damage.
-    except Exception:
+        content: dict[str, Any] = torch.load(io.BytesIO(stored), weights_only=True, map_location="cpu")
+    except _DAMAGED:
         raise InputError(
             f"checkpoint {path}",
             got="a damaged file",

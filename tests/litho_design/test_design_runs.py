@@ -82,6 +82,28 @@ def test_a_damaged_checkpoint_is_refused(tmp_path, small_settings, make_printer,
         design_hoe(small_settings, make_printer(small_settings.layout), *target, tmp_path)
 
 
+def test_a_checkpoint_cut_short_is_damaged_and_one_that_cannot_be_read_is_not(tmp_path):
+    layout = LayoutSettings(size_px=16)
+
+    def search():
+        settings = SearchSettings(iterations=4, checkpoint_every=2)
+        parameters = make_parametrisation(layout, settings)
+        return search_layout(parameters, lambda level: (level.square().mean(), {}), settings, folder=tmp_path)
+
+    search()
+    checkpoint = tmp_path / "checkpoint.pt"
+    whole = checkpoint.read_bytes()
+    for kept in (0, 10, len(whole) // 2, len(whole) - 100, len(whole) - 1):
+        checkpoint.write_bytes(whole[:kept])
+        with pytest.raises(InputError, match="damaged"):
+            search()
+    checkpoint.unlink()
+    checkpoint.mkdir()
+    # Nothing is said of a file to delete.
+    with pytest.raises(IsADirectoryError):
+        search()
+
+
 def test_a_model_that_changes_while_it_prints_leaves_no_design(
     tmp_path, small_settings, make_printer, target
 ):
