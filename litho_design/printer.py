@@ -265,7 +265,9 @@ def _check_calibration(card: Mapping[str, Any], layout: LayoutSettings, extrapol
                 f"{name} of the layout",
                 got=f"{asked:g} µm",
                 wanted=f"{calibrated:g} µm, as the model was trained",
-                hint="--pitch-um sets it" if name == "pitch_um" else "--extrapolate accepts a guess",
+                hint=f"design with --pitch-um {calibrated:g}, or take a model of {asked:g} µm"
+                if name == "pitch_um"
+                else "--extrapolate accepts a guess",
             )
     highest, asked = card["calibrated_range_um"][1], (layout.levels - 1) * layout.level_height_um
     if asked > highest + 1e-6 and not extrapolate:
