@@ -124,7 +124,8 @@ def run_design(
         announce: print the expected time and memory to stderr before starting.
 
     Raises:
-        InputError: ``out`` holds another design or result, or a printer that only judges.
+        InputError: ``out`` holds another design or result, a printer only judges, or a model
+            changed meanwhile.
     """
     _check_printers(task.printers)
     folder = Path(out)
@@ -147,8 +148,14 @@ def run_design(
     level = layout_level[None, None].float()
     with torch.no_grad():
         height = task.printer(level)[0, 0]
-    if [printer.weights_sha256() for printer in task.printers] != hashes_before:
-        raise AssertionError("a printer model changed while a layout was designed through it")
+    hashes_after = [printer.weights_sha256() for printer in task.printers]
+    for printer, before, after in zip(task.printers, hashes_before, hashes_after, strict=True):
+        if after != before:
+            raise InputError(
+                f"model {printer.name}",
+                got="weights or buffers that changed while a layout was designed through it",
+                wanted="a model that printing leaves as it is",
+            )
     layout_array = layout_level.cpu().numpy().astype(np.uint8)
     arrays = {LEVELS_FILE: layout_array, HEIGHT_FILE: height.cpu().numpy(), **task.arrays(height)}
     files = write_arrays(folder, arrays) | write_level_image(folder, layout_array)
@@ -171,7 +178,7 @@ def run_design(
         optics=settings.optics,
         target=task.target_record,
         printer=task.printer.record(),
-        printer_unchanged=True,
+        printer_unchanged=hashes_after == hashes_before,
         tiling=task.printer.tiling_check(level),
         ensemble=_ensemble(task.printers, level, settings.optics),
         stroke=make_stroke(heights, settings.optics, settings.layout),

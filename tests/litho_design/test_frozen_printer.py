@@ -120,7 +120,8 @@ def test_commands_design_score_and_compare(tmp_path, affine_folder):
     assert "judged by its own model" in output
     record = Design.read(design)
     assert record.printer.name == "affine"
-    assert record.printer_unchanged
+    # The model as it lies on disk, before and after.
+    assert record.printer.sha256 == load_printer(str(affine_folder), record.layout).weights_sha256()
     # The card of this model names no training levels: nothing can be said about its extrapolation.
     assert "extrapolation" not in stroke_advice(record)
     assert "the card of the model affine does not say" in distribution_warning(record)
@@ -179,6 +180,27 @@ def test_a_model_of_another_pitch_designs_on_its_own(tmp_path, monkeypatch, task
     # A hologram's free cell of 0.4 µm is two of these pixels wide, a lens has its symmetry.
     same = (levels[::2, ::2], levels[1::2, 1::2]) if task[0] == "hoe" else (levels, levels[::-1].T)
     assert np.array_equal(*same)
+
+
+def test_a_model_that_changes_itself_is_refused_and_leaves_no_design(
+    tmp_path, affine_folder, monkeypatch, capsys
+):
+    simulator_class = model_class("affine")
+    prints = simulator_class.forward
+
+    def forward(self, *arguments, **settings):
+        next(self.parameters()).data.add_(1e-6)
+        return prints(self, *arguments, **settings)
+
+    monkeypatch.setattr(simulator_class, "forward", forward)
+    arguments = ("hoe", "--model", str(affine_folder), "--target", "ring", "--out", str(tmp_path / "d"))
+    monkeypatch.setattr(sys, "argv", ["litho-design", *arguments, *SMALL[:4], "--iterations", "1"])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 2
+    *_, said = capsys.readouterr().err.splitlines()
+    assert "model affine, got weights or buffers that changed" in said
+    assert not (tmp_path / "d" / "design.json").exists()
 
 
 def test_an_odd_picture_is_adapted_and_the_adaptation_is_told(tmp_path, capsys, monkeypatch):
