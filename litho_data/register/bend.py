@@ -127,10 +127,16 @@ def fit_bent_affine(
     """The affine (3×3) and the bend that take points (n, 2) to their images, by least squares.
 
     ``images`` ≈ affine(``points`` + bend(``points``)); ``middle`` and ``half`` are those of the bend's frame.
+
+    Raises:
+        numpy.linalg.LinAlgError: points that do not determine six coefficients per axis (too few, or all on
+            one conic, as on a line), or images on a line.
     """
     u, v = ((points - middle) / half).T
     basis = np.stack([np.ones_like(u), u, v, u * u - 1 / 3, u * v, v * v - 1 / 3], axis=1)
-    coefficients, *_ = np.linalg.lstsq(basis, images, rcond=None)
+    coefficients, _, rank, _ = np.linalg.lstsq(basis, images, rcond=None)
+    if rank < basis.shape[1]:
+        raise np.linalg.LinAlgError(f"{len(points)} points do not determine an affine and a bend")
     matrix = np.eye(3)
     matrix[:2, :2] = coefficients[1:3].T / half
     matrix[:2, 2] = coefficients[0] - matrix[:2, :2] @ middle

@@ -130,7 +130,10 @@ def refine(
             matrix = matrix @ np.linalg.inv(increment)
             matrix /= matrix[2, 2]
         else:
-            moved, further_bent = _moved_on(matrix, bend, coefficients, shape)
+            try:
+                moved, further_bent = _moved_on(matrix, bend, coefficients, shape)
+            except np.linalg.LinAlgError:
+                break  # the scan shows too little of the layout to say where the step leads
             if not further_bent.slope < HOPELESS_SLOPE:
                 break
             matrix, bend = moved, further_bent
@@ -168,7 +171,11 @@ def corner_motion_px(coefficients: np.ndarray, shape: tuple[int, int], points: n
 def _moved_on(
     matrix: np.ndarray, bend: Bend, coefficients: np.ndarray, shape: tuple[int, int]
 ) -> tuple[np.ndarray, Bend]:
-    """The warp after a step, again as an affine and a bend: higher orders vanish with the step."""
+    """The warp after a step, again as an affine and a bend: higher orders vanish with the step.
+
+    Raises:
+        numpy.linalg.LinAlgError: the places in and around the scan do not determine them.
+    """
     y, x = (np.linspace(0, n - 1, 17) for n in shape)
     layout = np.stack([one.ravel() for one in np.meshgrid(x, y)], axis=1)
     scan = np.stack(bend.undo(*apply_transform(matrix, layout).T), axis=1)
