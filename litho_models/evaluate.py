@@ -87,8 +87,9 @@ def evaluate(
     """Score a frozen model on the scans of a store and write the result and its report.
 
     The locked scans are kept for models of these prints: one that was trained on them, in this store or in
-    another one built from the same raw files, is not scored on the locked ones unless asked for. A model of
-    other prints is scored on all scans. The result says which were locked, and whether any was scored.
+    another one built from the same raw files, is not scored on the locked ones unless asked for. Locked are
+    those of this store and those that were when the model was made. A model of other prints is scored on
+    all scans. The result says which were locked, and whether any was scored.
 
     Args:
         model: folder of a frozen model, or ``zoo:NAME``.
@@ -111,11 +112,12 @@ def evaluate(
     frozen = load_frozen(zoo.model_folder(model), device=device, extrapolate=extrapolate)
     frozen.check_geometry(dataset.pitch_um, dataset.level_height_um)
     every = dataset.scans()
-    locked = locked_ids(every)
+    kept = _locked_by_the_card(frozen, dataset)
+    locked = sorted({*locked_ids(every), *kept})
     if scan_ids is not None:
         scans = [dataset.scan(scan_id) for scan_id in scan_ids]
     else:
-        own = _of_these_prints(frozen, dataset, locked)
+        own = bool(kept) or (frozen.card["dataset"] or {}).get("sha256") == dataset.sha256
         scans = [scan for scan in every if open_lock_box or not own or scan.id not in locked]
     if not scans:
         raise InputError(f"scans of {store}", got="none", wanted="at least one to score")
@@ -157,15 +159,18 @@ def evaluate(
     return result
 
 
-def _of_these_prints(model: FrozenSimulator, dataset: Store, locked: Sequence[str]) -> bool:
-    """Whether a model was made from this dataset, or from another one built from the same prints.
+def _locked_by_the_card(model: FrozenSimulator, dataset: Store) -> list[str]:
+    """The scans of a store that were locked when the model was made, by their raw files.
 
-    Another recipe or registration changes every height of a store, but not the raw files of its lock box.
+    Another recipe or registration changes every height of a store, a scan more or less the box that it
+    draws, but neither changes a raw file. A card that lists no files locks the ids of its box in a dataset of
+    the same name.
     """
-    if (model.card["dataset"] or {}).get("sha256") == dataset.sha256:
-        return True
-    files = files_sha256(dataset, locked)
-    return files is not None and model.card["split"].get("lock_box_files_sha256") == files
+    split = model.card["split"]
+    if files := split.get("lock_box_files_sha256"):
+        return [scan_id for scan_id, file in files_sha256(dataset, dataset.ids).items() if file in files]
+    same_name = (model.card["dataset"] or {}).get("name") == dataset.name
+    return [scan_id for scan_id in split.get("lock_box", []) if same_name and scan_id in dataset.ids]
 
 
 def card_background(model: FrozenSimulator, scans: Sequence[PrintedScan]) -> Background | None:

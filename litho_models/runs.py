@@ -109,7 +109,7 @@ def train(
             "kind": "development",
             "lock_box": locked,
             "lock_box_sha256": ids_sha256(locked),
-            "lock_box_files_sha256": files_sha256(dataset, lock_box),
+            "lock_box_files_sha256": sorted(files_sha256(dataset, lock_box).values()),
         },
         limitations=["Not evaluated yet: see the evaluation of this model for its error."],
     )

@@ -8,6 +8,7 @@ that the same ids always give the same split.
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -128,14 +129,15 @@ def ids_sha256(ids: Sequence[str]) -> str:
     return hashlib.sha256("\n".join(sorted(ids)).encode()).hexdigest()
 
 
-def files_sha256(store: Store, ids: Sequence[str]) -> str | None:
-    """Hash of the raw files behind some scans, however they were levelled and registered.
+def files_sha256(store: Store, ids: Sequence[str]) -> dict[str, str]:
+    """Hash of the raw file behind each of some scans, however they were levelled and registered.
 
-    None where the store does not list the files of these scans.
+    A scan whose file the store does not list is left out. Layouts do not count: one may be printed twice.
     """
     wanted = set(ids)
-    files = [row["sha256"] for row in store.manifest.get("files", []) if row["scan"] in wanted]
-    return ids_sha256(files) if files else None
+    rows = [row for row in store.manifest.get("files", []) if row["scan"] in wanted and row["sha256"]]
+    # Only what was read as a scan has the facts of a reader.
+    return {row["scan"]: row["sha256"] for row in rows if json.loads(row["read"] or "{}")}
 
 
 def _order(name: str, seed: int) -> str:

@@ -147,7 +147,7 @@ def _save_process_model(closed: Closed, result: CloseLoop, store: Store, folder:
         command=result.run.command,
         split={
             **result.split.model_dump(),
-            "lock_box_files_sha256": files_sha256(store, closed.lock_box),
+            "lock_box_files_sha256": sorted(files_sha256(store, closed.lock_box).values()),
         },
         nuisance=result.nuisance.model_dump(),
         noise_floor=result.noise_floor.model_dump(),

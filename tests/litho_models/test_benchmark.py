@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
+import zarr
 from prints import make_scans, write_store
 
 from litho_data.build import build
 from litho_data.errors import InputError
 from litho_data.store import open_store
+from litho_data.store.write import write_table
 from litho_data.virtual_fab import simulate
 from litho_models.benchmark import Benchmark, benchmark
 from litho_models.compare import compare
@@ -19,6 +22,7 @@ from litho_models.evaluate import Evaluation, evaluate
 from litho_models.folds import plan_folds
 from litho_models.model_card import DatasetName
 from litho_models.runs import TrainingRun, freeze, train
+from litho_models.splits import locked_ids
 
 MODELS = ("identity", "affine", "linear")
 SETTINGS = {"nuisance": "offset"}
@@ -147,7 +151,7 @@ def test_a_model_of_the_same_prints_is_not_scored_on_locked_scans_unless_asked(s
 
 
 def test_a_model_of_other_prints_is_scored_on_all_scans_and_the_opened_box_is_recorded(store, tmp_path):
-    other = write_store(tmp_path / "other.zarr", make_scans(4, size_px=64))
+    other = write_store(tmp_path / "other.zarr", make_scans(4, size_px=64), name="other")
     train(other, "identity", tmp_path / "run")
     scored = evaluate(tmp_path / "run" / "model", store, tmp_path / "out")
     assert len(scored.scores.scans) == 8
@@ -156,25 +160,73 @@ def test_a_model_of_other_prints_is_scored_on_all_scans_and_the_opened_box_is_re
     assert f"scored ones: {scored.split.lock_box[0]}." in (tmp_path / "out" / "report.html").read_text()
 
 
+def listed_store(path, scans, lab, name):
+    """A store that lists, per scan, a raw file of its own and a layout that all have in common."""
+    write_store(path, scans, name=name)
+    rows = [{"scan": scan.id, "sha256": f"{lab} {scan.id}", "read": '{"unit": "um"}'} for scan in scans]
+    rows += [{"scan": scan.id, "sha256": "one layout", "read": "{}"} for scan in scans]
+    table = pd.DataFrame([{"path": str(number), **row} for number, row in enumerate(rows)])
+    write_table(zarr.open_group(path, mode="r+"), "manifest", table, "file")
+    return path
+
+
+# A print more, which is drawn instead; a scan fewer, so that a sixth is one scan and no longer two.
+@pytest.mark.parametrize(("before", "after"), [(4, 5), (9, 8)])
+def test_locked_files_stay_locked_in_a_store_of_more_or_fewer_scans(tmp_path, before, after):
+    first = listed_store(tmp_path / "first.zarr", make_scans(before, size_px=64), "ours", "first")
+    run = train(first, "identity", tmp_path / "run")
+    model = tmp_path / "run" / "model"
+    card = json.loads((model / "card.json").read_text())
+    assert card["split"]["lock_box_files_sha256"] == [f"ours {scan_id}" for scan_id in run.lock_box]
+    scans = make_scans(after, size_px=64, datum_um=0.02)
+    assert not set(run.lock_box) <= set(locked_ids(scans))
+    anew = listed_store(tmp_path / "anew.zarr", scans, "ours", "anew")
+    shut = evaluate(model, anew, tmp_path / "shut")
+    assert shut.split.lock_box == sorted({*locked_ids(scans), *run.lock_box})
+    assert set(shut.split.scored_ids) == {scan.id for scan in scans} - set(shut.split.lock_box)
+    others = listed_store(tmp_path / "others.zarr", scans, "theirs", "first")
+    assert len(evaluate(model, others, tmp_path / "scored").split.scored_ids) == after
+
+
+@pytest.mark.parametrize(("name", "scored_count"), [("made", 3), ("other", 5)])
+def test_a_card_without_files_locks_its_ids_in_a_dataset_of_the_same_name(tmp_path, name, scored_count):
+    first = write_store(tmp_path / "first.zarr", make_scans(4, size_px=64))
+    run = train(first, "identity", tmp_path / "run")
+    file = tmp_path / "run" / "model" / "card.json"
+    card = json.loads(file.read_text())
+    del card["split"]["lock_box_files_sha256"]
+    file.write_text(json.dumps(card))
+    scans = make_scans(5, size_px=64, datum_um=0.02)
+    assert not set(run.lock_box) & set(locked_ids(scans))
+    anew = write_store(tmp_path / "anew.zarr", scans, name=name)
+    scored = evaluate(file.parent, anew, tmp_path / "scored").split.scored_ids
+    assert len(scored) == scored_count
+    assert (run.lock_box[0] in scored) == (name == "other")
+
+
 @pytest.mark.slow
 def test_a_store_built_anew_from_the_same_files_keeps_its_lock_box_and_other_files_of_the_same_names_do_not(
     tmp_path,
 ):
-    def built(name, seed, registration):
-        card = simulate(tmp_path / name, count=3, size_px=192, seed=seed, microscope="aligned")
+    def built(name, count, seed, registration):
+        settings = {"size_px": 192, "microscope": "aligned", "fields_per_print": 1}
+        card = simulate(tmp_path / name, count=count, seed=seed, **settings)
         with card.open("a", encoding="utf-8") as stream:
             stream.write(f'\n[process]\nregistration = "{registration}"\n')
         build(card, tmp_path / f"{name}.zarr")
         return tmp_path / f"{name}.zarr"
 
-    first, anew = built("first", 0, "affine"), built("anew", 0, "homography")
-    assert open_store(first).sha256 != open_store(anew).sha256
+    # The scan more is one that the new store draws, instead of the one that the first drew.
+    first, anew = built("first", 4, 0, "affine"), built("anew", 5, 0, "homography")
     run = train(first, "identity", tmp_path / "run")
+    drawn = locked_ids(open_store(anew).scans())
     assert run.lock_box
+    assert not set(run.lock_box) & set(drawn)
     shut = evaluate(tmp_path / "run" / "model", anew, tmp_path / "shut")
-    assert not set(run.lock_box) & set(shut.split.scored_ids)
+    assert shut.split.lock_box == sorted([*run.lock_box, *drawn])
+    assert not set(shut.split.lock_box) & set(shut.split.scored_ids)
     assert not shut.split.lock_box_opened
-    others = built("others", 1, "affine")
+    others = built("others", 5, 1, "affine")
     scored = evaluate(tmp_path / "run" / "model", others, tmp_path / "scored")
     assert set(run.lock_box) <= set(scored.split.scored_ids)
 
@@ -230,8 +282,6 @@ def test_line_offsets_are_attributed_to_their_frame():
     angle = np.deg2rad(1.0)
     turned = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
     stripes = np.random.default_rng(0).normal(0, 0.01, 256)[:, None].astype(np.float32)
-    from dataclasses import replace
-
     from prints import printed_height_um
 
     scan = replace(scans[0], height_um=scans[0].height_um + stripes, scan_to_layout=turned)
