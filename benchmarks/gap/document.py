@@ -85,7 +85,6 @@ def _proof(out: Path) -> dict[str, Any] | None:
         "designed_with": "pbl",
         "iterations": design.iterations,
         "start": design.settings["search"]["start"],
-        "minutes": round(design.run.seconds / 60, 1),
         "designed": {name: design.predicted[name] for name in SHOWN["hoe"]},
         "judged": {name: score.scores[0].figures[name] for name in SHOWN["hoe"]},
     }

@@ -51,7 +51,8 @@ def as_markdown(record: Mapping[str, Any]) -> str:
     minutes = sum(sum(task["minutes"].values()) for task in record["tasks"].values())
     designs = sum(len(task["seeds"]) * len(task["minutes"]) for task in record["tasks"].values())
     parts.append(
-        f"{designs} designs, {minutes / 60:.1f} core hours of search; intervals: Student's, 95 %, over seeds."
+        f"{designs} designs, {minutes / 60:.1f} hours of search by the clock, one thread each, other work "
+        "beside it; intervals: Student's, 95 %, over seeds."
     )
     return "\n\n".join(parts)
 
@@ -93,8 +94,8 @@ def _proof_part(proof: Mapping[str, Any]) -> str:
     )
     return (
         f"### The paper's {proof['iterations']:,} iterations\n\n"
-        f"One hologram through {proof['designed_with']}, start {proof['start']}, {proof['minutes']:.0f} min "
-        f"on one core, in design → by fab: {figures}."
+        f"One hologram through {proof['designed_with']}, start {proof['start']}, "
+        f"in design → by fab: {figures}."
     )
 
 

@@ -148,7 +148,7 @@ def test_the_tables_name_the_winner_and_what_is_undecided():
     }  # fmt: skip
     figures = {"si_psnr_db": 15.5, "ssim": 0.5, "eff_signal": 0.4}
     record["proof"] = {
-        "designed_with": "pbl", "iterations": 1000, "start": "random", "minutes": 35.0,
+        "designed_with": "pbl", "iterations": 1000, "start": "random",
         "designed": figures, "judged": figures | {"si_psnr_db": 14.5},
     }  # fmt: skip
     text = as_markdown(record)
