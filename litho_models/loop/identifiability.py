@@ -118,7 +118,7 @@ def _squares_with(fits: FoldFits, fields: Sequence[Field], slot: int, value: flo
             for field, own in zip(fields, fits.linear, strict=True)
         ]
         total = sum(part[2] for part in parts)
-        if total > (1 - _GAIN) * best:
+        if total > (1 - _GAIN) * best or not others.any():
             return min(total, best)
         best = total
         normal, right = np.sum([p[0] for p in parts], axis=0), np.sum([p[1] for p in parts], axis=0)

@@ -60,3 +60,13 @@ def test_without_fitted_numbers_there_is_nothing_to_tell() -> None:
     frozen = fit_state(fits.chain, fields, FOLDS).fits
     assert identifiability(frozen) is None
     assert profiles(frozen, fields) == []
+
+
+def test_a_single_number_has_a_profile_though_nothing_else_is_fitted() -> None:
+    planted = {"vertical-shrinkage": {"fraction": 0.1}}
+    fields = prepare_fields(printed_scans(planted, count=8, size_px=64, seed=4))
+    chain = true_model(planted)
+    for parameter in chain.base.parameters():
+        parameter.requires_grad = False
+    (one,) = profiles(fit_state(chain, fields, FOLDS).fits, fields)
+    assert one.rmse_nm.argmin() == PROFILE_POINTS // 2
