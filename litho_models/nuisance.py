@@ -199,13 +199,9 @@ def scan_line_index(
     """
     y, x = np.meshgrid(*((np.arange(n) + 0.5) * pitch_um for n in shape), indexing="ij")
     inverse = np.linalg.inv(np.asarray(scan_to_layout, np.float64))
-    scan_y = (inverse[1, 0] * x + inverse[1, 1] * y + inverse[1, 2]) / (
-        inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2]
-    )
+    scan_x, scan_y, depth = (row[0] * x + row[1] * y + row[2] for row in inverse)
+    scan_x, scan_y = scan_x / depth, scan_y / depth
     if bend_um is not None:
-        scan_x = (inverse[0, 0] * x + inverse[0, 1] * y + inverse[0, 2]) / (
-            inverse[2, 0] * x + inverse[2, 1] * y + inverse[2, 2]
-        )
         # What the scan does not show is given to its first or last line; the end itself is beyond the last.
         end = 2 * bend_um.half[1] * (1 - 1e-9)
         scan_y = np.clip(bend_um.undo(scan_x, scan_y)[1], 0, end)
