@@ -68,10 +68,9 @@ def doubtful_effects(added: Sequence[Added], left_nm2: float) -> set[str]:
     """
     doubtful: set[str] = set()
     for entry in reversed(added):
-        gain_nm2 = float(entry.before.mse_nm2.mean() - entry.after.mse_nm2.mean())
-        if left_nm2 and entry.effect.linear and left_nm2 >= _DOUBTFUL_SHARE * gain_nm2:
+        if left_nm2 and entry.effect.linear and left_nm2 >= _DOUBTFUL_SHARE * entry.gain_nm2:
             doubtful.add(entry.effect.name)
-            left_nm2 += gain_nm2
+            left_nm2 += entry.gain_nm2
     return doubtful
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
@@ -76,6 +76,10 @@ class Closed:
     untestable: dict[str, str]
     planted: list[Planted]
     config: LoopConfig
+    # Scoring takes seconds, and every verdict asks for it; a state is kept so that its id stays its own.
+    _scores: dict[tuple[int, Terms], tuple[State, Score]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
 
     @property
     def structured(self) -> list[CovariateTest]:
@@ -88,7 +92,11 @@ class Closed:
 
     def errors(self, state: State, terms: Terms) -> Score:
         """Held-out errors of a state over the development scans."""
-        return score(self.development, state.predictions, terms, self.config.seed)
+        key = id(state), terms
+        if key not in self._scores:
+            found = score(self.development, state.predictions, terms, self.config.seed)
+            self._scores[key] = state, found
+        return self._scores[key][1]
 
 
 def corrected_chain(closed: Closed) -> EffectChain:

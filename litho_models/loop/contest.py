@@ -53,6 +53,11 @@ class Added:
     confirmation: Confirmation
     p_screen: float
 
+    @property
+    def gain_nm2(self) -> float:
+        """Mean gain in squared error on the scans left out."""
+        return float((self.before.mse_nm2 - self.after.mse_nm2).mean())
+
 
 @dataclass(frozen=True)
 class Entrant:

@@ -136,16 +136,12 @@ def why_nameless(
         name = earlier.effect.name
         if name not in before.fits.chain.names:
             continue
-        if _gain_nm2(added) < FORM_ERROR**2 * _gain_nm2(earlier):
+        if added.gain_nm2 < FORM_ERROR**2 * earlier.gain_nm2:
             return f"small beside {name}, whose form no catalogue knows to {100 * FORM_ERROR:.0f} %"
         if reason := remainder_of(found.steps[name], before, state, fields):
             return reason.format(name)
     rival = generic_rival(before, state, fields, fold_of)
     return f"{rival} does the same, and better, without a name" if rival else ""
-
-
-def _gain_nm2(added: Added) -> float:
-    return float((added.before.mse_nm2 - added.after.mse_nm2).mean())
 
 
 def _decide_again(
