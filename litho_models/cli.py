@@ -41,6 +41,10 @@ VariantOption = Annotated[
     typer.Option(help="ours, as printed in the paper, or as in the authors' code"),
 ]
 Steps = Annotated[int | None, typer.Option(min=1, help="optimiser steps; the recipe's by default")]
+PrecisionOption = Annotated[
+    Literal["bf16-mixed", "32-true"] | None,
+    typer.Option(help="of the products within networks in training; the recipe's by default"),
+]
 Seed = Annotated[int, typer.Option(min=0, help="seed of weights, crops and splits")]
 
 
@@ -54,6 +58,7 @@ def train(
     recipe: RecipeOption = "fast",
     variant: VariantOption = "default",
     steps: Steps = None,
+    precision: PrecisionOption = None,
     seed: Seed = 0,
     use_lock_box: Annotated[
         bool,
@@ -63,7 +68,7 @@ def train(
     """Train a model on all scans but the locked ones; the same command continues a killed run."""
     from litho_models.runs import train as train_model
 
-    settings = {"seed": seed, **_given(steps=steps)}
+    settings = {"seed": seed, **_given(steps=steps, precision=precision)}
     run = train_model(
         store, model, out, recipe=recipe, variant=variant, settings=settings, use_lock_box=use_lock_box
     )
@@ -123,6 +128,7 @@ def benchmark(
     recipe: RecipeOption = "fast",
     variant: VariantOption = "default",
     steps: Steps = None,
+    precision: PrecisionOption = None,
     folds: Annotated[int, typer.Option(min=2, help="folds of the grouped split")] = 5,
     policy: PolicyOption = "offset",
     background: BackgroundOption = "training",
@@ -137,7 +143,7 @@ def benchmark(
     from litho_models.benchmark import benchmark as run_benchmark
     from litho_models.score_tables import headline_table
 
-    settings = {"recipe": recipe, "variant": variant, **_given(steps=steps)}
+    settings = {"recipe": recipe, "variant": variant, **_given(steps=steps, precision=precision)}
     result = run_benchmark(
         store,
         out,

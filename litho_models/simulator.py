@@ -63,7 +63,8 @@ class Simulator(nn.Module, ABC):
 
     name: ClassVar[str]
     Config: ClassVar[type[SimulatorConfig]] = SimulatorConfig
-    # Few parameters with a meaning each: fitted by Gauss-Newton; otherwise by stochastic gradient.
+    # Few parameters with a meaning each: fitted by Gauss-Newton unless the recipe is the paper's; otherwise
+    # by stochastic gradient.
     is_small: ClassVar[bool] = True
     # The height is a linear function of the parameters: one Jacobian serves the whole fit.
     is_linear: ClassVar[bool] = False

@@ -8,18 +8,17 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from litho_data.errors import InputError
 from litho_models.nuisance import Policy
-from litho_models.simulator import Variant
+from litho_models.simulator import Simulator, Variant
 
 Recipe = Literal["fast", "paper"]
 RECIPES: tuple[str, ...] = get_args(Recipe)
 PAPER_EPOCHS, PAPER_CROPS, PAPER_BATCH = 4000, 72, 4
-# Others are fitted by Gauss-Newton and take no steps.
 FAST_STEPS = {"pbl": 2000, "fno": 1000}
 PAPER_LEARNING_RATE = {"pbl": 5e-4, "fno": 1e-4, "physics": 1e-2}
 
 
 class TrainingConfig(BaseModel):
-    """Settings of one fit. Small models are fitted by Gauss-Newton and use the seed and nuisances only.
+    """Settings of one fit. A model that is fitted by Gauss-Newton uses the seed and nuisances only.
 
     ``nuisance`` are the per-scan terms fitted jointly with the model (never part of it), their
     offset and gain pinned to a mean of zero over the training scans.
@@ -77,9 +76,17 @@ class TrainingConfig(BaseModel):
             "crops": "quadrants",
             "optimiser": "adam",
             "schedule": "constant",
-            "learning_rate": PAPER_LEARNING_RATE.get(model_name, 1e-2),
             "weight_decay": 0.0,
             "nuisance": "none",
             "precision": "32-true",
         }
+        if model_name in PAPER_LEARNING_RATE:
+            paper["learning_rate"] = PAPER_LEARNING_RATE[model_name]
         return cls(**{"recipe": recipe, **paper, **settings})
+
+    def takes_steps(self, model: Simulator) -> bool:
+        """Whether the model is trained by stochastic gradient rather than fitted by Gauss-Newton.
+
+        A model with many parameters always is; a small one where the paper trains it so.
+        """
+        return not model.is_small or (self.recipe == "paper" and model.name in PAPER_LEARNING_RATE)

@@ -73,9 +73,7 @@ def fit_with_record(
     ids = [scan.id for scan in scans]
     history: list[RoundRecord] = []
     validation_ids: list[str] = []
-    if model.is_small:
-        fit_gauss_newton(model, scans, config.nuisance, config.free_gain)
-    else:
+    if config.takes_steps(model):
         validation_ids = inner_validation(ids, config.validation_scans, config.seed)
         training = [scan for scan in scans if scan.id not in validation_ids]
         validation = [scan for scan in scans if scan.id in validation_ids]
@@ -85,6 +83,8 @@ def fit_with_record(
         history = train_network(
             model, training, validation, config, lambda: _stiff_predictions(training, config), folder
         )
+    else:
+        fit_gauss_newton(model, scans, config.nuisance, config.free_gain)
     return Fitted(
         model=model.eval(),
         training_ids=[scan_id for scan_id in ids if scan_id not in validation_ids],

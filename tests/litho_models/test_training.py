@@ -211,6 +211,17 @@ def test_the_paper_recipe_is_the_papers():
         assert config.nuisance == "none"
 
 
+def test_the_paper_recipe_trains_physics_with_adam_towards_the_printer():
+    scans = make_scans(4, size_px=64, datum_um=0.0)
+    config = TrainingConfig.of_recipe("paper", "physics", steps=120, rounds=3, crop_px=32, validation_scans=0)
+    fitted = fit_with_record("physics", scans, config)
+    unseen = make_scan(20, noise_um=0.0, datum_um=0.0)
+    assert [entry.step for entry in fitted.history] == [40, 80, 120]
+    assert error_nm(fitted.model, unseen) < 0.7 * error_nm(build_model("physics"), unseen)
+    # A baseline that the paper does not train is fitted as ever.
+    assert not fit_with_record("affine", scans, TrainingConfig.of_recipe("paper", "affine")).history
+
+
 def test_the_fast_recipe_takes_each_network_s_own_number_of_steps_unless_told():
     assert {name: TrainingConfig.of_recipe("fast", name).steps for name in FAST_STEPS} == FAST_STEPS
     assert TrainingConfig.of_recipe("fast", "pbl", steps=7).steps == 7
