@@ -50,7 +50,7 @@ class TrainingConfig(BaseModel):
         False, description="a gain per scan among the nuisances, where the policy has one"
     )
     validation_scans: int = Field(2, ge=0, description="training scans that only choose the checkpoint")
-    precision: Literal["bf16-mixed", "32-true"] = "bf16-mixed"
+    precision: Literal["bf16-mixed", "32-true"] = "32-true"
 
     @classmethod
     def of_recipe(cls, recipe: Recipe, model_name: str, **settings: Any) -> Self:
@@ -78,7 +78,6 @@ class TrainingConfig(BaseModel):
             "schedule": "constant",
             "weight_decay": 0.0,
             "nuisance": "none",
-            "precision": "32-true",
         }
         if model_name in PAPER_LEARNING_RATE:
             paper["learning_rate"] = PAPER_LEARNING_RATE[model_name]

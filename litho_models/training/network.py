@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 from litho_data.commands import progress
@@ -52,10 +52,9 @@ def train_network(
     """
     if model.tile is not None and config.crops == "random":
         config = config.model_copy(update={"crop_px": model.tile.size_px})
-    fabric = _fabric(config)
+    fabric = _fabric()
     optimiser = _optimiser(model, config)
-    module, optimiser = fabric.setup(model, optimiser)
-    module.mark_forward_method("interior")
+    module, optimiser = fabric.setup(_Heights(model, config), optimiser)
     state = TrainingState(model, optimiser)
     if checkpoints is not None:
         checkpoints.load(state)
@@ -104,9 +103,35 @@ class _Targets:
         self.heights_um = [np.pad(height, overhang_px) for height in heights]
 
 
+class _Heights(nn.Module):
+    """Heights of crops as training wants them, in one module: processes share the gradients of its forward.
+
+    Random crops come with their surroundings (``margin_px``) or are one tile of the model; quadrants are
+    images of their own. Layouts and heights are float32 whatever the precision within.
+    """
+
+    def __init__(self, model: Simulator, config: TrainingConfig):
+        super().__init__()
+        self.model = model
+        random = config.crops == "random"
+        self.tile = model.tile if random else None
+        self._inside = random and (model.reach_px is not None or model.tile is not None)
+        self._mixed = config.precision == "bf16-mixed"
+
+    @property
+    def margin_px(self) -> int:
+        """Pixels around a crop; a blur that learns its width needs more or fewer as it goes."""
+        return self.model.reach_px or 0 if self._inside else 0
+
+    def forward(self, layout_um: Tensor) -> Tensor:
+        predict = self.model.interior if self._inside else self.model
+        with torch.autocast(layout_um.device.type, torch.bfloat16, enabled=self._mixed):
+            return predict(layout_um).float()
+
+
 def _step(
     fabric: Fabric,
-    module: Simulator,
+    module: _Heights,
     optimiser: torch.optim.Optimizer,
     targets: _Targets,
     config: TrainingConfig,
@@ -131,28 +156,19 @@ def _step(
 
 
 def _losses(
-    fabric: Fabric, module: Simulator, targets: _Targets, windows: list[Window], config: TrainingConfig
+    fabric: Fabric, module: _Heights, targets: _Targets, windows: list[Window], config: TrainingConfig
 ) -> tuple[Tensor, Tensor]:
     """Loss of some windows, and for the record the weighted absolute error, µm, and the weight, (2,)."""
-    prediction = _predict_windows(fabric, module, targets, windows, config)
+    prediction = module(fabric.to_device(stack(targets.layouts_um, windows, module.margin_px)))
     height = fabric.to_device(stack(targets.heights_um, windows))
     weight = fabric.to_device(stack(targets.weights, windows))
-    if module.tile is not None and config.crops == "random":
+    if module.tile is not None:
         # A pixel counts as much as it will in the blended field.
         window = blending_window(module.tile, weight)
         weight = weight * (window / window.mean())
     # The count of pixels is fixed, so that the mean over processes is the loss of one process.
     loss = (weight * _error(prediction, height, config)).mean()
     return loss, torch.stack([(weight * (prediction - height).abs()).mean().detach(), weight.mean()])
-
-
-def _predict_windows(
-    fabric: Fabric, module: Simulator, targets: _Targets, windows: list[Window], config: TrainingConfig
-) -> Tensor:
-    whole = config.crops == "quadrants" or (module.reach_px is None and module.tile is None)
-    predict = module if whole else module.interior
-    margin = 0 if whole else module.reach_px or 0
-    return predict(fabric.to_device(stack(targets.layouts_um, windows, margin)))
 
 
 def _overhang_px(model: Simulator, scans: Sequence[PrintedScan], config: TrainingConfig) -> int:
@@ -194,8 +210,8 @@ def _optimiser(model: Simulator, config: TrainingConfig) -> torch.optim.Optimize
     return torch.optim.AdamW(model.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
 
 
-def _fabric(config: TrainingConfig) -> Fabric:
-    """Device and precision; under ``torchrun`` one process per local rank."""
+def _fabric() -> Fabric:
+    """The device; under ``torchrun`` one process per local rank."""
     from lightning.fabric import Fabric
 
     world = int(os.environ.get("WORLD_SIZE", "1"))
@@ -205,7 +221,6 @@ def _fabric(config: TrainingConfig) -> Fabric:
         devices=devices,
         num_nodes=max(1, world // devices),
         strategy="ddp" if world > 1 else "auto",
-        precision=config.precision,
     )
     if world > 1:
         fabric.launch()

@@ -14,6 +14,7 @@ from prints import BLUR_UM, make_scan, make_scans, printed_height_um, write_stor
 
 from litho_data.errors import InputError
 from litho_models.models import build_model
+from litho_models.models.pbl import Pbl
 from litho_models.tiles import predict_scan
 from litho_models.training import TrainingConfig, fit, fit_with_record
 from litho_models.training.checkpoint import CheckpointFolder
@@ -192,6 +193,47 @@ def test_passes_change_the_memory_and_not_the_step(monkeypatch):
         torch.testing.assert_close(apart.model.state_dict()[name], value, rtol=1e-4, atol=1e-4)
     assert apart.history[0].training_mae_nm == pytest.approx(together.history[0].training_mae_nm, rel=1e-4)
     assert apart.history[0].training_mae_nm != together.history[0].training_mae_nm
+
+
+@pytest.mark.parametrize("crops", ["random", "quadrants"])
+@pytest.mark.parametrize("precision", ["bf16-mixed", "32-true"])
+def test_precision_is_that_of_the_network_and_never_of_its_layout(crops, precision, monkeypatch):
+    seen = []
+    interior = Pbl.interior
+
+    def watched(model, layout_um):
+        height = interior(model, layout_um)
+        if height.requires_grad:
+            seen.append((torch.is_autocast_enabled("cpu"), layout_um.dtype, height.dtype))
+        return height
+
+    monkeypatch.setattr(Pbl, "interior", watched)
+    config = TrainingConfig(**{**QUICK, "crops": crops, "precision": precision, "validation_scans": 0})
+    fit_with_record("pbl", make_scans(2, size_px=64), config, model_fields=SMALL_NETS)
+    # A layout of 1.1 µm rounded to bfloat16 is 1.6 nm too high.
+    assert set(seen) == {(precision == "bf16-mixed", torch.float32, torch.float32)}
+
+
+@pytest.mark.parametrize("variant", ["default", "paper", "authors"])
+@pytest.mark.parametrize("name", ["physics", "pbl", "fno"])
+def test_reduced_precision_trains_as_full_precision_does(name, variant):
+    scans = make_scans(2, size_px=64)
+    errors = []
+    for precision in ("bf16-mixed", "32-true"):
+        config = TrainingConfig.of_recipe(
+            "paper",
+            name,
+            variant=variant,
+            steps=4,
+            rounds=2,
+            crop_px=32,
+            precision=precision,
+            validation_scans=0,
+        )
+        errors.append([entry.training_mae_nm for entry in fit_with_record(name, scans, config).history])
+    reduced, full = errors
+    # 8 bits of significance in the features, averaged over thousands of pixels.
+    assert reduced == pytest.approx(full, rel=0.02)
 
 
 def test_an_epoch_of_quadrants_sees_each_once():
