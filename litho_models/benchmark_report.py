@@ -78,6 +78,12 @@ def write_benchmark_report(
     )
     profiles = {name: shown[name] for name in [s.model for s in scores[-2:]]}
     page.figure(figures.line_profiles(scans[middle], profiles, result.nuisance), "Its middle row.")
+    page.heading("Gain and offset of single prints")
+    page.figure(
+        figures.print_gains(best),
+        f"Line through measured against predicted height ({best.model}, nothing fitted to the scan before); "
+        "95 % ellipses from blocks of 32 px. Numbers in scans.csv.",
+    )
     page.heading("By level and frequency")
     page.figure(figures.level_bias(scores), "Error by printed level.")
     page.figure(figures.transfer(scores), "Transfer and coherence.")

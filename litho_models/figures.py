@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 PAPER_MAE_NM = 24.35
 _RESIDUAL_RANGE_NM = 80.0
+# 95 % quantile of chi² with two degrees of freedom.
+_CHI2_95_OF_2 = 5.991
 
 
 def error_bars(scores: Sequence[ModelScores], floor: NoiseFloor, paper_line: bool) -> Figure:
@@ -175,3 +177,32 @@ def residual_um(scan: PrintedScan, prediction_um: np.ndarray, protocol: Nuisance
         buffer_px=protocol.buffer_px,
         seed=protocol.seed,
     ).residual_um
+
+
+def print_gains(score: ModelScores) -> Figure:
+    """Gain and offset of every print against a model's prediction, with 95 % ellipses, coloured by print."""
+    from matplotlib.patches import Ellipse
+
+    figure = new_figure(7.0, 5.0)
+    axes = figure.subplots()
+    prints = sorted({row.print for row in score.scans})
+    for number, name in enumerate(prints):
+        colour = f"C{number % 10}"
+        rows = [row for row in score.scans if row.print == name and row.slope is not None]
+        gains = [row.slope for row in rows if row.slope is not None]
+        axes.plot(gains, [row.intercept_nm for row in rows], ".", color=colour, label=name)
+        for row in rows:
+            covariance = row.line_covariance
+            if row.slope is None or covariance is None:
+                continue
+            variances, directions = np.linalg.eigh(covariance)
+            minor, major = 2 * np.sqrt(_CHI2_95_OF_2 * variances.clip(0))
+            angle = float(np.degrees(np.arctan2(directions[1, 1], directions[0, 1])))
+            middle = (row.slope, row.intercept_nm)
+            axes.add_patch(Ellipse(middle, major, minor, angle=angle, fill=False, color=colour))
+    axes.axvline(1.0, color="#9aa7b5", lw=0.8)
+    axes.axhline(0.0, color="#9aa7b5", lw=0.8)
+    axes.set_xlabel(f"gain: measured height per height predicted by {score.model}")
+    axes.set_ylabel("offset at predicted height zero, nm")
+    axes.legend(title="print", fontsize=8)
+    return figure

@@ -13,6 +13,7 @@ import numpy as np
 
 from litho_data.errors import InputError
 from litho_models.nuisance import BLOCK_PX, BUFFER_PX, Policy, cross_fitted_residual
+from litho_models.print_gain import print_gain
 
 NM_PER_UM = 1000.0
 # The step of index from air to the resist, at a red helium-neon line: where its elements are used.
@@ -42,7 +43,10 @@ class ScanScore:
     median_abs_datum_free_nm: float
     p95_abs_datum_free_nm: float
     slope: float
+    slope_error: float
     intercept_nm: float
+    intercept_error_nm: float
+    slope_intercept_correlation: float
 
 
 def score_scan(
@@ -59,7 +63,7 @@ def score_scan(
 ) -> ScanScore:
     """Score one prediction against one scan; arrays (ny, nx) in µm, the rest as in ``cross_fitted_residual``.
 
-    Slope and intercept are those of the regression of the measured height on the prediction.
+    Slope and intercept, the gain and offset of the print, are those of ``print_gain``.
 
     Raises:
         InputError: what ``cross_fitted_residual`` refuses, or no valid pixel.
@@ -80,7 +84,7 @@ def score_scan(
     height, prediction = (np.asarray(a, np.float64)[scored] for a in (height_um, prediction_um))
     plain = (height - prediction) * NM_PER_UM
     error = np.abs(free.residual_um[scored]) * NM_PER_UM
-    slope, intercept = regression_line(prediction, height)
+    line = print_gain(height_um, prediction_um, scored)
     return ScanScore(
         scan_id=scan_id,
         policy=policy,
@@ -93,22 +97,17 @@ def score_scan(
         rmse_datum_free_nm=float(np.sqrt((error**2).mean())),
         median_abs_datum_free_nm=float(np.median(error)),
         p95_abs_datum_free_nm=float(np.quantile(error, 0.95)),
-        slope=slope,
-        intercept_nm=intercept * NM_PER_UM,
+        slope=line.slope,
+        slope_error=line.slope_error,
+        intercept_nm=line.intercept_um * NM_PER_UM,
+        intercept_error_nm=line.intercept_error_um * NM_PER_UM,
+        slope_intercept_correlation=line.correlation,
     )
 
 
 def phase_waves(height_error_um: float) -> float:
     """Phase error, in waves, of light that passes an element whose height is wrong by so many µm."""
     return height_error_um * INDEX_STEP / WAVELENGTH_UM
-
-
-def regression_line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Slope and intercept of the least-squares line of ``y`` on ``x``; slope NaN where x is constant."""
-    centred = x - x.mean()
-    power = float(centred @ centred)
-    slope = float(centred @ y) / power if power > 0 else float("nan")
-    return slope, float(y.mean() - (slope * x.mean() if power > 0 else 0.0))
 
 
 def bootstrap_interval(

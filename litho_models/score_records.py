@@ -67,7 +67,11 @@ class ShapeFigures(Record):
 
 
 class ScanRow(ShapeFigures):
-    """The figures of one scan."""
+    """The figures of one scan.
+
+    Slope and intercept, the gain and offset of the print against the prediction, with standard errors and the
+    correlation of the two (``print_gain``); None where they cannot be known.
+    """
 
     scan: str
     print: str
@@ -77,9 +81,20 @@ class ScanRow(ShapeFigures):
     rmse_datum_free_nm: float
     median_abs_datum_free_nm: float
     p95_abs_datum_free_nm: float
-    slope: float
+    slope: float | None
     intercept_nm: float
+    slope_error: float | None = None
+    intercept_error_nm: float | None = None
+    slope_intercept_correlation: float | None = None
     pixels: int
+
+    @property
+    def line_covariance(self) -> np.ndarray | None:
+        """Covariance of slope and intercept (nm), (2, 2); None where it cannot be known."""
+        a, b, shared = self.slope_error, self.intercept_error_nm, self.slope_intercept_correlation
+        if a is None or b is None or shared is None:
+            return None
+        return np.array([[a * a, shared * a * b], [shared * a * b, b * b]])
 
 
 class ModelScores(ShapeFigures):

@@ -165,7 +165,11 @@ def noise_floor(dataset_name: str, analysis: str | Path | None = None) -> NoiseF
 
 
 def _row(scan: PrintedScan, score: ScanScore, shape: ShapeFigures) -> ScanRow:
-    kept = {key: value for key, value in asdict(score).items() if key in ScanRow.model_fields}
+    kept: dict[str, Any] = {
+        key: None if value != value else value  # NaN: cannot be known
+        for key, value in asdict(score).items()
+        if key in ScanRow.model_fields
+    }
     return ScanRow(scan=scan.id, print=scan.print_id, **kept, **shape.model_dump())
 
 
