@@ -15,6 +15,6 @@ def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]], *notes: 
     return "\n".join(lines)
 
 
-def with_interval(value: float, interval: list[float] | None) -> str:
+def with_interval(value: float, interval: Sequence[float] | None) -> str:
     """An error and, where it has one, its interval, nm."""
     return f"{value:.2f} nm" + (f" ({interval[0]:.2f} … {interval[1]:.2f})" if interval else "")

@@ -31,9 +31,11 @@ from litho_models.zoo_making import ZOO_MODELS
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "results" / "neural-lithography"
+# Draws of the paper's split, made by examples/demo.py.
+PAPER_SEEDS = (0,)
 RESULTS = {
     "benchmark.json": "benchmark/benchmark.json",
-    "benchmark_paper.json": "benchmark-paper/benchmark.json",
+    **{f"benchmark_paper_{seed}.json": f"benchmark-paper-{seed}/benchmark.json" for seed in PAPER_SEEDS},
     "noise.json": "noise/noise.json",
     "close_loop.json": "close-loop/close_loop.json",
     "close_loop_pbl.json": "close-loop-pbl/close_loop.json",
@@ -58,7 +60,7 @@ def texts(folder: Path) -> dict[str, str]:
 
     return {
         "benchmark": benchmark_table(found("benchmark.json")),
-        "paper split": paper_table(found("benchmark_paper.json")),
+        "paper split": paper_table([found(f"benchmark_paper_{seed}.json") for seed in PAPER_SEEDS]),
         "paired differences": paired_table(found("benchmark.json")),
         "further figures": further_table(found("benchmark.json")),
         "noise": noise_table(found("noise.json")),
