@@ -7,6 +7,7 @@ thousand pixels this is faster than a Fourier transform, and no period or paddin
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -54,6 +55,11 @@ def gaussian_blur(
         for sigma in (along_y, along_x)
     ]
     radii = [kernel_radius_px(float(sigma.detach())) for sigma in sigmas]
+    if edge == "replicate" and field.dtype.itemsize > 2 and not _is_wide(field.shape, radii):
+        with torch.autocast(device_type=field.device.type, enabled=False):
+            rows = _continuing_band(field.shape[-2], radii[0], sigmas[0])
+            columns = _continuing_band(field.shape[-1], radii[1], sigmas[1])
+            return rows @ field @ columns.T
     padded = pad_field(field, radii[0], radii[1], edge)
     return blur_interior(padded, (sigmas[0], sigmas[1]), (radii[0], radii[1]))
 
@@ -68,11 +74,16 @@ def blur_interior(
     with torch.autocast(device_type=field.device.type, enabled=False):
         field = field.float() if field.dtype in (torch.bfloat16, torch.float16) else field
         along_y, along_x = (sigma.to(field.dtype) for sigma in sigmas)
-        if min(field.shape[-2:]) > max(_DENSE_PX, 4 * max(radii)):
+        if _is_wide(field.shape, radii):
             return _blur_blocks_y(_blur_blocks_x(field, radii[1], along_x), radii[0], along_y)
         rows = _band(field.shape[-2], radii[0], along_y)
         columns = _band(field.shape[-1], radii[1], along_x)
         return rows @ field @ columns.T
+
+
+def _is_wide(shape: Sequence[int], radii: Sequence[int]) -> bool:
+    """Whether blocks are faster than one matrix for each axis."""
+    return min(shape[-2:]) > max(_DENSE_PX, 4 * max(radii))
 
 
 def kernel_radius_px(sigma_px: float, support: float = SUPPORT_SIGMAS) -> int:
@@ -130,3 +141,12 @@ def _band(size: int, radius: int, sigma_px: Tensor) -> Tensor:
     # All rows are windows on one symmetric kernel with zeros on both sides, the last row's first.
     kernel = functional.pad(taps / taps.sum(), (size - 2 * radius - 1,) * 2)
     return kernel.unfold(0, size, 1).flip(0)
+
+
+def _continuing_band(size: int, radius: int, sigma_px: Tensor) -> Tensor:
+    """Matrix (size, size) that blurs a line whose outermost pixels continue: they take the weight beyond."""
+    band = _band(size + 2 * radius, radius, sigma_px)
+    inner = band[:, radius:-radius].clone()
+    inner[:, 0] += band[:, :radius].sum(1)
+    inner[:, -1] += band[:, -radius:].sum(1)
+    return inner

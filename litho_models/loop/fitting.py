@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from litho_models.effects import get_effect
 from litho_models.effects.chain import EffectChain
@@ -106,11 +106,21 @@ def fit_folds(chain: EffectChain, fields: Sequence[Field], fold_of: np.ndarray) 
 def predict(chain: EffectChain, vector: np.ndarray, field: Field) -> np.ndarray:
     """Predicted height (y, x) float32, µm."""
     set_vector(chain, vector)
+    return _with_height_effects(chain, _base_height(chain, field), field)
+
+
+def _base_height(chain: EffectChain, field: Field) -> Tensor:
+    """Height (1, 1, y, x) of the base model on the layout with the layout effects, µm."""
     select = getattr(chain.base, "select", None)
     if select is not None:
         select(field.id)
     with torch.no_grad():
-        return chain(field.layout, field.context)[0, 0].numpy()
+        return chain.base(chain.before_base(field.layout, field.context))
+
+
+def _with_height_effects(chain: EffectChain, base_height: Tensor, field: Field) -> np.ndarray:
+    with torch.no_grad():
+        return chain.after_base(base_height, field.context)[0, 0].numpy()
 
 
 def get_vector(chain: EffectChain) -> np.ndarray:
@@ -137,13 +147,19 @@ def effect_slots(chain: EffectChain) -> dict[tuple[str, str], int]:
 
 def linearise(chain: EffectChain, vector: np.ndarray, field: Field) -> Linearisation:
     """Residual and derivatives of one scan at the sampled pixels."""
-    prediction = predict(chain, vector, field)
+    set_vector(chain, vector)
+    base_height = _base_height(chain, field)
+    prediction = _with_height_effects(chain, base_height, field)
     here = field.at_sample(prediction)
+    # What acts on the height leaves the base model's height, most of the work, as it is.
+    after_base = {i for (name, _), i in effect_slots(chain).items() if get_effect(name).acts_on == "height"}
     columns = []
     for i, step in enumerate(_steps(chain, vector)):
         moved = vector.copy()
         moved[i] += step
-        columns.append((field.at_sample(predict(chain, moved, field)) - here) / step)
+        set_vector(chain, moved)
+        height = base_height if i in after_base else _base_height(chain, field)
+        columns.append((field.at_sample(_with_height_effects(chain, height, field)) - here) / step)
     jacobian = np.stack(columns, axis=1) if columns else np.empty((len(here), 0))
     basis = orthonormal(nuisance_columns(field, prediction, gain=False))
     return Linearisation(field.height - here, jacobian, basis)

@@ -14,7 +14,7 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
-from litho_models.gaussian import Edge, blur_interior, gaussian_blur, kernel_radius_px
+from litho_models.gaussian import Edge, blur_interior, gaussian_blur, kernel_radius_px, pad_field
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 
 Shrinkage = Literal["fixed-reference", "image-range", "image-maximum"]
@@ -91,14 +91,14 @@ class Physics(Simulator):
 
     def forward(self, layout_um: Tensor) -> Tensor:
         """Height of the whole field, (batch, 1, y, x) µm."""
-        if self.reach_px is not None and self.config.edge == "replicate":
-            return super().forward(layout_um)
         config = self.config
-        relative = layout_um / config.full_height_um
+        # A continued layout, blurred, is itself continued from the radius of the optical blur on.
+        margin = self._radii_px()[0] if config.edge == "replicate" else 0
+        relative = pad_field(layout_um, margin, margin) / config.full_height_um
         aerial = gaussian_blur(relative, config.sigma_optical_um, self.pitch_um, edge=config.edge)
         initial = self._project(aerial)
         dose = gaussian_blur(initial, self.values["sigma_diffusion_um"], self.pitch_um, edge=config.edge)
-        return self._develop(initial, dose)
+        return self._develop(crop_border(initial, margin), crop_border(dose, margin))
 
     def _radii_px(self) -> tuple[int, int]:
         diffusion = float(self.values["sigma_diffusion_um"].detach())

@@ -10,7 +10,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from litho_data.errors import InputError
-from litho_models.gaussian import blur_interior, gaussian_blur, kernel_radius_px
+from litho_models.gaussian import blur_interior, gaussian_blur, kernel_radius_px, pad_field
 
 PITCH = 0.1
 
@@ -25,6 +25,16 @@ def test_agrees_with_an_independent_implementation(edge, sigma_um):
     )
     got = gaussian_blur(torch.from_numpy(field), sigma_um, PITCH, edge=edge)
     assert np.abs(got.numpy() - wanted).max() < 1e-12
+
+
+def test_a_field_that_continues_is_blurred_the_same_with_and_without_its_border():
+    field = torch.rand(1, 1, 70, 90, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    for sigma_um in (0.2, (0.2, 0.7)):
+        sigmas = sigma_um if isinstance(sigma_um, tuple) else (sigma_um, sigma_um)
+        radii = tuple(kernel_radius_px(sigma / PITCH) for sigma in sigmas)
+        widths = tuple(torch.tensor(sigma / PITCH, dtype=torch.float64) for sigma in sigmas)
+        bordered = blur_interior(pad_field(field, *radii), widths, radii)
+        assert float((gaussian_blur(field, sigma_um, PITCH) - bordered).abs().max()) < 1e-14
 
 
 def test_attenuates_a_grating_as_the_fourier_transform_of_a_gaussian():
