@@ -21,7 +21,7 @@ from benchmarks.blind_trials.scoreboard import make_scoreboard
 from litho_data.errors import InputError
 
 # Drawn from once the loop was finished; development uses seed 0.
-REPORTED_SEED = 20265
+REPORTED_SEED = 20266
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE, RESULTS = DOCS / "blind_trials.md", DOCS / "results" / "blind-trials"
 

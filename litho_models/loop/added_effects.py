@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from litho_models.effects import Effect
 from litho_models.loop.closed import Closed
 from litho_models.loop.contest import Added
-from litho_models.loop.fitting import effect_slots
 from litho_models.loop.measurement import MeasurementTest
+from litho_models.loop.parameters import effect_slots
 from litho_models.loop.probes import AddedProbe, figures
 from litho_models.loop.result import AddedEffect, EffectVerdict, ParameterEstimate
 from litho_models.loop.search import separating_experiment

@@ -11,12 +11,12 @@ from pydantic import Field as Setting
 
 from litho_models.effects.chain import EffectChain
 from litho_models.loop.fields import Field
-from litho_models.loop.fitting import set_vector
 from litho_models.loop.flexible import FoldedBase
 from litho_models.loop.identifiability import Identifiability, Profile
 from litho_models.loop.injecting import Planted
 from litho_models.loop.measurement import MeasurementTest
 from litho_models.loop.observed import Observed
+from litho_models.loop.parameters import set_vector
 from litho_models.loop.probes import Probed
 from litho_models.loop.scoring import DATUM_FREE, Score, Terms, names_to_terms, score
 from litho_models.loop.search import Search

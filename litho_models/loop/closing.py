@@ -14,12 +14,13 @@ from litho_models.effects import CATALOGUE, UNTESTABLE, get_effect
 from litho_models.effects.chain import EffectChain
 from litho_models.loop.closed import Closed, LoopConfig
 from litho_models.loop.fields import Field, prepare_fields
-from litho_models.loop.fitting import is_stiff, predict
+from litho_models.loop.fitting import predict
 from litho_models.loop.flexible import Trainer, carry_over, same_for_all, train_folds
 from litho_models.loop.identifiability import identifiability, profiles
 from litho_models.loop.injecting import parse_injection, plant
 from litho_models.loop.measurement import MeasurementTest, measurement_tests
 from litho_models.loop.observed import observe
+from litho_models.loop.parameters import is_stiff
 from litho_models.loop.probes import Probed, probe_residual
 from litho_models.loop.scoring import DATUM_FREE, Score, names_to_terms, score
 from litho_models.loop.search import search_effects

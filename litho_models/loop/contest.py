@@ -15,14 +15,14 @@ import numpy as np
 from litho_models.effects import Effect
 from litho_models.loop.confirming import BINOMIAL_P, SMALLEST_SHARE, Confirmation, confirm
 from litho_models.loop.directions import Directions, measure_directions
+from litho_models.loop.eligibility import is_eligible, shortlist, terms_for
 from litho_models.loop.fields import Field
-from litho_models.loop.fitting import FoldFits, effect_slots
+from litho_models.loop.fitting import FoldFits
 from litho_models.loop.linear import pooled_cosine, without_scan_terms
-from litho_models.loop.scoring import LINE_TERMS, Score, Terms, score
+from litho_models.loop.parameters import effect_slots
+from litho_models.loop.scoring import Score, Terms, score
 from litho_models.loop.screening import (
-    FAMILY_P,
     SAME_COSINE,
-    SMALLEST_RETAINED,
     Screened,
     cosine,
     screen,
@@ -32,12 +32,8 @@ from litho_models.loop.state import State, fit_state, held_out_residuals
 TRIES_PER_ROUND = 3
 # Where none of the most promising is confirmed, the next ones are fitted.
 HEATS = 3
-# Promising this part of the best predicted gain is enough to be fitted.
-CONTENDER_SHARE = 0.5
-MOST_CONTENDERS, MOST_RELATIVES = 4, 3
 # A member of a confusable set that loses this part of the gain in nearly every scan is told apart.
 TOLD_APART_SHARE = 0.25
-_FREE_WITHOUT = {"no-gain": "gain", "no-bow": "bow"}
 # The score test predicts the gain of a full fit within a factor of two or so.
 WORTH_FITTING = 0.3
 
@@ -128,11 +124,11 @@ def hold_contest(
         entrants.append(Entrant(next(s for s in found.screened if s.effect.name == holder[0]), holder[1]))
     for _ in range(HEATS):
         entered = {e.name for e in entrants}
-        shortlist, relatives = (
+        entering, relatives = (
             [s for s in group if s.effect.name not in entered]
-            for group in _shortlist(found.screened, remaining, directions)
+            for group in shortlist(found.screened, remaining, directions)
         )
-        entrants += _fitted(state, shortlist, fields, fold_of, report)
+        entrants += _fitted(state, entering, fields, fold_of, report)
         standing = sorted(
             (e for e in entrants if e.name not in rejected), key=lambda e: float(e.training_error.sum())
         )
@@ -164,32 +160,6 @@ def hold_contest(
     return found
 
 
-def may_be(s: Screened) -> bool:
-    """Physical, testable and of some use: enough for a member of a set of which another stands out."""
-    return s.in_range and s.retained >= SMALLEST_RETAINED and s.mean_gain_nm2 > 0
-
-
-def is_eligible(s: Screened, mse_nm2: float) -> bool:
-    """Physical, testable, promises a gain on held-out scans, and stands out.
-
-    To stand out: family-wise by the score test or, where few scans leave that test little power, by
-    a gain that would matter on scans not used for its estimate. Whether it is real, the fit decides.
-    """
-    return may_be(s) and (s.p <= FAMILY_P or s.mean_gain_nm2 >= SMALLEST_SHARE * mse_nm2)
-
-
-def terms_for(terms: Terms, screened: Sequence[Screened]) -> Terms:
-    """Per-scan terms of the comparison without and with effects: those that the fit leaves free.
-
-    Registration has already taken the mean shift and magnification out of every scan, so an effect that
-    has them must not be charged for them; what acts as a gain, as a distortion, or line by line, must not
-    be hidden by the scans' own.
-    """
-    free = (terms | {"warp"}) - {"distortion"}
-    free -= {_FREE_WITHOUT[s.projection] for s in screened if s.projection in _FREE_WITHOUT}
-    return free - LINE_TERMS if any(s.effect.along_lines for s in screened) else free
-
-
 def fold_amplitudes(fits: FoldFits, effect: Effect) -> dict[str, np.ndarray]:
     """Distance of each amplitude from its null in every fold, in typical sizes."""
     slots = effect_slots(fits.chain)
@@ -201,32 +171,15 @@ def fold_amplitudes(fits: FoldFits, effect: Effect) -> dict[str, np.ndarray]:
     return amplitudes
 
 
-def _shortlist(
-    screened: Sequence[Screened], eligible: Sequence[Screened], directions: Directions
-) -> tuple[list[Screened], list[Screened]]:
-    """Those to fit, and what looks like the first of them but is one too many to fit."""
-    if not eligible:
-        return [], []
-    first = eligible[0]
-    contenders = [s for s in eligible if s.mean_gain_nm2 >= CONTENDER_SHARE * first.mean_gain_nm2]
-    contenders = contenders[:MOST_CONTENDERS]
-    relatives = [
-        s
-        for s in screened
-        if s not in contenders and may_be(s) and abs(cosine(directions, first, s)) >= SAME_COSINE
-    ]
-    return contenders + relatives[:MOST_RELATIVES], relatives[MOST_RELATIVES:]
-
-
 def _fitted(
     state: State,
-    shortlist: Sequence[Screened],
+    entering: Sequence[Screened],
     fields: Sequence[Field],
     fold_of: np.ndarray,
     report: Callable[[str], None],
 ) -> list[Entrant]:
     entrants, chain = [], state.fits.chain
-    for s in shortlist:
+    for s in entering:
         report(f"fitting {s.effect.name}")
         extended = chain.with_effects({**chain.values(), s.effect.name: s.values})
         entrants.append(Entrant(s, fit_state(extended, fields, fold_of)))

@@ -11,8 +11,9 @@ import torch
 from litho_models.effects import Effect
 from litho_models.effects.chain import EffectChain
 from litho_models.loop.fields import Field
-from litho_models.loop.fitting import Linearisation, set_vector
+from litho_models.loop.fitting import Linearisation
 from litho_models.loop.linear import gram_inside, nuisance_columns, orthonormal
+from litho_models.loop.parameters import set_vector
 
 PROJECTIONS: Mapping[str, Mapping[str, bool]] = {
     "full": {"gain": True},

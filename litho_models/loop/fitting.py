@@ -13,22 +13,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from litho_models.effects import get_effect
 from litho_models.effects.chain import EffectChain
 from litho_models.loop.fields import Field
 from litho_models.loop.linear import COMMON_WEIGHT, gram, nuisance_columns, orthonormal, solve_damped
+from litho_models.loop.parameters import (
+    difference_steps,
+    effect_slots,
+    get_vector,
+    room,
+    set_vector,
+    within_bounds,
+)
 
-STIFF_PARAMETERS = 16
-_RELATIVE_STEP = 5e-3
 _STEPS = 12
 # The way to the neighbourhood of the optimum is walked on every third scan.
 _START_EVERY = 3
-# Base parameters are lengths in µm or logits of order 1. Beyond 4 a logit has no slope left, and a
-# fit that has run there (on scans that a fold holds out, say) could not come back.
-_LONGEST_STEP, _LARGEST_VALUE = 1.0, 4.0
-_AT_BOUND = 1e-6
 _FOLD_STEPS = 6
 _FOLD_GAIN = 1e-4
 # Keeps combinations of parameters without influence where the common fit put them.
@@ -73,11 +75,6 @@ class FoldFits:
     linear: list[Linearisation]
 
 
-def is_stiff(base: nn.Module) -> bool:
-    """Few enough trainable numbers to be fitted jointly with the effects."""
-    return 0 < sum(p.numel() for p in base.parameters() if p.requires_grad) <= STIFF_PARAMETERS
-
-
 def fit_folds(chain: EffectChain, fields: Sequence[Field], fold_of: np.ndarray) -> FoldFits:
     """Fit on all scans, then without each fold in turn.
 
@@ -98,7 +95,7 @@ def fit_folds(chain: EffectChain, fields: Sequence[Field], fold_of: np.ndarray) 
         for fold in range(int(fold_of.max()) + 1)
     ]
     per_fold, training_error = np.stack([vector for vector, _ in own]), np.array([error for _, error in own])
-    free = _within_bounds(chain, common)
+    free = within_bounds(chain, common)
     linear = [replace(part, jacobian=part.jacobian * free) for part in linear]
     return FoldFits(chain, common, per_fold, training_error, _robust_covariance(linear), linear)
 
@@ -123,28 +120,6 @@ def _with_height_effects(chain: EffectChain, base_height: Tensor, field: Field) 
         return chain.after_base(base_height, field.context)[0, 0].numpy()
 
 
-def get_vector(chain: EffectChain) -> np.ndarray:
-    """All fitted numbers: the base's (if stiff), then the effects'."""
-    return np.concatenate([p.detach().numpy().reshape(-1) for p in _fitted(chain)] or [np.empty(0)]).astype(
-        np.float64
-    )
-
-
-def set_vector(chain: EffectChain, vector: np.ndarray) -> None:
-    """Set what ``get_vector`` returns."""
-    at = 0
-    for parameter in _fitted(chain):
-        values = vector[at : at + parameter.numel()]
-        parameter.data.copy_(torch.as_tensor(values, dtype=parameter.dtype).reshape(parameter.shape))
-        at += parameter.numel()
-
-
-def effect_slots(chain: EffectChain) -> dict[tuple[str, str], int]:
-    """Where each effect parameter sits in the vector."""
-    start = len(get_vector(chain)) - len(chain.fitted)
-    return {slot: start + i for i, slot in enumerate(chain.fitted)}
-
-
 def linearise(chain: EffectChain, vector: np.ndarray, field: Field) -> Linearisation:
     """Residual and derivatives of one scan at the sampled pixels."""
     set_vector(chain, vector)
@@ -154,7 +129,7 @@ def linearise(chain: EffectChain, vector: np.ndarray, field: Field) -> Linearisa
     # What acts on the height leaves the base model's height, most of the work, as it is.
     after_base = {i for (name, _), i in effect_slots(chain).items() if get_effect(name).acts_on == "height"}
     columns = []
-    for i, step in enumerate(_steps(chain, vector)):
+    for i, step in enumerate(difference_steps(chain, vector)):
         moved = vector.copy()
         moved[i] += step
         set_vector(chain, moved)
@@ -242,37 +217,3 @@ def _robust_covariance(linear: Sequence[Linearisation]) -> np.ndarray:
     scores = np.stack([p[1] for p in parts])
     count = len(parts)
     return inverse @ (scores.T @ scores) @ inverse * count / max(count - 1, 1)
-
-
-def room(chain: EffectChain, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Smallest and largest step (p,) allowed from here: effects within their range, the base not too far."""
-    lowest = np.maximum(-_LONGEST_STEP, -_LARGEST_VALUE - vector)
-    highest = np.minimum(_LONGEST_STEP, _LARGEST_VALUE - vector)
-    for (name, parameter), slot in effect_slots(chain).items():
-        limits = get_effect(name).parameters[parameter]
-        lowest[slot], highest[slot] = limits.lower - vector[slot], limits.upper - vector[slot]
-    return np.minimum(lowest, 0), np.maximum(highest, 0)
-
-
-def _within_bounds(chain: EffectChain, vector: np.ndarray) -> np.ndarray:
-    """True for parameters (p,) with room on both sides."""
-    lowest, highest = room(chain, vector)
-    return (lowest < -_AT_BOUND) & (highest > _AT_BOUND)
-
-
-def _steps(chain: EffectChain, vector: np.ndarray) -> np.ndarray:
-    """Difference steps, pointing away from the nearer bound of an effect's range."""
-    steps = _RELATIVE_STEP * np.maximum(np.abs(vector), 0.2)
-    for (name, parameter), slot in effect_slots(chain).items():
-        limits = get_effect(name).parameters[parameter]
-        size = 0.05 * abs(limits.typical - limits.null if limits.kind == "amplitude" else limits.typical)
-        steps[slot] = size if vector[slot] + size <= limits.upper else -size
-    return steps
-
-
-def _fitted(chain: EffectChain) -> list[nn.Parameter]:
-    base = [p for p in chain.base.parameters() if p.requires_grad] if is_stiff(chain.base) else []
-    effects = [
-        chain.get_parameter(f"{name.replace('-', '_')}__{parameter}") for name, parameter in chain.fitted
-    ]
-    return base + effects

@@ -16,7 +16,7 @@ from litho_data.store.read import PrintedScan
 from litho_models.effects.chain import EffectChain
 from litho_models.loop.contest import Entrant, judged
 from litho_models.loop.fields import Field
-from litho_models.loop.fitting import effect_slots
+from litho_models.loop.parameters import effect_slots
 from litho_models.loop.scoring import Terms
 from litho_models.loop.search import Search
 from litho_models.loop.state import State, fit_state

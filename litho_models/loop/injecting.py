@@ -10,11 +10,11 @@ import torch
 
 from litho_data.errors import InputError
 from litho_models.effects import Effect, get_effect, screened_effects
-from litho_models.loop.contest import is_eligible
 from litho_models.loop.directions import measure_directions
+from litho_models.loop.eligibility import is_eligible
 from litho_models.loop.fields import Field
-from litho_models.loop.fitting import set_vector
 from litho_models.loop.linear import nuisance_columns, orthonormal
+from litho_models.loop.parameters import set_vector
 from litho_models.loop.scoring import Terms, score
 from litho_models.loop.screening import SAME_COSINE, best_by_fold, cosine, screen
 from litho_models.loop.state import State, held_out_residuals

@@ -17,10 +17,10 @@ from litho_models.freeze import save_frozen
 from litho_models.loop.closed import Closed, LoopConfig, corrected_chain
 from litho_models.loop.closing import close_loop
 from litho_models.loop.exporting import exported_effects, write_measurement_model
-from litho_models.loop.fitting import is_stiff
 from litho_models.loop.flexible import Trainer
 from litho_models.loop.observed import rounding_step_um
 from litho_models.loop.outcome import summarise
+from litho_models.loop.parameters import is_stiff
 from litho_models.loop.reporting import write_report
 from litho_models.loop.result import CloseLoop
 from litho_models.models import MODELS, build_model

@@ -17,10 +17,11 @@ from litho_models.loop import LoopConfig, close_loop, close_loop_on_store, parse
 from litho_models.loop.closed import Closed
 from litho_models.loop.exporting import exported_effects
 from litho_models.loop.fields import LARGE_PX, prepare_fields
-from litho_models.loop.fitting import fit_folds, get_vector, predict
+from litho_models.loop.fitting import fit_folds, predict
 from litho_models.loop.injecting import parse_injection
 from litho_models.loop.measurement import measurement_tests
 from litho_models.loop.outcome import summarise
+from litho_models.loop.parameters import get_vector
 from litho_models.loop.result import CloseLoop
 from litho_models.loop.structure import covariate_tests, is_structured
 from litho_models.model_card import ModelCard

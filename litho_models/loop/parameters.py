@@ -1,0 +1,78 @@
+"""The numbers that a fit moves: where they stand in one vector, their ranges and difference steps."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import nn
+
+from litho_models.effects import get_effect
+from litho_models.effects.chain import EffectChain
+
+STIFF_PARAMETERS = 16
+_RELATIVE_STEP = 5e-3
+# Base parameters are lengths in µm or logits of order 1. Beyond 4 a logit has no slope left, and a
+# fit that has run there (on scans that a fold holds out, say) could not come back.
+_LONGEST_STEP, _LARGEST_VALUE = 1.0, 4.0
+_AT_BOUND = 1e-6
+
+
+def is_stiff(base: nn.Module) -> bool:
+    """Few enough trainable numbers to be fitted jointly with the effects."""
+    return 0 < sum(p.numel() for p in base.parameters() if p.requires_grad) <= STIFF_PARAMETERS
+
+
+def get_vector(chain: EffectChain) -> np.ndarray:
+    """All fitted numbers: the base's (if stiff), then the effects'."""
+    return np.concatenate([p.detach().numpy().reshape(-1) for p in _fitted(chain)] or [np.empty(0)]).astype(
+        np.float64
+    )
+
+
+def set_vector(chain: EffectChain, vector: np.ndarray) -> None:
+    """Set what ``get_vector`` returns."""
+    at = 0
+    for parameter in _fitted(chain):
+        values = vector[at : at + parameter.numel()]
+        parameter.data.copy_(torch.as_tensor(values, dtype=parameter.dtype).reshape(parameter.shape))
+        at += parameter.numel()
+
+
+def effect_slots(chain: EffectChain) -> dict[tuple[str, str], int]:
+    """Where each effect parameter sits in the vector."""
+    start = len(get_vector(chain)) - len(chain.fitted)
+    return {slot: start + i for i, slot in enumerate(chain.fitted)}
+
+
+def room(chain: EffectChain, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Smallest and largest step (p,) allowed from here: effects within their range, the base not too far."""
+    lowest = np.maximum(-_LONGEST_STEP, -_LARGEST_VALUE - vector)
+    highest = np.minimum(_LONGEST_STEP, _LARGEST_VALUE - vector)
+    for (name, parameter), slot in effect_slots(chain).items():
+        limits = get_effect(name).parameters[parameter]
+        lowest[slot], highest[slot] = limits.lower - vector[slot], limits.upper - vector[slot]
+    return np.minimum(lowest, 0), np.maximum(highest, 0)
+
+
+def within_bounds(chain: EffectChain, vector: np.ndarray) -> np.ndarray:
+    """True for parameters (p,) with room on both sides."""
+    lowest, highest = room(chain, vector)
+    return (lowest < -_AT_BOUND) & (highest > _AT_BOUND)
+
+
+def difference_steps(chain: EffectChain, vector: np.ndarray) -> np.ndarray:
+    """Difference steps, pointing away from the nearer bound of an effect's range."""
+    steps = _RELATIVE_STEP * np.maximum(np.abs(vector), 0.2)
+    for (name, parameter), slot in effect_slots(chain).items():
+        limits = get_effect(name).parameters[parameter]
+        size = 0.05 * abs(limits.typical - limits.null if limits.kind == "amplitude" else limits.typical)
+        steps[slot] = size if vector[slot] + size <= limits.upper else -size
+    return steps
+
+
+def _fitted(chain: EffectChain) -> list[nn.Parameter]:
+    base = [p for p in chain.base.parameters() if p.requires_grad] if is_stiff(chain.base) else []
+    effects = [
+        chain.get_parameter(f"{name.replace('-', '_')}__{parameter}") for name, parameter in chain.fitted
+    ]
+    return base + effects
