@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from benchmarks import recipes
 from benchmarks.measured import FOLDER, PAGES, RESULTS, texts
 from benchmarks.measured_loop import loop_table
 from benchmarks.record import published
@@ -18,6 +19,13 @@ from litho_models.noise.result import NoiseAnalysis
 def test_the_page_quotes_the_committed_results(page):
     for name in PAGES[page]:
         assert published(page, name) == texts(FOLDER)[name]
+
+
+def test_the_page_on_training_quotes_the_committed_runs():
+    others = [Benchmark.read(recipes.FOLDER / name) for name in recipes.RUNS]
+    fast = Benchmark.read(recipes.FAST)
+    assert {other.split.scored_ids_sha256 for other in others} == {fast.split.scored_ids_sha256}
+    assert published(recipes.PAGE, recipes.MARK) == recipes.recipe_table(fast, others)
 
 
 def test_the_committed_results_are_of_the_published_schemas():
