@@ -32,7 +32,7 @@ from litho_models.zoo_making import ZOO_MODELS
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "results" / "neural-lithography"
 # Draws of the paper's split, made by examples/demo.py.
-PAPER_SEEDS = (0,)
+PAPER_SEEDS = (0, 1)
 RESULTS = {
     "benchmark.json": "benchmark/benchmark.json",
     **{f"benchmark_paper_{seed}.json": f"benchmark-paper-{seed}/benchmark.json" for seed in PAPER_SEEDS},
