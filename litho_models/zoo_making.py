@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+import torch
+from threadpoolctl import threadpool_limits
 
 from litho_data.errors import InputError
 from litho_data.store import PrintedScan, Store, open_store
@@ -83,15 +87,17 @@ def make_zoo(
 
 
 def scored_metrics(model: str | Path, scans: Sequence[PrintedScan], split: str) -> list[Metric]:
-    """The errors of a frozen model on scans, as they stand in its card."""
+    """The errors of a frozen model on scans, as they stand in its card, whatever the number of threads."""
     frozen = load_frozen(model)
     learned = card_background(frozen, scans)
-    predictions = [
-        Prediction(predict_frozen(frozen, scan), learned.map_um(scan.shape) if learned else None)
-        for scan in scans
-    ]
     protocol = protocol_for("offset", background="training" if learned else "none")
-    return _metrics(score_model(frozen.name, scans, predictions, protocol), split, protocol.background)
+    with _one_thread():
+        predictions = [
+            Prediction(predict_frozen(frozen, scan), learned.map_um(scan.shape) if learned else None)
+            for scan in scans
+        ]
+        scores = score_model(frozen.name, scans, predictions, protocol)
+    return _metrics(scores, split, protocol.background)
 
 
 def differing_metrics(store: str | Path, root: str | Path = zoo.ZOO_FOLDER) -> dict[str, list[str]]:
@@ -122,6 +128,18 @@ def differing_metrics(store: str | Path, root: str | Path = zoo.ZOO_FOLDER) -> d
             if old != new
         ]
     return found
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Threads that share a sum add it up in another order, and its last bits differ."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        with threadpool_limits(1):
+            yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _metrics(scores: ModelScores, split: str, background: BackgroundUse) -> list[Metric]:

@@ -146,7 +146,12 @@ def test_the_zoo_is_made_in_one_call_and_reproduces_its_cards(store, tmp_path):
         assert "/" not in card.command
         assert str(tmp_path) not in json.dumps(card.model_dump(mode="json"))
         assert "mae_datum_free" in (root / name / "README.md").read_text()
-    assert differing_metrics(store, root) == {name: [] for name in sorted(models)}
+    threads = torch.get_num_threads()
+    for others in (1, 2):
+        torch.set_num_threads(others)
+        assert differing_metrics(store, root) == {name: [] for name in sorted(models)}
+        assert torch.get_num_threads() == others
+    torch.set_num_threads(threads)
     card = ModelCard.read(root / "linear")
     metric = card.metrics[0].model_copy(update={"value": card.metrics[0].value * (1 + 1e-12)})
     card.model_copy(update={"metrics": [metric, *card.metrics[1:]]}).write(root / "linear")
