@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
 from threadpoolctl import threadpool_limits
 
 from litho_data.errors import InputError
@@ -91,7 +89,8 @@ def scored_metrics(model: str | Path, scans: Sequence[PrintedScan], split: str) 
     frozen = load_frozen(model)
     learned = card_background(frozen, scans)
     protocol = protocol_for("offset", background="training" if learned else "none")
-    with _one_thread():
+    # Threads that share a sum add it up in another order, and its last bits differ.
+    with threadpool_limits(1):
         predictions = [
             Prediction(predict_frozen(frozen, scan), learned.map_um(scan.shape) if learned else None)
             for scan in scans
@@ -128,18 +127,6 @@ def differing_metrics(store: str | Path, root: str | Path = zoo.ZOO_FOLDER) -> d
             if old != new
         ]
     return found
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Threads that share a sum add it up in another order, and its last bits differ."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with threadpool_limits(1):
-            yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _metrics(scores: ModelScores, split: str, background: BackgroundUse) -> list[Metric]:
