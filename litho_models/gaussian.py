@@ -7,7 +7,7 @@ thousand pixels this is faster than a Fourier transform, and no period or paddin
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import torch
@@ -55,11 +55,8 @@ def gaussian_blur(
         for sigma in (along_y, along_x)
     ]
     radii = [kernel_radius_px(float(sigma.detach())) for sigma in sigmas]
-    if edge == "replicate" and field.dtype.itemsize > 2 and not _is_wide(field.shape, radii):
-        with torch.autocast(device_type=field.device.type, enabled=False):
-            rows = _continuing_band(field.shape[-2], radii[0], sigmas[0])
-            columns = _continuing_band(field.shape[-1], radii[1], sigmas[1])
-            return rows @ field @ columns.T
+    if edge == "replicate" and not _is_wide(field.shape, radii):
+        return _blur(field, sigmas, radii, _continuing_band)
     padded = pad_field(field, radii[0], radii[1], edge)
     return blur_interior(padded, (sigmas[0], sigmas[1]), (radii[0], radii[1]))
 
@@ -70,14 +67,24 @@ def blur_interior(
     """Blur and keep only the pixels whose whole support lies inside: (..., y - 2r, x - 2r)."""
     sigmas = sigma_px if isinstance(sigma_px, tuple) else (sigma_px, sigma_px)
     radii = radius_px if isinstance(radius_px, tuple) else (radius_px, radius_px)
+    return _blur(field, sigmas, radii, _band)
+
+
+def _blur(
+    field: Tensor,
+    sigmas: Sequence[Tensor],
+    radii: Sequence[int],
+    band: Callable[[int, int, Tensor], Tensor],
+) -> Tensor:
+    """Blur by one matrix for each axis, made by ``band``; the interior of a wide field by blocks."""
     # Heights need full precision: bfloat16 resolves only some nanometres at 1 µm.
     with torch.autocast(device_type=field.device.type, enabled=False):
         field = field.float() if field.dtype in (torch.bfloat16, torch.float16) else field
         along_y, along_x = (sigma.to(field.dtype) for sigma in sigmas)
         if _is_wide(field.shape, radii):
             return _blur_blocks_y(_blur_blocks_x(field, radii[1], along_x), radii[0], along_y)
-        rows = _band(field.shape[-2], radii[0], along_y)
-        columns = _band(field.shape[-1], radii[1], along_x)
+        rows = band(field.shape[-2], radii[0], along_y)
+        columns = band(field.shape[-1], radii[1], along_x)
         return rows @ field @ columns.T
 
 

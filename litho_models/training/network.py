@@ -121,7 +121,7 @@ class _Heights(nn.Module):
     @property
     def margin_px(self) -> int:
         """Pixels around a crop; a blur that learns its width needs more or fewer as it goes."""
-        return self.model.reach_px or 0 if self._inside else 0
+        return (self.model.reach_px or 0) if self._inside else 0
 
     def forward(self, layout_um: Tensor) -> Tensor:
         predict = self.model.interior if self._inside else self.model
