@@ -1,7 +1,7 @@
 """Carry the results of the measured run into the documentation: small files, tables, figures.
 
     make demo DATASET=neural-lithography
-    python benchmarks/measured.py runs/neural-lithography
+    python -m benchmarks.measured runs/neural-lithography
 
 What the pages quote is written here from the result files, and a test holds the pages to them.
 """
@@ -25,14 +25,13 @@ from benchmarks.measured_models import (
     paper_table,
 )
 from benchmarks.record import publish
+from examples.demo import PAPER_SEEDS
 from litho_models import zoo
 from litho_models.model_card import ModelCard
 from litho_models.zoo_making import ZOO_MODELS
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "results" / "neural-lithography"
-# Draws of the paper's split, made by examples/demo.py.
-PAPER_SEEDS = (0, 1)
 RESULTS = {
     "benchmark.json": "benchmark/benchmark.json",
     **{f"benchmark_paper_{seed}.json": f"benchmark-paper-{seed}/benchmark.json" for seed in PAPER_SEEDS},

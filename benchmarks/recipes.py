@@ -62,6 +62,7 @@ def main() -> None:
             seed=fast.split.seed,
         )
         for name, (trained, own) in zip(RUNS, settings, strict=True)
+        if trained
     }
     text = recipe_table(fast, list(others.values()))
     print(text)
