@@ -1,8 +1,8 @@
 """A stack of 3 x 3 convolutions on a CPU, in tiles whose features lie in the cache of one core.
 
 Of each tile is kept what the gradient needs, in as few bytes as will do: where the weights are fixed
-the sign of each hidden value and nothing else (as the value in bfloat16: rounding keeps a sign),
-where they learn the values themselves.
+the sign of each hidden value and nothing else (or the value in bfloat16: rounding keeps a sign), where
+they learn the values themselves. Fixed weights in float32 run with fewer multiplications.
 """
 
 from __future__ import annotations
@@ -11,18 +11,30 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import chain, pairwise
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
+from litho_models.one_channel import (
+    adjoint_onto_one_channel,
+    correlation,
+    from_one_channel,
+    onto_one_channel,
+)
+
+if TYPE_CHECKING:
+    from litho_models.winograd import FixedStack
+
 _Made = TypeVar("_Made")
 
 # 64 channels of 96 x 96 pixels are 1.1 MiB in bfloat16; larger tiles leave the cache, smaller ones repeat
-# more halo.
-_TILE_PX = 96
+# more halo. Fixed weights are multiplied with blocks of a tile, which stay in the cache by themselves.
+_TILE_PX, _FIXED_TILE_PX = 96, 128
+# Channels that make a vector of the processor.
+_VECTOR = 16
 
 
 class StackSettings(NamedTuple):
@@ -66,22 +78,27 @@ class _Stack(torch.autograd.Function):
         kept_dtype = settings.adjoint_dtype if learns else torch.bfloat16
         halo = 2 * len(weights)
         out = field.new_empty((len(field), 1, field.shape[-2] - halo, field.shape[-1] - halo))
-        tiles = list(_tiles(out, halo))
+        fixed = None if learns or dtype != torch.float32 else _fixed_stack(field, weights, biases, slope)
+        tile_px = _TILE_PX if fixed is None else _FIXED_TILE_PX
+        tiles = list(_tiles(out, halo, tile_px))
 
         def compute(tile: int) -> list[Tensor]:
             inside, around = tiles[tile]
-            features = _from_one_channel(field[around], weights[0], biases[0])
+            if fixed is not None:
+                out[inside], signs = fixed.heights(field[around][0, 0])
+                return signs if keeps else []
+            features = from_one_channel(field[around], weights[0], biases[0])
             features = functional.leaky_relu_(features, slope).to(dtype)
             values = [features.to(kept_dtype)] if keeps else []
             for weight, bias in zip(hidden, hidden_biases, strict=True):
                 features = functional.leaky_relu_(functional.conv2d(features, weight, bias), slope)
                 values += [features.to(kept_dtype)] if keeps else []
-            out[inside] = _onto_one_channel(features.to(field.dtype), weights[-1])
+            out[inside] = onto_one_channel(features.to(field.dtype), weights[-1])
             return values
 
         kept = list(chain.from_iterable(_one_thread_each(compute, len(tiles))))
         out += biases[-1]
-        ctx.settings, ctx.learns = settings, learns
+        ctx.settings, ctx.learns, ctx.fixed, ctx.tile_px = settings, learns, fixed, tile_px
         ctx.save_for_backward(field, *parameters, *kept)
         return out
 
@@ -99,16 +116,25 @@ class _Stack(torch.autograd.Function):
         last = weights[-1].flip(2, 3).transpose(0, 1)
         no_bias = last.new_zeros(len(last))
         halo, layers = 2 * len(weights), len(weights) - 1
-        tiles = list(_tiles(gradient, halo))
+        tiles = list(_tiles(gradient, halo, ctx.tile_px))
+        fixed: FixedStack | None = ctx.fixed if dtype == torch.float32 else None
 
         def compute(tile: int) -> tuple[Tensor | None, list[tuple[Tensor, Tensor]]]:
             inside, around = tiles[tile]
-            values = [value.to(dtype) for value in kept[tile * layers : (tile + 1) * layers]]
+            own = kept[tile * layers : (tile + 1) * layers]
+            if fixed is not None:
+                return fixed.adjoint(gradient[inside][0, 0], own), []
+            ny, nx = gradient[inside].shape[-2:]
+            frames = range(2 * layers, 0, -2)
+            values = [
+                value[..., : ny + frame, : nx + frame].to(dtype)
+                for value, frame in zip(own, frames, strict=True)
+            ]
             above = functional.pad(gradient[inside], (2, 2, 2, 2))
-            slope = _from_one_channel(above, last, no_bias).to(dtype)
+            slope = from_one_channel(above, last, no_bias).to(dtype)
             shares: list[tuple[Tensor, Tensor]] = []
             if learns:
-                by_weight, _ = _correlation(above, values[-1])
+                by_weight, _ = correlation(above, values[-1])
                 shares.append((by_weight.transpose(0, 1).flip(2, 3), gradient[inside].sum()))
             for layer in range(layers - 1, 0, -1):
                 _through_relu_(slope, values[layer], settings.leaky_slope)
@@ -117,9 +143,9 @@ class _Stack(torch.autograd.Function):
                 )
                 shares += [(by_weight, by_bias)] if learns else []
             _through_relu_(slope, values[0], settings.leaky_slope)
-            shares += [_correlation(field[around], slope)] if learns else []
+            shares += [correlation(field[around], slope)] if learns else []
             wanted = ctx.needs_input_grad[0]
-            return _adjoint_onto_one_channel(slope, weights[0]) if wanted else None, shares[::-1]
+            return adjoint_onto_one_channel(slope, weights[0]) if wanted else None, shares[::-1]
 
         total = torch.zeros_like(field)
         sums = [torch.zeros_like(parameter) for parameter in parameters]
@@ -152,6 +178,18 @@ def _one_thread_each(compute: Callable[[int], _Made], count: int) -> Iterator[_M
         torch.set_num_threads(threads)
 
 
+def _fixed_stack(
+    field: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], leaky_slope: float
+) -> FixedStack | None:
+    """For float32 and channels that fill vectors; for others it would be compiled in vain."""
+    if field.dtype != torch.float32 or any(len(weight) % _VECTOR for weight in weights[:-1]):
+        return None
+    # Numba takes a moment to load, and much here runs without it.
+    from litho_models.winograd import FixedStack
+
+    return FixedStack(weights, biases, leaky_slope, _FIXED_TILE_PX)
+
+
 def _halves(items: Sequence[Tensor]) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
     return items[: len(items) // 2], items[len(items) // 2 :]
 
@@ -175,58 +213,6 @@ def _convolution_backward(
     )
 
 
-def _from_one_channel(tile: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """Convolution 1 -> channels as a matrix product, which leaves channels last: (1, c, y - 2, x - 2)."""
-    ny, nx = (length - 2 for length in tile.shape[-2:])
-    kernel = torch.cat([weight.reshape(-1, 9), bias[:, None]], dim=1)
-    return (_neighbours(tile).T @ kernel.T).view(1, ny, nx, -1).permute(0, 3, 1, 2)
-
-
-def _correlation(tile: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradients of ``_from_one_channel`` to its weight (c, 1, 3, 3) and bias, for that of its result."""
-    sums = (_neighbours(tile).to(features.dtype) @ _pixels(features)).T.to(tile.dtype)
-    return sums[:, :9].reshape(-1, 1, 3, 3), sums[:, 9]
-
-
-def _neighbours(tile: Tensor) -> Tensor:
-    """(10, pixels): 3 x 3 surroundings of each pixel of (1, 1, y, x) but the outermost; ones for a bias."""
-    ny, nx = (length - 2 for length in tile.shape[-2:])
-    shifted = [tile[..., y : y + ny, x : x + nx] for y in range(3) for x in range(3)]
-    return torch.cat([*shifted, torch.ones_like(shifted[0])]).view(10, -1)
-
-
-def _onto_one_channel(features: Tensor, weight: Tensor) -> Tensor:
-    """Convolution channels -> 1: one product for all nine taps, then nine shifted sums; (y - 2, x - 2)."""
-    taps = _taps(features, weight)
-    ny, nx = (length - 2 for length in features.shape[-2:])
-    total = torch.zeros_like(taps[0, :ny, :nx])
-    for index, tap in enumerate(taps):
-        y, x = divmod(index, 3)
-        total += tap[y : y + ny, x : x + nx]
-    return total
-
-
-def _adjoint_onto_one_channel(slope: Tensor, weight: Tensor) -> Tensor:
-    """Adjoint of ``_from_one_channel`` for (1, c, y, x): (y + 2, x + 2)."""
-    ny, nx = slope.shape[-2:]
-    total = weight.new_zeros((ny + 2, nx + 2))
-    for index, tap in enumerate(_taps(slope, weight.to(slope.dtype)).to(total.dtype)):
-        y, x = divmod(index, 3)
-        total[y : y + ny, x : x + nx] += tap
-    return total
-
-
-def _taps(features: Tensor, weight: Tensor) -> Tensor:
-    """(9, y, x): each of nine weightings of the channels of (1, c, y, x)."""
-    by_tap = weight.reshape(-1, 9).T
-    return torch.mm(by_tap, _pixels(features).T).view(9, *features.shape[-2:])
-
-
-def _pixels(features: Tensor) -> Tensor:
-    """(y x, c) of (1, c, y, x)."""
-    return features.permute(0, 2, 3, 1).reshape(-1, features.shape[1])
-
-
 def _through_relu_(slope: Tensor, values: Tensor, leaky_slope: float) -> None:
     torch.ops.aten.leaky_relu_backward.grad_input(slope, values, leaky_slope, True, grad_input=slope)
 
@@ -235,18 +221,18 @@ def _channels_last(weights: Sequence[Tensor], dtype: torch.dtype) -> list[Tensor
     return [weight.to(dtype).contiguous(memory_format=torch.channels_last) for weight in weights]
 
 
-def _tiles(out: Tensor, halo_px: int) -> Iterator[tuple[tuple[slice, ...], tuple[slice, ...]]]:
+def _tiles(out: Tensor, halo_px: int, size_px: int) -> Iterator[tuple[tuple[slice, ...], tuple[slice, ...]]]:
     """Slices of each tile in the result (b, 1, y, x), and of what it depends on in the wider input."""
     every = slice(None)
     for sample in range(len(out)):
         one = slice(sample, sample + 1)
-        for rows in _equal_parts(out.shape[-2]):
-            for columns in _equal_parts(out.shape[-1]):
+        for rows in _equal_parts(out.shape[-2], size_px):
+            for columns in _equal_parts(out.shape[-1], size_px):
                 wide = [slice(part.start, part.stop + halo_px) for part in (rows, columns)]
                 yield (one, every, rows, columns), (one, every, *wide)
 
 
-def _equal_parts(length_px: int) -> list[slice]:
-    count = max(1, math.ceil(length_px / _TILE_PX))
+def _equal_parts(length_px: int, size_px: int) -> list[slice]:
+    count = max(1, math.ceil(length_px / size_px))
     edges = [round(length_px * part / count) for part in range(count + 1)]
     return [slice(start, stop) for start, stop in pairwise(edges)]

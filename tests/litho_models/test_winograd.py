@@ -1,0 +1,168 @@
+"""Fixed convolutions with fewer multiplications are the convolutions they stand for."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional
+
+from litho_models import winograd
+from litho_models.areawise import StackSettings, convolution_stack
+from litho_models.winograd import FixedStack
+from litho_models.winograd_passes import FRAME_PX, lift_back
+
+SLOPE = 0.02
+WIDTHS = (1, 32, 16, 48, 1)
+LAYERS = len(WIDTHS) - 1
+
+
+@pytest.fixture(scope="module")
+def parameters():
+    generator = torch.Generator().manual_seed(0)
+    weights = [torch.randn(b, a, 3, 3, generator=generator) / (9 * a) ** 0.5 for a, b in pairwise(WIDTHS)]
+    return weights, [0.3 * torch.randn(width, generator=generator) for width in WIDTHS[1:]]
+
+
+@pytest.fixture
+def stack(parameters):
+    return FixedStack(*parameters, SLOPE, tile_px=128)
+
+
+def random_field(*shape: int, seed: int = 1) -> torch.Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+
+
+def exact(
+    tile: torch.Tensor, parameters, signs: list[torch.Tensor], upstream: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Result without the last bias, and gradient to the tile, by plain convolutions in float64.
+
+    The leaky ReLU goes by ``signs``: beside a value of 1e-7 rounding decides on which side it stands.
+    """
+    tile = tile.double().requires_grad_()
+    features = tile[None, None]
+    (*weights, last), biases = parameters
+    for weight, bias, sign in zip(weights, biases, signs, strict=False):
+        features = functional.conv2d(features, weight.double(), bias.double())
+        ny, nx = features.shape[-2:]
+        features = features * torch.where(sign[..., :ny, :nx] > 0, 1.0, SLOPE)
+    heights = functional.conv2d(features, last.double())[0, 0]
+    (gradient,) = torch.autograd.grad(heights, tile, upstream.double())
+    return heights.detach(), gradient
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (4, 4), (5, 6), (7, 3), (64, 81), (128, 127)])
+def test_heights_and_gradient_are_those_of_plain_convolutions(shape, parameters, stack):
+    # Sides of all four remainders, one patch and many blocks of them.
+    tile, upstream = random_field(*(side + 2 * LAYERS for side in shape)), random_field(*shape, seed=2)
+    heights, signs = stack.heights(tile)
+    gradient = stack.adjoint(upstream, signs)
+    expected, expected_gradient = exact(tile, parameters, signs, upstream)
+    assert heights.shape == shape
+    assert gradient.shape == tile.shape
+    # The transforms hold coefficients up to 8 and cancel them again: some ten times the 1e-7 of float32,
+    # over three layers. A wrong coefficient shows in the first digit.
+    assert float((heights - expected).abs().max()) < 1e-5 * max(1.0, float(expected.abs().max()))
+    assert float((gradient - expected_gradient).norm()) < 1e-5 * float(expected_gradient.norm())
+
+
+def test_a_kernel_of_one_tap_moves_the_field(parameters):
+    weights = [torch.zeros_like(weight) for weight in parameters[0]]
+    for number, weight in enumerate(weights):
+        weight[0, 0, number % 3, 2 - number % 3] = 1
+    biases = [torch.zeros(width) for width in WIDTHS[1:]]
+    tile = random_field(30, 30).abs()
+    heights, _ = FixedStack(weights, biases, SLOPE, 128).heights(tile)
+    y, x = (sum(taps) for taps in ((0, 1, 2, 0), (2, 1, 0, 2)))
+    assert torch.allclose(heights, tile[y : y + 22, x : x + 22], atol=1e-5)
+
+
+def test_a_value_that_is_not_a_number_stays_one_and_goes_no_farther_than_its_patches(stack):
+    tile = random_field(100, 100)
+    clean, _ = stack.heights(tile)
+    tile[50, 50] = torch.nan
+    spoilt, _ = stack.heights(tile)
+    assert torch.isnan(spoilt[50 - LAYERS, 50 - LAYERS])
+    # Each of the two inner layers spreads over its patch of 4, one of them more than the kernels do.
+    far = torch.ones_like(spoilt, dtype=torch.bool)
+    far[30:62, 30:62] = False
+    assert torch.equal(spoilt[far], clean[far])
+    # Nothing of it is left in the memory that the next tile uses.
+    again, _ = stack.heights(torch.nan_to_num(tile, nan=0.0))
+    assert torch.isfinite(again).all()
+
+
+def test_signs_are_those_of_the_hidden_values(parameters, stack):
+    weights, biases = parameters
+    tile = random_field(20, 21)
+    _, signs = stack.heights(tile)
+    features = tile[None, None]
+    for weight, bias, sign in zip(weights, biases, signs, strict=False):
+        features = functional.conv2d(features, weight, bias)
+        ny, nx = features.shape[-2:]
+        clear = features.abs() > 1e-4
+        assert torch.equal((sign[..., :ny, :nx] > 0)[clear], (features > 0)[clear])
+        features = functional.leaky_relu(features, SLOPE)
+
+
+def test_the_frame_of_an_adjoint_stays_zero():
+    framed = np.zeros((9 + 2 * FRAME_PX, 8 + 2 * FRAME_PX, 16), np.float32)
+    signs = np.where(np.arange(9 * 8 * 16).reshape(9, 8, 16) % 2, 1, -1).astype(np.int8)
+    taps = np.zeros((9, 16), np.float32)
+    taps[4] = np.arange(16)
+    image = random_field(11, 10).numpy()
+    lift_back(image, taps, np.float32(SLOPE), signs, framed)
+    inside = framed[FRAME_PX:-FRAME_PX, FRAME_PX:-FRAME_PX]
+    expected = image[1:-1, 1:-1, None] * taps[4] * np.where(signs > 0, np.float32(1), np.float32(SLOPE))
+    assert np.allclose(inside, expected, rtol=1e-6, atol=0)
+    inside[:] = 0
+    assert not framed.any()
+
+
+@pytest.mark.parametrize("adjoint", [torch.float32, torch.bfloat16])
+def test_it_is_what_a_fixed_stack_runs_with_any_number_of_threads(adjoint, parameters, monkeypatch):
+    uses = []
+    heights = FixedStack.heights
+    monkeypatch.setattr(FixedStack, "heights", lambda self, tile: uses.append(1) or heights(self, tile))
+    field = random_field(2, 1, 150, 310).requires_grad_()
+    settings = StackSettings(SLOPE, torch.float32, adjoint)
+    threads, made = torch.get_num_threads(), []
+    try:
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            height = convolution_stack(field, *parameters, settings)
+            made.append([height.detach(), *torch.autograd.grad(height.square().sum(), field)])
+    finally:
+        torch.set_num_threads(threads)
+    # Two fields of 2 x 3 tiles, twice.
+    assert len(uses) == 24
+    assert all(torch.equal(a, b) for a, b in zip(*made, strict=True))
+    by_convolutions = convolution_stack(field.double(), *_double(parameters), _in(torch.float64))
+    assert torch.allclose(made[0][0].double(), by_convolutions, atol=1e-5)
+    (expected,) = torch.autograd.grad(by_convolutions.square().sum(), field)
+    # Some of 10 million hidden values are within 1e-6 of zero and pass another slope there. bfloat16 rounds
+    # by up to 2^-9 of a value, at most 12 times one after the other.
+    tolerance = 1e-2 if adjoint == torch.float32 else 12 * 2**-9
+    assert float((made[0][1] - expected).norm() / expected.norm()) < tolerance
+
+
+def test_weights_that_learn_and_odd_numbers_of_channels_are_convolved(parameters, monkeypatch):
+    monkeypatch.setattr(winograd, "FixedStack", None)
+    settings = _in(torch.float32)
+    field = random_field(1, 1, 20, 20)
+    learning = [[p.clone().requires_grad_() for p in half] for half in parameters]
+    assert convolution_stack(field, *learning, settings).requires_grad
+    weights, biases = parameters
+    narrow = [weights[0][:7], weights[1][:, :7], *weights[2:]], [biases[0][:7], *biases[1:]]
+    assert convolution_stack(field, *narrow, settings).shape == (1, 1, 12, 12)
+
+
+def _double(parameters) -> list[list[torch.Tensor]]:
+    return [[tensor.double() for tensor in half] for half in parameters]
+
+
+def _in(dtype: torch.dtype) -> StackSettings:
+    return StackSettings(SLOPE, dtype, dtype)
