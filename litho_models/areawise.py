@@ -78,7 +78,9 @@ class _Stack(torch.autograd.Function):
         kept_dtype = settings.adjoint_dtype if learns else torch.bfloat16
         halo = 2 * len(weights)
         out = field.new_empty((len(field), 1, field.shape[-2] - halo, field.shape[-1] - halo))
-        fixed = None if learns or dtype != torch.float32 else _fixed_stack(field, weights, biases, slope)
+        # Weights in training are convolved also where no gradient is wanted: one model, one rounding.
+        is_fixed = dtype == torch.float32 and not any(parameter.requires_grad for parameter in parameters)
+        fixed = _fixed_stack(field, weights, biases, slope) if is_fixed else None
         tile_px = _TILE_PX if fixed is None else _FIXED_TILE_PX
         tiles = list(_tiles(out, halo, tile_px))
 
