@@ -31,10 +31,13 @@ if TYPE_CHECKING:
 _Made = TypeVar("_Made")
 
 # 64 channels of 96 x 96 pixels are 1.1 MiB in bfloat16; larger tiles leave the cache, smaller ones repeat
-# more halo. Fixed weights are multiplied with blocks of a tile, which stay in the cache by themselves.
+# more halo. Fixed weights in float32 run on blocks of a tile, so that it may be larger (on the way back in
+# bfloat16 as well, where both sizes are as fast).
 _TILE_PX, _FIXED_TILE_PX = 96, 128
-# Channels that make a vector of the processor.
+# LANES of `winograd_passes`, which would load Numba.
 _VECTOR = 16
+# Inputs of the function before the weights.
+_OTHER_INPUTS = 3
 
 
 class StackSettings(NamedTuple):
@@ -63,44 +66,52 @@ def convolution_stack(
         biases: (outputs,) per layer.
         settings: slope and precision.
     """
-    return _Stack.apply(field, settings, *weights, *biases)
+    # Within the function gradients are always off.
+    return _Stack.apply(field, settings, torch.is_grad_enabled(), *weights, *biases)
 
 
 class _Stack(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, field: Tensor, settings: StackSettings, *parameters: Tensor) -> Tensor:
+    def forward(
+        ctx: Any, field: Tensor, settings: StackSettings, records: bool, *parameters: Tensor
+    ) -> Tensor:
         slope, dtype = settings.leaky_slope, settings.hidden_dtype
         weights, biases = _halves(parameters)
         hidden = _channels_last(weights[1:-1], dtype)
         hidden_biases = [bias.to(dtype) for bias in biases[1:-1]]
-        learns = any(ctx.needs_input_grad[2:])
-        keeps = learns or ctx.needs_input_grad[0]
+        # True of weights in training also where no gradient is recorded: one model, one rounding.
+        learns = any(ctx.needs_input_grad[_OTHER_INPUTS:])
+        keeps = records and (learns or ctx.needs_input_grad[0])
         kept_dtype = settings.adjoint_dtype if learns else torch.bfloat16
         halo = 2 * len(weights)
         out = field.new_empty((len(field), 1, field.shape[-2] - halo, field.shape[-1] - halo))
-        # Weights in training are convolved also where no gradient is wanted: one model, one rounding.
-        is_fixed = dtype == torch.float32 and not any(parameter.requires_grad for parameter in parameters)
-        fixed = _fixed_stack(field, weights, biases, slope) if is_fixed else None
+        fixed = None if learns or dtype != torch.float32 else _fixed_stack(field, weights, biases, slope)
         tile_px = _TILE_PX if fixed is None else _FIXED_TILE_PX
         tiles = list(_tiles(out, halo, tile_px))
 
-        def compute(tile: int) -> list[Tensor]:
-            inside, around = tiles[tile]
+        def compute(tile: int) -> tuple[Tensor, list[Tensor]]:
+            _, around = tiles[tile]
             if fixed is not None:
-                out[inside], signs = fixed.heights(field[around][0, 0])
-                return signs if keeps else []
+                heights, signs = fixed.heights(field[around][0, 0])
+                return heights, signs if keeps else []
             features = from_one_channel(field[around], weights[0], biases[0])
             features = functional.leaky_relu_(features, slope).to(dtype)
             values = [features.to(kept_dtype)] if keeps else []
             for weight, bias in zip(hidden, hidden_biases, strict=True):
                 features = functional.leaky_relu_(functional.conv2d(features, weight, bias), slope)
                 values += [features.to(kept_dtype)] if keeps else []
-            out[inside] = onto_one_channel(features.to(field.dtype), weights[-1])
-            return values
+            return onto_one_channel(features.to(field.dtype), weights[-1]), values
 
-        kept = list(chain.from_iterable(_one_thread_each(compute, len(tiles))))
+        kept: list[Tensor] = []
+        computed = _one_thread_each(compute, len(tiles), fixed is not None)
+        for (inside, _), (heights, values) in zip(tiles, computed, strict=True):
+            out[inside] = heights
+            kept += values
         out += biases[-1]
-        ctx.settings, ctx.learns, ctx.fixed, ctx.tile_px = settings, learns, fixed, tile_px
+        ctx.settings, ctx.learns, ctx.tile_px = settings, learns, tile_px
+        ctx.fixed = fixed if keeps and settings.adjoint_dtype == torch.float32 else None
+        if fixed is not None:
+            fixed.free_rooms()
         ctx.save_for_backward(field, *parameters, *kept)
         return out
 
@@ -109,7 +120,7 @@ class _Stack(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         settings: StackSettings = ctx.settings
         dtype, learns = settings.adjoint_dtype, ctx.learns
-        count = len(ctx.needs_input_grad) - 2
+        count = len(ctx.needs_input_grad) - _OTHER_INPUTS
         field, *saved = ctx.saved_tensors
         parameters, kept = saved[:count], saved[count:]
         weights = parameters[: count // 2]
@@ -119,7 +130,7 @@ class _Stack(torch.autograd.Function):
         no_bias = last.new_zeros(len(last))
         halo, layers = 2 * len(weights), len(weights) - 1
         tiles = list(_tiles(gradient, halo, ctx.tile_px))
-        fixed: FixedStack | None = ctx.fixed if dtype == torch.float32 else None
+        fixed: FixedStack | None = ctx.fixed
 
         def compute(tile: int) -> tuple[Tensor | None, list[tuple[Tensor, Tensor]]]:
             inside, around = tiles[tile]
@@ -151,29 +162,35 @@ class _Stack(torch.autograd.Function):
 
         total = torch.zeros_like(field)
         sums = [torch.zeros_like(parameter) for parameter in parameters]
-        for (_, around), (by_field, shares) in zip(tiles, _one_thread_each(compute, len(tiles)), strict=True):
+        computed = _one_thread_each(compute, len(tiles), fixed is not None)
+        for (_, around), (by_field, shares) in zip(tiles, computed, strict=True):
             if by_field is not None:
                 total[around] += by_field
             if learns:
                 for parameter_sum, share in zip(sums, chain(*zip(*shares, strict=True)), strict=True):
                     parameter_sum += share
-        return total, None, *(sums if learns else [None] * count)
+        if fixed is not None:
+            fixed.free_rooms()
+        return total, None, None, *(sums if learns else [None] * count)
 
 
-def _one_thread_each(compute: Callable[[int], _Made], count: int) -> Iterator[_Made]:
+def _one_thread_each(compute: Callable[[int], _Made], count: int, is_serial: bool) -> Iterator[_Made]:
     """``compute(0)``, ``compute(1)``, ... in order, side by side on the threads that PyTorch may use.
+
+    With fewer of them than threads each may use all threads in turn, unless it ``is_serial``.
 
     A tile stays with one thread: shared out operation by operation, its features would move from one
     core's cache to another's, and all threads would wait for the slowest after each.
     """
     threads = torch.get_num_threads()
-    if not 1 < threads <= count:
+    workers = min(threads, count)
+    if workers < 2 or (workers < threads and not is_serial):
         yield from map(compute, range(count))
         return
     # It holds for this thread and for those made from here on.
     torch.set_num_threads(1)
     try:
-        with ThreadPoolExecutor(threads) as pool:
+        with ThreadPoolExecutor(workers) as pool:
             # A new thread records gradients, whatever this one does.
             yield from pool.map(torch.no_grad()(compute), range(count))
     finally:
@@ -183,7 +200,7 @@ def _one_thread_each(compute: Callable[[int], _Made], count: int) -> Iterator[_M
 def _fixed_stack(
     field: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], leaky_slope: float
 ) -> FixedStack | None:
-    """For float32 and channels that fill vectors; for others it would be compiled in vain."""
+    """For a field and weights of float32 and channels that fill vectors, else None."""
     if field.dtype != torch.float32 or any(len(weight) % _VECTOR for weight in weights[:-1]):
         return None
     # Numba takes a moment to load, and much here runs without it.

@@ -1,14 +1,17 @@
 """A stack of 3 x 3 convolutions with fixed weights, in float32 on a CPU, with fewer multiplications.
 
-Winograd's minimal filtering F(4 x 4, 3 x 3) (Lavin and Gray 2016, arXiv:1509.09308): 4 x 4 pixels of a
-result take 36 products over the channels where sums over neighbours take 144. What lies between the
-products of two layers (transforms, bias, leaky ReLU) is compiled, in ``winograd_passes``.
+Winograd's minimal filtering F(4 x 4, 3 x 3) (Lavin and Gray 2016, arXiv:1509.09308). A patch of 4 x 4 results
+depends on 6 x 6 pixels; these and the kernel are transformed to 36 numbers each, here called frequencies,
+which are multiplied one by one, for all channels: 36 products where sums over neighbours take 144. What
+lies between the products of two layers (transforms, bias, leaky ReLU) is compiled, in ``winograd_passes``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import cached_property
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -19,17 +22,17 @@ from torch.nn import functional
 
 from litho_models import winograd_passes as passes
 from litho_models.one_channel import onto_one_channel
-from litho_models.winograd_passes import FRAME_PX, PATCH_PX, SPAN
+from litho_models.winograd_passes import FRAME_PX, LANES, PATCH_PX, SPAN
 
 # Patches that are transformed, multiplied and transformed back together: 64 channels of them and of their
-# products stay in the second cache of a core. An odd number, for frequencies that lie a multiple of 4096
-# bytes apart compete for the same lines of the first.
+# products take 1.8 MB, about the second cache of a core. An odd number, for frequencies that lie a multiple
+# of 4096 bytes apart compete for the same lines of the first.
 _BLOCK = 97
 # Pixels by which the last patches of a row or a column reach beyond the field.
 _SPARE_PX = PATCH_PX - 1
 _LARGE_PAGE_BYTES = 2**21
 
-# Of a weight, for polynomials at 0, 1, -1, 2, -2 and infinity, as the passes take those of fields.
+# G of the paper: a kernel, as a polynomial, at 0, 1, -1, 2, -2 and infinity, scaled.
 _WEIGHT_TRANSFORM = (
     (1 / 4, 0, 0),
     (-1 / 6, -1 / 6, -1 / 6),
@@ -54,14 +57,18 @@ class FixedStack:
         biases: (outputs,) per layer.
         leaky_slope: slope below zero.
         tile_px: longest side of a result.
+
+    Raises:
+        ValueError: weights or biases of another dtype, or of sizes that do not fit.
     """
 
     def __init__(self, weights: Sequence[Tensor], biases: Sequence[Tensor], leaky_slope: float, tile_px: int):
-        self._first, *hidden, self._last = (weight.detach() for weight in weights)
-        self._biases = [bias.detach().numpy() for bias in biases[:-1]]
+        # The passes check nothing.
+        _check_layers(weights, biases)
+        self._first, *self._hidden, self._last = (weight.detach() for weight in weights)
+        self._biases = [bias.detach().contiguous().numpy() for bias in biases[:-1]]
         self._slope = np.float32(leaky_slope)
-        self._forwards = [_in_frequencies(weight) for weight in hidden]
-        self._backwards = [_in_frequencies(_turned(weight)) for weight in hidden]
+        self._forwards = [_in_frequencies(weight) for weight in self._hidden]
         self._side_px = tile_px + 2 * len(weights) + 2 * FRAME_PX + _SPARE_PX
         self._idle_rooms: list[_Room] = []
 
@@ -109,6 +116,14 @@ class FixedStack:
                 framed = made
             return onto_one_channel(_as_image(framed), _turned(self._first))[: ny + 2, : nx + 2]
 
+    def free_rooms(self) -> None:
+        """Give the memory back that tiles have left for the next ones."""
+        self._idle_rooms.clear()
+
+    @cached_property
+    def _backwards(self) -> list[Tensor]:
+        return [_in_frequencies(_turned(weight)) for weight in self._hidden]
+
     @contextmanager
     def _room(self) -> Iterator[_Room]:
         """Room for one thread, left by an earlier tile if there is one."""
@@ -133,7 +148,7 @@ class _Block(NamedTuple):
 class _Room:
     """Memory for two fields, which take turns, and two spectra, used again for every layer and tile.
 
-    It is one array so large that NumPy asks for large pages. The spectra lie in one of them: a patch writes
+    It is one array so large that NumPy asks for large pages, and the spectra begin with one: a patch writes
     to 36 places, and to find as many small pages takes longer than to write.
     """
 
@@ -179,11 +194,25 @@ class _Room:
             yield block, product
 
 
+def _check_layers(weights: Sequence[Tensor], biases: Sequence[Tensor]) -> None:
+    channels = [1, *(len(weight) for weight in weights)]
+    shapes = [(outputs, inputs, 3, 3) for inputs, outputs in pairwise(channels)]
+    got = [tuple(weight.shape) for weight in weights], [tuple(bias.shape) for bias in biases]
+    if got != (shapes, [shape[:1] for shape in shapes]) or channels[-1] != 1:
+        raise ValueError(f"channels of layers and biases do not fit: {got}")
+    if any(count % LANES for count in channels[1:-1]):
+        raise ValueError(f"channels are {channels[1:-1]}, not multiples of {LANES}")
+    dtypes = {tensor.dtype for tensor in (*weights, *biases)}
+    if dtypes != {torch.float32}:
+        raise ValueError(f"weights and biases are {dtypes}, not float32")
+
+
 def _in_frequencies(weight: Tensor) -> Tensor:
     """(36, inputs, outputs) of (outputs, inputs, 3, 3)."""
     transform = torch.tensor(_WEIGHT_TRANSFORM, dtype=torch.float64)
-    both = torch.einsum("fy,oiyx,gx->fgio", transform, weight.double(), transform)
-    return both.flatten(0, 1).to(weight.dtype).contiguous()
+    taps = weight.double().permute(2, 3, 1, 0)
+    frequencies = torch.kron(transform, transform) @ taps.reshape(9, -1)
+    return frequencies.view(-1, *taps.shape[2:]).to(weight.dtype)
 
 
 def _turned(weight: Tensor) -> Tensor:

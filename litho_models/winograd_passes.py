@@ -1,29 +1,40 @@
 """Compiled: what ``winograd`` does to fields before and after its products, patch by patch.
 
 Fields are (y, x, channels), spectra (36, patches, channels), both contiguous float32; signs are int8
-like a field. The channels are a multiple of ``vectors.LANES``.
+like a field. The channels are a multiple of ``LANES``. Nothing is checked here.
+
+The loops over channels go by vectors that are a type of their own (at the end): what the compiler makes
+of a plain loop depends on the number of channels and on what it can prove of the memories, and differs
+by a factor of four. Processors with shorter vectors take several for one. All this is in one file
+because Numba compiles anew what has changed in the file of a function, and in no other.
 """
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable
 from typing import Any
 
 import numba
 import numpy as np
+from llvmlite import ir
+from numba.core import types
+from numba.extending import intrinsic, models, overload, register_model
 from numpy.typing import NDArray
 
-from litho_models.vectors import LANES, leaky, leaky_by_signs, load, scaled, store, store_signs
-
-# Side of a patch of results, and of the frequencies and neighbours that it depends on.
+# Side of a patch of results, and of the pixels and the frequencies that it depends on.
 PATCH_PX, SPAN = 4, 6
 # Zeros around the field of an adjoint.
 FRAME_PX = 2
+# Channels in a vector.
+LANES = 16
 
 _TWO, _FOUR, _FIVE, _EIGHT = (np.float32(number) for number in (2, 4, 5, 8))
 _Floats = NDArray[np.float32]
 _Signs = NDArray[np.int8]
 _inlined = numba.njit(forceinline=True)
+# For mypy an intrinsic still has the first argument, which Numba supplies.
+_intrinsic: Any = intrinsic
 
 
 def _compiled(function: Callable[..., None]) -> Callable[..., None]:
@@ -75,9 +86,9 @@ def activate(
                 at = (PATCH_PX * y + i) * row + PATCH_PX * x * channels + k
                 sign_at = (PATCH_PX * y + i) * sign_row + PATCH_PX * x * channels + k
                 for result in _four(half, SPAN * i * LANES, LANES):
-                    value = result + load(bias, k)
-                    store(target, at, leaky(value, slope))
-                    store_signs(kept, sign_at, value)
+                    value = result + _load(bias, k)
+                    _store(target, at, _leaky(value, slope))
+                    _store_signs(kept, sign_at, value)
                     at += channels
                     sign_at += channels
 
@@ -105,7 +116,7 @@ def restrain(
                 at = (PATCH_PX * y + i + FRAME_PX) * row + (PATCH_PX * x + FRAME_PX) * channels + k
                 sign_at = (PATCH_PX * y + i) * sign_row + PATCH_PX * x * channels + k
                 for result in _four(half, SPAN * i * LANES, LANES):
-                    store(target, at, leaky_by_signs(result, slope, kept, sign_at))
+                    _store(target, at, _leaky_by_signs(result, slope, kept, sign_at))
                     at += channels
                     sign_at += channels
 
@@ -121,9 +132,9 @@ def lift(
         for x in range(image.shape[1] - 2):
             at, sign_at = (y * field.shape[1] + x) * channels, (y * signs.shape[1] + x) * channels
             for k in range(0, channels, LANES):
-                value = _nine(image, y, x, weights, k, channels) + load(bias, k)
-                store(target, at + k, leaky(value, slope))
-                store_signs(kept, sign_at + k, value)
+                value = _nine(image, y, x, weights, k, channels) + _load(bias, k)
+                _store(target, at + k, _leaky(value, slope))
+                _store_signs(kept, sign_at + k, value)
 
 
 @_compiled
@@ -137,35 +148,35 @@ def lift_back(image: _Floats, taps: _Floats, slope: np.float32, signs: _Signs, f
             sign_at = (y * signs.shape[1] + x) * channels
             for k in range(0, channels, LANES):
                 value = _nine(image, y, x, weights, k, channels)
-                store(target, at + k, leaky_by_signs(value, slope, kept, sign_at + k))
+                _store(target, at + k, _leaky_by_signs(value, slope, kept, sign_at + k))
 
 
 @_inlined
 def _six(source: Any, at: int, step: int, target: Any, target_at: int, target_step: int) -> None:
-    """Six neighbours as values of a polynomial at 0, 1, -1, 2, -2 and infinity."""
-    a, b, c = load(source, at), load(source, at + step), load(source, at + 2 * step)
-    d, e, f = load(source, at + 3 * step), load(source, at + 4 * step), load(source, at + 5 * step)
-    one, minus_one = d - scaled(b, _FOUR), e - scaled(c, _FOUR)
-    two, minus_two = scaled(d - b, _TWO), e - c
-    store(target, target_at, scaled(a, _FOUR) - scaled(c, _FIVE) + e)
-    store(target, target_at + target_step, minus_one + one)
-    store(target, target_at + 2 * target_step, minus_one - one)
-    store(target, target_at + 3 * target_step, minus_two + two)
-    store(target, target_at + 4 * target_step, minus_two - two)
-    store(target, target_at + 5 * target_step, scaled(b, _FOUR) - scaled(d, _FIVE) + f)
+    """B transposed of Lavin and Gray: six neighbours to six frequencies."""
+    a, b, c = _load(source, at), _load(source, at + step), _load(source, at + 2 * step)
+    d, e, f = _load(source, at + 3 * step), _load(source, at + 4 * step), _load(source, at + 5 * step)
+    one, minus_one = d - _scaled(b, _FOUR), e - _scaled(c, _FOUR)
+    two, minus_two = _scaled(d - b, _TWO), e - c
+    _store(target, target_at, _scaled(a, _FOUR) - _scaled(c, _FIVE) + e)
+    _store(target, target_at + target_step, minus_one + one)
+    _store(target, target_at + 2 * target_step, minus_one - one)
+    _store(target, target_at + 3 * target_step, minus_two + two)
+    _store(target, target_at + 4 * target_step, minus_two - two)
+    _store(target, target_at + 5 * target_step, _scaled(b, _FOUR) - _scaled(d, _FIVE) + f)
 
 
 @_inlined
 def _four(source: Any, at: int, step: int) -> Any:
-    """Four results of six frequencies."""
-    a, b, c = load(source, at), load(source, at + step), load(source, at + 2 * step)
-    d, e, f = load(source, at + 3 * step), load(source, at + 4 * step), load(source, at + 5 * step)
+    """A transposed of Lavin and Gray: six frequencies back to four results."""
+    a, b, c = _load(source, at), _load(source, at + step), _load(source, at + 2 * step)
+    d, e, f = _load(source, at + 3 * step), _load(source, at + 4 * step), _load(source, at + 5 * step)
     one, minus_one, two, minus_two = b + c, b - c, d + e, d - e
     return (
         a + one + two,
-        minus_one + scaled(minus_two, _TWO),
-        one + scaled(two, _FOUR),
-        minus_one + scaled(minus_two, _EIGHT) + f,
+        minus_one + _scaled(minus_two, _TWO),
+        one + _scaled(two, _FOUR),
+        minus_one + _scaled(minus_two, _EIGHT) + f,
     )
 
 
@@ -175,18 +186,142 @@ def _columns(source: Any, at: int, step: int, half: Any) -> None:
     for j in range(SPAN):
         target = j * LANES
         for result in _four(source, at + j * step, SPAN * step):
-            store(half, target, result)
+            _store(half, target, result)
             target += SPAN * LANES
 
 
 @_inlined
 def _nine(image: Any, y: int, x: int, weights: Any, k: int, channels: int) -> Any:
     """3 x 3 neighbours of a pixel, weighted."""
-    upper = scaled(load(weights, k), image[y, x])
-    middle = scaled(load(weights, 3 * channels + k), image[y + 1, x])
-    lower = scaled(load(weights, 6 * channels + k), image[y + 2, x])
+    upper = _scaled(_load(weights, k), image[y, x])
+    middle = _scaled(_load(weights, 3 * channels + k), image[y + 1, x])
+    lower = _scaled(_load(weights, 6 * channels + k), image[y + 2, x])
     for j in range(1, 3):
-        upper = upper + scaled(load(weights, j * channels + k), image[y, x + j])
-        middle = middle + scaled(load(weights, (3 + j) * channels + k), image[y + 1, x + j])
-        lower = lower + scaled(load(weights, (6 + j) * channels + k), image[y + 2, x + j])
+        upper = upper + _scaled(_load(weights, j * channels + k), image[y, x + j])
+        middle = middle + _scaled(_load(weights, (3 + j) * channels + k), image[y + 1, x + j])
+        lower = lower + _scaled(_load(weights, (6 + j) * channels + k), image[y + 2, x + j])
     return upper + middle + lower
+
+
+class _VectorType(types.Type):
+    """A vector of floats as a value, for Numba."""
+
+
+_vector = _VectorType(name="Vector16")
+_FLOATS = ir.VectorType(ir.FloatType(), LANES)
+_SIGNS = ir.VectorType(ir.IntType(8), LANES)
+_ZEROS, _NO_SIGNS = ir.Constant(_FLOATS, [0.0] * LANES), ir.Constant(_SIGNS, [0] * LANES)
+# A product and a sum may be rounded once; a NaN stays one.
+_FUSED = ("contract",)
+
+
+@register_model(_VectorType)
+class _VectorModel(models.PrimitiveModel):
+    def __init__(self, manager: Any, kind: Any):
+        super().__init__(manager, kind, _FLOATS)
+
+
+@_intrinsic
+def _load(typing: Any, memory: Any, at: Any) -> Any:
+    """Floats of a flat array from position ``at`` on."""
+
+    def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        where = _pointer(context, builder, signature.args[0], given[0], given[1], _FLOATS)
+        return builder.load(where, align=1, typ=_FLOATS)
+
+    return (_vector(memory, at), generate) if _is_flat(memory, types.float32) else None
+
+
+@_intrinsic
+def _store(typing: Any, memory: Any, at: Any, vector: Any) -> Any:
+    """Write a vector into a flat array from position ``at`` on."""
+
+    def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        where = _pointer(context, builder, signature.args[0], given[0], given[1], _FLOATS)
+        builder.store(given[2], where, align=1)
+        return context.get_dummy_value()
+
+    return (types.void(memory, at, vector), generate) if _is_flat(memory, types.float32) else None
+
+
+@_intrinsic
+def _store_signs(typing: Any, memory: Any, at: Any, vector: Any) -> Any:
+    """Write 1 for what is above zero and -1 for the rest."""
+
+    def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        where = _pointer(context, builder, signature.args[0], given[0], given[1], _SIGNS)
+        signs = (ir.Constant(_SIGNS, [sign] * LANES) for sign in (1, -1))
+        builder.store(builder.select(builder.fcmp_ordered(">", given[2], _ZEROS), *signs), where, align=1)
+        return context.get_dummy_value()
+
+    return (types.void(memory, at, vector), generate) if _is_flat(memory, types.int8) else None
+
+
+@_intrinsic
+def _leaky(typing: Any, vector: Any, slope: Any) -> Any:
+    """Values above zero, and the others times ``slope``."""
+
+    def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        reduced = builder.fmul(given[0], _splat(builder, given[1]))
+        return builder.select(builder.fcmp_ordered(">", given[0], _ZEROS), given[0], reduced)
+
+    return _vector(vector, slope), generate
+
+
+@_intrinsic
+def _leaky_by_signs(typing: Any, vector: Any, slope: Any, memory: Any, at: Any) -> Any:
+    """Values where ``_store_signs`` has written 1, and the others times ``slope``."""
+
+    def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        where = _pointer(context, builder, signature.args[2], given[2], given[3], _SIGNS)
+        positive = builder.icmp_signed(">", builder.load(where, align=1, typ=_SIGNS), _NO_SIGNS)
+        return builder.select(positive, given[0], builder.fmul(given[0], _splat(builder, given[1])))
+
+    return (_vector(vector, slope, memory, at), generate) if _is_flat(memory, types.int8) else None
+
+
+@_intrinsic
+def _scaled(typing: Any, vector: Any, factor: Any) -> Any:
+    """A vector times a float32."""
+
+    def generate(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        return builder.fmul(given[0], _splat(builder, given[1]), flags=_FUSED)
+
+    return _vector(vector, factor), generate
+
+
+@_intrinsic
+def _sum(typing: Any, a: Any, b: Any) -> Any:
+    return _vector(a, b), lambda context, builder, signature, given: builder.fadd(*given, flags=_FUSED)
+
+
+@_intrinsic
+def _difference(typing: Any, a: Any, b: Any) -> Any:
+    return _vector(a, b), lambda context, builder, signature, given: builder.fsub(*given, flags=_FUSED)
+
+
+@overload(operator.add)
+def _add(a, b):
+    return (lambda a, b: _sum(a, b)) if a is _vector and b is _vector else None
+
+
+@overload(operator.sub)
+def _subtract(a, b):
+    return (lambda a, b: _difference(a, b)) if a is _vector and b is _vector else None
+
+
+def _is_flat(memory: Any, dtype: Any) -> bool:
+    is_array = isinstance(memory, types.Array)
+    return is_array and (memory.ndim, memory.layout, memory.dtype) == (1, "C", dtype)
+
+
+def _pointer(context: Any, builder: Any, kind: Any, memory: Any, at: Any, vector: ir.Type) -> Any:
+    array = context.make_array(kind)(context, builder, memory)
+    return builder.bitcast(builder.gep(array.data, [at]), vector.as_pointer())
+
+
+def _splat(builder: Any, number: Any) -> Any:
+    nothing = ir.Constant(_FLOATS, ir.Undefined)
+    one = builder.insert_element(nothing, number, ir.Constant(ir.IntType(32), 0))
+    every = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
+    return builder.shuffle_vector(one, nothing, every)

@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import torch
+from torch.autograd.function import FunctionCtx
 from torch.nn import functional
 
 from litho_models import winograd
@@ -15,19 +16,21 @@ from litho_models.winograd import FixedStack
 from litho_models.winograd_passes import FRAME_PX, lift_back
 
 SLOPE = 0.02
-WIDTHS = (1, 32, 16, 48, 1)
-LAYERS = len(WIDTHS) - 1
+
+
+def make_parameters(*channels: int) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
+    generator = torch.Generator().manual_seed(0)
+    widths = (1, *channels, 1)
+    weights = [torch.randn(b, a, 3, 3, generator=generator) / (9 * a) ** 0.5 for a, b in pairwise(widths)]
+    return weights, [0.3 * torch.randn(width, generator=generator) for width in widths[1:]]
 
 
 @pytest.fixture(scope="module")
 def parameters():
-    generator = torch.Generator().manual_seed(0)
-    weights = [torch.randn(b, a, 3, 3, generator=generator) / (9 * a) ** 0.5 for a, b in pairwise(WIDTHS)]
-    return weights, [0.3 * torch.randn(width, generator=generator) for width in WIDTHS[1:]]
+    return make_parameters(32, 16, 48)
 
 
-@pytest.fixture
-def stack(parameters):
+def make_stack(parameters) -> FixedStack:
     return FixedStack(*parameters, SLOPE, tile_px=128)
 
 
@@ -54,17 +57,21 @@ def exact(
     return heights.detach(), gradient
 
 
+@pytest.mark.parametrize("channels", [(16,), (32, 16, 48), (16, 32, 16, 16, 16)])
 @pytest.mark.parametrize("shape", [(1, 1), (4, 4), (5, 6), (7, 3), (64, 81), (128, 127)])
-def test_heights_and_gradient_are_those_of_plain_convolutions(shape, parameters, stack):
-    # Sides of all four remainders, one patch and many blocks of them.
-    tile, upstream = random_field(*(side + 2 * LAYERS for side in shape)), random_field(*shape, seed=2)
+def test_heights_and_gradient_are_those_of_plain_convolutions(shape, channels):
+    # Sides of all four remainders, one patch and many blocks of them; no hidden weights and many.
+    parameters = make_parameters(*channels)
+    stack = make_stack(parameters)
+    halo = 2 * len(parameters[0])
+    tile, upstream = random_field(*(side + halo for side in shape)), random_field(*shape, seed=2)
     heights, signs = stack.heights(tile)
     gradient = stack.adjoint(upstream, signs)
     expected, expected_gradient = exact(tile, parameters, signs, upstream)
     assert heights.shape == shape
     assert gradient.shape == tile.shape
-    # The transforms hold coefficients up to 8 and cancel them again: some ten times the 1e-7 of float32,
-    # over three layers. A wrong coefficient shows in the first digit.
+    # The transforms hold coefficients up to 8 and cancel them again: some ten times the 1e-7 of float32 in
+    # each layer. A wrong coefficient shows in the first digit.
     assert float((heights - expected).abs().max()) < 1e-5 * max(1.0, float(expected.abs().max()))
     assert float((gradient - expected_gradient).norm()) < 1e-5 * float(expected_gradient.norm())
 
@@ -73,32 +80,59 @@ def test_a_kernel_of_one_tap_moves_the_field(parameters):
     weights = [torch.zeros_like(weight) for weight in parameters[0]]
     for number, weight in enumerate(weights):
         weight[0, 0, number % 3, 2 - number % 3] = 1
-    biases = [torch.zeros(width) for width in WIDTHS[1:]]
     tile = random_field(30, 30).abs()
-    heights, _ = FixedStack(weights, biases, SLOPE, 128).heights(tile)
+    heights, _ = make_stack((weights, [torch.zeros_like(bias) for bias in parameters[1]])).heights(tile)
     y, x = (sum(taps) for taps in ((0, 1, 2, 0), (2, 1, 0, 2)))
     assert torch.allclose(heights, tile[y : y + 22, x : x + 22], atol=1e-5)
 
 
-def test_a_value_that_is_not_a_number_stays_one_and_goes_no_farther_than_its_patches(stack):
-    tile = random_field(100, 100)
+def test_a_value_that_is_not_a_number_stays_one_and_goes_no_farther_than_its_patches(parameters):
+    stack, tile = make_stack(parameters), random_field(100, 100)
     clean, _ = stack.heights(tile)
     tile[50, 50] = torch.nan
     spoilt, _ = stack.heights(tile)
-    assert torch.isnan(spoilt[50 - LAYERS, 50 - LAYERS])
-    # Each of the two inner layers spreads over its patch of 4, one of them more than the kernels do.
-    far = torch.ones_like(spoilt, dtype=torch.bool)
-    far[30:62, 30:62] = False
-    assert torch.equal(spoilt[far], clean[far])
-    # Nothing of it is left in the memory that the next tile uses.
-    again, _ = stack.heights(torch.nan_to_num(tile, nan=0.0))
-    assert torch.isfinite(again).all()
+    assert torch.isnan(spoilt[46, 46])
+    # In the first and the last layer it reaches 2 px towards the origin, in the two between as many, and
+    # with the patch 3 more on both sides.
+    near = slice(50 - 4 * 2 - 2 * 3, 50 + 2 * 3 + 1)
+    assert torch.isfinite(spoilt).any()
+    spoilt[near, near] = clean[near, near]
+    assert torch.equal(spoilt, clean)
 
 
-def test_signs_are_those_of_the_hidden_values(parameters, stack):
+def test_nothing_of_a_tile_is_left_for_the_next(parameters):
+    used = make_stack(parameters)
+    _, signs = used.heights(torch.full((136, 136), torch.nan))
+    used.adjoint(torch.full((128, 128), torch.nan), signs)
+    for side in (90, 31, 10):
+        tile, upstream = random_field(side, side + 1), random_field(side - 8, side - 7, seed=2)
+        made = []
+        for stack in (used, make_stack(parameters)):
+            heights, signs = stack.heights(tile)
+            made.append((heights, stack.adjoint(upstream, signs)))
+        assert all(torch.equal(ours, fresh) for ours, fresh in zip(*made, strict=True))
+
+
+def test_biases_may_be_views_and_what_does_not_fit_is_said(parameters):
+    weights, biases = parameters
+    tile = random_field(20, 20)
+    expected, _ = make_stack(parameters).heights(tile)
+    views = [torch.stack([bias, bias + 1], dim=1)[:, 0] for bias in biases]
+    assert torch.equal(make_stack((weights, views)).heights(tile)[0], expected)
+    wrong = {
+        "do not fit": ([*weights[:1], weights[1][:, :16], *weights[2:]], biases),
+        "not multiples": make_parameters(16, 20),
+        "not float32": (weights, [bias.double() for bias in biases]),
+    }
+    for reason, layers in wrong.items():
+        with pytest.raises(ValueError, match=reason):
+            make_stack(layers)
+
+
+def test_signs_are_those_of_the_hidden_values(parameters):
     weights, biases = parameters
     tile = random_field(20, 21)
-    _, signs = stack.heights(tile)
+    _, signs = make_stack(parameters).heights(tile)
     features = tile[None, None]
     for weight, bias, sign in zip(weights, biases, signs, strict=False):
         features = functional.conv2d(features, weight, bias)
@@ -122,24 +156,32 @@ def test_the_frame_of_an_adjoint_stays_zero():
     assert not framed.any()
 
 
+@pytest.fixture
+def threads():
+    before = torch.get_num_threads()
+    yield torch.set_num_threads
+    torch.set_num_threads(before)
+
+
 @pytest.mark.parametrize("adjoint", [torch.float32, torch.bfloat16])
-def test_it_is_what_a_fixed_stack_runs_with_any_number_of_threads(adjoint, parameters, monkeypatch):
+def test_it_is_what_a_fixed_stack_runs_with_any_number_of_threads(adjoint, parameters, threads, monkeypatch):
     uses = []
     heights = FixedStack.heights
     monkeypatch.setattr(FixedStack, "heights", lambda self, tile: uses.append(1) or heights(self, tile))
     field = random_field(2, 1, 150, 310).requires_grad_()
     settings = StackSettings(SLOPE, torch.float32, adjoint)
-    threads, made = torch.get_num_threads(), []
-    try:
-        for count in (1, 3):
-            torch.set_num_threads(count)
-            height = convolution_stack(field, *parameters, settings)
-            made.append([height.detach(), *torch.autograd.grad(height.square().sum(), field)])
-    finally:
-        torch.set_num_threads(threads)
-    # Two fields of 2 x 3 tiles, twice.
-    assert len(uses) == 24
-    assert all(torch.equal(a, b) for a, b in zip(*made, strict=True))
+    made = []
+    # Two fields of 2 x 3 tiles: more of them than threads, and fewer.
+    for count in (1, 3, 16):
+        threads(count)
+        height = convolution_stack(field, *parameters, settings)
+        made.append([height.detach()])
+        for _ in range(2):
+            made[-1] += torch.autograd.grad(height.square().sum(), field, retain_graph=True)
+    assert len(uses) == 3 * 12
+    for others in made[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(made[0], others, strict=True))
+    assert torch.equal(made[0][1], made[0][2])
     by_convolutions = convolution_stack(field.double(), *_double(parameters), _in(torch.float64))
     assert torch.allclose(made[0][0].double(), by_convolutions, atol=1e-5)
     (expected,) = torch.autograd.grad(by_convolutions.square().sum(), field)
@@ -149,15 +191,38 @@ def test_it_is_what_a_fixed_stack_runs_with_any_number_of_threads(adjoint, param
     assert float((made[0][1] - expected).norm() / expected.norm()) < tolerance
 
 
+@pytest.mark.parametrize("without", [torch.no_grad, torch.inference_mode])
+def test_without_a_graph_any_number_of_threads_predicts_and_nothing_is_kept(
+    without, parameters, threads, monkeypatch
+):
+    kept = []
+    save = FunctionCtx.save_for_backward
+
+    def count(ctx, *tensors):
+        kept.append(len(tensors))
+        save(ctx, *tensors)
+
+    monkeypatch.setattr(FunctionCtx, "save_for_backward", count)
+    field = random_field(1, 1, 300, 300).requires_grad_()
+    expected = convolution_stack(field, *parameters, _in(torch.float32)).detach()
+    threads(3)
+    with without():
+        assert torch.equal(convolution_stack(field, *parameters, _in(torch.float32)), expected)
+    # The field, four weights, four biases; with a graph the signs of 3 x 3 tiles in three layers too.
+    assert kept == [9 + 27, 9]
+
+
 def test_weights_that_learn_and_odd_numbers_of_channels_are_convolved(parameters, monkeypatch):
     monkeypatch.setattr(winograd, "FixedStack", None)
     settings = _in(torch.float32)
     field = random_field(1, 1, 20, 20)
     learning = [[p.clone().requires_grad_() for p in half] for half in parameters]
-    assert convolution_stack(field, *learning, settings).requires_grad
-    weights, biases = parameters
-    narrow = [weights[0][:7], weights[1][:, :7], *weights[2:]], [biases[0][:7], *biases[1:]]
-    assert convolution_stack(field, *narrow, settings).shape == (1, 1, 12, 12)
+    height = convolution_stack(field, *learning, settings)
+    assert height.requires_grad
+    with torch.no_grad():
+        assert torch.equal(convolution_stack(field, *learning, settings), height)
+    narrow = make_parameters(7, 16)
+    assert convolution_stack(field, *narrow, settings).shape == (1, 1, 14, 14)
 
 
 def _double(parameters) -> list[list[torch.Tensor]]:
