@@ -90,7 +90,8 @@ def fit_with_record(
         training_ids=[scan_id for scan_id in ids if scan_id not in validation_ids],
         validation_ids=validation_ids,
         history=history,
-        seconds=time.monotonic() - started,
+        # Also what was done before a kill.
+        seconds=sum(entry.seconds for entry in history) or time.monotonic() - started,
     )
 
 
