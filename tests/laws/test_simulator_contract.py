@@ -177,7 +177,11 @@ def test_a_frozen_model_is_the_model(name, variant, tmp_path):
     field = layout().requires_grad_()
     height = frozen(field, pitch_um=0.1)
     with torch.no_grad():
-        assert torch.equal(height, model(layout()))
+        learning = model(layout())
+    # Weights that learn and weights that do not may be summed in another order: some roundings of 1e-7 of
+    # heights of 1 µm. With the same weights at rest the frozen model is the same to the bit.
+    assert torch.allclose(height, learning, rtol=0, atol=1e-6)
+    assert torch.equal(height, model.requires_grad_(False)(layout()))
     height.sum().backward()
     assert field.grad.isfinite().all()
     assert field.grad.abs().sum() > 0
