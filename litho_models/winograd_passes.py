@@ -74,23 +74,7 @@ def activate(
     signs: _Signs,
 ) -> None:
     """Results of the same patches of a product, with bias and leaky ReLU, and their signs."""
-    channels = field.shape[2]
-    row, sign_row = field.shape[1] * channels, signs.shape[1] * channels
-    source, target, kept = spectrum.reshape(-1), field.reshape(-1), signs.reshape(-1)
-    half = np.empty(PATCH_PX * SPAN * LANES, np.float32)
-    for patch in range(count):
-        y, x = divmod(first + patch, per_row)
-        for k in range(0, channels, LANES):
-            _columns(source, patch * channels + k, spectrum.shape[1] * channels, half)
-            for i in range(PATCH_PX):
-                at = (PATCH_PX * y + i) * row + PATCH_PX * x * channels + k
-                sign_at = (PATCH_PX * y + i) * sign_row + PATCH_PX * x * channels + k
-                for result in _four(half, SPAN * i * LANES, LANES):
-                    value = result + _load(bias, k)
-                    _store(target, at, _leaky(value, slope))
-                    _store_signs(kept, sign_at, value)
-                    at += channels
-                    sign_at += channels
+    _results(spectrum, first, count, per_row, field, 0, signs, _activated, (bias, slope))
 
 
 @_compiled
@@ -104,21 +88,7 @@ def restrain(
     framed: _Floats,
 ) -> None:
     """Results of the same patches, times the slope of the leaky ReLU whose signs these are, in a frame."""
-    channels = framed.shape[2]
-    row, sign_row = framed.shape[1] * channels, signs.shape[1] * channels
-    source, target, kept = spectrum.reshape(-1), framed.reshape(-1), signs.reshape(-1)
-    half = np.empty(PATCH_PX * SPAN * LANES, np.float32)
-    for patch in range(count):
-        y, x = divmod(first + patch, per_row)
-        for k in range(0, channels, LANES):
-            _columns(source, patch * channels + k, spectrum.shape[1] * channels, half)
-            for i in range(PATCH_PX):
-                at = (PATCH_PX * y + i + FRAME_PX) * row + (PATCH_PX * x + FRAME_PX) * channels + k
-                sign_at = (PATCH_PX * y + i) * sign_row + PATCH_PX * x * channels + k
-                for result in _four(half, SPAN * i * LANES, LANES):
-                    _store(target, at, _leaky_by_signs(result, slope, kept, sign_at))
-                    at += channels
-                    sign_at += channels
+    _results(spectrum, first, count, per_row, framed, FRAME_PX, signs, _restrained, (slope,))
 
 
 @_compiled
@@ -126,29 +96,71 @@ def lift(
     image: _Floats, taps: _Floats, bias: _Floats, slope: np.float32, field: _Floats, signs: _Signs
 ) -> None:
     """Convolution of an image (y, x) with (9, channels), bias and leaky ReLU, and the signs."""
-    channels = field.shape[2]
-    weights, target, kept = taps.reshape(-1), field.reshape(-1), signs.reshape(-1)
-    for y in range(image.shape[0] - 2):
-        for x in range(image.shape[1] - 2):
-            at, sign_at = (y * field.shape[1] + x) * channels, (y * signs.shape[1] + x) * channels
-            for k in range(0, channels, LANES):
-                value = _nine(image, y, x, weights, k, channels) + _load(bias, k)
-                _store(target, at + k, _leaky(value, slope))
-                _store_signs(kept, sign_at + k, value)
+    _lifted(image, taps, field, 0, signs, _activated, (bias, slope))
 
 
 @_compiled
 def lift_back(image: _Floats, taps: _Floats, slope: np.float32, signs: _Signs, framed: _Floats) -> None:
     """The same without bias, times the slope of the leaky ReLU whose signs these are, in a frame."""
-    channels = framed.shape[2]
-    weights, target, kept = taps.reshape(-1), framed.reshape(-1), signs.reshape(-1)
+    _lifted(image, taps, framed, FRAME_PX, signs, _restrained, (slope,))
+
+
+@_inlined
+def _results(
+    spectrum: Any,
+    first: int,
+    count: int,
+    per_row: int,
+    field: Any,
+    frame_px: int,
+    signs: Any,
+    finish: Any,
+    settings: Any,
+) -> None:
+    """Results of patches, finished one by one into a field within a frame."""
+    channels = field.shape[2]
+    row, sign_row = field.shape[1] * channels, signs.shape[1] * channels
+    source, target, kept = spectrum.reshape(-1), field.reshape(-1), signs.reshape(-1)
+    half = np.empty(PATCH_PX * SPAN * LANES, np.float32)
+    for patch in range(count):
+        y, x = divmod(first + patch, per_row)
+        for k in range(0, channels, LANES):
+            _columns(source, patch * channels + k, spectrum.shape[1] * channels, half)
+            for i in range(PATCH_PX):
+                at = (PATCH_PX * y + i + frame_px) * row + (PATCH_PX * x + frame_px) * channels + k
+                sign_at = (PATCH_PX * y + i) * sign_row + PATCH_PX * x * channels + k
+                for result in _four(half, SPAN * i * LANES, LANES):
+                    finish(result, k, settings, target, at, kept, sign_at)
+                    at += channels
+                    sign_at += channels
+
+
+@_inlined
+def _lifted(image: Any, taps: Any, field: Any, frame_px: int, signs: Any, finish: Any, settings: Any) -> None:
+    """Convolution of an image, finished pixel by pixel into a field within a frame."""
+    channels = field.shape[2]
+    weights, target, kept = taps.reshape(-1), field.reshape(-1), signs.reshape(-1)
     for y in range(image.shape[0] - 2):
         for x in range(image.shape[1] - 2):
-            at = ((y + FRAME_PX) * framed.shape[1] + x + FRAME_PX) * channels
+            at = ((y + frame_px) * field.shape[1] + x + frame_px) * channels
             sign_at = (y * signs.shape[1] + x) * channels
             for k in range(0, channels, LANES):
                 value = _nine(image, y, x, weights, k, channels)
-                _store(target, at + k, _leaky_by_signs(value, slope, kept, sign_at + k))
+                finish(value, k, settings, target, at + k, kept, sign_at + k)
+
+
+@_inlined
+def _activated(value: Any, k: int, settings: Any, target: Any, at: int, kept: Any, sign_at: int) -> None:
+    bias, slope = settings
+    value = value + _load(bias, k)
+    _store(target, at, _leaky(value, slope))
+    _store_signs(kept, sign_at, value)
+
+
+@_inlined
+def _restrained(value: Any, k: int, settings: Any, target: Any, at: int, kept: Any, sign_at: int) -> None:
+    (slope,) = settings
+    _store(target, at, _leaky_by_signs(value, slope, kept, sign_at))
 
 
 @_inlined
