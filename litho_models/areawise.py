@@ -19,6 +19,7 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional
 
 from litho_models.one_channel import (
+    adjoint_kernel,
     adjoint_onto_one_channel,
     correlation,
     from_one_channel,
@@ -125,8 +126,7 @@ class _Stack(torch.autograd.Function):
         parameters, kept = saved[:count], saved[count:]
         weights = parameters[: count // 2]
         hidden = _channels_last(weights[1:-1], dtype)
-        # The adjoint of a convolution is the convolution with the kernel turned round, on a wider frame.
-        last = weights[-1].flip(2, 3).transpose(0, 1)
+        last = adjoint_kernel(weights[-1])
         no_bias = last.new_zeros(len(last))
         halo, layers = 2 * len(weights), len(weights) - 1
         tiles = list(_tiles(gradient, halo, ctx.tile_px))
@@ -148,7 +148,7 @@ class _Stack(torch.autograd.Function):
             shares: list[tuple[Tensor, Tensor]] = []
             if learns:
                 by_weight, _ = correlation(above, values[-1])
-                shares.append((by_weight.transpose(0, 1).flip(2, 3), gradient[inside].sum()))
+                shares.append((adjoint_kernel(by_weight), gradient[inside].sum()))
             for layer in range(layers - 1, 0, -1):
                 _through_relu_(slope, values[layer], settings.leaky_slope)
                 slope, by_weight, by_bias = _convolution_backward(

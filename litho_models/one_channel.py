@@ -43,6 +43,11 @@ def adjoint_onto_one_channel(slope: Tensor, weight: Tensor) -> Tensor:
     return total
 
 
+def adjoint_kernel(weight: Tensor) -> Tensor:
+    """Kernel that takes a convolution back, on a wider frame: turned round, inputs and outputs exchanged."""
+    return weight.flip(2, 3).transpose(0, 1)
+
+
 def _neighbours(tile: Tensor) -> Tensor:
     """(10, pixels): 3 x 3 surroundings of each pixel of (1, 1, y, x) but the outermost; ones for a bias."""
     ny, nx = (length - 2 for length in tile.shape[-2:])

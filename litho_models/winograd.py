@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from litho_models import winograd_passes as passes
-from litho_models.one_channel import onto_one_channel
+from litho_models.one_channel import adjoint_kernel, onto_one_channel
 from litho_models.winograd_passes import FRAME_PX, LANES, PATCH_PX, SPAN
 
 # Patches that are transformed, multiplied and transformed back together: 64 channels of them and of their
@@ -104,17 +104,16 @@ class FixedStack:
         with self._room() as room:
             framed = room.framed(ny, nx, signs.shape[-1])
             image = functional.pad(slopes, (FRAME_PX,) * 4).numpy()
-            passes.lift_back(image, _taps(_turned(self._last)), self._slope, signs, framed)
+            passes.lift_back(image, _taps(adjoint_kernel(self._last)), self._slope, signs, framed)
+            _close_frame(framed, ny, nx)
             for weight, signs in zip(reversed(self._backwards), reversed(hidden), strict=True):
                 ny, nx = ny + 2, nx + 2
                 made = room.framed(ny, nx, signs.shape[-1])
                 for block, product in room.products(framed, weight, ny, nx):
                     passes.restrain(product, *block, self._slope, signs, made)
-                # What the last patches left beyond the field.
-                made[FRAME_PX + ny :] = 0
-                made[:, FRAME_PX + nx :] = 0
+                _close_frame(made, ny, nx)
                 framed = made
-            return onto_one_channel(_as_image(framed), _turned(self._first))[: ny + 2, : nx + 2]
+            return onto_one_channel(_as_image(framed), adjoint_kernel(self._first))[: ny + 2, : nx + 2]
 
     def free_rooms(self) -> None:
         """Give the memory back that tiles have left for the next ones."""
@@ -122,7 +121,7 @@ class FixedStack:
 
     @cached_property
     def _backwards(self) -> list[Tensor]:
-        return [_in_frequencies(_turned(weight)) for weight in self._hidden]
+        return [_in_frequencies(adjoint_kernel(weight)) for weight in self._hidden]
 
     @contextmanager
     def _room(self) -> Iterator[_Room]:
@@ -170,12 +169,10 @@ class _Room:
         return field
 
     def framed(self, ny: int, nx: int, channels: int) -> _Floats:
-        """The same with zeros around the field, ``FRAME_PX`` wide."""
+        """The same in a frame ``FRAME_PX`` wide, zero where it begins; ``_close_frame`` when it is filled."""
         field = self.field(ny + 2 * FRAME_PX, nx + 2 * FRAME_PX, channels)
-        for border in (slice(FRAME_PX), slice(FRAME_PX + ny, None)):
-            field[border] = 0
-        for border in (slice(FRAME_PX), slice(FRAME_PX + nx, None)):
-            field[:, border] = 0
+        field[:FRAME_PX] = 0
+        field[:, :FRAME_PX] = 0
         return field
 
     def products(self, field: _Floats, weight: Tensor, ny: int, nx: int) -> Iterator[tuple[_Block, _Floats]]:
@@ -215,9 +212,10 @@ def _in_frequencies(weight: Tensor) -> Tensor:
     return frequencies.view(-1, *taps.shape[2:]).to(weight.dtype)
 
 
-def _turned(weight: Tensor) -> Tensor:
-    """Kernel of the adjoint: turned round, inputs and outputs exchanged."""
-    return weight.flip(2, 3).transpose(0, 1)
+def _close_frame(framed: _Floats, ny: int, nx: int) -> None:
+    """Zeros behind the field, where its last patches have left something."""
+    framed[FRAME_PX + ny :] = 0
+    framed[:, FRAME_PX + nx :] = 0
 
 
 def _taps(weight: Tensor) -> _Floats:
