@@ -151,7 +151,7 @@ def test_predictions_are_measured_and_unchanged():
     assert cost.seconds_per_scan > 0
 
 
-@pytest.mark.parametrize("mib", [8, 64])
+@pytest.mark.parametrize("mib", [64, 256])
 def test_memory_held_for_a_moment_is_seen(mib):
     scans = make_scans(5, size_px=32)
 
@@ -162,5 +162,6 @@ def test_memory_held_for_a_moment_is_seen(mib):
     _, cost = measured_predictions(greedy, scans, "cpu")
     if cost.peak_memory_mib is None:
         pytest.skip("the peak of resident memory cannot be reset here")
-    # Parts of 1 MiB of float32, which the allocator keeps once freed; pages of 4 KiB, headers, rounding.
-    assert cost.peak_memory_mib == pytest.approx(mib, rel=0.1)
+    # Parts of 1 MiB of float32. NumPy asks for pages of 2 MiB for its large arrays, and the allocator hands
+    # such addresses out again after them: then resident memory grows by 2 MiB at a time, once at either end.
+    assert cost.peak_memory_mib == pytest.approx(mib, abs=2 * 2)
