@@ -30,7 +30,7 @@ from benchmarks.trained_pbl import load_pbl
 from litho_design.hoe import HoeTask
 from litho_design.hologram import image_error
 from litho_design.optimise import make_parametrisation
-from litho_design.printer import load_printer
+from litho_design.printer_source import load_printer
 from litho_design.settings import HoeSettings, hoe_preset
 from litho_design.targets import make_target
 

@@ -92,7 +92,7 @@ def hoe(
 ) -> None:
     """Design a holographic element; an interrupted run in OUT is continued."""
     from litho_design.hoe import design_hoe
-    from litho_design.printer import load_printer
+    from litho_design.printer_source import load_printer
     from litho_design.targets import make_target
 
     settings = hoe_settings(
@@ -155,7 +155,7 @@ def lens(
     """Design a multi-level diffractive lens; an interrupted run in OUT is continued."""
     from litho_design.lens import design_lens
     from litho_design.objects import bring_objects
-    from litho_design.printer import load_printer
+    from litho_design.printer_source import load_printer
 
     settings = lens_settings(
         variant, task, size_px=size_px, pitch_um=pitch_um, distance_um=focal_length_um,

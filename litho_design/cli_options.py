@@ -156,7 +156,7 @@ def load_printers(
     specs: Iterable[str], layout: LayoutSettings, device: str, extrapolate: bool
 ) -> dict[str, Printer]:
     """Printers by name from NAME=MODEL, MODEL or `none`."""
-    from litho_design.printer import load_printer
+    from litho_design.printer_source import load_printer
 
     printers: dict[str, Printer] = {}
     for spec in specs:

@@ -14,7 +14,8 @@ from litho_design.hologram import HologramBench
 from litho_design.lens_bench import ImagingSettings, LensBench
 from litho_design.lens_metrics import score_lens
 from litho_design.objects import picture_records
-from litho_design.printer import Printer, check_device
+from litho_design.printer import Printer
+from litho_design.printer_source import check_device
 from litho_design.settings import HoeSettings, LensSettings
 
 

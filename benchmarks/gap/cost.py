@@ -162,7 +162,7 @@ def _task(task: Task, source: str) -> tuple[Any, Any]:
     from litho_design.cli_options import hoe_settings, lens_settings
     from litho_design.hoe import HoeTask
     from litho_design.lens import LensTask
-    from litho_design.printer import load_printer
+    from litho_design.printer_source import load_printer
     from litho_design.targets import make_target
 
     options: dict[str, Any] = {

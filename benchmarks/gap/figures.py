@@ -9,7 +9,8 @@ import numpy as np
 from litho_data.report import new_figure
 from litho_design.compare import GapResult, design_folder
 from litho_design.judging import Judging
-from litho_design.printer import Printer, load_printer
+from litho_design.printer import Printer
+from litho_design.printer_source import load_printer
 
 _DETAIL_PX = 160
 

@@ -16,7 +16,7 @@ from litho_data.virtual_fab.settings import Printer as FabPrinter
 from litho_design.design import Design
 from litho_design.hoe import design_hoe
 from litho_design.parametrise import LayoutSettings
-from litho_design.printer import load_printer
+from litho_design.printer_source import load_printer
 from litho_design.score import score_design
 from litho_design.targets import make_target
 

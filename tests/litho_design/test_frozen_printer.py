@@ -17,7 +17,7 @@ from litho_design.cli import app, main
 from litho_design.design import Design
 from litho_design.gauge import OutOfDistribution
 from litho_design.parametrise import LayoutSettings
-from litho_design.printer import load_printer
+from litho_design.printer_source import load_printer
 from litho_design.report_design import distribution_warning, stroke_advice
 from litho_models import save_frozen
 from litho_models.models import model_class
