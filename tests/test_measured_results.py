@@ -25,7 +25,7 @@ def test_the_page_on_training_quotes_the_committed_runs():
     others = [Benchmark.read(recipes.FOLDER / name) for name in recipes.RUNS]
     fast = Benchmark.read(recipes.FAST)
     assert {other.split.scored_ids_sha256 for other in others} == {fast.split.scored_ids_sha256}
-    assert published(recipes.PAGE, recipes.MARK) == recipes.recipe_table(fast, others)
+    assert published(recipes.PAGE, recipes.MARK) == recipes.recipe_text(fast, others)
 
 
 def test_the_committed_results_are_of_the_published_schemas():
