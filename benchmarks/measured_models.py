@@ -56,13 +56,16 @@ def paired_table(benchmark: dict[str, Any]) -> str:
 
 
 def paper_table(draws: Sequence[dict[str, Any]]) -> str:
-    """Errors on every draw of the paper's split, one row per model."""
+    """Errors on every draw of the paper's split, one row per model, and how far the models are apart."""
     heads = ("model", *(f"draw {own['split']['seed']}" for own in draws), "absolute error, mean over draws")
     rows = []
     for name in [score["model"] for score in draws[0]["scores"]]:
         scores = [score for own in draws for score in own["scores"] if score["model"] == name]
         free = [with_interval(own["mae_datum_free_nm"], own["mae_datum_free_ci95_nm"]) for own in scores]
         rows.append((name, *free, f"{sum(own['mae_abs_nm'] for own in scores) / len(scores):.2f} nm"))
+    for pairs in zip(*(own["paired"] for own in draws), strict=True):
+        apart = [with_interval(pair["mean_nm"], pair["ci95_nm"]) for pair in pairs]
+        rows.append((f"{pairs[0]['first']} − {pairs[0]['second']}", *apart, "–"))
     split = draws[0]["split"]
     return markdown_table(
         heads,
