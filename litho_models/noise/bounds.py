@@ -155,7 +155,7 @@ def _neighbourhoods(scans: Sequence[PrintedScan], seed: int) -> NoiseBound | Non
         sigma_nm=found.sigma_nm,
         ci95_nm=found.ci95_nm,
         mae_nm=found.mae_nm,
-        scans=len(scans),
+        scans=found.scans,
         contains="all that the layout within about 3 µm does not decide: roughness, microscope, lines, bow "
         "and slow drift within a scan; each scan's offset removed",
         lacks="noise shared by places 4 µm apart in one scan; a model that knows the position may do better",

@@ -25,20 +25,34 @@ _PIXELS_PER_SCAN = 3000
 
 
 class NeighbourhoodNoise(NamedTuple):
-    """σ at distance zero with its interval over scans, its MAE, and σ of the nearest pairs."""
+    """σ at distance zero with its interval over scans, its MAE, σ of the nearest pairs, and the scans used."""
 
     sigma_nm: float
     ci95_nm: tuple[float, float] | None
     mae_nm: float
     nearest_sigma_nm: float
+    scans: int
+
+
+class _Drawn(NamedTuple):
+    """The pixels drawn from one scan: (n, k), (n,) nm, (n, 2) µm, and the number of the scan (n,)."""
+
+    feature: np.ndarray
+    height_nm: np.ndarray
+    place_um: np.ndarray
+    owner: np.ndarray
 
 
 def neighbourhood_noise(
     scans: Sequence[PrintedScan], *, pixels_per_scan: int = _PIXELS_PER_SCAN, seed: int = 0
 ) -> NeighbourhoodNoise | None:
-    """Spread of the height among pixels with like surroundings, nm; None with too few measured pixels."""
+    """Spread of the height among pixels with like surroundings, nm; None where no two pixels can be compared.
+
+    Scans of different doses differ where their layouts do not: only prints of one dose are fitted together
+    and compared.
+    """
     random = np.random.default_rng(seed)
-    features, heights, places, owners = [], [], [], []
+    drawn: dict[float | None, list[_Drawn]] = {}
     for number, scan in enumerate(scans):
         inside = np.zeros(scan.shape, bool)
         border = round(2 * max(_BLURS_UM) / scan.pitch_um)
@@ -47,17 +61,19 @@ def neighbourhood_noise(
         if candidates.size < 200:
             continue
         chosen = random.choice(candidates, min(pixels_per_scan, candidates.size), replace=False)
-        features.append(layout_features(scan)[:, chosen].T)
-        height = NM_PER_UM * scan.height_um.ravel()[chosen].astype(np.float64)
-        heights.append(height)
-        places.append(np.stack(np.unravel_index(chosen, scan.shape), axis=1) * scan.pitch_um)
-        owners.append(np.full(chosen.size, number))
-    if not features:
+        found = _Drawn(
+            feature=layout_features(scan)[:, chosen].T,
+            height_nm=NM_PER_UM * scan.height_um.ravel()[chosen].astype(np.float64),
+            place_um=np.stack(np.unravel_index(chosen, scan.shape), axis=1) * scan.pitch_um,
+            owner=np.full(chosen.size, number),
+        )
+        drawn.setdefault(scan.dose, []).append(found)
+    if not drawn:
         return None
-    owner, place = np.concatenate(owners), np.concatenate(places)
-    feature = np.concatenate(features)
-    residual = _linear_residual(feature, np.concatenate(heights), owner)
-    distance2, half_square, absolute, mine = _pairs(_whitened(feature), residual, place, owner)
+    pairs = [_pairs_of_one_dose(group) for group in drawn.values()]
+    distance2, half_square, absolute, mine = (np.concatenate(part) for part in zip(*pairs, strict=True))
+    if not mine.size:
+        return None
     mean_distance2, gamma = distance2.mean(axis=0), half_square.mean(axis=0)
     per_scan = [
         _intercept(mean_distance2, half_square[mine == number].mean(axis=0)) for number in np.unique(mine)
@@ -72,6 +88,7 @@ def neighbourhood_noise(
         # E|n₁ − n₂| is √2 E|n| for a Gaussian; the extrapolation scales it as it scales σ.
         mae_nm=float(absolute[:, 0].mean() / np.sqrt(2)) * shrink,
         nearest_sigma_nm=nearest,
+        scans=len(per_scan),
     )
 
 
@@ -84,6 +101,11 @@ def layout_features(scan: PrintedScan) -> np.ndarray:
     slopes = np.gradient(gaussian_filter(layout, _SLOPE_BLUR_UM / scan.pitch_um, mode="nearest"))
     maps += [slope * (_SLOPE_BLUR_UM / scan.pitch_um) for slope in slopes]
     return np.stack([field.ravel() for field in maps])
+
+
+def _pairs_of_one_dose(drawn: Sequence[_Drawn]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    feature, height_nm, place_um, owner = (np.concatenate(part) for part in zip(*drawn, strict=True))
+    return _pairs(_whitened(feature), _linear_residual(feature, height_nm, owner), place_um, owner)
 
 
 def _linear_residual(feature: np.ndarray, height: np.ndarray, owner: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from prints import make_scans, write_store
+from prints import make_scans, printed_height_um, write_store
 from scipy.integrate import quad
 from scipy.stats import norm
 
@@ -274,6 +274,28 @@ def test_like_neighbourhoods_show_the_noise_without_a_model():
     assert found.sigma_nm == pytest.approx(10, rel=0.08)
     assert found.mae_nm == pytest.approx(np.sqrt(2 / np.pi) * 10, rel=0.08)
     assert found.sigma_nm <= found.nearest_sigma_nm
+
+
+def test_what_a_dose_changes_is_no_noise_of_like_neighbourhoods():
+    plain = make_scans(3, size_px=192, noise_um=0.010)
+    dosed = [
+        replace(
+            scan,
+            dose=dose,
+            height_um=(scan.height_um + (dose - 1) * printed_height_um(scan.layout_um)).astype(np.float32),
+        )
+        for scan, dose in zip(plain, (0.7, 1.0, 1.3), strict=True)
+    ]
+    found = neighbourhood_noise(dosed, pixels_per_scan=2500)
+    # As above for one dose; each dose now has a third of the pixels, which leave more to extrapolate.
+    assert found.sigma_nm == pytest.approx(10, rel=0.1)
+    assert found.scans == 3
+
+
+def test_a_field_too_small_for_pairs_of_its_own_dose_is_no_evidence():
+    # 80 px less a border of 32 px on each side leaves 1.6 x 1.6 µm: no two places are 4 µm apart.
+    alone = replace(make_scans(1, size_px=80)[0], dose=0.9)
+    assert neighbourhood_noise([alone]) is None
 
 
 # --- σ(x) and its calibration -------------------------------------------------------------------
