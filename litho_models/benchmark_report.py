@@ -45,7 +45,7 @@ def write_benchmark_report(
     page.figure(
         figures.error_bars(scores, result.noise_floor, on_paper_data), "Held-out error of every model."
     )
-    page.table(score_tables.headline_table(scores), "Held-out error.", "benchmark.csv")
+    page.table(score_tables.headline_table(scores, result.noise_floor), "Held-out error.", "benchmark.csv")
     page.paragraph(score_tables.protocol_text(result.nuisance))
     if on_paper_data:
         page.note(paper_sentence(result.split.kind))
@@ -53,7 +53,7 @@ def write_benchmark_report(
     if result.locked_scores:
         page.heading("Lock box")
         page.table(
-            score_tables.headline_table(result.locked_scores),
+            score_tables.headline_table(result.locked_scores, result.noise_floor),
             "Trained on all development scans, scored once on the locked scans.",
             "lock_box.csv",
         )

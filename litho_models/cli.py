@@ -137,13 +137,18 @@ def benchmark(
         bool, typer.Option("--open-lock-box", help="also score the locked scans; once per release")
     ] = False,
     seed: Seed = 0,
+    training_seed: Annotated[
+        int | None,
+        typer.Option(min=0, help="of weights and crops alone, same split; --seed by default"),
+    ] = None,
 ) -> None:
     """Train every model per fold and score it on scans it never saw; resumable."""
     from litho_models.benchmark import DEFAULT_MODELS
     from litho_models.benchmark import benchmark as run_benchmark
     from litho_models.score_tables import headline_table
 
-    settings = {"recipe": recipe, "variant": variant, **_given(steps=steps, precision=precision)}
+    settings = {"recipe": recipe, "variant": variant}
+    settings |= _given(steps=steps, precision=precision, seed=training_seed)
     result = run_benchmark(
         store,
         out,
@@ -157,7 +162,7 @@ def benchmark(
         open_lock_box=open_lock_box,
         seed=seed,
     )
-    typer.echo(headline_table(result.scores).round(2).to_string(index=False))
+    typer.echo(headline_table(result.scores, result.noise_floor).round(2).to_string(index=False, na_rep="–"))
     typer.echo(f"report {out / 'report.html'}")
 
 
@@ -166,7 +171,7 @@ def compare(
     first: Annotated[Path, typer.Argument(help="benchmark.json or evaluation.json")],
     second: Annotated[Path, typer.Argument(help="another one, of the same protocol")],
 ) -> None:
-    """Difference of two results, paired by scan; refuses different data, splits or nuisances."""
+    """Difference of two results, paired by scan; refuses different data, folds or nuisances."""
     from litho_models.compare import compare as compare_results
 
     typer.echo(compare_results(first, second).round(3).to_string(index=False))

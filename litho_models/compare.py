@@ -33,7 +33,8 @@ def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
     difference means that the first is better.
 
     Raises:
-        InputError: files that cannot be read, or different data, split, scans or nuisances.
+        InputError: files that cannot be read, different data, folds, scans or nuisances, or a model that
+            was trained on scored scans beside one that was not.
     """
     import pandas as pd
 
@@ -70,10 +71,12 @@ def read_scored(path: str | Path) -> ScoredResult:
         file = file / (names[0] if names else Benchmark.FILE_NAME)
     result: Benchmark | Evaluation
     result = Evaluation.read(file) if _schema(file) == Evaluation.SCHEMA else Benchmark.read(file)
+    split = result.split
     protocol: dict[str, object] = {
         "dataset": result.dataset.sha256,
-        "split": result.split.kind,
-        "scored scans": result.split.scored_ids_sha256,
+        "split": split.model_dump(include={"kind", "folds", "seed"}),
+        "scored scans": split.scored_ids_sha256,
+        "held out": isinstance(result, Benchmark) or not result.trained_on_scored_scans,
         "nuisance": result.nuisance.model_dump(),
     }
     scores = result.scores if isinstance(result, Benchmark) else [result.scores]
@@ -89,8 +92,10 @@ def _schema(file: Path) -> object:
 
 
 def _row(first: ModelScores, second: ModelScores) -> dict[str, object]:
+    # A result lists its scans in the order of its folds: they meet by id.
+    others = {row.scan: row.mae_datum_free_nm for row in second.scans}
     paired = paired_difference(
-        [row.mae_datum_free_nm for row in first.scans], [row.mae_datum_free_nm for row in second.scans]
+        [row.mae_datum_free_nm for row in first.scans], [others[row.scan] for row in first.scans]
     )
     return {
         "first": first.model,

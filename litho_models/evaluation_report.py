@@ -42,7 +42,7 @@ def write_evaluation_report(
         page.note("Layouts beyond the calibrated range were accepted (extrapolate).")
     page.paragraph(score_tables.protocol_text(result.nuisance))
     page.figure(figures.error_bars([scores], result.noise_floor, False), "Error and noise floor.")
-    page.table(score_tables.headline_table([scores]), "Error over scans.", "headline.csv")
+    page.table(score_tables.headline_table([scores], result.noise_floor), "Error over scans.", "headline.csv")
     page.paragraph(score_tables.floor_text(result.noise_floor))
     page.table(
         score_tables.policy_table([scores], result.nuisance),

@@ -18,8 +18,9 @@ Interval = tuple[float, float] | None
 class NuisanceProtocol(Record):
     """What a scan may be freed of before it is scored, and on which pixels that was fitted.
 
-    ``background``: ``training`` if the smooth background learned on the training scans was added to the
-    predictions; nothing of it is fitted to the scored scan.
+    ``k``: smooth terms per scan; line offsets of ``full+rows`` come on top, by their effective number, which
+    depends on the prediction (``PolicyError.k``). ``background``: ``training`` if the smooth background
+    learned on the training scans was added to the predictions; nothing of it is fitted to the scored scan.
     """
 
     policy: Policy = "offset"

@@ -18,29 +18,34 @@ if TYPE_CHECKING:
     from litho_models.diagnostics import TileConsistency
 
 
-def headline_table(scores: Sequence[ModelScores]) -> pd.DataFrame:
-    """One row per model: both error figures with intervals, spread and bias."""
+def headline_table(scores: Sequence[ModelScores], floor: NoiseFloor) -> pd.DataFrame:
+    """One row per model: both error figures with intervals, spread and bias; below them the noise floor."""
     import pandas as pd
 
-    return pd.DataFrame(
-        [
-            {
-                "model": s.model,
-                "mae_datum_free_nm": s.mae_datum_free_nm,
-                "mae_datum_free_ci95_nm": interval_text(s.mae_datum_free_ci95_nm),
-                "rmse_datum_free_nm": s.rmse_datum_free_nm,
-                "mae_abs_nm": s.mae_abs_nm,
-                "mae_abs_ci95_nm": interval_text(s.mae_abs_ci95_nm),
-                "bias_nm": s.bias_nm,
-                "scans": len(s.scans),
-            }
-            for s in scores
-        ]
-    )
+    rows = [
+        {
+            "model": s.model,
+            "mae_datum_free_nm": s.mae_datum_free_nm,
+            "mae_datum_free_ci95_nm": interval_text(s.mae_datum_free_ci95_nm),
+            "rmse_datum_free_nm": s.rmse_datum_free_nm,
+            "mae_abs_nm": s.mae_abs_nm,
+            "mae_abs_ci95_nm": interval_text(s.mae_abs_ci95_nm),
+            "bias_nm": s.bias_nm,
+            "scans": len(s.scans),
+        }
+        for s in scores
+    ]
+    known = {
+        "model": f"noise floor ({floor.kind})",
+        "mae_datum_free_nm": floor.mae_nm,
+        "rmse_datum_free_nm": floor.rmse_nm,
+        "scans": "",
+    }
+    return pd.DataFrame([*rows, known])
 
 
 def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol) -> pd.DataFrame:
-    """One row per model and background, one column per nuisance policy."""
+    """One row per model and background, one column per policy; of line offsets their effective number."""
     import pandas as pd
 
     rows = []
@@ -48,7 +53,8 @@ def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol) -> p
         for background, errors in ((protocol.background, s.by_policy), ("none", s.without_background)):
             if errors:
                 named = {f"{error.policy}_mae_nm": error.mae_nm for error in errors}
-                rows.append({"model": s.model, "background": background, **named})
+                lines = {f"{error.policy}_k": error.k for error in errors if error.policy == "full+rows"}
+                rows.append({"model": s.model, "background": background, **named, **lines})
     return pd.DataFrame(rows)
 
 
@@ -94,9 +100,10 @@ def interval_text(interval: Interval) -> str:
 
 def protocol_text(protocol: NuisanceProtocol) -> str:
     """How the datum-free figure was obtained, in one paragraph."""
+    lines = " and its line offsets" if protocol.policy == "full+rows" else ""
     return (
         f"mae_abs has no fit at test time. mae_datum_free frees each scan of the nuisances of policy "
-        f"'{protocol.policy}' (k = {protocol.k:g} per scan), fitted on one half of a checkerboard of "
+        f"'{protocol.policy}' (k = {protocol.k:g} per scan{lines}), fitted on one half of a checkerboard of "
         f"{protocol.block_px} px blocks shrunk by {protocol.buffer_px} px and scored on the other half, "
         "both halves swapped; 'full+rows' uses stripes of columns instead. Means are per scan first, then "
         f"over scans; intervals resample whole scans (2,000 draws). {_BACKGROUND_TEXT[protocol.background]}"

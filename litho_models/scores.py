@@ -124,7 +124,7 @@ def _policy_error(policy: Policy, scores: Sequence[ScanScore]) -> PolicyError:
 
 
 def protocol_for(policy: Policy, seed: int = 0, background: BackgroundUse = "none") -> NuisanceProtocol:
-    """The standard protocol of a policy: k is the number of its smooth terms."""
+    """The standard protocol of a policy."""
     return NuisanceProtocol(policy=policy, k=float(TERM_COUNT[policy]), seed=seed, background=background)
 
 

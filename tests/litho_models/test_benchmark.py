@@ -72,7 +72,7 @@ def test_the_result_is_complete_on_disk(result):
     assert Benchmark.read(out) == record
     assert (out / "report.html").stat().st_size > 50_000
     table = pd.read_csv(out / "benchmark.csv")
-    assert sorted(table["model"]) == sorted(MODELS)
+    assert list(table["model"]) == [*MODELS, "noise floor (unknown)"]
     assert {"pairs.csv", "scans.csv", "levels.csv", "policies.csv", "fits.csv", "shapes.csv"} <= {
         p.name for p in out.iterdir()
     }
@@ -239,6 +239,35 @@ def test_comparing_different_protocols_is_refused(store, tmp_path):
         compare(tmp_path / "offset", tmp_path / "full")
     with pytest.raises(InputError):
         compare(tmp_path / "offset", tmp_path / "nothing")
+
+
+def test_results_meet_by_scan_whatever_the_order_of_their_lists(result, tmp_path):
+    record, out = result
+    turned = [scores.model_copy(update={"scans": scores.scans[::-1]}) for scores in record.scores]
+    record.model_copy(update={"scores": turned}).write(tmp_path)
+    table = compare(out, tmp_path)
+    assert list(table["first"]) == [scores.model for scores in record.scores]
+    assert (table[["difference_nm", "low_nm", "high_nm"]] == 0).all(axis=None)
+    assert (table["p"] == 1).all()
+
+
+def test_other_folds_are_another_protocol_and_another_training_seed_is_not(result, store, tmp_path):
+    _, out = result
+    benchmark(store, tmp_path / "two", models=["affine"], folds=2, settings=SETTINGS)
+    with pytest.raises(InputError, match=r"split differs.*'folds': 3.*'folds': 2"):
+        compare(out, tmp_path / "two")
+    benchmark(store, tmp_path / "reseeded", models=["affine"], folds=3, settings={**SETTINGS, "seed": 1})
+    assert list(compare(out, tmp_path / "reseeded")["first"]) == ["affine"]
+
+
+def test_a_training_error_is_not_compared_with_a_held_out_one(store, tmp_path):
+    run = train(store, "affine", tmp_path / "run", settings=SETTINGS)
+    evaluate(tmp_path / "run" / "model", store, tmp_path / "seen", scan_ids=run.training_ids[:1])
+    scored = Evaluation.read(tmp_path / "seen")
+    unseen = scored.model_copy(update={"trained_on_scored_scans": []})
+    unseen.write(tmp_path / "unseen")
+    with pytest.raises(InputError, match="held out differs"):
+        compare(tmp_path / "seen", tmp_path / "unseen")
 
 
 def test_the_floor_beside_the_errors_is_that_of_the_noise_analysis_given(store, tmp_path):
