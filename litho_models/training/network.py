@@ -139,12 +139,15 @@ def _step(
 ) -> float:
     for group in optimiser.param_groups:
         group["lr"] = learning_rate(config, step)
-    windows = plan_batch(targets.shapes, config, step)[fabric.global_rank :: fabric.world_size]
-    passes = in_passes(windows, fabric.device)
+    batch = plan_batch(targets.shapes, config, step)
+    own = batch[fabric.global_rank :: fabric.world_size]
+    # A process without a crop takes part in the sum of gradients with one that does not count.
+    passes = in_passes(own or batch[:1], fabric.device)
     optimiser.zero_grad(set_to_none=True)
     sums = torch.zeros(2, device=fabric.device)
     for number, some in enumerate(passes, 1):
-        share = len(some) / len(windows)
+        # The mean over processes is the mean over the crops of the batch, however they are dealt.
+        share = len(some) * fabric.world_size / len(batch) if own else 0.0
         # Processes add their gradients once, with the last pass.
         with fabric.no_backward_sync(cast(Any, module), enabled=number < len(passes)):
             loss, means = _losses(fabric, module, targets, some, config)
@@ -166,7 +169,7 @@ def _losses(
         # A pixel counts as much as it will in the blended field.
         window = blending_window(module.tile, weight)
         weight = weight * (window / window.mean())
-    # The count of pixels is fixed, so that the mean over processes is the loss of one process.
+    # A mean over all pixels, valid or not: every crop of a step counts alike, in whatever group it comes.
     loss = (weight * _error(prediction, height, config)).mean()
     return loss, torch.stack([(weight * (prediction - height).abs()).mean().detach(), weight.mean()])
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from litho_data.errors import InputError
 from litho_models.models import build_model
 from litho_models.models.pbl import Pbl
 from litho_models.tiles import predict_scan
-from litho_models.training import TrainingConfig, fit, fit_with_record
+from litho_models.training import TrainingConfig, fit, fit_with_record, network
 from litho_models.training.checkpoint import CheckpointFolder
 from litho_models.training.config import FAST_STEPS, PAPER_LEARNING_RATE
 from litho_models.training.crops import Window, cut, plan_batch
@@ -294,8 +295,54 @@ def test_bad_requests_are_refused(call):
         call()
 
 
+class OneOfMany:
+    """What a training step asks of its process; sums over processes are left to the test."""
+
+    def __init__(self, rank, world):
+        self.global_rank, self.world_size, self.device = rank, world, torch.device("cpu")
+
+    def to_device(self, batch):
+        return batch
+
+    def no_backward_sync(self, _module, enabled):
+        return nullcontext()
+
+    def backward(self, loss):
+        loss.backward()
+
+    def all_reduce(self, sums):
+        self.sums = sums
+        return torch.ones(2)
+
+
+@pytest.mark.parametrize("world", [2, 3, 5])
+def test_any_number_of_processes_has_the_mean_gradient_of_one(world, monkeypatch):
+    monkeypatch.setattr("litho_models.training.crops._PASS_PX", 1)
+    scans = make_scans(3, size_px=64)
+    # Unequal weights of the crops: a mean of means would show.
+    scans[0].valid[:, :40] = False
+    config = TrainingConfig(batch=4, crop_px=32)
+    targets = network._Targets(scans, [np.zeros(scan.shape) for scan in scans], 0)
+
+    def of_process(rank, count):
+        torch.manual_seed(0)
+        module = network._Heights(build_model("pbl", **SMALL_NETS), config)
+        process = OneOfMany(rank, count)
+        network._step(process, module, torch.optim.SGD(module.parameters()), targets, config, 0)
+        return torch.cat([parameter.grad.flatten() for parameter in module.parameters()]), process.sums
+
+    one, sums = of_process(0, 1)
+    every = [of_process(rank, world) for rank in range(world)]
+    # Four crops are summed in another order: float32 rounding of the largest term.
+    torch.testing.assert_close(
+        sum(gradient for gradient, _ in every) / world, one, rtol=0, atol=1e-5 * float(one.abs().max())
+    )
+    torch.testing.assert_close(sum(own for _, own in every) / world, sums)
+
+
 @pytest.mark.slow
-def test_two_processes_give_the_loss_curve_of_one(tmp_path):
+@pytest.mark.parametrize("world", [2, 3, 5])
+def test_several_processes_give_the_loss_curve_of_one(world, tmp_path):
     from litho_models.runs import TrainingRun
 
     store = write_store(tmp_path / "made.zarr", make_scans(6, size_px=64))
@@ -311,10 +358,10 @@ def test_two_processes_give_the_loss_curve_of_one(tmp_path):
     )
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
     subprocess.run([sys.executable, script, tmp_path / "one"], check=True, env=environment)
-    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-    subprocess.run([*torchrun, script, tmp_path / "two"], check=True, env=environment)
-    one, two = (TrainingRun.read(tmp_path / name).history for name in ("one", "two"))
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={world}"]
+    subprocess.run([*torchrun, script, tmp_path / "many"], check=True, env=environment)
+    one, many = (TrainingRun.read(tmp_path / name).history for name in ("one", "many"))
     # Gradients are summed in another order: float32 rounding, a few 1e-6 after four steps.
-    for a, b in zip(one, two, strict=True):
+    for a, b in zip(one, many, strict=True):
         assert b.training_mae_nm == pytest.approx(a.training_mae_nm, rel=1e-4)
         assert b.validation_mae_datum_free_nm == pytest.approx(a.validation_mae_datum_free_nm, rel=1e-4)
