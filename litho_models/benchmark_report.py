@@ -86,7 +86,13 @@ def write_benchmark_report(
     )
     page.heading("By level and frequency")
     page.figure(figures.level_bias(scores), "Error by printed level.")
-    page.figure(figures.transfer(scores), "Transfer and coherence.")
+    page.figure(figures.transfer(scores), "Transfer, coherence and error by spatial frequency.")
+    page.table(
+        score_tables.band_table(scores),
+        "How far up in frequency the prediction follows the measurement, cycles/µm.",
+        "bands.csv",
+    )
+    page.paragraph(score_tables.band_text())
     page.heading("Training")
     page.table(
         _fits(result),

@@ -63,7 +63,13 @@ def write_evaluation_report(
     page.figure(figures.line_profiles(scans[worst], shown, result.nuisance), "Middle row.")
     page.heading("By level and frequency")
     page.figure(figures.level_bias([scores]), "Error by printed level.")
-    page.figure(figures.transfer([scores]), "Transfer and coherence.")
+    page.figure(figures.transfer([scores]), "Transfer, coherence and error by spatial frequency.")
+    page.table(
+        score_tables.band_table([scores]),
+        "How far up in frequency the prediction follows the measurement, cycles/µm.",
+        "bands.csv",
+    )
+    page.paragraph(score_tables.band_text())
     page.heading("Tables")
     page.table(score_tables.scan_table([scores]), "By scan.", "scans.csv")
     page.table(score_tables.level_table([scores]), "By level.", "levels.csv")

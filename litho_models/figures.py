@@ -16,7 +16,7 @@ from litho_models.scores import NoiseFloor
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from litho_models.benchmark import FitRecord
+    from litho_models.fit_cache import FitRecord
 
 PAPER_MAE_NM = 24.35
 _RESIDUAL_RANGE_NM = 80.0
@@ -131,20 +131,23 @@ def level_bias(scores: Sequence[ModelScores]) -> Figure:
 
 
 def transfer(scores: Sequence[ModelScores]) -> Figure:
-    """Transfer and coherence against spatial frequency, along x (solid) and y (dashed)."""
-    figure = new_figure(9, 3.4)
-    left, right = figure.subplots(1, 2)
+    """Transfer, coherence and error density against spatial frequency, along x (solid) and y (dashed)."""
+    figure = new_figure(12, 3.4)
+    panels = figure.subplots(1, 3)
     for number, score in enumerate(scores):
         curves, colour = score.transfer, f"C{number % 10}"
-        left.plot(curves.frequency_per_um, curves.gain_x, color=colour, lw=1.2, label=score.model)
-        left.plot(curves.frequency_per_um, curves.gain_y, color=colour, lw=1, ls="--")
-        right.plot(curves.frequency_per_um, curves.coherence_x, color=colour, lw=1.2)
-        right.plot(curves.frequency_per_um, curves.coherence_y, color=colour, lw=1, ls="--")
+        for axes, name in zip(panels, ("gain", "coherence", "error_psd"), strict=True):
+            along_x, along_y = getattr(curves, f"{name}_x"), getattr(curves, f"{name}_y")
+            axes.plot(curves.frequency_per_um, along_x, color=colour, lw=1.2, label=score.model)
+            axes.plot(curves.frequency_per_um, along_y, color=colour, lw=1, ls="--")
+    left, middle, right = panels
     left.axhline(1, color="#9aa7b5", lw=0.8)
     left.set_ylim(0, 2)
     left.set_ylabel("predicted over measured")
-    right.set_ylabel("coherence γ²")
-    for axes in (left, right):
+    middle.set_ylabel("coherence γ²")
+    right.set_yscale("log")
+    right.set_ylabel("error, nm² per cycle/µm")
+    for axes in panels:
         axes.set_xlabel("spatial frequency, 1/µm (solid x, dashed y)")
     left.legend(fontsize=8)
     return figure

@@ -67,6 +67,16 @@ def shape_table(scores: Sequence[ModelScores]) -> pd.DataFrame:
     return pd.DataFrame([s.model_dump(include={"model", *fields, *counts}) for s in scores])
 
 
+def band_table(scores: Sequence[ModelScores]) -> pd.DataFrame:
+    """One row per model: how far up in frequency the prediction follows the measurement, along x and y."""
+    import pandas as pd
+
+    names = [f"{figure}_{axis}_per_um" for figure in ("half_power", "noise_band") for axis in "xy"]
+    return pd.DataFrame(
+        [{"model": s.model, **{name: getattr(s.transfer, name) for name in names}} for s in scores]
+    )
+
+
 def scan_table(scores: Sequence[ModelScores]) -> pd.DataFrame:
     """One row per model and scan."""
     import pandas as pd
@@ -133,6 +143,14 @@ def shape_text() -> str:
         "distances of the measured contours from the predicted ones at the heights half way between nominal "
         f"levels, over the pieces whose partner lies within {SEARCH_UM:g} µm; the counts are of pieces: of "
         "the measured contours with and without a partner, of the predicted contours without."
+    )
+
+
+def band_text() -> str:
+    """What the figures of ``band_table`` are."""
+    return (
+        "half_power is where predicted over measured falls to 1/√2 of that at the lowest frequencies, "
+        "noise_band the width of the ideal low pass that lets as much white noise through; along x and y."
     )
 
 

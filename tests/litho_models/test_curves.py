@@ -1,0 +1,60 @@
+"""Curves over spatial frequency: a known blur, white noise, Parseval."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter1d
+
+from litho_models.curves import half_power_frequency, transfer_curves
+from tests.litho_models.prints import make_scan
+
+PITCH_UM = 0.1
+
+
+def scan_of(height_um):
+    scan = make_scan(0, len(height_um))
+    scan.height_um[...] = height_um
+    scan.valid[...] = True
+    return scan
+
+
+def white(seed, sd_um, size_px=512):
+    return np.random.default_rng(seed).normal(0, sd_um, (size_px, size_px)).astype(np.float32)
+
+
+def test_white_error_has_a_flat_density_whose_integral_is_its_variance():
+    height = white(0, 0.2)
+    curves = transfer_curves([scan_of(height)], [height + white(1, 0.010)])
+    width = curves.frequency_per_um[1] - curves.frequency_per_um[0]
+    for density in (curves.error_psd_x, curves.error_psd_y):
+        # One-sided: σ² spread over 0 … 5 cycles/µm. A band averages 512 lines of some 7 independent
+        # frequencies (the Hann window joins neighbours): 1/√3500 = 1.7 %, four of them. The removed line mean
+        # takes power from the lowest band.
+        assert density[1:] == pytest.approx([100 / 5] * (len(density) - 1), rel=0.07)
+        assert np.sum(density) * width == pytest.approx(100, rel=0.03)
+
+
+def test_a_blurred_prediction_falls_to_half_power_where_the_gaussian_does():
+    height = white(2, 0.2)
+    sigma_um = 0.15
+    curves = transfer_curves([scan_of(height)], [gaussian_filter1d(height, sigma_um / PITCH_UM, axis=1)])
+    # exp(-2 π² σ² f²) = 1/√2; along y nothing is blurred.
+    assert curves.half_power_x_per_um == pytest.approx(
+        np.sqrt(np.log(2) / 2) / (np.sqrt(2) * np.pi * sigma_um), rel=0.02
+    )
+    assert curves.half_power_y_per_um is None
+    # The integral of the squared Gaussian is 1/(4 σ √π).
+    assert curves.noise_band_x_per_um == pytest.approx(1 / (4 * sigma_um * np.sqrt(np.pi)), rel=0.02)
+
+
+def test_a_perfect_prediction_follows_to_the_end():
+    height = white(3, 0.2, 64)
+    curves = transfer_curves([scan_of(height)], [height])
+    assert curves.half_power_x_per_um is None
+    assert curves.noise_band_x_per_um == pytest.approx(0.5 / PITCH_UM)
+    assert np.max(curves.error_psd_x) == 0
+
+
+def test_half_power_lies_between_the_bands_that_enclose_it():
+    assert half_power_frequency(np.array([1.0, 2.0]), np.array([1.0, 0.0])) == pytest.approx(2 - np.sqrt(0.5))
