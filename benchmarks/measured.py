@@ -58,8 +58,10 @@ def texts(folder: Path) -> dict[str, str]:
         return json.loads((folder / file).read_text(encoding="utf-8"))
 
     return {
-        "benchmark": benchmark_table(found("benchmark.json")),
-        "paper split": paper_table([found(f"benchmark_paper_{seed}.json") for seed in PAPER_SEEDS]),
+        "benchmark": benchmark_table(found("benchmark.json"), found("noise.json")),
+        "paper split": paper_table(
+            [found(f"benchmark_paper_{seed}.json") for seed in PAPER_SEEDS], found("benchmark.json")
+        ),
         "paired differences": paired_table(found("benchmark.json")),
         "further figures": further_table(found("benchmark.json")),
         "noise": noise_table(found("noise.json")),

@@ -128,16 +128,18 @@ def _paired(first: ModelScores, second: ModelScores) -> tuple[str, str]:
 
 def _row(result: Benchmark, score: ModelScores, difference: tuple[str, str]) -> tuple[str, ...]:
     settings = result.training[score.model]
-    how = [settings["recipe"], settings["precision"], f"seed {settings['seed']}"]
-    how += [] if settings["variant"] == "default" else [f"variant {settings['variant']}"]
     fit = next(fit for fit in result.fits if fit.model == score.model)
-    rounds = fit.steps
-    pixels = settings["batch"] * settings["crop_px"] ** 2
+    how, steps, seen = [settings["recipe"]], "Gauss-Newton", "–"
+    if fit.steps:
+        how += [settings["precision"], f"seed {settings['seed']}"]
+        how += [] if settings["variant"] == "default" else [f"variant {settings['variant']}"]
+        steps = f"{fit.steps[-1]:,}"
+        seen = f"{fit.steps[-1] * settings['batch'] * settings['crop_px'] ** 2 / 1e6:,.0f}"
     return (
         score.model,
-        ", ".join(how) if rounds else settings["recipe"],
-        f"{rounds[-1]:,}" if rounds else "Gauss-Newton",
-        f"{rounds[-1] * pixels / 1e6:,.0f}" if rounds else "–",
+        ", ".join(how),
+        steps,
+        seen,
         f"{fit.diagnostics.training_nm:.2f} nm" if fit.diagnostics else "–",
         with_interval(score.mae_datum_free_nm, score.mae_datum_free_ci95_nm),
         *difference,

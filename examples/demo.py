@@ -129,7 +129,10 @@ def plan(out: Path, dataset: str) -> list[Step]:
     if dataset:
         network, noise = out / "close-loop-pbl", out / "noise"
         steps += [
-            *(_paper_split(store, out / f"benchmark-paper-{seed}", seed) for seed in PAPER_SEEDS),
+            *(
+                _paper_split(store, effort.models, out / f"benchmark-paper-{seed}", seed)
+                for seed in PAPER_SEEDS
+            ),
             Step(
                 "What no model can predict: the noise",
                 _models("noise", store, "--out", noise),
@@ -239,12 +242,11 @@ def _spell(command: tuple[str, ...]) -> str:
     return shlex.join(command)
 
 
-def _paper_split(store: Path, out: Path, seed: int) -> Step:
+def _paper_split(store: Path, models: str, out: Path, seed: int) -> Step:
     return Step(
         f"The same on the paper's split, draw {seed}",
         _models(
-            "benchmark", store, "--models", "physics,pbl,fno", "--split", "paper",
-            "--seed", seed, "--out", out,
+            "benchmark", store, "--models", models, "--split", "paper", "--seed", seed, "--out", out,
         ),
         out / "benchmark.json",
         out / "report.html",
