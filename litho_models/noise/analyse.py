@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from litho_data.readers import read_scan
-from litho_data.store import PrintedScan, Store, open_store
+from litho_data.store import Store, open_store
 from litho_models.model_card import DatasetName
 from litho_models.noise.bounds import NoiseBound, noise_bounds
 from litho_models.noise.calibration import analyse_spread
@@ -63,18 +63,26 @@ def noise(
     references = store_references(dataset)
     spread = read_residuals(dataset, residuals, model) if residuals else None
     found = reference_prints(references, dataset.level_height_um)
-    dosed = [scan for scan in every if scan.dose is not None]
+    dose, notes = dose_matrix(every)
+    # A dose often has one print, without which it is lost, and no model is judged by the matrix.
+    in_matrix = {scan_id for row in dose.rows for scan_id in row.scans} if dose is not None else set()
+    if open_for_it := [scan_id for scan_id in locked if scan_id in in_matrix]:
+        notes.append(f"Locked, and in the dose matrix only, which judges no model: {', '.join(open_for_it)}.")
+    dropped = [
+        f"{scan_id}: lock box" + (", in the dose matrix only" if scan_id in in_matrix else "")
+        for scan_id in locked
+    ]
     bounds = noise_bounds(dataset, scans, seed)
     result = NoiseAnalysis(
         schema="litho-models/noise/1",
-        run=run_info([seed], len(scans), [f"{scan_id}: lock box" for scan_id in locked]),
+        run=run_info([seed], len(scans), dropped),
         dataset=DatasetName(name=dataset.name, sha256=dataset.sha256),
         noise_floor=floor_of(found, bounds),
         references=found,
-        dose=dose_matrix(dosed),
+        dose=dose,
         bounds=bounds,
         spread=analyse_spread(spread, seed) if spread is not None else None,
-        notes=_notes(found, bounds, dosed),
+        notes=[*_notes(found, bounds), *notes],
     )
     result.write(out)
     write_noise_report(result, references, out)
@@ -223,7 +231,7 @@ def _recorded_pitches(store: Store) -> dict[str, tuple[float, float]]:
     return pitches
 
 
-def _notes(found: ReferencePrints, bounds: Sequence[NoiseBound], dosed: Sequence[PrintedScan]) -> list[str]:
+def _notes(found: ReferencePrints, bounds: Sequence[NoiseBound]) -> list[str]:
     notes = []
     if not found.flats and not any(bound.name.startswith("repeated") for bound in bounds):
         notes.append(
@@ -232,6 +240,4 @@ def _notes(found: ReferencePrints, bounds: Sequence[NoiseBound], dosed: Sequence
         )
     if found.flats and not found.substrates:
         notes.append("No bare substrate: the flat print's roughness includes microscope and substrate.")
-    if not dosed:
-        notes.append("No doses in the store: a dose matrix needs a column 'dose' in the card's table.")
     return notes

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from litho_data.errors import InputError
 from litho_data.results import Record
 from litho_data.store import PrintedScan
 from litho_models.noise.staircase import READABLE_AT
@@ -21,6 +20,7 @@ GUARD_UM = 1.0
 # A step that prints at less than half of what the steps of its dose usually do is lost.
 LOST_BELOW = 0.5
 _FEWEST_PIXELS = 50
+_FEWEST_LEVELS = 3
 # Beyond the guard a print still feels its surroundings: diffusion reaches up to 2.5 µm.
 _REACHES_UM = (1.0, 2.0)
 
@@ -70,22 +70,36 @@ class DoseMatrix(Record):
     guard_um: float
 
 
-def dose_matrix(scans: Sequence[PrintedScan], guard_um: float = GUARD_UM) -> DoseMatrix | None:
-    """Judge the doses of the scans that carry one; None with fewer than two doses.
+def dose_matrix(
+    scans: Sequence[PrintedScan], guard_um: float = GUARD_UM
+) -> tuple[DoseMatrix | None, list[str]]:
+    """Judge the doses of the scans that carry one; notes say what is not judged, and why.
 
-    Recommended is, among the doses that lose the fewest steps at either end, the one whose height comes
-    nearest to the nominal one.
-
-    Raises:
-        InputError: doses whose layouts have no area of one level wide enough to measure on.
+    A dose without three levels that have areas wide enough to measure on is left out; fewer than two doses
+    make no matrix. Recommended is, among the doses that lose the fewest steps at either end, the one whose
+    height comes nearest to the nominal one.
     """
     by_dose: dict[float, list[PrintedScan]] = {}
     for scan in scans:
         if scan.dose is not None:
             by_dose.setdefault(round(scan.dose, 6), []).append(scan)
-    if len(by_dose) < 2:
-        return None
-    rows = [_row(dose, by_dose[dose], guard_um) for dose in sorted(by_dose)]
+    if not by_dose:
+        return None, ["No doses in the store: a dose matrix needs a column 'dose' in the card's table."]
+    if len(by_dose) == 1:
+        return None, [f"No dose matrix: every dose in the store is {min(by_dose):g}."]
+    heights = {dose: _level_heights(by_dose[dose], guard_um) for dose in sorted(by_dose)}
+    narrow = [dose for dose in heights if len(heights[dose]) < _FEWEST_LEVELS]
+    rows = [_row(dose, by_dose[dose], heights[dose]) for dose in heights if dose not in narrow]
+    notes = []
+    if narrow:
+        notes.append(
+            f"{'Left out of the' if len(rows) > 1 else 'No'} dose matrix: prints at dose "
+            f"{', '.join(f'{dose:g}' for dose in narrow)} have fewer than {_FEWEST_LEVELS} levels with areas "
+            f"farther than {guard_um:g} µm from every edge; step ladders have them (litho-data masks "
+            "--pattern dose-matrix)."
+        )
+    if len(rows) < 2:
+        return None, notes
     fewest = min(row.lost_low + row.lost_high for row in rows)
     sound = [row for row in rows if row.lost_low + row.lost_high == fewest]
     best = min(sound, key=lambda row: abs(row.height_gain - 1))
@@ -95,17 +109,12 @@ def dose_matrix(scans: Sequence[PrintedScan], guard_um: float = GUARD_UM) -> Dos
         f"nominal one (gain {best.height_gain:.3f}); single pixels of neighbouring levels {told_apart} be "
         f"told apart (worst step {best.worst_readability:.2f} σ, needed {READABLE_AT:.2f} σ)"
     )
-    return DoseMatrix(rows=rows, recommended_dose=best.dose, reason=reason, guard_um=guard_um)
+    return DoseMatrix(
+        rows=rows, recommended_dose=best.dose, reason=reason, guard_um=guard_um
+    ), notes if narrow else []
 
 
-def _row(dose: float, scans: Sequence[PrintedScan], guard_um: float) -> DoseRow:
-    levels = _level_heights(scans, guard_um)
-    if len(levels) < 3:
-        raise InputError(
-            f"prints at dose {dose:g}",
-            got=f"{len(levels)} levels with areas farther than {guard_um:g} µm from every edge",
-            wanted="at least 3, as in a step ladder",
-        )
+def _row(dose: float, scans: Sequence[PrintedScan], levels: list[LevelHeight]) -> DoseRow:
     nominal = np.array([entry.level for entry in levels]) * scans[0].level_height_um * NM_PER_UM
     height = np.array([entry.height_nm for entry in levels])
     sigma = np.array([entry.sigma_nm for entry in levels])

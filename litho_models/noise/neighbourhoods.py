@@ -25,7 +25,7 @@ _PIXELS_PER_SCAN = 3000
 
 
 class NeighbourhoodNoise(NamedTuple):
-    """σ at distance zero with its interval over scans, its MAE, σ of the nearest pairs, and the scans used."""
+    """σ at distance zero with its interval over scans, its MAE, σ of the nearest pairs, scans compared."""
 
     sigma_nm: float
     ci95_nm: tuple[float, float] | None

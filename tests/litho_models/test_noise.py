@@ -20,6 +20,7 @@ from litho_models.noise.residuals import disagreement_um
 from litho_models.noise.staircase import READABLE_AT, find_edges, step_print
 from litho_models.noise.surface import print_noise, surface_noise
 from litho_models.noise.variance import COVARIATES, covariate_maps, fit_log_variance, sigma_nm
+from litho_models.splits import locked_ids
 
 RANDOM = np.random.default_rng(0)
 
@@ -185,7 +186,8 @@ def ladder(dose, sigma_um=0.006, seed=0):
 
 def test_the_dose_matrix_sees_height_roughness_and_lost_steps():
     doses = [0.7, 0.85, 1.0, 1.15, 1.3]
-    found = dose_matrix([ladder(dose) for dose in reversed(doses)])
+    found, notes = dose_matrix([ladder(dose) for dose in reversed(doses)])
+    assert notes == []
     assert [row.dose for row in found.rows] == doses
     under, low, nominal, high, over = found.rows
     # Levels 0, 1 and 2 are one height: two steps lost. 0.75 µm is reached below level 6 (0.78 µm).
@@ -206,7 +208,7 @@ def test_shrinkage_alone_is_no_wrong_exposure_and_the_nearest_height_wins():
         replace(ladder(dose), height_um=(0.6 * ladder(dose).height_um).astype(np.float32))
         for dose in (0.9, 1.0, 1.15)
     ]
-    found = dose_matrix(shrunk)
+    found, _ = dose_matrix(shrunk)
     assert not any(row.under_exposed or row.over_exposed for row in found.rows)
     # 0.6 · 1.15 = 0.69 is the nearest to 1.
     assert found.recommended_dose == 1.15
@@ -216,19 +218,34 @@ def test_a_tilted_scan_does_not_change_its_dose_row():
     level_scan = ladder(1.0)
     y = np.linspace(-0.1, 0.1, 60, dtype=np.float32)[:, None]
     tilted = replace(level_scan, height_um=level_scan.height_um + y)
-    rows = [dose_matrix([scan, ladder(1.1)]).rows[0] for scan in (level_scan, tilted)]
+    rows = [dose_matrix([scan, ladder(1.1)])[0].rows[0] for scan in (level_scan, tilted)]
     assert rows[1].roughness_nm == pytest.approx(rows[0].roughness_nm, rel=1e-3)
     assert rows[1].height_gain == pytest.approx(rows[0].height_gain, abs=1e-4)
 
 
-def test_one_dose_makes_no_matrix_and_narrow_structures_are_refused():
-    assert dose_matrix([ladder(1.0), ladder(1.0, seed=1)]) is None
-    assert dose_matrix(make_scans(2, size_px=64)) is None
-    busy = [replace(scan, dose=0.9 + 0.2 * n) for n, scan in enumerate(make_scans(2, size_px=64))]
-    for scan in busy:
-        scan.mask_level[::2] = 0
-    with pytest.raises(InputError, match="step ladder"):
-        dose_matrix(busy)
+def test_without_two_doses_there_is_no_matrix_and_a_note_says_so():
+    for scans, reason in (
+        ([ladder(1.0), ladder(1.0, seed=1)], "every dose in the store is 1"),
+        (make_scans(2, size_px=64), "needs a column 'dose'"),
+    ):
+        found, (note,) = dose_matrix(scans)
+        assert found is None
+        assert reason in note
+
+
+def narrow_print(dose):
+    scan = make_scans(1, size_px=64)[0]
+    scan.mask_level[::2] = 0
+    return replace(scan, id=f"N{dose:g}", dose=dose)
+
+
+def test_doses_of_narrow_structures_are_left_out_and_named():
+    found, (note,) = dose_matrix([narrow_print(0.9), narrow_print(1.1), ladder(1.0)])
+    assert found is None
+    assert note.startswith("No dose matrix: prints at dose 0.9, 1.1 have fewer than 3 levels")
+    found, (note,) = dose_matrix([narrow_print(0.9), ladder(1.0), ladder(1.1)])
+    assert [row.dose for row in found.rows] == [1.0, 1.1]
+    assert note.startswith("Left out of the dose matrix: prints at dose 0.9 have")
 
 
 # --- bounds -------------------------------------------------------------------------------------
@@ -392,6 +409,34 @@ def test_a_store_without_references_gets_a_lower_bound_that_is_one(store, tmp_pa
     page = (tmp_path / "out" / "report.html").read_text()
     assert "lower bound" in page
     assert "http://" not in page.replace("http://www.w3.org", "")
+
+
+def test_a_store_of_ordinary_layouts_with_doses_has_bounds_and_no_matrix(tmp_path):
+    from litho_models.noise import noise
+
+    doses = (0.9, 1.0, 1.1, 0.9, 1.0, 1.1)
+    scans = [replace(scan, dose=dose) for scan, dose in zip(make_scans(6, size_px=64), doses, strict=True)]
+    for scan in scans:
+        scan.mask_level[::2] = 0
+    result = noise(write_store(tmp_path / "dosed.zarr", scans), tmp_path / "out")
+    assert result.dose is None
+    assert result.bounds
+    assert any("No dose matrix: prints at dose 0.9, 1, 1.1" in note for note in result.notes)
+
+
+def test_a_locked_print_is_in_the_dose_matrix_and_in_nothing_else(tmp_path):
+    from litho_models.noise import noise
+
+    doses = [0.8, 0.9, 1.0, 1.1, 1.2]
+    prints = [replace(ladder(dose), order=number, print_id=str(number)) for number, dose in enumerate(doses)]
+    result = noise(write_store(tmp_path / "doses.zarr", prints), tmp_path / "out")
+    (locked,) = locked_ids(prints)
+    assert [row.scans for row in result.dose.rows] == [[scan.id] for scan in prints]
+    assert result.run.dropped == [f"{locked}: lock box, in the dose matrix only"]
+    assert any(note.endswith(f"no model: {locked}.") for note in result.notes)
+    assert result.run.n_scans == 4
+    assert max(bound.scans for bound in result.bounds) == 4
+    assert locked in (tmp_path / "out" / "report.html").read_text()
 
 
 def test_residuals_of_a_benchmark_are_out_of_fold_and_locked_scans_stay_out(store, tmp_path):
