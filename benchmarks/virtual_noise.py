@@ -1,0 +1,91 @@
+"""The noise analysis of virtual prints, whose roughness is known, in the documentation.
+
+    litho-data masks --out doses --pattern dose-matrix --count 7 --size 512
+    litho-data simulate --out doses-printed --layouts doses/card.toml
+    litho-data build doses-printed/raw/card.toml --out doses.zarr
+    litho-models noise doses.zarr --out doses-noise
+    litho-data simulate --out fab --references
+    litho-data build fab/raw/card.toml --out fab.zarr
+    litho-models noise fab.zarr --out fab-noise
+    python -m benchmarks.virtual_noise doses-noise fab-noise
+
+What the page quotes is written here from the result files, and a test holds the page to them.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from benchmarks.markdown_table import markdown_table, with_interval
+from benchmarks.record import publish
+from litho_data.virtual_fab.settings import Noise
+from litho_models.noise import NoiseAnalysis
+
+ROOT = Path(__file__).parents[1]
+FOLDER = ROOT / "docs" / "results" / "virtual-noise"
+PAGE = ROOT / "docs" / "noise.md"
+DOSES, REFERENCES = "dose-matrix", "references"
+
+
+def texts(folder: Path) -> dict[str, str]:
+    """The text of each mark of the page, from the two results in a folder."""
+    doses, references = (NoiseAnalysis.read(folder / name) for name in (DOSES, REFERENCES))
+    return {"dose matrix": dose_table(doses), "planted roughness": planted_text(doses, references)}
+
+
+def dose_table(found: NoiseAnalysis) -> str:
+    """Height, roughness, lost steps and readability of every dose, and the recommended one."""
+    assert found.dose is not None
+    rows = [
+        (
+            f"{row.dose:g}",
+            f"{row.height_gain:.3f}",
+            f"{row.full_height_nm:.0f} nm",
+            f"{row.roughness_nm:.1f} nm",
+            f"{row.lost_low} + {row.lost_high}",
+            f"{row.worst_readability:.2f} σ",
+        )
+        for row in found.dose.rows
+    ]
+    return markdown_table(
+        ("dose", "gain", "highest level", "roughness", "lost steps, low + high", "worst step"),
+        rows,
+        f"Recommended: {found.dose.recommended_dose:g}, {found.dose.reason}. Left out of the other figures: "
+        f"{', '.join(found.run.dropped)}.",
+    )
+
+
+def planted_text(doses: NoiseAnalysis, references: NoiseAnalysis) -> str:
+    """The flat print and the gamma tests beside the roughness that was planted."""
+    planted_nm = Noise().roughness_nm
+    flat = next(one for one in references.references.flats if one.background == "offset")
+    return (
+        f"On virtual prints, planted {planted_nm:g} nm: the flat print gives {flat.sigma_nm:.2f} ± "
+        f"{flat.sigma_uncertainty_nm:.2f} nm, the gamma test {_gamma_test(references)} of random layouts and "
+        f"{_gamma_test(doses)} of the dose matrix."
+    )
+
+
+def _gamma_test(found: NoiseAnalysis) -> str:
+    bound = next(one for one in found.bounds if one.name.startswith("pixels whose layout surroundings"))
+    return f"{with_interval(bound.sigma_nm, bound.ci95_nm)} on {bound.scans} scans"
+
+
+def main() -> None:
+    """Copy and publish."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    for name in (DOSES, REFERENCES):
+        parser.add_argument(name, type=Path, help="result folder of litho-models noise")
+    given = vars(parser.parse_args())
+    for name in (DOSES, REFERENCES):
+        NoiseAnalysis.read(given[name]).write(FOLDER / name)
+    for mark, text in texts(FOLDER).items():
+        print(text)
+        publish(PAGE, mark, text)
+
+
+if __name__ == "__main__":
+    main()
