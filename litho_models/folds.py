@@ -36,7 +36,7 @@ def plan_folds(
     """The folds of a split; scans of the lock box are in none of them, except in the leaky ``paper``.
 
     Raises:
-        InputError: too few scans, or an unknown split.
+        InputError: too few scans, a lock box to open where there is none, or an unknown split.
     """
     if split == "paper":
         held_out = paper_draw([scan.id for scan in scans], seed)
@@ -44,6 +44,13 @@ def plan_folds(
         parts = {crop: _quadrant(scan, crop) for crop, scan in crops}
         training = [part for crop, part in parts.items() if crop not in held_out]
         return [Fold(0, training, [parts[crop] for crop in held_out])]
+    if open_lock_box and not locked:
+        raise InputError(
+            "lock box to open",
+            got=f"none: {len(scans)} scans are too few for one",
+            wanted="at least 3 scans",
+            hint="leave out --open-lock-box",
+        )
     development = [scan for scan in scans if scan.id not in locked]
     ids = [scan.id for scan in development]
     if split == "grouped":

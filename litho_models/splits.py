@@ -79,9 +79,11 @@ def grouped_folds(ids: Sequence[str], k: int = 5, seed: int = 0) -> list[list[st
     """Deal the scans into ``k`` folds; each fold lists the ids held out of its training.
 
     Raises:
-        InputError: ids that repeat, or ``k`` outside 2 ... number of scans.
+        InputError: ids that repeat, fewer than two, or ``k`` outside 2 ... number of scans.
     """
     _check_ids(ids)
+    if len(ids) < 2:
+        raise InputError("scans to deal into folds", got=len(ids), wanted="at least 2, one of them held out")
     if not 2 <= k <= len(ids):
         raise InputError("number of folds", got=k, wanted=f"2 to {len(ids)}, the number of scans")
     shuffled = sorted(ids, key=lambda scan_id: _order(scan_id, seed))
