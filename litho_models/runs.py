@@ -76,11 +76,13 @@ def train(
     locked = [] if use_lock_box else lock_box
     used = [scan for scan in scans if scan.id not in locked]
     folder = Path(out)
+    named = DatasetName(name=dataset.name, sha256=dataset.sha256)
+    _require_same_run(folder, {"dataset": named, "model": model, "config": config, "lock_box": locked})
     fitted = fit_with_record(model, used, config, checkpoint=folder / CHECKPOINT_FOLDER)
     record = TrainingRun(
         schema="litho-models/run/1",
         run=run_info([config.seed], len(used)),
-        dataset=DatasetName(name=dataset.name, sha256=dataset.sha256),
+        dataset=named,
         model=model,
         parameters=fitted.model.parameter_count,
         config=config,
@@ -116,6 +118,21 @@ def train(
     _write_history(record, folder)
     record.write(folder)
     return record
+
+
+def _require_same_run(folder: Path, facts: dict[str, Any]) -> None:
+    """Refuse a folder with the record of a run that differs in ``facts``, fields of ``TrainingRun``."""
+    if not (folder / TrainingRun.FILE_NAME).exists():
+        return
+    held = TrainingRun.read(folder)
+    differing = [name for name, fact in facts.items() if getattr(held, name) != fact]
+    if differing:
+        raise InputError(
+            f"{folder} holds another run",
+            got=f"{held.model} on {held.dataset.name}, of another {', '.join(differing)}",
+            wanted="a new folder, or the same run again",
+            hint="choose another --out, or delete the folder",
+        )
 
 
 def freeze(source: str | Path, out: str | Path, declare_process: Sequence[str] = ()) -> ModelCard:

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
 from pydantic import BaseModel, ConfigDict
+from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
@@ -77,12 +80,38 @@ class TrainingState:
         self._best_error = min(errors, default=None)
 
 
+@contextmanager
+def reading_kept(folder: Path) -> Iterator[None]:
+    """Read what an earlier call kept in ``folder``, whose files appear whole or not at all.
+
+    Raises:
+        InputError: a file is missing or was damaged since.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except (OSError, ValueError, LookupError, TypeError, EOFError, RuntimeError, SafetensorError) as error:
+        said = str(error).partition("\n")[0]
+        raise InputError(
+            f"cannot read what an earlier call kept in {folder}",
+            got=f"{type(error).__name__} ({said})",
+            wanted="its files as they were written",
+            hint=f"delete {folder} and run again",
+        ) from error
+
+
 class CheckpointFolder:
-    """One folder that always holds the last complete checkpoint; ``key`` names the run it belongs to."""
+    """One folder that always holds the last complete checkpoint; ``key`` names the run it belongs to.
+
+    Raises:
+        InputError: the folder holds a checkpoint of another model, configuration or data, or a damaged one.
+    """
 
     def __init__(self, path: str | Path, key: str):
         self.path = Path(path)
         self._key = key
+        self._kept = self._kept_history()
 
     def save(self, state: TrainingState) -> None:
         """Replace the checkpoint as a whole."""
@@ -92,23 +121,30 @@ class CheckpointFolder:
             (folder / "state.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 
     def load(self, state: TrainingState) -> None:
-        """Continue from the checkpoint, if there is one.
+        """Continue from the checkpoint, if there was one.
 
         Raises:
-            InputError: the checkpoint is of another model, configuration or data.
+            InputError: its tensors are damaged.
         """
-        if not (self.path / "state.json").exists():
-            return
-        record = json.loads((self.path / "state.json").read_text(encoding="utf-8"))
-        if record["key"] != self._key:
+        if self._kept:
+            with reading_kept(self.path):
+                state.load(load_file(self.path / "state.safetensors"), self._kept)
+
+    def _kept_history(self) -> list[RoundRecord]:
+        file = self.path / "state.json"
+        if not file.exists():
+            return []
+        with reading_kept(self.path):
+            record = json.loads(file.read_text(encoding="utf-8"))
+            key, history = record["key"], [RoundRecord(**entry) for entry in record["history"]]
+        if key != self._key:
             raise InputError(
                 f"checkpoint in {self.path}",
                 got="one of another model, configuration or dataset",
                 wanted="the run that is being continued",
                 hint="choose another --out, or delete the folder",
             )
-        history = [RoundRecord(**entry) for entry in record["history"]]
-        state.load(load_file(self.path / "state.safetensors"), history)
+        return history
 
 
 def _with_prefix(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

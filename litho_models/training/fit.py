@@ -65,11 +65,16 @@ def fit_with_record(
     """As ``fit``, with the history; ``checkpoint`` is a folder from which a killed run continues.
 
     ``model_fields`` override hyper-parameters of the model's variant.
+
+    Raises:
+        InputError: as ``fit``, or a folder that holds another run's checkpoint or a damaged one.
     """
     geometry = common_geometry(scans)
     started = time.monotonic()
     torch.manual_seed(config.seed)
     model = build_model(model_name, config.variant, **geometry, **(model_fields or {}))
+    # Also for a model that leaves no checkpoint: the folder may hold another's.
+    folder = None if checkpoint is None else CheckpointFolder(checkpoint, run_key(model, scans, config))
     ids = [scan.id for scan in scans]
     history: list[RoundRecord] = []
     validation_ids: list[str] = []
@@ -77,9 +82,6 @@ def fit_with_record(
         validation_ids = inner_validation(ids, config.validation_scans, config.seed)
         training = [scan for scan in scans if scan.id not in validation_ids]
         validation = [scan for scan in scans if scan.id in validation_ids]
-        folder = None
-        if checkpoint is not None:
-            folder = CheckpointFolder(checkpoint, run_key(model, scans, config))
         history = train_network(
             model, training, validation, config, lambda: _stiff_predictions(training, config), folder
         )
