@@ -1,7 +1,6 @@
 """All models on one dataset under one protocol: trained per fold, scored on scans never seen.
 
-Each (model, fold) is a folder of its own in the cache, named by the hash of everything that decides
-it; a benchmark that was stopped continues where it was, and an unchanged fit is never repeated.
+A benchmark that was stopped continues where it was, and an unchanged fit is never repeated.
 """
 
 from __future__ import annotations
@@ -10,53 +9,30 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
-import numpy as np
 from pydantic import Field
 
 from litho_data.commands import progress
-from litho_data.files import atomic_file, atomic_folder
 from litho_data.results import Record, Result
 from litho_data.store import PrintedScan, open_store
 from litho_models.background import BackgroundUse
 from litho_models.benchmark_report import write_benchmark_report
-from litho_models.diagnostics import FitDiagnostics, diagnose
 from litho_models.evaluate import SplitRecord
-from litho_models.folds import GROUPED_FOLDS, Fold, SplitKind, plan_folds
+from litho_models.fit_cache import FitRecord, fit_or_load
+from litho_models.folds import GROUPED_FOLDS, SplitKind, plan_folds
 from litho_models.metrics import paired_difference
 from litho_models.model_card import DatasetName
-from litho_models.models import build_model, model_class
+from litho_models.models import build_model, require_models
 from litho_models.nuisance import Policy
 from litho_models.run_info import RunInfo, run_info
 from litho_models.runs import training_config
 from litho_models.score_records import ModelScores, NuisanceProtocol, Prediction
 from litho_models.scores import NoiseFloor, noise_floor, protocol_for, score_model
 from litho_models.splits import ids_sha256, locked_ids
-from litho_models.tiles import predict_scan
-from litho_models.training import Fitted, TrainingConfig, fit_in_cache
-from litho_models.training.fit import common_geometry, run_key
+from litho_models.training import TrainingConfig
+from litho_models.training.fit import common_geometry
 
 BASELINES = ("identity", "affine", "affine-mtf", "blur-table", "linear")
 DEFAULT_MODELS = (*BASELINES, "physics", "pbl", "fno")
-
-
-class FitRecord(Record):
-    """One fit: what it saw and what it cost; errors are nm, None where the model has no rounds.
-
-    ``diagnostics`` are None in results of before they were made.
-    """
-
-    model: str
-    fold: int
-    key: str
-    training_ids: list[str]
-    validation_ids: list[str]
-    held_out_ids: list[str]
-    parameters: int
-    seconds: float
-    steps: list[int]
-    training_mae_nm: list[float]
-    validation_mae_datum_free_nm: list[float | None]
-    diagnostics: FitDiagnostics | None = None
 
 
 class Paired(Record):
@@ -121,11 +97,10 @@ def benchmark(
         seed: of the split, the nuisance blocks and the training.
 
     Raises:
-        InputError: unknown model, a store that cannot be read or is too small for the split, or a noise
-            analysis of other data.
+        InputError: no model, an unknown one or one twice, a store that cannot be read or is too small for
+            the split or for a lock box to open, a noise analysis of other data, or a damaged cache.
     """
-    for name in models:
-        model_class(name)
+    require_models(models)
     dataset = open_store(store)
     scans = dataset.scans()
     floor = noise_floor(dataset.name, noise)
@@ -136,9 +111,14 @@ def benchmark(
     predicted: dict[tuple[str, bool], dict[str, Prediction]] = {}
     jobs = [(name, fold) for name in models for fold in plan]
     for name, fold in progress(jobs, f"benchmark of {dataset.name}"):
-        record, predictions = _fit_or_load(name, fold, configs[name], Path(out) / "cache", background)
+        record, heights = fit_or_load(name, fold, configs[name], Path(out) / "cache")
         fits.append(record)
-        predicted.setdefault((name, fold.locked), {}).update(predictions)
+        assert record.diagnostics is not None
+        learned = record.diagnostics.background if background == "training" else None
+        predicted.setdefault((name, fold.locked), {}).update(
+            (scan.id, Prediction(height, learned.map_um(scan.shape) if learned else None))
+            for scan, height in zip(fold.held_out, heights, strict=True)
+        )
     protocol = protocol_for(policy, seed, background)
     scored = [scan for fold in plan if not fold.locked for scan in fold.held_out]
     boxed = [scan for fold in plan if fold.locked for scan in fold.held_out]
@@ -164,7 +144,7 @@ def benchmark(
         ),
         nuisance=protocol,
         noise_floor=floor,
-        training={name: config.model_dump(mode="json") for name, config in configs.items()},
+        training={name: _settings(name, config, scans) for name, config in configs.items()},
         scores=scores,
         locked_scores=[score(name, boxed, True) for name in models] if boxed else [],
         paired=_all_pairs(scores, seed),
@@ -181,54 +161,8 @@ def _config(name: str, settings: dict[str, Any] | None, seed: int) -> TrainingCo
     return training_config(given.pop("recipe", "fast"), name, given)
 
 
-def _fit_or_load(
-    name: str, fold: Fold, config: TrainingConfig, cache: Path, background: BackgroundUse
-) -> tuple[FitRecord, dict[str, Prediction]]:
-    untrained = build_model(name, config.variant, **common_geometry(fold.training))
-    key = run_key(untrained, fold.training, config, [scan.id for scan in fold.held_out])
-    folder = cache / f"{name}-{key[:16]}"
-    fit_file, diagnostics_file = folder / "fit.json", folder / "diagnostics.json"
-    if not (fit_file.exists() and diagnostics_file.exists()):
-        # A finished training is read from its checkpoint; a small model is fitted again.
-        fitted = fit_in_cache(name, fold.training, config, cache)
-        if not fit_file.exists():
-            _keep_fit(folder, fitted, fold, key)
-        heights = _kept_heights(folder)
-        found = diagnose(fitted.model, fold.training, fitted.validation_ids, fold.held_out, heights)
-        with atomic_file(diagnostics_file) as temporary:
-            temporary.write_text(found.model_dump_json(indent=1), encoding="utf-8")
-    record = FitRecord.model_validate_json(fit_file.read_text(encoding="utf-8"))
-    diagnostics = FitDiagnostics.model_validate_json(diagnostics_file.read_text(encoding="utf-8"))
-    learned = diagnostics.background if background == "training" else None
-    predictions = {
-        scan.id: Prediction(height, learned.map_um(scan.shape) if learned else None)
-        for scan, height in zip(fold.held_out, _kept_heights(folder), strict=True)
-    }
-    return record.model_copy(update={"diagnostics": diagnostics}), predictions
-
-
-def _keep_fit(folder: Path, fitted: Fitted, fold: Fold, key: str) -> None:
-    record = FitRecord(
-        model=fitted.model.name,
-        fold=fold.number,
-        key=key,
-        training_ids=fitted.training_ids,
-        validation_ids=fitted.validation_ids,
-        held_out_ids=[scan.id for scan in fold.held_out],
-        parameters=fitted.model.parameter_count,
-        seconds=fitted.seconds,
-        steps=[entry.step for entry in fitted.history],
-        training_mae_nm=[entry.training_mae_nm for entry in fitted.history],
-        validation_mae_datum_free_nm=[entry.validation_mae_datum_free_nm for entry in fitted.history],
-    )
-    with atomic_folder(folder) as temporary:
-        for number, scan in enumerate(fold.held_out):
-            np.save(temporary / f"prediction_{number:03d}.npy", predict_scan(fitted.model, scan))
-        (temporary / "fit.json").write_text(record.model_dump_json(indent=1), encoding="utf-8")
-
-
-def _kept_heights(folder: Path) -> list[np.ndarray]:
-    return [np.load(file, allow_pickle=False) for file in sorted(folder.glob("prediction_*.npy"))]
+def _settings(name: str, config: TrainingConfig, scans: Sequence[PrintedScan]) -> dict[str, Any]:
+    return config.used_by(build_model(name, config.variant, **common_geometry(scans)))
 
 
 def _all_pairs(scores: Sequence[ModelScores], seed: int) -> list[Paired]:

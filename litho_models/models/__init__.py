@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from litho_data.errors import InputError
@@ -15,7 +16,7 @@ from litho_models.models.pbl import Pbl
 from litho_models.models.physics import Physics
 from litho_models.simulator import Simulator, Variant
 
-__all__ = ["MODELS", "build_model", "model_class"]
+__all__ = ["MODELS", "build_model", "model_class", "require_models"]
 
 MODELS: dict[str, type[Simulator]] = {
     model.name: model for model in (Identity, Affine, AffineMtf, BlurTable, Linear, Physics, Pbl, Fno)
@@ -31,6 +32,20 @@ def model_class(name: str) -> type[Simulator]:
     if name not in MODELS:
         raise InputError("model", got=repr(name), wanted=", ".join(MODELS))
     return MODELS[name]
+
+
+def require_models(names: Sequence[str]) -> None:
+    """Check a list of model names, as a user gives one.
+
+    Raises:
+        InputError: no name, one twice, or an unknown one.
+    """
+    for name in names:
+        model_class(name)
+    if not names or len(set(names)) < len(names):
+        raise InputError(
+            "models", got=", ".join(names) or "none", wanted=f"one or more of {', '.join(MODELS)}, each once"
+        )
 
 
 def build_model(name: str, variant: Variant = "default", **fields: Any) -> Simulator:

@@ -14,6 +14,8 @@ Recipe = Literal["fast", "paper"]
 RECIPES: tuple[str, ...] = get_args(Recipe)
 PAPER_EPOCHS, PAPER_CROPS, PAPER_BATCH = 4000, 72, 4
 FAST_STEPS = {"pbl": 2000, "fno": 1000}
+# What a fit by Gauss-Newton depends on.
+GAUSS_NEWTON_FIELDS = {"recipe", "variant", "seed", "nuisance", "free_gain"}
 PAPER_LEARNING_RATE = {"pbl": 5e-4, "fno": 1e-4, "physics": 1e-2}
 
 
@@ -89,3 +91,9 @@ class TrainingConfig(BaseModel):
         A model with many parameters always is; a small one where the paper trains it so.
         """
         return not model.is_small or (self.recipe == "paper" and model.name in PAPER_LEARNING_RATE)
+
+    def used_by(self, model: Simulator) -> dict[str, Any]:
+        """The settings that decide a fit of ``model``, for its record."""
+        if self.takes_steps(model):
+            return self.model_dump(mode="json")
+        return {**self.model_dump(mode="json", include=GAUSS_NEWTON_FIELDS), "optimiser": "gauss-newton"}

@@ -99,7 +99,7 @@ def test_an_unchanged_benchmark_fits_nothing_again(result, store, monkeypatch):
     def refuse(*_args, **_kwargs):
         raise AssertionError("fitted again")
 
-    monkeypatch.setattr("litho_models.benchmark.fit_in_cache", refuse)
+    monkeypatch.setattr("litho_models.fit_cache.fit_in_cache", refuse)
     again = benchmark(store, out, models=MODELS, folds=3, settings=SETTINGS, open_lock_box=True)
     assert again.scores == record.scores
 

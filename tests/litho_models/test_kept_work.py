@@ -1,0 +1,183 @@
+"""What an earlier call kept: the same call goes on from it, another is refused, damage names its folder."""
+
+from __future__ import annotations
+
+import json
+import shutil
+
+import pytest
+from prints import make_scans, write_store
+from typer.testing import CliRunner
+
+from litho_data.errors import InputError
+from litho_models.benchmark import benchmark
+from litho_models.cli import app
+from litho_models.folds import plan_folds
+from litho_models.model_card import ModelCard
+from litho_models.noise.residuals import read_residuals
+from litho_models.runs import TrainingRun, train
+from litho_models.splits import grouped_folds, locked_ids
+from litho_models.training import TrainingConfig, fit_with_record
+from litho_models.training.checkpoint import CheckpointFolder
+
+QUICK = {"steps": 2, "rounds": 2, "batch": 1, "crop_px": 32, "nuisance": "offset"}
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    return write_store(tmp_path_factory.mktemp("data") / "made.zarr", make_scans(4, size_px=64))
+
+
+@pytest.fixture(scope="module")
+def trained(store, tmp_path_factory):
+    """A run of a network, with its checkpoint."""
+    folder = tmp_path_factory.mktemp("run") / "pbl"
+    return train(store, "pbl", folder, settings=QUICK), folder
+
+
+@pytest.fixture(scope="module")
+def scored(store, tmp_path_factory):
+    """A benchmark of a fit by Gauss-Newton and of one in steps."""
+    out = tmp_path_factory.mktemp("benchmark")
+    return benchmark(store, out, models=["affine", "pbl"], folds=2, settings=QUICK), out
+
+
+def test_the_same_run_again_goes_on_where_it_was_and_its_seconds_are_those_of_all_rounds(trained, store):
+    run, folder = trained
+    again = train(store, "pbl", folder, settings=QUICK)
+    assert again.history == run.history
+    assert again.seconds == run.seconds == sum(entry.seconds for entry in run.history)
+
+
+def test_seconds_of_a_killed_fit_hold_those_of_before(tmp_path, monkeypatch):
+    class Killed(Exception):
+        pass
+
+    save = CheckpointFolder.save
+
+    def save_and_die(self, state):
+        # What the first round took, as if it had been long.
+        state.history[0] = state.history[0].model_copy(update={"seconds": 1000.0})
+        save(self, state)
+        raise Killed
+
+    scans, config = make_scans(4, size_px=64), TrainingConfig(**QUICK)
+    monkeypatch.setattr(CheckpointFolder, "save", save_and_die)
+    with pytest.raises(Killed):
+        fit_with_record("pbl", scans, config, checkpoint=tmp_path / "run")
+    monkeypatch.undo()
+    resumed = fit_with_record("pbl", scans, config, checkpoint=tmp_path / "run")
+    assert [entry.step for entry in resumed.history] == [1, 2]
+    assert resumed.seconds == 1000.0 + resumed.history[1].seconds
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "differs"),
+    [
+        ("affine", {"model": "linear"}, "model"),
+        ("affine", {"settings": {"seed": 1}}, "config"),
+        ("affine", {"use_lock_box": True}, "lock_box"),
+        ("pbl", {"model": "affine"}, "model"),
+    ],
+)
+def test_a_folder_keeps_the_run_that_it_holds(before, now, differs, trained, store, tmp_path):
+    folder = tmp_path / "run"
+    if before == "pbl":
+        shutil.copytree(trained[1], folder)
+    else:
+        train(store, before, folder)
+    weights = ModelCard.read(folder / "model").weights_sha256
+    with pytest.raises(InputError, match=rf"holds another run.*of another .*{differs}.*--out"):
+        train(store, **{"model": before, "out": folder, **now})
+    assert ModelCard.read(folder / "model").weights_sha256 == weights
+    assert TrainingRun.read(folder).model == before
+
+
+def test_a_killed_run_keeps_its_folder_from_models_that_leave_no_checkpoint(trained, store, tmp_path):
+    shutil.copytree(trained[1] / "checkpoint", tmp_path / "checkpoint")
+    with pytest.raises(InputError, match="another model, configuration or dataset"):
+        train(store, "affine", tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["checkpoint"]
+
+
+def cut_short(file):
+    file.write_bytes(file.read_bytes()[:50])
+
+
+def emptied(file):
+    file.write_bytes(b"")
+
+
+@pytest.mark.parametrize("damage", [cut_short, emptied])
+@pytest.mark.parametrize("name", ["state.json", "state.safetensors"])
+def test_a_damaged_checkpoint_is_told_with_its_folder(name, damage, trained, store, tmp_path):
+    folder = tmp_path / "run"
+    shutil.copytree(trained[1], folder)
+    damage(folder / "checkpoint" / name)
+    with pytest.raises(InputError, match=f"delete {folder / 'checkpoint'} and run again") as told:
+        train(store, "pbl", folder, settings=QUICK)
+    assert "\n" not in str(told.value)
+    shutil.rmtree(folder / "checkpoint")
+    assert train(store, "pbl", folder, settings=QUICK).history[-1].training_mae_nm == pytest.approx(
+        trained[0].history[-1].training_mae_nm
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "damage"),
+    [
+        ("fit.json", cut_short),
+        ("diagnostics.json", cut_short),
+        ("prediction_000.npy", cut_short),
+        ("prediction_000.npy", emptied),
+        ("prediction_000.npy", lambda file: file.unlink()),
+    ],
+)
+def test_a_damaged_fit_is_told_with_its_folder(name, damage, scored, store, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(scored[1], out)
+    folder = next(path for path in (out / "cache").glob("affine-*"))
+    damage(folder / name)
+    with pytest.raises(InputError, match=f"delete {folder} and run again") as told:
+        benchmark(store, out, models=["affine"], folds=2, settings=QUICK)
+    assert "\n" not in str(told.value)
+    shutil.rmtree(folder)
+    again = benchmark(store, out, models=["affine"], folds=2, settings=QUICK)
+    assert again.scores[0] == scored[0].scores[0]
+
+
+def test_a_damaged_fit_is_told_where_the_noise_reads_it_too(scored, store, tmp_path):
+    from litho_data.store import open_store
+
+    out = tmp_path / "out"
+    shutil.copytree(scored[1], out)
+    assert read_residuals(open_store(store), [out], "affine").held_out
+    folder = next(path for path in (out / "cache").glob("affine-*"))
+    (folder / "prediction_000.npy").unlink()
+    with pytest.raises(InputError, match=f"delete {folder} and run again"):
+        read_residuals(open_store(store), [out], "affine")
+
+
+def test_a_result_lists_the_settings_that_a_fit_used(scored):
+    settings = json.loads((scored[1] / "benchmark.json").read_text())["training"]
+    affine = {"recipe": "fast", "variant": "default", "seed": 0, "nuisance": "offset", "free_gain": False}
+    assert settings["affine"] == {**affine, "optimiser": "gauss-newton"}
+    assert {**settings["pbl"], **QUICK} == TrainingConfig(**QUICK).model_dump(mode="json")
+
+
+@pytest.mark.parametrize(("names", "got"), [(",", "none"), ("affine,affine", "affine, affine")])
+def test_a_list_of_models_has_names_and_each_once(names, got, store, tmp_path):
+    command = ["benchmark", str(store), "--models", names, "--out", str(tmp_path / "out")]
+    refused = CliRunner().invoke(app, command).exception
+    assert isinstance(refused, InputError)
+    assert f"models, got {got}, wanted one or more of identity" in str(refused)
+    assert not (tmp_path / "out").exists()
+
+
+def test_two_scans_have_no_lock_box_to_open_and_one_scan_no_folds():
+    two = make_scans(2, size_px=32)
+    assert len(plan_folds(two, locked_ids(two), "grouped")) == 2
+    with pytest.raises(InputError, match=r"lock box to open, got none.*at least 3 scans"):
+        plan_folds(two, locked_ids(two), "grouped", open_lock_box=True)
+    with pytest.raises(InputError, match="got 1, wanted at least 2"):
+        grouped_folds(["a"], 2)
