@@ -117,7 +117,7 @@ def evaluate(
     if scan_ids is not None:
         scans = [dataset.scan(scan_id) for scan_id in scan_ids]
     else:
-        own = bool(kept) or (frozen.card["dataset"] or {}).get("sha256") == dataset.sha256
+        own = _of_these_prints(frozen, dataset)
         scans = [scan for scan in every if open_lock_box or not own or scan.id not in locked]
     if not scans:
         raise InputError(f"scans of {store}", got="none", wanted="at least one to score")
@@ -129,7 +129,6 @@ def evaluate(
         for scan, height in zip(scans, heights, strict=True)
     ]
     protocol = protocol_for(policy, background="training" if learned else "none")
-    trained_on = set(frozen.card["training"].get("scan_ids", [])) & set(ids)
     result = Evaluation(
         schema="litho-models/evaluation/1",
         run=run_info([protocol.seed], len(scans)),
@@ -151,12 +150,23 @@ def evaluate(
         ),
         nuisance=protocol,
         noise_floor=floor,
-        trained_on_scored_scans=sorted(trained_on),
+        trained_on_scored_scans=sorted(trained_ids(frozen, dataset) & set(ids)),
         scores=score_model(frozen.name, scans, predictions, protocol),
     )
     result.write(out)
     write_evaluation_report(result, scans, [prediction.map_um for prediction in predictions], out)
     return result
+
+
+def trained_ids(model: FrozenSimulator, dataset: Store) -> set[str]:
+    """The scans that the model was trained on, none where it was made of other prints than the store's."""
+    return set(model.card["training"].get("scan_ids", [])) if _of_these_prints(model, dataset) else set()
+
+
+def _of_these_prints(model: FrozenSimulator, dataset: Store) -> bool:
+    """Whether a model was made of the prints in a store: the same dataset, or the same locked scans in it."""
+    same_dataset = (model.card["dataset"] or {}).get("sha256") == dataset.sha256
+    return same_dataset or bool(_locked_by_the_card(model, dataset))
 
 
 def _locked_by_the_card(model: FrozenSimulator, dataset: Store) -> list[str]:

@@ -11,7 +11,7 @@ import numpy as np
 from litho_data.errors import InputError
 from litho_data.store import PrintedScan, Store
 from litho_models import zoo
-from litho_models.evaluate import predict_frozen
+from litho_models.evaluate import predict_frozen, trained_ids
 from litho_models.freeze import load_frozen
 from litho_models.model_card import CARD_FILE
 from litho_models.noise.calibration import Residuals
@@ -108,7 +108,7 @@ def _of_frozen(store: Store, folders: Sequence[Path]) -> tuple[str, Predictions,
     models = [load_frozen(folder) for folder in folders]
     for frozen in models:
         frozen.check_geometry(store.pitch_um, store.level_height_um)
-    trained_on = {scan_id for frozen in models for scan_id in frozen.card["training"].get("scan_ids", [])}
+    trained_on = {scan_id for frozen in models for scan_id in trained_ids(frozen, store)}
     every = store.scans()
     locked = locked_ids(every)
     scans: list[PrintedScan] = [scan for scan in every if scan.id not in locked]

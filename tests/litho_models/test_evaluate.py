@@ -1,0 +1,30 @@
+"""Evaluation of a frozen model: what it was trained on counts only among the same prints."""
+
+from __future__ import annotations
+
+import pytest
+from prints import make_scans, write_store
+
+from litho_data.store import open_store
+from litho_models.evaluate import evaluate
+from litho_models.noise.residuals import read_residuals
+from litho_models.runs import train
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("trained")
+    store = write_store(folder / "made.zarr", make_scans(4, size_px=64))
+    return store, train(store, "identity", folder / "run"), folder / "run"
+
+
+# Built anew the heights differ, and with them the hash: the prints are the same by their name.
+@pytest.mark.parametrize(("name", "same"), [("made", True), ("other", False)])
+def test_equal_ids_in_another_dataset_were_not_used_in_training(trained, tmp_path, name, same):
+    _, run, folder = trained
+    store = write_store(tmp_path / "anew.zarr", make_scans(4, size_px=64, datum_um=0.02), name=name)
+    scored = evaluate(folder / "model", store, tmp_path / "out")
+    assert set(run.training_ids) & set(scored.split.scored_ids)
+    assert scored.trained_on_scored_scans == (sorted(run.training_ids) if same else [])
+    assert ("not a held-out error" in (tmp_path / "out" / "report.html").read_text()) == same
+    assert read_residuals(open_store(store), [folder / "model"]).held_out == (not same)
