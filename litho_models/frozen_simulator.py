@@ -29,6 +29,8 @@ class FrozenSimulator(nn.Module):
         self.card: Mapping[str, Any] = card.model_dump(mode="json", by_alias=True)
         self.sha256 = sha256
         self.extrapolate = extrapolate
+        # Receptive radius, µm; None where a pixel depends on the whole image.
+        self.reach_um = simulator.reach_um if isinstance(simulator, Simulator) else None
         self._lowest_um, self._highest_um = card.calibrated_range_um
         self.eval().requires_grad_(False)
 
@@ -42,11 +44,6 @@ class FrozenSimulator(nn.Module):
         """Lateral sampling that the model is made for, µm."""
         return self.card["pitch_um"]
 
-    @property
-    def reach_um(self) -> float | None:
-        """Receptive radius, µm; None where a pixel depends on the whole image."""
-        return self.card["receptive_radius_um"]
-
     def train(self, mode: bool = True) -> FrozenSimulator:
         """Frozen models stay in eval mode."""
         return super().train(False)
@@ -57,12 +54,13 @@ class FrozenSimulator(nn.Module):
         """Printed height (b, 1, y, x), µm.
 
         Args:
-            layout_um: nominal height (b, 1, y, x), µm, float.
+            layout_um: nominal height (b, 1, y, x), µm, of the weights' dtype: float32, or float64 after
+                ``double()``.
             pitch_um: sampling of the layout, if the caller wants it checked; so is ``level_height_um``.
 
         Raises:
-            InputError: another pitch or level height, another shape, or heights beyond the calibrated
-                range without ``extrapolate``.
+            InputError: another pitch or level height, no tensor, another shape or dtype, or heights beyond
+                the calibrated range without ``extrapolate``.
         """
         self._check_layout(layout_um, pitch_um, level_height_um)
         if isinstance(self.simulator, Simulator):
@@ -89,8 +87,24 @@ class FrozenSimulator(nn.Module):
 
     def _check_layout(self, layout_um: Tensor, pitch_um: float | None, level_height_um: float | None) -> None:
         self.check_geometry(pitch_um, level_height_um)
-        if layout_um.ndim != 4 or layout_um.shape[1] != 1:
-            raise InputError("layout", got=f"shape {tuple(layout_um.shape)}", wanted="(batch, 1, y, x)")
+        if not isinstance(layout_um, Tensor):
+            raise InputError(
+                "layout",
+                got=f"a {type(layout_um).__name__}",
+                wanted="a tensor of PyTorch",
+                hint="torch.from_numpy makes one of a NumPy array",
+            )
+        if layout_um.ndim != 4 or layout_um.shape[1] != 1 or not layout_um.numel():
+            raise InputError(
+                "layout", got=f"shape {tuple(layout_um.shape)}", wanted="(batch, 1, y, x), none of them 0"
+            )
+        # A model without weights takes every floating-point layout.
+        own = layout_um.dtype if layout_um.is_floating_point() else torch.float32
+        wanted = next((weight.dtype for weight in self.parameters()), own)
+        if layout_um.dtype != wanted:
+            raise InputError(
+                "layout", got=layout_um.dtype, wanted=f"{wanted}, as the weights", hint=f"layout.to({wanted})"
+            )
         if not self.extrapolate:
             self._check_range(layout_um)
 
@@ -102,7 +116,7 @@ class FrozenSimulator(nn.Module):
         """
         for name, given in (("pitch_um", pitch_um), ("level_height_um", level_height_um)):
             wanted = self.card[name]
-            if given is not None and abs(given - wanted) > 1e-9:
+            if given is not None and not abs(given - wanted) <= 1e-9:
                 raise InputError(
                     f"{name} for model {self.name}", got=f"{given:g} µm", wanted=f"{wanted:g} µm"
                 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from litho_data.errors import InputError
 from litho_models.freeze import load_frozen, save_frozen
 from litho_models.models import MODELS, build_model
 from litho_models.simulator import VARIANTS, Simulator
@@ -187,6 +188,22 @@ def test_a_frozen_model_is_the_model(name, variant, tmp_path):
     assert field.grad.abs().sum() > 0
     assert not any(parameter.requires_grad for parameter in frozen.parameters())
     assert frozen.name == name
+
+
+@pytest.mark.parametrize("name", list(MODELS))
+def test_a_frozen_model_takes_layouts_of_its_own_precision_only(name, tmp_path):
+    model = make(name)
+    save_frozen(model, tmp_path / "model")
+    frozen, others = load_frozen(tmp_path / "model"), [torch.int64, torch.uint8, torch.bool]
+    if list(model.parameters()):
+        others += [torch.float64, torch.float16, torch.bfloat16]
+    for dtype in others:
+        with pytest.raises(InputError, match=r"wanted torch\.float32, as the weights"):
+            frozen(layout().to(dtype))
+    single, double = frozen(layout()), frozen.double()(layout().double())
+    assert (single.dtype, double.dtype) == (torch.float32, torch.float64)
+    # Roundings of 1e-7 of 1 µm, which slopes and layers of these small models amplify some tens of times.
+    assert torch.allclose(single.double(), double, rtol=0, atol=1e-5)
 
 
 @pytest.mark.parametrize(("name", "variant"), [("physics", "paper"), ("physics", "authors")])
