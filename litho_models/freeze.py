@@ -78,6 +78,7 @@ def save_frozen(
             )
         except ValidationError as error:
             raise InputError("model card", got=first_error(error), wanted=ModelCard.SCHEMA) from error
+        _check_effects(card)
         card.write(temporary)
         (temporary / README_FILE).write_text(model_readme(card), encoding="utf-8")
     return Path(folder)
@@ -98,6 +99,7 @@ def load_frozen(
     """
     path = Path(folder)
     card = ModelCard.read(path / CARD_FILE)
+    _check_effects(card)
     simulator = load_simulator(path, card)
     model: nn.Module = simulator
     if card.process_effects:
@@ -144,3 +146,19 @@ def _empty_simulator(card: ModelCard, weights: Path) -> Simulator:
     if stated != (config.pitch_um, config.level_height_um, config.levels):
         raise InputError("card", got=f"geometry {stated}", wanted="the same in hyper_parameters")
     return known(config)
+
+
+def _check_effects(card: ModelCard) -> None:
+    """Refuse process effects that are none, or whose values no printer has."""
+    from litho_models.effects import get_effect
+
+    for name, values in card.process_effects.items():
+        effect = get_effect(name)
+        if effect.role != "process" and name not in card.declared_processes:
+            raise InputError(
+                "process effect",
+                got=f"{name}, whose role is {effect.role}",
+                wanted="an effect of the printer",
+                hint="`litho-models freeze --declare-process` takes in an undetermined one",
+            )
+        effect.require_in_range(values)

@@ -18,6 +18,9 @@ Kind = Literal["amplitude", "shape", "choice"]
 
 Values = Mapping[str, Tensor]
 
+# Share of a range: a value fitted to a bound is stored in float32.
+_ROUNDING = 1e-6
+
 
 @dataclass(frozen=True)
 class Parameter:
@@ -181,6 +184,20 @@ class Effect:
                 f"parameter of {self.name}", got=", ".join(sorted(unknown)), wanted=", ".join(self.parameters)
             )
         return {**self.off_values(), **values}
+
+    def require_in_range(self, values: Mapping[str, float]) -> None:
+        """Refuse values that this effect cannot have.
+
+        Raises:
+            InputError: a name this effect does not have, or a value outside its physical range.
+        """
+        for name, value in self.with_values(values).items():
+            limits = self.parameters[name]
+            slack = _ROUNDING * (limits.upper - limits.lower)
+            if not limits.lower - slack <= value <= limits.upper + slack:
+                raise InputError(
+                    f"{name} of {self.name}", got=value, wanted=f"{limits.lower:g} to {limits.upper:g}"
+                )
 
     def __call__(self, array: Tensor, values: Mapping[str, float | Tensor], context: FieldContext) -> Tensor:
         """Apply the effect; numbers become tensors on the array's device."""

@@ -94,8 +94,13 @@ def get_effect(name: str) -> Effect:
 
 
 def in_forward_order(names: Sequence[str]) -> list[str]:
-    """The names sorted as the effects act, from exposure to microscope."""
-    return [name for name in CATALOGUE if name in set(names)]
+    """The names sorted as the effects act, from exposure to microscope.
+
+    Raises:
+        InputError: a name that is no effect's.
+    """
+    given = {get_effect(name).name for name in names}
+    return [name for name in CATALOGUE if name in given]
 
 
 def screened_effects() -> list[Effect]:

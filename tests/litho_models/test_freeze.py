@@ -103,6 +103,10 @@ def pickled_weights(folder):
     rehash(folder)
 
 
+def with_effect(name, **values):
+    return lambda folder: edit_card(folder, process_effects={name: values})
+
+
 class _Bomb:
     def __reduce__(self):
         return (exec, ("raise SystemExit('code ran on loading')",))
@@ -122,6 +126,12 @@ DAMAGE = {
     "unknown model": lambda f: edit_card(f, model="os.system"),
     "unknown hyper-parameter": lambda f: edit_card(f, hyper_parameters={"depth": 3}),
     "geometry of another card": lambda f: edit_card(f, pitch_um=0.2),
+    "unknown effect": with_effect("nope", a=1.0),
+    "effect of the microscope": with_effect("z-gain", gain=0.1),
+    "undetermined effect": with_effect("slope-thinning", along_x_um=0.3),
+    "unknown parameter of an effect": with_effect("vignetting", zzz=0.1),
+    "effect that is not a number": with_effect("vignetting", strength=float("nan")),
+    "effect beyond its range": with_effect("vignetting", strength=1e6),
 }
 
 
@@ -131,6 +141,20 @@ def test_damaged_or_foreign_files_are_refused_in_one_line(folder, damage):
     with pytest.raises(InputError) as caught:
         load_frozen(folder)
     assert "\n" not in str(caught.value)
+
+
+def test_what_would_not_load_is_not_saved(tmp_path):
+    for effects in ({"nope": {"a": 1.0}}, {"z-gain": {"gain": 0.1}}, {"vignetting": {"strength": 7.0}}):
+        with pytest.raises(InputError):
+            save_frozen(build_model("physics"), tmp_path / "model", process_effects=effects)
+    assert not (tmp_path / "model").exists()
+
+
+def test_an_effect_at_its_bound_loads_as_float32_rounds_it(tmp_path):
+    for name, values in (("vignetting", {"strength": 0.6}), ("long-range-proximity", {"weight": -0.3})):
+        rounded = {key: float(torch.tensor(value)) for key, value in values.items()}
+        folder = save_frozen(build_model("physics"), tmp_path / name, process_effects={name: rounded})
+        assert load_frozen(folder).card["process_effects"] == {name: rounded}
 
 
 def test_weights_that_are_not_finite_are_not_saved(tmp_path):
