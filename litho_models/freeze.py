@@ -98,7 +98,7 @@ def load_frozen(
         InputError: no such folder, or a card or weights that are damaged, foreign or do not fit.
     """
     path = Path(folder)
-    card = ModelCard.read(path / CARD_FILE)
+    card = ModelCard.read(path)
     _check_effects(card)
     simulator = load_simulator(path, card)
     model: nn.Module = simulator

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from pathlib import Path
+from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field
 
+from litho_data.errors import InputError
 from litho_data.results import Record, Result
 from litho_models.background import Background, BackgroundUse
 
@@ -73,3 +75,21 @@ class ModelCard(Result):
     optimiser_gap: float | None = None
     limitations: list[str] = Field(default_factory=list)
     versions: dict[str, str] = Field(default_factory=dict)
+
+    @classmethod
+    def read(cls, path: str | Path) -> Self:
+        """Read the card in a folder.
+
+        Raises:
+            InputError: no card there, or one that is damaged or of another schema.
+        """
+        folder = Path(path) if Path(path).is_dir() else Path(path).parent
+        if not (folder / CARD_FILE).exists():
+            inside = sorted(card.parent for card in folder.glob(f"*/{CARD_FILE}"))
+            raise InputError(
+                f"model in {folder}",
+                got=f"no {CARD_FILE}",
+                wanted="the folder of a frozen model",
+                hint=f"take {inside[0]}" if inside else "`litho-models freeze RUN --out FOLDER` writes one",
+            )
+        return super().read(folder)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from prints import make_scans, write_store
 
+from litho_data.errors import InputError
 from litho_data.store import open_store
 from litho_models.evaluate import evaluate
 from litho_models.noise.residuals import read_residuals
@@ -28,3 +29,13 @@ def test_equal_ids_in_another_dataset_were_not_used_in_training(trained, tmp_pat
     assert scored.trained_on_scored_scans == (sorted(run.training_ids) if same else [])
     assert ("not a held-out error" in (tmp_path / "out" / "report.html").read_text()) == same
     assert read_residuals(open_store(store), [folder / "model"]).held_out == (not same)
+
+
+def test_a_run_folder_is_answered_with_the_place_of_its_model(trained, tmp_path):
+    store, _, folder = trained
+    with pytest.raises(InputError, match=f"take {folder}/model$") as caught:
+        evaluate(folder, store, tmp_path / "out")
+    assert "\n" not in str(caught.value)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="litho-models freeze"):
+        evaluate(tmp_path / "empty", store, tmp_path / "out")
