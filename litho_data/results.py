@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
+import reprlib
 import sys
 from importlib import metadata
 from pathlib import Path
@@ -14,6 +15,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from litho_data.errors import InputError
 from litho_data.files import atomic_file
 
+# A value that does not belong may be of any size and nested to any depth.
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = 120
 _REPORTED_PACKAGES = ("litholoop", "numpy", "scipy", "torch", "opencv-python-headless", "xarray", "zarr")
 
 
@@ -52,8 +56,8 @@ class Result(Record):
         file = Path(path)
         file = file / cls.FILE_NAME if file.is_dir() else file
         try:
-            content: Any = json.loads(file.read_text(encoding="utf-8"))
-        except (OSError, ValueError) as error:
+            content: Any = json.loads(file.read_text(encoding="utf-8"), parse_constant=_refuse)
+        except (OSError, ValueError, RecursionError) as error:
             raise InputError(f"cannot read {file} as JSON", got=str(error), wanted=cls.SCHEMA) from error
         schema = content.get("schema") if isinstance(content, dict) else None
         if schema != cls.SCHEMA:
@@ -67,8 +71,12 @@ class Result(Record):
 def first_error(error: ValidationError) -> str:
     """The first complaint of pydantic as one line: where, what, and the value."""
     first = error.errors()[0]
-    where = ".".join(str(part) for part in first["loc"]) or "(root)"
-    return f"{where}: {first['msg']} (value {first['input']!r})"
+    where = ".".join(str(part) for part in first["loc"][:8]) or "(root)"
+    return f"{where}: {first['msg']} (value {_SHORT.repr(first['input'])})"
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(f"{constant} is no number of JSON")
 
 
 def software_versions() -> dict[str, str]:

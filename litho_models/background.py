@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
+from pydantic import ConfigDict
 
 from litho_data.results import Record
 from litho_data.store import PrintedScan
@@ -28,6 +29,8 @@ class Background(Record):
     x and y run from -1 to 1 over a field of ``field_um`` (y, x); each term has a mean of zero over it,
     so that a background moves no datum.
     """
+
+    model_config = ConfigDict(allow_inf_nan=False)
 
     x_nm: float
     y_nm: float

@@ -6,6 +6,7 @@ people. Only numbers and names of known classes are read: nothing is unpickled.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import torch
 from pydantic import ValidationError
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
-from torch import nn
+from torch import Tensor, nn
 
 from litho_data.errors import InputError
 from litho_data.files import atomic_folder, file_sha256
@@ -46,14 +47,10 @@ def save_frozen(
         card_fields: further fields of ``ModelCard`` (dataset, training, split, metrics, …).
 
     Raises:
-        InputError: weights that are not finite, or card fields that do not belong.
+        InputError: weights that are not finite or not float32, or card fields that do not belong.
     """
     state = {key: value.detach().cpu().contiguous() for key, value in simulator.state_dict().items()}
-    broken = [key for key, value in state.items() if not torch.isfinite(value).all()]
-    if broken:
-        raise InputError(
-            f"weights of {simulator.name}", got=f"non-finite values in {broken[0]}", wanted="numbers"
-        )
+    _check_numbers(state, f"weights of {simulator.name}")
     require_replaceable_folder(folder, WEIGHTS_FILE, CARD_FILE, README_FILE)
     config = simulator.config
     with atomic_folder(folder) as temporary:
@@ -128,11 +125,20 @@ def load_simulator(folder: str | Path, card: ModelCard) -> Simulator:
             wanted=f"{card.weights_sha256[:12]}…, as its card says",
             hint="the file is damaged or belongs to another model",
         )
-    simulator = _empty_simulator(card, weights)
     try:
-        simulator.load_state_dict(load_file(weights))
-    except (SafetensorError, RuntimeError) as error:
+        state = load_file(weights)
+    except SafetensorError as error:
         raise InputError(f"weights in {weights}", got=str(error), wanted=f"those of {card.model}") from error
+    _check_numbers(state, f"weights in {weights}")
+    simulator = _empty_simulator(card, weights)
+    wanted = simulator.state_dict()
+    for key in sorted(wanted.keys() | state.keys()):
+        found, fits = (str(tuple(part[key].shape)) if key in part else "no such" for part in (state, wanted))
+        if found != fits:
+            raise InputError(
+                f"weights in {weights}", got=f"{key} {found}", wanted=f"{fits}, as in {card.model}"
+            )
+    simulator.load_state_dict(state)
     return simulator
 
 
@@ -145,7 +151,25 @@ def _empty_simulator(card: ModelCard, weights: Path) -> Simulator:
     stated = (card.pitch_um, card.level_height_um, card.levels)
     if stated != (config.pitch_um, config.level_height_um, config.levels):
         raise InputError("card", got=f"geometry {stated}", wanted="the same in hyper_parameters")
-    return known(config)
+    lowest, highest = card.calibrated_range_um
+    if not 0 <= lowest < highest <= config.full_height_um:
+        raise InputError(
+            f"calibrated_range_um beside {weights}",
+            got=f"{lowest:g} to {highest:g} µm",
+            wanted=f"a range within 0 to {config.full_height_um:g} µm, the heights of its levels",
+        )
+    try:
+        return known(config)
+    except (ArithmeticError, ValueError) as error:
+        # Each is in its range, but not with the others: a start beyond its upper bound, say.
+        raise InputError(f"hyper_parameters beside {weights}", got=str(error)) from error
+
+
+def _check_numbers(state: Mapping[str, Tensor], what: str) -> None:
+    for key, value in state.items():
+        if value.dtype != torch.float32 or not torch.isfinite(value).all():
+            got = f"{value.dtype}" if value.dtype != torch.float32 else "non-finite values"
+            raise InputError(what, got=f"{got} in {key}", wanted="finite numbers in float32")
 
 
 def _check_effects(card: ModelCard) -> None:

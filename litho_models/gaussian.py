@@ -22,6 +22,8 @@ _SMALLEST_SIGMA_PX = 0.1
 # Most of a band's matrix is zeros; wider fields are cut into blocks, which for narrow ones is no faster.
 _DENSE_PX = 768
 _SMALLEST_BLOCK_PX = 64
+# Wider than any field that is printed; a wider one would take the memory of a machine.
+_LARGEST_RADIUS_PX = 4096
 
 Edge = Literal["replicate", "zero"]
 
@@ -94,7 +96,17 @@ def _is_wide(shape: Sequence[int], radii: Sequence[int]) -> bool:
 
 
 def kernel_radius_px(sigma_px: float, support: float = SUPPORT_SIGMAS) -> int:
-    """Whole pixels on each side that hold ``support`` standard deviations; 1 at least."""
+    """Whole pixels on each side that hold ``support`` standard deviations; 1 at least.
+
+    Raises:
+        InputError: a Gaussian wider than any field, or without a width.
+    """
+    if not support * sigma_px <= _LARGEST_RADIUS_PX:
+        raise InputError(
+            "Gaussian blur",
+            got=f"a standard deviation of {sigma_px:g} px",
+            wanted=f"at most {_LARGEST_RADIUS_PX / support:g} px",
+        )
     return max(1, math.ceil(support * sigma_px))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, ClassVar, Literal, Self
 
-from pydantic import Field
+from pydantic import ConfigDict, Field, JsonValue, field_validator
 
 from litho_data.errors import InputError
 from litho_data.results import Record, Result
@@ -14,6 +14,9 @@ from litho_models.background import Background, BackgroundUse
 CARD_FILE = "card.json"
 
 EffectValues = dict[str, dict[str, float]]
+
+# What is looked up in the free facts of a training and of a split.
+_LISTS_OF_NAMES = ("scan_ids", "lock_box", "lock_box_files_sha256")
 
 
 class DatasetName(Record):
@@ -41,6 +44,8 @@ class ModelCard(Result):
     measured maps uses it, the model's height never contains it.
     """
 
+    model_config = ConfigDict(allow_inf_nan=False)
+
     SCHEMA: ClassVar[str] = "litho-models/frozen/1"
     FILE_NAME: ClassVar[str] = CARD_FILE
 
@@ -48,7 +53,7 @@ class ModelCard(Result):
     name: str
     model: str
     variant: str
-    hyper_parameters: dict[str, Any]
+    hyper_parameters: dict[str, JsonValue]
     parameters: int
     weights_sha256: str
     pitch_um: float
@@ -58,13 +63,13 @@ class ModelCard(Result):
     training_level_share: list[float] = Field(default_factory=list)
     receptive_radius_um: float | None
     dataset: DatasetName | None = None
-    training: dict[str, Any] = Field(default_factory=dict)
+    training: dict[str, JsonValue] = Field(default_factory=dict)
     command: str = ""
-    split: dict[str, Any] = Field(default_factory=dict)
-    nuisance: dict[str, Any] = Field(default_factory=dict)
+    split: dict[str, JsonValue] = Field(default_factory=dict)
+    nuisance: dict[str, JsonValue] = Field(default_factory=dict)
     background: Background | None = None
     metrics: list[Metric] = Field(default_factory=list)
-    noise_floor: dict[str, Any] | None = None
+    noise_floor: dict[str, JsonValue] | None = None
     process_effects: EffectValues = Field(default_factory=dict)
     measurement_effects: EffectValues = Field(default_factory=dict)
     undetermined_effects: EffectValues = Field(default_factory=dict)
@@ -75,6 +80,15 @@ class ModelCard(Result):
     optimiser_gap: float | None = None
     limitations: list[str] = Field(default_factory=list)
     versions: dict[str, str] = Field(default_factory=dict)
+
+    @field_validator("training", "split")
+    @classmethod
+    def _names_are_names(cls, facts: dict[str, Any]) -> dict[str, Any]:
+        for key in _LISTS_OF_NAMES:
+            names = facts.get(key, [])
+            if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+                raise ValueError(f"{key} has to be a list of names")
+        return facts
 
     @classmethod
     def read(cls, path: str | Path) -> Self:

@@ -28,7 +28,7 @@ class SimulatorConfig(BaseModel):
     variant: Variant = "default"
     pitch_um: float = Field(0.1, gt=0, description="lateral sampling, µm")
     level_height_um: float = Field(0.1, gt=0, description="nominal height of one level, µm")
-    levels: int = Field(13, ge=2, description="number of layout levels, 0 included")
+    levels: int = Field(13, ge=2, le=65536, description="number of layout levels, 0 included")
 
     @classmethod
     def of_variant(cls, variant: Variant = "default", **fields: Any) -> Self:

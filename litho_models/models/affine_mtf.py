@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 
 from litho_models.gaussian import blur_interior, kernel_radius_px
@@ -10,7 +11,7 @@ from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 
 
 class AffineMtfConfig(SimulatorConfig):
-    sigmas_um: tuple[float, ...] = (0.1, 0.2, 0.35, 0.6, 1.0, 1.8)
+    sigmas_um: tuple[float, ...] = Field((0.1, 0.2, 0.35, 0.6, 1.0, 1.8), min_length=1)
 
 
 class AffineMtf(Simulator):

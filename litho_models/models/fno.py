@@ -9,27 +9,31 @@ image, so it answers differently for another image size: ``default`` runs it on 
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import torch
-from pydantic import Field
+from pydantic import Field, PositiveInt, model_validator
 from torch import Tensor, nn
 from torch.nn import functional
 
 from litho_models.simulator import Simulator, SimulatorConfig, Tile
 from litho_models.tiles import blend_tiles
 
+# Ninety times the paper's, 0.5 GB of weights: more no card may ask of the machine that loads it.
+_MOST_MATRIX_ENTRIES = 30_000_000
+
 
 class FnoConfig(SimulatorConfig):
-    layers: int = Field(4, ge=1)
-    modes: tuple[int, int] = Field((12, 12), description="frequencies kept along y (both signs) and x")
-    width: int = Field(24, ge=1, description="channels of the layers")
-    projection_channels: int = Field(128, ge=1, description="hidden channels of the last two layers")
+    layers: int = Field(4, ge=1, le=64)
+    # Frequencies kept along y (both signs) and x.
+    modes: tuple[PositiveInt, PositiveInt] = (12, 12)
+    width: int = Field(24, ge=1, le=1024, description="channels of the layers")
+    projection_channels: int = Field(128, ge=1, le=4096, description="hidden channels of the last layers")
     # 1 x 1 in the paper: what the kept modes do not resolve can then only be mapped pixel by pixel.
-    local_px: int = Field(3, ge=1, description="side of the local convolution, odd")
+    local_px: int = Field(3, ge=1, le=15, description="side of the local convolution, odd")
     coordinates: bool = Field(False, description="y and x on 0 ... 1 of the image as further inputs")
-    padding_fraction: float = Field(0.0, ge=0, description="zeros added at bottom and right, share of image")
-    tile_px: int | None = Field(128, ge=8, description="side of a tile; None takes the image as it is")
+    padding_fraction: float = Field(0.0, ge=0, le=1, description="zeros at bottom and right, share of image")
+    tile_px: int | None = Field(128, ge=8, le=4096, description="side of a tile; None: the whole image")
     overlap_px: int = Field(32, ge=0, description="blended pixels of neighbouring tiles, at most half a tile")
     # Start as the layout and learn what differs; the paper's network starts at random.
     starts_as_layout: bool = True
@@ -46,6 +50,14 @@ class FnoConfig(SimulatorConfig):
         }
         for variant, fields in {"paper": {}, "authors": {"width": 12}}.items()
     }
+
+    @model_validator(mode="after")
+    def _can_be_built(self) -> Self:
+        if self.local_px % 2 == 0:
+            raise ValueError("local_px has to be odd")
+        if self.layers * self.width**2 * self.modes[0] * self.modes[1] > _MOST_MATRIX_ENTRIES:
+            raise ValueError(f"more than {_MOST_MATRIX_ENTRIES:g} entries in layers · width² · modes")
+        return self
 
 
 class Fno(Simulator):

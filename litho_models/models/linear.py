@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from pydantic import Field
 from torch import Tensor, nn
 
 from litho_models.gaussian import kernel_radius_px
@@ -11,7 +12,7 @@ from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 
 
 class LinearConfig(SimulatorConfig):
-    sigmas_um: tuple[float, ...] = (0.1, 0.2, 0.35, 0.6, 1.0, 1.8, 3.0)
+    sigmas_um: tuple[float, ...] = Field((0.1, 0.2, 0.35, 0.6, 1.0, 1.8, 3.0), min_length=1)
     power_sigma_um: float = 0.25
     power_reference_um: float = 0.5
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import Any, ClassVar, cast
+from typing import Annotated, Any, ClassVar, cast
 
 import torch
 from pydantic import Field
@@ -21,21 +21,23 @@ from litho_models.gaussian import Edge, blur_interior, kernel_radius_px, pad_fie
 from litho_models.lookup import PointwiseNet
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 
+Channels = Annotated[int, Field(ge=1, le=1024)]
+
 
 class PblConfig(SimulatorConfig):
     sigma_optical_um: float = Field(0.2, gt=0, description="optical spot, standard deviation, µm")
     sigma_diffusion_max_um: float = Field(2.5, gt=0, description="η, upper bound of the diffusion, µm")
     # Wider than the areawise network sees (0.5 µm): what it starts with is what it alone can learn.
     sigma_diffusion_init_um: float = Field(1.5, gt=0, description="diffusion before training, µm")
-    pointwise_channels: tuple[int, ...] = (128, 64)
-    areawise_channels: tuple[int, ...] = (64, 64, 32, 32)
+    pointwise_channels: tuple[Channels, ...] = Field((128, 64), max_length=16)
+    areawise_channels: tuple[Channels, ...] = Field((64, 64, 32, 32), max_length=16)
     leaky_slope: float = Field(0.02, ge=0)
     # Start as the optically blurred layout and learn what differs; the paper's networks start at random.
     starts_as_blur: bool = True
-    kernel_cap_px: int | None = Field(None, description="largest kernel radius; None keeps four sigma")
+    kernel_cap_px: int | None = Field(None, ge=1, description="largest kernel radius; None keeps four sigma")
     blur_modulus: bool = Field(False, description="absolute value after the diffusion blur")
     edge: Edge = "replicate"
-    knots: int = Field(1025, ge=0, description="points of a pointwise network; 0 evaluates it per pixel")
+    knots: int = Field(1025, ge=0, le=1_000_000, description="points of a pointwise network; 0: each pixel")
 
     VARIANT_FIELDS: ClassVar[dict[str, dict[str, Any]]] = {
         "paper": {"starts_as_blur": False, "edge": "zero"},

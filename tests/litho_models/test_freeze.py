@@ -7,9 +7,10 @@ import pickle
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 import torch
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
 from litho_data.errors import InputError
 from litho_models import load_frozen, save_frozen
@@ -64,6 +65,10 @@ def test_it_stays_frozen(folder):
         (lambda m: m(torch.full((1, 1, 64, 64), -0.1)), "calibrated range"),
         (lambda m: m(torch.full((1, 1, 64, 64), float("nan"))), "calibrated range"),
         (lambda m: m(torch.zeros(64, 64)), "shape"),
+        (lambda m: m(torch.zeros(0, 1, 64, 64)), "shape"),
+        (lambda m: m(torch.zeros(1, 1, 0, 64)), "shape"),
+        (lambda m: m(torch.zeros(1, 1, 64, 64), pitch_um=float("nan")), "pitch_um"),
+        (lambda m: m(np.zeros((1, 1, 64, 64), "f4")), "torch.from_numpy"),
     ],
 )
 def test_it_refuses_in_one_line_what_it_was_not_made_for(folder, call, said):
@@ -103,6 +108,22 @@ def pickled_weights(folder):
     rehash(folder)
 
 
+def changed_weights(change):
+    def damage(folder):
+        state = load_file(folder / WEIGHTS_FILE)
+        save_file({key: change(value) for key, value in state.items()}, folder / WEIGHTS_FILE)
+        rehash(folder)
+
+    return damage
+
+
+def edit_hyper_parameters(folder, **changes):
+    edit_card(
+        folder,
+        hyper_parameters={**json.loads((folder / CARD_FILE).read_text())["hyper_parameters"], **changes},
+    )
+
+
 def with_effect(name, **values):
     return lambda folder: edit_card(folder, process_effects={name: values})
 
@@ -126,6 +147,23 @@ DAMAGE = {
     "unknown model": lambda f: edit_card(f, model="os.system"),
     "unknown hyper-parameter": lambda f: edit_card(f, hyper_parameters={"depth": 3}),
     "geometry of another card": lambda f: edit_card(f, pitch_um=0.2),
+    "card nested beyond reading": lambda f: (f / CARD_FILE).write_text("[" * 100_000),
+    "card nested deeply": lambda f: edit_card(f, training={"scan_ids": [], "deep": nested(400)}),
+    "a value nested deeply": lambda f: edit_card(f, name=nested(400)),
+    "not a number": lambda f: edit_card(f, pitch_um=float("nan")),
+    "not a number among free facts": lambda f: edit_card(f, noise_floor={"mae_nm": float("nan")}),
+    "weights that are not numbers": changed_weights(lambda value: value * float("nan")),
+    "whole numbers as weights": changed_weights(lambda value: value.long()),
+    "weights of another precision": changed_weights(lambda value: value.double()),
+    "weights of another shape": changed_weights(lambda value: value.repeat(3)),
+    "no list of trained scans": lambda f: edit_card(f, training={"scan_ids": None}),
+    "no list of locked scans": lambda f: edit_card(f, split={"lock_box": 7}),
+    "no list of locked files": lambda f: edit_card(f, split={"lock_box_files_sha256": [5]}),
+    "reversed range": lambda f: edit_card(f, calibrated_range_um=[1.2, 0.0]),
+    "range beyond the levels": lambda f: edit_card(f, calibrated_range_um=[-1e9, 1e9]),
+    "blur wider than any field": lambda f: edit_hyper_parameters(f, sigma_diffusion_max_um=1e9),
+    "start outside its range": lambda f: edit_hyper_parameters(f, sigma_diffusion_init_um=3.0),
+    "steepness beyond numbers": lambda f: edit_hyper_parameters(f, alpha_init=1e9),
     "unknown effect": with_effect("nope", a=1.0),
     "effect of the microscope": with_effect("z-gain", gain=0.1),
     "undetermined effect": with_effect("slope-thinning", along_x_um=0.3),
@@ -135,18 +173,53 @@ DAMAGE = {
 }
 
 
+def nested(depth):
+    """A list in a list in a list …"""
+    return json.loads("[" * depth + "]" * depth)
+
+
 @pytest.mark.parametrize("damage", list(DAMAGE))
 def test_damaged_or_foreign_files_are_refused_in_one_line(folder, damage):
     DAMAGE[damage](folder)
     with pytest.raises(InputError) as caught:
         load_frozen(folder)
     assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 1000
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("fno", {"width": 10**7}),
+        ("fno", {"width": 10**12}),
+        ("fno", {"layers": 10**9}),
+        ("fno", {"modes": [0, 4]}),
+        ("fno", {"tile_px": 10**9}),
+        ("fno", {"local_px": 4}),
+        ("pbl", {"pointwise_channels": [-1]}),
+        ("pbl", {"areawise_channels": [1024] * 100_000}),
+        ("pbl", {"knots": 10**12}),
+        ("affine-mtf", {"sigmas_um": []}),
+        ("blur-table", {"levels": 10**12}),
+    ],
+)
+def test_no_size_in_a_card_takes_memory(tmp_path, name, changes):
+    small = {"fno": {"width": 2, "modes": (4, 4), "projection_channels": 2}}.get(name, {})
+    folder = save_frozen(build_model(name, **small), tmp_path / "model")
+    edit_hyper_parameters(folder, **changes)
+    edit_card(folder, **{key: value for key, value in changes.items() if key == "levels"})
+    with pytest.raises(InputError) as caught:
+        load_frozen(folder)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 1000
 
 
 def test_what_would_not_load_is_not_saved(tmp_path):
     for effects in ({"nope": {"a": 1.0}}, {"z-gain": {"gain": 0.1}}, {"vignetting": {"strength": 7.0}}):
         with pytest.raises(InputError):
             save_frozen(build_model("physics"), tmp_path / "model", process_effects=effects)
+    with pytest.raises(InputError, match="float32"):
+        save_frozen(build_model("physics").double(), tmp_path / "model")
     assert not (tmp_path / "model").exists()
 
 
