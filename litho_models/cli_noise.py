@@ -9,8 +9,13 @@ import typer
 
 from litho_data.errors import InputError
 
+# What only single files need, and what only a store has.
+OF_FILES = ("substrate", "flat", "steps", "unit", "size_um", "level_height_um")
+OF_A_STORE = ("residuals", "model", "seed")
+
 
 def noise(
+    context: typer.Context,
     out: Annotated[Path, typer.Option("--out", help="folder for noise.json, report and tables")],
     store: Annotated[
         Path | None, typer.Argument(help="dataset store; its scans of use substrate, flat and steps are used")
@@ -42,10 +47,7 @@ def noise(
     from litho_models.noise import noise as analyse
     from litho_models.noise import noise_of_files
 
-    if (store is None) == (flat is None):
-        raise InputError(
-            "noise", got="neither or both", wanted="a store, or --flat with --substrate, --steps"
-        )
+    _check_given(context)
     if store is not None:
         result = analyse(store, out, residuals=residuals or (), model=model, seed=seed)
     else:
@@ -70,3 +72,23 @@ def noise(
     if result.dose is not None:
         typer.echo(f"recommended dose {result.dose.recommended_dose:g}: {result.dose.reason}")
     typer.echo(f"report {out / 'report.html'}")
+
+
+def _check_given(context: typer.Context) -> None:
+    """A store, or files with a flat print among them, and each with its own options only."""
+    sources = {name: context.get_parameter_source(name) for name in context.params}
+    given = {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
+
+    def options(names: tuple[str, ...]) -> str:
+        return ", ".join(f"--{name.replace('_', '-')}" for name in names if name in given)
+
+    if "store" in given and (of_files := options(OF_FILES)):
+        raise InputError("noise", got=f"a store and {of_files}", wanted="a store, or files without one")
+    if "store" not in given and "flat" not in given:
+        raise InputError(
+            "noise", got=options(OF_FILES) or "nothing to analyse", wanted="a store, or --flat and its scan"
+        )
+    if "flat" in given and (of_a_store := options(OF_A_STORE)):
+        raise InputError("noise", got=f"--flat and {of_a_store}", wanted=f"a store for {of_a_store}")
+    if "level_height_um" in given and "store" not in given and "steps" not in given:
+        raise InputError("noise", got="--level-height-um", wanted="--steps with it, whose nominal step it is")

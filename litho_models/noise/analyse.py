@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from litho_data.errors import InputError
 from litho_data.readers import read_scan
 from litho_data.store import Store, open_store
 from litho_models.model_card import DatasetName
@@ -56,6 +57,8 @@ def noise(
     Raises:
         InputError: a store or residuals that cannot be read or do not belong together.
     """
+    if model is not None and not residuals:
+        raise InputError("model", got=f"{model} and no residuals", wanted="a benchmark to choose it from")
     dataset = open_store(store)
     every = dataset.scans()
     locked = locked_ids(every)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from pydantic import Field
 
 from litho_data.errors import InputError
 from litho_data.results import Record
@@ -27,6 +28,7 @@ from litho_models.noise.variance import (
     sigma_nm,
     variance_model,
 )
+from litho_models.score_records import NuisanceProtocol
 
 _FOLDS = 5
 _PIXELS_PER_SCAN = 20_000
@@ -72,7 +74,10 @@ class Calibration(Record):
 
 
 class SpreadAnalysis(Record):
-    """σ(x) of one model's residuals and its calibration; ``bins`` are out of fold, the model is of all."""
+    """σ(x) of one model's residuals and its calibration; ``bins`` are out of fold, the model is of all.
+
+    ``nuisance``: what the residuals were freed of; in results of before it was stated, an offset only.
+    """
 
     model: str
     members: int
@@ -83,11 +88,13 @@ class SpreadAnalysis(Record):
     variance: VarianceModel
     bins: list[SigmaBin]
     calibrations: list[Calibration]
+    nuisance: NuisanceProtocol = Field(default_factory=NuisanceProtocol)
 
 
 class Residuals(NamedTuple):
     """Out-of-fold residuals of one model: scans, measured minus predicted (nm, NaN where not scored), and
-    the standard deviation of the members' predictions (nm), None for a single one."""
+    the standard deviation of the members' predictions (nm), None for a single one; ``protocol`` is what the
+    residuals were freed of."""
 
     model: str
     scans: Sequence[PrintedScan]
@@ -95,6 +102,7 @@ class Residuals(NamedTuple):
     disagreement_nm: Sequence[np.ndarray] | None
     members: int
     held_out: bool
+    protocol: NuisanceProtocol = NuisanceProtocol()
 
 
 def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
@@ -141,6 +149,7 @@ def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
         variance=variance_model(everything),
         bins=sigma_bins(scans, residuals, by_covariates),
         calibrations=calibrations,
+        nuisance=found.protocol,
     )
 
 

@@ -115,10 +115,12 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
 
     page.heading(f"Uncertainty of {found.model}")
     origin = "out of fold" if found.held_out else "of scans that the model was trained on: too small"
+    shared = "with" if found.nuisance.background == "training" else "without"
+    background = f"{shared} the background that the training scans share"
     page.paragraph(
-        f"Residuals {origin}, each scan freed of its offset: RMS {found.residual_rms_nm:.2f} nm, MAE "
-        f"{found.residual_mae_nm:.2f} nm. They hold the noise and what the model lacks. σ(x) is fitted on "
-        "other scans than it is judged on."
+        f"Residuals {origin}, each scan freed by policy {found.nuisance.policy}, {background}: RMS "
+        f"{found.residual_rms_nm:.2f} nm, MAE {found.residual_mae_nm:.2f} nm. They hold the noise and what "
+        "the model lacks. σ(x) is fitted on other scans than it is judged on."
     )
     if found.epistemic_rms_nm is not None:
         page.paragraph(
@@ -146,7 +148,16 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
     ]
     page.table(pd.DataFrame(rows), "Means over scans; NLL in nats of nm.", "calibration.csv", digits=3)
     scans = [
-        {"σ": one.name, **_flat_row(row.model_dump())} for one in found.calibrations for row in one.scans
+        {
+            "σ": one.name,
+            **row.model_dump(exclude={"coverage"}),
+            **{
+                f"coverage_{100 * level:.0f}": share
+                for level, share in zip(one.levels, row.coverage, strict=True)
+            },
+        }
+        for one in found.calibrations
+        for row in one.scans
     ]
     page.table(pd.DataFrame(scans), "By scan.", "calibration_scans.csv", digits=3)
     page.table(
@@ -158,11 +169,6 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
         digits=4,
     )
     page.table(pd.DataFrame([row.model_dump() for row in found.bins]), "The bins.", "spread.csv")
-
-
-def _flat_row(row: dict) -> dict:
-    shares = row.pop("coverage")
-    return {**row, "coverage_50": shares[0], "coverage_80": shares[1], "coverage_90": shares[2]}
 
 
 def _bounds(result: NoiseAnalysis) -> pd.DataFrame:

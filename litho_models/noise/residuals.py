@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,21 +10,25 @@ import numpy as np
 from litho_data.errors import InputError
 from litho_data.store import PrintedScan, Store
 from litho_models import zoo
-from litho_models.evaluate import predict_frozen, trained_ids
+from litho_models.background import Background
+from litho_models.evaluate import card_background, predict_frozen, trained_ids
 from litho_models.freeze import load_frozen
 from litho_models.model_card import CARD_FILE
 from litho_models.noise.calibration import Residuals
 from litho_models.noise.surface import NM_PER_UM
-from litho_models.nuisance import Policy, cross_fitted_residual
+from litho_models.nuisance import cross_fitted_residual
+from litho_models.score_records import NuisanceProtocol, Prediction
+from litho_models.scores import protocol_for
 from litho_models.splits import locked_ids
 
 Predictions = dict[str, list[np.ndarray]]
 
 
-def read_residuals(
-    store: Store, sources: Sequence[str | Path], model: str | None = None, policy: Policy = "offset"
-) -> Residuals:
+def read_residuals(store: Store, sources: Sequence[str | Path], model: str | None = None) -> Residuals:
     """Measured minus the mean prediction of all members, each scan freed of its nuisances by cross-fitting.
+
+    The protocol is that of the benchmark, or of ``evaluate`` for a frozen model: the same pixels, policy and
+    shared background, so that these are the residuals whose mean absolute value is the error stated there.
 
     Args:
         store: the store that the sources were made from.
@@ -33,31 +36,36 @@ def read_residuals(
             the fit never saw, or frozen models (folders, ``zoo:NAME``); not both kinds at once. The lock box
             is left out.
         model: which model of a benchmark; its best one by default.
-        policy: nuisances.
 
     Raises:
-        InputError: a folder that is neither, sources of another dataset, or no scan that all predict.
+        InputError: a folder that is neither, one given twice, sources of another dataset or of different
+            policies, a ``model`` beside frozen ones, or no scan that all predict.
     """
     folders = [zoo.model_folder(source, other="or that of a benchmark") for source in sources]
+    if len({folder.resolve() for folder in folders}) < len(folders):
+        raise InputError("residuals", got="one source twice", wanted="different members of an ensemble")
     frozen = [(folder / CARD_FILE).exists() for folder in folders]
     if any(frozen) and not all(frozen):
         raise InputError("residuals", got="benchmarks and frozen models", wanted="one kind of source")
     if all(frozen):
-        name, members, held_out = _of_frozen(store, folders)
+        if model is not None:
+            raise InputError("model", got=f"{model} and a frozen one", wanted="a benchmark to choose it from")
+        name, members, protocol, held_out = _of_frozen(store, folders)
     else:
-        name, members = _of_benchmarks(store, folders, model)
+        name, members, protocol = _of_benchmarks(store, folders, model)
         held_out = True
     scans = [store.scan(scan_id) for scan_id in store.ids if scan_id in members]
     if not scans:
         raise InputError("residuals", got="no scan of the store", wanted="predictions of its scans")
     count = min(len(members[scan.id]) for scan in scans)
     residuals = []
+    geometry = protocol.model_dump(include={"block_px", "buffer_px", "seed"})
     for scan in scans:
         mean = np.mean(members[scan.id], axis=0)
-        fit = cross_fitted_residual(scan.height_um, mean, scan.valid, policy)
+        fit = cross_fitted_residual(scan.height_um, mean, scan.valid, protocol.policy, **geometry)
         residuals.append(NM_PER_UM * fit.residual_um)
     spread = [NM_PER_UM * disagreement_um(members[scan.id]) for scan in scans] if count > 1 else None
-    return Residuals(name, scans, residuals, spread, count, held_out)
+    return Residuals(name, scans, residuals, spread, count, held_out, protocol)
 
 
 def disagreement_um(predictions_um: Sequence[np.ndarray]) -> np.ndarray:
@@ -69,11 +77,14 @@ def disagreement_um(predictions_um: Sequence[np.ndarray]) -> np.ndarray:
     return stack.std(axis=0, ddof=1)
 
 
-def _of_benchmarks(store: Store, folders: Sequence[Path], model: str | None) -> tuple[str, Predictions]:
+def _of_benchmarks(
+    store: Store, folders: Sequence[Path], model: str | None
+) -> tuple[str, Predictions, NuisanceProtocol]:
     from litho_models.benchmark import Benchmark
 
     members: Predictions = {}
     chosen = model
+    protocols = []
     for folder in folders:
         result = Benchmark.read(folder)
         if result.dataset.sha256 != store.sha256:
@@ -85,26 +96,37 @@ def _of_benchmarks(store: Store, folders: Sequence[Path], model: str | None) -> 
         if chosen not in names:
             raise InputError(f"model of {folder}", got=chosen, wanted=", ".join(names))
         allowed = set(result.split.scored_ids) & set(store.ids)
+        protocols.append(result.nuisance)
+        with_background = result.nuisance.background == "training"
         for fit in (entry for entry in result.fits if entry.model == chosen):
-            for scan_id, prediction in _cached(folder, fit.model, fit.key).items():
+            learned = fit.diagnostics.background if with_background and fit.diagnostics else None
+            for scan_id, height_um in _cached(folder, fit.model, fit.key).items():
                 if scan_id in allowed:
-                    members.setdefault(scan_id, []).append(prediction)
-    return str(chosen), members
+                    members.setdefault(scan_id, []).append(_map_um(height_um, learned))
+    policies = sorted({protocol.policy for protocol in protocols})
+    if len(policies) > 1:
+        raise InputError("nuisance policies of the benchmarks", got=", ".join(policies), wanted="one")
+    return str(chosen), members, protocols[0]
+
+
+def _map_um(height_um: np.ndarray, learned: Background | None) -> np.ndarray:
+    background_um = learned.map_um((height_um.shape[0], height_um.shape[1])) if learned else None
+    return Prediction(height_um, background_um).map_um
 
 
 def _cached(folder: Path, model: str, key: str) -> dict[str, np.ndarray]:
-    cache = folder / "cache" / f"{model}-{key[:16]}"
-    record = cache / "fit.json"
-    if not record.exists():
+    from litho_models.fit_cache import fit_folder, kept_fit
+
+    cache = fit_folder(folder / "cache", model, key)
+    if not cache.exists():
         raise InputError(
             f"cache of {folder}", got=f"no {cache.name}", wanted="the benchmark's own cache folder"
         )
-    ids = json.loads(record.read_text(encoding="utf-8"))["held_out_ids"]
-    files = sorted(cache.glob("prediction_*.npy"))
-    return {scan_id: np.load(file, allow_pickle=False) for scan_id, file in zip(ids, files, strict=True)}
+    record, heights = kept_fit(cache)
+    return dict(zip(record.held_out_ids, heights, strict=True))
 
 
-def _of_frozen(store: Store, folders: Sequence[Path]) -> tuple[str, Predictions, bool]:
+def _of_frozen(store: Store, folders: Sequence[Path]) -> tuple[str, Predictions, NuisanceProtocol, bool]:
     models = [load_frozen(folder) for folder in folders]
     for frozen in models:
         frozen.check_geometry(store.pitch_um, store.level_height_um)
@@ -112,5 +134,14 @@ def _of_frozen(store: Store, folders: Sequence[Path]) -> tuple[str, Predictions,
     every = store.scans()
     locked = locked_ids(every)
     scans: list[PrintedScan] = [scan for scan in every if scan.id not in locked]
-    members = {scan.id: [predict_frozen(frozen, scan) for frozen in models] for scan in scans}
-    return "+".join(sorted({frozen.name for frozen in models})), members, not trained_on & set(members)
+    learned = [card_background(frozen, scans) for frozen in models]
+    members = {
+        scan.id: [
+            _map_um(predict_frozen(frozen, scan), background)
+            for frozen, background in zip(models, learned, strict=True)
+        ]
+        for scan in scans
+    }
+    protocol = protocol_for("offset", background="training" if any(learned) else "none")
+    name = "+".join(sorted({frozen.name for frozen in models}))
+    return name, members, protocol, not trained_on & set(members)

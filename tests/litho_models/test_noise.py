@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from dataclasses import replace
 
 import numpy as np
@@ -462,11 +463,21 @@ def test_residuals_of_a_benchmark_are_out_of_fold_and_locked_scans_stay_out(stor
     assert spread.epistemic_rms_nm > 0
     # Planted noise 4 nm; the model adds what it lacks.
     assert 3.9 < spread.residual_rms_nm < 12
+    with (tmp_path / "out" / "calibration_scans.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    for level, share in zip(
+        spread.calibrations[0].levels, spread.calibrations[0].scans[0].coverage, strict=True
+    ):
+        assert float(rows[0][f"coverage_{100 * level:.0f}"]) == pytest.approx(share, abs=5e-4)
     chosen = noise(store, tmp_path / "affine", residuals=folders[:1], model="affine").spread
     assert chosen.model == "affine"
     assert chosen.residual_rms_nm > spread.residual_rms_nm
     with pytest.raises(InputError, match="model of"):
         noise(store, tmp_path / "none", residuals=folders, model="pbl")
+    with pytest.raises(InputError, match="one source twice"):
+        noise(store, tmp_path / "none", residuals=[folders[0], folders[0]])
+    with pytest.raises(InputError, match="no residuals"):
+        noise(store, tmp_path / "none", model="linear")
     other = write_store(tmp_path / "other.zarr", make_scans(3, size_px=64))
     with pytest.raises(InputError, match="dataset of"):
         noise(other, tmp_path / "none", residuals=folders)
@@ -480,6 +491,34 @@ def test_residuals_of_a_frozen_model_say_what_it_saw(store, tmp_path):
     spread = noise(store, tmp_path / "out", residuals=[tmp_path / "run" / "model"]).spread
     assert not spread.held_out
     assert len(spread.calibrations[0].scans) == 7
+    with pytest.raises(InputError, match="a frozen one"):
+        noise(store, tmp_path / "none", residuals=[tmp_path / "run" / "model"], model="linear")
+
+
+def test_residuals_are_those_of_the_benchmark_and_of_the_evaluation(tmp_path):
+    from litho_data.store import open_store
+    from litho_models.benchmark import benchmark
+    from litho_models.evaluate import evaluate
+    from litho_models.noise.residuals import read_residuals
+    from litho_models.runs import train
+
+    # A bow of 30 nm in every scan, which a residual without the shared background would hold.
+    bowed = write_store(tmp_path / "bowed.zarr", make_scans(6, size_px=96, bow_um=0.03))
+    scored = benchmark(bowed, tmp_path / "b", models=("linear",), folds=2, policy="offset-gain", seed=3)
+    train(bowed, "linear", tmp_path / "run")
+    model = tmp_path / "run" / "model"
+    evaluated = evaluate(model, bowed, tmp_path / "e")
+    for source, nuisance, scores in (
+        (tmp_path / "b", scored.nuisance, scored.scores[0]),
+        (model, evaluated.nuisance, evaluated.scores),
+    ):
+        found = read_residuals(open_store(bowed), [source])
+        assert found.protocol == nuisance
+        assert nuisance.background == "training"
+        # Every pixel is valid, so that the mean over pixels is the mean over scans.
+        mae_nm = np.mean(np.abs(found.residuals_nm))
+        assert mae_nm == pytest.approx(scores.mae_datum_free_nm, rel=1e-6)
+        assert mae_nm < 0.8 * scores.without_background[1].mae_nm
 
 
 def test_the_command_takes_single_files(tmp_path):
@@ -516,5 +555,24 @@ def test_the_command_takes_single_files(tmp_path):
     offset = next(one for one in found.references.print_noise if one.background == "offset")
     assert offset.print_nm == pytest.approx(np.sqrt(16**2 - 1.25**2), rel=1e-3)
     assert found.references.steps[0].resolvable_step_nm == pytest.approx(READABLE_AT * 16, rel=0.02)
-    refused = CliRunner().invoke(app, ["noise", "--out", str(tmp_path / "none")])
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ([], "got nothing to analyse"),
+        (["--steps", "F"], "got --steps, wanted a store, or --flat"),
+        (["STORE", "--substrate", "F", "--steps", "F"], "got a store and --substrate, --steps"),
+        (["STORE", "--level-height-um", "0.2"], "got a store and --level-height-um"),
+        (["--flat", "F", "--residuals", "B", "--seed", "1"], "got --flat and --residuals, --seed"),
+        (["--flat", "F", "--level-height-um", "0.2"], "got --level-height-um, wanted --steps"),
+    ],
+)
+def test_the_command_refuses_options_that_it_would_not_use(tmp_path, given, said):
+    from typer.testing import CliRunner
+
+    from litho_models.cli import app
+
+    refused = CliRunner().invoke(app, ["noise", *given, "--out", str(tmp_path / "none")])
     assert isinstance(refused.exception, InputError)
+    assert said in str(refused.exception)
