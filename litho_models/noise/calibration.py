@@ -19,6 +19,7 @@ from litho_models.noise.gaussian_law import (
     negative_log_likelihood,
     probability_below,
 )
+from litho_models.noise.spread_scores import normalised_calibration_error, sparsification_error
 from litho_models.noise.variance import (
     SigmaBin,
     VarianceModel,
@@ -40,7 +41,8 @@ CONFORMAL_LEVEL = 0.9
 class ScanCalibration(Record):
     """One scan: likelihood and CRPS (nm, lower is better), coverage at 50, 80, 90, 95 %, rms of r/σ.
 
-    ``factor_90`` is what σ has to be multiplied by for 90 % of this scan's pixels to be covered.
+    ``factor_90`` is what σ has to be multiplied by for 90 % of this scan's pixels to be covered; ``ence`` and
+    ``ause`` are shares (see ``spread_scores``), None in results of before they were scored.
     """
 
     scan: str
@@ -49,6 +51,8 @@ class ScanCalibration(Record):
     coverage: list[float]
     standardised_rms: float
     factor_90: float
+    ence: float | None = None
+    ause: float | None = None
 
 
 class Calibration(Record):
@@ -56,7 +60,7 @@ class Calibration(Record):
 
     Args:
         name: constant, by covariates, or with the ensemble's disagreement added.
-        nll, crps_nm, coverage: means over scans; ``levels`` are what the coverages should be.
+        nll, crps_nm, coverage, ence, ause: means over scans; ``levels`` are what the coverages should be.
         pit: histogram of Φ(r/σ) in 20 equal bins, sums to one; flat if the shape is Gaussian.
         conformal_factor: σ times this covers 90 % of the pixels in 90 % of new scans, the scan being
             the exchangeable unit; None with fewer than nine scans.
@@ -71,6 +75,8 @@ class Calibration(Record):
     pit: list[float]
     conformal_factor: float | None
     scans: list[ScanCalibration]
+    ence: float | None = None
+    ause: float | None = None
 
 
 class SpreadAnalysis(Record):
@@ -175,6 +181,8 @@ def calibrate(
                 coverage=[coverage(r, s, level) for level in COVERAGE_LEVELS],
                 standardised_rms=float(np.sqrt(np.mean((r / s) ** 2))),
                 factor_90=float(np.quantile(np.abs(r / s), 0.9) / half_width(0.9)),
+                ence=normalised_calibration_error(r, s),
+                ause=sparsification_error(r, s),
             )
         )
     shares = np.array([row.coverage for row in rows])
@@ -188,6 +196,8 @@ def calibrate(
         pit=(histogram / len(rows)).tolist(),
         conformal_factor=conformal_factor([row.factor_90 for row in rows]),
         scans=rows,
+        ence=float(np.mean([row.ence for row in rows])),
+        ause=float(np.mean([row.ause for row in rows])),
     )
 
 

@@ -135,6 +135,8 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
             "σ": one.name,
             "nll": one.nll,
             "crps_nm": one.crps_nm,
+            "ence": one.ence,
+            "ause": one.ause,
             **{
                 f"cover {100 * level:.0f} %": 100 * share
                 for level, share in zip(one.levels, one.coverage, strict=True)
@@ -146,7 +148,12 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
         }
         for one in found.calibrations
     ]
-    page.table(pd.DataFrame(rows), "Means over scans; NLL in nats of nm.", "calibration.csv", digits=3)
+    page.table(
+        pd.DataFrame(rows),
+        "Means over scans; NLL in nats of nm, ENCE and AUSE as shares (0 is best).",
+        "calibration.csv",
+        digits=3,
+    )
     scans = [
         {
             "σ": one.name,

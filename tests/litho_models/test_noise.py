@@ -18,6 +18,7 @@ from litho_models.noise.dose import dose_matrix
 from litho_models.noise.gaussian_law import coverage, crps, half_width, negative_log_likelihood
 from litho_models.noise.neighbourhoods import neighbourhood_noise
 from litho_models.noise.residuals import disagreement_um
+from litho_models.noise.spread_scores import normalised_calibration_error, sparsification_error
 from litho_models.noise.staircase import READABLE_AT, find_edges, step_print
 from litho_models.noise.surface import print_noise, surface_noise
 from litho_models.noise.variance import COVARIATES, covariate_maps, fit_log_variance, sigma_nm
@@ -58,6 +59,38 @@ def test_coverage_of_a_gaussian_is_its_level(level):
     residual = RANDOM.normal(0, 2.0, 100_000)
     # Binomial sd √(p(1 − p)/n) ≤ 0.0016.
     assert coverage(residual, 2.0, level) == pytest.approx(level, abs=0.007)
+
+
+def test_ence_is_the_relative_error_of_sigma():
+    sigma = np.repeat([1.0, 2.0, 5.0, 9.0], 1000)
+    # Residuals of ± σ have that rms in every bin.
+    residual = sigma * RANDOM.choice([-1.0, 1.0], sigma.size)
+    assert normalised_calibration_error(residual, sigma) == pytest.approx(0, abs=1e-12)
+    assert normalised_calibration_error(residual, 2 * sigma) == pytest.approx(0.5)
+    assert normalised_calibration_error(residual, sigma / 2) == pytest.approx(1.0)
+    # The mean of σ over its four values is right for none: the one bin of a constant hides it.
+    constant = np.full(sigma.size, np.sqrt(np.mean(sigma**2)))
+    assert normalised_calibration_error(residual, constant) == pytest.approx(0, abs=1e-12)
+    # Of a Gaussian the rms of n pixels has the relative sd 1/√(2n), so its mean deviation is 1/√(πn); ten
+    # bins of 4,000 know that to a quarter.
+    steady = RANDOM.uniform(1, 9, 40_000)
+    gaussian = steady * RANDOM.normal(0, 1, steady.size)
+    assert normalised_calibration_error(gaussian, steady) == pytest.approx(
+        1 / np.sqrt(4000 * np.pi), abs=1 / np.sqrt(4000 * np.pi)
+    )
+
+
+def test_ause_of_uniform_errors_has_closed_forms():
+    error = (np.arange(10_000) + 0.5) / 10_000
+    residual = RANDOM.permutation(error) * RANDOM.choice([-1.0, 1.0], error.size)
+    size = np.abs(residual)
+    # The lowest share q of errors uniform on 0 ... 1 has q times the mean, the highest 2 − q times: areas of
+    # 1/2 and 3/2; any order of equal σ has 1. Sums over 10,000 pixels stand for the integrals.
+    assert sparsification_error(residual, size) == 0
+    assert sparsification_error(residual, np.full(error.size, 3.0)) == pytest.approx(0.5, abs=2e-4)
+    assert sparsification_error(residual, 1 / size) == pytest.approx(1.0, abs=2e-4)
+    # Units and any growing function of σ do not matter.
+    assert sparsification_error(1e3 * residual, size**2) == pytest.approx(0, abs=1e-12)
 
 
 # --- surfaces -----------------------------------------------------------------------------------
@@ -350,6 +383,8 @@ def test_a_spread_by_covariates_is_calibrated_where_a_constant_one_is_not():
     constant, by_covariates = found.calibrations
     assert by_covariates.nll < constant.nll - 0.02
     assert by_covariates.crps_nm < constant.crps_nm
+    assert by_covariates.ence < constant.ence
+    assert by_covariates.ause < constant.ause
     for level, share in zip(by_covariates.levels, by_covariates.coverage, strict=True):
         # 90,000 pixels: 0.2 %; the fit on eight scans adds as much.
         assert share == pytest.approx(level, abs=0.01)
