@@ -89,7 +89,9 @@ def _of_benchmarks(
         result = Benchmark.read(folder)
         if result.dataset.sha256 != store.sha256:
             raise InputError(
-                f"dataset of {folder}", got=result.dataset.name, wanted=f"{store.name}, the store given"
+                f"dataset of {folder}",
+                got=f"{result.dataset.name} {result.dataset.sha256[:12]}…",
+                wanted=f"{store.name} {store.sha256[:12]}…, the store given",
             )
         names = [score.model for score in result.scores]
         chosen = chosen or min(result.scores, key=lambda score: score.mae_datum_free_nm).model
