@@ -19,6 +19,7 @@ from benchmarks.measured_loop import locked_table, loop_table
 from benchmarks.measured_models import (
     benchmark_table,
     design_table,
+    extrapolation_table,
     further_table,
     noise_table,
     paired_table,
@@ -35,6 +36,7 @@ FOLDER = ROOT / "docs" / "results" / "neural-lithography"
 RESULTS = {
     "benchmark.json": "benchmark/benchmark.json",
     **{f"benchmark_paper_{seed}.json": f"benchmark-paper-{seed}/benchmark.json" for seed in PAPER_SEEDS},
+    "benchmark_prints.json": "leave-one-print-out/benchmark.json",
     "noise.json": "noise/noise.json",
     "close_loop.json": "close-loop/close_loop.json",
     "close_loop_pbl.json": "close-loop-pbl/close_loop.json",
@@ -46,7 +48,7 @@ RESULTS = {
 NAMES = ("benchmark", "paper split", "loop", "loop with PBL", "locked scans", "design")
 PAGES = {
     ROOT / "README.md": NAMES,
-    FOLDER / "README.md": (*NAMES, "paired differences", "further figures"),
+    FOLDER / "README.md": (*NAMES, "whole prints", "paired differences", "further figures"),
     ROOT / "docs" / "noise.md": ("noise",),
 }
 
@@ -62,6 +64,7 @@ def texts(folder: Path) -> dict[str, str]:
         "paper split": paper_table(
             [found(f"benchmark_paper_{seed}.json") for seed in PAPER_SEEDS], found("benchmark.json")
         ),
+        "whole prints": extrapolation_table(found("benchmark_prints.json"), found("benchmark.json")),
         "paired differences": paired_table(found("benchmark.json")),
         "further figures": further_table(found("benchmark.json")),
         "noise": noise_table(found("noise.json")),

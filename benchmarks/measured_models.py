@@ -92,6 +92,35 @@ def paper_table(draws: Sequence[dict[str, Any]], grouped: dict[str, Any]) -> str
     )
 
 
+def extrapolation_table(by_print: dict[str, Any], by_scan: dict[str, Any]) -> str:
+    """Errors where every scan of a print is held out, beside those where other scans of it are seen."""
+    seen = {score["model"]: score for score in by_scan["scores"]}
+    rows = []
+    for score in by_print["scores"]:
+        other = seen[score["model"]]
+        rows.append(
+            (
+                score["model"],
+                with_interval(score["mae_datum_free_nm"], score["mae_datum_free_ci95_nm"]),
+                f"{other['mae_datum_free_nm']:.2f} nm",
+                with_interval(score["mae_abs_nm"], score["mae_abs_ci95_nm"]),
+                f"{other['mae_abs_nm']:.2f} nm",
+            )
+        )
+    heads = ("model", "datum-free error, whole prints held out", "whole scans held out")
+    heads += ("absolute error, whole prints held out", "whole scans held out")
+    rows.append(_floor_row(by_print["noise_floor"], len(heads)))
+    split = by_print["split"]
+    missing = [name for name in seen if name not in {score["model"] for score in by_print["scores"]}]
+    left_out = f" Not run: {', '.join(missing)}." if missing else ""
+    return markdown_table(
+        heads,
+        rows,
+        f"{split['folds']} folds, one per print, {len(split['scored_ids'])} scans; "
+        f"the {len(split['lock_box'])} locked scans are in no fold.{left_out}",
+    )
+
+
 def further_table(benchmark: dict[str, Any]) -> str:
     """Phase, similarity, edges, crops, and training against held-out error, one row per model."""
     heads = ("model", "phase", "SSIM", "edges, mean", "edges, P95", "edges without partner")

@@ -25,6 +25,8 @@ CARDS = Path(__file__).parents[1] / "datasets"
 # Draws of the paper's split.
 PAPER_SEEDS = (0, 1, 2, 3)
 ARMS = ("affine", "physics", "pbl")
+# On whole prints the networks would take as long again as all the rest.
+BY_PRINT = "identity,affine,affine-mtf,blur-table,linear,physics"
 
 
 @dataclass(frozen=True)
@@ -132,6 +134,15 @@ def plan(out: Path, dataset: str) -> list[Step]:
             *(
                 _paper_split(store, effort.models, out / f"benchmark-paper-{seed}", seed)
                 for seed in PAPER_SEEDS
+            ),
+            Step(
+                "The same on prints of which no scan was seen",
+                _models(
+                    "benchmark", store, "--models", BY_PRINT, "--split", "leave-one-print-out",
+                    "--out", out / "leave-one-print-out",
+                ),
+                out / "leave-one-print-out" / "benchmark.json",
+                out / "leave-one-print-out" / "report.html",
             ),
             Step(
                 "What no model can predict: the noise",
