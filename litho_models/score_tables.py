@@ -64,7 +64,9 @@ def shape_table(scores: Sequence[ModelScores]) -> pd.DataFrame:
 
     fields = ("phase_rms_waves", "ssim", "edge_mean_nm", "edge_p95_nm")
     counts = ("edge_matched", "edge_unmatched", "edge_unmatched_expected")
-    return pd.DataFrame([s.model_dump(include={"model", *fields, *counts}) for s in scores])
+    return pd.DataFrame(
+        [{"model": s.model, **{name: getattr(s, name) for name in (*fields, *counts)}} for s in scores]
+    )
 
 
 def band_table(scores: Sequence[ModelScores]) -> pd.DataFrame:
