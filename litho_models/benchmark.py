@@ -116,7 +116,7 @@ def benchmark(
         assert record.diagnostics is not None
         learned = record.diagnostics.background if background == "training" else None
         predicted.setdefault((name, fold.locked), {}).update(
-            (scan.id, Prediction(height, learned.map_um(scan.shape) if learned else None))
+            (scan.id, Prediction.beside(learned, height))
             for scan, height in zip(fold.held_out, heights, strict=True)
         )
     protocol = protocol_for(policy, seed, background)

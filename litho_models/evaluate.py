@@ -124,10 +124,7 @@ def evaluate(
     ids = [scan.id for scan in scans]
     learned = card_background(frozen, scans) if background == "training" else None
     heights, cost = measured_predictions(lambda scan: predict_frozen(frozen, scan), scans, device_of(frozen))
-    predictions = [
-        Prediction(height, learned.map_um(scan.shape) if learned else None)
-        for scan, height in zip(scans, heights, strict=True)
-    ]
+    predictions = [Prediction.beside(learned, height) for height in heights]
     protocol = protocol_for(policy, background="training" if learned else "none")
     result = Evaluation(
         schema="litho-models/evaluation/1",

@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import Field
 
 from litho_data.results import Record
-from litho_models.background import BackgroundUse
+from litho_models.background import Background, BackgroundUse
 from litho_models.curves import LevelError, TransferCurves
 from litho_models.nuisance import BLOCK_PX, BUFFER_PX, Policy
 
@@ -36,6 +36,12 @@ class Prediction(NamedTuple):
 
     height_um: np.ndarray
     background_um: np.ndarray | None = None
+
+    @classmethod
+    def beside(cls, background: Background | None, height_um: np.ndarray) -> Prediction:
+        """The print and a learned background on its field, where there is one."""
+        ny, nx = height_um.shape
+        return cls(height_um, None if background is None else background.map_um((ny, nx)))
 
     @property
     def map_um(self) -> np.ndarray:

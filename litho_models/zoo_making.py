@@ -91,10 +91,7 @@ def scored_metrics(model: str | Path, scans: Sequence[PrintedScan], split: str) 
     protocol = protocol_for("offset", background="training" if learned else "none")
     # Threads that share a sum add it up in another order, and its last bits differ.
     with threadpool_limits(1):
-        predictions = [
-            Prediction(predict_frozen(frozen, scan), learned.map_um(scan.shape) if learned else None)
-            for scan in scans
-        ]
+        predictions = [Prediction.beside(learned, predict_frozen(frozen, scan)) for scan in scans]
         scores = score_model(frozen.name, scans, predictions, protocol)
     return _metrics(scores, split, protocol.background)
 

@@ -10,7 +10,6 @@ import numpy as np
 from litho_data.errors import InputError
 from litho_data.store import PrintedScan, Store
 from litho_models import zoo
-from litho_models.background import Background
 from litho_models.evaluate import card_background, predict_frozen, trained_ids
 from litho_models.freeze import load_frozen
 from litho_models.model_card import CARD_FILE
@@ -104,16 +103,11 @@ def _of_benchmarks(
             learned = fit.diagnostics.background if with_background and fit.diagnostics else None
             for scan_id, height_um in _cached(folder, fit.model, fit.key).items():
                 if scan_id in allowed:
-                    members.setdefault(scan_id, []).append(_map_um(height_um, learned))
+                    members.setdefault(scan_id, []).append(Prediction.beside(learned, height_um).map_um)
     policies = sorted({protocol.policy for protocol in protocols})
     if len(policies) > 1:
         raise InputError("nuisance policies of the benchmarks", got=", ".join(policies), wanted="one")
     return str(chosen), members, protocols[0]
-
-
-def _map_um(height_um: np.ndarray, learned: Background | None) -> np.ndarray:
-    background_um = learned.map_um((height_um.shape[0], height_um.shape[1])) if learned else None
-    return Prediction(height_um, background_um).map_um
 
 
 def _cached(folder: Path, model: str, key: str) -> dict[str, np.ndarray]:
@@ -139,7 +133,7 @@ def _of_frozen(store: Store, folders: Sequence[Path]) -> tuple[str, Predictions,
     learned = [card_background(frozen, scans) for frozen in models]
     members = {
         scan.id: [
-            _map_um(predict_frozen(frozen, scan), background)
+            Prediction.beside(background, predict_frozen(frozen, scan)).map_um
             for frozen, background in zip(models, learned, strict=True)
         ]
         for scan in scans
