@@ -16,8 +16,8 @@ from typing import Any
 from benchmarks.markdown_table import markdown_table, with_interval
 from benchmarks.record import publish
 from litho_models.benchmark import Benchmark, benchmark
-from litho_models.metrics import paired_difference
 from litho_models.score_records import ModelScores
+from litho_models.scores import paired_scores
 from litho_models.training.config import PAPER_BATCH, PAPER_CROPS, PAPER_EPOCHS
 
 ROOT = Path(__file__).parents[1]
@@ -121,8 +121,7 @@ def paper_order(others: Sequence[Benchmark]) -> str:
 
 def _paired(first: ModelScores, second: ModelScores) -> tuple[str, str]:
     """How much larger the first error is, quadrant by quadrant, and p."""
-    errors = ([scan.mae_datum_free_nm for scan in score.scans] for score in (first, second))
-    paired = paired_difference(*errors, seed=0)
+    paired = paired_scores(first, second)
     return with_interval(paired.mean, paired.interval), f"{paired.p:.4f}"
 
 

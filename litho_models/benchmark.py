@@ -19,14 +19,13 @@ from litho_models.benchmark_report import write_benchmark_report
 from litho_models.evaluate import SplitRecord
 from litho_models.fit_cache import FitRecord, fit_or_load
 from litho_models.folds import GROUPED_FOLDS, SplitKind, plan_folds
-from litho_models.metrics import paired_difference
 from litho_models.model_card import DatasetName
 from litho_models.models import build_model, require_models
 from litho_models.nuisance import Policy
 from litho_models.run_info import RunInfo, run_info
 from litho_models.runs import training_config
 from litho_models.score_records import ModelScores, NuisanceProtocol, Prediction
-from litho_models.scores import NoiseFloor, noise_floor, protocol_for, score_model
+from litho_models.scores import NoiseFloor, noise_floor, paired_scores, protocol_for, score_model
 from litho_models.splits import ids_sha256, locked_ids
 from litho_models.training import TrainingConfig
 from litho_models.training.fit import common_geometry
@@ -169,11 +168,7 @@ def _all_pairs(scores: Sequence[ModelScores], seed: int) -> list[Paired]:
     pairs = []
     for position, first in enumerate(scores):
         for second in scores[position + 1 :]:
-            compared = paired_difference(
-                [row.mae_datum_free_nm for row in first.scans],
-                [row.mae_datum_free_nm for row in second.scans],
-                seed=seed,
-            )
+            compared = paired_scores(first, second, seed)
             pairs.append(
                 Paired(
                     first=first.model,

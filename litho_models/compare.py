@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from litho_data.errors import InputError
 from litho_models.benchmark import Benchmark
 from litho_models.evaluate import Evaluation
-from litho_models.metrics import paired_difference
 from litho_models.score_records import ModelScores
+from litho_models.scores import paired_scores
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -92,11 +92,7 @@ def _schema(file: Path) -> object:
 
 
 def _row(first: ModelScores, second: ModelScores) -> dict[str, object]:
-    # A result lists its scans in the order of its folds: they meet by id.
-    others = {row.scan: row.mae_datum_free_nm for row in second.scans}
-    paired = paired_difference(
-        [row.mae_datum_free_nm for row in first.scans], [others[row.scan] for row in first.scans]
-    )
+    paired = paired_scores(first, second)
     return {
         "first": first.model,
         "second": second.model,

@@ -15,7 +15,15 @@ from litho_data.store import PrintedScan
 from litho_models.background import BackgroundUse
 from litho_models.curves import level_errors, transfer_curves
 from litho_models.edges import edge_placement, mid_step_heights_um
-from litho_models.metrics import NM_PER_UM, ScanScore, bootstrap_interval, phase_waves, score_scan
+from litho_models.metrics import (
+    NM_PER_UM,
+    PairedDifference,
+    ScanScore,
+    bootstrap_interval,
+    paired_difference,
+    phase_waves,
+    score_scan,
+)
 from litho_models.nuisance import (
     POLICIES,
     TERM_COUNT,
@@ -121,6 +129,19 @@ def _policy_error(policy: Policy, scores: Sequence[ScanScore]) -> PolicyError:
     values = [score.mae_datum_free_nm for score in scores]
     freedom = float(np.mean([score.degrees_of_freedom for score in scores]))
     return PolicyError(policy=policy, k=freedom, mae_nm=float(np.mean(values)), ci95_nm=interval(values))
+
+
+def paired_scores(first: ModelScores, second: ModelScores, seed: int = 0) -> PairedDifference:
+    """First minus second datum-free error of the same scans, which meet by id: results list them by fold.
+
+    Raises:
+        InputError: scores of different scans.
+    """
+    errors = [{row.scan: row.mae_datum_free_nm for row in score.scans} for score in (first, second)]
+    if errors[0].keys() != errors[1].keys():
+        counts = " and ".join(str(len(found)) for found in errors)
+        raise InputError("paired scores", got=f"{counts} scans", wanted="the same scans in both")
+    return paired_difference(list(errors[0].values()), [errors[1][scan] for scan in errors[0]], seed=seed)
 
 
 def protocol_for(policy: Policy, seed: int = 0, background: BackgroundUse = "none") -> NuisanceProtocol:
