@@ -109,9 +109,7 @@ def dose_matrix(
         f"nominal one (gain {best.height_gain:.3f}); single pixels of neighbouring levels {told_apart} be "
         f"told apart (worst step {best.worst_readability:.2f} σ, needed {READABLE_AT:.2f} σ)"
     )
-    return DoseMatrix(
-        rows=rows, recommended_dose=best.dose, reason=reason, guard_um=guard_um
-    ), notes if narrow else []
+    return DoseMatrix(rows=rows, recommended_dose=best.dose, reason=reason, guard_um=guard_um), notes
 
 
 def _row(dose: float, scans: Sequence[PrintedScan], levels: list[LevelHeight]) -> DoseRow:
