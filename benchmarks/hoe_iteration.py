@@ -27,12 +27,12 @@ from benchmarks.plain_pbl import PlainPbl
 from benchmarks.predict import SIDES, gradient_gflop
 from benchmarks.side_by_side import Arrays, Work
 from benchmarks.trained_pbl import load_pbl
-from litho_design.hoe import HoeTask
-from litho_design.hologram import image_error
-from litho_design.optimise import make_parametrisation
-from litho_design.printer_source import load_printer
-from litho_design.settings import HoeSettings, hoe_preset
-from litho_design.targets import make_target
+from litho_design.optimisation.optimise import make_parametrisation
+from litho_design.printers.source import load_printer
+from litho_design.tasks.hoe import HoeTask
+from litho_design.tasks.hologram import image_error
+from litho_design.tasks.settings import HoeSettings, hoe_preset
+from litho_design.tasks.targets import make_target
 
 NAME = "hoe_iteration"
 

@@ -27,9 +27,9 @@ from benchmarks.measured_models import (
 )
 from benchmarks.record import publish
 from examples.demo import PAPER_SEEDS
-from litho_models import zoo
-from litho_models.model_card import ModelCard
-from litho_models.zoo_making import ZOO_MODELS
+from litho_models.evaluation.zoo_making import ZOO_MODELS
+from litho_models.frozen import zoo
+from litho_models.frozen.card import ModelCard
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "results" / "neural-lithography"

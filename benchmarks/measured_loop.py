@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from benchmarks.markdown_table import markdown_table, with_interval
-from litho_models.model_card import ModelCard
-from litho_models.zoo_making import HELD_OUT
+from litho_models.evaluation.zoo_making import HELD_OUT
+from litho_models.frozen.card import ModelCard
 
 
 def loop_table(loop: dict[str, Any], on_physics: dict[str, Any] | None = None) -> str:

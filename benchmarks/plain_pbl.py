@@ -14,7 +14,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from litho_models.gaussian import kernel_radius_px
+from litho_models.layers.gaussian import kernel_radius_px
 from litho_models.models.pbl import Pbl
 
 

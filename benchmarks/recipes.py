@@ -15,10 +15,10 @@ from typing import Any
 
 from benchmarks.markdown_table import markdown_table, with_interval
 from benchmarks.record import publish
-from litho_models.benchmark import Benchmark, benchmark
-from litho_models.score_records import ModelScores
-from litho_models.scores import paired_scores
-from litho_models.training.config import PAPER_BATCH, PAPER_CROPS, PAPER_EPOCHS
+from litho_models.evaluation.benchmark import Benchmark, benchmark
+from litho_models.fitting.config import PAPER_BATCH, PAPER_CROPS, PAPER_EPOCHS
+from litho_models.scoring.records import ModelScores
+from litho_models.scoring.scores import paired_scores
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "results" / "recipes"

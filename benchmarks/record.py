@@ -10,10 +10,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from litho_data.errors import InputError
-from litho_data.files import atomic_file
-from litho_data.provenance import code_commit
-from litho_data.results import software_versions
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import atomic_file
+from litho_data.foundation.results import software_versions
+from litho_data.provenance.steps import code_commit
 
 NOT_MEASURED = "Not measured yet."
 

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 
 from benchmarks.record import origin, publish, usable_cores, write_record
-from litho_models import zoo
+from litho_models.frozen import zoo
 
 PAGE = Path(__file__).parents[1] / "docs" / "speed.md"
 RESULTS = PAGE.parent / "results" / "speed"

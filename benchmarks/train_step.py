@@ -20,9 +20,9 @@ from benchmarks import side_by_side
 from benchmarks.plain_pbl import PlainPbl
 from benchmarks.side_by_side import Arrays, Work
 from benchmarks.trained_pbl import areawise_gflop, load_pbl, random_layout
+from litho_models.fitting.crops import Window, in_passes
 from litho_models.models.pbl import PblConfig
 from litho_models.simulator import crop_border
-from litho_models.training.crops import Window, in_passes
 
 NAME = "train_step"
 SIDES = (side_by_side.PLAIN, "float32", "bfloat16")

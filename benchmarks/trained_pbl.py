@@ -7,8 +7,8 @@ from pathlib import Path
 
 import torch
 
-from litho_models.freeze import load_simulator
-from litho_models.model_card import ModelCard
+from litho_models.frozen.card import ModelCard
+from litho_models.frozen.files import load_simulator
 from litho_models.models.pbl import Pbl, PblConfig
 
 

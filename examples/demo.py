@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from litho_data.report import Page
+from litho_data.foundation.report import Page
 
 BIN = Path(sys.executable).parent
 CARDS = Path(__file__).parents[1] / "datasets"

@@ -11,8 +11,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from litho_models import zoo
-from litho_models.zoo_making import ZOO_MODELS, differing_metrics, make_zoo
+from litho_models.evaluation.zoo_making import ZOO_MODELS, differing_metrics, make_zoo
+from litho_models.frozen import zoo
 
 
 def main() -> int:

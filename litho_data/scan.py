@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from litho_data.errors import InputError
-from litho_data.grid import PixelGrid
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.grid import PixelGrid
 
 Axis = Literal["x", "y"]
 

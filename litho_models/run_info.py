@@ -7,8 +7,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from litho_data.provenance import code_commit, code_record
-from litho_data.results import Record
+from litho_data.foundation.results import Record
+from litho_data.provenance.steps import code_commit, code_record
 
 
 class RunInfo(Record):

@@ -8,8 +8,8 @@ from typing import Any, ClassVar, Literal, NamedTuple, Self, get_args
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 
-from litho_data.errors import InputError
-from litho_models.gaussian import pad_field
+from litho_data.foundation.errors import InputError
+from litho_models.layers.gaussian import pad_field
 
 Variant = Literal["default", "paper", "authors"]
 VARIANTS: tuple[str, ...] = get_args(Variant)

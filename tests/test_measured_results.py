@@ -8,10 +8,10 @@ from benchmarks import recipes
 from benchmarks.measured import FOLDER, PAGES, RESULTS, texts
 from benchmarks.measured_loop import loop_table
 from benchmarks.record import published
-from litho_design.compare import GapResult
-from litho_design.score import ScoreResult
-from litho_models.benchmark import Benchmark
-from litho_models.loop.result import CloseLoop
+from litho_design.judging.compare import GapResult
+from litho_design.judging.score import ScoreResult
+from litho_models.evaluation.benchmark import Benchmark
+from litho_models.loop.result.record import CloseLoop
 from litho_models.noise.result import NoiseAnalysis
 
 

@@ -18,7 +18,7 @@ from benchmarks.blind_trials.campaign import finished, open_campaign, run_campai
 from benchmarks.blind_trials.document import figures_of, publish
 from benchmarks.blind_trials.report import CSV_NAME, write_report
 from benchmarks.blind_trials.scoreboard import make_scoreboard
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 
 # Drawn from once the loop was finished; development uses seed 0.
 REPORTED_SEED = 20266

@@ -13,7 +13,7 @@ from pathlib import Path
 from benchmarks.blind_trials.draws import draw_trials
 from benchmarks.blind_trials.records import Draw, Draws, Trial
 from benchmarks.blind_trials.trial import failed, run_trial, trial_folder
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.virtual_fab.jobs import Plan
 
 _ROOT = Path(__file__).parents[2]

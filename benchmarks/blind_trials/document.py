@@ -6,8 +6,8 @@ from pathlib import Path
 
 from benchmarks.blind_trials.records import Outcome, Planted, Scoreboard, Trial
 from benchmarks.blind_trials.scoreboard import COUNTS_FROM_RMS_NM
-from litho_data.errors import InputError
-from litho_data.files import atomic_file
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import atomic_file
 
 START, END = "<!-- scoreboard: written by the command -->", "<!-- end of scoreboard -->"
 _HEAD = (

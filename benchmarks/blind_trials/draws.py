@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from benchmarks.blind_trials.records import Draw, Kind, KnobDraw
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.virtual_fab.knobs import KNOBS, OFF_CATALOGUE
 
 SMALLEST_RMS_NM, LARGEST_RMS_NM = 4.0, 60.0

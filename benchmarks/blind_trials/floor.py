@@ -13,8 +13,8 @@ from litho_data.register.resample import resample_to_layout
 from litho_data.store import Store
 from litho_data.virtual_fab import Fab, Job, KnobSetting, Microscope, Noise, Printer, Truth, scan_job
 from litho_data.virtual_fab.knobs import KnobBoard
-from litho_models.loop.fields import prepare_fields
-from litho_models.loop.result import CloseLoop
+from litho_models.loop.prepared import prepare_fields
+from litho_models.loop.result.record import CloseLoop
 from litho_models.loop.scoring import DATUM_FREE, names_to_terms, score
 
 # What no model can foretell: an offset drawn anew for every line is estimated from the other half of the

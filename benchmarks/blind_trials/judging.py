@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from benchmarks.blind_trials.records import Judgement, Kind, Named, Outcome, Planted
 from litho_models.effects import CATALOGUE
-from litho_models.loop.result import CloseLoop
+from litho_models.loop.result.record import CloseLoop
 
 _CAUSES = ("explained", "confusable")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import ClassVar, Literal
 
-from litho_data.results import Record, Result
+from litho_data.foundation.results import Record, Result
 
 Kind = Literal["single", "two", "none", "off-catalogue"]
 Judgement = Literal[

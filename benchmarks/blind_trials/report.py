@@ -10,7 +10,7 @@ from benchmarks.blind_trials.document import figures_of
 from benchmarks.blind_trials.records import Scoreboard, Trial
 from benchmarks.blind_trials.scoreboard import COUNTS_FROM_RMS_NM, FLOOR_TOLERANCE, trial_table
 from benchmarks.blind_trials.trial import trial_folder
-from litho_data.report import Page, new_figure
+from litho_data.foundation.report import Page, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -13,10 +13,10 @@ from benchmarks.blind_trials.floor import true_floor
 from benchmarks.blind_trials.judging import judge, named_outside_span, scan_terms, strangers
 from benchmarks.blind_trials.planting import plant, settings, trial_jobs
 from benchmarks.blind_trials.records import Cost, Draw, ErrorPair, Outcome, Planted, Trial, TrialErrors
-from litho_data.build import build
+from litho_data.build.build import build
 from litho_data.store import open_store
 from litho_data.virtual_fab import Truth, simulate
-from litho_models.loop.result import CloseLoop, Errors
+from litho_models.loop.result.record import CloseLoop, Errors
 from litho_models.loop.run import close_loop_on_store
 
 

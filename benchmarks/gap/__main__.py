@@ -23,8 +23,8 @@ from benchmarks.gap.jobs import run_jobs
 from benchmarks.gap.plan import Effort, Plan, open_plan
 from benchmarks.gap.steps import fab_jobs, model_jobs, proof_jobs
 from benchmarks.gap.tasks import Task, chosen, tasks
-from litho_data.errors import InputError
-from litho_models import zoo
+from litho_data.foundation.errors import InputError
+from litho_models.frozen import zoo
 
 
 def main() -> None:

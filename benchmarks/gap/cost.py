@@ -15,7 +15,7 @@ from benchmarks.gap.jobs import Job, module_command
 from benchmarks.gap.plan import Effort
 from benchmarks.gap.tasks import Task
 from benchmarks.record import write_record
-from litho_models.model_card import ModelCard
+from litho_models.frozen.card import ModelCard
 
 # A step of training takes about this long on one core (24 fields of 512 x 512 px); the rest is small.
 TRAINING_S = {"pbl": 0.45, "fno": 0.6}
@@ -37,7 +37,7 @@ def run_trial(out: Path, task: Task, arm: str) -> None:
     Weights do not change the time: an untrained model stands for an arm that is not trained yet. What a
     design costs beside its iterations is the same optics for every arm, and is timed with the arm ``none``.
     """
-    from litho_design.optimise import make_parametrisation
+    from litho_design.optimisation.optimise import make_parametrisation
 
     torch.set_num_threads(1)
     source = task.models[arm]
@@ -71,8 +71,8 @@ def _iterate(design: Any, parameters: Any) -> None:
 
 def _beside_s(design: Any, parameters: Any, height: torch.Tensor) -> float:
     """Start, reference, yield curve, focus window of a lens, and report of one design."""
-    from litho_design.lens_bench import LensBench
-    from litho_design.process_window import focus_window
+    from litho_design.judging.process_window import focus_window
+    from litho_design.lens.bench import LensBench
 
     seconds = _cpu_s(lambda: design.start(parameters, design.printer.level_heights_um()))
     seconds += _cpu_s(design.reference_efficiency)
@@ -159,11 +159,11 @@ def _untrained(arm: str, folder: Path) -> Path:
 
 def _task(task: Task, source: str) -> tuple[Any, Any]:
     """The task with its printer, from the options that its commands get."""
-    from litho_design.cli_options import hoe_settings, lens_settings
-    from litho_design.hoe import HoeTask
-    from litho_design.lens import LensTask
-    from litho_design.printer_source import load_printer
-    from litho_design.targets import make_target
+    from litho_design.cli.options import hoe_settings, lens_settings
+    from litho_design.lens.lens import LensTask
+    from litho_design.printers.source import load_printer
+    from litho_design.tasks.hoe import HoeTask
+    from litho_design.tasks.targets import make_target
 
     options: dict[str, Any] = {
         name.removeprefix("--").replace("-", "_"): _number(value)

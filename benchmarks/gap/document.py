@@ -16,9 +16,9 @@ from benchmarks.gap.steps import proof_folders
 from benchmarks.gap.tables import SHOWN, as_markdown, figure_file
 from benchmarks.gap.tasks import Task
 from benchmarks.record import origin, publish, usable_cores, write_record
-from litho_design.compare import HEADLINE, GapResult
-from litho_design.design import Design
-from litho_design.score import ScoreResult
+from litho_design.judging.compare import HEADLINE, GapResult
+from litho_design.judging.score import ScoreResult
+from litho_design.tasks.design import Design
 
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE, RESULTS = DOCS / "optics.md", DOCS / "results" / "gap"

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.report import new_figure
-from litho_design.compare import GapResult, design_folder
-from litho_design.judging import Judging
-from litho_design.printer import Printer
-from litho_design.printer_source import load_printer
+from litho_data.foundation.report import new_figure
+from litho_design.judging.compare import GapResult, design_folder
+from litho_design.judging.judge import Judging
+from litho_design.printers.printer import Printer
+from litho_design.printers.source import load_printer
 
 _DETAIL_PX = 160
 

@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 
 _BIN = Path(sys.executable).parent
 # One thread per process: processes side by side use the cores better than threads within one.

@@ -7,8 +7,8 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from litho_data.errors import InputError
-from litho_data.results import Record, Result
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import Record, Result
 
 ARMS = ("none", "affine", "affine-mtf", "physics", "fno", "pbl")
 # Stated before any design was made, by one rule: each effect of the print changes the training prints by

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from benchmarks.gap.jobs import Job, design_command
 from benchmarks.gap.plan import ARMS, Effort, model
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 
 ZOO_ARMS = ("none", "physics", "fno", "pbl")
 # ``lens`` calls its distance what it is; ``compare`` has one name for both tasks.

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.commands import progress
-from litho_data.errors import InputError
-from litho_data.files import atomic_folder
+from litho_data.foundation.commands import progress
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import atomic_folder
+from litho_data.foundation.outputs import require_replaceable_folder
 from litho_data.layouts.card_text import CARD_NAME, TABLE_NAME, CardText, write_layout, write_table
 from litho_data.layouts.patterns import (
     checkerboard,
@@ -25,7 +26,6 @@ from litho_data.layouts.patterns import (
 from litho_data.layouts.random_layout import random_layout
 from litho_data.layouts.statistics import LayoutStatistics, layout_statistics
 from litho_data.layouts.statistics_report import statistics_page
-from litho_data.outputs import require_replaceable_folder
 
 # Leaves an even strip of a micrometre between two edges that the printer blurs over a micrometre each.
 _TREAD_UM = 3.0

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 
 
 def flat(shape: tuple[int, int], *, level: int) -> np.ndarray:

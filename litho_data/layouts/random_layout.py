@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 
 PASSBANDS = ("square", "round")
 

@@ -8,8 +8,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from litho_data.errors import InputError
-from litho_data.results import Record, Result
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import Record, Result
 
 FEATURES = ("mean_level", "sd_level", "mean_jump", "extreme_share", "correlation_at_half_um")
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
+from litho_data.foundation.report import Page, new_figure
 from litho_data.layouts.statistics import LayoutStatistics
-from litho_data.report import Page, new_figure
 
 _SHOWN = 4
 # Lower limit of the logarithmic axes: below it a share is rounding.

@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from scipy import ndimage
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.level.polynomial import evaluate, fit_terms, polynomial_terms
 from litho_data.level.robust import noise_sigma, robust_surface
 from litho_data.level.selection import Levelled, Masking, as_height, select, subtract

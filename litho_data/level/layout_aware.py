@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy import ndimage
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.level.polynomial import Terms, evaluate, polynomial_terms
 from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
 

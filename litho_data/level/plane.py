@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.level.polynomial import Terms, fit_terms
 from litho_data.level.selection import Levelled, Masking, as_height, select, subtract_product
 

@@ -7,7 +7,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.polynomial import legendre
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.level.selection import Levelled, Masking, as_height, select, subtract_product
 
 MAX_DEGREE = 11

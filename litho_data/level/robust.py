@@ -6,7 +6,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.level.polynomial import Terms, evaluate, fit_terms, polynomial_terms
 from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.level.plane import PLANE, slopes_per_px
 from litho_data.level.polynomial import fit_terms
 from litho_data.level.selection import Levelled, Masking, as_height, select

@@ -6,7 +6,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.level.row_statistics import (
     MEDIAN_TRIM,
     fewest_for_row,

@@ -8,7 +8,7 @@ import numpy as np
 from scipy import ndimage, sparse
 from scipy.sparse import linalg
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
 
 ScarSign = Literal["both", "positive", "negative"]

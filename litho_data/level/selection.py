@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 
 Masking = Literal["ignore", "exclude", "include"]
 MASKINGS: tuple[Masking, ...] = ("ignore", "exclude", "include")

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.level.selection import Masking
 
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.units import is_length
 from litho_data.scan import Axis
-from litho_data.units import is_length
 
 # 2 GiB as float64: beyond it a damaged header is far likelier than a scan.
 _MAX_PIXELS = 2**28

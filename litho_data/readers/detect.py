@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.readers.tiff import is_jpk
 
 _HEAD_BYTES = 1 << 16

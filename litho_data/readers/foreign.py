@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 
 _LOGGERS = ("tifffile", "igor2", "SurfaceTopography")
 _LONGEST_MESSAGE = 160

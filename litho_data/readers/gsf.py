@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.units import is_length, um_per
 from litho_data.readers.channel import Channel
-from litho_data.units import is_length, um_per
 
 _MAGIC = b"Gwyddion Simple Field 1.0\n"
 _ITEM = 4

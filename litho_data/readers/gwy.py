@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.units import is_length, um_per
 from litho_data.readers.channel import Channel, with_unique_names
 from litho_data.readers.foreign import foreign_parser
 from litho_data.readers.gwy_structure import check_structure
-from litho_data.units import is_length, um_per
 
 _FIELD_KEY = re.compile(r"/(\d+)/data")
 

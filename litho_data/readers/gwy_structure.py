@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 
 _MAGIC = b"GWYP"
 _SCALAR_BYTES = {"b": 1, "c": 1, "i": 4, "q": 8, "d": 8}

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.readers.channel import Channel
 from litho_data.readers.foreign import foreign_parser
 

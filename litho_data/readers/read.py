@@ -6,12 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.units import um_per
 from litho_data.readers import gsf, gwy, npy, text_matrix, tiff, vendor
 from litho_data.readers.channel import Channel
 from litho_data.readers.detect import detect_format, require_file
 from litho_data.scan import Axis, Scan
-from litho_data.units import um_per
 
 _READERS = {
     "text-matrix": text_matrix.read_channels,

@@ -9,9 +9,9 @@ from typing import NoReturn
 
 import numpy as np
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.units import is_length, um_per
 from litho_data.readers.channel import Channel
-from litho_data.units import is_length, um_per
 
 _TEXT_BYTES = bytes(range(0x20, 0x7F)) + b"\t\n\r\x0c"
 _EMPTY_CELL = re.compile(rb"[,;][ \t]*[,;]")

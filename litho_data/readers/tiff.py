@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.units import is_length, um_per
 from litho_data.readers.channel import Channel, Loaded
 from litho_data.readers.foreign import foreign_parser
-from litho_data.units import is_length, um_per
 
 if TYPE_CHECKING:
     from tifffile import TiffFile

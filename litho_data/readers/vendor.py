@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.units import is_length, um_per
 from litho_data.readers.channel import Channel, Loaded, with_unique_names
 from litho_data.readers.foreign import foreign_parser
 from litho_data.readers.vendor_headers import fast_axis, layer_names, vendor_header
-from litho_data.units import is_length, um_per
 
 # Left out: formats with readers of our own, plain text, and two that have no signature and would
 # take any bytes of a fitting length for a map.

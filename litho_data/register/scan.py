@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.register.bend import Bend, fit_bent_affine
 from litho_data.register.coarse import SEARCH_BLUR_PX, CoarseFit, find_coarse
 from litho_data.register.evidence import height_correlation, mutual_information_bit

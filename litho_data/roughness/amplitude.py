@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from litho_data.errors import InputError
-from litho_data.results import Record
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import Record
 
 
 class AmplitudeParameters(Record):

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 import scipy.fft
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.roughness.amplitude import amplitude_parameters
 
 Axis = Literal["x", "y"]

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 import scipy.fft
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 
 Correlation = Callable[[np.ndarray, np.ndarray], np.ndarray]
 

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 
 Axis = Literal["x", "y"]
 

@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from litho_data.errors import InputError
-from litho_data.results import Record
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import Record
 
 Axis = Literal["x", "y"]
 

@@ -8,7 +8,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 
 if TYPE_CHECKING:
     import pandas as pd

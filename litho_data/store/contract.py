@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.store.access import array_of, group_of, has_child, values_of
 from litho_data.store.schema import SAMPLE_VARIABLES
 

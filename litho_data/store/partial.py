@@ -18,8 +18,8 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from litho_data.errors import InputError
-from litho_data.files import atomic_file, writable
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import atomic_file, writable
 from litho_data.store.access import group_of, open_root, values_of
 from litho_data.store.schema import SAMPLE_VARIABLES, SCAN_VARIABLES, STORE_SCHEMA, VARIABLES
 from litho_data.store.write import write_scan_group

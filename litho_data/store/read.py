@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.register.bend import Bend
 from litho_data.store.access import (
     decoded,

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.provenance import array_sha256, record_sha256
+from litho_data.provenance.steps import array_sha256, record_sha256
 
 STORE_SCHEMA = "litho-data/store/1"
 

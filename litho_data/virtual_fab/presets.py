@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,11 @@ from typing import TypeVar
 
 import numpy as np
 
-from litho_data.commands import progress
-from litho_data.errors import InputError
-from litho_data.files import atomic_folder
+from litho_data.foundation.commands import progress
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import atomic_folder
+from litho_data.foundation.outputs import require_replaceable_folder
 from litho_data.layouts.card_text import CardText, write_layout, write_table
-from litho_data.outputs import require_replaceable_folder
 from litho_data.virtual_fab.fab import Fab, FabScan, scan_job
 from litho_data.virtual_fab.jobs import PRINT_PATTERN, Plan, random_jobs
 from litho_data.virtual_fab.knobs import KnobBoard, KnobSetting

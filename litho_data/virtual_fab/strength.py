@@ -8,7 +8,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.virtual_fab.fab import Fab, scan_job
 from litho_data.virtual_fab.jobs import Plan, random_jobs
 from litho_data.virtual_fab.knobs import KNOBS, KnobBoard, KnobSetting

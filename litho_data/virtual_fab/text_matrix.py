@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 
 _TEXT_WIDTH = len("-1.2345e-007\t")
 

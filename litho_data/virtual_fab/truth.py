@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from litho_data.results import Record, Result
+from litho_data.foundation.results import Record, Result
 from litho_data.virtual_fab.knobs import KNOBS, KnobSetting
 
 

@@ -8,14 +8,14 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from litho_data.errors import InputError
-from litho_data.files import writable
-from litho_data.outputs import require_replaceable_folder
-from litho_design.design import LEVELS_FILE, Design, read_array
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import writable
+from litho_data.foundation.outputs import require_replaceable_folder
 from litho_design.export.gds import GdsLayers, read_gds_levels, write_gds
 from litho_design.export.image import read_image_levels, write_bmp, write_png16, write_tiff
 from litho_design.export.sidecar import Format, Sidecar, make_sidecar, read_sidecar, sidecar_path
 from litho_design.export.stl import read_stl_levels, write_stl
+from litho_design.tasks.design import LEVELS_FILE, Design, read_array
 
 _SUFFIX: dict[str, str] = {"png16": ".png", "bmp": ".bmp", "tiff": ".tif", "stl": ".stl", "gds": ".gds"}
 

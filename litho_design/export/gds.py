@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 
 _UNIT_M = 1e-6
 _PRECISION_M = 1e-9

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.errors import InputError
-from litho_design.parametrise import LayoutSettings
+from litho_data.foundation.errors import InputError
+from litho_design.optimisation.parametrise import LayoutSettings
 
 _UM_PER_CM = 1e4
 

@@ -7,11 +7,11 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
-from litho_data.errors import InputError
-from litho_data.files import file_sha256
-from litho_data.results import Result
-from litho_design.design import Design
-from litho_design.gauge import OutOfDistribution, Printability
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import file_sha256
+from litho_data.foundation.results import Result
+from litho_design.optimisation.gauge import OutOfDistribution, Printability
+from litho_design.tasks.design import Design
 
 Format = Literal["png16", "bmp", "tiff", "stl", "gds"]
 

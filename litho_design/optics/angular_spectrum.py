@@ -7,8 +7,8 @@ import math
 import torch
 from torch import Tensor, nn
 
-from litho_data.errors import InputError
-from litho_data.grid import PixelGrid
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.grid import PixelGrid
 from litho_design.optics.convolution import convolve
 from litho_design.optics.sampling import fast_length, first_centre_um
 

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor, nn
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_design.optics.rayleigh_sommerfeld import rs_kernel
 
 _CHUNK_ENTRIES = 1 << 23

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from litho_data.errors import InputError
-from litho_data.grid import PixelGrid
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.grid import PixelGrid
 
 # Replicas of the spectrum sit at 1/pitch; two decay lengths of the evanescent wave there leave 4e-6.
 _DECAY_LENGTHS = 2.0

@@ -8,8 +8,8 @@ import torch
 from pydantic import PositiveFloat
 from torch import Tensor
 
-from litho_data.grid import PixelGrid
-from litho_data.results import Record
+from litho_data.foundation.grid import PixelGrid
+from litho_data.foundation.results import Record
 
 
 class Optics(Record):

@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 
 Stage = Literal["exposure", "resist", "development", "measurement"]
 Role = Literal["process", "measurement", "nuisance", "undetermined"]

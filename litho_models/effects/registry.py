@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_models.effects import (
     development,
     exposure_field,

@@ -17,7 +17,6 @@ from torch import Tensor
 
 from litho_models.effects import get_effect
 from litho_models.effects.chain import EffectChain
-from litho_models.loop.fields import Field
 from litho_models.loop.linear import COMMON_WEIGHT, gram, nuisance_columns, orthonormal, solve_damped
 from litho_models.loop.parameters import (
     difference_steps,
@@ -27,6 +26,7 @@ from litho_models.loop.parameters import (
     set_vector,
     within_bounds,
 )
+from litho_models.loop.prepared import Field
 
 _STEPS = 12
 # The way to the neighbourhood of the optimum is walked on every third scan.

@@ -14,11 +14,11 @@ from torch import Tensor, nn
 
 from litho_data.store.read import PrintedScan
 from litho_models.effects.chain import EffectChain
-from litho_models.loop.contest import Entrant, judged
-from litho_models.loop.fields import Field
 from litho_models.loop.parameters import effect_slots
+from litho_models.loop.prepared import Field
 from litho_models.loop.scoring import Terms
-from litho_models.loop.search import Search
+from litho_models.loop.selection.contest import Entrant, judged
+from litho_models.loop.selection.search import Search
 from litho_models.loop.state import State, fit_state
 
 Trainer = Callable[[Sequence[PrintedScan]], nn.Module]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import lsq_linear
 
-from litho_models.loop.fields import Field
+from litho_models.loop.prepared import Field
 
 # Weight left to the per-scan terms in a fit: enough to fix what only they carry (the common datum),
 # too little to let one scan's datum or bow pull the parameters of the process.

@@ -7,26 +7,26 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.errors import InputError
-from litho_data.files import atomic_folder
-from litho_data.outputs import require_replaceable_folder
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import atomic_folder
+from litho_data.foundation.outputs import require_replaceable_folder
 from litho_data.store import PrintedScan, Store, open_store
-from litho_models import zoo
 from litho_models.effects import get_effect
-from litho_models.freeze import save_frozen
-from litho_models.loop.closed import Closed, LoopConfig, corrected_chain
-from litho_models.loop.closing import close_loop
-from litho_models.loop.exporting import exported_effects, write_measurement_model
+from litho_models.fitting.runs import level_share
+from litho_models.frozen import zoo
+from litho_models.frozen.files import save_frozen
+from litho_models.loop.close import close_loop
+from litho_models.loop.findings import Closed, LoopConfig, corrected_chain
 from litho_models.loop.flexible import Trainer
-from litho_models.loop.observed import rounding_step_um
-from litho_models.loop.outcome import summarise
 from litho_models.loop.parameters import is_stiff
-from litho_models.loop.reporting import write_report
-from litho_models.loop.result import CloseLoop
+from litho_models.loop.report.page import write_report
+from litho_models.loop.result.exporting import exported_effects, write_measurement_model
+from litho_models.loop.result.record import CloseLoop
+from litho_models.loop.result.summary import summarise
+from litho_models.loop.single_scans.observed import rounding_step_um
 from litho_models.models import MODELS, build_model
-from litho_models.runs import level_share
 from litho_models.simulator import Simulator
-from litho_models.splits import files_sha256, locked_ids
+from litho_models.splits.splits import files_sha256, locked_ids
 
 MODEL_FOLDER, MEASUREMENT_FILE = "model", "measurement_model.json"
 
@@ -109,7 +109,7 @@ def _rounding_um(store: Store, scans: Sequence[PrintedScan]) -> dict[str, float]
 
 
 def _trainer(base: str, config: LoopConfig | None, steps: int | None, cache: Path) -> Trainer:
-    from litho_models.training import TrainingConfig, fit_in_cache
+    from litho_models.fitting import TrainingConfig, fit_in_cache
 
     given = {} if steps is None else {"steps": steps}
     settings = TrainingConfig.of_recipe("fast", base, seed=config.seed if config else 0, **given)
@@ -123,8 +123,8 @@ def _base_model(base: str, store: Store) -> tuple[Simulator, str]:
         )
         return model, base
     folder = zoo.model_folder(base, other=f"or one of {', '.join(MODELS)}")
-    from litho_models.freeze import load_simulator
-    from litho_models.model_card import ModelCard
+    from litho_models.frozen.card import ModelCard
+    from litho_models.frozen.files import load_simulator
 
     card = ModelCard.read(folder)
     if abs(card.pitch_um - store.pitch_um) > 1e-9:

@@ -9,9 +9,8 @@ from functools import lru_cache
 import numpy as np
 
 from litho_models.effects.measurement_height import CREEP_DECAYS
-from litho_models.loop.fields import Field
-from litho_models.metrics import NM_PER_UM, bootstrap_interval
-from litho_models.nuisance import (
+from litho_models.loop.prepared import Field
+from litho_models.scan_terms.nuisance import (
     Half,
     calibration_blocks,
     calibration_stripes,
@@ -20,6 +19,7 @@ from litho_models.nuisance import (
     row_index,
     shrunk_line_offsets,
 )
+from litho_models.scoring.metrics import NM_PER_UM, bootstrap_interval
 
 Terms = frozenset[str]
 # Per-scan terms by the measurement effect that they stand for, in the order in which they are tested.

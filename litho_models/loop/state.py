@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from litho_models.effects.chain import EffectChain
-from litho_models.loop.fields import Field
 from litho_models.loop.fitting import FoldFits, fit_folds, predict
+from litho_models.loop.prepared import Field
 
 
 @dataclass(frozen=True)

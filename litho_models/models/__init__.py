@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_models.models.affine import Affine
 from litho_models.models.affine_mtf import AffineMtf
 from litho_models.models.blur_table import BlurTable

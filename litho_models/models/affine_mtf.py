@@ -6,7 +6,7 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from litho_models.gaussian import blur_interior, kernel_radius_px
+from litho_models.layers.gaussian import blur_interior, kernel_radius_px
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 
 

@@ -16,8 +16,8 @@ from pydantic import Field, PositiveInt, model_validator
 from torch import Tensor, nn
 from torch.nn import functional
 
+from litho_models.prediction.tiles import blend_tiles
 from litho_models.simulator import Simulator, SimulatorConfig, Tile
-from litho_models.tiles import blend_tiles
 
 # Ninety times the paper's, 0.5 GB of weights: more no card may ask of the machine that loads it.
 _MOST_MATRIX_ENTRIES = 30_000_000

@@ -6,7 +6,7 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from litho_models.gaussian import kernel_radius_px
+from litho_models.layers.gaussian import kernel_radius_px
 from litho_models.models.affine_mtf import blurred_interior
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 

@@ -16,9 +16,9 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
-from litho_models.areawise import StackSettings, convolution_stack
-from litho_models.gaussian import Edge, blur_interior, kernel_radius_px, pad_field
-from litho_models.lookup import PointwiseNet
+from litho_models.fast.stack import StackSettings, convolution_stack
+from litho_models.layers.gaussian import Edge, blur_interior, kernel_radius_px, pad_field
+from litho_models.layers.lookup import PointwiseNet
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 
 Channels = Annotated[int, Field(ge=1, le=1024)]

@@ -14,7 +14,7 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
-from litho_models.gaussian import Edge, blur_interior, gaussian_blur, kernel_radius_px, pad_field
+from litho_models.layers.gaussian import Edge, blur_interior, gaussian_blur, kernel_radius_px, pad_field
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 
 Shrinkage = Literal["fixed-reference", "image-range", "image-maximum"]

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.readers import read_scan
 from litho_data.store import Store, open_store
-from litho_models.model_card import DatasetName
+from litho_models.frozen.card import DatasetName
 from litho_models.noise.bounds import NoiseBound, noise_bounds
 from litho_models.noise.calibration import analyse_spread
 from litho_models.noise.dose import dose_matrix
@@ -22,8 +22,8 @@ from litho_models.noise.result import NoiseAnalysis, ReferencePrints
 from litho_models.noise.staircase import step_print
 from litho_models.noise.surface import BACKGROUNDS, SurfaceNoise, print_noise, surface_noise
 from litho_models.run_info import run_info
-from litho_models.scores import NoiseFloor
-from litho_models.splits import locked_ids
+from litho_models.scoring.scores import NoiseFloor
+from litho_models.splits.splits import locked_ids
 
 
 @dataclass(frozen=True)

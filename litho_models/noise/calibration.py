@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from pydantic import Field
 
-from litho_data.errors import InputError
-from litho_data.results import Record
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
 from litho_models.noise.gaussian_law import (
     COVERAGE_LEVELS,
@@ -29,7 +29,7 @@ from litho_models.noise.variance import (
     sigma_nm,
     variance_model,
 )
-from litho_models.score_records import NuisanceProtocol
+from litho_models.scoring.records import NuisanceProtocol
 
 _FOLDS = 5
 _PIXELS_PER_SCAN = 20_000

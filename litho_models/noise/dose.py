@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from litho_data.results import Record
+from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
 from litho_models.noise.staircase import READABLE_AT
 from litho_models.noise.surface import NM_PER_UM

@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from litho_data.report import Page
+from litho_data.foundation.report import Page
+from litho_models.evaluation.tables import interval_text
 from litho_models.noise import figures
 from litho_models.noise.calibration import SpreadAnalysis
 from litho_models.noise.dose import DoseMatrix
 from litho_models.noise.staircase import StepPrint
-from litho_models.score_tables import interval_text
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -7,18 +7,18 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.store import PrintedScan, Store
-from litho_models import zoo
-from litho_models.evaluate import card_background, predict_frozen, trained_ids
-from litho_models.freeze import load_frozen
-from litho_models.model_card import CARD_FILE
+from litho_models.evaluation.evaluate import card_background, predict_frozen, trained_ids
+from litho_models.frozen import zoo
+from litho_models.frozen.card import CARD_FILE
+from litho_models.frozen.files import load_frozen
 from litho_models.noise.calibration import Residuals
 from litho_models.noise.surface import NM_PER_UM
-from litho_models.nuisance import cross_fitted_residual
-from litho_models.score_records import NuisanceProtocol, Prediction
-from litho_models.scores import protocol_for
-from litho_models.splits import locked_ids
+from litho_models.scan_terms.nuisance import cross_fitted_residual
+from litho_models.scoring.records import NuisanceProtocol, Prediction
+from litho_models.scoring.scores import protocol_for
+from litho_models.splits.splits import locked_ids
 
 Predictions = dict[str, list[np.ndarray]]
 
@@ -79,7 +79,7 @@ def disagreement_um(predictions_um: Sequence[np.ndarray]) -> np.ndarray:
 def _of_benchmarks(
     store: Store, folders: Sequence[Path], model: str | None
 ) -> tuple[str, Predictions, NuisanceProtocol]:
-    from litho_models.benchmark import Benchmark
+    from litho_models.evaluation.benchmark import Benchmark
 
     members: Predictions = {}
     chosen = model
@@ -111,7 +111,7 @@ def _of_benchmarks(
 
 
 def _cached(folder: Path, model: str, key: str) -> dict[str, np.ndarray]:
-    from litho_models.fit_cache import fit_folder, kept_fit
+    from litho_models.evaluation.fit_cache import fit_folder, kept_fit
 
     cache = fit_folder(folder / "cache", model, key)
     if not cache.exists():

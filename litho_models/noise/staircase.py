@@ -7,8 +7,8 @@ from typing import Literal
 
 import numpy as np
 
-from litho_data.errors import InputError
-from litho_data.results import Record
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import Record
 from litho_data.roughness import stair_steps
 from litho_models.noise.gaussian_law import half_width, probability_below
 from litho_models.noise.surface import NM_PER_UM

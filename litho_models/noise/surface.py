@@ -6,8 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from litho_data.errors import InputError
-from litho_data.results import Record
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import Record
 from litho_data.roughness import amplitude_parameters, effective_samples
 from litho_models.noise.gaussian_law import GAUSSIAN_MAE
 

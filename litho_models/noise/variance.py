@@ -12,8 +12,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from litho_data.errors import InputError
-from litho_data.results import Record
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
 
 COVARIATES = ("constant", "level", "level²", "slope", "slope²", "edge distance", "radius²", "radius⁴")

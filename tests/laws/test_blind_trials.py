@@ -32,12 +32,12 @@ from benchmarks.blind_trials.records import (
 from benchmarks.blind_trials.report import write_report
 from benchmarks.blind_trials.scoreboard import make_scoreboard, summarise
 from benchmarks.blind_trials.trial import run_trial, trial_folder
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.virtual_fab import KNOBS, Fab, Microscope, Noise, Printer, Truth, scan_job
 from litho_data.virtual_fab.knobs import KnobBoard
 from litho_models.effects import CATALOGUE
-from litho_models.loop.result import AddedEffect, Candidate, CloseLoop, Residual
-from litho_models.nuisance import least_squares, nuisance_basis
+from litho_models.loop.result.record import AddedEffect, Candidate, CloseLoop, Residual
+from litho_models.scan_terms.nuisance import least_squares, nuisance_basis
 
 DEVELOPMENT_SEED = 0
 

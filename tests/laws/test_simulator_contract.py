@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 import torch
 
-from litho_data.errors import InputError
-from litho_models.freeze import load_frozen, save_frozen
+from litho_data.foundation.errors import InputError
+from litho_models.frozen.files import load_frozen, save_frozen
 from litho_models.models import MODELS, build_model
+from litho_models.prediction.tiles import predict_field, tile_difference
 from litho_models.simulator import VARIANTS, Simulator
-from litho_models.tiles import predict_field, tile_difference
 
 CASES = [(name, variant) for name in MODELS for variant in VARIANTS]
 # Narrow blurs keep the fields of this suite small; the law does not depend on them.

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from campaigns import write_campaign
 
-from litho_data.build import build
+from litho_data.build.build import build
 
 
 @pytest.fixture(scope="session")

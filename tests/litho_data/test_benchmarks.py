@@ -15,8 +15,8 @@ import pytest
 from benchmarks import build as build_benchmark
 from benchmarks import levelling as levelling_benchmark
 from benchmarks.record import NOT_MEASURED, publish, published
-from litho_data.errors import InputError
-from litho_data.provenance import code_commit
+from litho_data.foundation.errors import InputError
+from litho_data.provenance.steps import code_commit
 
 
 @pytest.mark.parametrize("benchmark", [build_benchmark, levelling_benchmark])

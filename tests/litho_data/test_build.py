@@ -16,18 +16,18 @@ import pytest
 import tifffile
 from campaigns import LEVEL_HEIGHT_UM, MARGIN_PX, NOISE_UM, height_of, layout_of, write_campaign, write_scan
 
-from litho_data.build import build
-from litho_data.errors import InputError
-from litho_data.jobs import attempt, field_jobs
-from litho_data.listing import list_fields
-from litho_data.make_store import BuildResult, report_folder
-from litho_data.operations import load_recipe
-from litho_data.records import read_steps
-from litho_data.replay import replay
+from litho_data.build.build import build
+from litho_data.build.jobs import attempt, field_jobs
+from litho_data.build.listing import list_fields
+from litho_data.build.make_store import BuildResult, report_folder
+from litho_data.build.operations import load_recipe
+from litho_data.foundation.errors import InputError
+from litho_data.provenance.records import read_steps
+from litho_data.provenance.replay import replay
+from litho_data.provenance.verify import verify
 from litho_data.store import open_store
 from litho_data.store.access import values_of
 from litho_data.store.partial import Piece, partial_store
-from litho_data.verify import verify
 
 
 def test_heights_come_back_on_the_layout(campaign: Path) -> None:
@@ -239,7 +239,7 @@ def test_layout_aware_levelling_knows_where_the_layout_lies(tmp_path: Path) -> N
 def test_a_killed_build_is_finished_by_the_next(campaign: Path, tmp_path: Path) -> None:
     out = tmp_path / "prints.zarr"
     pieces = tmp_path / ".prints.zarr.partial" / "pieces"
-    code = f"from litho_data.build import build; build({str(campaign / 'card.toml')!r}, {str(out)!r})"
+    code = f"from litho_data.build.build import build; build({str(campaign / 'card.toml')!r}, {str(out)!r})"
     process = subprocess.Popen([sys.executable, "-c", code])
     deadline = time.monotonic() + 60
     while not list(pieces.glob("*.json")) and process.poll() is None and time.monotonic() < deadline:

@@ -10,15 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from litho_data.build import build
-from litho_data.fetch import find_card
+from litho_data.build.build import build
+from litho_data.exchange.fetch import find_card
+from litho_data.provenance.verify import verify
 from litho_data.store import open_store
 from litho_data.store.schema import SAMPLE_VARIABLES
-from litho_data.verify import verify
 
 _BUILD = """
 import json, resource, sys
-from litho_data.build import build
+from litho_data.build.build import build
 if __name__ == "__main__":
     result = build(sys.argv[1], sys.argv[2], workers=int(sys.argv[3]))
     whose = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)

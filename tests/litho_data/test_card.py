@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 from campaigns import card_text
 
-from litho_data.card import check_card, load_card
-from litho_data.errors import InputError
-from litho_data.fetch import known_cards
+from litho_data.build.card import check_card, load_card
+from litho_data.exchange.fetch import known_cards
+from litho_data.foundation.errors import InputError
 
 GOOD: dict[str, Any] = tomllib.loads(card_text())
 

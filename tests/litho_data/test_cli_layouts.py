@@ -9,10 +9,10 @@ import pytest
 from scipy.ndimage import maximum_filter, minimum_filter
 from typer.testing import CliRunner
 
-from litho_data.build import build
-from litho_data.cli_layouts import masks, simulate
-from litho_data.commands import new_app
-from litho_data.errors import InputError
+from litho_data.build.build import build
+from litho_data.cli.layouts import masks, simulate
+from litho_data.foundation.commands import new_app
+from litho_data.foundation.errors import InputError
 from litho_data.store import open_store
 from litho_data.virtual_fab import KNOBS, Truth
 from litho_data.virtual_fab.presets import PRESETS

@@ -9,7 +9,7 @@ from pathlib import Path
 from campaigns import card_text
 from typer.testing import CliRunner
 
-from litho_data.cli import app
+from litho_data.cli.app import app
 
 run = CliRunner()
 
@@ -17,7 +17,7 @@ run = CliRunner()
 def test_bad_input_is_one_line_and_code_2(tmp_path: Path) -> None:
     card = tmp_path / "card.toml"
     card.write_text(card_text(unit='"furlong"'), encoding="utf-8")
-    code = "from litho_data.cli import main; main()"
+    code = "from litho_data.cli.app import main; main()"
     command = [sys.executable, "-c", code, "build", str(card), "--out", str(tmp_path / "out.zarr")]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 2

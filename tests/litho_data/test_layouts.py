@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from litho_data.card import load_card
-from litho_data.card_files import read_table
-from litho_data.errors import InputError
+from litho_data.build.card import load_card
+from litho_data.build.card_files import read_table
+from litho_data.foundation.errors import InputError
 from litho_data.layouts import (
     PATTERNS,
     LayoutStatistics,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.level import (
     layout_in_scan_frame,
     level_layout_aware,

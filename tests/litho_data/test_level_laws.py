@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.level import (
     align_rows,
     fix_zero,

@@ -8,7 +8,7 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.level import Recipe, align_rows, level_plane, level_polynomial, mask_and_relevel
 from litho_data.level.recipe_steps import AnyStep, Plane, Polynomial
 from litho_data.scan import Scan

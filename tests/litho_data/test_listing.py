@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from campaigns import card_text
 
-from litho_data.errors import InputError
-from litho_data.listing import list_fields
+from litho_data.build.listing import list_fields
+from litho_data.foundation.errors import InputError
 
 
 def folder_with(tmp_path: Path, files: list[str], **card: str) -> Path:

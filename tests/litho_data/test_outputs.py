@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from litho_data.errors import InputError
-from litho_data.files import atomic_file, atomic_folder
+from litho_data.exchange.pairs_export import export_pairs
+from litho_data.exchange.release import export_ro_crate
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import atomic_file, atomic_folder
 from litho_data.layouts import write_layout_set
-from litho_data.pairs_export import export_pairs
-from litho_data.release import export_ro_crate
 from litho_data.virtual_fab import simulate
 
 Writer = Callable[[Path, Path], object]

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import tifffile
 
-from litho_data.build import build
-from litho_data.errors import InputError
-from litho_data.pairs import import_pairs
-from litho_data.pairs_export import export_pairs
+from litho_data.build.build import build
+from litho_data.exchange.pairs import import_pairs
+from litho_data.exchange.pairs_export import export_pairs
+from litho_data.foundation.errors import InputError
+from litho_data.provenance.verify import verify
 from litho_data.store import open_store
-from litho_data.verify import verify
 
 
 def test_a_store_survives_the_format_to_half_a_grey_value(campaign: Path, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 import tifffile
 from afm_files import HEIGHT_UM, SHAPE, SIZE_UM
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.readers import list_channels, read_layout, read_scan
 
 PITCH_UM = (SIZE_UM[0] / SHAPE[0], SIZE_UM[1] / SHAPE[1])

@@ -14,7 +14,7 @@ import tifffile
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.readers import FORMATS, list_channels, read_layout, read_scan
 
 SIGNATURES = [

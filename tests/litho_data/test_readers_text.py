@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.readers import read_scan
 
 ROWS = "1e-007\t2e-007\t3e-007\r\n4e-007\t5e-007\t6e-007\r\n"

@@ -15,7 +15,7 @@ from register_phantoms import (
     warp_error_px,
 )
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.register import Registration, apply_transform, centred_placement, register_scan
 from litho_data.register.geometry import ORIENTATIONS, orient, orientation_matrix
 

@@ -9,18 +9,18 @@ import pytest
 from register_phantoms import LEVEL_HEIGHT_UM, PITCH_UM, PRINT_BLUR_PX, random_layout, warp_about_centre
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from litho_data.build import build
+from litho_data.build.build import build
+from litho_data.exchange.release import export_zip
 from litho_data.level import layout_in_scan_frame
-from litho_data.records import read_steps
+from litho_data.provenance.records import read_steps
+from litho_data.provenance.replay import replay
+from litho_data.provenance.verify import verify
 from litho_data.register import Bend, Registration, apply_transform, register_scan, resample_to_layout
 from litho_data.register.bend import fit_bent_affine
 from litho_data.register.geometry import index_to_um, orient, orientation_matrix
 from litho_data.register.quality import Thresholds, judge
 from litho_data.register.refine import refine
-from litho_data.release import export_zip
-from litho_data.replay import replay
 from litho_data.store import open_store
-from litho_data.verify import verify
 from litho_data.virtual_fab import KnobSetting, Truth, simulate
 from litho_data.virtual_fab.canvas import GUARD_PX
 from litho_data.virtual_fab.geometry import ScanFrame, sample_surface

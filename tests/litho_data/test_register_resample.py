@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.register import apply_transform, resample_to_layout, smooth_measured
 from litho_data.register.resample import noise_variance_factor
 

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from litho_data.errors import InputError
-from litho_data.files import file_sha256
-from litho_data.release import export_ro_crate, export_zip
+from litho_data.exchange.release import export_ro_crate, export_zip
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import file_sha256
+from litho_data.provenance.verify import verify
 from litho_data.store import open_store
-from litho_data.verify import verify
 
 
 def test_one_file_reads_as_the_folder_does(campaign: Path, tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.roughness import (
     amplitude_parameters,
     autocorrelation,

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.units import is_length, um_per
 from litho_data.scan import Scan
-from litho_data.units import is_length, um_per
 
 HEIGHT_UM = np.arange(12.0).reshape(3, 4)
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import zarr
 
-from litho_data.errors import InputError
-from litho_data.history import history
-from litho_data.replay import replay
+from litho_data.foundation.errors import InputError
+from litho_data.provenance.history import history
+from litho_data.provenance.replay import replay
+from litho_data.provenance.verify import verify
 from litho_data.store.access import array_of, values_of
-from litho_data.verify import verify
 
 
 def flip(path: Path, position: float = 0.5) -> None:

@@ -8,9 +8,9 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from litho_data.card import load_card
-from litho_data.errors import InputError
-from litho_data.listing import list_fields
+from litho_data.build.card import load_card
+from litho_data.build.listing import list_fields
+from litho_data.foundation.errors import InputError
 from litho_data.readers import read_layout, read_scan
 from litho_data.roughness import amplitude_parameters, correlation_length_um, stair_steps
 from litho_data.virtual_fab import (

@@ -7,8 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 
-from litho_data.errors import InputError
-from litho_data.workers import _windowed, run_jobs
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.workers import _windowed, run_jobs
 
 
 def double(number: int) -> int:

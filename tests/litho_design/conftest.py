@@ -10,11 +10,11 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from litho_design.cli import main
+from litho_design.cli.app import main
 from litho_design.optics import Optics
-from litho_design.parametrise import LayoutSettings
-from litho_design.printer import Printer
-from litho_design.settings import HoeSettings, hoe_preset
+from litho_design.optimisation.parametrise import LayoutSettings
+from litho_design.printers.printer import Printer
+from litho_design.tasks.settings import HoeSettings, hoe_preset
 
 
 class BlurPrinter(nn.Module):

@@ -5,11 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from litho_data.errors import InputError
-from litho_design.compare import HEADLINE, GapResult, compare, interval95, paired_differences, summarise
-from litho_design.hoe import design_hoe
-from litho_design.printer import Printer
-from litho_design.targets import make_target
+from litho_data.foundation.errors import InputError
+from litho_design.judging.compare import (
+    HEADLINE,
+    GapResult,
+    compare,
+    interval95,
+    paired_differences,
+    summarise,
+)
+from litho_design.printers.printer import Printer
+from litho_design.tasks.hoe import design_hoe
+from litho_design.tasks.targets import make_target
 
 
 def ring_designer(settings, printer, place):

@@ -13,17 +13,17 @@ import numpy as np
 import pytest
 import torch
 
-from litho_data.errors import InputError
-from litho_design.budget import Budget
-from litho_design.design import Design, read_array
-from litho_design.hoe import HoeTask, design_hoe
+from litho_data.foundation.errors import InputError
+from litho_design.judging.score import score_design
 from litho_design.optics import Optics, RSPropagator, centred_grid, element_field, intensity_share
-from litho_design.optimise import SearchSettings, make_parametrisation, search_layout
-from litho_design.parametrise import CellMap, LayoutSettings
-from litho_design.polish import polish_levels
-from litho_design.printer import Printer
-from litho_design.score import score_design
-from litho_design.targets import make_target
+from litho_design.optimisation.budget import Budget
+from litho_design.optimisation.optimise import SearchSettings, make_parametrisation, search_layout
+from litho_design.optimisation.parametrise import CellMap, LayoutSettings
+from litho_design.optimisation.polish import polish_levels
+from litho_design.printers.printer import Printer
+from litho_design.tasks.design import Design, read_array
+from litho_design.tasks.hoe import HoeTask, design_hoe
+from litho_design.tasks.targets import make_target
 
 
 @pytest.fixture
@@ -126,7 +126,7 @@ def test_a_model_that_changes_while_it_prints_leaves_no_design(
 def test_a_killed_command_resumes_to_the_same_layout(tmp_path):
     def command(out):
         return [
-            *(sys.executable, "-c", "from litho_design.cli import main; main()"),
+            *(sys.executable, "-c", "from litho_design.cli.app import main; main()"),
             *("hoe", "--model", "none", "--target", "ring", "--out", str(out)),
             *("--size-px", "128", "--distance-um", "30", "--iterations", "250"),
         ]

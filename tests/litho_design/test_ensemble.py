@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from litho_design.design import LEVELS_FILE, Design
-from litho_design.ensemble import disagreement_um, penalised
-from litho_design.hoe import HoeTask, design_hoe
-from litho_design.lens import design_lens
-from litho_design.lens_bench import LensView, RadialLensBench
+from litho_design.lens.bench import LensView, RadialLensBench
+from litho_design.lens.lens import design_lens
 from litho_design.optics import Optics
-from litho_design.parametrise import CellMap, LayoutSettings
-from litho_design.printer import Printer
-from litho_design.settings import lens_preset
-from litho_design.targets import make_target
+from litho_design.optimisation.parametrise import CellMap, LayoutSettings
+from litho_design.printers.ensemble import disagreement_um, penalised
+from litho_design.printers.printer import Printer
+from litho_design.tasks.design import LEVELS_FILE, Design
+from litho_design.tasks.hoe import HoeTask, design_hoe
+from litho_design.tasks.settings import lens_preset
+from litho_design.tasks.targets import make_target
 
 
 def test_disagreement_is_the_rms_spread_without_the_datum():

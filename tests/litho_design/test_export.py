@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 import tifffile
 
-from litho_data.errors import InputError
-from litho_design.design import Design
+from litho_data.foundation.errors import InputError
 from litho_design.export import export_design, import_levels, sidecar_path
 from litho_design.export.gds import rectangles, write_gds
 from litho_design.export.image import read_published_bmp, write_bmp, write_png16, write_tiff
 from litho_design.export.stl import read_stl_triangles, write_stl
-from litho_design.gauge import out_of_distribution, printability
-from litho_design.hoe import design_hoe
-from litho_design.parametrise import LayoutSettings
-from litho_design.targets import make_target
+from litho_design.optimisation.gauge import out_of_distribution, printability
+from litho_design.optimisation.parametrise import LayoutSettings
+from litho_design.tasks.design import Design
+from litho_design.tasks.hoe import design_hoe
+from litho_design.tasks.targets import make_target
 
 FORMATS = ["png16", "bmp", "tiff", "stl", "gds"]
 # An "F" has no symmetry: any flip or rotation shows.
@@ -28,8 +28,8 @@ LETTER = np.array([[1, 1, 1, 1], [1, 0, 0, 0], [1, 1, 1, 0], [1, 0, 0, 0], [1, 0
 @pytest.fixture(scope="module")
 def design(tmp_path_factory):
     from litho_design.optics import Optics
-    from litho_design.printer import Printer
-    from litho_design.settings import hoe_preset
+    from litho_design.printers.printer import Printer
+    from litho_design.tasks.settings import hoe_preset
 
     default = hoe_preset("default")
     layout = LayoutSettings(size_px=64)

@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 import torch
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.virtual_fab import simulate
 from litho_data.virtual_fab.fab import Fab, scan_job
 from litho_data.virtual_fab.knobs import KnobBoard, KnobSetting
 from litho_data.virtual_fab.printer import Job
 from litho_data.virtual_fab.settings import Microscope, Noise
 from litho_data.virtual_fab.settings import Printer as FabPrinter
-from litho_design.design import Design
-from litho_design.hoe import design_hoe
-from litho_design.parametrise import LayoutSettings
-from litho_design.printer_source import load_printer
-from litho_design.score import score_design
-from litho_design.targets import make_target
+from litho_design.judging.score import score_design
+from litho_design.optimisation.parametrise import LayoutSettings
+from litho_design.printers.source import load_printer
+from litho_design.tasks.design import Design
+from litho_design.tasks.hoe import design_hoe
+from litho_design.tasks.targets import make_target
 
 KNOBS = ("write-order-memory=0.2", "slope-thinning-x=0.4", "edge-bead=0.1")
 LAYOUT = LayoutSettings(size_px=64)

@@ -11,14 +11,14 @@ import pytest
 import tifffile
 import torch
 
-from litho_data.errors import InputError
-from litho_data.provenance import code_commit
-from litho_design.cli import app, main
-from litho_design.design import Design
-from litho_design.gauge import OutOfDistribution
-from litho_design.parametrise import LayoutSettings
-from litho_design.printer_source import load_printer
-from litho_design.report_design import distribution_warning, stroke_advice
+from litho_data.foundation.errors import InputError
+from litho_data.provenance.steps import code_commit
+from litho_design.cli.app import app, main
+from litho_design.optimisation.gauge import OutOfDistribution
+from litho_design.optimisation.parametrise import LayoutSettings
+from litho_design.printers.source import load_printer
+from litho_design.reports.design import distribution_warning, stroke_advice
+from litho_design.tasks.design import Design
 from litho_models import save_frozen
 from litho_models.models import model_class
 
@@ -88,7 +88,7 @@ def test_layouts_that_the_model_does_not_know_are_refused(affine_folder, change,
 
 
 def test_models_of_the_package_have_a_short_name():
-    from litho_models import zoo
+    from litho_models.frozen import zoo
 
     layout = LayoutSettings(size_px=16)
     (name, *_) = zoo.list()

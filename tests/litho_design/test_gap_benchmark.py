@@ -14,11 +14,11 @@ from benchmarks.gap.jobs import Job, run_jobs
 from benchmarks.gap.plan import ARMS, PRINT_KNOBS, Effort, open_plan
 from benchmarks.gap.tables import as_markdown
 from benchmarks.gap.tasks import Task, chosen, tasks
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.virtual_fab import KnobSetting, knob_rms_nm
 from litho_data.virtual_fab.settings import Printer
 from litho_data.virtual_fab.strength import default_fields
-from litho_design.cli import app
+from litho_design.cli.app import app
 from litho_models import save_frozen
 from litho_models.models import build_model
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import pytest
 import torch
 
-from litho_data.grid import PixelGrid
-from litho_design.hoe import design_hoe
-from litho_design.lens import design_lens
+from litho_data.foundation.grid import PixelGrid
+from litho_design.judging.score import score_design
+from litho_design.lens.lens import design_lens
 from litho_design.optics import ASMPropagator, RadialPropagator, RSPropagator, centred_grid
-from litho_design.parametrise import LayoutSettings
-from litho_design.score import score_design
-from litho_design.settings import lens_preset
-from litho_design.targets import make_target
+from litho_design.optimisation.parametrise import LayoutSettings
+from litho_design.tasks.hoe import design_hoe
+from litho_design.tasks.settings import lens_preset
+from litho_design.tasks.targets import make_target
 
 GPU = "cuda"
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU on this machine")

@@ -9,10 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from litho_design.hologram import HologramBench, image_error
-from litho_design.initialise import fresnel_lens_phase, gerchberg_saxton
-from litho_design.lens_metrics import image_figures
-from litho_design.metrics import (
+from litho_design.judging.metrics import (
     SSIM_WINDOW_PX,
     CameraView,
     hologram_score,
@@ -21,9 +18,12 @@ from litho_design.metrics import (
     ssim,
     through_aperture,
 )
+from litho_design.lens.metrics import image_figures
 from litho_design.optics import Optics, RSPropagator, centred_grid, element_field, intensity_share
-from litho_design.parametrise import CellMap, LayoutSettings
-from litho_design.targets import draw_target
+from litho_design.optimisation.initialise import fresnel_lens_phase, gerchberg_saxton
+from litho_design.optimisation.parametrise import CellMap, LayoutSettings
+from litho_design.tasks.hologram import HologramBench, image_error
+from litho_design.tasks.targets import draw_target
 
 WAVELENGTH_UM = 0.6328
 

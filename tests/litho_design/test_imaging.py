@@ -9,7 +9,7 @@ from scipy.signal import convolve2d
 
 from litho_design.optics.deconvolve import richardson_lucy
 from litho_design.optics.imaging import Blur, bin_pixels
-from litho_design.targets import draw_target
+from litho_design.tasks.targets import draw_target
 
 
 def gaussian_psf(size, sigma, energy=1.0, shift=(0.0, 0.0)):

@@ -8,22 +8,22 @@ import pytest
 import torch
 from pydantic import ValidationError
 
-from litho_data.errors import InputError
-from litho_design.judging import Judging
-from litho_design.lens import LensTask, design_lens
-from litho_design.lens_bench import (
+from litho_data.foundation.errors import InputError
+from litho_design.judging.judge import Judging
+from litho_design.judging.score import score_design
+from litho_design.lens.bench import (
     ImagingSettings,
     LensBench,
     LensView,
     RadialLensBench,
     centre_to_background,
 )
-from litho_design.lens_metrics import half_maximum_width_um, lens_score
+from litho_design.lens.lens import LensTask, design_lens
+from litho_design.lens.metrics import half_maximum_width_um, lens_score
 from litho_design.optics import Optics, blaze_efficiency
-from litho_design.parametrise import LayoutSettings
-from litho_design.printer import Printer
-from litho_design.score import score_design
-from litho_design.settings import lens_preset
+from litho_design.optimisation.parametrise import LayoutSettings
+from litho_design.printers.printer import Printer
+from litho_design.tasks.settings import lens_preset
 
 LAYOUT = LayoutSettings(size_px=300, cell_um=0.1, symmetry="radial")
 OPTICS = Optics(distance_um=100.0)
@@ -86,7 +86,7 @@ def test_staircase_lens_loses_what_the_blaze_formula_says(levels, step_um):
         ),
         Printer(None, layout, source="none"),
     )
-    from litho_design.optimise import make_parametrisation
+    from litho_design.optimisation.optimise import make_parametrisation
 
     parameters = make_parametrisation(layout, task.settings.search)
     task.start(parameters, task.printer.level_heights_um())

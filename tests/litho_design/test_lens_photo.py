@@ -10,23 +10,23 @@ import pytest
 import torch
 from scipy.ndimage import map_coordinates
 
-from litho_data.errors import InputError
-from litho_data.files import file_sha256
-from litho_design.cli import main
-from litho_design.judging import Judging
-from litho_design.lens import design_lens
-from litho_design.lens_bench import reconstruct, sensor_psf
-from litho_design.lens_metrics import image_figures
-from litho_design.lens_photo import score_lens_photo
-from litho_design.metrics import matched_scale
-from litho_design.objects import object_stack, read_object
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import file_sha256
+from litho_design.cli.app import main
+from litho_design.judging.judge import Judging
+from litho_design.judging.metrics import matched_scale
+from litho_design.judging.score import MeasuredSource, PhotoSource, ScoreResult, score_design
+from litho_design.lens.bench import reconstruct, sensor_psf
+from litho_design.lens.lens import design_lens
+from litho_design.lens.metrics import image_figures
+from litho_design.lens.objects import object_stack, read_object
+from litho_design.lens.photo import score_lens_photo
 from litho_design.optics import Optics
 from litho_design.optics.imaging import Blur
-from litho_design.parametrise import LayoutSettings
-from litho_design.printer import Printer
-from litho_design.score import MeasuredSource, PhotoSource, ScoreResult, score_design
-from litho_design.settings import lens_preset
-from litho_design.targets import TargetRecord
+from litho_design.optimisation.parametrise import LayoutSettings
+from litho_design.printers.printer import Printer
+from litho_design.tasks.settings import lens_preset
+from litho_design.tasks.targets import TargetRecord
 
 SENSOR_UM, CAMERA_UM, DARK, WHITE, NOISE = 0.2, 0.15, 300.0, 30000.0, 100.0
 OBJECT_PX, PHOTO_PX = 96, 160

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from litho_data.errors import InputError
-from litho_design.hoe import design_hoe
-from litho_design.judging import Judging
-from litho_design.score import MeasuredSource, PhotoSource, score_design
-from litho_design.targets import make_target
+from litho_data.foundation.errors import InputError
+from litho_design.judging.judge import Judging
+from litho_design.judging.score import MeasuredSource, PhotoSource, score_design
+from litho_design.tasks.hoe import design_hoe
+from litho_design.tasks.targets import make_target
 
 
 @pytest.fixture
@@ -75,7 +75,7 @@ def test_a_photograph_is_cleaned_registered_and_scored(tmp_path, printed_design)
     found = np.array(score.judge.photo_to_window)[:, :2]
     assert found == pytest.approx(np.linalg.inv(2 * matrix), abs=0.01)
     blurred = torch.from_numpy(cv2.GaussianBlur(image, (0, 0), 1.4)).double()
-    from litho_design.metrics import si_psnr_db
+    from litho_design.judging.metrics import si_psnr_db
 
     wanted = si_psnr_db(blurred, judging.target.double())
     assert score.figures["si_psnr_db"] == pytest.approx(wanted, abs=1.0)

@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 import torch
 
-from litho_data.errors import InputError
-from litho_data.files import file_sha256
-from litho_design.cli import main
-from litho_design.compare import GapResult
-from litho_design.design import HEIGHT_FILE, Design, read_array
-from litho_design.lens import LensTask, design_lens
-from litho_design.objects import bring_objects, object_name, object_stack, picture_records
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import file_sha256
+from litho_design.cli.app import main
+from litho_design.judging.compare import GapResult
+from litho_design.judging.score import score_design
+from litho_design.lens.lens import LensTask, design_lens
+from litho_design.lens.objects import bring_objects, object_name, object_stack, picture_records
 from litho_design.optics import Optics
-from litho_design.parametrise import LayoutSettings
-from litho_design.score import score_design
-from litho_design.settings import lens_preset
-from litho_design.targets import draw_target
+from litho_design.optimisation.parametrise import LayoutSettings
+from litho_design.tasks.design import HEIGHT_FILE, Design, read_array
+from litho_design.tasks.settings import lens_preset
+from litho_design.tasks.targets import draw_target
 
 SMALL = (
     *("--size-px", "128", "--window-px", "64", "--object-px", "32", "--iterations", "2"),

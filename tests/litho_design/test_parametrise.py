@@ -7,8 +7,14 @@ import math
 import pytest
 import torch
 
-from litho_data.errors import InputError
-from litho_design.parametrise import CellMap, DirectLevels, GumbelLevels, LayoutSettings, nearest_levels
+from litho_data.foundation.errors import InputError
+from litho_design.optimisation.parametrise import (
+    CellMap,
+    DirectLevels,
+    GumbelLevels,
+    LayoutSettings,
+    nearest_levels,
+)
 
 SQUARE = LayoutSettings(size_px=16, cell_um=0.4, levels=5)
 RINGS = LayoutSettings(size_px=15, cell_um=0.1, levels=5, symmetry="radial")

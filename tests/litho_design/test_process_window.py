@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from litho_data.errors import InputError
-from litho_design.lens_bench import LensBench, LensView
+from litho_data.foundation.errors import InputError
+from litho_design.judging.process_window import focus_window, range_above
+from litho_design.lens.bench import LensBench, LensView
 from litho_design.optics import Optics
-from litho_design.parametrise import LayoutSettings
-from litho_design.process_window import focus_window, range_above
-from litho_design.robust import Draw, ProcessWindow, draws, measured_window
-from litho_models.splits import locked_ids
+from litho_design.optimisation.parametrise import LayoutSettings
+from litho_design.optimisation.robust import Draw, ProcessWindow, draws, measured_window
+from litho_models.splits.splits import locked_ids
 
 
 def test_range_above_a_limit_is_linear_between_samples():

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from litho_data.errors import InputError
-from litho_data.grid import PixelGrid
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.grid import PixelGrid
 from litho_design.optics import (
     ASMPropagator,
     RSPropagator,

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from litho_data.errors import InputError
-from litho_design.design import HEIGHT_FILE
-from litho_design.hoe import HoeTask, design_hoe
-from litho_design.hologram import HologramBench
+from litho_data.foundation.errors import InputError
 from litho_design.optics import Optics
-from litho_design.robust import Draw, ProcessWindow, draws, risk
-from litho_design.targets import make_target
+from litho_design.optimisation.robust import Draw, ProcessWindow, draws, risk
+from litho_design.tasks.design import HEIGHT_FILE
+from litho_design.tasks.hoe import HoeTask, design_hoe
+from litho_design.tasks.hologram import HologramBench
+from litho_design.tasks.targets import make_target
 
 
 def test_draws_have_their_spread_and_repeat():

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
-from litho_data.errors import InputError
-from litho_design.targets import draw_target, make_target
+from litho_data.foundation.errors import InputError
+from litho_design.tasks.targets import draw_target, make_target
 
 
 @pytest.mark.parametrize("name", ["text", "ring", "chart", "spots"])

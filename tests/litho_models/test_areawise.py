@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch.nn import functional
 
-from litho_models.areawise import StackSettings, convolution_stack
-from litho_models.freeze import load_frozen, save_frozen
+from litho_models.fast.stack import StackSettings, convolution_stack
+from litho_models.frozen.files import load_frozen, save_frozen
 from litho_models.models import build_model
 
 SLOPE = 0.02

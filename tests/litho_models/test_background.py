@@ -7,21 +7,21 @@ import pytest
 import torch
 from prints import make_scans, printed_height_um, write_store
 
-from litho_data.errors import InputError
-from litho_data.results import Result
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import Result
 from litho_models import load_frozen, save_frozen
-from litho_models.background import Background
-from litho_models.benchmark import benchmark
-from litho_models.compare import compare
-from litho_models.evaluate import evaluate
-from litho_models.folds import plan_folds
-from litho_models.model_card import ModelCard
+from litho_models.evaluation.benchmark import benchmark
+from litho_models.evaluation.compare import compare
+from litho_models.evaluation.evaluate import evaluate
+from litho_models.fitting.runs import freeze, train
+from litho_models.frozen.card import ModelCard
 from litho_models.models import build_model
-from litho_models.nuisance import TERM_COUNT
-from litho_models.runs import freeze, train
-from litho_models.score_records import Prediction
-from litho_models.scores import protocol_for, score_model
-from litho_models.training.nuisances import learn_background
+from litho_models.scan_terms.background import Background
+from litho_models.scan_terms.nuisance import TERM_COUNT
+from litho_models.scan_terms.training import learn_background
+from litho_models.scoring.records import Prediction
+from litho_models.scoring.scores import protocol_for, score_model
+from litho_models.splits.folds import plan_folds
 
 BOW_NM = 40.0
 SMOOTH = ("full", "full+rows")

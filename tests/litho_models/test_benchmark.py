@@ -11,18 +11,18 @@ import pytest
 import zarr
 from prints import make_scans, write_store
 
-from litho_data.build import build
-from litho_data.errors import InputError
+from litho_data.build.build import build
+from litho_data.foundation.errors import InputError
 from litho_data.store import open_store
 from litho_data.store.write import write_table
 from litho_data.virtual_fab import simulate
-from litho_models.benchmark import Benchmark, benchmark
-from litho_models.compare import compare
-from litho_models.evaluate import Evaluation, evaluate
-from litho_models.folds import plan_folds
-from litho_models.model_card import DatasetName
-from litho_models.runs import TrainingRun, freeze, train
-from litho_models.splits import locked_ids
+from litho_models.evaluation.benchmark import Benchmark, benchmark
+from litho_models.evaluation.compare import compare
+from litho_models.evaluation.evaluate import Evaluation, evaluate
+from litho_models.fitting.runs import TrainingRun, freeze, train
+from litho_models.frozen.card import DatasetName
+from litho_models.splits.folds import plan_folds
+from litho_models.splits.splits import locked_ids
 
 MODELS = ("identity", "affine", "linear")
 SETTINGS = {"nuisance": "offset"}
@@ -99,7 +99,7 @@ def test_an_unchanged_benchmark_fits_nothing_again(result, store, monkeypatch):
     def refuse(*_args, **_kwargs):
         raise AssertionError("fitted again")
 
-    monkeypatch.setattr("litho_models.fit_cache.fit_in_cache", refuse)
+    monkeypatch.setattr("litho_models.evaluation.fit_cache.fit_in_cache", refuse)
     again = benchmark(store, out, models=MODELS, folds=3, settings=SETTINGS, open_lock_box=True)
     assert again.scores == record.scores
 
@@ -304,8 +304,8 @@ def test_a_model_of_another_geometry_is_refused(store, tmp_path):
 
 
 def test_line_offsets_are_attributed_to_their_frame():
-    from litho_models.score_records import Prediction
-    from litho_models.scores import protocol_for, score_model
+    from litho_models.scoring.records import Prediction
+    from litho_models.scoring.scores import protocol_for, score_model
 
     scans = make_scans(1, size_px=256, noise_um=0.005)
     angle = np.deg2rad(1.0)
@@ -325,7 +325,7 @@ def test_line_offsets_are_attributed_to_their_frame():
 def test_the_commands(store, tmp_path):
     from typer.testing import CliRunner
 
-    from litho_models.cli import app
+    from litho_models.cli.app import app
 
     runner = CliRunner()
     run, model, out = (str(tmp_path / name) for name in ("run", "model", "out"))

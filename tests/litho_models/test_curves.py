@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter1d
 
-from litho_models.curves import half_power_frequency, transfer_curves
+from litho_models.scoring.transfer import half_power_frequency, transfer_curves
 from tests.litho_models.prints import make_scan
 
 PITCH_UM = 0.1

@@ -7,7 +7,7 @@ import torch
 
 from litho_models.effects import CATALOGUE
 from litho_models.effects.chain import EffectChain
-from litho_models.freeze import load_frozen, save_frozen
+from litho_models.frozen.files import load_frozen, save_frozen
 from litho_models.models import build_model
 
 LAYOUT = (torch.rand(1, 1, 40, 40, generator=torch.Generator().manual_seed(0)) * 12).floor() / 10

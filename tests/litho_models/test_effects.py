@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_models.effects import CATALOGUE, FieldContext, get_effect, in_forward_order, screened_effects
 from litho_models.effects.effect import Effect, Parameter
 

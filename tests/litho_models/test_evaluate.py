@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 from prints import make_scans, write_store
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.store import open_store
-from litho_models.evaluate import evaluate
+from litho_models.evaluation.evaluate import evaluate
+from litho_models.fitting.runs import train
 from litho_models.noise.residuals import read_residuals
-from litho_models.runs import train
 
 
 @pytest.fixture(scope="module")

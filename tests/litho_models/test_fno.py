@@ -10,12 +10,12 @@ import pytest
 import torch
 from prints import make_scans
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
+from litho_models.fitting import TrainingConfig, fit_with_record
 from litho_models.models import build_model
 from litho_models.models.fno import PeriodicConvolution, SpectralConvolution
+from litho_models.prediction.tiles import blend_tiles, blending_window, predict_scan
 from litho_models.simulator import Tile
-from litho_models.tiles import blend_tiles, blending_window, predict_scan
-from litho_models.training import TrainingConfig, fit_with_record
 
 SMALL = {"width": 6, "modes": (4, 4), "projection_channels": 16, "tile_px": 32, "overlap_px": 16}
 QUICK = {"steps": 12, "rounds": 3, "batch": 2, "precision": "32-true", "nuisance": "offset"}

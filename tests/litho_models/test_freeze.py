@@ -12,12 +12,12 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_models import load_frozen, save_frozen
-from litho_models.freeze import README_FILE, WEIGHTS_FILE
-from litho_models.model_card import CARD_FILE, ModelCard
+from litho_models.fitting.runs import freeze
+from litho_models.frozen.card import CARD_FILE, ModelCard
+from litho_models.frozen.files import README_FILE, WEIGHTS_FILE
 from litho_models.models import build_model
-from litho_models.runs import freeze
 
 
 @pytest.fixture
@@ -88,7 +88,7 @@ def truncate(folder):
 
 
 def rehash(folder):
-    from litho_data.files import file_sha256
+    from litho_data.foundation.files import file_sha256
 
     edit_card(folder, weights_sha256=file_sha256(folder / WEIGHTS_FILE))
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
-from litho_data.errors import InputError
-from litho_models.gaussian import blur_interior, gaussian_blur, kernel_radius_px, pad_field
+from litho_data.foundation.errors import InputError
+from litho_models.layers.gaussian import blur_interior, gaussian_blur, kernel_radius_px, pad_field
 
 PITCH = 0.1
 

@@ -11,23 +11,23 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_models.effects import get_effect
+from litho_models.fitting.runs import train
+from litho_models.frozen.card import ModelCard
 from litho_models.loop import LoopConfig, close_loop, close_loop_on_store, parse_priors
-from litho_models.loop.closed import Closed
-from litho_models.loop.exporting import exported_effects
-from litho_models.loop.fields import LARGE_PX, prepare_fields
+from litho_models.loop.findings import Closed
 from litho_models.loop.fitting import fit_folds, predict
-from litho_models.loop.injecting import parse_injection
-from litho_models.loop.measurement import measurement_tests
-from litho_models.loop.outcome import summarise
 from litho_models.loop.parameters import get_vector
-from litho_models.loop.result import CloseLoop
+from litho_models.loop.prepared import LARGE_PX, prepare_fields
+from litho_models.loop.result.exporting import exported_effects
+from litho_models.loop.result.record import CloseLoop
+from litho_models.loop.result.summary import summarise
+from litho_models.loop.screening.power import parse_injection
+from litho_models.loop.single_scans.tests import measurement_tests
 from litho_models.loop.structure import covariate_tests, is_structured
-from litho_models.model_card import ModelCard
 from litho_models.models import build_model
-from litho_models.runs import train
-from litho_models.splits import lock_box, locked_ids
+from litho_models.splits.splits import lock_box, locked_ids
 from tests.litho_models.loop_scans import printed_scans, true_model
 from tests.litho_models.prints import write_store
 

@@ -11,10 +11,10 @@ from scipy.ndimage import gaussian_filter
 
 from litho_models.effects import FieldContext, get_effect
 from litho_models.loop import LoopConfig, close_loop
-from litho_models.loop.directions import blocks_of
-from litho_models.loop.fields import prepare_fields
 from litho_models.loop.fitting import FoldFits
-from litho_models.loop.rivals import generic_rival, remainder_of
+from litho_models.loop.prepared import prepare_fields
+from litho_models.loop.screening.directions import blocks_of
+from litho_models.loop.selection.rivals import generic_rival, remainder_of
 from litho_models.loop.state import State
 from litho_models.models import build_model
 from tests.litho_models.loop_scans import printed_scans, true_model

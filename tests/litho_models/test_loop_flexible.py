@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from litho_models.loop import LoopConfig, close_loop, corrected_chain
-from litho_models.loop.outcome import summarise
+from litho_models.loop.result.summary import summarise
 from tests.litho_models.loop_scans import printed_scans, true_model
 
 EFFECT = {"vignetting": {"strength": 0.2}}

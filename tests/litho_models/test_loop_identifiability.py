@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from litho_models.effects import get_effect
-from litho_models.loop.fields import prepare_fields
 from litho_models.loop.identifiability import PROFILE_POINTS, identifiability, profiles
 from litho_models.loop.parameters import effect_slots, get_vector
+from litho_models.loop.prepared import prepare_fields
 from litho_models.loop.state import fit_state
 from tests.litho_models.loop_scans import printed_scans, true_model
 

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from litho_models.effects import get_effect
-from litho_models.loop.added_effects import doubtful_effects
-from litho_models.loop.confirming import confirm
-from litho_models.loop.contest import Added
-from litho_models.loop.fields import prepare_fields
+from litho_models.loop.prepared import prepare_fields
+from litho_models.loop.result.added_effects import doubtful_effects
 from litho_models.loop.scoring import Score
-from litho_models.loop.search import FORM_ERROR, Search, why_nameless
+from litho_models.loop.selection.confirming import confirm
+from litho_models.loop.selection.contest import Added
+from litho_models.loop.selection.search import FORM_ERROR, Search, why_nameless
 from litho_models.loop.state import State, fit_state
 from tests.litho_models.loop_scans import printed_scans, true_model
 

@@ -8,9 +8,16 @@ import numpy as np
 import pytest
 
 from litho_data.register.bend import Bend
-from litho_models.loop.fields import prepare_fields
-from litho_models.loop.observed import bends, line_roughness, observe, quantisation, rounding_step_um, scars
+from litho_models.loop.prepared import prepare_fields
 from litho_models.loop.probes.defects import find_defects
+from litho_models.loop.single_scans.observed import (
+    bends,
+    line_roughness,
+    observe,
+    quantisation,
+    rounding_step_um,
+    scars,
+)
 from tests.litho_models.loop_scans import printed_scans
 
 HEIGHTS = np.random.default_rng(0).normal(0.5, 0.1, size=(80, 90))

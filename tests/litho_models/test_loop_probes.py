@@ -12,8 +12,8 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
-from litho_models.loop.fields import Field, prepare_fields
 from litho_models.loop.fitting import FoldFits
+from litho_models.loop.prepared import Field, prepare_fields
 from litho_models.loop.probes import Probed, figures, probe_residual
 from litho_models.loop.probes.defects import find_defects
 from litho_models.loop.probes.kernel import off_centre_peak, resampled

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from litho_data.errors import InputError
-from litho_models.metrics import bootstrap_interval, paired_difference, score_scan
-from litho_models.print_gain import print_gain
+from litho_data.foundation.errors import InputError
+from litho_models.scoring.metrics import bootstrap_interval, paired_difference, score_scan
+from litho_models.scoring.print_gain import print_gain
 
 VALID = np.ones((256, 256), bool)
 

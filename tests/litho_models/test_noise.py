@@ -11,7 +11,7 @@ from prints import make_scans, printed_height_um, write_store
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_models.noise.bounds import high_band_sigma_nm, repeated_prints
 from litho_models.noise.calibration import Residuals, analyse_spread, conformal_factor
 from litho_models.noise.dose import dose_matrix
@@ -22,7 +22,7 @@ from litho_models.noise.spread_scores import normalised_calibration_error, spars
 from litho_models.noise.staircase import READABLE_AT, find_edges, step_print
 from litho_models.noise.surface import print_noise, surface_noise
 from litho_models.noise.variance import COVARIATES, covariate_maps, fit_log_variance, sigma_nm
-from litho_models.splits import locked_ids
+from litho_models.splits.splits import locked_ids
 
 RANDOM = np.random.default_rng(0)
 
@@ -430,7 +430,7 @@ def store(tmp_path_factory):
 
 def test_a_store_without_references_gets_a_lower_bound_that_is_one(store, tmp_path):
     from litho_models.noise import NoiseAnalysis, noise
-    from litho_models.scores import noise_floor
+    from litho_models.scoring.scores import noise_floor
 
     result = noise(store, tmp_path / "out")
     assert NoiseAnalysis.read(tmp_path / "out") == result
@@ -476,7 +476,7 @@ def test_a_locked_print_is_in_the_dose_matrix_and_in_nothing_else(tmp_path):
 
 
 def test_residuals_of_a_benchmark_are_out_of_fold_and_locked_scans_stay_out(store, tmp_path):
-    from litho_models.benchmark import benchmark
+    from litho_models.evaluation.benchmark import benchmark
     from litho_models.noise import noise
 
     folders = [tmp_path / "b0", tmp_path / "b1"]
@@ -519,8 +519,8 @@ def test_residuals_of_a_benchmark_are_out_of_fold_and_locked_scans_stay_out(stor
 
 
 def test_residuals_of_a_frozen_model_say_what_it_saw(store, tmp_path):
+    from litho_models.fitting.runs import train
     from litho_models.noise import noise
-    from litho_models.runs import train
 
     train(store, "linear", tmp_path / "run")
     spread = noise(store, tmp_path / "out", residuals=[tmp_path / "run" / "model"]).spread
@@ -532,10 +532,10 @@ def test_residuals_of_a_frozen_model_say_what_it_saw(store, tmp_path):
 
 def test_residuals_are_those_of_the_benchmark_and_of_the_evaluation(tmp_path):
     from litho_data.store import open_store
-    from litho_models.benchmark import benchmark
-    from litho_models.evaluate import evaluate
+    from litho_models.evaluation.benchmark import benchmark
+    from litho_models.evaluation.evaluate import evaluate
+    from litho_models.fitting.runs import train
     from litho_models.noise.residuals import read_residuals
-    from litho_models.runs import train
 
     # A bow of 30 nm in every scan, which a residual without the shared background would hold.
     bowed = write_store(tmp_path / "bowed.zarr", make_scans(6, size_px=96, bow_um=0.03))
@@ -559,7 +559,7 @@ def test_residuals_are_those_of_the_benchmark_and_of_the_evaluation(tmp_path):
 def test_the_command_takes_single_files(tmp_path):
     from typer.testing import CliRunner
 
-    from litho_models.cli import app
+    from litho_models.cli.app import app
     from litho_models.noise import NoiseAnalysis
 
     files = {
@@ -606,7 +606,7 @@ def test_the_command_takes_single_files(tmp_path):
 def test_the_command_refuses_options_that_it_would_not_use(tmp_path, given, said):
     from typer.testing import CliRunner
 
-    from litho_models.cli import app
+    from litho_models.cli.app import app
 
     refused = CliRunner().invoke(app, ["noise", *given, "--out", str(tmp_path / "none")])
     assert isinstance(refused.exception, InputError)

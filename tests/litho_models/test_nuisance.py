@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_cdt
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
 from litho_data.register import Bend, resample_to_layout
-from litho_models.nuisance import (
+from litho_models.scan_terms.nuisance import (
     POLICIES,
     TERM_COUNT,
     calibration_blocks,

@@ -7,15 +7,15 @@ import pytest
 import torch
 from prints import make_scan, make_scans
 
-from litho_models.cost import measured_predictions
-from litho_models.diagnostics import tile_consistency
-from litho_models.edges import edge_placement, mid_step_heights_um
-from litho_models.metrics import phase_waves
+from litho_models.evaluation.diagnostics import tile_consistency
 from litho_models.models import build_model
-from litho_models.score_records import Prediction
-from litho_models.scores import protocol_for, score_model
-from litho_models.similarity import SSIM_WINDOW_PX, structural_similarity
-from litho_models.tiles import predict_scan
+from litho_models.prediction.cost import measured_predictions
+from litho_models.prediction.tiles import predict_scan
+from litho_models.scoring.edges import edge_placement, mid_step_heights_um
+from litho_models.scoring.metrics import phase_waves
+from litho_models.scoring.records import Prediction
+from litho_models.scoring.scores import protocol_for, score_model
+from litho_models.scoring.similarity import SSIM_WINDOW_PX, structural_similarity
 
 PITCH_UM = 0.1
 HEIGHTS_UM = mid_step_heights_um(13, 0.1)

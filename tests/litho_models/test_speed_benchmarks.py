@@ -13,7 +13,7 @@ from benchmarks.plain_pbl import PlainPbl
 from benchmarks.record import NOT_MEASURED, published
 from benchmarks.side_by_side import PAGE, RESULTS, as_markdown, relative_percent
 from benchmarks.trained_pbl import areawise_gflop, random_layout
-from litho_models.freeze import save_frozen
+from litho_models.frozen.files import save_frozen
 from litho_models.models import build_model
 from litho_models.simulator import crop_border
 

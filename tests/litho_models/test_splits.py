@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from litho_data.errors import InputError
-from litho_models.splits import (
+from litho_data.foundation.errors import InputError
+from litho_models.splits.splits import (
     Crop,
     grouped_folds,
     ids_sha256,

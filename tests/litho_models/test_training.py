@@ -13,17 +13,18 @@ import pytest
 import torch
 from prints import BLUR_UM, make_scan, make_scans, printed_height_um, write_store
 
-from litho_data.errors import InputError
+from litho_data.foundation.errors import InputError
+from litho_models.fitting import TrainingConfig, fit, fit_with_record
+from litho_models.fitting import stochastic as network
+from litho_models.fitting.checkpoint import CheckpointFolder
+from litho_models.fitting.config import FAST_STEPS, PAPER_LEARNING_RATE
+from litho_models.fitting.crops import Window, cut, plan_batch
+from litho_models.fitting.gauss_newton import fit_gauss_newton
+from litho_models.fitting.stochastic import learning_rate
 from litho_models.models import build_model
 from litho_models.models.pbl import Pbl
-from litho_models.tiles import predict_scan
-from litho_models.training import TrainingConfig, fit, fit_with_record, network
-from litho_models.training.checkpoint import CheckpointFolder
-from litho_models.training.config import FAST_STEPS, PAPER_LEARNING_RATE
-from litho_models.training.crops import Window, cut, plan_batch
-from litho_models.training.gauss_newton import fit_gauss_newton
-from litho_models.training.network import learning_rate
-from litho_models.training.nuisances import estimate_nuisances
+from litho_models.prediction.tiles import predict_scan
+from litho_models.scan_terms.training import estimate_nuisances
 
 QUICK = {"steps": 12, "rounds": 3, "batch": 2, "crop_px": 32, "precision": "32-true"}
 SMALL_NETS = {"pointwise_channels": (8, 4), "areawise_channels": (8, 4), "sigma_diffusion_init_um": 0.3}
@@ -187,7 +188,7 @@ def test_passes_change_the_memory_and_not_the_step(monkeypatch):
         return fit_with_record("pbl", make_scans(4, size_px=64), config, model_fields=SMALL_NETS)
 
     together = trained()
-    monkeypatch.setattr("litho_models.training.crops._PASS_PX", 1)
+    monkeypatch.setattr("litho_models.fitting.crops._PASS_PX", 1)
     apart = trained()
     # Sums in another order: rounding of float32 and no more, a few 1e-6 after four steps.
     for name, value in together.model.state_dict().items():
@@ -317,7 +318,7 @@ class OneOfMany:
 
 @pytest.mark.parametrize("world", [2, 3, 5])
 def test_any_number_of_processes_has_the_mean_gradient_of_one(world, monkeypatch):
-    monkeypatch.setattr("litho_models.training.crops._PASS_PX", 1)
+    monkeypatch.setattr("litho_models.fitting.crops._PASS_PX", 1)
     scans = make_scans(3, size_px=64)
     # Unequal weights of the crops: a mean of means would show.
     scans[0].valid[:, :40] = False
@@ -343,14 +344,14 @@ def test_any_number_of_processes_has_the_mean_gradient_of_one(world, monkeypatch
 @pytest.mark.slow
 @pytest.mark.parametrize("world", [2, 3, 5])
 def test_several_processes_give_the_loss_curve_of_one(world, tmp_path):
-    from litho_models.runs import TrainingRun
+    from litho_models.fitting.runs import TrainingRun
 
     store = write_store(tmp_path / "made.zarr", make_scans(6, size_px=64))
     script = tmp_path / "run.py"
     script.write_text(
         "import sys\n"
-        "from litho_models.runs import train\n"
-        "from litho_models.training import crops\n"
+        "from litho_models.fitting.runs import train\n"
+        "from litho_models.fitting import crops\n"
         # A pass per crop: processes must add their gradients once per step all the same.
         "crops._PASS_PX = 1\n"
         "settings = dict(steps=4, rounds=2, batch=4, crop_px=32, precision='32-true', nuisance='offset')\n"

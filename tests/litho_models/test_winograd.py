@@ -10,10 +10,10 @@ import torch
 from torch.autograd.function import FunctionCtx
 from torch.nn import functional
 
-from litho_models import winograd
-from litho_models.areawise import StackSettings, convolution_stack
-from litho_models.winograd import FixedStack
-from litho_models.winograd_passes import FRAME_PX, lift_back
+from litho_models.fast import winograd
+from litho_models.fast.stack import StackSettings, convolution_stack
+from litho_models.fast.winograd import FixedStack
+from litho_models.fast.winograd_passes import FRAME_PX, lift_back
 
 SLOPE = 0.02
 

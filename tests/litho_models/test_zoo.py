@@ -11,12 +11,13 @@ import torch
 from prints import make_scans, write_store
 from typer.testing import CliRunner
 
-from litho_data.errors import InputError
-from litho_models import save_frozen, zoo
-from litho_models.cli import app
-from litho_models.model_card import ModelCard
+from litho_data.foundation.errors import InputError
+from litho_models import save_frozen
+from litho_models.cli.app import app
+from litho_models.evaluation.zoo_making import HELD_OUT, OUT_OF_FOLD, TRAINED_ON, differing_metrics, make_zoo
+from litho_models.frozen import zoo
+from litho_models.frozen.card import ModelCard
 from litho_models.models import build_model
-from litho_models.zoo_making import HELD_OUT, OUT_OF_FOLD, TRAINED_ON, differing_metrics, make_zoo
 
 SMALL = {
     "physics": {},
@@ -97,10 +98,10 @@ def test_unknown_names_and_paths_are_refused(small_zoo):
 
 def test_every_command_that_takes_a_frozen_model_takes_it_from_the_zoo(store, tmp_path):
     from litho_data.store import open_store
-    from litho_models.evaluate import Evaluation
+    from litho_models.evaluation.evaluate import Evaluation
+    from litho_models.fitting.runs import freeze
     from litho_models.loop.run import _base_model
     from litho_models.noise.residuals import read_residuals
-    from litho_models.runs import freeze
 
     name = zoo.list()[-1]
     named, there = f"zoo:{name}", zoo.folder(name)
@@ -117,13 +118,13 @@ def test_every_command_that_takes_a_frozen_model_takes_it_from_the_zoo(store, tm
 
 
 def test_listing_the_zoo_loads_no_torch():
-    code = "import sys, litho_models; litho_models.zoo.list(); print('torch' in sys.modules)"
+    code = "import sys, litho_models; litho_models.frozen.zoo.list(); print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
 
 
 def test_the_zoo_is_made_in_one_call_and_reproduces_its_cards(store, tmp_path):
-    from litho_models.benchmark import benchmark
+    from litho_models.evaluation.benchmark import benchmark
 
     models = ("physics", "linear")
     scored = benchmark(store, tmp_path / "b", models=models, folds=2, settings={"nuisance": "offset"})
@@ -164,7 +165,7 @@ def test_the_command_in_the_card_makes_the_same_weights(store, tmp_path):
 
     from typer.testing import CliRunner
 
-    from litho_models.cli import app
+    from litho_models.cli.app import app
 
     card = make_zoo(store, tmp_path / "runs", tmp_path / "zoo", models=["affine-mtf"])["affine-mtf"]
     shutil.copytree(store, tmp_path / "made.zarr")
@@ -179,7 +180,7 @@ def test_the_command_in_the_card_makes_the_same_weights(store, tmp_path):
 
 
 def test_a_benchmark_of_other_data_is_refused(store, tmp_path):
-    from litho_models.benchmark import benchmark
+    from litho_models.evaluation.benchmark import benchmark
 
     other = write_store(tmp_path / "other.zarr", make_scans(5, size_px=80))
     benchmark(other, tmp_path / "b", models=["identity"], folds=2)

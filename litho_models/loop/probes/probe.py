@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from litho_models.loop.fields import Field
+from litho_models.loop.prepared import Field
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from litho_models.loop.confirming import SMALLEST_SHARE, Confirmation, confirm
-from litho_models.loop.fields import Field
+from litho_models.loop.prepared import Field
 from litho_models.loop.probes.defects import Defects, find_defects
 from litho_models.loop.probes.kernel import missing_kernel
 from litho_models.loop.probes.places import position_map, profile
@@ -16,8 +15,9 @@ from litho_models.loop.probes.probe import Estimate, Probe
 from litho_models.loop.probes.tables import axis_slope_table, level_table, slope_table
 from litho_models.loop.probes.trend import OrderTrend, order_trends
 from litho_models.loop.scoring import Score, Terms, score
+from litho_models.loop.selection.confirming import SMALLEST_SHARE, Confirmation, confirm
 from litho_models.loop.state import State
-from litho_models.nuisance import nuisance_basis
+from litho_models.scan_terms.nuisance import nuisance_basis
 
 CONTROLS = 199
 CONTROL_QUANTILE = 0.95

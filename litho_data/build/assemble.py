@@ -1,0 +1,178 @@
+"""From finished scans to a finished store: arrays, tables, manifest, attributes, hashes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from litho_data.build.card import Card
+from litho_data.provenance.steps import array_sha256, canonical_json, record_sha256
+from litho_data.store.schema import SAMPLE_VARIABLES, STORE_SCHEMA, dataset_sha256
+from litho_data.store.write import consolidate, write_samples, write_table
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import zarr
+
+Record = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """What a store is made of besides its scans.
+
+    ``recipe`` is the levelling recipe in canonical form, ``files`` has one row per raw file (``path``,
+    ``scan``, ``kind``, ``sha256``, ``size_bytes``, ``reader``, ``status``, ``reason``, ``header``), and
+    ``build`` is what must not enter a hash: when, where, with which software.
+    """
+
+    card: Card
+    recipe: Record
+    seed: int
+    assumptions: Sequence[str]
+    files: pd.DataFrame
+    build: Record
+
+
+def assemble(
+    root: zarr.Group,
+    records: Sequence[Record],
+    load: Callable[[str], Mapping[str, np.ndarray]],
+    campaign: Campaign,
+) -> str:
+    """Write everything but the groups ``scans/<id>``, which are there; returns the dataset's hash.
+
+    Args:
+        root: the growing group.
+        records: of the finished scans, sorted by id; references (``use`` other than dataset) included.
+        load: the arrays of an id on the layout grid.
+        campaign: the rest.
+    """
+    scans = [_row(record) for record in records if record["use"] == "dataset"]
+    write_samples(root, scans, load, campaign.card.layout.pitch_um)
+    quality, provenance = quality_table(records), provenance_table(records)
+    write_table(root, "quality", quality, "scan")
+    write_table(root, "provenance", provenance, "step")
+    manifest = manifest_attributes(campaign, quality, provenance)
+    write_table(root, "manifest", campaign.files, "file", {**manifest, "build": dict(campaign.build)})
+    sha256 = dataset_sha256(
+        dataset_facts(campaign.card), [_identity(record) for record in records_of_use(records)]
+    )
+    manifest_sha256 = record_sha256([manifest, table_sha256(campaign.files)])
+    root.attrs.update(root_attributes(manifest, sha256, manifest_sha256))
+    consolidate(root)
+    return sha256
+
+
+def records_of_use(records: Sequence[Record], use: str = "dataset") -> list[Record]:
+    """The records of one use, in order."""
+    return [record for record in records if record["use"] == use]
+
+
+def dataset_facts(card: Card) -> dict[str, Any]:
+    """What a card says about every scan alike, as it enters the dataset's hash."""
+    layout = card.layout
+    facts = {"pitch_um": layout.pitch_um, "level_height_um": layout.level_height_um, "levels": layout.levels}
+    write = card.write.model_dump(exclude_none=True) if card.write else {}
+    return {**facts, "write": write} if write else facts
+
+
+def root_attributes(manifest: Record, dataset_hash: str, manifest_hash: str) -> dict[str, Any]:
+    """The attributes of the root group; all but the two hashes follow from the manifest."""
+    card = Card.model_validate(manifest["card"])
+    operations = "read, level, register, resample" if manifest["recipe"] else "read, register, resample"
+    return {
+        "Conventions": "CF-1.11",
+        "schema": STORE_SCHEMA,
+        "name": card.name,
+        "title": card.title,
+        "license": card.license,
+        "citation": card.citation,
+        **dataset_facts(card),
+        "assumptions": list(manifest["assumptions"]),
+        "history": f"litho-data: {operations}; the steps of every array are in the group provenance",
+        "dataset_sha256": dataset_hash,
+        "manifest_sha256": manifest_hash,
+    }
+
+
+def manifest_attributes(
+    campaign: Campaign, quality: pd.DataFrame, provenance: pd.DataFrame
+) -> dict[str, Any]:
+    """The manifest beside its table of files: the card as it was understood, and hashes of the tables."""
+    content = {
+        "card": campaign.card.model_dump(mode="json", exclude_none=True),
+        "recipe": dict(campaign.recipe),
+        "seed": campaign.seed,
+        "assumptions": list(campaign.assumptions),
+        "quality_sha256": table_sha256(quality),
+        "provenance_sha256": table_sha256(provenance),
+    }
+    return json.loads(json.dumps(content))
+
+
+def quality_table(records: Sequence[Record]) -> pd.DataFrame:
+    """One row per scan of the dataset; a figure that could not be had is NaN."""
+    import pandas as pd
+
+    rows = []
+    for record in records_of_use(records):
+        ny, nx = _shape_of(record, "mask_level")
+        scan_ny, scan_nx = _shape_of(record, "raw_height_um")
+        pitch_y_um, pitch_x_um = record["read"]["pitch_um"]
+        shape = {"layout_ny": ny, "layout_nx": nx, "scan_ny": scan_ny, "scan_nx": scan_nx}
+        pitch = {"scan_pitch_y_um": pitch_y_um, "scan_pitch_x_um": pitch_x_um}
+        rows.append({"scan": record["id"], **shape, **pitch, **record["quality"]})
+    return pd.DataFrame(rows)
+
+
+def provenance_table(records: Sequence[Record]) -> pd.DataFrame:
+    """One row per step of every scan: the record as JSON, its id, and the software that ran it."""
+    import pandas as pd
+
+    rows = [
+        {
+            "scan": record["id"],
+            "op": step["op"],
+            "step_id": step["id"],
+            "record": canonical_json(step),
+            "software": canonical_json(record["software"]),
+        }
+        for record in records
+        for step in record["steps"]
+    ]
+    return pd.DataFrame(rows)
+
+
+def table_sha256(table: pd.DataFrame) -> str:
+    """Hash of a table: column names and values, in order; the software column, which varies, is left out."""
+    columns = {}
+    for name in sorted(str(column) for column in table.columns if column != "software"):
+        values = table[name].to_numpy()
+        numeric = values.dtype.kind in "biuf"
+        columns[name] = (
+            array_sha256(values, "1", ("row",)) if numeric else record_sha256([str(v) for v in values])
+        )
+    return record_sha256(columns)
+
+
+def _row(record: Record) -> dict[str, Any]:
+    keys = ("id", "print", "order", "columns")
+    return {**{key: record[key] for key in keys}, "shape": _shape_of(record, "mask_level")}
+
+
+def _identity(record: Record) -> dict[str, Any]:
+    hashes = {output["name"]: output["sha256"] for step in record["steps"] for output in step["outputs"]}
+    names = [*(variable.name for variable in SAMPLE_VARIABLES), "bend_um"]
+    arrays = {name: hashes[name] for name in names if name in hashes}
+    return {**{key: record[key] for key in ("id", "print", "order")}, **record["columns"], "arrays": arrays}
+
+
+def _shape_of(record: Record, name: str) -> tuple[int, int]:
+    outputs = (output for step in record["steps"] for output in step["outputs"])
+    shape = next(output["shape"] for output in outputs if output["name"] == name)
+    return int(shape[0]), int(shape[1])

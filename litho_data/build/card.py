@@ -1,0 +1,191 @@
+"""The dataset card: one TOML file that says what the raw files are and what they mean."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import Record, first_error
+from litho_data.foundation.units import um_per
+
+ScanFormat = Literal["auto", "text-matrix", "tiff", "npy", "gsf", "gwy", "vendor"]
+Use = Literal["dataset", "flat", "substrate", "steps"]
+Registration = Literal["affine", "homography", "ladder"]
+
+_WITHOUT_SIZE = ("text-matrix", "tiff", "npy")
+
+
+def load_card(path: str | Path) -> Card:
+    """Read and check a dataset card.
+
+    Raises:
+        InputError: no such file, no TOML, or a key that is unknown, missing or has an impossible value; the
+            message names the key, the value and what was expected.
+    """
+    file = Path(path)
+    try:
+        content = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(
+            f"cannot read {file} as a dataset card", got=str(error), wanted="a TOML file"
+        ) from error
+    return check_card(content, f"card {file}")
+
+
+def check_card(content: dict[str, Any], what: str) -> Card:
+    """The same checks on a card that is already a dict."""
+    try:
+        return Card.model_validate(content)
+    except ValidationError as error:
+        raise _readable(error, what) from error
+
+
+def _positive(value: float) -> float:
+    # pydantic takes inf for a positive number.
+    if not 0 < value < float("inf"):
+        raise ValueError("wanted a positive number")
+    return value
+
+
+def _known_unit(value: str) -> str:
+    um_per(value)
+    return value
+
+
+def _file_pattern(value: str) -> str:
+    if "{id}" not in value:
+        raise ValueError("wanted a pattern with {id}, for example 'scans/{id}.txt'")
+    return _inside(value)
+
+
+def _inside(value: str) -> str:
+    """A relative path that stays in the data folder, whichever separator it is written with."""
+    parts = PurePosixPath(value.replace("\\", "/")).parts
+    if not parts or ".." in parts or parts[0] == "/" or re.match("[A-Za-z]:", value):
+        raise ValueError("wanted a path that stays inside the data folder")
+    return value
+
+
+def _id_pattern(value: str) -> str:
+    try:
+        groups = re.compile(value).groupindex
+    except re.error as error:
+        raise ValueError(f"wanted a regular expression ({error})") from error
+    if "print" not in groups:
+        raise ValueError("wanted a regular expression with a group named print: (?P<print>…)")
+    return value
+
+
+Length = Annotated[float, Field(strict=True), AfterValidator(_positive)]
+FilePattern = Annotated[str, AfterValidator(_file_pattern)]
+InsidePath = Annotated[str, AfterValidator(_inside)]
+
+
+class LayoutFiles(Record):
+    """What was sent to the printer."""
+
+    files: FilePattern
+    pitch_um: Length
+    level_height_um: Length
+    levels: int = Field(ge=2, le=256)
+
+
+class ScanFiles(Record):
+    """What the microscope wrote. ``size_um`` is (y, x), for formats that do not carry it."""
+
+    files: FilePattern
+    format: ScanFormat = "auto"
+    unit: Annotated[str, AfterValidator(_known_unit)] | None = None
+    size_um: tuple[Length, Length] | None = None
+    channel: str | None = None
+    fast_axis: Literal["x", "y"] | None = None
+    full_scale_file: InsidePath | None = None
+
+    @model_validator(mode="after")
+    def _complete(self) -> Self:
+        if self.full_scale_file is not None and self.unit is not None:
+            raise ValueError("wanted either unit or full_scale_file, which is in metres")
+        if self.format in _WITHOUT_SIZE:
+            if self.unit is None and self.full_scale_file is None:
+                raise ValueError(
+                    f"unit is missing: a {self.format} file does not carry it, wanted e.g. unit = 'm'"
+                )
+            if self.size_um is None:
+                raise ValueError(
+                    f"size_um is missing: a {self.format} file does not carry it, wanted [y, x] in µm"
+                )
+        return self
+
+
+class Process(Record):
+    """How raw scans become heights on the layout grid: a levelling recipe file, a registration model."""
+
+    level: InsidePath | None = None
+    registration: Registration = "affine"
+
+
+class Ids(Record):
+    """What an id says: a regular expression over the whole id, and a CSV table with more about it."""
+
+    print: Annotated[str, AfterValidator(_id_pattern)] | None = None
+    table: InsidePath | None = None
+
+
+class Write(Record):
+    """How the printer wrote a field; what is absent is assumed and labelled as an assumption."""
+
+    slow_axis: Literal["x", "y"] | None = None
+    field_um: Length | None = None
+
+
+class Source(Record):
+    """Where the files can be had: a base URL, and a registry of SHA-256 sums beside the card."""
+
+    url: str = Field(pattern=r"^https?://")
+    registry: InsidePath
+
+
+class Card(Record):
+    """A dataset card, checked."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")
+    title: str = ""
+    license: str = ""
+    citation: str = ""
+    layout: LayoutFiles
+    scan: ScanFiles
+    process: Process = Process()
+    ids: Ids = Ids()
+    write: Write | None = None
+    source: Source | None = None
+
+
+def _readable(error: ValidationError, what: str) -> InputError:
+    first = error.errors()[0]
+    key = ".".join(str(part) for part in first["loc"])
+    if first["type"] == "extra_forbidden":
+        allowed = ", ".join(_model_at(first["loc"][:-1]).model_fields)
+        return InputError(f"{what}: unknown key {key}", got=repr(first["input"]), wanted=f"one of {allowed}")
+    if first["type"] == "missing":
+        return InputError(f"{what}: key {key}", got="nothing", wanted="a value")
+    if first["type"] == "value_error":
+        # The cause is our own sentence; for a table it already names the key within it.
+        cause = first["ctx"]["error"]
+        shown = "" if isinstance(first["input"], dict) else f" = {first['input']!r}"
+        return InputError(f"{what}: {key}{shown}: {cause}")
+    return InputError(f"{what}: {first_error(error)}")
+
+
+def _model_at(location: tuple[int | str, ...]) -> type[BaseModel]:
+    """The model that the keys of an error location lead to."""
+    model: type[BaseModel] = Card
+    for part in location:
+        annotation = model.model_fields[str(part)].annotation
+        candidates = [annotation, *getattr(annotation, "__args__", ())]
+        model = next(c for c in candidates if isinstance(c, type) and issubclass(c, BaseModel))
+    return model

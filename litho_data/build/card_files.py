@@ -1,0 +1,86 @@
+"""The two files a card may point to: the table with more about each id, and the full scales of images."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import get_args
+
+from litho_data.build.card import Use
+from litho_data.foundation.errors import InputError
+from litho_data.store.schema import OPTIONAL_COLUMNS
+
+SAFE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._+-]*")
+COLUMNS = ("id", "order", *OPTIONAL_COLUMNS, "use")
+
+
+def read_table(path: Path) -> dict[str, dict[str, str]]:
+    """Rows of a card's CSV table by id; empty cells are left out, every cell that is left has been checked.
+
+    Raises:
+        InputError: unreadable, an unknown column, an id that is no plain name, or a cell of the wrong kind.
+    """
+    try:
+        with open(path, newline="", encoding="utf-8-sig") as stream:
+            reader = csv.DictReader(stream, strict=True, restkey="(too many cells)")
+            rows = list(reader)
+            columns = list(reader.fieldnames or ())
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"cannot read table {path}", got=str(error), wanted="a CSV file") from error
+    unknown = [name for name in columns if name not in COLUMNS]
+    if unknown or "id" not in columns:
+        raise InputError(f"columns of {path}", got=columns, wanted=f"id and any of {', '.join(COLUMNS[1:])}")
+    table: dict[str, dict[str, str]] = {}
+    for number, row in enumerate(rows, start=2):
+        filled = {
+            key: value.strip() for key, value in row.items() if isinstance(value, str) and value.strip()
+        }
+        _check_row(filled, f"{path} line {number}", "(too many cells)" in row, "order" in columns)
+        if filled["id"] in table:
+            raise InputError(f"{path} line {number}: id", got=repr(filled["id"]), wanted="each id once")
+        table[filled.pop("id")] = filled
+    return table
+
+
+def _check_row(row: Mapping[str, str], what: str, overfull: bool, needs_order: bool) -> None:
+    if overfull:
+        raise InputError(f"{what}: cells", got="more cells than columns")
+    scan_id = row.get("id", "")
+    if not SAFE_ID.fullmatch(scan_id):
+        raise InputError(f"{what}: id", got=repr(scan_id), wanted="an id of the data folder, without path")
+    if needs_order and not row.get("order", "").lstrip("-").isdecimal():
+        raise InputError(f"{what}: order", got=repr(row.get("order", "")), wanted="a whole number")
+    if row.get("use", "dataset") not in get_args(Use):
+        raise InputError(f"{what}: use", got=repr(row["use"]), wanted=" | ".join(get_args(Use)))
+    for name in OPTIONAL_COLUMNS:
+        if name in row and not _is_finite(row[name]):
+            raise InputError(f"{what}: {name}", got=repr(row[name]), wanted="a number")
+
+
+def _is_finite(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
+
+
+def read_full_scales(path: Path) -> dict[str, float]:
+    """Height of the largest grey value per file name or id, from a JSON object in metres, as µm.
+
+    Raises:
+        InputError: no such file, no JSON object, or a value that is not a positive number.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot read {path}", got=str(error), wanted="a JSON object, m per id") from error
+    if not isinstance(content, dict):
+        raise InputError(f"content of {path}", got=type(content).__name__, wanted="a JSON object, m per id")
+    for key, value in content.items():
+        if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value < math.inf:
+            raise InputError(f"{path}: {key}", got=repr(value), wanted="a positive number of metres")
+    return {key: float(value) * 1e6 for key, value in content.items()}

@@ -1,0 +1,191 @@
+"""Which printed fields a card stands for: files found, paired by id, and described by the card's table."""
+
+from __future__ import annotations
+
+import glob
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import cast
+
+from litho_data.build.card import Card, Use, load_card
+from litho_data.build.card_files import SAFE_ID, read_full_scales, read_table
+from litho_data.exchange.fetch import known_folders
+from litho_data.foundation.errors import InputError
+from litho_data.store.schema import OPTIONAL_COLUMNS
+
+
+@dataclass(frozen=True)
+class PrintedField:
+    """One field to build: its files and what the card says about it.
+
+    ``columns`` holds the optional numbers of the table (µm, dose), ``full_scale_um`` the height of the
+    largest integer of an image scan; ``layout`` may be None for a reference scan only (``use`` not dataset).
+    """
+
+    id: str
+    print_id: str
+    order: int
+    use: Use
+    scan: Path
+    layout: Path | None
+    full_scale_um: float | None = None
+    columns: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class LeftAside:
+    """Files that make no field: an id with only one of its files (``unpaired``), or one that is refused."""
+
+    id: str
+    files: tuple[Path, ...]
+    unpaired: bool
+    reason: str
+
+
+@dataclass(frozen=True)
+class Listing:
+    """A card, the folder of its files, the fields to build, and what was left aside with the reason why."""
+
+    card: Card
+    card_path: Path
+    data_dir: Path
+    fields: tuple[PrintedField, ...]
+    left_aside: tuple[LeftAside, ...]
+    assumptions: tuple[str, ...]
+
+    def relative(self, path: Path) -> str:
+        """The path as it is recorded: relative to the data folder, with forward slashes."""
+        return path.relative_to(self.data_dir).as_posix()
+
+
+def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Listing:
+    """Find and pair the files of a card.
+
+    Args:
+        card_path: the card.
+        data_dir: folder that the card's file patterns start from; by default the card's own folder, then
+            ``$LITHO_DATA_DIR/<name>``, then the user cache, whichever has files.
+
+    Raises:
+        InputError: a bad card, no folder with files, a bad table, or no id that has both files.
+    """
+    file = Path(card_path)
+    card = load_card(file)
+    folder = _data_folder(card, file, data_dir)
+    layouts = _files_by_id(folder, card.layout.files)
+    scans = _files_by_id(folder, card.scan.files)
+    table = _table(card, folder, file.parent)
+    scales = _read_full_scales(card, folder)
+
+    fields: list[PrintedField] = []
+    aside: list[LeftAside] = []
+    for scan_id in sorted({*layouts, *scans, *table}):
+        row = table.get(scan_id, {})
+        use = cast(Use, row.get("use", "dataset"))
+        files = tuple(found[scan_id] for found in (layouts, scans) if scan_id in found)
+        if scan_id not in scans or (scan_id not in layouts and use == "dataset"):
+            missing = card.scan.files if scan_id not in scans else card.layout.files
+            aside.append(LeftAside(scan_id, files, True, f"no file {missing.replace('{id}', scan_id)}"))
+            continue
+        print_id = _print_id(scan_id, card)
+        scale = _full_scale(scales, scan_id, scans[scan_id])
+        reason = _refusal(scan_id, print_id, use, table, card)
+        if not reason and scales is not None and scale is None:
+            reason = f"no full scale in {card.scan.full_scale_file}"
+        if reason:
+            aside.append(LeftAside(scan_id, files, False, reason))
+            continue
+        fields.append(
+            PrintedField(
+                id=scan_id,
+                print_id=print_id or scan_id,
+                order=int(row["order"]) if "order" in row else len(fields),
+                use=use,
+                scan=scans[scan_id],
+                layout=layouts.get(scan_id),
+                full_scale_um=scale,
+                columns={name: float(row[name]) for name in OPTIONAL_COLUMNS if name in row},
+            )
+        )
+    if not any(one.use == "dataset" for one in fields):
+        shown = "; ".join(f"{one.id}: {one.reason}" for one in aside[:3]) or "no ids"
+        raise InputError(f"card {file}: no field to build", got=shown, wanted="a layout and a scan of one id")
+    return Listing(card, file, folder, tuple(fields), tuple(aside), _assumptions(card, table))
+
+
+def _data_folder(card: Card, card_path: Path, data_dir: str | Path | None) -> Path:
+    folders = [Path(data_dir)] if data_dir is not None else [card_path.parent, *known_folders(card.name)]
+    for folder in folders:
+        if all(_files_by_id(folder, pattern) for pattern in (card.layout.files, card.scan.files)):
+            return folder.resolve()
+    raise InputError(
+        f"files of card {card_path}",
+        got=f"none in {', '.join(str(folder) for folder in folders)}",
+        wanted=f"{card.layout.files} and {card.scan.files}",
+        hint=f"try litho-data fetch {card.name}, or set LITHO_DATA_DIR" if card.source else "",
+    )
+
+
+def _files_by_id(folder: Path, pattern: str) -> dict[str, Path]:
+    before, *rest = pattern.split("{id}")
+    # Only the first place captures the id, the others must repeat it.
+    text = re.escape(before) + "(?P<id>[^/]+)" + "(?P=id)".join(re.escape(part) for part in rest)
+    match = re.compile(text)
+    found = glob.glob("*".join(glob.escape(part) for part in (before, *rest)), root_dir=folder)
+    names = {name: match.fullmatch(name.replace("\\", "/")) for name in sorted(found)}
+    return {hit["id"]: folder / name for name, hit in names.items() if hit and (folder / name).is_file()}
+
+
+def _refusal(
+    scan_id: str, print_id: str | None, use: str, table: Mapping[str, Mapping[str, str]], card: Card
+) -> str:
+    """Why an id with all its files cannot be used; empty if it can."""
+    if not SAFE_ID.fullmatch(scan_id):
+        return "an id may hold letters, digits, space and ._+- only"
+    if print_id is None and use == "dataset":
+        return f"id does not match [ids] print = {card.ids.print!r}"
+    if scan_id not in table and any("order" in row for row in table.values()):
+        return f"not in {card.ids.table}, which gives the order"
+    return ""
+
+
+def _print_id(scan_id: str, card: Card) -> str | None:
+    if card.ids.print is None:
+        return scan_id
+    match = re.fullmatch(card.ids.print, scan_id)
+    return match["print"] if match else None
+
+
+def _table(card: Card, *folders: Path) -> dict[str, dict[str, str]]:
+    if card.ids.table is None:
+        return {}
+    path = next((folder / card.ids.table for folder in folders if (folder / card.ids.table).is_file()), None)
+    if path is None:
+        raise InputError(
+            "table of the card", got=f"no file {card.ids.table}", wanted="a CSV file beside the card"
+        )
+    return read_table(path)
+
+
+def _read_full_scales(card: Card, folder: Path) -> dict[str, float] | None:
+    if card.scan.full_scale_file is None:
+        return None
+    return read_full_scales(folder / card.scan.full_scale_file)
+
+
+def _full_scale(scales: Mapping[str, float] | None, scan_id: str, scan: Path) -> float | None:
+    return None if scales is None else scales.get(scan_id, scales.get(scan.name))
+
+
+def _assumptions(card: Card, table: Mapping[str, Mapping[str, str]]) -> tuple[str, ...]:
+    """What the card does not say and the effects that need it must take as assumed."""
+    assumed = []
+    if card.write is None or card.write.field_um is None:
+        assumed.append("one scan is one write field, centred on it")
+    if not any("order" in row for row in table.values()):
+        assumed.append("the writing order is that of the sorted ids")
+    if card.ids.print is None:
+        assumed.append("every scan is a print of its own")
+    return tuple(assumed)

@@ -1,0 +1,165 @@
+"""The human report of a build: what went in, what came out, and a look at every scan."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from litho_data.foundation.colour_image import colour_bar_png, coloured_png
+from litho_data.foundation.files import atomic_file
+from litho_data.foundation.report import Page
+from litho_data.store.read import PrintedScan, Store, open_store
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from litho_data.build.make_store import BuildResult
+
+_MAX_SCANS_SHOWN = 48
+_THUMBNAIL_PX = 180
+# Blur of the layout in the residual: about the width of the printer's line; a look, not a model.
+_BLUR_PX = 3.0
+_STAGES = {
+    "layout [level]": "viridis",
+    "raw [nm]": "cividis",
+    "registered [nm]": "cividis",
+    "residual [nm]": "RdBu_r",
+}
+_TABLE = {
+    "scan": "scan",
+    "model": "model",
+    "ncc_before": "correlation, centred",
+    "ncc_after": "correlation, registered",
+    "reprojection_px": "reprojection [px]",
+    "tre_median_nm": "held-out error, median [nm]",
+    "tre_p95_nm": "held-out error, p95 [nm]",
+    "corner_sd_nm": "corner spread [nm]",
+    "overlap": "overlap",
+    "bend_um": "bend [µm]",
+    "rotation_deg": "rotation [deg]",
+    "singular_min": "scale, least",
+    "singular_max": "scale, most",
+    "noise_x_nm": "noise along x [nm]",
+    "noise_y_nm": "noise along y [nm]",
+    "row_step_nm": "row steps [nm]",
+    "removed_sd_nm": "levelled away, sd [nm]",
+}
+
+
+def write_report(result: BuildResult, store_path: Path, folder: Path) -> Path:
+    """Write ``report.html``, ``build.json`` and CSV tables into ``folder``; returns the page's path."""
+    store = open_store(store_path)
+    page = Page(
+        f"Dataset {store.name}", "Raw scans read, levelled, registered onto their layouts and stored."
+    )
+    _summary(page, result, store)
+    _left_out(page, result)
+    _warnings(page, store.quality)
+    _quality(page, store.quality)
+    _pictures(page, store)
+    result.write(folder)
+    with atomic_file(folder / "quality.csv") as temporary:
+        store.quality.to_csv(temporary, index=False)
+    return page.write(folder)
+
+
+def _summary(page: Page, result: BuildResult, store: Store) -> None:
+    quality = store.quality
+    tiles = [(str(result.n_scans), "scans in the store")]
+    if "ncc_after" in quality:
+        tiles.append((f"{quality['ncc_after'].median():.3f}", "median correlation of height and layout"))
+    if "tre_median_nm" in quality:
+        tiles.append((f"{quality['tre_median_nm'].median():.0f} nm", "median held-out registration error"))
+    tiles += [(str(len(result.skipped)), "scans skipped"), (f"{result.seconds:.1f} s", "time of the build")]
+    page.tiles(tiles)
+    page.paragraph(
+        f"Pitch {store.pitch_um} µm, level height {store.level_height_um} µm, {store.levels} levels. "
+        f"Dataset hash {store.sha256}; it covers layouts, heights, validity and transforms of all scans, "
+        "and building again gives the same."
+    )
+    for assumption in store.manifest["assumptions"]:
+        page.note(f"Assumed, because the card does not say: {assumption}.")
+
+
+def _left_out(page: Page, result: BuildResult) -> None:
+    import pandas as pd
+
+    rows = [(one.id, "skipped", one.reason) for one in result.skipped]
+    rows += [(one.id, "unpaired", one.reason) for one in result.unpaired]
+    if rows:
+        page.heading("Not in the store")
+        table = pd.DataFrame(rows, columns=["id", "status", "reason"])
+        page.table(table, "Ids that are not in the store, and why", "left_out.csv")
+
+
+def _warnings(page: Page, quality: pd.DataFrame) -> None:
+    if "warning" in quality and (warned := quality["warning"].astype(bool)).any():
+        page.heading("Passed with a warning")
+        page.table(quality.loc[warned, ["scan", "warning"]], "What to know about a scan", "warnings.csv")
+
+
+def _quality(page: Page, quality: pd.DataFrame) -> None:
+    page.heading("Quality of every scan")
+    shown = quality[[name for name in _TABLE if name in quality]].rename(columns=_TABLE)
+    page.table(
+        shown, "Registration and noise of every scan; quality.csv has all figures", "summary.csv", digits=3
+    )
+
+
+def _pictures(page: Page, store: Store) -> None:
+    page.heading("Every scan")
+    ids = _shown_ids(store)
+    if len(ids) < len(store):
+        page.note(f"The {len(ids)} scans that correlate least with their layout, of {len(store)}.")
+    stages = [_stages(store, scan_id) for scan_id in ids]
+    columns, pictures = [], []
+    for (title, colours), images in zip(_STAGES.items(), zip(*stages, strict=True), strict=True):
+        low, high = _range(images, symmetric=colours == "RdBu_r")
+        columns.append((f"{title}, {low:.4g} … {high:.4g}", colour_bar_png(colours)))
+        pictures.append([coloured_png(image, colours, low, high) for image in images])
+    caption = (
+        "Raw: the scan in its own frame. Registered: on the layout's grid, white where not measured. "
+        "Residual: registered height minus the blurred layout, with the best gain and offset. "
+        "One colour scale per column."
+    )
+    page.gallery(columns, list(zip(ids, zip(*pictures, strict=True), strict=True)), caption)
+
+
+def _shown_ids(store: Store) -> list[str]:
+    if len(store) <= _MAX_SCANS_SHOWN or "ncc_after" not in store.quality:
+        return store.ids[:_MAX_SCANS_SHOWN]
+    worst = store.quality.sort_values("ncc_after")["scan"].head(_MAX_SCANS_SHOWN)
+    return [str(scan_id) for scan_id in worst]
+
+
+def _stages(store: Store, scan_id: str) -> list[np.ndarray]:
+    """Thumbnails of a scan, in the order of ``_STAGES``."""
+    scan = store.scan(scan_id)
+    raw = store.scan_frame(scan_id, "raw_height_um")
+    images = [scan.mask_level, raw * 1e3, scan.height_um * 1e3, _residual_nm(scan)]
+    return [_thumbnail(image) for image in images]
+
+
+def _residual_nm(scan: PrintedScan) -> np.ndarray:
+    from litho_data.register import predicted_topography
+
+    layout = predicted_topography(scan.mask_level, _BLUR_PX)
+    x, z = layout[scan.valid].astype(np.float64), scan.height_um[scan.valid].astype(np.float64)
+    x_mean, z_mean = (float(values.mean()) if values.size else 0.0 for values in (x, z))
+    variance = float(((x - x_mean) ** 2).sum())
+    gain = float(((x - x_mean) * (z - z_mean)).sum()) / variance if variance > 0 else 0.0
+    return (scan.height_um - (z_mean + gain * (layout - x_mean))) * 1e3
+
+
+def _range(images: Sequence[np.ndarray], symmetric: bool) -> tuple[float, float]:
+    values = np.concatenate([image.ravel() for image in images])
+    low, high = (float(value) for value in np.nanpercentile(values, [0.5, 99.5]))
+    return (-max(-low, high), max(-low, high)) if symmetric else (low, high)
+
+
+def _thumbnail(image: np.ndarray) -> np.ndarray:
+    step = max(1, -(-max(image.shape) // _THUMBNAIL_PX))
+    return image[::step, ::step]

@@ -1,0 +1,184 @@
+"""``litho-data``: every command parses arguments and calls one public function."""
+
+from __future__ import annotations
+
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from litho_data.cli.layouts import masks, simulate
+from litho_data.cli.scan import inspect, level
+from litho_data.foundation.commands import new_app, run_app
+
+app = new_app(
+    "Raw AFM scans and layouts in, a dataset with provenance out. Lengths in µm unless said otherwise."
+)
+app.command()(masks)
+app.command()(simulate)
+app.command()(inspect)
+app.command()(level)
+
+StorePath = Annotated[Path, typer.Argument(help="dataset store, a .zarr folder or .zarr.zip file")]
+DataDir = Annotated[
+    Path | None,
+    typer.Option(
+        help="folder of the raw files; by default the card's, $LITHO_DATA_DIR/<name> or the user cache"
+    ),
+]
+Workers = Annotated[int, typer.Option(min=1, help="local processes; the result does not depend on it")]
+Strict = Annotated[bool, typer.Option("--strict", help="do not build if any scan has to be skipped")]
+
+
+class Format(StrEnum):
+    """What a store can be exported as."""
+
+    zip = "zip"
+    pairs = "pairs"
+    ro_crate = "ro-crate"
+
+
+@app.command()
+def fetch(
+    name: Annotated[
+        str, typer.Argument(help="a dataset of this project, e.g. neural-lithography, or a card's path")
+    ],
+    into: Annotated[Path | None, typer.Option(help="folder to fill; by default the user cache")] = None,
+) -> None:
+    """Download a known dataset, or find it in $LITHO_DATA_DIR or the user cache; checks every SHA-256."""
+    from litho_data.exchange.fetch import fetch as fetch_dataset
+
+    typer.echo(fetch_dataset(name, into))
+
+
+@app.command()
+def build(
+    card: Annotated[Path, typer.Argument(help="dataset card (TOML)")],
+    out: Annotated[
+        Path, typer.Option(help="store to write, e.g. prints.zarr; an older store there is replaced")
+    ],
+    data_dir: DataDir = None,
+    workers: Workers = 1,
+    dask: Annotated[
+        str | None, typer.Option(help="address of a Dask scheduler, e.g. tcp://host:8786")
+    ] = None,
+    strict: Strict = False,
+    seed: Annotated[int, typer.Option(min=0, help="seed of the robust registration")] = 0,
+) -> None:
+    """Read, level, register and store all scans of a card; writes the store and a report beside it."""
+    from litho_data.build.build import build as build_store
+    from litho_data.build.make_store import report_folder
+
+    result = build_store(card, out, data_dir=data_dir, workers=workers, dask=dask, strict=strict, seed=seed)
+    typer.echo(f"{out}: {result.n_scans} scans, {len(result.skipped)} skipped, {result.seconds:.1f} s")
+    typer.echo(f"dataset sha256 {result.dataset.sha256}")
+    typer.echo(f"report {report_folder(out) / 'report.html'}")
+
+
+@app.command()
+def verify(store: StorePath, data_dir: DataDir = None) -> None:
+    """Hash a store and its raw files again and name everything that is not as it was built."""
+    from litho_data.provenance.verify import verify as verify_store
+
+    result = verify_store(store, data_dir)
+    for note in result.notes:
+        typer.echo(f"note: {note}")
+    for finding in result.findings:
+        typer.echo(f"CHANGED {finding}")
+    if result.findings:
+        raise typer.Exit(1)
+    typer.echo(f"unchanged: {result.n_arrays} arrays, {result.n_steps} steps, {result.n_raw_files} raw files")
+
+
+@app.command()
+def history(
+    store: StorePath,
+    scan: Annotated[str | None, typer.Argument(help="id of a scan; without it, one line per scan")] = None,
+) -> None:
+    """Print where the arrays of a scan come from: files, operations, parameters, hashes."""
+    from litho_data.provenance.history import history as history_of
+
+    typer.echo(history_of(store, scan))
+
+
+@app.command()
+def replay(
+    store: StorePath,
+    scan: Annotated[list[str] | None, typer.Argument(help="ids of scans; without, all")] = None,
+    array: Annotated[
+        list[str] | None, typer.Option(help="name of an array, e.g. height_um; repeat for more")
+    ] = None,
+    data_dir: DataDir = None,
+) -> None:
+    """Compute arrays again from the raw files and report the largest difference to what is stored."""
+    from litho_data.provenance.replay import replay as replay_store
+
+    table = replay_store(store, scan, arrays=array, data_dir=data_dir)
+    typer.echo(table.to_string(index=False))
+    typer.echo(f"largest difference {table['max_abs_difference'].max():.3g}, over {len(table)} arrays")
+
+
+@app.command()
+def export(
+    store: StorePath,
+    format: Annotated[
+        Format, typer.Option(help="one file, the authors' 8-bit pairs, or a self-describing release")
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="file (zip) or folder to write; by default beside the store")
+    ] = None,
+) -> None:
+    """Write a store as one .zarr.zip file, as 8-bit pairs, or as an RO-Crate folder."""
+    endings = {Format.zip: ".zarr.zip", Format.pairs: "-pairs", Format.ro_crate: "-crate"}
+    target = out or store.parent / (store.name.split(".zarr")[0] + endings[format])
+    if format is Format.zip:
+        from litho_data.exchange.release import export_zip
+
+        export_zip(store, target)
+    elif format is Format.ro_crate:
+        from litho_data.exchange.release import export_ro_crate
+
+        export_ro_crate(store, target)
+    else:
+        from litho_data.exchange.pairs_export import export_pairs
+
+        for note in export_pairs(store, target):
+            print(note, file=sys.stderr)
+    typer.echo(target)
+
+
+@app.command("import-pairs")
+def import_pairs(
+    folder: Annotated[Path, typer.Argument(help="folder with mask/, afm/ and src_max_dict.txt")],
+    out: Annotated[Path | None, typer.Option(help="store to write; by default FOLDER.zarr")] = None,
+    pitch_um: Annotated[float, typer.Option(help="pixel pitch, µm")] = 0.1,
+    level_height_um: Annotated[float, typer.Option(help="nominal height of one level, µm")] = 0.1,
+    levels: Annotated[int, typer.Option(help="number of levels of the layouts")] = 13,
+    name: Annotated[str | None, typer.Option(help="name of the dataset; by default the folder's")] = None,
+    workers: Workers = 1,
+    strict: Strict = False,
+) -> None:
+    """Build a store from the authors' 8-bit pair format; four quadrants of one name become one field."""
+    from litho_data.build.make_store import report_folder
+    from litho_data.exchange.pairs import import_pairs as build_from_pairs
+
+    target = out or folder.resolve().with_suffix(".zarr")
+    result = build_from_pairs(
+        folder,
+        target,
+        pitch_um=pitch_um,
+        level_height_um=level_height_um,
+        levels=levels,
+        name=name,
+        workers=workers,
+        strict=strict,
+    )
+    typer.echo(f"{target}: {result.n_scans} fields, {len(result.skipped)} skipped, {result.seconds:.1f} s")
+    typer.echo(f"report {report_folder(target) / 'report.html'}")
+
+
+def main() -> None:
+    """Entry point of ``litho-data``."""
+    run_app(app, "litho-data")

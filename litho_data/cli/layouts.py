@@ -1,0 +1,123 @@
+"""Commands `masks` and `simulate`: parse arguments, call one function, say where the result is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def _list_patterns(wanted: bool) -> None:
+    if wanted:
+        from litho_data.layouts import PATTERNS
+
+        for name, (_, meaning) in PATTERNS.items():
+            typer.echo(f"{name:14} {meaning}")
+        raise typer.Exit
+
+
+def _list_knobs(wanted: bool) -> None:
+    if wanted:
+        from litho_data.virtual_fab import KNOBS
+
+        for knob in KNOBS.values():
+            typer.echo(f"{knob.name:26}{f'0 … {knob.limit_with_unit}':16}{knob.meaning} [{knob.effect}]")
+        raise typer.Exit
+
+
+def masks(
+    out: Annotated[Path, typer.Option(help="folder to write; an older result there is replaced")],
+    pattern: Annotated[
+        str, typer.Option(help="random, or a calibration pattern: see --list-patterns")
+    ] = "random",
+    count: Annotated[int, typer.Option(min=1, help="number of random layouts")] = 12,
+    size: Annotated[int, typer.Option(min=8, help="side of a layout, pixels")] = 512,
+    levels: Annotated[int, typer.Option(min=2, max=256, help="number of levels, 0 … levels − 1")] = 13,
+    cutoff_per_um: Annotated[float, typer.Option(help="low-pass cut-off, cycles/µm")] = 0.25,
+    passband: Annotated[str, typer.Option(help="square (as the measured layouts) or round")] = "square",
+    pitch_um: Annotated[float, typer.Option(help="pixel pitch, µm")] = 0.1,
+    level_height_um: Annotated[float, typer.Option(help="nominal height of one level, µm")] = 0.1,
+    seed: Annotated[int, typer.Option(min=0, help="decides every random draw")] = 0,
+    list_patterns: Annotated[
+        bool,
+        typer.Option(
+            "--list-patterns", help="list the patterns and stop", callback=_list_patterns, is_eager=True
+        ),
+    ] = False,
+) -> None:
+    """Write layouts (8-bit TIFF of level numbers), their statistics, and a card that waits for scans."""
+    from litho_data.layouts import write_layout_set
+
+    card = write_layout_set(
+        out,
+        pattern=pattern,
+        count=count,
+        size_px=size,
+        levels=levels,
+        cutoff_per_um=cutoff_per_um,
+        passband=passband,
+        pitch_um=pitch_um,
+        level_height_um=level_height_um,
+        seed=seed,
+    )
+    typer.echo(f"card    {card}\nreport  {card.parent / 'report.html'}")
+
+
+def simulate(
+    out: Annotated[
+        Path, typer.Option(help="folder to write (raw/ and truth/); an older result there is replaced")
+    ],
+    preset: Annotated[str, typer.Option(help="plain, demo or measured-like")] = "plain",
+    layouts: Annotated[
+        Path | None, typer.Option(help="print the layouts of this card instead of random ones")
+    ] = None,
+    count: Annotated[int | None, typer.Option(min=1, help="number of scans; by default the preset's")] = None,
+    size: Annotated[
+        int | None, typer.Option(min=32, help="side of a layout, pixels; by default the preset's")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="decides every random draw")] = 0,
+    knob: Annotated[
+        list[str] | None,
+        typer.Option(help="an effect, name=strength or name=strength@seed; repeat for more; --list-knobs"),
+    ] = None,
+    noise: Annotated[str, typer.Option(help="default or off")] = "default",
+    microscope: Annotated[str, typer.Option(help="default (small warps) or aligned (none)")] = "default",
+    write_field_um: Annotated[
+        float | None, typer.Option(help="side of a write field shared by a print's fields, µm")
+    ] = None,
+    references: Annotated[
+        bool, typer.Option("--references", help="add scans of a bare substrate, a flat and a 5-step print")
+    ] = False,
+    metadata: Annotated[
+        str, typer.Option(help="full, or files-only (no order, positions, write axis)")
+    ] = "full",
+    list_knobs: Annotated[
+        bool,
+        typer.Option("--list-knobs", help="list the knobs and stop", callback=_list_knobs, is_eager=True),
+    ] = False,
+) -> None:
+    """The virtual fab: print layouts, scan the prints with an AFM, and write what a laboratory would."""
+    from litho_data.foundation.errors import InputError
+    from litho_data.virtual_fab import jobs_of_card, simulate
+    from litho_data.virtual_fab.presets import preset as named_preset
+
+    if layouts is not None and any(value is not None for value in (count, size, write_field_um)):
+        wanted = "no --count, --size or --write-field-um: the card's layouts have them"
+        raise InputError("options beside --layouts", wanted=wanted)
+    chosen = named_preset(preset)
+    card = simulate(
+        out,
+        count=count or chosen.count,
+        size_px=size or chosen.size_px,
+        fields_per_print=chosen.fields_per_print,
+        seed=seed,
+        knobs=knob if knob is not None else chosen.knobs,
+        noise=noise,
+        microscope=microscope,
+        write_field_um=write_field_um,
+        references=references,
+        metadata=metadata,
+        jobs=jobs_of_card(layouts) if layouts is not None else None,
+    )
+    typer.echo(f"card   {card}\ntruth  {card.parent.parent / 'truth' / 'truth.json'}")

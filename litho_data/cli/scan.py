@@ -1,0 +1,143 @@
+"""``litho-data level`` and ``litho-data inspect``: one scan, any supported format."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from litho_data.foundation.errors import InputError
+
+if TYPE_CHECKING:
+    from litho_data.readers.channel import Channel
+    from litho_data.scan import Scan
+
+
+class ScanFormat(StrEnum):
+    """How a scan is read."""
+
+    auto = "auto"
+    text_matrix = "text-matrix"
+    tiff = "tiff"
+    npy = "npy"
+    gsf = "gsf"
+    gwy = "gwy"
+    vendor = "vendor"
+
+
+ScanPath = Annotated[Path, typer.Argument(help="a scan in any supported format")]
+Format = Annotated[ScanFormat, typer.Option(help="by default judged by the content of the file")]
+Unit = Annotated[str | None, typer.Option(help="unit of the heights where the file states none, e.g. m, nm")]
+Size = Annotated[
+    tuple[float, float] | None,
+    typer.Option("--size-um", metavar="Y X", help="field size in µm (y, x) where the file states none"),
+]
+ChannelName = Annotated[str | None, typer.Option(help="which channel, where there are several of heights")]
+FullScale = Annotated[
+    float | None,
+    typer.Option("--full-scale-um", help="height in µm of the largest value of an integer image"),
+]
+
+
+def level(
+    scan: ScanPath,
+    recipe: Annotated[Path, typer.Option(help="levelling recipe (TOML)")],
+    out: Annotated[Path, typer.Option(help="file to write: .gsf (opens in Gwyddion) or .npy (µm)")],
+    format: Format = ScanFormat.auto,
+    unit: Unit = None,
+    size_um: Size = None,
+    channel: ChannelName = None,
+    full_scale_um: FullScale = None,
+) -> None:
+    """Level one scan; writes the levelled heights, the removed surface and a record beside them."""
+    from litho_data.level import Recipe
+    from litho_data.level.scan import level_scan
+    from litho_data.readers import read_scan
+
+    steps = Recipe.from_toml(recipe)
+    heights = read_scan(
+        scan, format=format, unit=unit, size_um=size_um, channel=channel, full_scale_um=full_scale_um
+    )
+    record = level_scan(heights, steps, out)
+    typer.echo(f"{out}: {len(steps.step)} steps")
+    typer.echo(f"levelled sha256 {record.levelled_sha256}")
+    typer.echo(f"removed surface {out.with_name(record.removed)}")
+
+
+def inspect(
+    file: ScanPath,
+    format: Format = ScanFormat.auto,
+    unit: Unit = None,
+    size_um: Size = None,
+    channel: ChannelName = None,
+    full_scale_um: FullScale = None,
+    picture: Annotated[Path | None, typer.Option(help="PNG to write")] = None,
+    header: Annotated[bool, typer.Option("--header", help="print what the file says, word by word")] = False,
+) -> None:
+    """List the channels of a file with sizes, units and pitch, and show the heights.
+
+    A picture needs one channel of heights: choose it with --channel where there are several, and
+    give --unit (or --full-scale-um) where the file states none.
+    """
+    from rich.console import Console
+
+    from litho_data.readers import list_channels, read_scan
+
+    console = Console()
+    channels = list_channels(file, format=format)
+    _print_channels(console, file, channels)
+    if header:
+        for listed in channels:
+            for key, value in listed.header.items():
+                typer.echo(f"{listed.name}: {key} = {value}")
+    try:
+        scan = read_scan(
+            file, format=format, unit=unit, size_um=size_um, channel=channel, full_scale_um=full_scale_um
+        )
+    except InputError as error:
+        # Without a wish for a picture the list of channels is the answer.
+        if picture is not None or unit or size_um or channel or full_scale_um:
+            raise
+        typer.echo(f"no picture: {error}")
+        return
+    _print_scan(console, scan, picture)
+
+
+def _print_channels(console, file: Path, channels: list[Channel]) -> None:
+    from rich.table import Table
+
+    table = Table(title=str(file))
+    for column in ("channel", "pixels (y × x)", "unit", "size (µm)", "pitch (µm)", "heights"):
+        table.add_column(column)
+    for channel in channels:
+        ny, nx = channel.shape
+        size = channel.size_um
+        table.add_row(
+            channel.name,
+            f"{ny} × {nx}",
+            channel.unit or "not stated",
+            f"{size[0]:.6g} × {size[1]:.6g}" if size else "not stated",
+            f"{size[0] / ny:.6g} × {size[1] / nx:.6g}" if size else "not stated",
+            "yes" if channel.is_height else "no",
+        )
+    console.print(table)
+
+
+def _print_scan(console, scan: Scan, picture: Path | None) -> None:
+    import numpy as np
+
+    from litho_data.foundation.scan_picture import terminal_preview, write_picture
+
+    pitch = f"{scan.pitch_um[0]:.6g} × {scan.pitch_um[1]:.6g} µm" if scan.pitch_um else "unknown"
+    low, high = np.nanmin(scan.height_um), np.nanmax(scan.height_um)
+    missing = int(np.isnan(scan.height_um).sum())
+    typer.echo(f"read as {scan.format}, channel {scan.channel!r}, unit {scan.unit}, pitch {pitch}")
+    typer.echo(f"heights {low:.6g} to {high:.6g} µm, {missing} pixels missing")
+    if scan.mask is not None:
+        typer.echo(f"mask covers {scan.mask.mean():.1%} of the pixels")
+    if console.is_terminal:
+        console.print(terminal_preview(scan))
+    if picture is not None:
+        typer.echo(f"picture {write_picture(scan, picture)}")

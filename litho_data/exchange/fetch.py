@@ -1,0 +1,133 @@
+"""Getting a known dataset: a file is downloaded once, and used only if its SHA-256 is the registered one."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from litho_data.build.card import load_card
+from litho_data.foundation.commands import progress
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import file_sha256
+
+if TYPE_CHECKING:
+    import pooch
+
+CARDS = Path(__file__).parents[1] / "datasets"
+"""The cards that come with the package; in a source checkout a link to the folder beside the packages."""
+
+
+def fetch(dataset: str | Path, into: str | Path | None = None) -> Path:
+    """Make sure that all files of a dataset are there and unharmed; returns the folder with them.
+
+    Without ``into``, a folder that is already complete is taken: ``$LITHO_DATA_DIR/<name>`` first, then the
+    user cache, into which missing files are downloaded. Files that are there and right are never
+    downloaded again, so an interrupted fetch goes on where it stopped.
+
+    Args:
+        dataset: name of a card of this project, for example ``neural-lithography``, or the path of a card.
+        into: folder to fill; by default the user cache.
+
+    Raises:
+        InputError: unknown name, a card without source, a file that cannot be had, or a wrong hash.
+    """
+    card_path = find_card(dataset)
+    name, registry = _registry(card_path)
+    if into is None:
+        for folder in known_folders(name):
+            if not _missing(folder, registry):
+                return folder
+    target = Path(into) if into is not None else cache_folder(name)
+    registry.path = target
+    for file in progress(_missing(target, registry), f"fetching {name}"):
+        _download(registry, file)
+    return target
+
+
+def known_folders(name: str) -> list[Path]:
+    """Where the files of a dataset are looked for: ``$LITHO_DATA_DIR/<name>``, then the user cache."""
+    root = os.environ.get("LITHO_DATA_DIR")
+    return [*([Path(root) / name] if root else []), cache_folder(name)]
+
+
+def cache_folder(name: str) -> Path:
+    """Folder of a dataset in the user cache."""
+    import pooch
+
+    return Path(pooch.os_cache("litholoop")) / name
+
+
+def find_card(dataset: str | Path) -> Path:
+    """Path of a card: a path to a ``.toml`` file is taken as it is, a name is one of the project's cards.
+
+    Raises:
+        InputError: no card of that name.
+    """
+    if Path(dataset).suffix == ".toml":
+        return Path(dataset)
+    known = known_cards()
+    if str(dataset) not in known:
+        wanted = f"{', '.join(known) or 'a name'} or the path of a card"
+        raise InputError("dataset", got=repr(str(dataset)), wanted=wanted)
+    return known[str(dataset)]
+
+
+def known_cards() -> dict[str, Path]:
+    """The project's cards by name; files like ``<name>.split.toml`` beside them say something else."""
+    return {path.stem: path for path in sorted(CARDS.glob("*.toml")) if "." not in path.stem}
+
+
+def _registry(card_path: Path) -> tuple[str, pooch.Pooch]:
+    import pooch
+
+    card = load_card(card_path)
+    if card.source is None:
+        raise InputError(
+            f"card {card_path} has no [source]", wanted="url and registry", hint="fetch needs both"
+        )
+    registry = pooch.create(path=Path(), base_url=card.source.url.rstrip("/") + "/", retry_if_failed=1)
+    path = card_path.parent / card.source.registry
+    try:
+        registry.load_registry(path)
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read registry {path}", got=str(error)) from error
+    if not registry.registry:
+        raise InputError(f"registry {path}", got="no files", wanted="lines of file name and SHA-256")
+    for file in registry.registry:
+        if ".." in Path(file).parts or Path(file).is_absolute():
+            raise InputError(f"registry {path}: file", got=file, wanted="a path inside the data folder")
+    return card.name, registry
+
+
+def _missing(folder: Path, registry: pooch.Pooch) -> list[str]:
+    """Registered files that are not in the folder, or not as registered."""
+    hashes = registry.registry.items()
+    return [
+        file
+        for file, sha256 in hashes
+        if not (folder / file).is_file() or file_sha256(folder / file) != sha256
+    ]
+
+
+def _download(registry: pooch.Pooch, file: str) -> None:
+    import pooch
+    import requests
+
+    downloader = pooch.HTTPDownloader(progressbar=False, timeout=60)
+    logger = pooch.get_logger()
+    level = logger.level
+    logger.setLevel("ERROR")  # the progress bar says what is going on
+    try:
+        registry.fetch(file, downloader=downloader)
+    except (requests.RequestException, OSError) as error:
+        url = registry.get_url(file)
+        raise InputError(
+            f"cannot fetch {file}", got=str(error), wanted=url, hint="run fetch again to go on"
+        ) from error
+    except ValueError as error:  # pooch removes what does not match
+        url, wanted = registry.get_url(file), registry.registry[file]
+        hint = "the source has changed or the transfer was damaged; nothing was kept"
+        raise InputError(f"{file} from {url}", got="another SHA-256", wanted=wanted, hint=hint) from error
+    finally:
+        logger.setLevel(level)

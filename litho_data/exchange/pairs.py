@@ -1,0 +1,221 @@
+"""The authors' pair format: 8-bit layouts and registered heights, a field cut into four quadrants.
+
+``mask/<id><q>.tif`` holds levels, ``afm/<id><q>.tif`` heights as value / 255 · full scale, with the full
+scales in metres in ``src_max_dict.txt``; q is 1 top left, 2 top right, 3 bottom left, 4 bottom right. The
+format has no validity, no negative heights and 256 grey values, so that going through it costs accuracy.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from litho_data.build.card import Card, check_card
+from litho_data.build.card_files import SAFE_ID, read_full_scales
+from litho_data.build.make_store import BuildResult, Source, make_store
+from litho_data.build.operations import OPERATIONS, perform
+from litho_data.build.quality import noise_figures
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import file_sha256
+from litho_data.provenance.steps import code_record, record_sha256
+from litho_data.store.partial import Piece
+
+GREY_MAX = 255
+SCALES_FILE = "src_max_dict.txt"
+_AUTHORS_IDS = r"FOV(?P<print>\d)(?P<field>\d)\d?"
+
+
+def import_pairs(
+    folder: str | Path,
+    out: str | Path,
+    *,
+    pitch_um: float = 0.1,
+    level_height_um: float = 0.1,
+    levels: int = 13,
+    name: str | None = None,
+    workers: int = 1,
+    strict: bool = False,
+) -> BuildResult:
+    """Build a store from a folder in the pair format; four quadrants of one name become one field.
+
+    The heights are taken as they are, value / 255 · full scale. In the authors' own files they are cut off to
+    the grey value below, half a grey value (about 2 nm) too low on average.
+
+    Args:
+        folder: with ``mask/``, ``afm/`` and ``src_max_dict.txt``.
+        out: the store.
+        pitch_um, level_height_um, levels: what the files do not say; by default those of the paper.
+        name: of the dataset, by default the folder's.
+        workers: local processes.
+        strict: refuse to build if any field has to be skipped.
+
+    Raises:
+        InputError: not such a folder, no complete pair, or pitch and heights that are not positive.
+    """
+    root = Path(folder).resolve()
+    scales = read_full_scales(root / SCALES_FILE)
+    fields, unpaired = _fields(root, scales)
+    if not fields:
+        raise InputError(
+            f"pairs in {folder}", got="none", wanted=f"mask/*.tif, afm/*.tif and their names in {SCALES_FILE}"
+        )
+    card = _card(
+        name or re.sub(r"[^A-Za-z0-9._-]", "-", root.name), pitch_um, level_height_um, levels, list(fields)
+    )
+    print_of = re.compile(card.ids.print) if card.ids.print else None
+    jobs = []
+    for order, (field_id, quadrants) in enumerate(sorted(fields.items())):
+        match = print_of.fullmatch(field_id) if print_of else None
+        jobs.append(
+            PairsJob(field_id, match["print"] if match else field_id, order, root, quadrants, scales, card)
+        )
+    source = Source(
+        card=card,
+        jobs=jobs,
+        data_dir=root,
+        files={job.id: job.files for job in jobs} | {key: {key: root / key} for key in unpaired},
+        assumptions=(
+            "one scan is one write field, centred on it",
+            "the writing order is that of the sorted ids",
+        ),
+        unpaired=unpaired,
+    )
+    return make_store(source, Path(out), workers=workers, strict=strict)
+
+
+@dataclass(frozen=True)
+class PairsJob:
+    """Stitch one field; ``quadrants`` maps a quadrant (0: a field in one piece) to the name of its files."""
+
+    id: str
+    print_id: str
+    order: int
+    root: Path
+    quadrants: Mapping[int, str]
+    scales_um: Mapping[str, float]
+    card: Card
+
+    @property
+    def files(self) -> dict[str, Path]:
+        """Layouts, then heights, in the order of the quadrants."""
+        names = [f"{kind}/{name}" for kind in ("mask", "afm") for name in self.quadrants.values()]
+        return {name: self.root / name for name in names}
+
+    def key(self) -> str:
+        """Hash of everything that decides the piece."""
+        operation = OPERATIONS["stitch-pairs"]
+        plan = [self.print_id, self.order, operation.version, operation.code_sha256, self._params]
+        return record_sha256([plan, [file_sha256(path) for path in self.files.values()]])
+
+    def run(self) -> Piece:
+        """The stitched field as a piece."""
+        done = perform("stitch-pairs", self._params, self.files, {})
+        pitch_um = self.card.layout.pitch_um
+        record = {
+            "id": self.id,
+            "key": self.key(),
+            "use": "dataset",
+            "print": self.print_id,
+            "order": self.order,
+            "columns": {},
+            "steps": [done.step.to_record()],
+            "quality": noise_figures(done.arrays["raw_height_um"]) | {"valid_fraction": 1.0},
+            "read": {"pitch_um": [pitch_um, pitch_um]},
+            "software": code_record(),
+        }
+        return Piece(json.loads(json.dumps(record)), done.arrays)
+
+    @property
+    def _params(self) -> dict[str, Any]:
+        return {
+            "quadrants": list(self.quadrants),
+            "full_scale_um": [self.scales_um[name] for name in self.quadrants.values()],
+            "levels": self.card.layout.levels,
+        }
+
+
+def stitch_field(
+    files: Sequence[Path], quadrants: Sequence[int], full_scale_um: Sequence[float], levels: int
+) -> dict[str, np.ndarray]:
+    """One field from its layouts and heights (first all layouts, then all heights, in quadrant order).
+
+    Raises:
+        InputError: unreadable files, quadrants of different sizes, levels above the stated number.
+    """
+    from litho_data.readers import read_layout
+
+    images = [read_layout(path) for path in files]
+    if len({image.shape for image in images}) != 1:
+        raise InputError(
+            f"sizes of {', '.join(path.name for path in files)}", got={image.shape for image in images}
+        )
+    mask = _join(images[: len(quadrants)], quadrants)
+    if mask.max() >= levels:
+        raise InputError(
+            f"layout {files[0]}: highest level", got=int(mask.max()), wanted=f"at most {levels - 1}"
+        )
+    scaled = [
+        (image.astype(np.float64) / GREY_MAX * scale).astype(np.float32)
+        for image, scale in zip(images[len(quadrants) :], full_scale_um, strict=True)
+    ]
+    height = _join(scaled, quadrants)
+    arrays = {"mask_level": mask, "raw_height_um": height, "height_um": height}
+    return {**arrays, "valid": np.ones(height.shape, dtype=bool), "scan_to_layout": np.eye(3)}
+
+
+def quadrant_slices(quadrant: int, shape: tuple[int, ...]) -> tuple[slice, slice]:
+    """Rows and columns of a quadrant in a field of this shape; quadrant 0 is the whole field."""
+    if quadrant == 0:
+        return slice(None), slice(None)
+    ny, nx = shape[0] // 2, shape[1] // 2
+    row, column = divmod(quadrant - 1, 2)
+    return slice(row * ny, (row + 1) * ny), slice(column * nx, (column + 1) * nx)
+
+
+def _fields(root: Path, scales: Mapping[str, float]) -> tuple[dict[str, dict[int, str]], dict[str, str]]:
+    """Files by field and quadrant, and the files without partner with the reason."""
+    masks, heights = ({path.name for path in (root / kind).glob("*.tif")} for kind in ("mask", "afm"))
+    unpaired = {f"mask/{name}": "no heights of this name" for name in sorted(masks - heights)}
+    unpaired |= {f"afm/{name}": "no layout of this name" for name in sorted(heights - masks)}
+    unpaired |= {f"afm/{name}": f"not in {SCALES_FILE}" for name in sorted((masks & heights) - set(scales))}
+    complete = sorted(name for name in masks & heights & set(scales) if SAFE_ID.fullmatch(name))
+    cut: dict[str, dict[int, str]] = {}
+    for name in complete:
+        stem = Path(name).stem
+        if stem[-1:] in "1234":
+            cut.setdefault(stem[:-1], {})[int(stem[-1])] = name
+    whole = {field: dict(sorted(names.items())) for field, names in cut.items() if field and len(names) == 4}
+    stitched = {name for names in whole.values() for name in names.values()}
+    return whole | {Path(name).stem: {0: name} for name in complete if name not in stitched}, unpaired
+
+
+def _card(name: str, pitch_um: float, level_height_um: float, levels: int, ids: Sequence[str]) -> Card:
+    matches = all(re.fullmatch(_AUTHORS_IDS, field_id) for field_id in ids)
+    content = {
+        "name": name,
+        "title": "Imported from 8-bit pairs",
+        "layout": {
+            "files": "mask/{id}.tif",
+            "pitch_um": pitch_um,
+            "level_height_um": level_height_um,
+            "levels": levels,
+        },
+        "scan": {"files": "afm/{id}.tif", "full_scale_file": SCALES_FILE},
+        "ids": {"print": _AUTHORS_IDS} if matches else {},
+    }
+    return check_card(content, "import-pairs")
+
+
+def _join(parts: Sequence[np.ndarray], quadrants: Sequence[int]) -> np.ndarray:
+    factor = 1 if len(parts) == 1 else 2
+    shape = (parts[0].shape[0] * factor, parts[0].shape[1] * factor)
+    field = np.empty(shape, dtype=parts[0].dtype)
+    for part, quadrant in zip(parts, quadrants, strict=True):
+        field[quadrant_slices(quadrant, shape)] = part
+    return field

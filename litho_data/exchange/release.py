@@ -1,0 +1,132 @@
+"""Releasing a store: one file, or a folder that describes itself as an RO-Crate."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+from litho_data.foundation.commands import progress
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import atomic_file, atomic_folder, file_sha256
+from litho_data.foundation.outputs import require_replaceable_folder
+from litho_data.store.read import Store, open_store
+
+# Zip cannot hold a file without a time; a fixed one keeps the archive the same for the same store.
+_ZIP_TIME = (1980, 1, 1, 0, 0, 0)
+_CRATE_FILE = "ro-crate-metadata.json"
+_CRATE_VERSION = "https://w3id.org/ro/crate/1.1"
+
+
+def export_zip(store_path: str | Path, out: str | Path) -> Path:
+    """Pack a store into one ``.zarr.zip`` file, which ``open_store`` and zarr read as it is.
+
+    Raises:
+        InputError: no store, or one that is packed already.
+    """
+    store = open_store(store_path)
+    folder = Path(store_path)
+    if not folder.is_dir():
+        raise InputError("store to export", got=f"{folder}, which is packed already", wanted="a .zarr folder")
+    if Path(out).suffix != ".zip":
+        raise InputError("output", got=str(out), wanted=f"a file {store.name}.zarr.zip")
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    with atomic_file(out) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
+        for path in progress(files, "packing"):
+            entry = zipfile.ZipInfo(path.relative_to(folder).as_posix(), _ZIP_TIME)
+            archive.writestr(entry, path.read_bytes())
+    return Path(out)
+
+
+def export_ro_crate(store_path: str | Path, out: str | Path) -> Path:
+    """Write a release folder: the packed store, its quality table, and ``ro-crate-metadata.json`` about them.
+
+    The metadata name every raw file with its SHA-256, the software of the build, licence and citation.
+
+    Raises:
+        InputError: no store, a packed one, one without manifest, or a folder with something else in it.
+    """
+    store = open_store(store_path)
+    if not store.manifest:
+        raise InputError(f"{store_path} carries no manifest", wanted="a store made by litho-data build")
+    require_replaceable_folder(out, "*.zarr.zip", "quality.csv", _CRATE_FILE)
+    with atomic_folder(out) as folder:
+        packed = export_zip(store_path, folder / f"{store.name}.zarr.zip")
+        store.quality.to_csv(folder / "quality.csv", index=False)
+        content = {
+            "@context": f"{_CRATE_VERSION}/context",
+            "@graph": _graph(store, packed, folder / "quality.csv"),
+        }
+        text = json.dumps(content, indent=1, ensure_ascii=False)
+        (folder / _CRATE_FILE).write_text(text + "\n", encoding="utf-8")
+    return Path(out)
+
+
+def _graph(store: Store, packed: Path, table: Path) -> list[dict[str, Any]]:
+    manifest = store.manifest
+    card, software = manifest["card"], manifest["build"]["software"]
+    raw = [row for row in manifest["files"] if row["status"] == "ok"]
+    root: dict[str, Any] = {
+        "@id": "./",
+        "@type": "Dataset",
+        "name": card.get("title") or store.name,
+        "identifier": f"sha256:{store.sha256}",
+        "description": f"{len(store)} printed fields measured by AFM and registered onto their layouts, "
+        f"{store.pitch_um} µm per pixel, levels of {store.level_height_um} µm",
+        "datePublished": manifest["build"]["started"][:10],
+        "hasPart": [{"@id": packed.name}, {"@id": table.name}],
+        "mentions": {"@id": "#build"},
+    }
+    if card.get("license"):
+        root["license"] = {"@id": f"https://spdx.org/licenses/{card['license']}"}
+    if card.get("citation"):
+        root["citation"] = card["citation"]
+    return [
+        {
+            "@id": _CRATE_FILE,
+            "@type": "CreativeWork",
+            "conformsTo": {"@id": _CRATE_VERSION},
+            "about": {"@id": "./"},
+        },
+        root,
+        _file(packed, "application/zip", "Dataset store, Zarr v3 in one file"),
+        _file(table, "text/csv", "Registration, levelling and noise figures per scan"),
+        {
+            "@id": "#build",
+            "@type": "CreateAction",
+            "name": "Building the dataset from raw files",
+            "endTime": manifest["build"]["started"],
+            "instrument": {"@id": "#software"},
+            "object": [{"@id": f"#raw/{row['path']}"} for row in raw],
+            "result": {"@id": packed.name},
+        },
+        {
+            "@id": "#software",
+            "@type": "SoftwareApplication",
+            "name": "litholoop",
+            "version": software["versions"].get("litholoop", ""),
+            "softwareRequirements": [f"{name} {version}" for name, version in software["versions"].items()],
+        },
+        *(
+            {
+                "@id": f"#raw/{row['path']}",
+                "@type": "CreativeWork",
+                "name": row["path"],
+                "identifier": f"sha256:{row['sha256']}",
+                "size": f"{row['size_bytes']} B",
+            }
+            for row in raw
+        ),
+    ]
+
+
+def _file(path: Path, media_type: str, name: str) -> dict[str, Any]:
+    return {
+        "@id": path.name,
+        "@type": "File",
+        "name": name,
+        "encodingFormat": media_type,
+        "contentSize": str(path.stat().st_size),
+        "sha256": file_sha256(path),
+    }

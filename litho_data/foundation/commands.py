@@ -1,0 +1,38 @@
+"""What the three command lines share: exit codes, one-line errors, a progress bar on stderr."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterable, Iterator
+from typing import TypeVar
+
+from litho_data.foundation.errors import InputError
+
+T = TypeVar("T")
+
+
+def new_app(help_text: str):
+    """A typer application with our settings."""
+    import typer
+
+    return typer.Typer(
+        help=help_text, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False
+    )
+
+
+def run_app(app, name: str) -> None:
+    """Run a typer application; bad input becomes one line on stderr and exit code 2."""
+    try:
+        app(prog_name=name)
+    except InputError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+
+
+def progress(items: Iterable[T], what: str, total: int | None = None) -> Iterator[T]:
+    """Iterate with a progress bar on stderr; silent where stderr is not a terminal."""
+    from rich.console import Console
+    from rich.progress import track
+
+    console = Console(stderr=True)
+    yield from track(items, description=what, total=total, console=console, disable=not console.is_terminal)

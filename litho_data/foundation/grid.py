@@ -1,0 +1,54 @@
+"""The sampling geometry that travels with every array: one type for all three packages."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError
+
+
+@dataclass(frozen=True)
+class PixelGrid:
+    """A rectangular grid of square or rectangular pixels, row 0 on top.
+
+    Args:
+        shape: (ny, nx) in pixels.
+        pitch_um: (along y, along x) distance between pixel centres, µm.
+        origin_um: (y, x) of the top-left *corner* of pixel (0, 0), µm; a pixel centre therefore
+            lies at ``origin + (i + 0.5) * pitch``.
+
+    Raises:
+        InputError: a size below one pixel, or a pitch that is not a positive number.
+    """
+
+    shape: tuple[int, int]
+    pitch_um: tuple[float, float]
+    origin_um: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if min(self.shape) < 1:
+            raise InputError("grid shape", got=self.shape, wanted="at least 1 x 1 pixels")
+        if not all(np.isfinite(pitch) and pitch > 0 for pitch in self.pitch_um):
+            raise InputError("grid pitch_um", got=self.pitch_um, wanted="two positive numbers in µm")
+
+    @classmethod
+    def square(cls, shape: tuple[int, int], pitch_um: float) -> PixelGrid:
+        """A grid of square pixels with its corner at the origin."""
+        return cls((int(shape[0]), int(shape[1])), (float(pitch_um), float(pitch_um)))
+
+    @property
+    def size_um(self) -> tuple[float, float]:
+        """(y, x) extent from edge to edge, µm."""
+        return self.shape[0] * self.pitch_um[0], self.shape[1] * self.pitch_um[1]
+
+    @property
+    def y_um(self) -> np.ndarray:
+        """Row centres, shape (ny,), µm."""
+        return self.origin_um[0] + (np.arange(self.shape[0]) + 0.5) * self.pitch_um[0]
+
+    @property
+    def x_um(self) -> np.ndarray:
+        """Column centres, shape (nx,), µm."""
+        return self.origin_um[1] + (np.arange(self.shape[1]) + 0.5) * self.pitch_um[1]

@@ -1,0 +1,90 @@
+"""Result files: schema-versioned JSON, validated on writing and on reading."""
+
+from __future__ import annotations
+
+import json
+import platform
+import reprlib
+import sys
+from importlib import metadata
+from pathlib import Path
+from typing import Any, ClassVar, Self
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import atomic_file
+
+# A value that does not belong may be of any size and nested to any depth.
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = 120
+_REPORTED_PACKAGES = ("litholoop", "numpy", "scipy", "torch", "opencv-python-headless", "xarray", "zarr")
+
+
+class Record(BaseModel):
+    """A frozen part of a result; an unknown key is an error."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
+
+
+class Result(Record):
+    """The root of a result file. Subclasses set ``SCHEMA`` and ``FILE_NAME``."""
+
+    SCHEMA: ClassVar[str]
+    FILE_NAME: ClassVar[str]
+
+    schema_: str = Field(alias="schema")
+
+    def write(self, folder: str | Path) -> Path:
+        """Write ``folder/FILE_NAME`` atomically and return its path."""
+        path = Path(folder) / self.FILE_NAME
+        # Validation once more from plain JSON: what is written is what a reader will accept.
+        content = self.model_dump(mode="json", by_alias=True)
+        text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
+        type(self).model_validate_json(text)
+        with atomic_file(path) as temporary:
+            temporary.write_text(text + "\n", encoding="utf-8")
+        return path
+
+    @classmethod
+    def read(cls, path: str | Path) -> Self:
+        """Read one result; a folder stands for the file inside it.
+
+        Raises:
+            InputError: no such file, not JSON, another schema, or fields that do not belong.
+        """
+        file = Path(path)
+        file = file / cls.FILE_NAME if file.is_dir() else file
+        try:
+            content: Any = json.loads(file.read_text(encoding="utf-8"), parse_constant=_refuse)
+        except (OSError, ValueError, RecursionError) as error:
+            raise InputError(f"cannot read {file} as JSON", got=str(error), wanted=cls.SCHEMA) from error
+        schema = content.get("schema") if isinstance(content, dict) else None
+        if schema != cls.SCHEMA:
+            raise InputError(f"schema of {file}", got=repr(schema), wanted=repr(cls.SCHEMA))
+        try:
+            return cls.model_validate(content)
+        except ValidationError as error:
+            raise InputError(f"fields of {file}", got=first_error(error), wanted=cls.SCHEMA) from error
+
+
+def first_error(error: ValidationError) -> str:
+    """The first complaint of pydantic as one line: where, what, and the value."""
+    first = error.errors()[0]
+    where = ".".join(str(part) for part in first["loc"][:8]) or "(root)"
+    return f"{where}: {first['msg']} (value {_SHORT.repr(first['input'])})"
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(f"{constant} is no number of JSON")
+
+
+def software_versions() -> dict[str, str]:
+    """Versions of Python and of the packages that decide the numbers; what is absent is left out."""
+    versions = {"python": platform.python_version(), "platform": sys.platform}
+    for name in _REPORTED_PACKAGES:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    return versions

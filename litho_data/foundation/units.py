@@ -1,0 +1,47 @@
+"""Units of length as they are written in files: known ones are converted, all others are refused."""
+
+from __future__ import annotations
+
+from litho_data.foundation.errors import InputError
+
+_IN_UM = {
+    "km": 1e9,
+    "m": 1e6,
+    "metre": 1e6,
+    "meter": 1e6,
+    "dm": 1e5,
+    "cm": 1e4,
+    "mm": 1e3,
+    "um": 1.0,
+    "micron": 1.0,
+    "microns": 1.0,
+    "nm": 1e-3,
+    "å": 1e-4,
+    "angstrom": 1e-4,
+    "ångström": 1e-4,
+    "pm": 1e-6,
+}
+# MICRO SIGN and GREEK SMALL LETTER MU look alike, Bruker files write a tilde for both, and the
+# ångström has a sign of its own beside the letter.
+_SPELLINGS = str.maketrans({"\u00b5": "u", "\u03bc": "u", "~": "u", "\u212b": "å", "\u00c5": "å"})
+
+
+def um_per(unit: str) -> float:
+    """How many µm one ``unit`` of length is.
+
+    Args:
+        unit: for example ``"m"``, ``"nm"``, ``"µm"``, ``"um"``, ``"pm"``, ``"Å"``; upper and lower
+            case differ, because ``"Mm"`` is not ``"mm"``.
+
+    Raises:
+        InputError: the unit is unknown or not a length. ``"A"`` is the ampere, never the ångström.
+    """
+    try:
+        return _IN_UM[unit.strip().translate(_SPELLINGS)]
+    except KeyError:
+        raise InputError("unit of length", got=repr(unit), wanted="m, mm, µm (um), nm, pm or Å") from None
+
+
+def is_length(unit: str) -> bool:
+    """Whether ``um_per`` knows the unit."""
+    return unit.strip().translate(_SPELLINGS) in _IN_UM

@@ -1,0 +1,67 @@
+"""Levelling one file: the levelled heights, the removed surface, and a record of how."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, ClassVar
+
+from litho_data.foundation.files import atomic_file, file_sha256
+from litho_data.foundation.results import Result, software_versions
+from litho_data.level import Recipe
+from litho_data.provenance.steps import array_sha256
+from litho_data.readers.scan_files import write_heights
+from litho_data.scan import Scan
+
+_DIMS = ("y", "x")
+
+
+class LevelRecord(Result):
+    """What was levelled, how, and what came out; beside the levelled file as ``<file>.json``."""
+
+    SCHEMA: ClassVar[str] = "litho-data/level/1"
+    FILE_NAME: ClassVar[str] = "level.json"
+
+    source: str
+    source_sha256: str
+    channel: str
+    pitch_um: tuple[float, float] | None
+    recipe: dict[str, Any]
+    levelled: str
+    levelled_sha256: str
+    removed: str
+    removed_sha256: str
+    versions: dict[str, str]
+
+
+def level_scan(scan: Scan, recipe: Recipe, out: str | Path) -> LevelRecord:
+    """Level a scan and write ``out``, ``<out stem>.removed<suffix>`` and ``<out>.json``.
+
+    Args:
+        scan: a scan that was read from a file.
+        recipe: the steps.
+        out: a ``.gsf`` or ``.npy`` file.
+
+    Raises:
+        InputError: a step that cannot be applied, or another suffix.
+    """
+    levelled, removed = recipe.apply(scan)
+    target = Path(out)
+    removed_file = target.with_name(f"{target.stem}.removed{target.suffix}")
+    write_heights(target, levelled, pitch_um=scan.pitch_um, title=f"{scan.name} levelled")
+    write_heights(removed_file, removed, pitch_um=scan.pitch_um, title=f"{scan.name} removed")
+    record = LevelRecord(
+        schema=LevelRecord.SCHEMA,
+        source=scan.source,
+        source_sha256=file_sha256(scan.source),
+        channel=scan.channel,
+        pitch_um=scan.pitch_um,
+        recipe=recipe.canonical(),
+        levelled=target.name,
+        levelled_sha256=array_sha256(levelled, "µm", _DIMS),
+        removed=removed_file.name,
+        removed_sha256=array_sha256(removed, "µm", _DIMS),
+        versions=software_versions(),
+    )
+    with atomic_file(target.with_name(f"{target.name}.json")) as temporary:
+        temporary.write_text(record.model_dump_json(by_alias=True, indent=1) + "\n", encoding="utf-8")
+    return record

@@ -1,0 +1,1 @@
+"""Who made which array from what: records, history, verification, replay."""

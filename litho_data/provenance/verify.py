@@ -1,0 +1,239 @@
+"""``verify``: is a store still what was built, and are the raw files still those it was built from?"""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from litho_data.build.assemble import root_attributes, table_sha256
+from litho_data.build.operations import OPERATIONS
+from litho_data.foundation.commands import progress
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import file_sha256
+from litho_data.provenance.records import raw_folder, read_steps, require_folder, stored_array
+from litho_data.provenance.steps import Step, record_sha256
+from litho_data.store.access import array_of, decoded, group_of, open_root, read_table, values_of
+from litho_data.store.read import Store, open_store
+from litho_data.store.schema import SAMPLE_VARIABLES, STORE_SCHEMA, VARIABLES
+from litho_data.store.write import pixel_centres_um
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something that is not as it was built: where, and what is wrong there."""
+
+    where: str
+    problem: str
+
+    def __str__(self) -> str:
+        return f"{self.where}: {self.problem}"
+
+
+@dataclass(frozen=True)
+class Verification:
+    """What ``verify`` found. ``notes`` are worth knowing and no damage."""
+
+    findings: tuple[Finding, ...]
+    notes: tuple[str, ...]
+    n_arrays: int
+    n_steps: int
+    n_raw_files: int
+
+
+def verify(store_path: str | Path, data_dir: str | Path | None = None) -> Verification:
+    """Hash everything again and compare it with what was recorded at the build.
+
+    Args:
+        store_path: a ``.zarr`` folder or ``.zarr.zip`` file.
+        data_dir: folder of the raw files; by default where they were at the build, seen from the store, then
+            ``$LITHO_DATA_DIR/<name>`` and the user cache. Where there are none, a note says so.
+
+    Raises:
+        InputError: no store at the path, or ``data_dir`` that is not there.
+    """
+    path = Path(store_path)
+    if open_root(path).attrs.get("schema") != STORE_SCHEMA:
+        raise InputError(f"{path} carries no provenance", wanted="a store made by litho-data build")
+    if data_dir is not None:
+        require_folder(data_dir)
+    findings = list(_documents(path))
+    try:
+        store = open_store(path)
+        history = read_steps(store)
+        manifest = store.manifest
+        folder = raw_folder(store, data_dir)
+    except InputError as error:
+        return Verification((*findings, Finding("store", str(error))), (), 0, 0, 0)
+    arrays = list(progress(_arrays(store, history), "hashing arrays"))
+    findings += [finding for finding in arrays if finding]
+    for check in (_attributes, _tables, _padding, _coordinates):
+        findings += _guarded(check(store))
+    findings += _steps(store, history)
+    notes = list(_other_code(history))
+    files = [row for row in manifest["files"] if row["sha256"]]
+    if folder is None:
+        files = []
+        notes.append("the raw files were not found and not checked; data_dir says where they are")
+    else:
+        findings += [
+            finding for row in progress(files, "hashing raw files") for finding in _raw_file(folder, row)
+        ]
+    n_steps = sum(len(steps) for steps in history.values())
+    return Verification(tuple(findings), tuple(notes), len(arrays), n_steps, len(files))
+
+
+def _documents(path: Path) -> Iterator[Finding]:
+    """Metadata documents that are damaged, or differ from their copy in the root document."""
+    documents: dict[str, Any] = {}
+    for name, content in _read_documents(path):
+        try:
+            documents[name] = json.loads(content)
+        except ValueError as error:
+            yield Finding(f"metadata {name}", f"no JSON ({error})")
+    root = documents.get("zarr.json", {})
+    copies = (root.get("consolidated_metadata") or {}).get("metadata", {})
+    for name in sorted({f"{key}/zarr.json" for key in copies} | set(documents) - {"zarr.json"}):
+        copy = copies.get(name.removesuffix("/zarr.json"))
+        single = documents.get(name)
+        if isinstance(copy, dict) and isinstance(single, dict):
+            copy, single = (
+                {k: v for k, v in one.items() if k != "consolidated_metadata"} for one in (copy, single)
+            )
+        if copy != single:
+            yield Finding(f"metadata {name}", "differs from its copy in the store's zarr.json")
+
+
+def _read_documents(path: Path) -> Iterator[tuple[str, bytes]]:
+    if path.is_dir():
+        for file in sorted(path.rglob("zarr.json")):
+            yield file.relative_to(path).as_posix(), file.read_bytes()
+        return
+    with zipfile.ZipFile(path) as archive:
+        for name in sorted(archive.namelist()):
+            if name.split("/")[-1] == "zarr.json":
+                yield name, archive.read(name)
+
+
+def _guarded(check: Iterator[Finding]) -> Iterator[Finding]:
+    """A check whose data cannot be read has found something, too."""
+    try:
+        yield from check
+    except InputError as error:
+        yield Finding("store", str(error))
+
+
+def _attributes(store: Store) -> Iterator[Finding]:
+    """Attributes of the root against those that follow from the manifest and the arrays."""
+    attributes = dict(store.root.attrs)
+    wanted = root_attributes(store.manifest, _dataset_sha256(store), str(attributes.get("manifest_sha256")))
+    for name in sorted({*wanted, *attributes}):
+        if attributes.get(name) != wanted.get(name):
+            yield Finding(
+                f"attribute {name}", f"is {attributes.get(name)!r}, by the build {wanted.get(name)!r}"
+            )
+
+
+def _tables(store: Store) -> Iterator[Finding]:
+    """The tables against the hashes in the manifest, the manifest against its hash in the root."""
+    manifest = {key: value for key, value in store.manifest.items() if key not in ("build", "files")}
+    files = read_table(group_of(store.root, "manifest"), "path")
+    if record_sha256([manifest, table_sha256(files)]) != store.root.attrs.get("manifest_sha256"):
+        yield Finding("manifest", "is not the one whose hash the store carries")
+    for name in ("quality", "provenance"):
+        if table_sha256(read_table(group_of(store.root, name), "scan")) != manifest.get(f"{name}_sha256"):
+            yield Finding(f"table {name}", "is not the one whose hash the manifest carries")
+
+
+def _dataset_sha256(store: Store) -> str:
+    """The dataset's hash now; the stored one where an array is damaged, since that has its own finding."""
+    try:
+        return store.computed_sha256()
+    except InputError:
+        return store.sha256
+
+
+def _steps(store: Store, history: Mapping[str, list[tuple[str, Step]]]) -> Iterator[Finding]:
+    """Each step's id against its content, and its inputs against what came before it."""
+    raw = {row["path"]: row["sha256"] for row in store.manifest["files"]}
+    for scan_id, steps in history.items():
+        made: dict[str, str] = {}
+        for recorded_id, step in steps:
+            where = f"step {step.op} of scan {scan_id}"
+            if step.id != recorded_id:
+                yield Finding(where, "operation, parameters or inputs are not those that its id stands for")
+            for one in step.inputs:
+                known = made.get(one["name"], raw.get(one["name"]))
+                if one["sha256"] != known:
+                    yield Finding(
+                        where, f"input {one['name']} is not the output of the step before, nor a raw file"
+                    )
+            made |= {one["name"]: one["sha256"] for one in step.outputs}
+    for scan_id in store.ids:
+        if scan_id not in history:
+            yield Finding(f"scan {scan_id}", "has no provenance")
+
+
+def _arrays(store: Store, history: Mapping[str, list[tuple[str, Step]]]) -> Iterator[Finding | None]:
+    """One entry per stored array of every scan: None if it still has its hash."""
+    for scan_id, steps in history.items():
+        for name, wanted in ((one["name"], one["sha256"]) for _, step in steps for one in step.outputs):
+            yield _array(store, scan_id, name, wanted)
+
+
+def _array(store: Store, scan_id: str, name: str, wanted: str) -> Finding | None:
+    where = f"{name} of scan {scan_id}"
+    try:
+        array = stored_array(store, scan_id, name)
+    except InputError as error:
+        return Finding(where, str(error))
+    if array is None:
+        return None
+    same = VARIABLES[name].sample_sha256(array) == wanted
+    return None if same else Finding(where, "values are not those that were built")
+
+
+def _padding(store: Store) -> Iterator[Finding]:
+    empty = {"mask_level": 0, "height_um": np.nan, "valid": False}
+    for name, fill in empty.items():
+        array = array_of(store.root, name)
+        for row, scan_id in enumerate(store.ids):
+            ny, nx = store.shapes[row]
+            if (ny, nx) == array.shape[1:]:
+                continue
+            field = decoded(array, row, f"{name} of scan {scan_id}")
+            rest = np.concatenate([field[ny:].ravel(), field[:ny, nx:].ravel()])
+            if not np.array_equal(rest, np.full_like(rest, fill), equal_nan=True):
+                yield Finding(f"{name} of scan {scan_id}", "padding is not empty")
+
+
+def _coordinates(store: Store) -> Iterator[Finding]:
+    shape = array_of(store.root, "mask_level").shape
+    for name, count in (("y_um", shape[1]), ("x_um", shape[2])):
+        if not np.array_equal(values_of(store.root, name), pixel_centres_um(count, store.pitch_um)):
+            yield Finding(f"coordinate {name}", "is not at pixel centres")
+    for variable in SAMPLE_VARIABLES:
+        attributes = array_of(store.root, variable.name).attrs
+        if attributes.get("units") != variable.unit:
+            problem = f"is {attributes.get('units')!r}, by the schema {variable.unit!r}"
+            yield Finding(f"unit of {variable.name}", problem)
+
+
+def _other_code(history: Mapping[str, list[tuple[str, Step]]]) -> Iterator[str]:
+    used = {(step.op, step.code_sha256) for recorded in history.values() for _, step in recorded}
+    other = {op for op, code in used if op not in OPERATIONS or code != OPERATIONS[op].code_sha256}
+    if other:
+        yield f"made by other code than is installed: {', '.join(sorted(other))}; replay tells if it matters"
+
+
+def _raw_file(folder: Path, row: Mapping[str, Any]) -> Iterator[Finding]:
+    path = folder / row["path"]
+    if not path.is_file():
+        yield Finding(f"raw file {row['path']}", f"is not in {folder}")
+    elif file_sha256(path) != row["sha256"]:
+        yield Finding(f"raw file {row['path']}", "has changed since the build")

@@ -1,0 +1,111 @@
+"""`litho-design`: thin commands over the public functions."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from litho_data.foundation.commands import new_app, run_app
+from litho_data.foundation.errors import InputError
+from litho_design.cli.compare import compare
+from litho_design.cli.design import hoe, lens
+from litho_design.cli.options import Device, Extrapolate, Out, command_line, headline, load_printers
+
+app = new_app("Design diffractive optics through a frozen model of the printer, score them, export them.")
+app.command()(hoe)
+app.command()(lens)
+app.command()(compare)
+
+
+@app.command()
+def score(
+    design: Annotated[Path, typer.Argument(help="Folder of a design.")],
+    out: Out,
+    judge: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="NAME=MODEL, MODEL or `none`; MODEL may be truth/ of a virtual fab; may be repeated."
+        ),
+    ] = None,
+    scan: Annotated[Path | None, typer.Option(help="AFM height map of the printed part.")] = None,
+    scan_unit: Annotated[str | None, typer.Option(help="Unit of its heights, if the file has none.")] = None,
+    scan_size_um: Annotated[float | None, typer.Option(help="Its side, µm, if the file has none.")] = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option(help="Photograph of the printed hologram's image, or through the printed lens."),
+    ] = None,
+    camera_pitch_um: Annotated[float | None, typer.Option(help="Its pixel in the image plane, µm.")] = None,
+    camera_dark_level: Annotated[float | None, typer.Option(help="Its dark level, counts.")] = None,
+    camera_object: Annotated[
+        str | None,
+        typer.Option(help="What the lens looked at: one of the design's objects by name, or a picture."),
+    ] = None,
+    device: Device = "cpu",
+    extrapolate: Extrapolate = False,
+) -> None:
+    """Score a design as printed by models, as measured by AFM, or as photographed."""
+    from litho_design.judging.score import MeasuredSource, PhotoSource, score_design
+    from litho_design.tasks.design import Design
+
+    if not judge and scan is None and camera is None:
+        raise InputError("score", got="nothing to judge with", wanted="--judge, --scan or --camera")
+    if camera is not None and camera_pitch_um is None:
+        raise InputError(
+            "--camera", got="no --camera-pitch-um", wanted="the camera's pixel in the image plane, µm"
+        )
+    if camera is None and camera_object is not None:
+        raise InputError("--camera-object", got="no --camera", wanted="the photograph of it")
+    layout = Design.read(design).layout
+    judges = list(load_printers(judge or [], layout, device, extrapolate).values())
+    size = None if scan_size_um is None else (scan_size_um, scan_size_um)
+    result = score_design(
+        design,
+        judges,
+        out,
+        scan=None if scan is None else MeasuredSource(scan, scan_unit, size),
+        camera=None
+        if camera is None
+        else PhotoSource(camera, camera_pitch_um or 0.0, camera_dark_level, camera_object),
+        command=command_line(),
+        device=device,
+    )
+    for item in result.scores:
+        print(f"{item.kind} {item.judge.name}: {headline(item.figures)}")
+    print(out / "report.html")
+
+
+@app.command()
+def export(
+    design: Annotated[Path, typer.Argument(help="Folder of a design.")],
+    out: Out,
+    format: Annotated[
+        Literal["png16", "bmp", "tiff", "stl", "gds"], typer.Option(help="File for the printer.")
+    ] = "png16",
+    pedestal_um: Annotated[float, typer.Option(help="Base under level 0, µm.")] = 1.0,
+    slicing_um: Annotated[float, typer.Option(help="Slicing distance for the job, µm.")] = 0.1,
+    hatching_um: Annotated[float, typer.Option(help="Hatching distance for the job, µm.")] = 0.1,
+    gds_layers: Annotated[
+        Literal["cumulative", "exclusive"], typer.Option(help="Layer k is level >= k, or level == k.")
+    ] = "cumulative",
+) -> None:
+    """Write the layout for the printer, with the sidecar that gives it heights and size."""
+    from litho_design.export import export_design, sidecar_path
+
+    file = export_design(
+        design,
+        format,
+        out,
+        pedestal_um=pedestal_um,
+        slicing_um=slicing_um,
+        hatching_um=hatching_um,
+        gds_layers=gds_layers,
+    )
+    print(file)
+    print(sidecar_path(file))
+
+
+def main() -> None:
+    """Entry point of `litho-design`."""
+    run_app(app, "litho-design")

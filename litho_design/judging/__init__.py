@@ -1,0 +1,1 @@
+"""How good a print is: predicted, measured, photographed, over a process window."""

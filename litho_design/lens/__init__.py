@@ -1,0 +1,1 @@
+"""Flat lenses: direct focus and imaging with a computer behind."""

@@ -1,0 +1,1 @@
+"""From a task to a layout: start, search, polish, robustness."""

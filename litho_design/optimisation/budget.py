@@ -1,0 +1,73 @@
+"""Time and memory of a design, told before it starts."""
+
+from __future__ import annotations
+
+import resource
+import time
+
+import torch
+from torch import nn
+
+from litho_data.foundation.results import Record
+from litho_design.optimisation.optimise import Objective, SearchSettings
+from litho_design.optimisation.parametrise import Parametrisation
+
+_KIB_PER_GIB = 1 << 20
+
+
+class Budget(Record):
+    """What one iteration costs, measured on a trial iteration that changes nothing."""
+
+    seconds_per_iteration: float
+    seconds_per_evaluation: float
+    peak_memory_gib: float
+
+    def total_seconds(self, search: SearchSettings, done: int = 0) -> float:
+        """Expected time of the search after ``done`` iterations, and of its polish."""
+        left = search.iterations - done
+        evaluations = left / search.evaluate_every
+        return (
+            left + search.polish_rounds
+        ) * self.seconds_per_iteration + evaluations * self.seconds_per_evaluation
+
+    def sentence(self, search: SearchSettings, done: int = 0) -> str:
+        """The estimate in one line; ``done`` iterations of an interrupted run need not be repeated."""
+        minutes = self.total_seconds(search, done) / 60
+        what = f"{search.iterations - done} more iterations" if done else f"{search.iterations} iterations"
+        return (
+            f"estimate: {what} of {self.seconds_per_iteration:.2f} s, "
+            f"about {minutes:.1f} min; peak memory {self.peak_memory_gib:.2f} GiB"
+        )
+
+
+def measure_budget(parameters: Parametrisation, objective: Objective, search: SearchSettings) -> Budget:
+    """Time one iteration with gradient and one without, on the parameters as they are."""
+    assert isinstance(parameters, nn.Module)
+    device = next(parameters.parameters()).device
+    started = time.perf_counter()
+    loss, _ = objective(parameters.sample(search.temperature(0), search.hard(0), seed=0))
+    loss.backward()
+    _wait(device)
+    middle = time.perf_counter()
+    with torch.no_grad():
+        objective(parameters.sample(search.temperature(0), search.hard(0), seed=0))
+    _wait(device)
+    for parameter in parameters.parameters():
+        parameter.grad = None
+    return Budget(
+        seconds_per_iteration=middle - started,
+        seconds_per_evaluation=time.perf_counter() - middle,
+        peak_memory_gib=peak_memory_gib(device),
+    )
+
+
+def peak_memory_gib(device: torch.device) -> float:
+    """Highest memory so far: of the device on CUDA, of the process elsewhere."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated(device) / 2**30
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _KIB_PER_GIB
+
+
+def _wait(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)

@@ -1,0 +1,96 @@
+"""The last touch on the printable layout: single-level changes that are kept only if they help."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from litho_data.foundation.commands import progress
+from litho_design.optimisation.optimise import Objective
+from litho_design.optimisation.parametrise import CellMap
+
+# Up to this many cells every single change is tried; beyond it the gradient proposes.
+_EXHAUSTIVE_CELLS = 64
+
+
+def polish_levels(
+    levels: Tensor, cells: CellMap, objective: Objective, *, level_count: int, rounds: int
+) -> tuple[Tensor, list[float]]:
+    """Improve an integer layout by changing cells; the loss never rises.
+
+    Few cells: every level of every cell is tried in turn until no change helps. Many cells: the
+    gradient at the integer layout ranks one-level moves, the best share of them is applied at once,
+    and the share is halved whenever the true loss of the changed layout does not fall.
+
+    Args:
+        levels: int64 (*cells).
+        rounds: evaluations with gradient (many cells), or sweeps (few cells).
+
+    Returns:
+        Levels, int64 (*cells), and the loss after each accepted round, starting value first.
+    """
+    if levels.numel() <= _EXHAUSTIVE_CELLS:
+        return _coordinate_descent(levels, cells, objective, level_count, rounds)
+    return _gradient_moves(levels, cells, objective, level_count, rounds)
+
+
+@torch.no_grad()
+def _coordinate_descent(
+    levels: Tensor, cells: CellMap, objective: Objective, level_count: int, rounds: int
+) -> tuple[Tensor, list[float]]:
+    best = levels.clone()
+    losses = [_loss(best, cells, objective)]
+    for _ in range(rounds):
+        before = losses[-1]
+        for index in range(best.numel()):
+            trial = best.clone()
+            for level in range(level_count):
+                trial.view(-1)[index] = level
+                loss = _loss(trial, cells, objective)
+                if loss < losses[-1]:
+                    best = trial.clone()
+                    losses.append(loss)
+        if losses[-1] == before:
+            break
+    return best, losses
+
+
+def _gradient_moves(
+    levels: Tensor, cells: CellMap, objective: Objective, level_count: int, rounds: int
+) -> tuple[Tensor, list[float]]:
+    best = levels.clone()
+    share = 0.02
+    gain, move, loss = _rank_moves(best, cells, objective, level_count)
+    losses = [loss]
+    for _ in progress(range(rounds), "polishing", total=rounds):
+        count = min(math.ceil(share * best.numel()), int((gain > 0).sum()))
+        if count == 0:
+            break
+        chosen = gain.flatten().topk(count).indices
+        trial = best.clone()
+        trial.view(-1)[chosen] += move.flatten()[chosen]
+        trial_gain, trial_move, trial_loss = _rank_moves(trial, cells, objective, level_count)
+        if trial_loss < losses[-1]:
+            best, gain, move = trial, trial_gain, trial_move
+            losses.append(trial_loss)
+        else:
+            share /= 2
+    return best, losses
+
+
+def _rank_moves(
+    levels: Tensor, cells: CellMap, objective: Objective, level_count: int
+) -> tuple[Tensor, Tensor, float]:
+    """First-order gain of the best one-level move of each cell, that move (-1 or +1), and the loss."""
+    values = levels.float().requires_grad_()
+    loss, _ = objective(cells(values)[None, None])
+    (slope,) = torch.autograd.grad(loss, values)
+    move = -slope.sign().long()
+    allowed = (levels + move >= 0) & (levels + move < level_count)
+    return torch.where(allowed, slope.abs(), 0.0), move, float(loss.detach())
+
+
+def _loss(levels: Tensor, cells: CellMap, objective: Objective) -> float:
+    return float(objective(cells(levels)[None, None].float())[0])

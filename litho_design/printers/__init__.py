@@ -1,0 +1,1 @@
+"""What stands for the printer: a frozen model, an ensemble, the virtual fab."""

@@ -1,0 +1,100 @@
+"""The virtual fab as a judge: it prints a finished layout, and nothing can be designed through it.
+
+It shares no code with the models that designs are made through, and holds the effects that were hidden
+in their training prints: what it prints is what the machine would have printed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from litho_data.foundation.errors import InputError
+from litho_data.virtual_fab import Job, KnobSetting, Noise, Printer, Truth
+from litho_data.virtual_fab.canvas import GUARD_PX, Canvas, cut_layout
+from litho_data.virtual_fab.knobs import KnobBoard
+from litho_data.virtual_fab.printer import print_clean, surface_noise
+from litho_design.optimisation.parametrise import LayoutSettings
+
+# A stream of its own: no scan of the run that the truth file describes has this roughness.
+_ROUGHNESS_STREAM = 2
+
+
+@dataclass(frozen=True)
+class ElementJob(Job):
+    """A layout that stands alone on the substrate: nothing is written around it."""
+
+    def canvas(self, pitch_um: float) -> Canvas:
+        """The layout in a frame of level 0, in the middle of a write field of its own size."""
+        framed = np.pad(self.level, GUARD_PX)
+        return Canvas(framed, pitch_um, self.field_um, max(self.level.shape) * pitch_um)
+
+
+class FabSimulator(nn.Module):
+    """Print as the virtual fab of a ``truth.json`` does, surface roughness included, scan effects not.
+
+    Called as a frozen model is, but without gradients. The roughness is the same for every layout of
+    one size, so that prints of several layouts differ by their layouts only.
+    """
+
+    name = "fab"
+    # The frame of level 0 is part of the print job.
+    reach_um = 0.0
+
+    def __init__(self, truth: Truth):
+        super().__init__()
+        self.printer, self.noise = Printer(**_whole(truth.printer)), Noise(**truth.noise)
+        settings = [KnobSetting(knob.name, knob.strength, knob.seed) for knob in truth.knobs]
+        self.knobs = KnobBoard(settings, truth.seed)
+        self.scans, self.seed = len(truth.scans), truth.seed
+        # What decides the print, where a model has its weights: results tell fabs apart by its hash.
+        text = truth.model_dump_json(include={"printer", "noise", "knobs", "seed"})
+        self.register_buffer("settings", torch.frombuffer(bytearray(text.encode()), dtype=torch.uint8))
+
+    @torch.no_grad()
+    def forward(self, layout_um: Tensor, pitch_um: float) -> Tensor:
+        """Printed height (b, 1, y, x), µm, of nominal heights of the same shape."""
+        levels = (layout_um / self.printer.level_height_um).round().to(torch.uint8).cpu().numpy()
+        prints = np.stack([self._print(level) for level in levels[:, 0]])[:, None]
+        return torch.from_numpy(prints.astype(np.float32)).to(layout_um.device)
+
+    def _print(self, level: np.ndarray) -> np.ndarray:
+        job = ElementJob(id="element", level=level, index=self.scans)
+        rng = np.random.default_rng([self.seed, self.scans, _ROUGHNESS_STREAM])
+        rough = surface_noise(job, self.printer, self.noise, self.knobs, rng)
+        return cut_layout(print_clean(job, self.printer, self.knobs) + rough)
+
+
+def is_fab(source: str | Path) -> bool:
+    """Whether ``source`` is what ``litho-data simulate`` hides: a truth file, or the folder that holds it."""
+    path = Path(source)
+    return path.name == Truth.FILE_NAME or (path / Truth.FILE_NAME).is_file()
+
+
+def load_fab(source: str | Path, layout: LayoutSettings) -> FabSimulator:
+    """The fab of a truth file.
+
+    Raises:
+        InputError: no truth file, or a layout of another pitch, level height or more levels than it prints.
+    """
+    fab = FabSimulator(Truth.read(source))
+    asked = {"pitch_um": layout.pitch_um, "level_height_um": layout.level_height_um}
+    for name, value in asked.items():
+        prints = getattr(fab.printer, name)
+        if abs(prints - value) > 1e-9:
+            raise InputError(
+                f"{name} of the layout", got=f"{value:g} µm", wanted=f"{prints:g} µm, what the fab prints"
+            )
+    if layout.levels > fab.printer.levels:
+        raise InputError("levels of the layout", got=layout.levels, wanted=f"at most {fab.printer.levels}")
+    return fab
+
+
+def _whole(printer: dict[str, float]) -> dict[str, Any]:
+    """Printer settings of a truth file with their number of levels as an integer again."""
+    return {**printer, "levels": int(printer["levels"])}

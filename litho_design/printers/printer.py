@@ -1,0 +1,242 @@
+"""The printer as the designer meets it: layout levels in, printed height of the element out."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, Literal, cast
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from litho_data.foundation.results import Record
+from litho_design.optimisation.parametrise import LayoutSettings
+from litho_design.printers.fab import FabSimulator
+
+_GUARD_UM = 6.4
+
+Precision = Literal["float32", "mixed", "bfloat16"]
+
+
+class TilingCheck(Record):
+    """How much a print depends on the tile in which it is computed, over some tiles of the layout.
+
+    With a receptive radius this is rounding; without one (a Fourier operator) it is the model's error.
+    """
+
+    tile_px: int
+    tiles: int
+    max_nm: float
+    rms_nm: float
+
+
+class PrinterRecord(Record):
+    """Which printer a design or a score was made with; the dataset is the one its model was trained on."""
+
+    name: str
+    sha256: str
+    source: str
+    dataset_sha256: str = ""
+    guard_um: float
+    extrapolated: bool = False
+
+
+class Printer(nn.Module):
+    """A frozen lithography model, or no model at all, applied to one element.
+
+    The element stands alone on the substrate, but models continue their input beyond its edge; so
+    the layout is surrounded by a guard ring of level 0 before printing and cropped afterwards.
+
+    Args:
+        simulator: a frozen model called as ``simulator(layout_um, pitch_um=...)``, or None for a
+            print equal to the nominal height.
+        layout: geometry and levels of the element.
+    """
+
+    device_marker: Tensor
+
+    def __init__(
+        self,
+        simulator: nn.Module | None,
+        layout: LayoutSettings,
+        *,
+        source: str,
+        name: str = "",
+        extrapolate: bool = False,
+    ):
+        super().__init__()
+        self.simulator = simulator
+        self.register_buffer("device_marker", torch.zeros(()), persistent=False)
+        self.layout = layout
+        self.source = source
+        self.extrapolate = extrapolate
+        self._reduced = False
+        self.name = name or ("none" if simulator is None else str(simulator.name))
+        # The reach is a whole number of pixels times the pitch, give or take a rounding.
+        self.guard_px = 0 if simulator is None else math.ceil(_guard_um(simulator) / layout.pitch_um - 1e-6)
+        self.halo_px = 0 if simulator is None else _halo_px(simulator, self.guard_px)
+        self.strip_halo_px = 0 if simulator is None else _strip_halo_px(simulator, self.guard_px)
+        # What lies in the guard ring is cut off again: a model that can leave it out need not compute it.
+        self._interior: Callable[..., Tensor] | None = None
+        if getattr(simulator, "has_interior", False):
+            self._interior = cast(Any, simulator).interior
+        if simulator is not None:
+            simulator.eval().requires_grad_(False)
+
+    @property
+    def card(self) -> Mapping[str, Any]:
+        """The card of the model; empty where there is none."""
+        return getattr(self.simulator, "card", {})
+
+    @property
+    def only_judges(self) -> bool:
+        """Whether it prints without gradients: layouts cannot be searched through it."""
+        return isinstance(self.simulator, FabSimulator)
+
+    @property
+    def depends_on_position(self) -> bool:
+        """Whether added effects may depend on the place in the write field: a patch says nothing then."""
+        return bool(self.card.get("process_effects"))
+
+    @property
+    def device(self) -> torch.device:
+        """Where the model lives, also where there is no model."""
+        return self.device_marker.device
+
+    def forward(self, level: Tensor) -> Tensor:
+        """Printed height, µm (b, 1, size, size), of real ``level`` (b, 1, size, size)."""
+        height_um = level * self.layout.level_height_um
+        if self.simulator is None:
+            return height_um
+        return self._inside(F.pad(height_um, (self.guard_px,) * 4), self.guard_px)
+
+    def print_patch(self, level: Tensor, halo_px: int | None = None) -> Tensor:
+        """Printed height, µm, of a patch cut out of a layout (b, 1, y, x), without its outer ``halo_px``.
+
+        ``halo_px`` is that of the printer by default; ``strip_halo_px`` serves for two rows of pixels.
+        """
+        height_um = level * self.layout.level_height_um
+        return self._inside(height_um, self.halo_px if halo_px is None else halo_px)
+
+    @torch.no_grad()
+    def tiling_check(self, level: Tensor, tile_px: int = 256) -> TilingCheck | None:
+        """Compare the print of the whole element with tiles printed on their own, halo included.
+
+        Args:
+            level: layout (1, 1, size, size).
+            tile_px: side of a tile without its halo; up to four of them along the diagonal are compared.
+
+        Returns:
+            The differences; None where there is nothing to compare: nominal heights, an element not larger
+            than one tile, or a print that depends on the position.
+        """
+        size, halo = self.layout.size_px, self.halo_px
+        if self.simulator is None or size <= tile_px or self.depends_on_position:
+            return None
+        whole = self(level)
+        around = F.pad(level, (halo,) * 4)
+        count = min(4, size // tile_px)
+        # Odd starts: a multiple of the model's own tile would compare it with itself.
+        starts = [round((size - tile_px) * (index + 0.5) / count) | 1 for index in range(count)]
+        off = []
+        for start in (min(start, size - tile_px) for start in starts):
+            part = slice(start, start + tile_px)
+            wide = slice(start, start + tile_px + 2 * halo)
+            off.append(self.print_patch(around[..., wide, wide]) - whole[..., part, part])
+        nm = torch.stack(off).double() * 1000
+        return TilingCheck(
+            tile_px=tile_px,
+            tiles=count,
+            max_nm=float(nm.abs().max()),
+            rms_nm=float(nm.square().mean().sqrt()),
+        )
+
+    @contextmanager
+    def at_precision(self, precision: Precision) -> Iterator[None]:
+        """Run the networks of the model in ``precision`` inside the block.
+
+        ``mixed`` prints in float32 and sends gradients back through the areawise networks in bfloat16;
+        ``bfloat16`` does both so. Other models, and heights, blurs and waves, stay in float32.
+        """
+        networks: list[Any] = [network for network in self.modules() if hasattr(network, "adjoint_dtype")]
+        self._reduced = precision == "bfloat16"
+        for network in networks:
+            network.adjoint_dtype = torch.bfloat16 if precision == "mixed" else None
+        try:
+            yield
+        finally:
+            self._reduced = False
+            for network in networks:
+                network.adjoint_dtype = None
+
+    def record(self) -> PrinterRecord:
+        """Name, hashes and guard ring, for the results."""
+        return PrinterRecord(
+            name=self.name,
+            sha256=self.weights_sha256(),
+            source=self.source,
+            dataset_sha256=(self.card.get("dataset") or {}).get("sha256", ""),
+            guard_um=self.guard_px * self.layout.pitch_um,
+            extrapolated=self.extrapolate,
+        )
+
+    def weights_sha256(self) -> str:
+        """Hash of every parameter and buffer as it is now; equal before and after a design run."""
+        digest = hashlib.sha256()
+        state = {} if self.simulator is None else self.simulator.state_dict()
+        for name in sorted(state):
+            value = state[name].detach().cpu().contiguous()
+            digest.update(f"{name}:{value.dtype}:{tuple(value.shape)};".encode())
+            digest.update(value.reshape(-1).view(torch.uint8).numpy().tobytes())
+        return digest.hexdigest()
+
+    @torch.no_grad()
+    def level_heights_um(self) -> list[float]:
+        """Printed height of a wide uniform field of each level, µm: the level table of the advisor."""
+        size = 2 * self.guard_px + 16
+        heights = []
+        for level in range(self.layout.levels):
+            nominal = torch.full((1, 1, size, size), level * self.layout.level_height_um, device=self.device)
+            printed = (
+                nominal if self.simulator is None else self.simulator(nominal, pitch_um=self.layout.pitch_um)
+            )
+            heights.append(
+                float(printed[..., size // 2 - 4 : size // 2 + 4, size // 2 - 4 : size // 2 + 4].mean())
+            )
+        return heights
+
+    def _inside(self, height_um: Tensor, border_px: int) -> Tensor:
+        """Print of ``height_um`` without its outer ``border_px``."""
+        if border_px and self._interior is not None:
+            return self._simulate(height_um, self._interior)
+        printed = height_um if self.simulator is None else self._simulate(height_um, self.simulator)
+        return F.pad(printed, (-border_px,) * 4)
+
+    def _simulate(self, height_um: Tensor, call: Callable[..., Tensor]) -> Tensor:
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self._reduced):
+            return call(height_um, pitch_um=self.layout.pitch_um).to(height_um.dtype)
+
+
+def _guard_um(simulator: nn.Module) -> float:
+    reach = getattr(simulator, "reach_um", None)
+    return _GUARD_UM if reach is None else float(reach)
+
+
+def _halo_px(simulator: nn.Module, guard_px: int) -> int:
+    """What a patch needs around it: the guard, or a whole tile where the model runs on tiles."""
+    tile = getattr(getattr(simulator, "simulator", None), "tile", None)
+    return guard_px if tile is None else max(guard_px, tile.size_px)
+
+
+def _strip_halo_px(simulator: nn.Module, guard_px: int) -> int:
+    """What two rows of pixels need around them: the guard, or what makes the strip two rows of tiles high.
+
+    A whole tile around them would only add tiles whose print is cut off again.
+    """
+    tile = getattr(getattr(simulator, "simulator", None), "tile", None)
+    if tile is None:
+        return guard_px
+    return max(guard_px, (2 * tile.size_px - 3 * tile.overlap_px) // 2 - 1)

@@ -1,0 +1,86 @@
+"""Where a printer comes from: a folder of a frozen model, the zoo, a virtual fab, or none."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from litho_data.foundation.errors import InputError
+from litho_design.optimisation.parametrise import LayoutSettings
+from litho_design.printers.fab import is_fab, load_fab
+from litho_design.printers.printer import Printer
+
+
+def load_printer(
+    source: str,
+    layout: LayoutSettings,
+    *,
+    name: str = "",
+    device: str | torch.device = "cpu",
+    extrapolate: bool = False,
+) -> Printer:
+    """The printer for ``source``: a folder of a frozen model, ``zoo:NAME``, or ``none`` for nominal heights.
+
+    The folder ``truth`` of a virtual fab is a printer that can only judge. ``name`` is what results
+    call it; the model's own name by default.
+
+    Raises:
+        InputError: no frozen model there, another pitch, levels the model was not calibrated for, or a
+            device that this machine does not have.
+    """
+    check_device(device)
+    if source == "none":
+        return Printer(None, layout, source=source, name=name).to(device)
+    if is_fab(source):
+        return Printer(load_fab(source, layout), layout, source=source, name=name).to(device)
+    simulator = _load_simulator(source, device, extrapolate)
+    _check_calibration(simulator.card, layout, extrapolate)
+    return Printer(simulator, layout, source=str(source), name=name, extrapolate=extrapolate).to(device)
+
+
+def _load_simulator(source: str, device: str | torch.device, extrapolate: bool) -> Any:
+    from litho_models import load_frozen
+    from litho_models.frozen import zoo
+
+    return load_frozen(zoo.model_folder(source, other="or none"), device=device, extrapolate=extrapolate)
+
+
+def _check_calibration(card: Mapping[str, Any], layout: LayoutSettings, extrapolate: bool) -> None:
+    for name, asked in (("pitch_um", layout.pitch_um), ("level_height_um", layout.level_height_um)):
+        calibrated = card[name]
+        if abs(calibrated - asked) > 1e-9 and not (extrapolate and name == "level_height_um"):
+            raise InputError(
+                f"{name} of the layout",
+                got=f"{asked:g} µm",
+                wanted=f"{calibrated:g} µm, as the model was trained",
+                hint=f"design with --pitch-um {calibrated:g}, or take a model of {asked:g} µm"
+                if name == "pitch_um"
+                else "--extrapolate accepts a guess",
+            )
+    highest, asked = card["calibrated_range_um"][1], (layout.levels - 1) * layout.level_height_um
+    if asked > highest + 1e-6 and not extrapolate:
+        raise InputError(
+            "highest level of the layout",
+            got=f"{layout.levels} levels of {layout.level_height_um:g} µm ({asked:g} µm)",
+            wanted=f"at most {highest:g} µm, what the model was calibrated for",
+            hint="use fewer levels, or --extrapolate to accept a guess",
+        )
+
+
+def check_device(device: str | torch.device) -> None:
+    """Refuse a device that this machine does not have.
+
+    Raises:
+        InputError: no such device.
+    """
+    try:
+        wanted = torch.device(device)
+        there = wanted.type != "cuda" or (wanted.index or 0) < torch.cuda.device_count()
+    except RuntimeError:
+        there = False
+    if not there:
+        raise InputError(
+            "device", got=repr(str(device)), wanted="cpu, or a GPU of this machine: cuda, cuda:1 …"
+        )

@@ -1,0 +1,1 @@
+"""Designs and scores for people."""

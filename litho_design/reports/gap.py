@@ -1,0 +1,229 @@
+"""The report of a comparison: tables with intervals and the images in design and after printing."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from litho_data.foundation.report import Page, new_figure
+from litho_design.judging.judge import Judging
+from litho_design.printers.printer import Printer
+from litho_design.reports.design import SCORE_LABELS
+from litho_design.reports.lens import LENS_LABELS
+from litho_design.reports.plots import image_grid
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from litho_design.judging.compare import GapResult
+
+# Side of the cut-out that shows layout against print; features of some pixels must stay visible.
+_DETAIL_PX = 160
+_LABELS = {**SCORE_LABELS, **LENS_LABELS}
+
+
+def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Printer]) -> Path:
+    """Write ``report.html`` and one CSV per table."""
+    from litho_design.judging.compare import HEADLINE
+
+    what = f"hologram of “{result.target}”" if result.task == "hoe" else result.task.replace("-", ", ")
+    page = Page(
+        "The design-to-manufacturing gap",
+        f"{what}: {len(result.arms)} arms, {len(result.seeds)} seed(s), {result.settings.search.iterations} "
+        "iterations each; every layout is scored as it would be printed.",
+    )
+    if len(result.seeds) < 3:
+        page.note(
+            f"Only {len(result.seeds)} seed(s): intervals are missing or wide, and no ranking is supported."
+        )
+    page.paragraph(
+        "Rows are the model a layout was designed with, columns the judge that prints it. A design's own "
+        "model is on the diagonal: that figure is an expectation, not a measurement."
+    )
+    headline = HEADLINE[result.task]
+    for figure in headline:
+        caption = f"{_LABELS[figure]}: mean over seeds [95 % interval]"
+        page.table(_matrix(result, figure), caption, f"matrix_{figure}.csv", digits=3)
+    page.heading("In design and after printing")
+    judged = _judged(folder, result, printers)
+    page.figure(
+        _pictures(result, judged),
+        f"Seed {result.seeds[0]}. Rows: designed with; columns: printed by. "
+        + ("Images at matched scale." if result.task == "hoe" else "Square root of the PSF over its peak."),
+    )
+    page.figure(
+        _prints(result, judged, printers),
+        f"Seed {result.seeds[0]}: layout and prints in the middle of the element, heights in µm, each in the "
+        "range of its row.",
+    )
+    if result.task != "hoe":
+        page.figure(
+            _profiles(result, judged),
+            f"Seed {result.seeds[0]}: PSF across the centre and its Fourier spectrum along x (MTF × power); "
+            "thick in design, thin as printed.",
+        )
+    page.figure(
+        _bars(result, "ssim" if result.task == "hoe" else headline[0]),
+        "Left: expected in design (circles) and after each judge's print (bars), means over seeds. Right: "
+        "design minus print, the gap.",
+    )
+    page.heading("Arm against arm")
+    page.paragraph(
+        "Differences under the same judge, paired by seed; an interval that holds 0 decides nothing."
+    )
+    page.table(_paired_frame(result), "Paired differences", "paired.csv", digits=3)
+    page.table(_long_frame(result), "All means", "summary.csv", digits=4)
+    return page.write(folder)
+
+
+def _matrix(result: GapResult, figure: str) -> pd.DataFrame:
+    import pandas as pd
+
+    rows = []
+    for arm in result.arms:
+        row: dict[str, str] = {"designed with": arm}
+        for item in result.summary:
+            if item.arm == arm and item.figure == figure:
+                interval = "" if item.judged_ci95 is None else " [{:.3f}, {:.3f}]".format(*item.judged_ci95)
+                row[f"printed by {item.judge}"] = f"{item.judged_mean:.3f}{interval}"
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _judged(
+    folder: Path, result: GapResult, printers: Mapping[str, Printer]
+) -> dict[str, tuple[Judging, dict[str, np.ndarray]]]:
+    """For every arm the image (or PSF) that each judge's print gives, first seed."""
+    from litho_design.judging.compare import design_folder
+
+    images = {}
+    for arm, own in printers.items():
+        if arm not in result.arms:
+            continue
+        judging = Judging(design_folder(folder, arm, result.seeds[0]), device=own.device)
+        images[arm] = (
+            judging,
+            {name: judging.image(judging.printed_um(judge)) for name, judge in printers.items()},
+        )
+    return images
+
+
+def _pictures(result: GapResult, judged: dict[str, tuple[Judging, dict[str, np.ndarray]]]):
+    images, titles, side_um = [], [], 0.0
+    for arm, (judging, by_judge) in judged.items():
+        images.append([judging.display(image) for image in by_judge.values()])
+        titles.append([f"{arm}: in design" if name == arm else f"printed by {name}" for name in by_judge])
+        side_um = judging.window_um
+    return image_grid(images, titles, list(judged), side_um)
+
+
+def _prints(
+    result: GapResult,
+    judged: dict[str, tuple[Judging, dict[str, np.ndarray]]],
+    printers: Mapping[str, Printer],
+):
+    """The layout (nominal heights) and what every judge prints of it, cut out around the centre."""
+    layout = result.settings.layout
+    side = min(layout.size_px, _DETAIL_PX)
+    first = (layout.size_px - side) // 2
+    middle = (slice(first, first + side), slice(first, first + side))
+    extent = (0, side * layout.pitch_um, side * layout.pitch_um, 0)
+    figure = new_figure(2.3 * (len(printers) + 1) + 0.6, 2.45 * len(judged))
+    axes = figure.subplots(len(judged), len(printers) + 1, squeeze=False)
+    for (arm, (judging, _)), row in zip(judged.items(), axes, strict=True):
+        maps = {"layout, nominal": judging.level.cpu().numpy() * layout.level_height_um}
+        maps |= {f"printed by {name}": judging.printed_um(p).cpu().numpy() for name, p in printers.items()}
+        highest = max(float(height[middle].max()) for height in maps.values())
+        for axis, (name, height) in zip(row, maps.items(), strict=True):
+            shown = axis.imshow(height[middle], cmap="viridis", vmin=0, vmax=highest, extent=extent)
+            axis.set_title(name, fontsize=8)
+            axis.tick_params(labelsize=6)
+        row[0].set_ylabel(f"designed with {arm}", fontsize=8)
+        figure.colorbar(shown, ax=row.tolist(), label="µm", shrink=0.8)
+    return figure
+
+
+def _profiles(result: GapResult, judged: dict[str, tuple[Judging, dict[str, np.ndarray]]]):
+    figure = new_figure(9, 2.6 * len(judged))
+    axes = figure.subplots(len(judged), 2, squeeze=False, sharey="col")
+    for (arm, (_, by_judge)), (left, right) in zip(judged.items(), axes, strict=True):
+        for name, psf in by_judge.items():
+            pitch = result.settings.layout.pitch_um
+            x = (np.arange(psf.shape[0]) - (psf.shape[0] - 1) / 2) * pitch
+            width = 2.5 if name == arm else 1.0
+            label = f"{name} (design)" if name == arm else name
+            left.plot(x, psf[psf.shape[0] // 2], linewidth=width, label=label)
+            spectrum = np.abs(np.fft.rfft(psf.sum(0)))
+            frequency = np.fft.rfftfreq(psf.shape[0], pitch)
+            right.plot(frequency, spectrum, linewidth=width)
+        left.set_xlim(-6, 6)
+        left.set_ylabel(f"designed with {arm}\nshare per pixel")
+        left.legend(fontsize=7)
+        right.set_xlim(0, 0.6)
+        right.set_ylabel("|spectrum|")
+    axes[-1, 0].set_xlabel("x, µm")
+    axes[-1, 1].set_xlabel("cycles/µm")
+    return figure
+
+
+def _bars(result: GapResult, name: str):
+    """Left: one figure in design and after each judge's print; right: what the print cost of it."""
+    figure = new_figure(12, 3.8)
+    left, right = figure.subplots(1, 2)
+    judges, arms = list(result.judges), list(result.arms)
+    width = 0.8 / len(arms)
+    for index, arm in enumerate(arms):
+        items = [item for item in result.summary if item.arm == arm and item.figure == name]
+        place = np.arange(len(judges)) + (index - (len(arms) - 1) / 2) * width
+        half = [0.0 if i.judged_ci95 is None else i.judged_ci95[1] - i.judged_mean for i in items]
+        error = {"yerr": half, "capsize": 2} if any(half) else {}
+        left.bar(place, [item.judged_mean for item in items], width, color=f"C{index}", label=arm, **error)
+        left.plot(place, [item.designed_mean for item in items], "o", mfc="none", color="black", ms=4)
+        right.bar(place, [item.gap_mean for item in items], width, color=f"C{index}")
+    left.set_ylabel(textwrap.fill(_LABELS[name], 32))
+    right.set_ylabel(textwrap.fill(f"Δ {_LABELS[name]}", 32))
+    right.axhline(0, color="black", linewidth=0.8)
+    for axis in (left, right):
+        axis.set_xticks(range(len(judges)), judges, fontsize=8)
+        axis.set_xlabel("printed by")
+    figure.legend(title="designed with", ncols=len(arms), fontsize=8, loc="outside upper center")
+    return figure
+
+
+def _paired_frame(result: GapResult) -> pd.DataFrame:
+    import pandas as pd
+
+    rows = [
+        {
+            "judge": item.judge,
+            "figure": item.figure,
+            "difference": f"{item.arm} − {item.against}",
+            "mean": item.mean,
+            "95 % from": float("nan") if item.ci95 is None else item.ci95[0],
+            "to": float("nan") if item.ci95 is None else item.ci95[1],
+        }
+        for item in result.paired
+    ]
+    return pd.DataFrame(rows, columns=["judge", "figure", "difference", "mean", "95 % from", "to"])
+
+
+def _long_frame(result: GapResult) -> pd.DataFrame:
+    import pandas as pd
+
+    return pd.DataFrame(
+        [
+            {
+                "arm": item.arm,
+                "judge": item.judge,
+                "figure": item.figure,
+                "in design": item.designed_mean,
+                "after printing": item.judged_mean,
+                "gap": item.gap_mean,
+            }
+            for item in result.summary
+        ]
+    )

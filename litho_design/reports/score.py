@@ -1,0 +1,80 @@
+"""The report of one score."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from litho_data.foundation.report import Page
+from litho_design.reports.design import SCORE_LABELS
+from litho_design.reports.lens import LENS_LABELS
+from litho_design.reports.plots import image_grid
+
+if TYPE_CHECKING:
+    from litho_design.judging.score import ScoreResult
+
+
+def write_score_report(
+    folder: Path,
+    result: ScoreResult,
+    pictures: dict[str, np.ndarray],
+    side_um: float,
+    photos: dict[str, np.ndarray],
+    frame_um: float,
+) -> Path:
+    """Write ``report.html`` and ``scores.csv``.
+
+    Args:
+        pictures: image or PSF (m, m) behind each print, ``side_um`` wide.
+        photos: what was photographed through a lens and what became of it, (n, n), ``frame_um`` wide.
+    """
+    import pandas as pd
+
+    page = Page(
+        "Score of a printable layout",
+        f"Designed through “{result.designed_with.name}”, printed by {len(result.scores)} judge(s).",
+    )
+    if not any(score.independent for score in result.scores):
+        page.note(
+            "No judge is independent of the design: these figures repeat the design model's own opinion."
+        )
+    columns = {f"{result.designed_with.name} (design)": result.designed}
+    columns |= {
+        score.judge.name + ("" if score.independent else " (not independent)"): score.figures
+        for score in result.scores
+    }
+    names = list(dict.fromkeys(name for figures in columns.values() for name in figures))
+    table = pd.DataFrame(
+        [
+            {"figure": name, **{judge: figures.get(name, np.nan) for judge, figures in columns.items()}}
+            for name in names
+        ]
+    )
+    labels = SCORE_LABELS if result.task == "hoe" else LENS_LABELS
+    table["meaning"] = [labels[name] for name in names]
+    page.table(table, "Figures by judge", "scores.csv", digits=3)
+    page.figure(
+        image_grid([list(pictures.values())], [list(pictures)], [""], side_um),
+        "Behind each print: the image at matched scale, or the square root of the PSF.",
+    )
+    if photos:
+        page.figure(
+            image_grid([list(photos.values())], [list(photos)], [""], frame_um),
+            "Photograph through the printed lens, each image at the scale of least error; its figures are "
+            "those of this one object.",
+        )
+    heights = pd.DataFrame(
+        [
+            {
+                "printed by": score.judge.name,
+                "mean difference to the designed print, nm": 1000 * score.mean_height_difference_um,
+                "rms difference, nm": 1000 * score.rms_height_difference_um,
+            }
+            for score in result.scores
+            if score.mean_height_difference_um is not None and score.rms_height_difference_um is not None
+        ]
+    )
+    page.table(heights, "Heights against the print that the design expected", "heights.csv", digits=1)
+    return page.write(folder)

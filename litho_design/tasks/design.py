@@ -1,0 +1,131 @@
+"""A finished design as a folder: the record in design.json, levels, predicted print and image."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import atomic_file, file_sha256
+from litho_data.foundation.results import Record, Result
+from litho_design.optics import Optics, stroke_table
+from litho_design.optimisation.gauge import OutOfDistribution, Printability
+from litho_design.optimisation.parametrise import LayoutSettings
+from litho_design.printers.ensemble import EnsembleRecord
+from litho_design.printers.printer import PrinterRecord, TilingCheck
+from litho_design.tasks.targets import TargetRecord
+
+LEVELS_FILE = "layout_level.npy"
+HEIGHT_FILE = "predicted_height_um.npy"
+IMAGE_FILE = "image_share.npy"
+TARGET_FILE = "target.npy"
+PICTURES_FILE = "object_pictures.npy"
+
+
+DesignTask = Literal["hoe", "lens-direct", "lens-computational"]
+
+
+class RunRecord(Record):
+    """What was run, with what, and how long it took; results of before commits were kept have none."""
+
+    command: str
+    commit: str = ""
+    versions: dict[str, str]
+    device: str
+    threads: int
+    seconds: float
+    seconds_per_iteration: float
+    peak_memory_gib: float
+
+
+class Stroke(Record):
+    """What the print makes of the levels."""
+
+    printed_height_um: list[float]
+    stroke_um: float
+    stroke_waves: float
+    print_gain: float
+    blaze_order_1: float
+    blaze_order_0: float
+    levels_for_one_wave: float | None
+    level_height_for_one_wave_um: float | None
+
+
+class Design(Result):
+    """design.json."""
+
+    SCHEMA: ClassVar[str] = "litho-design/design/1"
+    FILE_NAME: ClassVar[str] = "design.json"
+
+    schema_: Literal["litho-design/design/1"] = Field(default="litho-design/design/1", alias="schema")
+    task: DesignTask
+    variant: str
+    fingerprint: str
+    run: RunRecord
+    settings: dict[str, Any]
+    layout: LayoutSettings
+    optics: Optics
+    target: TargetRecord | None = None
+    printer: PrinterRecord
+    printer_unchanged: bool
+    tiling: TilingCheck | None = None
+    ensemble: EnsembleRecord | None = None
+    stroke: Stroke
+    printability: Printability
+    out_of_distribution: OutOfDistribution | None = None
+    notes: list[str] = Field(default_factory=list)
+    iterations: int
+    start_loss: float
+    sample_loss: float
+    argmax_loss: float
+    polished_loss: float
+    reference_efficiency: float | None = None
+    predicted: dict[str, float]
+    files: dict[str, str]
+
+
+def make_stroke(level_heights_um: list[float], optics: Optics, layout: LayoutSettings) -> Stroke:
+    """The advisor's figures as a record; what no level count can reach is None."""
+    _, advice = stroke_table(level_heights_um, optics.wave_height_um, level_height_um=layout.level_height_um)
+    reachable = {name: value if math.isfinite(value) else None for name, value in advice.items()}
+    return Stroke.model_validate({"printed_height_um": level_heights_um, **reachable})
+
+
+def write_arrays(folder: Path, arrays: dict[str, np.ndarray]) -> dict[str, str]:
+    """Save arrays by file name; returns their SHA-256."""
+    hashes = {}
+    for name, array in arrays.items():
+        with atomic_file(folder / name) as temporary, open(temporary, "wb") as stream:
+            np.save(stream, array, allow_pickle=False)
+        hashes[name] = file_sha256(folder / name)
+    return hashes
+
+
+def write_level_image(folder: Path, levels: np.ndarray) -> dict[str, str]:
+    """The layout as a 16-bit PNG whose grey value is the level."""
+    import cv2
+
+    name = "layout_level.png"
+    encoded = cv2.imencode(".png", levels.astype(np.uint16))[1]
+    with atomic_file(folder / name) as temporary:
+        temporary.write_bytes(encoded.tobytes())
+    return {name: file_sha256(folder / name)}
+
+
+def read_array(folder: str | Path, name: str) -> np.ndarray:
+    """One array of a design folder, checked against the hash in its record.
+
+    Raises:
+        InputError: no such file, or a file that is not the one the record names.
+    """
+    path = Path(folder) / name
+    wanted = Design.read(folder).files.get(name)
+    if wanted is None or not path.exists():
+        raise InputError(f"array {name}", got=f"no such file in {folder}", wanted="a complete design folder")
+    if file_sha256(path) != wanted:
+        raise InputError(f"array {path}", got="a file changed after the design", wanted=f"SHA-256 {wanted}")
+    return np.load(path, allow_pickle=False)

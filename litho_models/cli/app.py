@@ -1,0 +1,204 @@
+"""``litho-models``: every command parses arguments and calls one public function."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+from litho_data.foundation.commands import new_app, run_app
+from litho_models.cli.loop import close_loop
+from litho_models.cli.noise import noise
+
+app = new_app("Train, judge and correct models of the printer. Lengths in µm, height errors in nm.")
+app.command("close-loop")(close_loop)
+app.command()(noise)
+
+StorePath = Annotated[Path, typer.Argument(help="dataset store made by `litho-data build`")]
+Out = Annotated[Path, typer.Option(help="folder of the result")]
+PolicyOption = Annotated[
+    Literal["none", "offset", "offset-gain", "full", "full+rows"],
+    typer.Option(help="nuisances that a scan may be freed of in mae_datum_free"),
+]
+BackgroundOption = Annotated[
+    Literal["training", "none"],
+    typer.Option(
+        help="training: add the smooth background that the training scans share to predictions of measured "
+        "maps; both errors are in the tables"
+    ),
+]
+NoiseOption = Annotated[
+    Path | None,
+    typer.Option(help="noise.json of `litho-models noise` on this dataset, for the floor beside the errors"),
+]
+RecipeOption = Annotated[
+    Literal["fast", "paper"],
+    typer.Option(help="fast: one-cycle with nuisances fitted jointly; paper: 4,000 epochs of Adam"),
+]
+VariantOption = Annotated[
+    Literal["default", "paper", "authors"],
+    typer.Option(help="ours, as printed in the paper, or as in the authors' code"),
+]
+Steps = Annotated[int | None, typer.Option(min=1, help="optimiser steps; the recipe's by default")]
+PrecisionOption = Annotated[
+    Literal["bf16-mixed", "32-true"] | None,
+    typer.Option(help="of the products within networks in training; the recipe's by default"),
+]
+Seed = Annotated[int, typer.Option(min=0, help="seed of weights, crops and splits")]
+
+
+@app.command()
+def train(
+    store: StorePath,
+    model: Annotated[
+        str, typer.Option(help="identity, affine, affine-mtf, blur-table, linear, physics, pbl or fno")
+    ],
+    out: Out,
+    recipe: RecipeOption = "fast",
+    variant: VariantOption = "default",
+    steps: Steps = None,
+    precision: PrecisionOption = None,
+    seed: Seed = 0,
+    use_lock_box: Annotated[
+        bool,
+        typer.Option("--use-lock-box", help="train on the locked scans too; nothing is left to judge by"),
+    ] = False,
+) -> None:
+    """Train a model on all scans but the locked ones; the same command continues a killed run."""
+    from litho_models.fitting.runs import train as train_model
+
+    settings = {"seed": seed, **_given(steps=steps, precision=precision)}
+    run = train_model(
+        store, model, out, recipe=recipe, variant=variant, settings=settings, use_lock_box=use_lock_box
+    )
+    typer.echo(f"{model} trained on {len(run.training_ids)} scans in {run.seconds:.0f} s: {out}")
+
+
+@app.command()
+def evaluate(
+    model: Annotated[str, typer.Argument(help="folder of a frozen model, or zoo:NAME")],
+    store: StorePath,
+    out: Out,
+    policy: PolicyOption = "offset",
+    background: BackgroundOption = "training",
+    noise: NoiseOption = None,
+    extrapolate: Annotated[
+        bool, typer.Option("--extrapolate", help="accept layouts beyond the calibrated range")
+    ] = False,
+    open_lock_box: Annotated[
+        bool,
+        typer.Option(
+            "--open-lock-box",
+            help="score the locked scans of the dataset that the model was trained on too; once per release",
+        ),
+    ] = False,
+) -> None:
+    """Score one frozen model on a store; on the dataset it was trained on, without the locked scans."""
+    from litho_models.evaluation.evaluate import evaluate as evaluate_model
+    from litho_models.evaluation.evaluation_report import lock_box_text
+
+    result = evaluate_model(
+        model,
+        store,
+        out,
+        policy=policy,
+        background=background,
+        noise=noise,
+        extrapolate=extrapolate,
+        open_lock_box=open_lock_box,
+    )
+    scores = result.scores
+    typer.echo(lock_box_text(result.split))
+    typer.echo(
+        f"{scores.model}: mae_datum_free {scores.mae_datum_free_nm:.2f} nm, "
+        f"mae_abs {scores.mae_abs_nm:.2f} nm; "
+        f"report {out / 'report.html'}"
+    )
+
+
+@app.command()
+def benchmark(
+    store: StorePath,
+    out: Out,
+    split: Annotated[
+        Literal["grouped", "paper", "leave-one-print-out"], typer.Option(help="what is held out")
+    ] = "grouped",
+    models: Annotated[str | None, typer.Option(help="names, separated by commas; all by default")] = None,
+    recipe: RecipeOption = "fast",
+    variant: VariantOption = "default",
+    steps: Steps = None,
+    precision: PrecisionOption = None,
+    folds: Annotated[int, typer.Option(min=2, help="folds of the grouped split")] = 5,
+    policy: PolicyOption = "offset",
+    background: BackgroundOption = "training",
+    noise: NoiseOption = None,
+    open_lock_box: Annotated[
+        bool, typer.Option("--open-lock-box", help="also score the locked scans; once per release")
+    ] = False,
+    seed: Seed = 0,
+    training_seed: Annotated[
+        int | None,
+        typer.Option(min=0, help="of weights and crops alone, same split; --seed by default"),
+    ] = None,
+) -> None:
+    """Train every model per fold and score it on scans it never saw; resumable."""
+    from litho_models.evaluation.benchmark import DEFAULT_MODELS
+    from litho_models.evaluation.benchmark import benchmark as run_benchmark
+    from litho_models.evaluation.tables import headline_table
+
+    settings = {"recipe": recipe, "variant": variant}
+    settings |= _given(steps=steps, precision=precision, seed=training_seed)
+    result = run_benchmark(
+        store,
+        out,
+        split=split,
+        models=[name.strip() for name in models.split(",") if name.strip()] if models else DEFAULT_MODELS,
+        settings=settings,
+        folds=folds,
+        policy=policy,
+        background=background,
+        noise=noise,
+        open_lock_box=open_lock_box,
+        seed=seed,
+    )
+    typer.echo(headline_table(result.scores, result.noise_floor).round(2).to_string(index=False, na_rep="–"))
+    typer.echo(f"report {out / 'report.html'}")
+
+
+@app.command()
+def compare(
+    first: Annotated[Path, typer.Argument(help="benchmark.json or evaluation.json")],
+    second: Annotated[Path, typer.Argument(help="another one, of the same protocol")],
+) -> None:
+    """Difference of two results, paired by scan; refuses different data, folds or nuisances."""
+    from litho_models.evaluation.compare import compare as compare_results
+
+    typer.echo(compare_results(first, second).round(3).to_string(index=False))
+
+
+@app.command()
+def freeze(
+    run: Annotated[
+        str, typer.Argument(help="folder of `train` or `close-loop`, or a frozen model (a folder, zoo:NAME)")
+    ],
+    out: Out,
+    declare_process: Annotated[
+        list[str] | None,
+        typer.Option(help="an undetermined effect that you declare part of the printer; repeatable"),
+    ] = None,
+) -> None:
+    """Write the process model only: weights, card and a page for people."""
+    from litho_models.fitting.runs import freeze as freeze_run
+
+    card = freeze_run(run, out, declare_process or [])
+    typer.echo(f"{card.name}: {card.parameters} parameters, frozen in {out}")
+
+
+def main() -> None:
+    """Entry point of ``litho-models``."""
+    run_app(app, "litho-models")
+
+
+def _given(**options: Any) -> dict[str, Any]:
+    return {name: value for name, value in options.items() if value is not None}

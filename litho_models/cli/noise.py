@@ -1,0 +1,94 @@
+"""`litho-models noise`: what no model of the printer can predict."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from litho_data.foundation.errors import InputError
+
+# What only single files need, and what only a store has.
+OF_FILES = ("substrate", "flat", "steps", "unit", "size_um", "level_height_um")
+OF_A_STORE = ("residuals", "model", "seed")
+
+
+def noise(
+    context: typer.Context,
+    out: Annotated[Path, typer.Option("--out", help="folder for noise.json, report and tables")],
+    store: Annotated[
+        Path | None, typer.Argument(help="dataset store; its scans of use substrate, flat and steps are used")
+    ] = None,
+    substrate: Annotated[
+        Path | None, typer.Option(help="scan of the bare substrate, without a store")
+    ] = None,
+    flat: Annotated[Path | None, typer.Option(help="scan of a flat print, without a store")] = None,
+    steps: Annotated[Path | None, typer.Option(help="scan of a step print, without a store")] = None,
+    unit: Annotated[str | None, typer.Option(help="unit of these scans where the files state none")] = None,
+    size_um: Annotated[
+        tuple[float, float] | None,
+        typer.Option("--size-um", metavar="Y X", help="their size in µm where the files state none"),
+    ] = None,
+    level_height_um: Annotated[float, typer.Option(help="nominal step of the step print, µm")] = 0.1,
+    residuals: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="folder of `benchmark`, or a frozen model (a folder, zoo:NAME): adds σ(x) and calibration; "
+            "repeatable"
+        ),
+    ] = None,
+    model: Annotated[
+        str | None, typer.Option(help="which model of the benchmark; its best one by default")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="seed of the pixels drawn")] = 0,
+) -> None:
+    """Roughness, dose matrix, bounds on the noise, σ(x) and its calibration; lengths in µm, noise in nm."""
+    from litho_models.noise import noise as analyse
+    from litho_models.noise import noise_of_files
+
+    _check_given(context)
+    if store is not None:
+        result = analyse(store, out, residuals=residuals or (), model=model, seed=seed)
+    else:
+        result = noise_of_files(
+            out,
+            flat=Path(flat or ""),
+            substrate=substrate,
+            steps=steps,
+            unit=unit,
+            size_um=size_um,
+            level_height_um=level_height_um,
+        )
+    floor = result.noise_floor
+    typer.echo(
+        f"noise floor ({floor.kind}): "
+        + (
+            "not known"
+            if floor.mae_nm is None
+            else f"MAE {floor.mae_nm:.2f} nm, sigma {floor.rmse_nm:.2f} nm"
+        )
+    )
+    if result.dose is not None:
+        typer.echo(f"recommended dose {result.dose.recommended_dose:g}: {result.dose.reason}")
+    typer.echo(f"report {out / 'report.html'}")
+
+
+def _check_given(context: typer.Context) -> None:
+    """A store, or files with a flat print among them, and each with its own options only."""
+    sources = {name: context.get_parameter_source(name) for name in context.params}
+    given = {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
+
+    def options(names: tuple[str, ...]) -> str:
+        return ", ".join(f"--{name.replace('_', '-')}" for name in names if name in given)
+
+    if "store" in given and (of_files := options(OF_FILES)):
+        raise InputError("noise", got=f"a store and {of_files}", wanted="a store, or files without one")
+    if "store" not in given and "flat" not in given:
+        raise InputError(
+            "noise", got=options(OF_FILES) or "nothing to analyse", wanted="a store, or --flat and its scan"
+        )
+    if "flat" in given and (of_a_store := options(OF_A_STORE)):
+        raise InputError("noise", got=f"--flat and {of_a_store}", wanted=f"a store for {of_a_store}")
+    if "level_height_um" in given and "store" not in given and "steps" not in given:
+        raise InputError("noise", got="--level-height-um", wanted="--steps with it, whose nominal step it is")

@@ -1,0 +1,1 @@
+"""Models scored on datasets: evaluation, benchmark, comparison, with their reports."""

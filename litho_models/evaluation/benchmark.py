@@ -1,0 +1,183 @@
+"""All models on one dataset under one protocol: trained per fold, scored on scans never seen.
+
+A benchmark that was stopped continues where it was, and an unchanged fit is never repeated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field
+
+from litho_data.foundation.commands import progress
+from litho_data.foundation.results import Record, Result
+from litho_data.store import PrintedScan, open_store
+from litho_models.evaluation.benchmark_report import write_benchmark_report
+from litho_models.evaluation.evaluate import SplitRecord
+from litho_models.evaluation.fit_cache import FitRecord, fit_or_load
+from litho_models.fitting import TrainingConfig
+from litho_models.fitting.fit import common_geometry
+from litho_models.fitting.runs import training_config
+from litho_models.frozen.card import DatasetName
+from litho_models.models import build_model, require_models
+from litho_models.run_info import RunInfo, run_info
+from litho_models.scan_terms.background import BackgroundUse
+from litho_models.scan_terms.nuisance import Policy
+from litho_models.scoring.records import ModelScores, NuisanceProtocol, Prediction
+from litho_models.scoring.scores import NoiseFloor, noise_floor, paired_scores, protocol_for, score_model
+from litho_models.splits.folds import GROUPED_FOLDS, SplitKind, plan_folds
+from litho_models.splits.splits import ids_sha256, locked_ids
+
+BASELINES = ("identity", "affine", "affine-mtf", "blur-table", "linear")
+DEFAULT_MODELS = (*BASELINES, "physics", "pbl", "fno")
+
+
+class Paired(Record):
+    """Mean over scans of first minus second ``mae_datum_free_nm``; negative means the first is better."""
+
+    first: str
+    second: str
+    mean_nm: float
+    ci95_nm: tuple[float, float] | None
+    p: float
+    first_better: int
+    scans: int
+
+
+class Benchmark(Result):
+    """``benchmark.json``."""
+
+    SCHEMA: ClassVar[str] = "litho-models/benchmark/1"
+    FILE_NAME: ClassVar[str] = "benchmark.json"
+
+    schema_: Literal["litho-models/benchmark/1"] = Field("litho-models/benchmark/1", alias="schema")
+    run: RunInfo
+    dataset: DatasetName
+    split: SplitRecord
+    nuisance: NuisanceProtocol
+    noise_floor: NoiseFloor
+    training: dict[str, dict[str, Any]]
+    scores: list[ModelScores]
+    locked_scores: list[ModelScores] = Field(default_factory=list)
+    paired: list[Paired]
+    fits: list[FitRecord]
+
+
+def benchmark(
+    store: str | Path,
+    out: str | Path,
+    *,
+    split: SplitKind = "grouped",
+    models: Sequence[str] = DEFAULT_MODELS,
+    settings: dict[str, Any] | None = None,
+    folds: int = GROUPED_FOLDS,
+    policy: Policy = "offset",
+    background: BackgroundUse = "training",
+    noise: str | Path | None = None,
+    open_lock_box: bool = False,
+    seed: int = 0,
+) -> Benchmark:
+    """Train and score ``models`` out of fold; write ``benchmark.json``, a report and CSV tables.
+
+    Args:
+        store: dataset store.
+        out: result folder; ``out/cache`` keeps every fit.
+        split: ``grouped`` by scan, ``leave-one-print-out``, or ``paper``: one random 75/25 draw of
+            quadrants over all scans, leaky, for comparison with the paper only.
+        models: names of models; baselines cost next to nothing and belong in the table.
+        settings: fields of ``TrainingConfig`` that replace the recipe's.
+        folds: number of folds of ``grouped``, at most the number of development scans.
+        policy: nuisances of ``mae_datum_free_nm``.
+        background: whether each fit's background, learned on its training scans, is added to its predictions.
+        noise: ``noise.json`` of this dataset, or its folder: the floor beside the errors is the one in it.
+        open_lock_box: also train on all development scans and score the locked ones.
+        seed: of the split, the nuisance blocks and the training.
+
+    Raises:
+        InputError: no model, an unknown one or one twice, a store that cannot be read or is too small for
+            the split or for a lock box to open, a noise analysis of other data, or a damaged cache.
+    """
+    require_models(models)
+    dataset = open_store(store)
+    scans = dataset.scans()
+    floor = noise_floor(dataset.name, noise)
+    locked = locked_ids(scans)
+    plan = plan_folds(scans, locked, split, folds=folds, seed=seed, open_lock_box=open_lock_box)
+    configs = {name: _config(name, settings, seed) for name in models}
+    fits: list[FitRecord] = []
+    predicted: dict[tuple[str, bool], dict[str, Prediction]] = {}
+    jobs = [(name, fold) for name in models for fold in plan]
+    for name, fold in progress(jobs, f"benchmark of {dataset.name}"):
+        record, heights = fit_or_load(name, fold, configs[name], Path(out) / "cache")
+        fits.append(record)
+        assert record.diagnostics is not None
+        learned = record.diagnostics.background if background == "training" else None
+        predicted.setdefault((name, fold.locked), {}).update(
+            (scan.id, Prediction.beside(learned, height))
+            for scan, height in zip(fold.held_out, heights, strict=True)
+        )
+    protocol = protocol_for(policy, seed, background)
+    scored = [scan for fold in plan if not fold.locked for scan in fold.held_out]
+    boxed = [scan for fold in plan if fold.locked for scan in fold.held_out]
+
+    def score(name: str, judged: Sequence[PrintedScan], locked: bool) -> ModelScores:
+        own = predicted[name, locked]
+        return score_model(name, judged, [own[scan.id] for scan in judged], protocol)
+
+    scores = [score(name, scored, False) for name in models]
+    ids = [scan.id for scan in scored]
+    result = Benchmark(
+        schema="litho-models/benchmark/1",
+        run=run_info([seed], len(scans)),
+        dataset=DatasetName(name=dataset.name, sha256=dataset.sha256),
+        split=SplitRecord(
+            kind=split,
+            folds=sum(not fold.locked for fold in plan),
+            seed=seed,
+            scored_ids=ids,
+            scored_ids_sha256=ids_sha256(ids),
+            lock_box=locked,
+            lock_box_opened=open_lock_box or split == "paper",
+        ),
+        nuisance=protocol,
+        noise_floor=floor,
+        training={name: _settings(name, config, scans) for name, config in configs.items()},
+        scores=scores,
+        locked_scores=[score(name, boxed, True) for name in models] if boxed else [],
+        paired=_all_pairs(scores, seed),
+        fits=fits,
+    )
+    result.write(out)
+    maps = {name: {scan.id: predicted[name, False][scan.id].map_um for scan in scored} for name in models}
+    write_benchmark_report(result, scored, maps, out)
+    return result
+
+
+def _config(name: str, settings: dict[str, Any] | None, seed: int) -> TrainingConfig:
+    given = {"seed": seed, **(settings or {})}
+    return training_config(given.pop("recipe", "fast"), name, given)
+
+
+def _settings(name: str, config: TrainingConfig, scans: Sequence[PrintedScan]) -> dict[str, Any]:
+    return config.used_by(build_model(name, config.variant, **common_geometry(scans)))
+
+
+def _all_pairs(scores: Sequence[ModelScores], seed: int) -> list[Paired]:
+    pairs = []
+    for position, first in enumerate(scores):
+        for second in scores[position + 1 :]:
+            compared = paired_scores(first, second, seed)
+            pairs.append(
+                Paired(
+                    first=first.model,
+                    second=second.model,
+                    mean_nm=compared.mean,
+                    ci95_nm=compared.interval if compared.scans > 1 else None,
+                    p=compared.p,
+                    first_better=compared.first_better,
+                    scans=compared.scans,
+                )
+            )
+    return pairs

@@ -1,0 +1,93 @@
+"""What a benchmark records of each fit beside its held-out predictions; only the fitted model can tell it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+
+from litho_data.foundation.results import Record
+from litho_data.store import PrintedScan
+from litho_models.prediction.cost import PredictionCost, measured_predictions
+from litho_models.prediction.tiles import predict_scan, tile_difference
+from litho_models.scan_terms.background import Background
+from litho_models.scan_terms.training import learn_background
+from litho_models.scoring.metrics import score_scan
+from litho_models.simulator import Simulator
+
+
+class TileConsistency(Record):
+    """The same pixels predicted in the whole field and in a crop of it, nm."""
+
+    max_nm: float
+    rms_nm: float
+    pixels: int
+
+
+class FitDiagnostics(Record):
+    """One fitted model on its own scans and on those held out.
+
+    The three errors are alike, so that over-fitting shows: mean over scans of the datum-free error of
+    policy ``offset``, without a background. Fits without inner validation have none there.
+    """
+
+    background: Background
+    training_nm: float
+    inner_validation_nm: float | None
+    held_out_nm: float
+    tiles: TileConsistency | None
+    cost: PredictionCost
+
+
+def diagnose(
+    model: Simulator,
+    scans: Sequence[PrintedScan],
+    validation_ids: Sequence[str],
+    held_out: Sequence[PrintedScan],
+    held_out_um: Sequence[np.ndarray],
+) -> FitDiagnostics:
+    """Examine a fitted model.
+
+    Args:
+        model: the model; ``scans``: all that it was fitted to, of which ``validation_ids`` chose the weights.
+        held_out: scans that it never saw; ``held_out_um``: its heights (ny, nx) for them, µm.
+    """
+    heights, cost = measured_predictions(lambda scan: predict_scan(model, scan), scans, device_of(model))
+    seen = {scan.id: height for scan, height in zip(scans, heights, strict=True)}
+    unseen = {scan.id: height for scan, height in zip(held_out, held_out_um, strict=True)}
+    chosen_by = [scan for scan in scans if scan.id in validation_ids]
+    return FitDiagnostics(
+        background=learn_background(scans, heights),
+        training_nm=_error_nm([scan for scan in scans if scan.id not in validation_ids], seen),
+        inner_validation_nm=_error_nm(chosen_by, seen) if chosen_by else None,
+        held_out_nm=_error_nm(held_out, unseen),
+        tiles=tile_consistency(model, held_out[0]),
+        cost=cost,
+    )
+
+
+def tile_consistency(model: torch.nn.Module, scan: PrintedScan) -> TileConsistency | None:
+    """Difference between a scan's field and a crop of it that lacks a third of the rows and columns.
+
+    Pixels within the receptive radius of the crop's edge are not compared, nor those within one tile
+    of a model on tiles. None for fields too small to leave any, and for models with effects behind them.
+    """
+    if not isinstance(model, Simulator):
+        return None
+    border = model.tile.size_px if model.tile is not None else model.reach_px or 0
+    offset = scan.shape[0] // 3, scan.shape[1] // 3
+    if any(length - cut <= 2 * border for length, cut in zip(scan.shape, offset, strict=True)):
+        return None
+    layout = torch.from_numpy(scan.layout_um)[None, None].to(device_of(model))
+    return TileConsistency(**tile_difference(model, layout, offset, border)._asdict())
+
+
+def device_of(model: torch.nn.Module) -> str:
+    """Where a model's weights are, as torch names it."""
+    return str(next((parameter.device for parameter in model.parameters()), torch.device("cpu")))
+
+
+def _error_nm(scans: Sequence[PrintedScan], heights_um: Mapping[str, np.ndarray]) -> float:
+    scores = [score_scan(scan.id, scan.height_um, heights_um[scan.id], scan.valid) for scan in scans]
+    return float(np.mean([score.mae_datum_free_nm for score in scores]))

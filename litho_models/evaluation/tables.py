@@ -1,0 +1,178 @@
+"""Tables that the evaluation and benchmark reports share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from litho_models.scoring.edges import SEARCH_UM
+from litho_models.scoring.metrics import INDEX_STEP, WAVELENGTH_UM
+from litho_models.scoring.records import Interval, ModelScores, NuisanceProtocol
+from litho_models.scoring.scores import NoiseFloor
+from litho_models.scoring.similarity import SSIM_RANGE_UM, SSIM_SIGMA_PX, SSIM_WINDOW_PX
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from litho_models.evaluation.diagnostics import TileConsistency
+    from litho_models.prediction.cost import PredictionCost
+
+
+def headline_table(scores: Sequence[ModelScores], floor: NoiseFloor) -> pd.DataFrame:
+    """One row per model: both error figures with intervals, spread and bias; below them the noise floor."""
+    import pandas as pd
+
+    rows = [
+        {
+            "model": s.model,
+            "mae_datum_free_nm": s.mae_datum_free_nm,
+            "mae_datum_free_ci95_nm": interval_text(s.mae_datum_free_ci95_nm),
+            "rmse_datum_free_nm": s.rmse_datum_free_nm,
+            "mae_abs_nm": s.mae_abs_nm,
+            "mae_abs_ci95_nm": interval_text(s.mae_abs_ci95_nm),
+            "bias_nm": s.bias_nm,
+            "scans": len(s.scans),
+        }
+        for s in scores
+    ]
+    known = {
+        "model": f"noise floor ({floor.kind})",
+        "mae_datum_free_nm": floor.mae_nm,
+        "rmse_datum_free_nm": floor.rmse_nm,
+        "scans": "",
+    }
+    return pd.DataFrame([*rows, known])
+
+
+def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol) -> pd.DataFrame:
+    """One row per model and background, one column per policy; of line offsets their effective number."""
+    import pandas as pd
+
+    rows = []
+    for s in scores:
+        for background, errors in ((protocol.background, s.by_policy), ("none", s.without_background)):
+            if errors:
+                named = {f"{error.policy}_mae_nm": error.mae_nm for error in errors}
+                lines = {f"{error.policy}_k": error.k for error in errors if error.policy == "full+rows"}
+                rows.append({"model": s.model, "background": background, **named, **lines})
+    return pd.DataFrame(rows)
+
+
+def shape_table(scores: Sequence[ModelScores]) -> pd.DataFrame:
+    """One row per model: phase error, structural similarity and edge placement."""
+    import pandas as pd
+
+    fields = ("phase_rms_waves", "ssim", "edge_mean_nm", "edge_p95_nm")
+    counts = ("edge_matched", "edge_unmatched", "edge_unmatched_expected")
+    return pd.DataFrame(
+        [{"model": s.model, **{name: getattr(s, name) for name in (*fields, *counts)}} for s in scores]
+    )
+
+
+def band_table(scores: Sequence[ModelScores]) -> pd.DataFrame:
+    """One row per model: how far up in frequency the prediction follows the measurement, along x and y."""
+    import pandas as pd
+
+    names = [f"{figure}_{axis}_per_um" for figure in ("half_power", "noise_band") for axis in "xy"]
+    return pd.DataFrame(
+        [{"model": s.model, **{name: getattr(s.transfer, name) for name in names}} for s in scores]
+    )
+
+
+def scan_table(scores: Sequence[ModelScores]) -> pd.DataFrame:
+    """One row per model and scan."""
+    import pandas as pd
+
+    return pd.DataFrame(
+        [{"model": s.model, "scan": row.scan, **row.model_dump()} for s in scores for row in s.scans]
+    )
+
+
+def level_table(scores: Sequence[ModelScores]) -> pd.DataFrame:
+    """One row per model and printed level."""
+    import pandas as pd
+
+    return pd.DataFrame([{"model": s.model, **entry.model_dump()} for s in scores for entry in s.by_level])
+
+
+def prediction_columns(tiles: TileConsistency | None, cost: PredictionCost) -> dict[str, float | None]:
+    """Crop dependence and cost of a model's predictions, as columns."""
+    return {
+        "tile_max_nm": tiles.max_nm if tiles else None,
+        "tile_rms_nm": tiles.rms_nm if tiles else None,
+        "prediction_s": cost.seconds_per_scan,
+        "prediction_mib": cost.peak_memory_mib,
+    }
+
+
+def interval_text(interval: Interval) -> str:
+    """An interval for people."""
+    return "–" if interval is None else f"{interval[0]:.2f} … {interval[1]:.2f}"
+
+
+def protocol_text(protocol: NuisanceProtocol) -> str:
+    """How the datum-free figure was obtained, in one paragraph."""
+    lines = " and its line offsets" if protocol.policy == "full+rows" else ""
+    return (
+        f"mae_abs has no fit at test time. mae_datum_free frees each scan of the nuisances of policy "
+        f"'{protocol.policy}' (k = {protocol.k:g} per scan{lines}), fitted on one half of a checkerboard of "
+        f"{protocol.block_px} px blocks shrunk by {protocol.buffer_px} px and scored on the other half, "
+        "both halves swapped; 'full+rows' uses stripes of columns instead. Means are per scan first, then "
+        f"over scans; intervals resample whole scans (2,000 draws). {_BACKGROUND_TEXT[protocol.background]}"
+    )
+
+
+_BACKGROUND_TEXT = {
+    "none": "Background 'none': predictions are those of the print alone.",
+    "training": "Background 'training': to each prediction is added what the training scans have in common "
+    "beside their prints (five smooth terms, nothing fitted to the scored scan); the table of policies has "
+    "the errors without it too. Policies with smooth terms of their own cannot tell the difference.",
+}
+
+
+def floor_text(floor: NoiseFloor) -> str:
+    """The noise floor and how it is known."""
+    known = f"MAE {floor.mae_nm:.2f} nm, RMSE {floor.rmse_nm:.2f} nm; " if floor.mae_nm is not None else ""
+    return f"Noise floor ({floor.kind}): {known}{floor.source}"
+
+
+def shape_text() -> str:
+    """What the figures of ``shape_table`` are."""
+    return (
+        f"phase_rms_waves is the RMS error seen by light of {WAVELENGTH_UM:g} µm that passes the print "
+        f"(index step {INDEX_STEP:g}). ssim has a Gaussian window of {SSIM_SIGMA_PX:g} px, "
+        f"{SSIM_WINDOW_PX} px wide, and a data range of {SSIM_RANGE_UM:g} µm. edge_mean and edge_p95 are "
+        "distances of the measured contours from the predicted ones at the heights half way between nominal "
+        f"levels, over the pieces whose partner lies within {SEARCH_UM:g} µm; the counts are of pieces: of "
+        "the measured contours with and without a partner, of the predicted contours without."
+    )
+
+
+def band_text() -> str:
+    """What the figures of ``band_table`` are."""
+    return (
+        "half_power is where predicted over measured falls to 1/√2 of that at the lowest frequencies, "
+        "noise_band the width of the ideal low pass that lets as much white noise through; along x and y."
+    )
+
+
+def caveats(scores: Sequence[ModelScores]) -> list[str]:
+    """Things worth knowing about the numbers: what was dropped, what is degenerate, what is small."""
+    notes = []
+    for s in scores:
+        if s.constant_predictions:
+            notes.append(f"{s.model} predicts a constant height for {s.constant_predictions} scans.")
+        if s.dropped_pixels:
+            notes.append(
+                f"{s.model}: {s.dropped_pixels} pixels were not measured or not valid and are not scored."
+            )
+    if scores and len(scores[0].scans) < 8:
+        notes.append(f"Only {len(scores[0].scans)} scans: intervals over scans are rough.")
+    if scores:
+        s = min(scores, key=lambda entry: entry.mae_datum_free_nm)
+        notes.append(
+            f"Line offsets left by {s.model}: {s.row_offset_sd_nm:.1f} nm along the rows of the layout, "
+            f"{s.scan_line_offset_sd_nm:.1f} nm along the scan's own lines. Offsets that follow the layout "
+            "although the scans are rotated belong to the print, not to the microscope."
+        )
+    return notes

@@ -1,0 +1,174 @@
+"""Making the zoo: train on all scans but the locked ones, score, and freeze with the scores in the card."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from threadpoolctl import threadpool_limits
+
+from litho_data.foundation.errors import InputError
+from litho_data.store import PrintedScan, Store, open_store
+from litho_models.evaluation.evaluate import card_background, predict_frozen
+from litho_models.fitting.config import Recipe
+from litho_models.fitting.runs import MODEL_FOLDER, freeze, train
+from litho_models.frozen import zoo
+from litho_models.frozen.card import Metric, ModelCard
+from litho_models.frozen.files import load_frozen
+from litho_models.scan_terms.background import BackgroundUse
+from litho_models.scan_terms.nuisance import Policy
+from litho_models.scoring.records import ModelScores, Prediction
+from litho_models.scoring.scores import noise_floor, protocol_for, score_model
+from litho_models.simulator import Variant
+from litho_models.splits.splits import locked_ids
+
+ZOO_MODELS = ("physics", "pbl", "fno")
+TRAINED_ON, HELD_OUT, OUT_OF_FOLD = "development, trained on", "lock box, held out", "grouped, out of fold"
+
+
+def make_zoo(
+    store: str | Path,
+    runs: str | Path,
+    root: str | Path = zoo.ZOO_FOLDER,
+    *,
+    models: Sequence[str] = ZOO_MODELS,
+    recipe: Recipe = "fast",
+    variant: Variant = "default",
+    steps: int | None = None,
+    seed: int = 0,
+    open_lock_box: bool = False,
+    benchmark: str | Path | None = None,
+) -> dict[str, ModelCard]:
+    """Train, score and freeze ``models``; a killed call goes on where it stopped.
+
+    Args:
+        store: dataset store.
+        runs: folder of the run folders.
+        root: the zoo to write into, a folder per model.
+        recipe, variant, steps, seed: as in ``litho-models train``, which makes the same weights.
+        open_lock_box: score the locked scans too; once per release.
+        benchmark: result of ``litho-models benchmark`` with split ``grouped``, whose out-of-fold errors of
+            the same models go into the cards, said to be of other fits.
+
+    Raises:
+        InputError: a store or benchmark that cannot be used, or a zoo that is too large.
+    """
+    dataset = open_store(store)
+    every = dataset.scans()
+    locked = locked_ids(every)
+    out_of_fold = _out_of_fold(benchmark, dataset) if benchmark is not None else {}
+    given = {"seed": seed, **({"steps": steps} if steps is not None else {})}
+    cards = {}
+    for name in models:
+        run = Path(runs) / name
+        train(store, name, run, recipe=recipe, variant=variant, settings=given)
+        metrics = scored_metrics(run / MODEL_FOLDER, [s for s in every if s.id not in locked], TRAINED_ON)
+        if open_lock_box:
+            metrics += scored_metrics(run / MODEL_FOLDER, [s for s in every if s.id in locked], HELD_OUT)
+        metrics += out_of_fold.get(name, [])
+        card = ModelCard.read(run / MODEL_FOLDER)
+        described = {
+            "metrics": metrics,
+            "command": _command(dataset.name, name, recipe, variant, given),
+            "nuisance": protocol_for("offset", background="training").model_dump(mode="json"),
+            "noise_floor": noise_floor(dataset.name).model_dump(mode="json"),
+            "limitations": _limitations(metrics),
+        }
+        card.model_copy(update=described).write(run / MODEL_FOLDER)
+        cards[name] = freeze(run, Path(root) / name)
+    size = zoo.size_bytes(root)
+    if size > zoo.LARGEST_ZOO_BYTES:
+        raise InputError("size of the zoo", got=f"{size} bytes", wanted=f"at most {zoo.LARGEST_ZOO_BYTES}")
+    return cards
+
+
+def scored_metrics(model: str | Path, scans: Sequence[PrintedScan], split: str) -> list[Metric]:
+    """The errors of a frozen model on scans, as they stand in its card, whatever the number of threads."""
+    frozen = load_frozen(model)
+    learned = card_background(frozen, scans)
+    protocol = protocol_for("offset", background="training" if learned else "none")
+    # Threads that share a sum add it up in another order, and its last bits differ.
+    with threadpool_limits(1):
+        predictions = [Prediction.beside(learned, predict_frozen(frozen, scan)) for scan in scans]
+        scores = score_model(frozen.name, scans, predictions, protocol)
+    return _metrics(scores, split, protocol.background)
+
+
+def differing_metrics(store: str | Path, root: str | Path = zoo.ZOO_FOLDER) -> dict[str, list[str]]:
+    """Score every zoo model again; per model, what differs from its card in any bit.
+
+    Out-of-fold figures are of other fits and are not compared.
+
+    Raises:
+        InputError: a model of another dataset.
+    """
+    dataset = open_store(store)
+    every = dataset.scans()
+    locked = locked_ids(every)
+    found = {}
+    for name in zoo.list(root):
+        card = ModelCard.read(zoo.folder(name, root))
+        if card.dataset is None or card.dataset.sha256 != dataset.sha256:
+            raise InputError(f"dataset of zoo model {name}", got=card.dataset, wanted=dataset.sha256)
+        stated = [metric for metric in card.metrics if metric.split in (TRAINED_ON, HELD_OUT)]
+        again: list[Metric] = []
+        for split, inside in ((TRAINED_ON, False), (HELD_OUT, True)):
+            if any(metric.split == split for metric in stated):
+                scans = [scan for scan in every if (scan.id in locked) == inside]
+                again += scored_metrics(zoo.folder(name, root), scans, split)
+        found[name] = [
+            f"{old.name} ({old.policy}, {old.split}): card {old.value!r}, now {new.value!r}"
+            for old, new in zip(stated, again, strict=True)
+            if old != new
+        ]
+    return found
+
+
+def _metrics(scores: ModelScores, split: str, background: BackgroundUse) -> list[Metric]:
+    """The figures of a card, first as the protocol has them, then without its background."""
+
+    def metric(name: str, value: float, policy: Policy, used: BackgroundUse) -> Metric:
+        return Metric(name=name, value=value, split=split, policy=policy, background=used)
+
+    return [
+        metric("mae_abs", scores.mae_abs_nm, "none", background),
+        metric("rmse_datum_free", scores.rmse_datum_free_nm, "offset", background),
+        *(
+            metric("mae_abs" if one.policy == "none" else "mae_datum_free", one.mae_nm, one.policy, used)
+            for used, errors in ((background, scores.by_policy[1:]), ("none", scores.without_background))
+            for one in errors
+        ),
+    ]
+
+
+def _out_of_fold(benchmark: str | Path, dataset: Store) -> dict[str, list[Metric]]:
+    from litho_models.evaluation.benchmark import Benchmark
+
+    result = Benchmark.read(benchmark)
+    if (result.dataset.sha256, result.split.kind) != (dataset.sha256, "grouped"):
+        raise InputError(
+            f"benchmark {benchmark}",
+            got=f"split {result.split.kind} of {result.dataset.name}",
+            wanted=f"split grouped of {dataset.name}, the store given",
+        )
+    background = result.nuisance.background
+    return {scores.model: _metrics(scores, OUT_OF_FOLD, background) for scores in result.scores}
+
+
+def _limitations(metrics: Sequence[Metric]) -> list[str]:
+    splits = {metric.split for metric in metrics}
+    notes = ["Trained on prints of one machine, resist and protocol: to be retrained for any other."]
+    if HELD_OUT not in splits:
+        notes.append("The locked scans were not opened: no figure is of scans that this model never saw.")
+    if OUT_OF_FOLD in splits:
+        notes.append("Out-of-fold figures are of other fits with the same recipe, each on fewer scans.")
+    return notes
+
+
+def _command(dataset: str, model: str, recipe: str, variant: str, given: dict[str, Any]) -> str:
+    options = {"model": model, "recipe": recipe, "variant": variant, **given, "out": model}
+    return shlex.join(
+        ["litho-models", "train", f"{dataset}.zarr", *(f"--{key}={value}" for key, value in options.items())]
+    )

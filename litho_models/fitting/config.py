@@ -1,0 +1,99 @@
+"""How a model is trained: one frozen, explicit record, saved with every run."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, Self, get_args
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from litho_data.foundation.errors import InputError
+from litho_models.scan_terms.nuisance import Policy
+from litho_models.simulator import Simulator, Variant
+
+Recipe = Literal["fast", "paper"]
+RECIPES: tuple[str, ...] = get_args(Recipe)
+PAPER_EPOCHS, PAPER_CROPS, PAPER_BATCH = 4000, 72, 4
+FAST_STEPS = {"pbl": 2000, "fno": 1000}
+# What a fit by Gauss-Newton depends on.
+GAUSS_NEWTON_FIELDS = {"recipe", "variant", "seed", "nuisance", "free_gain"}
+PAPER_LEARNING_RATE = {"pbl": 5e-4, "fno": 1e-4, "physics": 1e-2}
+
+
+class TrainingConfig(BaseModel):
+    """Settings of one fit. A model that is fitted by Gauss-Newton uses the seed and nuisances only.
+
+    ``nuisance`` are the per-scan terms fitted jointly with the model (never part of it), their
+    offset and gain pinned to a mean of zero over the training scans.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    recipe: Recipe = "fast"
+    variant: Variant = "default"
+    seed: int = Field(0, ge=0)
+    steps: int = Field(1000, ge=1, description="optimiser steps")
+    rounds: int = Field(
+        4, ge=1, description="times that nuisances are re-estimated, validation runs, a checkpoint is kept"
+    )
+    batch: int = Field(4, ge=1, description="crops per step")
+    crop_px: int = Field(
+        128, ge=8, description="scored width and height of a crop; a model with tiles takes its own"
+    )
+    crops: Literal["random", "quadrants"] = "random"
+    flips: bool = False
+    optimiser: Literal["adamw", "adam"] = "adamw"
+    schedule: Literal["one-cycle", "constant"] = "one-cycle"
+    learning_rate: float = Field(2e-3, gt=0)
+    weight_decay: float = Field(1e-3, ge=0)
+    loss: Literal["l1", "smooth-l1"] = "l1"
+    smooth_l1_beta_um: float = Field(0.1, gt=0, description="width of the quadratic part of smooth-l1, µm")
+    nuisance: Policy = "full+rows"
+    free_gain: bool = Field(
+        False, description="a gain per scan among the nuisances, where the policy has one"
+    )
+    validation_scans: int = Field(2, ge=0, description="training scans that only choose the checkpoint")
+    precision: Literal["bf16-mixed", "32-true"] = "32-true"
+
+    @classmethod
+    def of_recipe(cls, recipe: Recipe, model_name: str, **settings: Any) -> Self:
+        """The settings of a named recipe for a model; ``settings`` override single fields.
+
+        ``paper``: Adam, batch 4, L1, 4,000 epochs over 72 quadrants, the paper's learning rates, no
+        nuisances. ``fast``: AdamW with a one-cycle schedule, random crops, nuisances fitted jointly, and
+        ``FAST_STEPS``.
+
+        Raises:
+            InputError: unknown recipe.
+        """
+        if recipe not in RECIPES:
+            raise InputError("recipe", got=repr(recipe), wanted=", ".join(RECIPES))
+        if recipe == "fast":
+            steps = {"steps": FAST_STEPS[model_name]} if model_name in FAST_STEPS else {}
+            return cls(**{"recipe": recipe, **steps, **settings})
+        paper: dict[str, Any] = {
+            "steps": PAPER_EPOCHS * PAPER_CROPS // PAPER_BATCH,
+            "rounds": 100,
+            "batch": PAPER_BATCH,
+            "crop_px": 256,
+            "crops": "quadrants",
+            "optimiser": "adam",
+            "schedule": "constant",
+            "weight_decay": 0.0,
+            "nuisance": "none",
+        }
+        if model_name in PAPER_LEARNING_RATE:
+            paper["learning_rate"] = PAPER_LEARNING_RATE[model_name]
+        return cls(**{"recipe": recipe, **paper, **settings})
+
+    def takes_steps(self, model: Simulator) -> bool:
+        """Whether the model is trained by stochastic gradient rather than fitted by Gauss-Newton.
+
+        A model with many parameters always is; a small one where the paper trains it so.
+        """
+        return not model.is_small or (self.recipe == "paper" and model.name in PAPER_LEARNING_RATE)
+
+    def used_by(self, model: Simulator) -> dict[str, Any]:
+        """The settings that decide a fit of ``model``, for its record."""
+        if self.takes_steps(model):
+            return self.model_dump(mode="json")
+        return {**self.model_dump(mode="json", include=GAUSS_NEWTON_FIELDS), "optimiser": "gauss-newton"}

@@ -1,0 +1,94 @@
+"""Crops of scans with their surroundings: which ones, and how they are cut."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from litho_models.fitting.config import TrainingConfig
+
+# What a network remembers of a crop for its gradient is hundreds of bytes per pixel.
+_PASS_PX = 256**2
+
+
+@dataclass(frozen=True)
+class Window:
+    """A square of ``size_px`` pixels of scan number ``scan`` with its corner at (y, x); flips are (y, x)."""
+
+    scan: int
+    y: int
+    x: int
+    size_px: int
+    flip: tuple[bool, bool] = (False, False)
+
+
+def cut(field: np.ndarray, window: Window, margin_px: int = 0) -> np.ndarray:
+    """The window of (ny, nx) with ``margin_px`` around it; beyond the field its outermost pixels continue."""
+    rows, columns = (
+        np.clip(np.arange(start - margin_px, start + window.size_px + margin_px), 0, length - 1)
+        for start, length in zip((window.y, window.x), field.shape, strict=True)
+    )
+    cropped = field[np.ix_(rows, columns)]
+    if window.flip[0]:
+        cropped = cropped[::-1]
+    return cropped[:, ::-1] if window.flip[1] else cropped
+
+
+def stack(fields: Sequence[np.ndarray], windows: Sequence[Window], margin_px: int = 0) -> Tensor:
+    """Cut one window each, as a float32 batch (b, 1, y, x)."""
+    crops = [cut(fields[window.scan], window, margin_px) for window in windows]
+    return torch.from_numpy(np.stack(crops)[:, None].astype(np.float32))
+
+
+def plan_batch(shapes: Sequence[tuple[int, int]], config: TrainingConfig, step: int) -> list[Window]:
+    """The windows of one optimiser step; a function of seed and step, so a resumed run sees the same."""
+    if config.crops == "quadrants":
+        return _from_permuted_quadrants(shapes, config, step)
+    random = np.random.default_rng([config.seed, step])
+    windows = []
+    for _ in range(config.batch):
+        scan = int(random.integers(len(shapes)))
+        size = min(config.crop_px, *shapes[scan])
+        y, x = (int(random.integers(length - size + 1)) for length in shapes[scan])
+        flip = (bool(random.integers(2)), bool(random.integers(2))) if config.flips else (False, False)
+        windows.append(Window(scan, y, x, size, flip))
+    return windows
+
+
+def in_passes(windows: Sequence[Window], device: torch.device) -> list[list[Window]]:
+    """The windows of a step in groups that go through the network one after the other.
+
+    On a CPU as many as have ``_PASS_PX`` pixels together, one at least, which bounds the memory and costs no
+    time; elsewhere all at once.
+    """
+    per_pass = len(windows)
+    if device.type == "cpu":
+        per_pass = max(1, _PASS_PX // max(window.size_px**2 for window in windows))
+    return [list(windows[start : start + per_pass]) for start in range(0, len(windows), per_pass)]
+
+
+def quadrants(shapes: Sequence[tuple[int, int]], size_px: int) -> list[Window]:
+    """All squares of a regular grid that fit: four quadrants of 256 px in a scan of 512 px."""
+    return [
+        Window(scan, y, x, size_px)
+        for scan, (ny, nx) in enumerate(shapes)
+        for y in range(0, ny - size_px + 1, size_px)
+        for x in range(0, nx - size_px + 1, size_px)
+    ]
+
+
+def _from_permuted_quadrants(
+    shapes: Sequence[tuple[int, int]], config: TrainingConfig, step: int
+) -> list[Window]:
+    size = min(config.crop_px, *(length for shape in shapes for length in shape))
+    every = quadrants(shapes, size)
+    windows = []
+    for number in range(step * config.batch, (step + 1) * config.batch):
+        epoch, position = divmod(number, len(every))
+        order = np.random.default_rng([config.seed, epoch]).permutation(len(every))
+        windows.append(every[order[position]])
+    return windows

@@ -1,0 +1,160 @@
+"""Fit any model to printed scans: the one entry that commands, benchmark and loop call."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from litho_data.foundation.errors import InputError
+from litho_data.provenance.steps import array_sha256
+from litho_data.store import PrintedScan
+from litho_models.fitting.checkpoint import CheckpointFolder, RoundRecord
+from litho_models.fitting.config import TrainingConfig
+from litho_models.fitting.gauss_newton import fit_gauss_newton
+from litho_models.fitting.stochastic import train_network
+from litho_models.models import build_model
+from litho_models.prediction.tiles import predict_scan
+from litho_models.simulator import Simulator
+from litho_models.splits.splits import inner_validation
+
+# Closed form and close to the data: from it a network gets its first nuisances.
+STIFF_MODEL = "linear"
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A fitted model and how it came about; ``history`` is empty for models without rounds."""
+
+    model: Simulator
+    training_ids: list[str]
+    validation_ids: list[str]
+    history: list[RoundRecord]
+    seconds: float
+
+
+def fit(model_name: str, scans: Sequence[PrintedScan], config: TrainingConfig) -> Simulator:
+    """Fit a model to scans and return it, in eval mode.
+
+    Args:
+        model_name: one of ``litho_models.models.MODELS``.
+        scans: scans to learn from, all of one pitch, level height and number of levels.
+        config: recipe, variant, seed, nuisances.
+
+    Raises:
+        InputError: unknown model, no scans, or scans that do not belong together.
+    """
+    return fit_with_record(model_name, scans, config).model
+
+
+def fit_with_record(
+    model_name: str,
+    scans: Sequence[PrintedScan],
+    config: TrainingConfig,
+    *,
+    checkpoint: Path | None = None,
+    model_fields: dict[str, Any] | None = None,
+) -> Fitted:
+    """As ``fit``, with the history; ``checkpoint`` is a folder from which a killed run continues.
+
+    ``model_fields`` override hyper-parameters of the model's variant.
+
+    Raises:
+        InputError: as ``fit``, or a folder that holds another run's checkpoint or a damaged one.
+    """
+    geometry = common_geometry(scans)
+    started = time.monotonic()
+    torch.manual_seed(config.seed)
+    model = build_model(model_name, config.variant, **geometry, **(model_fields or {}))
+    # Also for a model that leaves no checkpoint: the folder may hold another's.
+    folder = None if checkpoint is None else CheckpointFolder(checkpoint, run_key(model, scans, config))
+    ids = [scan.id for scan in scans]
+    history: list[RoundRecord] = []
+    validation_ids: list[str] = []
+    if config.takes_steps(model):
+        validation_ids = inner_validation(ids, config.validation_scans, config.seed)
+        training = [scan for scan in scans if scan.id not in validation_ids]
+        validation = [scan for scan in scans if scan.id in validation_ids]
+        history = train_network(
+            model, training, validation, config, lambda: _stiff_predictions(training, config), folder
+        )
+    else:
+        fit_gauss_newton(model, scans, config.nuisance, config.free_gain)
+    return Fitted(
+        model=model.eval(),
+        training_ids=[scan_id for scan_id in ids if scan_id not in validation_ids],
+        validation_ids=validation_ids,
+        history=history,
+        # Also what was done before a kill.
+        seconds=sum(entry.seconds for entry in history) or time.monotonic() - started,
+    )
+
+
+def fit_in_cache(
+    model_name: str, scans: Sequence[PrintedScan], config: TrainingConfig, cache: Path
+) -> Fitted:
+    """As ``fit_with_record``, continued from (and kept in) a folder of ``cache`` named after its key.
+
+    Benchmark and loop that train the same model on the same scans find each other's work there.
+    """
+    untrained = build_model(model_name, config.variant, **common_geometry(scans))
+    name = f"{model_name}-{run_key(untrained, scans, config)[:16]}"
+    return fit_with_record(model_name, scans, config, checkpoint=cache / f"{name}.checkpoint")
+
+
+def _stiff_predictions(scans: Sequence[PrintedScan], config: TrainingConfig) -> list[np.ndarray]:
+    """Heights of a stiff model fitted to the scans, from which a network's first nuisances come."""
+    stiff = build_model(STIFF_MODEL, **common_geometry(scans))
+    if config.nuisance != "none":
+        fit_gauss_newton(stiff, scans, config.nuisance, config.free_gain)
+    return [predict_scan(stiff, scan) for scan in scans]
+
+
+def run_key(
+    model: Simulator, scans: Sequence[PrintedScan], config: TrainingConfig, held_out_ids: Sequence[str] = ()
+) -> str:
+    """Hash of all that decides a fit: model, hyper-parameters, settings, the scans, and what it predicts."""
+    record = {
+        "held_out_ids": list(held_out_ids),
+        "model": model.name,
+        "model_config": model.config.model_dump(mode="json"),
+        "training": config.model_dump(mode="json"),
+        "scans": scans_sha256(scans),
+    }
+    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
+
+
+def scans_sha256(scans: Sequence[PrintedScan]) -> dict[str, list[str]]:
+    """Per scan id the hashes of its layout, height and valid pixels."""
+    return {
+        scan.id: [
+            array_sha256(scan.mask_level, "level", ("y", "x")),
+            array_sha256(scan.height_um, "µm", ("y", "x")),
+            array_sha256(scan.valid, "1", ("y", "x")),
+        ]
+        for scan in scans
+    }
+
+
+def common_geometry(scans: Sequence[PrintedScan]) -> dict[str, Any]:
+    """Pitch, level height and number of levels that all scans share.
+
+    Raises:
+        InputError: no scans, or scans that differ.
+    """
+    if not scans:
+        raise InputError("training scans", got="none", wanted="at least one")
+    found = sorted({(scan.pitch_um, scan.level_height_um, scan.levels) for scan in scans})
+    if len(found) > 1:
+        raise InputError(
+            "pitch_um, level_height_um, levels of the scans", got=found, wanted="the same for all"
+        )
+    pitch, level_height, levels = found[0]
+    return {"pitch_um": pitch, "level_height_um": level_height, "levels": levels}

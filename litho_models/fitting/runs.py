@@ -1,0 +1,216 @@
+"""Run folders: train a model on a store, resumable, and freeze what came out."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field, ValidationError
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import atomic_file
+from litho_data.foundation.results import Result, first_error
+from litho_data.store import PrintedScan, open_store
+from litho_models.fitting import TrainingConfig, fit_with_record
+from litho_models.fitting.checkpoint import RoundRecord
+from litho_models.fitting.config import Recipe
+from litho_models.frozen import zoo
+from litho_models.frozen.card import CARD_FILE, DatasetName, ModelCard
+from litho_models.frozen.files import load_simulator, save_frozen
+from litho_models.prediction.tiles import predict_scan
+from litho_models.run_info import RunInfo, run_info
+from litho_models.scan_terms.training import learn_background
+from litho_models.simulator import Variant
+from litho_models.splits.splits import files_sha256, ids_sha256, locked_ids
+
+MODEL_FOLDER, CHECKPOINT_FOLDER = "model", "checkpoint"
+
+
+class TrainingRun(Result):
+    """``run.json``: what was trained, on what, and how it went."""
+
+    SCHEMA: ClassVar[str] = "litho-models/run/1"
+    FILE_NAME: ClassVar[str] = "run.json"
+
+    schema_: Literal["litho-models/run/1"] = Field("litho-models/run/1", alias="schema")
+    run: RunInfo
+    dataset: DatasetName
+    model: str
+    parameters: int
+    config: TrainingConfig
+    training_ids: list[str]
+    validation_ids: list[str]
+    lock_box: list[str]
+    history: list[RoundRecord]
+    seconds: float
+
+
+def train(
+    store: str | Path,
+    model: str,
+    out: str | Path,
+    *,
+    recipe: Recipe = "fast",
+    variant: Variant = "default",
+    settings: dict[str, Any] | None = None,
+    use_lock_box: bool = False,
+) -> TrainingRun:
+    """Train a model on a store into a run folder; the same call again continues a killed run.
+
+    The scans of the lock box are left out unless ``use_lock_box``.
+
+    Args:
+        store: dataset store; ``model``: name of a model; ``out``: run folder.
+        recipe, variant: see ``TrainingConfig`` and the model's config.
+        settings: fields of ``TrainingConfig`` that replace the recipe's.
+
+    Raises:
+        InputError: unknown names or settings, or a folder that holds another run.
+    """
+    config = training_config(recipe, model, {"variant": variant, **(settings or {})})
+    dataset = open_store(store)
+    scans = dataset.scans()
+    lock_box = locked_ids(scans)
+    locked = [] if use_lock_box else lock_box
+    used = [scan for scan in scans if scan.id not in locked]
+    folder = Path(out)
+    named = DatasetName(name=dataset.name, sha256=dataset.sha256)
+    _require_same_run(folder, {"dataset": named, "model": model, "config": config, "lock_box": locked})
+    fitted = fit_with_record(model, used, config, checkpoint=folder / CHECKPOINT_FOLDER)
+    record = TrainingRun(
+        schema="litho-models/run/1",
+        run=run_info([config.seed], len(used)),
+        dataset=named,
+        model=model,
+        parameters=fitted.model.parameter_count,
+        config=config,
+        training_ids=fitted.training_ids,
+        validation_ids=fitted.validation_ids,
+        lock_box=locked,
+        history=fitted.history,
+        seconds=fitted.seconds,
+    )
+    if int(os.environ.get("RANK", "0")) > 0:
+        return record  # under torchrun the first process writes
+    save_frozen(
+        fitted.model,
+        folder / MODEL_FOLDER,
+        dataset=record.dataset,
+        training={
+            **config.model_dump(mode="json"),
+            "scan_ids": [scan.id for scan in used],
+            "validation_ids": fitted.validation_ids,
+            "seconds": round(fitted.seconds, 1),
+        },
+        training_level_share=level_share(used),
+        background=learn_background(used, [predict_scan(fitted.model, scan) for scan in used]),
+        command=record.run.command,
+        split={
+            "kind": "development",
+            "lock_box": locked,
+            "lock_box_sha256": ids_sha256(locked),
+            "lock_box_files_sha256": sorted(files_sha256(dataset, lock_box).values()),
+        },
+        limitations=["Not evaluated yet: see the evaluation of this model for its error."],
+    )
+    _write_history(record, folder)
+    record.write(folder)
+    return record
+
+
+def _require_same_run(folder: Path, facts: dict[str, Any]) -> None:
+    """Refuse a folder with the record of a run that differs in ``facts``, fields of ``TrainingRun``."""
+    if not (folder / TrainingRun.FILE_NAME).exists():
+        return
+    held = TrainingRun.read(folder)
+    differing = [name for name, fact in facts.items() if getattr(held, name) != fact]
+    if differing:
+        raise InputError(
+            f"{folder} holds another run",
+            got=f"{held.model} on {held.dataset.name}, of another {', '.join(differing)}",
+            wanted="a new folder, or the same run again",
+            hint="choose another --out, or delete the folder",
+        )
+
+
+def freeze(source: str | Path, out: str | Path, declare_process: Sequence[str] = ()) -> ModelCard:
+    """Write the process model of a run folder, or of a model folder, as a frozen model.
+
+    Args:
+        source: what ``train`` or ``close-loop`` wrote, or a frozen model (a folder, ``zoo:NAME``).
+        out: folder of the frozen model.
+        declare_process: effects of undetermined role that the user declares part of the printer; the
+            card records the declaration.
+
+    Raises:
+        InputError: no model there, or an effect that is not among the undetermined ones.
+    """
+    folder = zoo.model_folder(source)
+    folder = folder if (folder / CARD_FILE).exists() else folder / MODEL_FOLDER
+    if not (folder / CARD_FILE).exists():
+        raise InputError(f"no model in {source}", wanted="a folder of `litho-models train` or a frozen model")
+    card = ModelCard.read(folder / CARD_FILE)
+    undetermined = dict(card.undetermined_effects)
+    process = dict(card.process_effects)
+    for name in declare_process:
+        if name not in undetermined:
+            raise InputError(
+                "--declare-process", got=name, wanted=", ".join(undetermined) or "nothing to declare"
+            )
+        process[name] = undetermined.pop(name)
+    kept = card.model_dump(mode="json", by_alias=True, include=_CARRIED_FIELDS)
+    kept["undetermined_effects"] = undetermined
+    kept["declared_processes"] = [*card.declared_processes, *declare_process]
+    simulator = load_simulator(folder, card)
+    save_frozen(simulator, out, name=card.name, process_effects=process, **kept)
+    return ModelCard.read(Path(out) / CARD_FILE)
+
+
+_CARRIED_FIELDS = {
+    "training_level_share",
+    "dataset",
+    "training",
+    "command",
+    "split",
+    "nuisance",
+    "background",
+    "metrics",
+    "noise_floor",
+    "measurement_effects",
+    "confusable_sets",
+    "unexplained_fraction",
+    "fabrication_batch",
+    "optimiser_gap",
+    "limitations",
+}
+
+
+def training_config(recipe: Recipe, model: str, settings: dict[str, Any]) -> TrainingConfig:
+    """The settings of a recipe, checked.
+
+    Raises:
+        InputError: unknown recipe, unknown field, or a value out of range.
+    """
+    try:
+        return TrainingConfig.of_recipe(recipe, model, **settings)
+    except ValidationError as error:
+        raise InputError(
+            "training settings", got=first_error(error), wanted="fields of TrainingConfig"
+        ) from error
+
+
+def level_share(scans: Sequence[PrintedScan]) -> list[float]:
+    """Share of pixels printed with each level."""
+    import numpy as np
+
+    levels = np.concatenate([scan.mask_level.ravel() for scan in scans])
+    return (np.bincount(levels, minlength=scans[0].levels) / levels.size).tolist()
+
+
+def _write_history(record: TrainingRun, folder: Path) -> None:
+    import pandas as pd
+
+    with atomic_file(folder / "history.csv") as temporary:
+        pd.DataFrame([entry.model_dump() for entry in record.history]).to_csv(temporary, index=False)

@@ -1,0 +1,230 @@
+"""Models with many parameters: stochastic gradient on random crops, in rounds.
+
+Between rounds the per-scan nuisances are estimated anew from whole-scan predictions, the inner
+validation scans are scored and a checkpoint is written; inside a round the targets are fixed. All
+that is random is a function of seed and step, so a killed run continues to the same result.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import time
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from litho_data.foundation.commands import progress
+from litho_data.store import PrintedScan
+from litho_models.fitting.checkpoint import CheckpointFolder, RoundRecord, TrainingState
+from litho_models.fitting.config import TrainingConfig
+from litho_models.fitting.crops import Window, in_passes, plan_batch, stack
+from litho_models.prediction.tiles import blending_window, predict_scan
+from litho_models.scan_terms.training import estimate_nuisances
+from litho_models.scoring.metrics import score_scan
+from litho_models.simulator import Simulator
+
+if TYPE_CHECKING:
+    from lightning.fabric import Fabric
+
+WARM_UP_FRACTION = 0.1
+FIRST_RATE, LAST_RATE = 0.1, 1e-3
+
+
+def train_network(
+    model: Simulator,
+    training: Sequence[PrintedScan],
+    validation: Sequence[PrintedScan],
+    config: TrainingConfig,
+    first_predictions_um: Callable[[], Sequence[np.ndarray]],
+    checkpoints: CheckpointFolder | None = None,
+) -> list[RoundRecord]:
+    """Train ``model`` in place; it ends with the weights of the best round on ``validation``.
+
+    Without validation scans the last round counts. ``first_predictions_um`` makes the
+    heights of a stiff model on the training scans, from which the first nuisances are estimated; a run
+    that continues has no need of it.
+    """
+    if model.tile is not None and config.crops == "random":
+        config = config.model_copy(update={"crop_px": model.tile.size_px})
+    fabric = _fabric()
+    optimiser = _optimiser(model, config)
+    module, optimiser = fabric.setup(_Heights(model, config), optimiser)
+    state = TrainingState(model, optimiser)
+    if checkpoints is not None:
+        checkpoints.load(state)
+    bounds = np.linspace(0, config.steps, config.rounds + 1).astype(int)
+    bounds = bounds[np.diff(bounds, prepend=-1) > 0]
+    for first, last in pairwise(bounds.tolist()):
+        if last <= state.step:
+            continue
+        started = time.monotonic()
+        predictions = [predict_scan(model, scan) for scan in training] if first else first_predictions_um()
+        nuisances = estimate_nuisances(training, predictions, config.nuisance, config.free_gain)
+        targets = _Targets(training, nuisances, _overhang_px(model, training, config))
+        losses = []
+        for step in progress(range(first, last), f"training {model.name} to step {config.steps}"):
+            losses.append(_step(fabric, module, optimiser, targets, config, step))
+        state.record(
+            RoundRecord(
+                step=last,
+                training_mae_nm=1000 * float(np.mean(losses)),
+                validation_mae_datum_free_nm=_validation_error(model, validation),
+                seconds=time.monotonic() - started,
+            )
+        )
+        if checkpoints is not None and fabric.is_global_zero:
+            checkpoints.save(state)
+        fabric.barrier()
+    state.restore_best()
+    return state.history
+
+
+class _Targets:
+    """Layouts and nuisance-free heights of the training scans; what is not measured has no weight.
+
+    Around each scan the outermost pixels of its layout continue for ``overhang_px``, without weight.
+    """
+
+    def __init__(self, scans: Sequence[PrintedScan], nuisances_um: Sequence[np.ndarray], overhang_px: int):
+        self.layouts_um = [np.pad(scan.layout_um, overhang_px, mode="edge") for scan in scans]
+        self.shapes = [layout.shape for layout in self.layouts_um]
+        usable = [scan.valid & np.isfinite(scan.height_um) for scan in scans]
+        self.weights = [np.pad(mask.astype(np.float32), overhang_px) for mask in usable]
+        heights = [
+            np.where(mask, scan.height_um - nuisance, 0).astype(np.float32)
+            for scan, nuisance, mask in zip(scans, nuisances_um, usable, strict=True)
+        ]
+        self.heights_um = [np.pad(height, overhang_px) for height in heights]
+
+
+class _Heights(nn.Module):
+    """Heights of crops as training wants them, in one module: processes share the gradients of its forward.
+
+    Random crops come with their surroundings (``margin_px``) or are one tile of the model; quadrants are
+    images of their own. Layouts and heights are float32 whatever the precision within.
+    """
+
+    def __init__(self, model: Simulator, config: TrainingConfig):
+        super().__init__()
+        self.model = model
+        random = config.crops == "random"
+        self.tile = model.tile if random else None
+        self._inside = random and (model.reach_px is not None or model.tile is not None)
+        self._mixed = config.precision == "bf16-mixed"
+
+    @property
+    def margin_px(self) -> int:
+        """Pixels around a crop; a blur that learns its width needs more or fewer as it goes."""
+        return (self.model.reach_px or 0) if self._inside else 0
+
+    def forward(self, layout_um: Tensor) -> Tensor:
+        predict = self.model.interior if self._inside else self.model
+        with torch.autocast(layout_um.device.type, torch.bfloat16, enabled=self._mixed):
+            return predict(layout_um).float()
+
+
+def _step(
+    fabric: Fabric,
+    module: _Heights,
+    optimiser: torch.optim.Optimizer,
+    targets: _Targets,
+    config: TrainingConfig,
+    step: int,
+) -> float:
+    for group in optimiser.param_groups:
+        group["lr"] = learning_rate(config, step)
+    batch = plan_batch(targets.shapes, config, step)
+    own = batch[fabric.global_rank :: fabric.world_size]
+    # A process without a crop takes part in the sum of gradients with one that does not count.
+    passes = in_passes(own or batch[:1], fabric.device)
+    optimiser.zero_grad(set_to_none=True)
+    sums = torch.zeros(2, device=fabric.device)
+    for number, some in enumerate(passes, 1):
+        # The mean over processes is the mean over the crops of the batch, however they are dealt.
+        share = len(some) * fabric.world_size / len(batch) if own else 0.0
+        # Processes add their gradients once, with the last pass.
+        with fabric.no_backward_sync(cast(Any, module), enabled=number < len(passes)):
+            loss, means = _losses(fabric, module, targets, some, config)
+            fabric.backward(share * loss)
+        sums += share * means
+    optimiser.step()
+    absolute, counted = cast(Tensor, fabric.all_reduce(sums)).tolist()
+    return absolute / counted
+
+
+def _losses(
+    fabric: Fabric, module: _Heights, targets: _Targets, windows: list[Window], config: TrainingConfig
+) -> tuple[Tensor, Tensor]:
+    """Loss of some windows, and for the record the weighted absolute error, µm, and the weight, (2,)."""
+    prediction = module(fabric.to_device(stack(targets.layouts_um, windows, module.margin_px)))
+    height = fabric.to_device(stack(targets.heights_um, windows))
+    weight = fabric.to_device(stack(targets.weights, windows))
+    if module.tile is not None:
+        # A pixel counts as much as it will in the blended field.
+        window = blending_window(module.tile, weight)
+        weight = weight * (window / window.mean())
+    # A mean over all pixels, valid or not: every crop of a step counts alike, in whatever group it comes.
+    loss = (weight * _error(prediction, height, config)).mean()
+    return loss, torch.stack([(weight * (prediction - height).abs()).mean().detach(), weight.mean()])
+
+
+def _overhang_px(model: Simulator, scans: Sequence[PrintedScan], config: TrainingConfig) -> int:
+    """Pixels that tiles may reach beyond a scan: as far as in prediction, and one tile at least."""
+    if model.tile is None or config.crops != "random":
+        return 0
+    shortest = min(length for scan in scans for length in scan.shape)
+    return max(model.tile.overlap_px, -(-(model.tile.size_px - shortest) // 2))
+
+
+def _error(prediction: Tensor, height: Tensor, config: TrainingConfig) -> Tensor:
+    if config.loss == "l1":
+        return (prediction - height).abs()
+    return functional.smooth_l1_loss(prediction, height, reduction="none", beta=config.smooth_l1_beta_um)
+
+
+def learning_rate(config: TrainingConfig, step: int) -> float:
+    """Rate of one step: constant, or up along a cosine for a tenth of the steps and down for the rest."""
+    if config.schedule == "constant":
+        return config.learning_rate
+    done = (step + 0.5) / config.steps
+    if done < WARM_UP_FRACTION:
+        start, stop, along = FIRST_RATE, 1.0, done / WARM_UP_FRACTION
+    else:
+        start, stop, along = 1.0, LAST_RATE, (done - WARM_UP_FRACTION) / (1 - WARM_UP_FRACTION)
+    return config.learning_rate * (stop + (start - stop) * (1 + math.cos(math.pi * along)) / 2)
+
+
+def _validation_error(model: Simulator, scans: Sequence[PrintedScan]) -> float | None:
+    if not scans:
+        return None
+    scores = [score_scan(scan.id, scan.height_um, predict_scan(model, scan), scan.valid) for scan in scans]
+    return float(np.mean([score.mae_datum_free_nm for score in scores]))
+
+
+def _optimiser(model: Simulator, config: TrainingConfig) -> torch.optim.Optimizer:
+    if config.optimiser == "adam":
+        return torch.optim.Adam(model.parameters(), lr=config.learning_rate)
+    return torch.optim.AdamW(model.parameters(), lr=config.learning_rate, weight_decay=config.weight_decay)
+
+
+def _fabric() -> Fabric:
+    """The device; under ``torchrun`` one process per local rank."""
+    from lightning.fabric import Fabric
+
+    world = int(os.environ.get("WORLD_SIZE", "1"))
+    devices = int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+    fabric = Fabric(
+        accelerator="auto",
+        devices=devices,
+        num_nodes=max(1, world // devices),
+        strategy="ddp" if world > 1 else "auto",
+    )
+    if world > 1:
+        fabric.launch()
+    return fabric

@@ -1,0 +1,109 @@
+"""The card of a frozen model: what it is for, what it was made from, and how well it does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, ClassVar, Literal, Self
+
+from pydantic import ConfigDict, Field, JsonValue, field_validator
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import Record, Result
+from litho_models.scan_terms.background import Background, BackgroundUse
+
+CARD_FILE = "card.json"
+
+EffectValues = dict[str, dict[str, float]]
+
+# What is looked up in the free facts of a training and of a split.
+_LISTS_OF_NAMES = ("scan_ids", "lock_box", "lock_box_files_sha256")
+
+
+class DatasetName(Record):
+    """A dataset by name and content hash."""
+
+    name: str
+    sha256: str
+
+
+class Metric(Record):
+    """One reported figure: what, how much, on which scans, with which nuisances and background."""
+
+    name: str
+    value: float
+    unit: str = "nm"
+    split: str
+    policy: str
+    background: BackgroundUse = "none"
+
+
+class ModelCard(Result):
+    """All that is needed to load, use and judge a frozen model.
+
+    ``background`` is what the microscope added to the training scans on average; only a comparison with
+    measured maps uses it, the model's height never contains it.
+    """
+
+    model_config = ConfigDict(allow_inf_nan=False)
+
+    SCHEMA: ClassVar[str] = "litho-models/frozen/1"
+    FILE_NAME: ClassVar[str] = CARD_FILE
+
+    schema_: Literal["litho-models/frozen/1"] = Field("litho-models/frozen/1", alias="schema")
+    name: str
+    model: str
+    variant: str
+    hyper_parameters: dict[str, JsonValue]
+    parameters: int
+    weights_sha256: str
+    pitch_um: float
+    level_height_um: float
+    levels: int
+    calibrated_range_um: tuple[float, float]
+    training_level_share: list[float] = Field(default_factory=list)
+    receptive_radius_um: float | None
+    dataset: DatasetName | None = None
+    training: dict[str, JsonValue] = Field(default_factory=dict)
+    command: str = ""
+    split: dict[str, JsonValue] = Field(default_factory=dict)
+    nuisance: dict[str, JsonValue] = Field(default_factory=dict)
+    background: Background | None = None
+    metrics: list[Metric] = Field(default_factory=list)
+    noise_floor: dict[str, JsonValue] | None = None
+    process_effects: EffectValues = Field(default_factory=dict)
+    measurement_effects: EffectValues = Field(default_factory=dict)
+    undetermined_effects: EffectValues = Field(default_factory=dict)
+    declared_processes: list[str] = Field(default_factory=list)
+    confusable_sets: list[list[str]] = Field(default_factory=list)
+    unexplained_fraction: float | None = None
+    fabrication_batch: str = ""
+    optimiser_gap: float | None = None
+    limitations: list[str] = Field(default_factory=list)
+    versions: dict[str, str] = Field(default_factory=dict)
+
+    @field_validator("training", "split")
+    @classmethod
+    def _names_are_names(cls, facts: dict[str, Any]) -> dict[str, Any]:
+        for key in _LISTS_OF_NAMES:
+            names = facts.get(key, [])
+            if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+                raise ValueError(f"{key} has to be a list of names")
+        return facts
+
+    @classmethod
+    def read(cls, path: str | Path) -> Self:
+        """Read the card in a folder.
+
+        Raises:
+            InputError: no card there, or one that is damaged or of another schema.
+        """
+        folder = Path(path) if Path(path).is_dir() else Path(path).parent
+        if not (folder / CARD_FILE).exists():
+            inside = sorted(card.parent for card in folder.glob(f"*/{CARD_FILE}"))
+            raise InputError(
+                f"model in {folder}",
+                got=f"no {CARD_FILE}",
+                wanted="the folder of a frozen model",
+                hint=f"take {inside[0]}" if inside else "`litho-models freeze RUN --out FOLDER` writes one",
+            )
+        return super().read(folder)

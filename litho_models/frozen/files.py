@@ -1,0 +1,188 @@
+"""Frozen models: a folder of weights and a plain card, written once, loaded without running anything.
+
+``model.safetensors`` holds the weights, ``card.json`` what they are for, ``README.md`` the same for
+people. Only numbers and names of known classes are read: nothing is unpickled.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from pydantic import ValidationError
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import atomic_folder, file_sha256
+from litho_data.foundation.outputs import require_replaceable_folder
+from litho_data.foundation.results import first_error, software_versions
+from litho_models.frozen.card import CARD_FILE, EffectValues, ModelCard
+from litho_models.frozen.readme import model_readme
+from litho_models.frozen.simulator import FrozenSimulator
+from litho_models.models import model_class
+from litho_models.simulator import Simulator
+
+WEIGHTS_FILE, README_FILE = "model.safetensors", "README.md"
+
+
+def save_frozen(
+    simulator: Simulator,
+    folder: str | Path,
+    *,
+    name: str | None = None,
+    process_effects: EffectValues | None = None,
+    **card_fields: Any,
+) -> Path:
+    """Write a process model for design; returns the folder.
+
+    Args:
+        simulator: the fitted model.
+        folder: where; an older model there is replaced as a whole.
+        name: name in reports; the model's own by default.
+        process_effects: effects of the printer that are part of the model, name to parameter values.
+        card_fields: further fields of ``ModelCard`` (dataset, training, split, metrics, …).
+
+    Raises:
+        InputError: weights that are not finite or not float32, or card fields that do not belong.
+    """
+    state = {key: value.detach().cpu().contiguous() for key, value in simulator.state_dict().items()}
+    _check_numbers(state, f"weights of {simulator.name}")
+    require_replaceable_folder(folder, WEIGHTS_FILE, CARD_FILE, README_FILE)
+    config = simulator.config
+    with atomic_folder(folder) as temporary:
+        # No metadata in the file: safetensors writes its entries in no fixed order, which moved the hash.
+        save_file(state, temporary / WEIGHTS_FILE)
+        try:
+            card = ModelCard(
+                name=name or simulator.name,
+                model=simulator.name,
+                variant=config.variant,
+                hyper_parameters=config.model_dump(mode="json"),
+                parameters=simulator.parameter_count,
+                weights_sha256=file_sha256(temporary / WEIGHTS_FILE),
+                pitch_um=config.pitch_um,
+                level_height_um=config.level_height_um,
+                levels=config.levels,
+                calibrated_range_um=(0.0, config.full_height_um),
+                receptive_radius_um=None if process_effects else simulator.reach_um,
+                process_effects=process_effects or {},
+                versions=software_versions(),
+                **card_fields,
+            )
+        except ValidationError as error:
+            raise InputError("model card", got=first_error(error), wanted=ModelCard.SCHEMA) from error
+        _check_effects(card)
+        card.write(temporary)
+        (temporary / README_FILE).write_text(model_readme(card), encoding="utf-8")
+    return Path(folder)
+
+
+def load_frozen(
+    folder: str | Path, device: str | torch.device = "cpu", extrapolate: bool = False
+) -> FrozenSimulator:
+    """Load a frozen model: eval mode, weights without gradients, effects of the printer included.
+
+    Args:
+        folder: what ``save_frozen`` wrote.
+        device: where to put it.
+        extrapolate: accept heights beyond the calibrated range.
+
+    Raises:
+        InputError: no such folder, or a card or weights that are damaged, foreign or do not fit.
+    """
+    path = Path(folder)
+    card = ModelCard.read(path)
+    _check_effects(card)
+    simulator = load_simulator(path, card)
+    model: nn.Module = simulator
+    if card.process_effects:
+        from litho_models.effects.chain import EffectChain
+
+        full = simulator.config.full_height_um
+        model = EffectChain(simulator, card.process_effects, full_height_um=full, pitch_um=card.pitch_um)
+    frozen = FrozenSimulator(model, card, file_sha256(path / CARD_FILE), extrapolate)
+    return frozen.to(device)
+
+
+def load_simulator(folder: str | Path, card: ModelCard) -> Simulator:
+    """The base model of a frozen folder without its effects, weights checked against the card.
+
+    Raises:
+        InputError: weights missing, damaged, or of another model than the card says.
+    """
+    weights = Path(folder) / WEIGHTS_FILE
+    if not weights.is_file():
+        raise InputError(f"no {WEIGHTS_FILE} in {folder}", wanted="a folder written by `litho-models freeze`")
+    found = file_sha256(weights)
+    if found != card.weights_sha256:
+        raise InputError(
+            f"SHA-256 of {weights}",
+            got=f"{found[:12]}…",
+            wanted=f"{card.weights_sha256[:12]}…, as its card says",
+            hint="the file is damaged or belongs to another model",
+        )
+    try:
+        state = load_file(weights)
+    except SafetensorError as error:
+        raise InputError(f"weights in {weights}", got=str(error), wanted=f"those of {card.model}") from error
+    _check_numbers(state, f"weights in {weights}")
+    simulator = _empty_simulator(card, weights)
+    wanted = simulator.state_dict()
+    for key in sorted(wanted.keys() | state.keys()):
+        found, fits = (str(tuple(part[key].shape)) if key in part else "no such" for part in (state, wanted))
+        if found != fits:
+            raise InputError(
+                f"weights in {weights}", got=f"{key} {found}", wanted=f"{fits}, as in {card.model}"
+            )
+    simulator.load_state_dict(state)
+    return simulator
+
+
+def _empty_simulator(card: ModelCard, weights: Path) -> Simulator:
+    known = model_class(card.model)
+    try:
+        config = known.Config.model_validate(card.hyper_parameters)
+    except ValidationError as error:
+        raise InputError(f"hyper_parameters beside {weights}", got=first_error(error)) from error
+    stated = (card.pitch_um, card.level_height_um, card.levels)
+    if stated != (config.pitch_um, config.level_height_um, config.levels):
+        raise InputError("card", got=f"geometry {stated}", wanted="the same in hyper_parameters")
+    lowest, highest = card.calibrated_range_um
+    if not 0 <= lowest < highest <= config.full_height_um:
+        raise InputError(
+            f"calibrated_range_um beside {weights}",
+            got=f"{lowest:g} to {highest:g} µm",
+            wanted=f"a range within 0 to {config.full_height_um:g} µm, the heights of its levels",
+        )
+    try:
+        return known(config)
+    except (ArithmeticError, ValueError) as error:
+        # Each is in its range, but not with the others: a start beyond its upper bound, say.
+        raise InputError(f"hyper_parameters beside {weights}", got=str(error)) from error
+
+
+def _check_numbers(state: Mapping[str, Tensor], what: str) -> None:
+    for key, value in state.items():
+        if value.dtype != torch.float32 or not torch.isfinite(value).all():
+            got = f"{value.dtype}" if value.dtype != torch.float32 else "non-finite values"
+            raise InputError(what, got=f"{got} in {key}", wanted="finite numbers in float32")
+
+
+def _check_effects(card: ModelCard) -> None:
+    """Refuse process effects that are none, or whose values no printer has."""
+    from litho_models.effects import get_effect
+
+    for name, values in card.process_effects.items():
+        effect = get_effect(name)
+        if effect.role != "process" and name not in card.declared_processes:
+            raise InputError(
+                "process effect",
+                got=f"{name}, whose role is {effect.role}",
+                wanted="an effect of the printer",
+                hint="`litho-models freeze --declare-process` takes in an undetermined one",
+            )
+        effect.require_in_range(values)

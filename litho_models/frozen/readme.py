@@ -1,0 +1,104 @@
+"""The page of a frozen model for people, rendered from its card."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from litho_models.frozen.card import ModelCard
+
+_HEADER = """---
+license: apache-2.0
+library_name: litholoop
+pipeline_tag: image-to-image
+tags: [lithography, AFM, {model}]
+datasets: [{dataset}]
+metrics: [mae]
+model-index:
+- name: {name}
+  results:{results}
+---
+"""
+
+_RESULT = """
+  - task: {{type: image-to-image, name: layout to printed height}}
+    dataset: {{name: {dataset}, type: {dataset}, split: "{split}", revision: {revision}}}
+    metrics:
+    - {{type: {metric}, value: {value:.4f}, config: "nuisance policy {policy}, background {background}"}}"""
+
+
+def model_readme(card: ModelCard) -> str:
+    """Markdown with a Hugging Face front matter: what the model is, where it may be used, what it scored."""
+    dataset = card.dataset.name if card.dataset else "unknown"
+    revision = card.dataset.sha256 if card.dataset else "unknown"
+    results = "".join(
+        _RESULT.format(
+            dataset=dataset,
+            revision=revision,
+            split=metric.split,
+            metric=metric.name,
+            value=metric.value,
+            policy=metric.policy,
+            background=metric.background,
+        )
+        for metric in card.metrics
+    )
+    header = _HEADER.format(model=card.model, dataset=dataset, name=card.name, results=results or " []")
+    low, high = card.calibrated_range_um
+    sections = [
+        header,
+        f"# {card.name}\n",
+        f"A frozen simulator of a lithography machine (`{card.model}`, variant `{card.variant}`, "
+        f"{card.parameters} parameters): layout in, printed height out, both in µm.\n",
+        "## Use\n",
+        "```python\nfrom litho_models import load_frozen\n\n"
+        'model = load_frozen("this/folder")\n'
+        f"height_um = model(layout_um, pitch_um={card.pitch_um:g})\n```\n",
+        f"Layouts are sampled at {card.pitch_um:g} µm with {card.levels} levels of "
+        f"{card.level_height_um:g} µm; heights from {low:g} to {high:g} µm are calibrated, others are "
+        "refused unless `extrapolate=True`.\n",
+        "## What it is not\n",
+        "It knows one machine, one resist and one batch of prints, and nothing about the microscope: datum, "
+        "tilt, bow and line offsets of a scan are not part of it"
+        + (
+            "; the smooth background that its training scans share is in the card, for comparison with "
+            "measured maps only.\n"
+            if card.background
+            else ".\n"
+        ),
+        "## Training\n",
+        _training(card),
+        "## Figures\n",
+        _metrics(card),
+        "## Effects\n",
+        f"Process effects inside the model: {_names(card.process_effects)}. Measurement effects, left out: "
+        f"{_names(card.measurement_effects)}. Undetermined, left out: {_names(card.undetermined_effects)}.\n",
+        "## Limitations\n",
+        "\n".join(f"- {line}" for line in card.limitations) or "- none stated",
+        "",
+    ]
+    return "\n".join(sections)
+
+
+def _training(card: ModelCard) -> str:
+    rows = [
+        ("dataset", f"{card.dataset.name} ({card.dataset.sha256[:12]}…)" if card.dataset else "not stated")
+    ]
+    rows += [("command", f"`{card.command}`")] if card.command else []
+    rows += [(key, str(value)) for key, value in card.training.items()]
+    return "| what | value |\n|---|---|\n" + "\n".join(f"| {key} | {value} |" for key, value in rows) + "\n"
+
+
+def _metrics(card: ModelCard) -> str:
+    if not card.metrics:
+        return "Not evaluated.\n"
+    head = "| figure | value | split | nuisance policy | background |\n|---|---|---|---|---|\n"
+    lines = [
+        f"| {m.name} | {m.value:.2f} {m.unit} | {m.split} | {m.policy} | {m.background} |"
+        for m in card.metrics
+    ]
+    return head + "\n".join(lines) + "\n"
+
+
+def _names(effects: dict[str, dict[str, float]]) -> str:
+    return ", ".join(effects) or "none"

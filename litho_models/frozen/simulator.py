@@ -1,0 +1,133 @@
+"""A frozen model as design calls it: fixed weights, its geometry and calibrated range checked at the door."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from litho_data.foundation.errors import InputError
+from litho_models.frozen.card import ModelCard
+from litho_models.prediction.tiles import predict_field, predict_interior
+from litho_models.simulator import Simulator
+
+# A level's height in float32 may exceed the range by rounding; a level off it differs by 100 nm.
+_ROUNDING_UM = 1e-5
+
+
+class FrozenSimulator(nn.Module):
+    """A process model for design: fixed weights, gradients to its input only.
+
+    ``model(layout_um, pitch_um=0.1)`` maps a layout (b, 1, y, x) in µm to its printed height.
+    """
+
+    def __init__(self, simulator: nn.Module, card: ModelCard, sha256: str, extrapolate: bool):
+        super().__init__()
+        self.simulator = simulator
+        self.card: Mapping[str, Any] = card.model_dump(mode="json", by_alias=True)
+        self.sha256 = sha256
+        self.extrapolate = extrapolate
+        # Receptive radius, µm; None where a pixel depends on the whole image.
+        self.reach_um = simulator.reach_um if isinstance(simulator, Simulator) else None
+        self._lowest_um, self._highest_um = card.calibrated_range_um
+        self.eval().requires_grad_(False)
+
+    @property
+    def name(self) -> str:
+        """Name in the card."""
+        return self.card["name"]
+
+    @property
+    def pitch_um(self) -> float:
+        """Lateral sampling that the model is made for, µm."""
+        return self.card["pitch_um"]
+
+    def train(self, mode: bool = True) -> FrozenSimulator:
+        """Frozen models stay in eval mode."""
+        return super().train(False)
+
+    def forward(
+        self, layout_um: Tensor, pitch_um: float | None = None, level_height_um: float | None = None
+    ) -> Tensor:
+        """Printed height (b, 1, y, x), µm.
+
+        Args:
+            layout_um: nominal height (b, 1, y, x), µm, of the weights' dtype: float32, or float64 after
+                ``double()``.
+            pitch_um: sampling of the layout, if the caller wants it checked; so is ``level_height_um``.
+
+        Raises:
+            InputError: another pitch or level height, no tensor, another shape or dtype, or heights beyond
+                the calibrated range without ``extrapolate``.
+        """
+        self._check_layout(layout_um, pitch_um, level_height_um)
+        if isinstance(self.simulator, Simulator):
+            return predict_field(self.simulator, layout_um)
+        return self.simulator(layout_um)
+
+    @property
+    def has_interior(self) -> bool:
+        """Whether ``interior`` can be asked for: a finite receptive radius, no effects behind the model."""
+        return isinstance(self.simulator, Simulator) and self.simulator.reach_px is not None
+
+    def interior(self, layout_um: Tensor, pitch_um: float | None = None) -> Tensor:
+        """As ``forward``, of the pixels farther than the receptive radius r from the edge only.
+
+        Nothing beyond the edge is assumed, and nothing is computed there: (b, 1, y - 2r, x - 2r), µm.
+
+        Raises:
+            InputError: as ``forward``, or a model without ``has_interior``.
+        """
+        self._check_layout(layout_um, pitch_um, None)
+        if not isinstance(self.simulator, Simulator):
+            raise InputError(f"interior of a print by {self.name}", wanted="a model without added effects")
+        return predict_interior(self.simulator, layout_um)
+
+    def _check_layout(self, layout_um: Tensor, pitch_um: float | None, level_height_um: float | None) -> None:
+        self.check_geometry(pitch_um, level_height_um)
+        if not isinstance(layout_um, Tensor):
+            raise InputError(
+                "layout",
+                got=f"a {type(layout_um).__name__}",
+                wanted="a tensor of PyTorch",
+                hint="torch.from_numpy makes one of a NumPy array",
+            )
+        if layout_um.ndim != 4 or layout_um.shape[1] != 1 or not layout_um.numel():
+            raise InputError(
+                "layout", got=f"shape {tuple(layout_um.shape)}", wanted="(batch, 1, y, x), none of them 0"
+            )
+        # A model without weights takes every floating-point layout.
+        own = layout_um.dtype if layout_um.is_floating_point() else torch.float32
+        wanted = next((weight.dtype for weight in self.parameters()), own)
+        if layout_um.dtype != wanted:
+            raise InputError(
+                "layout", got=layout_um.dtype, wanted=f"{wanted}, as the weights", hint=f"layout.to({wanted})"
+            )
+        if not self.extrapolate:
+            self._check_range(layout_um)
+
+    def check_geometry(self, pitch_um: float | None, level_height_um: float | None = None) -> None:
+        """Refuse another pitch or level height than the model's; None is not checked.
+
+        Raises:
+            InputError: they differ.
+        """
+        for name, given in (("pitch_um", pitch_um), ("level_height_um", level_height_um)):
+            wanted = self.card[name]
+            if given is not None and not abs(given - wanted) <= 1e-9:
+                raise InputError(
+                    f"{name} for model {self.name}", got=f"{given:g} µm", wanted=f"{wanted:g} µm"
+                )
+
+    def _check_range(self, layout_um: Tensor) -> None:
+        lowest, highest = (float(v) for v in torch.aminmax(layout_um.detach()))
+        inside = lowest >= self._lowest_um - _ROUNDING_UM and highest <= self._highest_um + _ROUNDING_UM
+        if not inside:
+            raise InputError(
+                f"layout for model {self.name}",
+                got=f"heights from {lowest:g} to {highest:g} µm",
+                wanted=f"{self._lowest_um:g} to {self._highest_um:g} µm, the calibrated range",
+                hint="load it with extrapolate=True to accept a guess",
+            )

@@ -1,0 +1,92 @@
+"""Frozen models that come with the package: one call from nothing to a printed height."""
+
+from __future__ import annotations
+
+import builtins
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from litho_data.foundation.errors import InputError
+
+if TYPE_CHECKING:
+    import torch
+
+    from litho_models.frozen.simulator import FrozenSimulator
+
+ZOO_FOLDER = Path(__file__).parent / "zoo_data"
+LARGEST_ZOO_BYTES = 8_000_000
+PREFIX = "zoo:"
+_CARD_FILE = "card.json"
+
+
+def list(root: str | Path = ZOO_FOLDER) -> builtins.list[str]:
+    """Names of the models in the zoo, sorted; empty where none is shipped."""
+    return sorted(card.parent.name for card in Path(root).glob(f"*/{_CARD_FILE}"))
+
+
+def folder(name: str, root: str | Path = ZOO_FOLDER) -> Path:
+    """The frozen model of that name, for commands that take a folder.
+
+    Raises:
+        InputError: no such model.
+    """
+    known = list(root)
+    if name not in known:
+        raise InputError(
+            "zoo model",
+            got=repr(name),
+            wanted=", ".join(known) or "one of a zoo that has models",
+            hint="" if known else "examples/make_zoo.py trains it",
+        )
+    return Path(root) / name
+
+
+def model_folder(source: str | Path, root: str | Path = ZOO_FOLDER, other: str = "") -> Path:
+    """The folder that a command is given: one that is there, or ``zoo:NAME`` for a model of the zoo.
+
+    Args:
+        source: what the user typed.
+        root: the zoo.
+        other: what else the caller takes, for the message.
+
+    Raises:
+        InputError: no such folder, or no such model in the zoo.
+    """
+    text = str(source)
+    if text.startswith(PREFIX):
+        return folder(text.removeprefix(PREFIX), root)
+    if not Path(source).is_dir():
+        raise InputError(
+            "model",
+            got=f"{text!r}, which is no folder",
+            wanted=", ".join(["the folder of a model", f"{PREFIX}NAME", *([other] if other else [])]),
+            hint=f"{PREFIX}{text} comes with the package" if text in list(root) else "",
+        )
+    return Path(source)
+
+
+def load(
+    name: str,
+    device: str | torch.device = "cpu",
+    extrapolate: bool = False,
+    root: str | Path = ZOO_FOLDER,
+) -> FrozenSimulator:
+    """Load a zoo model: ``load("pbl")(layout_um, pitch_um=0.1)``; its card is in ``.card``.
+
+    Args:
+        name: one of ``list()``.
+        device: where to put it.
+        extrapolate: accept heights beyond the calibrated range.
+        root: another zoo, by default the one in the package.
+
+    Raises:
+        InputError: no such model, or a damaged one.
+    """
+    from litho_models.frozen.files import load_frozen
+
+    return load_frozen(folder(name, root), device=device, extrapolate=extrapolate)
+
+
+def size_bytes(root: str | Path = ZOO_FOLDER) -> int:
+    """What the zoo adds to the package."""
+    return sum(file.stat().st_size for file in Path(root).rglob("*") if file.is_file())

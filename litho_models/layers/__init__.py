@@ -1,0 +1,1 @@
+"""Building blocks of the models: blurs and functions of one value."""

@@ -1,0 +1,194 @@
+"""The figures of the loop's report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+
+from litho_data.foundation.report import new_figure
+from litho_models.loop.findings import Closed
+from litho_models.loop.identifiability import Profile
+from litho_models.loop.probes import AddedProbe, figures
+from litho_models.loop.probes.kernel import MissingKernel
+from litho_models.loop.probes.places import drawn, drawn_profile
+from litho_models.loop.result.record import CloseLoop
+from litho_models.loop.scoring import Score
+from litho_models.loop.structure import CovariateTest
+from litho_models.scoring.metrics import NM_PER_UM
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_MAPS = 3
+# Probes that are tables, and what they run along.
+_TABLES = {
+    "level-table": "printed level",
+    "slope-table": "steepness of the print (µm/µm)",
+    "axis-slope-table": "steepness along the axis (µm/µm)",
+}
+_BEFORE, _AFTER = "#9aa5b1", "#0b6aa2"
+
+
+def staircase_figure(frame: pd.DataFrame, result: CloseLoop) -> Figure:
+    """Held-out error after each step."""
+    figure = new_figure(9, 0.42 * len(frame) + 1.2)
+    axes = figure.subplots()
+    y = np.arange(len(frame))[::-1]
+    colours = [_BEFORE if label.startswith("base") else _AFTER for label in frame["model"]]
+    mae = frame["MAE (nm)"].to_numpy()
+    errors = np.abs(np.stack([mae - frame["low"], frame["high"] - mae]))
+    axes.barh(y, mae, xerr=errors, color=colours, height=0.66, error_kw={"elinewidth": 1.2})
+    for position, value, high in zip(y, mae, frame["high"], strict=True):
+        axes.annotate(
+            f"{value:.1f}", (high, position), (5, 0), textcoords="offset points", va="center", fontsize=9
+        )
+    if result.noise_floor.mae_nm:
+        axes.axvline(result.noise_floor.mae_nm, color="k", ls=":", lw=1)
+    axes.set_yticks(y, frame["model"])
+    axes.set_xlim(0, 1.12 * float(frame["high"].max()))
+    axes.set_xlabel("mean absolute error on held-out scans (nm)")
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def map_figure(closed: Closed, before: Score, after: Score) -> Figure:
+    """Residual of the worst, the median and the best scan, before and after, on one scale."""
+    ranking = np.argsort(-before.mse_nm2)
+    picked = ranking[np.unique(np.linspace(0, len(ranking) - 1, _MAPS).astype(int))]
+    limit = 2.5 * before.rmse_nm
+    figure = new_figure(4.1 * len(picked) + 0.8, 8.2)
+    axes = figure.subplots(2, len(picked), squeeze=False)
+    for column, scan in enumerate(picked):
+        field = closed.development[scan]
+        extent_um = [
+            0,
+            field.usable.shape[1] * field.scan.pitch_um,
+            field.usable.shape[0] * field.scan.pitch_um,
+            0,
+        ]
+        for row, (label, s) in enumerate((("before", before), ("after", after))):
+            panel = axes[row, column]
+            panel.imshow(
+                s.residual_um[scan] * NM_PER_UM, cmap="RdBu_r", vmin=-limit, vmax=limit, extent=extent_um,
+                interpolation="nearest",
+            )  # fmt: skip
+            panel.set_title(f"{field.id} {label}: {s.mae_nm[scan]:.1f} nm", fontsize=10)
+            panel.set_xlabel("x (µm)" if row else "")
+            panel.set_ylabel("" if column else "y (µm)")
+    figure.colorbar(axes[0, 0].images[0], ax=axes, label="measured - predicted (nm)", shrink=0.6)
+    return figure
+
+
+def curve_figure(curves: list[CovariateTest]) -> Figure:
+    """Mean residual along each covariate."""
+    columns = 3
+    rows = -(-len(curves) // columns)
+    figure = new_figure(10, 2.3 * rows)
+    axes = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
+    for panel, test in zip(axes, curves, strict=False):
+        panel.axhline(0, color="k", lw=0.6)
+        panel.errorbar(
+            test.centres, test.curve_nm, 2 * test.error_nm, fmt="o-", color=_AFTER, ms=3.5, capsize=2
+        )
+        panel.set_xlabel(test.name, fontsize=8)
+        panel.tick_params(labelsize=8)
+    for panel in axes[len(curves) :]:
+        panel.set_visible(False)
+    for panel in axes[::columns]:
+        panel.set_ylabel("residual (nm)", fontsize=8)
+    return figure
+
+
+def probe_figure(entry: AddedProbe) -> Figure:
+    """What one generic term looks like: a table over levels, a map, or a kernel."""
+    probe, common = entry.probe, entry.estimate.common
+    if isinstance(probe, MissingKernel):
+        kernel = probe.kernel_map(common) / probe.pitch_um**2
+        shown = _half_um(probe.size, probe.pitch_um)
+        return _image(kernel, shown, "height per layout height and µm²", min(5.5, shown[0]))
+    if probe.name in _TABLES:
+        return _table_figure(entry)
+    unit = "relative height" if "-gain-" in probe.name else "nm"
+    scale = 1.0 if unit == "relative height" else NM_PER_UM
+    if probe.name.endswith("profile"):
+        return _profile_figure(drawn_profile(common) * scale, probe.name.partition("-")[0], unit)
+    return _image(drawn(common) * scale, (1.0, 1.0), unit, 1.0)
+
+
+def _table_figure(entry: AddedProbe) -> Figure:
+    found = figures(entry.probe, entry.estimate)
+    values = pd.DataFrame(
+        [(*name.rpartition("_")[::2], value, *interval) for name, (value, _, interval) in found.items()],
+        columns=["covariate", "place", "height", "low", "high"],
+    )
+    figure = new_figure(6, 3)
+    axes = figure.subplots()
+    axes.axhline(0, color="k", lw=0.6)
+    for colour, (covariate, table) in zip(
+        (_AFTER, "#c05621"), values.groupby("covariate", sort=False), strict=False
+    ):
+        errors = np.abs(table[["low", "high"]].to_numpy().T - table["height"].to_numpy())
+        label = str(covariate).replace("_", " ")
+        places = table["place"].astype(float)
+        axes.errorbar(places, table["height"], errors, fmt="o-", color=colour, ms=4, capsize=2, label=label)
+    if len(axes.containers) > 1:
+        axes.legend(frameon=False)
+    axes.set_xlabel(_TABLES[entry.probe.name])
+    axes.set_ylabel("missing height (nm)")
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def _profile_figure(values: np.ndarray, along: str, unit: str) -> Figure:
+    figure = new_figure(6, 3)
+    axes = figure.subplots()
+    axes.axhline(0, color="k", lw=0.6)
+    axes.plot(np.linspace(0, 1, len(values)), values, color=_AFTER)
+    axes.set_xlabel(f"{along}s, from the first to the last")
+    axes.set_ylabel(unit)
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def _half_um(size: tuple[int, int], pitch_um: float) -> tuple[float, float]:
+    return size[0] * pitch_um / 2, size[1] * pitch_um / 2
+
+
+def _image(values: np.ndarray, half: tuple[float, float], label: str, shown: float) -> Figure:
+    figure = new_figure(5, 4)
+    axes = figure.subplots()
+    limit = float(np.abs(values).max()) or 1.0
+    picture = axes.imshow(
+        values, cmap="RdBu_r", vmin=-limit, vmax=limit,
+        extent=(-half[1], half[1], half[0], -half[0]),
+    )  # fmt: skip
+    axes.set_xlim(-shown, shown)
+    axes.set_ylim(shown, -shown)
+    figure.colorbar(picture, ax=axes, label=label)
+    return figure
+
+
+def profile_figure(profiles: Sequence[Profile]) -> Figure:
+    """Root mean square residual against each number, the fitted value marked."""
+    columns = min(len(profiles), 3)
+    rows = -(-len(profiles) // columns)
+    figure = new_figure(3.4 * columns, 2.6 * rows)
+    axes = figure.subplots(rows, columns, squeeze=False)
+    for one, own in zip(profiles, axes.flat, strict=False):
+        own.plot(one.held, one.rmse_nm, "o-", color=_AFTER, ms=3, lw=1.2)
+        own.axvline(one.fitted, color=_BEFORE, lw=1)
+        unit = f" ({one.unit})" if one.unit != "1" else ""
+        own.set_title(one.effect, fontsize=9)
+        own.set_xlabel(f"{one.parameter}{unit}", fontsize=8)
+        own.ticklabel_format(axis="both", useOffset=False)
+        own.locator_params(axis="x", nbins=4)
+        own.tick_params(labelsize=7)
+        own.spines[["top", "right"]].set_visible(False)
+    for own in axes.flat[len(profiles) :]:
+        own.set_visible(False)
+    for first in axes[:, 0]:
+        first.set_ylabel("RMSE (nm)", fontsize=8)
+    return figure

@@ -1,0 +1,78 @@
+"""Report sections on what the scans could tell: how well they pin the fit down, what they would show."""
+
+from __future__ import annotations
+
+import pandas as pd
+
+from litho_data.foundation.report import Page
+from litho_models.loop.findings import Closed
+from litho_models.loop.report.plots import profile_figure
+
+
+def identifiability_section(page: Page, closed: Closed) -> None:
+    """Variance inflation of every fitted number, the least determined combination, and profiles."""
+    found = closed.identifiability
+    if found is None:
+        return
+    page.heading("How well these scans pin the fit down")
+    weakest = ", ".join(f"{part:+.2f} {name}" for name, part in found.weakest.items())
+    idle = ", ".join(found.without_slope)
+    bounds = f" At a bound, or without influence: {idle}." if idle else ""
+    page.paragraph(
+        f"Condition number of all fitted numbers together: {found.condition:.0f} (1: each has a signature of "
+        f"its own). The combination that the scans say least about: {weakest}.{bounds}"
+    )
+    page.table(
+        pd.DataFrame([{"number": n, "variance inflation": v} for n, v in found.inflation.items()]),
+        "By how much the variance of a number grows because the others are fitted too; above 10 it is known "
+        "only together with them.",
+        "identifiability.csv",
+        digits=2,
+    )
+    if not closed.profiles:
+        return
+    page.figure(
+        profile_figure(closed.profiles),
+        "Profile of each number of each effect: root mean square residual, on the scans it was fitted to, "
+        "with the number held there and all others fitted again. Steep sides: determined; flat: not.",
+    )
+    page.table(
+        pd.concat(
+            pd.DataFrame(
+                {
+                    "effect": one.effect,
+                    "parameter": one.parameter,
+                    "unit": one.unit,
+                    "value": one.held,
+                    "RMSE (nm)": one.rmse_nm,
+                }
+            )
+            for one in closed.profiles
+        ),
+        "The same in numbers.",
+        "profiles.csv",
+        digits=5,
+    )
+
+
+def power_section(page: Page, closed: Closed) -> None:
+    """The smallest planted amounts that were found, and the power at every amount."""
+    if not closed.planted:
+        return
+    page.heading("How small an effect would have been found")
+    for name in dict.fromkeys(p.name for p in closed.planted):
+        found = [p for p in closed.planted if p.name == name and p.found]
+        smallest = min(found, key=lambda p: p.rms_nm, default=None)
+        page.paragraph(
+            f"{name}: found from {smallest.amount:.3g} {smallest.unit} ({smallest.rms_nm:.1f} nm rms) "
+            "upwards."
+            if smallest
+            else f"{name}: not found at any of the planted amounts."
+        )
+    page.table(
+        pd.DataFrame([vars(p) for p in closed.planted]),
+        "The effect planted in copies of the development scans. Power: share of the training sets whose best "
+        "candidate it is, or one with the same signature.",
+        "power.csv",
+        digits=3,
+    )

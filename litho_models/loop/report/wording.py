@@ -1,0 +1,111 @@
+"""The words of the report: one paragraph for a process engineer, and what to be warned of."""
+
+from __future__ import annotations
+
+from litho_models.effects import get_effect
+from litho_models.loop.findings import Closed
+from litho_models.loop.result.record import AddedEffect, CloseLoop
+from litho_models.loop.selection.confirming import FEWEST_SCANS
+
+
+def plain_words(closed: Closed, result: CloseLoop) -> str:
+    """One paragraph for a process engineer."""
+    traced = [e for e in result.effects if e.verdict == "traced-to-covariate"]
+    named = [e for e in result.effects if e.verdict != "traced-to-covariate"]
+    scan_terms = [e for e in named if get_effect(e.name).per_scan]
+    causes = [e for e in named if not get_effect(e.name).per_scan]
+    total = len(closed.development)
+    parts = [
+        f"On {total} scans, each predicted by a fit that has not seen it, the model is wrong by "
+        f"{result.before.mae_abs_nm:.0f} nm as it stands and by {result.before.mae_datum_free_nm:.1f} nm "
+        "once the "
+        "zero of each scan is freed."
+    ]
+    microscope = [get_effect(e.name).title for e in scan_terms if e.role == "measurement"]
+    written = [get_effect(e.name).title for e in scan_terms if e.role != "measurement"]
+    if microscope:
+        parts.append(
+            f"The microscope accounts for: {', '.join(microscope)}. This says nothing about the printer."
+        )
+    if written:
+        parts.append(f"Every print adds anew, so that no model can foretell it: {', '.join(written)}.")
+    for e in causes:
+        alike = f" (or {', '.join(e.confusable_with)}: these data cannot tell)" if e.confusable_with else ""
+        parts.append(
+            f"{_sentence_case(get_effect(e.name).title)} [{e.name}]{alike}: {_estimate_text(e)}; with it the "
+            f"held-out error falls from {e.before_nm:.2f} to {e.after_nm:.2f} nm, in "
+            f"{e.scans_improved[0]} of "
+            f"{e.scans_improved[1]} scans."
+        )
+        if e.separating_experiment and (e.confusable_with or e.role == "undetermined"):
+            parts.append(f"To be sure: {e.separating_experiment}.")
+    parts += [
+        f"Seen without a model [{seen.name}]: {seen.evidence}."
+        for seen in closed.observed.values()
+        if seen.seen
+    ]
+    if not causes:
+        parts.append("No named effect of the printer is confirmed as missing from the model.")
+    for e in traced:
+        parts.append(
+            f"A generic term [{e.name}] lowers the held-out error from {e.before_nm:.2f} to "
+            f"{e.after_nm:.2f} nm in {e.scans_improved[0]} of {e.scans_improved[1]} scans: it says where the "
+            "rest lives, not why, and design does not use it."
+        )
+    if result.residual.state == "unexplained":
+        parts.append(f"What is left is still structured: {result.residual.signature}.")
+    else:
+        parts.append("What is left shows no structure that is shared between scans.")
+    return " ".join(parts)
+
+
+def warnings_for(closed: Closed, result: CloseLoop) -> list[str]:
+    warnings = []
+    if len(closed.development) < FEWEST_SCANS:
+        warnings.append(
+            f"Only {len(closed.development)} scans to work on, and nothing can be confirmed below "
+            f"{FEWEST_SCANS}: errors are given, verdicts are withheld."
+        )
+    if result.run.dropped:
+        warnings.append(f"Scans left out: {'; '.join(result.run.dropped)}")
+    if closed.development[0].scan.write is None:
+        warnings.append(
+            "The card says nothing about the write field: each scan is taken as a write field of its "
+            "own, its "
+            "lines written along x, one below the other."
+        )
+    if len({field.context.order for field in closed.development}) > 2:
+        warnings.append(
+            "Effects of the writing order rest on the order given in the card; where it gives none, the "
+            "sorted "
+            "names of the scans stand for it, which is an assumption."
+        )
+    flagged = [closed.development[i].id for i in closed.probed.defects.suspicious]
+    if flagged:
+        warnings.append(f"More than 2 % of the pixels lie in localised defects: {', '.join(flagged)}.")
+    if result.prior_hypotheses:
+        warnings.append(
+            f"Known from earlier looks at these data, so only a new print confirms them cleanly: "
+            f"{', '.join(result.prior_hypotheses)}."
+        )
+    if any(e.role == "undetermined" or e.confusable_with for e in result.effects):
+        warnings.append(
+            "Effects of undetermined role, and sets with a member that belongs to the microscope, are "
+            "left out "
+            "of the exported process model."
+        )
+    return warnings
+
+
+def _sentence_case(text: str) -> str:
+    return text[:1].upper() + text[1:]
+
+
+def _estimate_text(effect: AddedEffect) -> str:
+    parts = []
+    for name, p in effect.parameters.items():
+        if p.ci95 is None:
+            continue
+        unit = "" if p.unit == "1" else f" {p.unit}"
+        parts.append(f"{name} {p.value:.3g}{unit} [{p.ci95[0]:.3g}, {p.ci95[1]:.3g}]")
+    return ", ".join(parts)

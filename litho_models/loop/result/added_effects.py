@@ -1,0 +1,156 @@
+"""What was added, in the words of the result: verdict, estimates with intervals, errors before and after."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from litho_models.effects import Effect
+from litho_models.loop.findings import Closed
+from litho_models.loop.parameters import effect_slots
+from litho_models.loop.probes import AddedProbe, figures
+from litho_models.loop.result.record import AddedEffect, EffectVerdict, ParameterEstimate
+from litho_models.loop.selection.contest import Added
+from litho_models.loop.selection.search import separating_experiment
+from litho_models.loop.single_scans.tests import MeasurementTest
+from litho_models.loop.structure import LINEAR_RESPONSE, is_structured
+
+# Their parameters lie in the span of what every scan may add: nested tests, error without other fits.
+_SPAN_EFFECTS = {"datum-offset", "z-gain", "tilt-bow"}
+# Of what the effect gained.
+_DOUBTFUL_SHARE = 0.1
+
+
+def added_effects(closed: Closed) -> list[AddedEffect]:
+    """Measurement terms seen from the start, then the process effects, then terms seen only after them."""
+    first = {t.effect.name: t for t in closed.first_tests if t.confirmation.passed}
+    last = {t.effect.name: t for t in closed.last_tests if t.confirmation.passed}
+    early = [_added_measurement(closed, first[name]) for name in first if name in last]
+    late = [_added_measurement(closed, last[name]) for name in last if name not in first]
+    process = [_added_process(closed, entry) for entry in closed.search.added]
+    return early + process + [_added_probe(entry) for entry in closed.probed.added] + late
+
+
+def _added_measurement(closed: Closed, test: MeasurementTest) -> AddedEffect:
+    effect = test.effect
+    return AddedEffect(
+        name=effect.name,
+        stage=effect.stage,
+        role=effect.role,
+        verdict="confusable" if test.confusable_with else "explained",
+        prior_hypothesis=effect.name in closed.config.prior_hypotheses,
+        parameters={
+            name if name.startswith("sd") else f"{name}_sd_between_scans": ParameterEstimate(
+                value=value, unit=unit, ci95=interval
+            )
+            for name, (value, interval, unit) in test.spread.items()
+        },
+        metric="mae_abs" if effect.name in _SPAN_EFFECTS else "mae_datum_free",
+        before_nm=test.before.mean_mae_nm,
+        after_nm=test.after.mean_mae_nm,
+        gain_ci95_nm=test.confirmation.gain_ci95_nm,
+        p_screen=test.p_screen,
+        p_confirm=test.confirmation.p,
+        scans_improved=test.confirmation.improved,
+        confusable_with=list(test.confusable_with),
+        separating_experiment=effect.separating,
+    )
+
+
+def doubtful_effects(added: Sequence[Added], left_nm2: float) -> set[str]:
+    """Names of added filters that leave another filter a good part of their own gain: near the cause, not it.
+
+    What a doubtful effect took up was left by those before it.
+
+    Args:
+        added: effects in the order in which they were added.
+        left_nm2: what a linear response to the layout would still gain.
+    """
+    doubtful: set[str] = set()
+    for entry in reversed(added):
+        if left_nm2 and entry.effect.linear and left_nm2 >= _DOUBTFUL_SHARE * entry.gain_nm2:
+            doubtful.add(entry.effect.name)
+            left_nm2 += entry.gain_nm2
+    return doubtful
+
+
+def _left_for_a_filter_nm2(closed: Closed) -> float:
+    # A kernel added as a generic term takes it away; a table added before may bring it out.
+    left = [0.0]
+    for tests, state in ((closed.left_by_named, closed.search.state), (closed.structure, closed.final)):
+        share = sum(t.share for t in is_structured(tests) if t.name == LINEAR_RESPONSE)
+        left.append(share * float(closed.errors(state, closed.terms).mse_nm2.mean()))
+    return max(left)
+
+
+def verdict_on(closed: Closed, entry: Added) -> EffectVerdict:
+    """Of an added effect: a cause, one of a set, or near the cause."""
+    if entry.effect.name in doubtful_effects(closed.search.added, _left_for_a_filter_nm2(closed)):
+        return "traced-to-covariate"
+    return "confusable" if entry.confusable_with else "explained"
+
+
+def _added_process(closed: Closed, entry: Added) -> AddedEffect:
+    effect, verdict = entry.effect, verdict_on(closed, entry)
+    return AddedEffect(
+        name=effect.name,
+        stage=effect.stage,
+        role="undetermined" if verdict == "traced-to-covariate" else effect.role,
+        verdict=verdict,
+        prior_hypothesis=effect.name in closed.config.prior_hypotheses,
+        parameters=_parameter_estimates(closed, effect),
+        metric="mae_datum_free",
+        before_nm=entry.before.mean_mae_nm,
+        after_nm=entry.after.mean_mae_nm,
+        gain_ci95_nm=entry.confirmation.gain_ci95_nm,
+        p_screen=entry.p_screen,
+        p_confirm=entry.confirmation.p,
+        scans_improved=entry.confirmation.improved,
+        confusable_with=entry.confusable_with,
+        separating_experiment=separating_experiment([effect.name, *entry.confusable_with]),
+    )
+
+
+def _added_probe(entry: AddedProbe) -> AddedEffect:
+    """A generic term: where the residual lives, added to the height; never a cause."""
+    return AddedEffect(
+        name=entry.probe.name,
+        stage="development",
+        role="undetermined",
+        verdict="traced-to-covariate",
+        prior_hypothesis=False,
+        parameters={
+            name: ParameterEstimate(value=value, unit=unit, ci95=interval)
+            for name, (value, unit, interval) in figures(entry.probe, entry.estimate).items()
+        },
+        metric="mae_datum_free",
+        before_nm=entry.before.mean_mae_nm,
+        after_nm=entry.after.mean_mae_nm,
+        gain_ci95_nm=entry.confirmation.gain_ci95_nm,
+        p_screen=entry.p_control,
+        p_confirm=entry.confirmation.p,
+        scans_improved=entry.confirmation.improved,
+        confusable_with=[],
+        separating_experiment="print and scan the same layouts turned by 90 degrees",
+    )
+
+
+def _parameter_estimates(closed: Closed, effect: Effect) -> dict[str, ParameterEstimate]:
+    """Final values on all development scans, intervals from the spread over scans; choices have none."""
+    from scipy.stats import t
+
+    fits = closed.final.fits
+    slots = effect_slots(fits.chain)
+    reach = float(t.ppf(0.975, max(len(closed.development) - 1, 1)))
+    choices = fits.chain.values()[effect.name]
+    estimates = {}
+    for name, parameter in effect.parameters.items():
+        if (effect.name, name) not in slots:
+            estimates[name] = ParameterEstimate(value=choices[name], unit=parameter.unit, ci95=None)
+            continue
+        slot = slots[effect.name, name]
+        value, half = float(fits.common[slot]), reach * math.sqrt(max(fits.covariance[slot, slot], 0.0))
+        estimates[name] = ParameterEstimate(
+            value=value, unit=parameter.unit, ci95=(value - half, value + half)
+        )
+    return estimates

@@ -1,0 +1,57 @@
+"""What design may use, and what belongs to the microscope: the two models that come out."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+from litho_data.foundation.files import atomic_file
+from litho_models.effects import get_effect
+from litho_models.effects.chain import EffectChain
+from litho_models.loop.findings import Closed
+from litho_models.loop.result.record import CloseLoop
+from litho_models.loop.scoring import scan_parameter_names
+from litho_models.loop.single_scans.tests import scan_parameters
+
+EffectValues = dict[str, dict[str, float]]
+
+
+def exported_effects(chain: EffectChain, result: CloseLoop) -> dict[str, EffectValues]:
+    """The chain's effects as ``process``, ``measurement`` and ``undetermined`` (kept out of design).
+
+    A process effect that these data cannot tell from one of the microscope is undetermined, and so is
+    one that only comes near the cause.
+    """
+    alike = {e.name: e.confusable_with for e in result.effects}
+    doubtful = {e.name for e in result.effects if e.verdict == "traced-to-covariate"}
+    groups: dict[str, EffectValues] = {"process": {}, "measurement": {}, "undetermined": {}}
+    for name, values in chain.values().items():
+        roles = {get_effect(other).role for other in (name, *alike.get(name, []))}
+        group = next(iter(roles)) if len(roles) == 1 and name not in doubtful else "undetermined"
+        groups[group if group in groups else "undetermined"][name] = values
+    return groups
+
+
+def write_measurement_model(closed: Closed, result: CloseLoop, path: Path) -> None:
+    """Shared measurement effects and the terms of each scan, as JSON beside the process model."""
+    names = scan_parameter_names(closed.terms)
+    coefficients = scan_parameters(closed.development, closed.final.predictions, closed.terms)
+    scale = np.array([1e3 if name.endswith("(nm)") else 1.0 for name in names])
+    content = {
+        "schema": "litho-models/measurement-model/1",
+        "coordinates": "x and y run from -1 to 1 over the scan",
+        "shared": {
+            e.name: {key: p.value for key, p in e.parameters.items()}
+            for e in result.effects
+            if e.role == "measurement" and not get_effect(e.name).per_scan
+        },
+        "accepted": closed.accepted,
+        "scans": {
+            field.id: dict(zip(names, (row * scale).tolist(), strict=True))
+            for field, row in zip(closed.development, coefficients, strict=True)
+        },
+    }
+    with atomic_file(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")

@@ -1,0 +1,123 @@
+"""From what the loop found to ``close_loop.json``: errors, verdict, shares, and what is left."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from litho_models.effects import CATALOGUE
+from litho_models.loop.findings import Closed
+from litho_models.loop.result.added_effects import added_effects
+from litho_models.loop.result.candidates import all_candidates
+from litho_models.loop.result.record import (
+    CloseLoop,
+    Dataset,
+    Errors,
+    NoiseFloor,
+    Nuisance,
+    Residual,
+    Shares,
+    Split,
+    Verdict,
+)
+from litho_models.loop.scoring import DATUM_FREE, Score
+from litho_models.run_info import run_info
+from litho_models.scan_terms.nuisance import BLOCK_PX
+from litho_models.scoring.metrics import NM_PER_UM
+
+_NO_TERMS: frozenset[str] = frozenset()
+
+
+def summarise(closed: Closed, *, dataset: tuple[str, str], base_name: str, dropped: list[str]) -> CloseLoop:
+    """The result record of one run.
+
+    Args:
+        closed: what the loop found.
+        dataset: name and SHA-256 of the store; ``base_name``: the base model.
+        dropped: scans left out, with reason.
+    """
+    locked = closed.locked_scores
+    effects = added_effects(closed)
+    tested = [e for e in effects if e.name not in _span_names()]
+    structured = closed.structured
+    verdict: Verdict = "traced" if tested else "unexplained" if structured else "nothing-missing"
+    floor_rms, floor_mae = closed.floor_nm
+    return CloseLoop(
+        schema=CloseLoop.SCHEMA,
+        run=run_info([closed.config.seed], len(closed.development) + len(closed.locked), dropped),
+        dataset=Dataset(name=dataset[0], sha256=dataset[1]),
+        base_model=base_name,
+        split=Split(folds=int(closed.fold_of.max()) + 1, lock_box=closed.lock_box),
+        nuisance=Nuisance(block_px=BLOCK_PX, seed=closed.config.seed),
+        prior_hypotheses=list(closed.config.prior_hypotheses),
+        noise_floor=NoiseFloor(
+            mae_nm=floor_mae,
+            rmse_nm=floor_rms,
+            kind="lower-bound",
+            source="second differences along x of the held-out residual: blind to correlated roughness",
+        ),
+        before=_errors(
+            closed.errors(closed.base, _NO_TERMS), closed.errors(closed.base, DATUM_FREE), closed.config.seed
+        ),
+        after=_errors(
+            closed.errors(closed.final, _NO_TERMS),
+            closed.errors(closed.final, closed.terms),
+            closed.config.seed,
+        ),
+        locked_before=_errors(*locked[0], closed.config.seed) if locked else None,
+        locked_after=_errors(*locked[1], closed.config.seed) if locked else None,
+        effects=effects,
+        candidates=all_candidates(closed, {e.name for e in effects}),
+        shares=_shares(closed),
+        residual=Residual(
+            # Only a measured floor can show that it is reached; the loop has a lower bound: never at-floor.
+            state="unexplained" if structured else "undecided",
+            signature="; ".join(
+                f"follows {t.name} (p = {t.p:.4f}, {100 * t.share:.1f} % of the squared error)"
+                for t in sorted(structured, key=lambda t: -t.share)
+            ),
+        ),
+        verdict=verdict,
+    )
+
+
+def _span_names() -> set[str]:
+    return {name for name, effect in CATALOGUE.items() if effect.per_scan}
+
+
+def _errors(without_fit: Score, datum_free: Score, seed: int) -> Errors:
+    return Errors(
+        mae_abs_nm=without_fit.mean_mae_nm,
+        mae_datum_free_nm=datum_free.mean_mae_nm,
+        mae_datum_free_ci95_nm=datum_free.interval_nm(seed),
+        rmse_datum_free_nm=datum_free.rmse_nm,
+    )
+
+
+def _shares(closed: Closed) -> Shares:
+    """Parts of the base model's squared error without any fit; they sum to 1."""
+    total = float(closed.errors(closed.base, _NO_TERMS).mse_nm2.mean())
+    freed = min(total, float(closed.errors(closed.base, closed.terms).mse_nm2.mean()))
+    named = min(freed, float(closed.errors(closed.search.state, closed.terms).mse_nm2.mean()))
+    final = closed.errors(closed.final, closed.terms)
+    left = min(named, float(final.mse_nm2.mean()))
+    floor = min(left, closed.floor_nm[0] ** 2)
+    defects = min(left - floor, _squares_in_defects_nm2(closed, final))
+    parts = [total - freed, freed - named, named - left, defects, left - floor - defects, floor]
+    return Shares.model_validate(
+        dict(
+            zip(
+                ("nuisance", "effects", "traced", "masked_defects", "unexplained_structured", "noise_floor"),
+                np.array(parts) / max(total, np.finfo(float).tiny),
+                strict=True,
+            )
+        )
+    )
+
+
+def _squares_in_defects_nm2(closed: Closed, final: Score) -> float:
+    """What the pixels of localised defects add to the mean squared error, nm²."""
+    parts = []
+    for residual, mask in zip(final.residual_um, closed.probed.defects.masks, strict=True):
+        scored = np.isfinite(residual)
+        parts.append((residual[scored & mask] ** 2).sum() / max(scored.sum(), 1) * NM_PER_UM**2)
+    return float(np.mean(parts))

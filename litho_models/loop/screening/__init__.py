@@ -1,0 +1,1 @@
+"""Which effects the residual asks for: score tests at the null."""

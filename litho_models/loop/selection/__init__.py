@@ -1,0 +1,1 @@
+"""Which of the effects that stand out is taken: contests and confirmation."""

@@ -1,0 +1,179 @@
+"""Forward selection of effects: contests one after another, then one pass over what was taken."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from litho_models.effects import get_effect, screened_effects
+from litho_models.loop.prepared import Field
+from litho_models.loop.scoring import Terms
+from litho_models.loop.screening.score_test import Screened
+from litho_models.loop.selection.contest import Added, Contest, hold_contest
+from litho_models.loop.selection.rivals import generic_rival, remainder_of
+from litho_models.loop.state import State, fit_state
+
+MOST_EFFECTS = 8
+# Of the amplitude of an effect: as well as a formula of the catalogue can be trusted.
+FORM_ERROR = 0.1
+
+
+@dataclass
+class Search:
+    """What the selection found.
+
+    ``steps``: effect to the model without and with it, when it was added.
+    ``first``, ``last``: first and latest screening of every candidate.
+    ``failures``: effect to why it was not confirmed.
+    ``dropped``: added and not needed later; ``absorbed``: only the stiff model lacks it.
+    """
+
+    state: State
+    added: list[Added] = field(default_factory=list)
+    steps: dict[str, tuple[State, State]] = field(default_factory=dict)
+    first: dict[str, Screened] = field(default_factory=dict)
+    last: dict[str, Screened] = field(default_factory=dict)
+    failures: dict[str, str] = field(default_factory=dict)
+    dropped: dict[str, str] = field(default_factory=dict)
+    absorbed: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def names(self) -> list[str]:
+        return [entry.effect.name for entry in self.added]
+
+    def add(self, added: Added, state: State, *, before: State) -> None:
+        """Take a winner into the model."""
+        self.added.append(added)
+        self.steps[added.effect.name] = (before, state)
+        self.state = state
+
+    def note(self, contest: Contest) -> None:
+        """Keep the screenings of a contest, and why candidates were not confirmed."""
+        self.last = {s.effect.name: s for s in contest.screened}
+        for s in contest.screened:
+            self.first.setdefault(s.effect.name, s)
+        self.failures |= contest.failures
+        if contest.winner is not None:
+            self.failures.pop(contest.winner[0].effect.name, None)
+
+
+def search_effects(
+    start: State,
+    fields: Sequence[Field],
+    fold_of: np.ndarray,
+    terms: Terms,
+    *,
+    exclude: Mapping[str, str],
+    floor_nm2: float,
+    seed: int,
+    report: Callable[[str], None] = lambda message: None,
+) -> Search:
+    """Add effects one at a time while one is confirmed and no generic term does the same, and better.
+
+    Args:
+        start: the base model.
+        fields: development scans; ``fold_of``: fold that holds each out.
+        terms: per-scan terms of the scoring.
+        exclude: effects that cannot be tested here, with the reason.
+        floor_nm2: squared noise floor or its lower bound.
+        report: told in a sentence what happens.
+    """
+    found = Search(start)
+
+    def contest(state: State, holder: tuple[str, State] | None = None) -> Contest:
+        candidates = [
+            effect for effect in screened_effects() if effect.name not in {*exclude, *state.fits.chain.names}
+        ]
+        return hold_contest(
+            state,
+            candidates,
+            fields,
+            fold_of,
+            terms,
+            floor_nm2=floor_nm2,
+            seed=seed,
+            holder=holder,
+            report=report,
+        )
+
+    def select() -> bool:
+        """Add winners while they earn a name; whether the last one was refused."""
+        while len(found.added) < MOST_EFFECTS:
+            held = contest(found.state)
+            found.note(held)
+            if held.winner is None:
+                return False
+            if nameless := why_nameless(held.winner, found.state, found, fields, fold_of):
+                # Smaller effects cannot be named while the largest part of what is missing has no name.
+                found.failures[held.winner[0].effect.name] = nameless
+                return True
+            found.add(*held.winner, before=found.state)
+        return False
+
+    refused = select()
+    chosen = found.names
+    for entry in list(found.added[:-1]):
+        report(f"deciding once more on {entry.effect.name}")
+        _decide_again(found, entry, contest, fields, fold_of)
+    if refused and found.names != chosen:
+        # What it was refused for may be gone.
+        select()
+    return found
+
+
+def why_nameless(
+    winner: tuple[Added, State],
+    before: State,
+    found: Search,
+    fields: Sequence[Field],
+    fold_of: np.ndarray,
+) -> str:
+    """Why a winner gets no name: a generic term, or the error in an earlier one's form, does as much."""
+    added, state = winner
+    for earlier in found.added:
+        name = earlier.effect.name
+        if name not in before.fits.chain.names:
+            continue
+        if added.gain_nm2 < FORM_ERROR**2 * earlier.gain_nm2:
+            return f"small beside {name}, whose form no catalogue knows to {100 * FORM_ERROR:.0f} %"
+        if reason := remainder_of(found.steps[name], before, state, fields):
+            return reason.format(name)
+    rival = generic_rival(before, state, fields, fold_of)
+    return f"{rival} does the same, and better, without a name" if rival else ""
+
+
+def _decide_again(
+    found: Search,
+    entry: Added,
+    contest: Callable[..., Contest],
+    fields: Sequence[Field],
+    fold_of: np.ndarray,
+) -> None:
+    """An effect was chosen before those that came later: with them in place it defends its place."""
+    name, chain = entry.effect.name, found.state.fits.chain
+    kept = {other: values for other, values in chain.values().items() if other != name}
+    without = fit_state(chain.with_effects(kept), fields, fold_of)
+    held = contest(without, (name, found.state))
+    if held.winner is None:
+        found.added.remove(entry)
+        found.dropped[name] = f"not needed once the others were added: {held.failures.get(name, '')}"
+        found.state = without
+        return
+    added, _ = held.winner
+    if added.effect.name == name:
+        # Where it stands in the order stays; with what it can be confused is known better now.
+        found.added[found.added.index(entry)] = replace(entry, confusable_with=added.confusable_with)
+        return
+    if why_nameless(held.winner, without, found, fields, fold_of):
+        return
+    found.dropped[name] = f"{added.effect.name} does better once the others were added"
+    found.added.remove(entry)
+    found.add(*held.winner, before=without)
+
+
+def separating_experiment(names: Sequence[str]) -> str:
+    """What would tell the members of a set apart."""
+    experiments = dict.fromkeys(get_effect(name).separating for name in names)
+    return "; ".join(text for text in experiments if text)

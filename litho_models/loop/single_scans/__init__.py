@@ -1,0 +1,1 @@
+"""What single scans add, tested and seen."""

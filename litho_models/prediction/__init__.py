@@ -1,0 +1,1 @@
+"""Heights of whole fields: tiles, their consistency, and what a prediction costs."""

@@ -1,0 +1,159 @@
+"""Whole fields of any size: tiles that are exact where the model has a receptive radius, else blended."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from litho_data.foundation.errors import InputError
+from litho_data.store import PrintedScan
+from litho_models.layers.gaussian import pad_field
+from litho_models.simulator import Simulator, Tile
+
+TILE_PX = 1024
+NM_PER_UM = 1000.0
+
+
+class TileDifference(NamedTuple):
+    """How much a height changes with the crop it is predicted in, nm."""
+
+    max_nm: float
+    rms_nm: float
+    pixels: int
+
+
+def predict_field(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX) -> Tensor:
+    """Height (b, 1, y, x) of a layout (b, 1, y, x), µm; gradients flow to the layout.
+
+    A field larger than ``tile_px`` is computed tile by tile, each with the receptive radius around
+    it, which gives the same heights as the whole field at once. A model without a receptive radius
+    decides itself.
+    """
+    reach = model.reach_px
+    ny, nx = layout_um.shape[-2:]
+    if reach is None or max(ny, nx) <= tile_px:
+        return model(layout_um)
+    return predict_interior(model, pad_field(layout_um, reach, reach), tile_px)
+
+
+def predict_interior(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX) -> Tensor:
+    """Height of the pixels farther than the receptive radius r from the edge, (b, 1, y - 2r, x - 2r), µm.
+
+    Gradients flow to the layout; computed in tiles of at most ``tile_px``, which changes nothing.
+
+    Raises:
+        InputError: a model without a receptive radius, or a layout that has no interior.
+    """
+    reach = model.reach_px
+    if reach is None or min(layout_um.shape[-2:]) <= 2 * reach:
+        raise InputError(
+            f"interior of a print by {model.name}",
+            got=f"{tuple(layout_um.shape[-2:])} px and a receptive radius of {reach} px",
+            wanted="a field wider than twice the radius",
+        )
+    ny, nx = (length - 2 * reach for length in layout_um.shape[-2:])
+    rows = []
+    for y in range(0, ny, tile_px):
+        stop = min(y + tile_px, ny)
+        tiles = [
+            model.interior(layout_um[..., y : stop + 2 * reach, x : min(x + tile_px, nx) + 2 * reach])
+            for x in range(0, nx, tile_px)
+        ]
+        rows.append(torch.cat(tiles, dim=-1))
+    return torch.cat(rows, dim=-2)
+
+
+def blend_tiles(function: Callable[[Tensor], Tensor], layout_um: Tensor, tile: Tile) -> Tensor:
+    """Weighted mean of ``function`` over overlapping tiles; the weights at each pixel sum to one.
+
+    The first tile starts ``overlap_px`` before the field, whose outermost pixels are continued, so
+    that every pixel of the field has its full set of tiles.
+
+    Args:
+        function: (b, 1, T, T) to the same shape.
+        layout_um: (b, 1, y, x), any size, µm.
+        tile: side T and overlap.
+
+    Raises:
+        InputError: an overlap of more than half a tile.
+    """
+    size, overlap = tile
+    stride = size - overlap
+    batch, _, ny, nx = layout_um.shape
+    rows, columns = (-(-(length + overlap) // stride) for length in (ny, nx))
+    bottom, right = (
+        (count - 1) * stride + size - overlap - length for count, length in ((rows, ny), (columns, nx))
+    )
+    whole = functional.pad(layout_um, (overlap, right, overlap, bottom), mode="replicate")
+    window = blending_window(tile, layout_um)
+    blended = torch.zeros_like(whole)
+    for row in range(rows):
+        y = row * stride
+        strip = whole[..., y : y + size, :]
+        tiles = strip.unfold(-1, size, stride).permute(0, 3, 1, 2, 4).reshape(-1, 1, size, size)
+        heights = (function(tiles) * window).reshape(batch, columns, size * size).transpose(1, 2)
+        folded = functional.fold(heights, strip.shape[-2:], size, stride=stride)
+        blended[..., y : y + size, :] += folded
+    return blended[..., overlap : overlap + ny, overlap : overlap + nx]
+
+
+def blending_window(tile: Tile, like: Tensor) -> Tensor:
+    """Weight of each pixel of a tile, (T, T): sin² ramps over the overlap, which neighbours complete to one.
+
+    Raises:
+        InputError: an overlap of more than half a tile.
+    """
+    size, overlap = tile
+    if not 0 <= 2 * overlap <= size:
+        raise InputError("overlap of tiles", got=f"{overlap} px", wanted=f"0 to {size // 2} px, half a tile")
+    phase = (torch.arange(overlap, device=like.device, dtype=like.dtype) + 0.5) / max(1, overlap)
+    ramp = torch.sin(torch.pi / 2 * phase) ** 2
+    line = torch.cat(
+        [ramp, torch.ones(size - 2 * overlap, device=like.device, dtype=like.dtype), ramp.flip(0)]
+    )
+    return torch.outer(line, line)
+
+
+def tile_difference(
+    model: Simulator, layout_um: Tensor, offset_px: tuple[int, int], border_px: int
+) -> TileDifference:
+    """The same pixels predicted in the whole field and in a crop of it, which shifts all tiles.
+
+    Args:
+        model: any model; with a receptive radius the difference is rounding.
+        layout_um: field (b, 1, y, x), µm.
+        offset_px: rows and columns cut off at the top left.
+        border_px: pixels along the crop's edge that are not compared; the receptive radius, or a tile.
+
+    Raises:
+        InputError: nothing left to compare.
+    """
+    y, x = offset_px
+    crop = layout_um[..., y:, x:]
+    inner = (..., slice(border_px, crop.shape[-2] - border_px), slice(border_px, crop.shape[-1] - border_px))
+    with torch.no_grad():
+        in_crop = predict_field(model, crop)[inner]
+        in_whole = predict_field(model, layout_um)[..., y:, x:][inner]
+    if in_crop.numel() == 0:
+        raise InputError(
+            "field for a tile difference",
+            got=f"{tuple(layout_um.shape[-2:])} px",
+            wanted=f"more than {2 * border_px} px beyond the offset {offset_px}",
+        )
+    difference = (in_crop - in_whole).double() * NM_PER_UM
+    return TileDifference(
+        float(difference.abs().max()), float(difference.square().mean().sqrt()), difference.numel()
+    )
+
+
+def predict_scan(model: Simulator, scan: PrintedScan) -> np.ndarray:
+    """Height that the model expects for one scan, float32 (ny, nx) µm; no gradients."""
+    device = next(model.parameters(), torch.empty(0)).device
+    with torch.no_grad():
+        layout = torch.from_numpy(scan.layout_um)[None, None].to(device)
+        return predict_field(model, layout)[0, 0].float().cpu().numpy()

@@ -1,0 +1,1 @@
+"""What a scan adds to the height, and how it is taken out on pixels that are not scored."""

@@ -1,0 +1,55 @@
+"""The smooth background that all scans of one microscope share, as a handful of numbers.
+
+Levelling a scan removes what it was told to remove and leaves the rest: a bow, say, where only planes
+were taken out. Of that, the part that is the same in every scan can be learned on the training scans
+and added to a prediction of the *measured* map. It is no part of the printer: no design sees it.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from pydantic import ConfigDict
+
+from litho_data.foundation.results import Record
+from litho_data.store import PrintedScan
+from litho_models.scan_terms.nuisance import FloatMap, smooth_shapes
+from litho_models.scoring.metrics import NM_PER_UM
+
+BackgroundUse = Literal["none", "training"]
+
+# Relative; a bow taken from a field 1 % larger or smaller is wrong by 2 %.
+_SAME_SIZE = 0.01
+
+
+class Background(Record):
+    """Mean over ``scans`` training scans of the coefficients of x, y, x², xy, y², nm.
+
+    x and y run from -1 to 1 over a field of ``field_um`` (y, x); each term has a mean of zero over it,
+    so that a background moves no datum.
+    """
+
+    model_config = ConfigDict(allow_inf_nan=False)
+
+    x_nm: float
+    y_nm: float
+    xx_nm: float
+    xy_nm: float
+    yy_nm: float
+    field_um: tuple[float, float]
+    scans: int
+
+    def fits(self, scan: PrintedScan) -> bool:
+        """Whether the scan's field has the size that this was learned on; a bow is not that of another."""
+        return bool(np.allclose(field_um(scan), self.field_um, rtol=_SAME_SIZE, atol=0))
+
+    def map_um(self, shape: tuple[int, int]) -> FloatMap:
+        """The background on a field of ``shape`` (ny, nx), µm."""
+        coefficients = (self.x_nm, self.y_nm, self.xx_nm, self.xy_nm, self.yy_nm)
+        return np.tensordot(coefficients, smooth_shapes(shape), axes=1) / NM_PER_UM
+
+
+def field_um(scan: PrintedScan) -> tuple[float, float]:
+    """Size (y, x) of a scan's field, µm."""
+    return scan.shape[0] * scan.pitch_um, scan.shape[1] * scan.pitch_um

@@ -1,0 +1,1 @@
+"""Figures of merit: of one scan, over scans, between models."""

@@ -1,0 +1,104 @@
+"""Edge placement: how far the contours of a measured map lie from those that were expected.
+
+Both maps are cut at the heights half way between nominal levels, which no model moves. Contours are
+those of marching squares, so a position is a linear interpolation between pixels; nothing is smoothed,
+and the roughness of the measured contour is part of the figure.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from litho_models.scan_terms.nuisance import FloatMap
+from litho_models.scoring.metrics import NM_PER_UM
+
+SEARCH_UM = 0.5
+_CANDIDATES = 8
+# Half the longest piece of a contour, the diagonal of a pixel.
+_HALF_PIECE_PX = 0.5 * 2**0.5
+
+
+class EdgePlacement(NamedTuple):
+    """Distances of the measured contours' pieces (at most a pixel long) from the expected contour.
+
+    A piece has a partner where the expected contour of the same height passes within ``SEARCH_UM`` and
+    rises to the same side. ``mean_nm`` and ``p95_nm`` are over pieces with one, None if there are none.
+    """
+
+    mean_nm: float | None
+    p95_nm: float | None
+    matched: int
+    unmatched: int
+    unmatched_expected: int
+
+
+class _Contour(NamedTuple):
+    start: FloatMap  # (n, 2) row, column, px
+    along: FloatMap  # (n, 2), the higher side always on the same hand
+
+
+def edge_placement(
+    measured_um: np.ndarray, expected_um: np.ndarray, heights_um: np.ndarray, pitch_um: float
+) -> EdgePlacement:
+    """Compare the contours of two maps.
+
+    Args:
+        measured_um: (ny, nx) µm, NaN where not scored; contours end there in both maps.
+        expected_um: (ny, nx) µm.
+        heights_um: heights of the contours, µm, see ``mid_step_heights_um``; ``pitch_um``: of the maps, µm.
+    """
+    expected_um = np.where(np.isfinite(measured_um), expected_um, np.nan)
+    distances, missing, unexpected = [np.empty(0)], 0, 0
+    for height in heights_um:
+        measured, expected = _contour(measured_um, height), _contour(expected_um, height)
+        found = _distance_px(measured, expected, SEARCH_UM / pitch_um)
+        distances.append(found[np.isfinite(found)])
+        missing += int(np.isinf(found).sum())
+        unexpected += int(np.isinf(_distance_px(expected, measured, SEARCH_UM / pitch_um)).sum())
+    every = np.concatenate(distances) * pitch_um * NM_PER_UM
+    return EdgePlacement(
+        mean_nm=float(every.mean()) if every.size else None,
+        p95_nm=float(np.quantile(every, 0.95)) if every.size else None,
+        matched=every.size,
+        unmatched=missing,
+        unmatched_expected=unexpected,
+    )
+
+
+def mid_step_heights_um(levels: int, level_height_um: float) -> FloatMap:
+    """Heights half way between neighbouring nominal levels, (levels - 1,) µm."""
+    return np.arange(0.5, levels - 1, dtype=np.float64) * level_height_um
+
+
+def _contour(map_um: np.ndarray, height_um: float) -> _Contour:
+    from skimage.measure import find_contours
+
+    lines = find_contours(np.asarray(map_um, np.float64), height_um)
+    start = np.concatenate([np.empty((0, 2)), *(line[:-1] for line in lines)])
+    along = np.concatenate([np.empty((0, 2)), *(np.diff(line, axis=0) for line in lines)])
+    real = np.any(along != 0, axis=1)
+    return _Contour(start[real], along[real])
+
+
+def _distance_px(of: _Contour, to: _Contour, search_px: float) -> NDArray[np.float64]:
+    """Distance of the middle of each piece from the nearest piece that rises to the same side, else inf."""
+    from scipy.spatial import KDTree
+
+    middle = of.start + of.along / 2
+    if not len(to.start) or not len(middle):
+        return np.full(len(middle), np.inf)
+    count = min(_CANDIDATES, len(to.start))
+    tree = KDTree(to.start + to.along / 2)
+    nearest = tree.query(middle, k=count, distance_upper_bound=search_px + _HALF_PIECE_PX)[1]
+    nearest = nearest.reshape(len(middle), count)
+    candidate = np.minimum(nearest, len(to.start) - 1)
+    start, along = to.start[candidate], to.along[candidate]
+    offset = middle[:, None] - start
+    share = np.clip((offset * along).sum(-1) / (along * along).sum(-1), 0, 1)
+    distance = np.linalg.norm(offset - share[..., None] * along, axis=-1)
+    same_side = (along * of.along[:, None]).sum(-1) > 0
+    usable = (nearest < len(to.start)) & same_side & (distance <= search_px)
+    return np.where(usable, distance, np.inf).min(axis=1)

@@ -1,0 +1,132 @@
+"""What is scored and what comes out: the protocol, a prediction, and the figures of a scan and of a model."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from litho_data.foundation.results import Record
+from litho_models.scan_terms.background import Background, BackgroundUse
+from litho_models.scan_terms.nuisance import BLOCK_PX, BUFFER_PX, Policy
+from litho_models.scoring.transfer import LevelError, TransferCurves
+
+Interval = tuple[float, float] | None
+
+
+class NuisanceProtocol(Record):
+    """What a scan may be freed of before it is scored, and on which pixels that was fitted.
+
+    ``k``: smooth terms per scan; line offsets of ``full+rows`` come on top, by their effective number, which
+    depends on the prediction (``PolicyError.k``). ``background``: ``training`` if the smooth background
+    learned on the training scans was added to the predictions; nothing of it is fitted to the scored scan.
+    """
+
+    policy: Policy = "offset"
+    k: float = 1.0
+    block_px: int = BLOCK_PX
+    buffer_px: int = BUFFER_PX
+    seed: int = 0
+    background: BackgroundUse = "none"
+
+
+class Prediction(NamedTuple):
+    """What a model expects of a scan, (ny, nx) µm: the print, and what all scans add, if that is known."""
+
+    height_um: np.ndarray
+    background_um: np.ndarray | None = None
+
+    @classmethod
+    def beside(cls, background: Background | None, height_um: np.ndarray) -> Prediction:
+        """The print and a learned background on its field, where there is one."""
+        ny, nx = height_um.shape
+        return cls(height_um, None if background is None else background.map_um((ny, nx)))
+
+    @property
+    def map_um(self) -> np.ndarray:
+        """The map that the microscope should show."""
+        return self.height_um if self.background_um is None else self.height_um + self.background_um
+
+
+class PolicyError(Record):
+    """Mean absolute error under one nuisance policy, nm, with its interval over scans."""
+
+    policy: Policy
+    k: float
+    mae_nm: float
+    ci95_nm: Interval
+
+
+class ShapeFigures(Record):
+    """Figures of the shape of a map freed of its nuisances.
+
+    SSIM as in ``structural_similarity``, edges as in ``EdgePlacement``. None where there was nothing to
+    compare, or in results of before these were scored.
+    """
+
+    ssim: float | None = None
+    edge_mean_nm: float | None = None
+    edge_p95_nm: float | None = None
+    edge_matched: int | None = None
+    edge_unmatched: int | None = None
+    edge_unmatched_expected: int | None = None
+
+
+class ScanRow(ShapeFigures):
+    """The figures of one scan.
+
+    Slope and intercept, the gain and offset of the print against the prediction, with standard errors and the
+    correlation of the two (``print_gain``); None where they cannot be known.
+    """
+
+    scan: str
+    print: str
+    mae_abs_nm: float
+    bias_nm: float
+    mae_datum_free_nm: float
+    rmse_datum_free_nm: float
+    median_abs_datum_free_nm: float
+    p95_abs_datum_free_nm: float
+    slope: float | None
+    intercept_nm: float
+    slope_error: float | None = None
+    intercept_error_nm: float | None = None
+    slope_intercept_correlation: float | None = None
+    pixels: int
+
+    @property
+    def line_covariance(self) -> np.ndarray | None:
+        """Covariance of slope and intercept (nm), (2, 2); None where it cannot be known."""
+        a, b, shared = self.slope_error, self.intercept_error_nm, self.slope_intercept_correlation
+        if a is None or b is None or shared is None:
+            return None
+        return np.array([[a * a, shared * a * b], [shared * a * b, b * b]])
+
+
+class ModelScores(ShapeFigures):
+    """Everything reported about one model; means are over scans, counts are sums, intervals resample scans.
+
+    ``without_background`` repeats ``by_policy`` without the background of the protocol, for the policies
+    that have no smooth terms themselves; it is empty where the protocol has no background.
+    ``phase_rms_waves`` is the RMS error as light sees it that passes the print.
+    """
+
+    model: str
+    scans: list[ScanRow]
+    mae_abs_nm: float
+    mae_abs_ci95_nm: Interval
+    bias_nm: float
+    mae_datum_free_nm: float
+    mae_datum_free_ci95_nm: Interval
+    rmse_datum_free_nm: float
+    rmse_datum_free_ci95_nm: Interval
+    by_policy: list[PolicyError]
+    without_background: list[PolicyError] = Field(default_factory=list)
+    phase_rms_waves: float | None = None
+    by_level: list[LevelError]
+    transfer: TransferCurves
+    row_offset_sd_nm: float
+    scan_line_offset_sd_nm: float
+    dropped_pixels: int
+    constant_predictions: int

@@ -1,0 +1,1 @@
+"""Which scans are learned from, which are held out, which stay locked."""

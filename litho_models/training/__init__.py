@@ -1,6 +1,0 @@
-"""Fitting models to printed scans."""
-
-from litho_models.training.config import TrainingConfig
-from litho_models.training.fit import Fitted, fit, fit_in_cache, fit_with_record
-
-__all__ = ["Fitted", "TrainingConfig", "fit", "fit_in_cache", "fit_with_record"]
