@@ -1,24 +1,25 @@
 """Models of the printer, trained on a dataset, corrected by its residual, and frozen for design."""
 
-from __future__ import annotations
+from typing import TYPE_CHECKING
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from litho_data.foundation.faces import lazy_face
 
 if TYPE_CHECKING:
-    from litho_models.frozen import zoo
-    from litho_models.frozen.files import load_frozen, save_frozen
-    from litho_models.frozen.simulator import FrozenSimulator
+    from litho_models.frozen import zoo as zoo
+    from litho_models.frozen.files import load_frozen as load_frozen
+    from litho_models.frozen.files import save_frozen as save_frozen
+    from litho_models.frozen.simulator import FrozenSimulator as FrozenSimulator
 
-__all__ = ["FrozenSimulator", "load_frozen", "save_frozen", "zoo"]
+    __version__: str
+else:
+    __getattr__, __dir__ = lazy_face(
+        __name__,
+        {
+            "FrozenSimulator": "litho_models.frozen.simulator",
+            "load_frozen": "litho_models.frozen.files",
+            "save_frozen": "litho_models.frozen.files",
+            "zoo": "litho_models.frozen",
+        },
+    )
 
-
-def __getattr__(name: str) -> Any:
-    """Load torch only when a model is asked for."""
-    if name == "zoo":
-        return importlib.import_module("litho_models.frozen.zoo")
-    if name == "FrozenSimulator":
-        return importlib.import_module("litho_models.frozen.simulator").FrozenSimulator
-    if name in __all__:
-        return getattr(importlib.import_module("litho_models.frozen.files"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+__all__ = ["FrozenSimulator", "__version__", "load_frozen", "save_frozen", "zoo"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import subprocess
 import sys
 from pathlib import Path
@@ -16,7 +17,7 @@ ALLOWED = {
     "litho_design": {"litho_data", "litho_models", "litho_design"},
 }
 # What design may use of the models: what loads and calls a frozen one, and which scans stay locked.
-FROZEN_ONLY = {"load_frozen", "freeze", "simulator", "zoo", "splits"}
+FROZEN_ONLY = {"load_frozen", "frozen", "simulator", "splits"}
 HEAVY = ("torch", "cv2", "xarray", "zarr", "matplotlib", "pandas", "skimage", "SurfaceTopography")
 
 
@@ -75,6 +76,31 @@ def test_importing_litho_data_takes_less_than_half_a_second() -> None:
     # The best of three, because another process may hold the core; the promise is about our own work.
     code = "import time; t = time.perf_counter(); import litho_data; print(time.perf_counter() - t)"
     assert min(float(_python(code)) for _ in range(3)) < 0.5
+
+
+@pytest.mark.parametrize("package", sorted(ALLOWED))
+def test_a_public_face_is_small_and_every_name_on_it_is_there(package: str) -> None:
+    face = importlib.import_module(package)
+    if not hasattr(face, "__all__"):
+        pytest.skip(f"{package} has no public face yet")
+    assert face.__all__ == sorted(face.__all__)
+    assert set(dir(face)) == {*face.__all__, "__version__"}
+    assert len(face.__all__) <= 20
+    rooms = {path.stem for path in (ROOT / package).iterdir()}
+    assert not rooms & set(face.__all__), "importing a room binds its name and hides what the face shows"
+    assert all(getattr(face, name) is not None for name in face.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = face.nothing
+
+
+@pytest.mark.parametrize("package", sorted(ALLOWED))
+def test_type_checkers_see_the_names_of_a_public_face(package: str) -> None:
+    tree = ast.parse((ROOT / package / "__init__.py").read_text(encoding="utf-8"))
+    listed = {
+        alias.asname for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for alias in node.names
+    }
+    face = importlib.import_module(package)
+    assert listed - {None} == set(getattr(face, "__all__", ())) - {"__version__"}
 
 
 def _python(code: str) -> str:

@@ -1,0 +1,52 @@
+"""The public face of a package: the few names that users import, each loaded when it is first used."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping
+from typing import Any
+
+_DISTRIBUTION = "litholoop"
+
+
+def lazy_face(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """``__getattr__`` and ``__dir__`` of a package that loads its public names lazily.
+
+    In a package's ``__init__``, where type checkers read the imports and Python the mapping::
+
+        if TYPE_CHECKING:
+            from litho_data.readers.read import read_scan as read_scan
+        else:
+            __getattr__, __dir__ = lazy_face(__name__, {"read_scan": "litho_data.readers.read"})
+
+    Args:
+        package: ``__name__`` of the package.
+        homes: per public name the module that ``from module import name`` takes it from. A public name
+            must not be that of a room of the package, because importing a room binds its name.
+
+    ``__version__`` is always there: the version of the distribution, ``"0"`` where it is not installed.
+    """
+
+    def load(name: str) -> Any:
+        if name == "__version__":
+            value: Any = _version()
+        elif name in homes:
+            value = getattr(__import__(homes[name], fromlist=[name]), name)
+        else:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        setattr(sys.modules[package], name, value)
+        return value
+
+    def names() -> list[str]:
+        return sorted([*homes, "__version__"])
+
+    return load, names
+
+
+def _version() -> str:
+    from importlib import metadata  # not needed by most users, and it takes 30 ms
+
+    try:
+        return metadata.version(_DISTRIBUTION)
+    except metadata.PackageNotFoundError:
+        return "0"
