@@ -17,8 +17,8 @@ from benchmarks.markdown_table import markdown_table, with_interval
 from benchmarks.record import publish
 from litho_models.evaluation.benchmark import Benchmark, benchmark
 from litho_models.fitting.config import PAPER_BATCH, PAPER_CROPS, PAPER_EPOCHS
+from litho_models.scoring.pairs import paired_scores
 from litho_models.scoring.records import ModelScores
-from litho_models.scoring.scores import paired_scores
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "results" / "recipes"
@@ -122,7 +122,7 @@ def paper_order(others: Sequence[Benchmark]) -> str:
 def _paired(first: ModelScores, second: ModelScores) -> tuple[str, str]:
     """How much larger the first error is, quadrant by quadrant, and p."""
     paired = paired_scores(first, second)
-    return with_interval(paired.mean, paired.interval), f"{paired.p:.4f}"
+    return with_interval(paired.mean_nm, paired.ci95_nm), f"{paired.p:.4f}"
 
 
 def _row(result: Benchmark, score: ModelScores, difference: tuple[str, str]) -> tuple[str, ...]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from litho_data.foundation.errors import InputError
 
+NM_PER_UM = 1000.0
+
 _IN_UM = {
     "km": 1e9,
     "m": 1e6,

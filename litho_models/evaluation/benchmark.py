@@ -6,13 +6,14 @@ A benchmark that was stopped continues where it was, and an unchanged fit is nev
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
 from litho_data.foundation.commands import progress
-from litho_data.foundation.results import Record, Result
+from litho_data.foundation.results import Result
 from litho_data.store import PrintedScan, open_store
 from litho_models.evaluation.benchmark_report import write_benchmark_report
 from litho_models.evaluation.evaluate import SplitRecord
@@ -25,25 +26,14 @@ from litho_models.models import build_model, require_models
 from litho_models.run_info import RunInfo, run_info
 from litho_models.scan_terms.background import BackgroundUse
 from litho_models.scan_terms.nuisance import Policy
+from litho_models.scoring.pairs import Paired, paired_scores
 from litho_models.scoring.records import ModelScores, NuisanceProtocol, Prediction
-from litho_models.scoring.scores import NoiseFloor, noise_floor, paired_scores, protocol_for, score_model
+from litho_models.scoring.scores import NoiseFloor, noise_floor, protocol_for, score_model
 from litho_models.splits.folds import GROUPED_FOLDS, SplitKind, plan_folds
 from litho_models.splits.splits import ids_sha256, locked_ids
 
 BASELINES = ("identity", "affine", "affine-mtf", "blur-table", "linear")
 DEFAULT_MODELS = (*BASELINES, "physics", "pbl", "fno")
-
-
-class Paired(Record):
-    """Mean over scans of first minus second ``mae_datum_free_nm``; negative means the first is better."""
-
-    first: str
-    second: str
-    mean_nm: float
-    ci95_nm: tuple[float, float] | None
-    p: float
-    first_better: int
-    scans: int
 
 
 class Benchmark(Result):
@@ -146,7 +136,7 @@ def benchmark(
         training={name: _settings(name, config, scans) for name, config in configs.items()},
         scores=scores,
         locked_scores=[score(name, boxed, True) for name in models] if boxed else [],
-        paired=_all_pairs(scores, seed),
+        paired=[paired_scores(*pair, seed) for pair in combinations(scores, 2)],
         fits=fits,
     )
     result.write(out)
@@ -162,22 +152,3 @@ def _config(name: str, settings: dict[str, Any] | None, seed: int) -> TrainingCo
 
 def _settings(name: str, config: TrainingConfig, scans: Sequence[PrintedScan]) -> dict[str, Any]:
     return config.used_by(build_model(name, config.variant, **common_geometry(scans)))
-
-
-def _all_pairs(scores: Sequence[ModelScores], seed: int) -> list[Paired]:
-    pairs = []
-    for position, first in enumerate(scores):
-        for second in scores[position + 1 :]:
-            compared = paired_scores(first, second, seed)
-            pairs.append(
-                Paired(
-                    first=first.model,
-                    second=second.model,
-                    mean_nm=compared.mean,
-                    ci95_nm=compared.interval if compared.scans > 1 else None,
-                    p=compared.p,
-                    first_better=compared.first_better,
-                    scans=compared.scans,
-                )
-            )
-    return pairs

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from litho_data.foundation.errors import InputError
 from litho_models.evaluation.benchmark import Benchmark
 from litho_models.evaluation.evaluate import Evaluation
+from litho_models.scoring.pairs import paired_scores
 from litho_models.scoring.records import ModelScores
-from litho_models.scoring.scores import paired_scores
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -93,14 +93,15 @@ def _schema(file: Path) -> object:
 
 def _row(first: ModelScores, second: ModelScores) -> dict[str, object]:
     paired = paired_scores(first, second)
+    low, high = paired.ci95_nm or (float("nan"), float("nan"))
     return {
         "first": first.model,
         "second": second.model,
         "first_nm": first.mae_datum_free_nm,
         "second_nm": second.mae_datum_free_nm,
-        "difference_nm": paired.mean,
-        "low_nm": paired.interval[0],
-        "high_nm": paired.interval[1],
+        "difference_nm": paired.mean_nm,
+        "low_nm": low,
+        "high_nm": high,
         "p": paired.p,
         "first_better": f"{paired.first_better}/{paired.scans}",
     }

@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import get_effect
 from litho_models.effects.chain import EffectChain
 from litho_models.loop.fitting import FoldFits, Linearisation, predict
 from litho_models.loop.linear import solve_damped
 from litho_models.loop.parameters import effect_slots, is_stiff, room, set_vector
 from litho_models.loop.prepared import Field
-from litho_models.scoring.metrics import NM_PER_UM
 
 PROFILE_POINTS = 9
 # Standard errors on either side of the fitted value.

@@ -8,6 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects.measurement_height import CREEP_DECAYS
 from litho_models.loop.prepared import Field
 from litho_models.scan_terms.nuisance import (
@@ -19,7 +20,7 @@ from litho_models.scan_terms.nuisance import (
     row_index,
     shrunk_line_offsets,
 )
-from litho_models.scoring.metrics import NM_PER_UM, bootstrap_interval
+from litho_models.scoring.statistics import bootstrap_interval
 
 Terms = frozenset[str]
 # Per-scan terms by the measurement effect that they stand for, in the order in which they are tested.

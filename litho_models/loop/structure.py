@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.linear import without_scan_terms
 from litho_models.loop.prepared import Field
-from litho_models.scoring.metrics import NM_PER_UM
-from litho_models.scoring.sign_flips import sign_flip_statistics
+from litho_models.scoring.statistics import sign_flip_statistics
 
 BINS = 8
 # Cells of the scan along y and along x.

@@ -11,13 +11,14 @@ from typing import Literal
 import numpy as np
 
 from litho_data.foundation.results import Record
+from litho_data.foundation.units import NM_PER_UM
 from litho_data.roughness import split_noise
 from litho_data.store import PrintedScan, Store
 from litho_data.store.access import has_child
 from litho_models.noise.gaussian_law import GAUSSIAN_MAE
 from litho_models.noise.neighbourhoods import neighbourhood_noise
-from litho_models.noise.surface import NM_PER_UM, without_background
-from litho_models.scoring.metrics import bootstrap_interval
+from litho_models.noise.surface import without_background
+from litho_models.scoring.statistics import bootstrap_interval
 
 Direction = Literal["lower bound", "upper bound", "estimate", "control"]
 # Above this frequency a Gaussian spot of 0.2 µm passes less than 1 %: √(ln 100 / 2π²) / 0.2 µm.

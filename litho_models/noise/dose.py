@@ -11,9 +11,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from litho_data.foundation.results import Record
+from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.noise.staircase import READABLE_AT
-from litho_models.noise.surface import NM_PER_UM
 
 # Off every change of level by four σ of the optical spot and two of a diffusion of 0.5 µm.
 GUARD_UM = 1.0

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from litho_data.foundation.report import new_figure
+from litho_data.foundation.units import NM_PER_UM
 from litho_models.noise.bounds import NoiseBound
 from litho_models.noise.calibration import SpreadAnalysis
 from litho_models.noise.dose import DoseMatrix
 from litho_models.noise.staircase import READABLE_AT, StepPrint
-from litho_models.noise.surface import NM_PER_UM, without_background
+from litho_models.noise.surface import without_background
 from litho_models.scoring.scores import NoiseFloor
 
 if TYPE_CHECKING:

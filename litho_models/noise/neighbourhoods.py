@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
-from litho_models.noise.surface import NM_PER_UM
-from litho_models.scoring.metrics import bootstrap_interval
+from litho_models.scoring.statistics import bootstrap_interval
 
 _BLURS_UM = (0.1, 0.2, 0.4, 0.8, 1.6)
 _SLOPE_BLUR_UM = 0.3

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan, Store
 from litho_models.evaluation.evaluate import card_background, predict_frozen, trained_ids
 from litho_models.frozen import zoo
 from litho_models.frozen.card import CARD_FILE
 from litho_models.frozen.files import load_frozen
 from litho_models.noise.calibration import Residuals
-from litho_models.noise.surface import NM_PER_UM
 from litho_models.scan_terms.nuisance import cross_fitted_residual
 from litho_models.scoring.records import NuisanceProtocol, Prediction
 from litho_models.scoring.scores import protocol_for

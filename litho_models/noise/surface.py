@@ -8,12 +8,12 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
+from litho_data.foundation.units import NM_PER_UM
 from litho_data.roughness import amplitude_parameters, effective_samples
 from litho_models.noise.gaussian_law import GAUSSIAN_MAE
 
 Background = Literal["offset", "quadratic"]
 BACKGROUNDS: tuple[Background, ...] = ("offset", "quadratic")
-NM_PER_UM = 1000.0
 
 
 class SurfaceNoise(Record):

@@ -11,12 +11,12 @@ from torch import Tensor
 from torch.nn import functional
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.layers.gaussian import pad_field
 from litho_models.simulator import Simulator, Tile
 
 TILE_PX = 1024
-NM_PER_UM = 1000.0
 
 
 class TileDifference(NamedTuple):

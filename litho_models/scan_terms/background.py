@@ -13,9 +13,9 @@ import numpy as np
 from pydantic import ConfigDict
 
 from litho_data.foundation.results import Record
+from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.scan_terms.nuisance import FloatMap, smooth_shapes
-from litho_models.scoring.metrics import NM_PER_UM
 
 BackgroundUse = Literal["none", "training"]
 

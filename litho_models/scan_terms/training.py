@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.scan_terms.background import Background, field_um
 from litho_models.scan_terms.nuisance import (
@@ -16,7 +17,6 @@ from litho_models.scan_terms.nuisance import (
     row_index,
     shrunk_line_offsets,
 )
-from litho_models.scoring.metrics import NM_PER_UM
 
 _GAIN_TERM = 1
 

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from litho_data.foundation.units import NM_PER_UM
 from litho_models.scan_terms.nuisance import FloatMap
-from litho_models.scoring.metrics import NM_PER_UM
 
 SEARCH_UM = 0.5
 _CANDIDATES = 8

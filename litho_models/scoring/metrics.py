@@ -1,26 +1,18 @@
-"""Error figures: over the valid pixels of a scan first, then over scans; intervals over scans.
-
-Pixels of one scan are correlated, scans are (nearly) independent: every interval and every test
-resamples whole scans.
-"""
+"""The errors of one scan, over its valid pixels."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.units import NM_PER_UM
 from litho_models.scan_terms.nuisance import BLOCK_PX, BUFFER_PX, Policy, cross_fitted_residual
 from litho_models.scoring.print_gain import print_gain
 
-NM_PER_UM = 1000.0
 # The step of index from air to the resist, at a red helium-neon line: where its elements are used.
 INDEX_STEP, WAVELENGTH_UM = 0.548, 0.6328
-BOOTSTRAP_DRAWS = 2000
-EXACT_SIGN_FLIP_SCANS = 14
-SIGN_FLIP_DRAWS = 9999
 
 
 @dataclass(frozen=True)
@@ -108,62 +100,3 @@ def score_scan(
 def phase_waves(height_error_um: float) -> float:
     """Phase error, in waves, of light that passes an element whose height is wrong by so many µm."""
     return height_error_um * INDEX_STEP / WAVELENGTH_UM
-
-
-def bootstrap_interval(
-    values: Sequence[float], *, level: float = 0.95, draws: int = BOOTSTRAP_DRAWS, seed: int = 0
-) -> tuple[float, float]:
-    """Percentile interval of the mean over scans, resampling whole scans.
-
-    With one scan there is nothing to resample: both ends are NaN.
-    """
-    sample = np.asarray(values, np.float64)
-    if sample.size < 2:
-        return float("nan"), float("nan")
-    picks = np.random.default_rng(seed).integers(0, sample.size, size=(draws, sample.size))
-    means = sample[picks].mean(axis=1)
-    low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
-    return float(low), float(high)
-
-
-@dataclass(frozen=True)
-class PairedDifference:
-    """Mean over scans of (first minus second), its bootstrap interval and two-sided sign-flip p."""
-
-    mean: float
-    interval: tuple[float, float]
-    p: float
-    first_better: int
-    scans: int
-
-
-def paired_difference(first: Sequence[float], second: Sequence[float], *, seed: int = 0) -> PairedDifference:
-    """Compare two models scan by scan; smaller values are better.
-
-    The null flips the sign of each scan's difference: all combinations up to 14 scans, 9,999 random
-    ones beyond (the observed one counted in).
-
-    Raises:
-        InputError: lists of different length, or empty.
-    """
-    if len(first) != len(second) or not first:
-        raise InputError(
-            "paired scores", got=f"{len(first)} and {len(second)} scans", wanted="the same scans in both"
-        )
-    difference = np.asarray(first, np.float64) - np.asarray(second, np.float64)
-    count = difference.size
-    if count <= EXACT_SIGN_FLIP_SCANS:
-        signs = 1.0 - 2.0 * ((np.arange(2**count)[:, None] >> np.arange(count)) & 1)
-    else:
-        drawn = np.random.default_rng(seed).choice([-1.0, 1.0], size=(SIGN_FLIP_DRAWS, count))
-        signs = np.vstack([np.ones(count), drawn])
-    flipped = np.abs(signs @ difference)
-    # The observed sum is one of the flips; rounding must not put it below itself.
-    p = float(np.mean(flipped >= abs(difference.sum()) * (1 - 1e-12)))
-    return PairedDifference(
-        mean=float(difference.mean()),
-        interval=bootstrap_interval(difference.tolist(), seed=seed),
-        p=p,
-        first_better=int((difference < 0).sum()),
-        scans=count,
-    )

@@ -11,6 +11,7 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
+from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.scan_terms.background import BackgroundUse
 from litho_models.scan_terms.nuisance import (
@@ -21,15 +22,7 @@ from litho_models.scan_terms.nuisance import (
     scan_line_index,
 )
 from litho_models.scoring.edges import edge_placement, mid_step_heights_um
-from litho_models.scoring.metrics import (
-    NM_PER_UM,
-    PairedDifference,
-    ScanScore,
-    bootstrap_interval,
-    paired_difference,
-    phase_waves,
-    score_scan,
-)
+from litho_models.scoring.metrics import ScanScore, phase_waves, score_scan
 from litho_models.scoring.records import (
     Interval,
     ModelScores,
@@ -40,6 +33,7 @@ from litho_models.scoring.records import (
     ShapeFigures,
 )
 from litho_models.scoring.similarity import structural_similarity
+from litho_models.scoring.statistics import bootstrap_interval
 from litho_models.scoring.transfer import level_errors, transfer_curves
 
 # Policies without smooth terms of their own: only their errors know of a smooth background.
@@ -129,19 +123,6 @@ def _policy_error(policy: Policy, scores: Sequence[ScanScore]) -> PolicyError:
     values = [score.mae_datum_free_nm for score in scores]
     freedom = float(np.mean([score.degrees_of_freedom for score in scores]))
     return PolicyError(policy=policy, k=freedom, mae_nm=float(np.mean(values)), ci95_nm=interval(values))
-
-
-def paired_scores(first: ModelScores, second: ModelScores, seed: int = 0) -> PairedDifference:
-    """First minus second datum-free error of the same scans, which meet by id: results list them by fold.
-
-    Raises:
-        InputError: scores of different scans.
-    """
-    errors = [{row.scan: row.mae_datum_free_nm for row in score.scans} for score in (first, second)]
-    if errors[0].keys() != errors[1].keys():
-        counts = " and ".join(str(len(found)) for found in errors)
-        raise InputError("paired scores", got=f"{counts} scans", wanted="the same scans in both")
-    return paired_difference(list(errors[0].values()), [errors[1][scan] for scan in errors[0]], seed=seed)
 
 
 def protocol_for(policy: Policy, seed: int = 0, background: BackgroundUse = "none") -> NuisanceProtocol:

@@ -9,8 +9,8 @@ import numpy as np
 from pydantic import Field
 
 from litho_data.foundation.results import Record
+from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
-from litho_models.scoring.metrics import NM_PER_UM
 
 TRANSFER_BANDS = 24
 _TINY = float(np.finfo(float).tiny)

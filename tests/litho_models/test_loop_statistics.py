@@ -9,7 +9,7 @@ import pytest
 
 from litho_models.loop.linear import gram, orthonormal, solve_damped
 from litho_models.loop.selection.confirming import binomial_p, confirm, confirm_variance
-from litho_models.scoring.sign_flips import (
+from litho_models.scoring.statistics import (
     family_wise_p,
     one_sided_flip_p,
     sign_flip_statistics,

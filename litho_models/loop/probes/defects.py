@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import find_objects, label
 
+from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.prepared import Field
 from litho_models.loop.scoring import term_maps
 from litho_models.scan_terms.nuisance import least_squares
-from litho_models.scoring.metrics import NM_PER_UM
 
 FAR_SD = 5.0
 FEWEST_PX = 9

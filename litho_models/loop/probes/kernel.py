@@ -14,11 +14,11 @@ from scipy.fft import irfft2, rfft2
 from scipy.ndimage import label
 from scipy.signal import fftconvolve
 
+from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.prepared import Field
 from litho_models.loop.probes.probe import Estimate
 from litho_models.loop.scoring import term_maps
 from litho_models.scan_terms.nuisance import least_squares
-from litho_models.scoring.metrics import NM_PER_UM
 
 SUPPORT_UM = 5.0
 # The regularisation, relative to the median power of the layouts.

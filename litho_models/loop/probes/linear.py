@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.linear import nuisance_columns, orthonormal
 from litho_models.loop.prepared import Field
 from litho_models.loop.probes.probe import Estimate
-from litho_models.scoring.metrics import NM_PER_UM
 
 # Relative to the mean information per column; the grid is wide, its choice is made on training scans.
 RIDGES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)

@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 from scipy.interpolate import BSpline
 
+from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.prepared import Field
 from litho_models.loop.probes.linear import LinearProbe, linear_probe, second_differences
-from litho_models.scoring.metrics import NM_PER_UM
 
 SPLINES = 5
 # One per µm in a field of 25 µm: what is finer is one line's, not the field's.

@@ -8,9 +8,9 @@ from functools import partial
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.prepared import Field
 from litho_models.loop.probes.linear import ColumnsOf, LinearProbe, linear_probe, second_differences
-from litho_models.scoring.metrics import NM_PER_UM
 
 # The level that reaches a pixel is spread by the printer's spot.
 SPOT_UM = 0.2

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.prepared import Field
 from litho_models.loop.single_scans.tests import scan_parameters
-from litho_models.scoring.metrics import NM_PER_UM
 
 PERMUTATIONS = 1999
 # Fewer scans than this on one side of a step fit anything.

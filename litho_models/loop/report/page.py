@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 
 from litho_data.foundation.report import Page
+from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.findings import Closed
 from litho_models.loop.report.plots import curve_figure, map_figure, probe_figure, staircase_figure
 from litho_models.loop.report.power import identifiability_section, power_section
@@ -16,7 +17,6 @@ from litho_models.loop.result.record import CloseLoop
 from litho_models.loop.scoring import DATUM_FREE, Score, Terms, names_to_terms, scan_parameter_names
 from litho_models.loop.single_scans.tests import scan_parameters
 from litho_models.loop.structure import PLACE
-from litho_models.scoring.metrics import NM_PER_UM
 
 
 def write_report(closed: Closed, result: CloseLoop, folder: Path) -> Path:

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from litho_data.foundation.report import new_figure
+from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.findings import Closed
 from litho_models.loop.identifiability import Profile
 from litho_models.loop.probes import AddedProbe, figures
@@ -17,7 +18,6 @@ from litho_models.loop.probes.places import drawn, drawn_profile
 from litho_models.loop.result.record import CloseLoop
 from litho_models.loop.scoring import Score
 from litho_models.loop.structure import CovariateTest
-from litho_models.scoring.metrics import NM_PER_UM
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import CATALOGUE
 from litho_models.loop.findings import Closed
 from litho_models.loop.result.added_effects import added_effects
@@ -22,7 +23,6 @@ from litho_models.loop.result.record import (
 from litho_models.loop.scoring import DATUM_FREE, Score
 from litho_models.run_info import run_info
 from litho_models.scan_terms.nuisance import BLOCK_PX
-from litho_models.scoring.metrics import NM_PER_UM
 
 _NO_TERMS: frozenset[str] = frozenset()
 

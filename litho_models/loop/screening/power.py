@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import Effect, get_effect, screened_effects
 from litho_models.loop.linear import nuisance_columns, orthonormal
 from litho_models.loop.parameters import set_vector
@@ -18,7 +19,6 @@ from litho_models.loop.screening.directions import measure_directions
 from litho_models.loop.screening.eligibility import is_eligible
 from litho_models.loop.screening.score_test import SAME_COSINE, best_by_fold, cosine, screen
 from litho_models.loop.state import State, held_out_residuals
-from litho_models.scoring.metrics import NM_PER_UM
 
 MULTIPLES = (0.125, 0.25, 0.5, 1.0)
 FOLDS_THAT_MUST_AGREE = 5 / 6

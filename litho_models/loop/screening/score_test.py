@@ -22,7 +22,7 @@ from litho_models.loop.screening.directions import (
     freed_grams,
     raw_information,
 )
-from litho_models.scoring.sign_flips import family_wise_p, sign_flip_statistics
+from litho_models.scoring.statistics import family_wise_p, sign_flip_statistics
 
 FAMILY_P = 0.05
 SAME_COSINE = 0.8

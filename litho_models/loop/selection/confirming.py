@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from litho_models.scoring.metrics import bootstrap_interval
-from litho_models.scoring.sign_flips import one_sided_flip_p
+from litho_models.scoring.statistics import bootstrap_interval, one_sided_flip_p
 
 BINOMIAL_P = 0.005
 # Seven gains out of seven have p = 0.0078: below eight scans nothing can be confirmed.

@@ -13,12 +13,12 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.linear import without_scan_terms
 from litho_models.loop.prepared import Field
 from litho_models.loop.probes.defects import find_defects
 from litho_models.loop.probes.selection import generic_terms
 from litho_models.loop.state import State
-from litho_models.scoring.metrics import NM_PER_UM
 
 # A generic term has to gain this much more: its own estimate is noisy, too.
 _BETTER = 1.05

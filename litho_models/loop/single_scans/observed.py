@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.prepared import Field
 from litho_models.loop.probes.defects import Defects
 from litho_models.loop.scoring import LINE_TERMS, Terms, score
 from litho_models.loop.selection.confirming import BINOMIAL_P, SMALLEST_RMSE_NM
 from litho_models.scan_terms.nuisance import row_index
-from litho_models.scoring.metrics import NM_PER_UM
-from litho_models.scoring.sign_flips import one_sided_flip_p
+from litho_models.scoring.statistics import one_sided_flip_p
 
 # Heights closer than this are one value of a file that rounds in single precision.
 _SAME_VALUE = 1e-6

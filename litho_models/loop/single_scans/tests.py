@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import Effect, get_effect
 from litho_models.loop.prepared import Field
 from litho_models.loop.scoring import (
@@ -24,8 +25,7 @@ from litho_models.loop.scoring import (
 )
 from litho_models.loop.selection.confirming import BINOMIAL_P, Confirmation, confirm_variance
 from litho_models.scan_terms.nuisance import least_squares
-from litho_models.scoring.metrics import NM_PER_UM, bootstrap_interval, paired_difference
-from litho_models.scoring.sign_flips import one_sided_flip_p
+from litho_models.scoring.statistics import bootstrap_interval, one_sided_flip_p, paired_difference
 
 # Terms whose mean over scans could be a property of the process.
 _SHARED: Terms = frozenset({"gain", "bow", "drift", "distortion"})
