@@ -16,8 +16,8 @@ ALLOWED = {
     "litho_models": {"litho_data", "litho_models"},
     "litho_design": {"litho_data", "litho_models", "litho_design"},
 }
-# What design may use of the models: what loads and calls a frozen one, and which scans stay locked.
-FROZEN_ONLY = {"load_frozen", "frozen", "simulator", "splits"}
+# What design may use of the models: what loads and calls a frozen one.
+FROZEN_ONLY = {"load_frozen", "frozen", "simulator"}
 HEAVY = ("torch", "cv2", "xarray", "zarr", "matplotlib", "pandas", "skimage", "SurfaceTopography")
 
 

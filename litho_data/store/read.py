@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,6 +24,7 @@ from litho_data.store.access import (
     values_of,
 )
 from litho_data.store.contract import checked_arrays, checked_attributes, true_shapes
+from litho_data.store.lock_box import lock_box, lock_box_size
 from litho_data.store.schema import OPTIONAL_COLUMNS, SAMPLE_VARIABLES, VARIABLES, dataset_sha256
 
 if TYPE_CHECKING:
@@ -164,6 +166,21 @@ class Store:
             InputError: no such scan or array, or a stored chunk that does not decode.
         """
         return values_of(group_of(self.root, f"scans/{scan_id}"), name)
+
+    @property
+    def locked_ids(self) -> list[str]:
+        """Ids of the lock box: a sixth of the scans, from different prints, the same in every session."""
+        return lock_box(self.ids, self._print_ids, lock_box_size(len(self)))
+
+    def files_sha256(self, ids: Sequence[str]) -> dict[str, str]:
+        """Hash of the raw file behind each of some scans, however they were levelled and registered.
+
+        A scan whose file the store does not list is left out. Layouts do not count: one may be printed twice.
+        """
+        wanted = set(ids)
+        rows = [row for row in self.manifest.get("files", []) if row["scan"] in wanted and row["sha256"]]
+        # Only what was read as a scan has the facts of a reader.
+        return {row["scan"]: row["sha256"] for row in rows if json.loads(row["read"] or "{}")}
 
     def references(self) -> dict[str, str]:
         """Scans outside the dataset: id and use (flat, substrate, steps); ``scan_frame`` has the heights."""

@@ -176,12 +176,9 @@ def measured_window(store: Any, window: ProcessWindow) -> ProcessWindow:
     Raises:
         InputError: fewer scans, or layouts without structure.
     """
-    from litho_models.splits.splits import locked_ids
-
-    scans = store.scans()
-    locked = locked_ids(scans)
+    locked = store.locked_ids
     fits = []
-    for scan in scans:
+    for scan in store.scans():
         if scan.id in locked:
             continue
         nominal, height = scan.layout_um[scan.valid], scan.height_um[scan.valid]

@@ -15,6 +15,7 @@ from pydantic import Field
 from litho_data.foundation.commands import progress
 from litho_data.foundation.results import Result
 from litho_data.store import PrintedScan, open_store
+from litho_data.store.lock_box import ids_sha256
 from litho_models.evaluation.benchmark_report import write_benchmark_report
 from litho_models.evaluation.evaluate import SplitRecord
 from litho_models.evaluation.fit_cache import FitRecord, fit_or_load
@@ -30,7 +31,6 @@ from litho_models.scoring.pairs import Paired, paired_scores
 from litho_models.scoring.records import ModelScores, NuisanceProtocol, Prediction
 from litho_models.scoring.scores import NoiseFloor, noise_floor, protocol_for, score_model
 from litho_models.splits.folds import GROUPED_FOLDS, SplitKind, plan_folds
-from litho_models.splits.splits import ids_sha256, locked_ids
 
 BASELINES = ("identity", "affine", "affine-mtf", "blur-table", "linear")
 DEFAULT_MODELS = (*BASELINES, "physics", "pbl", "fno")
@@ -93,7 +93,7 @@ def benchmark(
     dataset = open_store(store)
     scans = dataset.scans()
     floor = noise_floor(dataset.name, noise)
-    locked = locked_ids(scans)
+    locked = dataset.locked_ids
     plan = plan_folds(scans, locked, split, folds=folds, seed=seed, open_lock_box=open_lock_box)
     configs = {name: _config(name, settings, seed) for name in models}
     fits: list[FitRecord] = []

@@ -13,6 +13,7 @@ from pydantic import Field
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record, Result
 from litho_data.store import PrintedScan, Store, open_store
+from litho_data.store.lock_box import ids_sha256
 from litho_models.evaluation.diagnostics import TileConsistency, device_of, tile_consistency
 from litho_models.evaluation.evaluation_report import write_evaluation_report
 from litho_models.frozen import zoo
@@ -25,7 +26,6 @@ from litho_models.scan_terms.background import Background, BackgroundUse
 from litho_models.scan_terms.nuisance import Policy
 from litho_models.scoring.records import ModelScores, NuisanceProtocol, Prediction
 from litho_models.scoring.scores import NoiseFloor, noise_floor, protocol_for, score_model
-from litho_models.splits.splits import files_sha256, ids_sha256, locked_ids
 
 
 class SplitRecord(Record):
@@ -113,7 +113,7 @@ def evaluate(
     frozen.check_geometry(dataset.pitch_um, dataset.level_height_um)
     every = dataset.scans()
     kept = _locked_by_the_card(frozen, dataset)
-    locked = sorted({*locked_ids(every), *kept})
+    locked = sorted({*dataset.locked_ids, *kept})
     if scan_ids is not None:
         scans = [dataset.scan(scan_id) for scan_id in scan_ids]
     else:
@@ -175,7 +175,7 @@ def _locked_by_the_card(model: FrozenSimulator, dataset: Store) -> list[str]:
     """
     split = model.card["split"]
     if files := split.get("lock_box_files_sha256"):
-        return [scan_id for scan_id, file in files_sha256(dataset, dataset.ids).items() if file in files]
+        return [scan_id for scan_id, file in dataset.files_sha256(dataset.ids).items() if file in files]
     same_name = (model.card["dataset"] or {}).get("name") == dataset.name
     return [scan_id for scan_id in split.get("lock_box", []) if same_name and scan_id in dataset.ids]
 

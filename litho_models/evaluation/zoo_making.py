@@ -22,7 +22,6 @@ from litho_models.scan_terms.nuisance import Policy
 from litho_models.scoring.records import ModelScores, Prediction
 from litho_models.scoring.scores import noise_floor, protocol_for, score_model
 from litho_models.simulator import Variant
-from litho_models.splits.splits import locked_ids
 
 ZOO_MODELS = ("physics", "pbl", "fno")
 TRAINED_ON, HELD_OUT, OUT_OF_FOLD = "development, trained on", "lock box, held out", "grouped, out of fold"
@@ -57,7 +56,7 @@ def make_zoo(
     """
     dataset = open_store(store)
     every = dataset.scans()
-    locked = locked_ids(every)
+    locked = dataset.locked_ids
     out_of_fold = _out_of_fold(benchmark, dataset) if benchmark is not None else {}
     given = {"seed": seed, **({"steps": steps} if steps is not None else {})}
     cards = {}
@@ -106,7 +105,7 @@ def differing_metrics(store: str | Path, root: str | Path = zoo.ZOO_FOLDER) -> d
     """
     dataset = open_store(store)
     every = dataset.scans()
-    locked = locked_ids(every)
+    locked = dataset.locked_ids
     found = {}
     for name in zoo.list(root):
         card = ModelCard.read(zoo.folder(name, root))

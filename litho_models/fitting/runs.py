@@ -13,6 +13,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
 from litho_data.foundation.results import Result, first_error
 from litho_data.store import PrintedScan, open_store
+from litho_data.store.lock_box import ids_sha256
 from litho_models.fitting import TrainingConfig, fit_with_record
 from litho_models.fitting.checkpoint import RoundRecord
 from litho_models.fitting.config import Recipe
@@ -23,7 +24,6 @@ from litho_models.prediction.tiles import predict_scan
 from litho_models.run_info import RunInfo, run_info
 from litho_models.scan_terms.training import learn_background
 from litho_models.simulator import Variant
-from litho_models.splits.splits import files_sha256, ids_sha256, locked_ids
 
 MODEL_FOLDER, CHECKPOINT_FOLDER = "model", "checkpoint"
 
@@ -72,7 +72,7 @@ def train(
     config = training_config(recipe, model, {"variant": variant, **(settings or {})})
     dataset = open_store(store)
     scans = dataset.scans()
-    lock_box = locked_ids(scans)
+    lock_box = dataset.locked_ids
     locked = [] if use_lock_box else lock_box
     used = [scan for scan in scans if scan.id not in locked]
     folder = Path(out)
@@ -111,7 +111,7 @@ def train(
             "kind": "development",
             "lock_box": locked,
             "lock_box_sha256": ids_sha256(locked),
-            "lock_box_files_sha256": sorted(files_sha256(dataset, lock_box).values()),
+            "lock_box_files_sha256": sorted(dataset.files_sha256(lock_box).values()),
         },
         limitations=["Not evaluated yet: see the evaluation of this model for its error."],
     )

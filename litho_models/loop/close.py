@@ -10,6 +10,7 @@ from torch import nn
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
+from litho_data.store.lock_box import locked_ids
 from litho_data.store.read import PrintedScan
 from litho_models.effects import CATALOGUE, UNTESTABLE, get_effect
 from litho_models.effects.chain import EffectChain
@@ -28,7 +29,7 @@ from litho_models.loop.single_scans.tests import MeasurementTest, measurement_te
 from litho_models.loop.state import State, fit_state
 from litho_models.loop.structure import covariate_tests, is_structured
 from litho_models.models import build_model
-from litho_models.splits.splits import grouped_folds, locked_ids
+from litho_models.splits.splits import grouped_folds
 
 
 def close_loop(

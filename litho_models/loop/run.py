@@ -26,7 +26,6 @@ from litho_models.loop.result.summary import summarise
 from litho_models.loop.single_scans.observed import rounding_step_um
 from litho_models.models import MODELS, build_model
 from litho_models.simulator import Simulator
-from litho_models.splits.splits import files_sha256, locked_ids
 
 MODEL_FOLDER, MEASUREMENT_FILE = "model", "measurement_model.json"
 
@@ -72,7 +71,7 @@ def close_loop_on_store(
         config,
         trainer=trainer,
         rounding_um=_rounding_um(opened, usable),
-        lock_box=locked_ids(scans),
+        lock_box=opened.locked_ids,
         report=report,
     )
     result = summarise(closed, dataset=(opened.name, opened.sha256), base_name=name, dropped=dropped)
@@ -147,7 +146,7 @@ def _save_process_model(closed: Closed, result: CloseLoop, store: Store, folder:
         command=result.run.command,
         split={
             **result.split.model_dump(),
-            "lock_box_files_sha256": sorted(files_sha256(store, closed.lock_box).values()),
+            "lock_box_files_sha256": sorted(store.files_sha256(closed.lock_box).values()),
         },
         nuisance=result.nuisance.model_dump(),
         noise_floor=result.noise_floor.model_dump(),

@@ -23,7 +23,6 @@ from litho_models.noise.staircase import step_print
 from litho_models.noise.surface import BACKGROUNDS, SurfaceNoise, print_noise, surface_noise
 from litho_models.run_info import run_info
 from litho_models.scoring.scores import NoiseFloor
-from litho_models.splits.splits import locked_ids
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ def noise(
         raise InputError("model", got=f"{model} and no residuals", wanted="a benchmark to choose it from")
     dataset = open_store(store)
     every = dataset.scans()
-    locked = locked_ids(every)
+    locked = dataset.locked_ids
     scans = [scan for scan in every if scan.id not in locked]
     references = store_references(dataset)
     spread = read_residuals(dataset, residuals, model) if residuals else None

@@ -9,7 +9,7 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
-from litho_data.store import PrintedScan, Store
+from litho_data.store import Store
 from litho_models.evaluation.evaluate import card_background, predict_frozen, trained_ids
 from litho_models.frozen import zoo
 from litho_models.frozen.card import CARD_FILE
@@ -18,7 +18,6 @@ from litho_models.noise.calibration import Residuals
 from litho_models.scan_terms.nuisance import cross_fitted_residual
 from litho_models.scoring.records import NuisanceProtocol, Prediction
 from litho_models.scoring.scores import protocol_for
-from litho_models.splits.splits import locked_ids
 
 Predictions = dict[str, list[np.ndarray]]
 
@@ -127,9 +126,7 @@ def _of_frozen(store: Store, folders: Sequence[Path]) -> tuple[str, Predictions,
     for frozen in models:
         frozen.check_geometry(store.pitch_um, store.level_height_um)
     trained_on = {scan_id for frozen in models for scan_id in trained_ids(frozen, store)}
-    every = store.scans()
-    locked = locked_ids(every)
-    scans: list[PrintedScan] = [scan for scan in every if scan.id not in locked]
+    scans = [store.scan(scan_id) for scan_id in store.ids if scan_id not in store.locked_ids]
     learned = [card_background(frozen, scans) for frozen in models]
     members = {
         scan.id: [

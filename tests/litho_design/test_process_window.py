@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from litho_data.foundation.errors import InputError
+from litho_data.store.lock_box import locked_ids
 from litho_design.judging.process_window import focus_window, range_above
 from litho_design.lens.bench import LensBench, LensView
 from litho_design.optics import Optics
 from litho_design.optimisation.parametrise import LayoutSettings
 from litho_design.optimisation.robust import Draw, ProcessWindow, draws, measured_window
-from litho_models.splits.splits import locked_ids
 
 
 def test_range_above_a_limit_is_linear_between_samples():
@@ -63,6 +63,10 @@ class _Store:
     def scans(self) -> list[_Scan]:
         return self._scans
 
+    @property
+    def locked_ids(self) -> list[str]:
+        return locked_ids(self._scans)
+
 
 def _store(gains: np.ndarray, offsets: np.ndarray) -> _Store:
     return _Store(*(_Scan(f"scan{i}", g, o) for i, (g, o) in enumerate(zip(gains, offsets, strict=True))))
@@ -71,7 +75,7 @@ def _store(gains: np.ndarray, offsets: np.ndarray) -> _Store:
 def test_spreads_of_measured_prints_come_back_without_the_locked_ones():
     gains, offsets = np.array([0.5, 0.6, 0.7, 0.6, 0.65]), np.array([0.12, 0.2, 0.16, 0.16, 0.19])
     store = _store(gains, offsets)
-    locked = [int(name.removeprefix("scan")) for name in locked_ids(store.scans())]
+    locked = [int(name.removeprefix("scan")) for name in store.locked_ids]
     assert len(locked) == 1
     kept_gains, kept_offsets = np.delete(gains, locked), np.delete(offsets, locked)
     window = measured_window(store, ProcessWindow(samples=4))

@@ -14,6 +14,7 @@ from prints import make_scans, write_store
 from litho_data.build.build import build
 from litho_data.foundation.errors import InputError
 from litho_data.store import open_store
+from litho_data.store.lock_box import locked_ids
 from litho_data.store.write import write_table
 from litho_data.virtual_fab import simulate
 from litho_models.evaluation.benchmark import Benchmark, benchmark
@@ -22,7 +23,6 @@ from litho_models.evaluation.evaluate import Evaluation, evaluate
 from litho_models.fitting.runs import TrainingRun, freeze, train
 from litho_models.frozen.card import DatasetName
 from litho_models.splits.folds import plan_folds
-from litho_models.splits.splits import locked_ids
 
 MODELS = ("identity", "affine", "linear")
 SETTINGS = {"nuisance": "offset"}

@@ -10,6 +10,7 @@ from prints import make_scans, write_store
 from typer.testing import CliRunner
 
 from litho_data.foundation.errors import InputError
+from litho_data.store.lock_box import locked_ids
 from litho_models.cli.app import app
 from litho_models.evaluation.benchmark import benchmark
 from litho_models.fitting import TrainingConfig, fit_with_record
@@ -18,7 +19,7 @@ from litho_models.fitting.runs import TrainingRun, train
 from litho_models.frozen.card import ModelCard
 from litho_models.noise.residuals import read_residuals
 from litho_models.splits.folds import plan_folds
-from litho_models.splits.splits import grouped_folds, locked_ids
+from litho_models.splits.splits import grouped_folds
 
 QUICK = {"steps": 2, "rounds": 2, "batch": 1, "crop_px": 32, "nuisance": "offset"}
 

@@ -12,6 +12,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from litho_data.foundation.errors import InputError
+from litho_data.store.lock_box import lock_box, locked_ids
 from litho_models.effects import get_effect
 from litho_models.fitting.runs import train
 from litho_models.frozen.card import ModelCard
@@ -27,7 +28,6 @@ from litho_models.loop.screening.power import parse_injection
 from litho_models.loop.single_scans.tests import measurement_tests
 from litho_models.loop.structure import covariate_tests, is_structured
 from litho_models.models import build_model
-from litho_models.splits.splits import lock_box, locked_ids
 from tests.litho_models.loop_scans import printed_scans, true_model
 from tests.litho_models.prints import write_store
 

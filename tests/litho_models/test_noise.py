@@ -12,6 +12,7 @@ from scipy.integrate import quad
 from scipy.stats import norm
 
 from litho_data.foundation.errors import InputError
+from litho_data.store.lock_box import locked_ids
 from litho_models.noise.bounds import high_band_sigma_nm, repeated_prints
 from litho_models.noise.calibration import Residuals, analyse_spread, conformal_factor
 from litho_models.noise.dose import dose_matrix
@@ -22,7 +23,6 @@ from litho_models.noise.spread_scores import normalised_calibration_error, spars
 from litho_models.noise.staircase import READABLE_AT, find_edges, step_print
 from litho_models.noise.surface import print_noise, surface_noise
 from litho_models.noise.variance import COVARIATES, covariate_maps, fit_log_variance, sigma_nm
-from litho_models.splits.splits import locked_ids
 
 RANDOM = np.random.default_rng(0)
 

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import tomllib
+from pathlib import Path
+
 import pytest
 
 from litho_data.foundation.errors import InputError
+from litho_data.store.lock_box import lock_box, lock_box_size
 from litho_models.splits.splits import (
     Crop,
     grouped_folds,
-    ids_sha256,
     inner_validation,
     leave_one_print_out,
-    lock_box,
-    lock_box_size,
     paper_draw,
 )
 
@@ -31,28 +32,11 @@ def test_folds_depend_on_the_seed_and_not_on_the_order_of_the_ids():
     assert grouped_folds(MEASURED_IDS, 5, seed=3) != grouped_folds(MEASURED_IDS, 5, seed=4)
 
 
-def test_lock_box_takes_scans_from_different_prints():
-    locked = lock_box(MEASURED_IDS, PRINTS, lock_box_size(24))
-    assert len(locked) == 4
-    assert len({scan_id[3] for scan_id in locked}) == 4
-
-
-@pytest.mark.parametrize(("scans", "wanted"), [(1, 0), (2, 0), (3, 1), (8, 1), (24, 4)])
-def test_lock_box_is_a_sixth_of_the_scans(scans, wanted):
-    assert lock_box_size(scans) == wanted
-
-
-def test_the_recorded_lock_box_of_the_measured_prints_is_the_one_that_is_computed():
-    import tomllib
-    from pathlib import Path
-
+def test_the_recorded_folds_of_the_measured_prints_are_those_that_are_computed():
     record = Path(__file__).parents[2] / "datasets" / "neural-lithography.split.toml"
     stated = tomllib.loads(record.read_text(encoding="utf-8"))
     locked = lock_box(MEASURED_IDS, PRINTS, lock_box_size(24))
-    assert stated["lock_box"]["ids"] == locked
-    assert stated["lock_box"]["sha256"] == ids_sha256(locked)
-    development = [scan_id for scan_id in MEASURED_IDS if scan_id not in locked]
-    assert stated["grouped"]["folds"] == grouped_folds(development, 5)
+    assert stated["grouped"]["folds"] == grouped_folds([i for i in MEASURED_IDS if i not in locked], 5)
 
 
 def test_leave_one_print_out_holds_out_whole_prints():
@@ -91,8 +75,6 @@ def test_inner_validation_is_a_small_part_of_the_training_scans():
     [
         lambda: grouped_folds(["a", "a", "b"], 2),
         lambda: grouped_folds(["a", "b"], 3),
-        lambda: lock_box(["a", "b"], ["1"], 1),
-        lambda: lock_box(["a", "b"], ["1", "2"], 2),
         lambda: leave_one_print_out(["a", "b"], ["1", "1"]),
     ],
 )
