@@ -27,9 +27,10 @@ from litho_models.models import build_model, require_models
 from litho_models.run_info import RunInfo, run_info
 from litho_models.scan_terms.background import BackgroundUse
 from litho_models.scan_terms.nuisance import Policy
+from litho_models.scoring.noise_floor import NoiseFloor, noise_floor
 from litho_models.scoring.pairs import Paired, paired_scores
 from litho_models.scoring.records import ModelScores, NuisanceProtocol, Prediction
-from litho_models.scoring.scores import NoiseFloor, noise_floor, protocol_for, score_model
+from litho_models.scoring.scores import protocol_for, score_model
 from litho_models.splits.folds import GROUPED_FOLDS, SplitKind, plan_folds
 
 BASELINES = ("identity", "affine", "affine-mtf", "blur-table", "linear")

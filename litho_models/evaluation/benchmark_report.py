@@ -68,8 +68,8 @@ def write_benchmark_report(
         _pairs(result), "Datum-free MAE, first minus second, over the same scans.", "pairs.csv", digits=3
     )
     page.heading("Phase, similarity, edges")
-    page.table(score_tables.shape_table(scores), "Means over held-out scans.", "shapes.csv", digits=3)
-    page.paragraph(score_tables.shape_text())
+    page.table(score_tables.metric_table(scores), "Means over held-out scans.", "shapes.csv", digits=3)
+    page.paragraph(score_tables.metric_text())
     page.heading("One scan")
     middle = _median_scan(best.scans)
     shown = {s.model: predictions_um[s.model][scans[middle].id] for s in scores}

@@ -24,8 +24,9 @@ from litho_models.prediction.cost import PredictionCost, measured_predictions
 from litho_models.run_info import RunInfo, run_info
 from litho_models.scan_terms.background import Background, BackgroundUse
 from litho_models.scan_terms.nuisance import Policy
+from litho_models.scoring.noise_floor import NoiseFloor, noise_floor
 from litho_models.scoring.records import ModelScores, NuisanceProtocol, Prediction
-from litho_models.scoring.scores import NoiseFloor, noise_floor, protocol_for, score_model
+from litho_models.scoring.scores import protocol_for, score_model
 
 
 class SplitRecord(Record):

@@ -50,8 +50,8 @@ def write_evaluation_report(
         "MAE under every nuisance policy, with and without the background, nm.",
         "policies.csv",
     )
-    page.table(score_tables.shape_table([scores]), "Phase, similarity, edges.", "shapes.csv", digits=3)
-    page.paragraph(score_tables.shape_text())
+    page.table(score_tables.metric_table([scores]), "Phase, similarity, edges.", "shapes.csv", digits=3)
+    page.paragraph(score_tables.metric_text())
     page.table(
         _model(result.model),
         "The same pixels in another crop; what predicting a scan costs on the machine that made this.",

@@ -10,8 +10,8 @@ import numpy as np
 from litho_data.foundation.report import new_figure
 from litho_data.store import PrintedScan
 from litho_models.scan_terms.nuisance import cross_fitted_residual
+from litho_models.scoring.noise_floor import NoiseFloor
 from litho_models.scoring.records import ModelScores, NuisanceProtocol
-from litho_models.scoring.scores import NoiseFloor
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from litho_models.scoring.edges import SEARCH_UM
+from litho_models.scoring.metric_registry import metrics_text, registered_metrics
 from litho_models.scoring.metrics import INDEX_STEP, WAVELENGTH_UM
+from litho_models.scoring.noise_floor import NoiseFloor
 from litho_models.scoring.records import Interval, ModelScores, NuisanceProtocol
-from litho_models.scoring.scores import NoiseFloor
-from litho_models.scoring.similarity import SSIM_RANGE_UM, SSIM_SIGMA_PX, SSIM_WINDOW_PX
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -58,14 +57,20 @@ def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol) -> p
     return pd.DataFrame(rows)
 
 
-def shape_table(scores: Sequence[ModelScores]) -> pd.DataFrame:
-    """One row per model: phase error, structural similarity and edge placement."""
+def metric_table(scores: Sequence[ModelScores]) -> pd.DataFrame:
+    """One row per model: phase error, and all metrics of ``metric_registry``."""
     import pandas as pd
 
-    fields = ("phase_rms_waves", "ssim", "edge_mean_nm", "edge_p95_nm")
-    counts = ("edge_matched", "edge_unmatched", "edge_unmatched_expected")
+    keys = [metric.key for metric in registered_metrics()]
     return pd.DataFrame(
-        [{"model": s.model, **{name: getattr(s, name) for name in (*fields, *counts)}} for s in scores]
+        [
+            {
+                "model": s.model,
+                "phase_rms_waves": s.phase_rms_waves,
+                **{key: s.metric(key) for key in keys},
+            }
+            for s in scores
+        ]
     )
 
 
@@ -84,7 +89,11 @@ def scan_table(scores: Sequence[ModelScores]) -> pd.DataFrame:
     import pandas as pd
 
     return pd.DataFrame(
-        [{"model": s.model, "scan": row.scan, **row.model_dump()} for s in scores for row in s.scans]
+        [
+            {"model": s.model, **row.model_dump(exclude={"metrics"}), **row.metrics}
+            for s in scores
+            for row in s.scans
+        ]
     )
 
 
@@ -136,15 +145,11 @@ def floor_text(floor: NoiseFloor) -> str:
     return f"Noise floor ({floor.kind}): {known}{floor.source}"
 
 
-def shape_text() -> str:
-    """What the figures of ``shape_table`` are."""
+def metric_text() -> str:
+    """What the columns of ``metric_table`` are."""
     return (
         f"phase_rms_waves is the RMS error seen by light of {WAVELENGTH_UM:g} µm that passes the print "
-        f"(index step {INDEX_STEP:g}). ssim has a Gaussian window of {SSIM_SIGMA_PX:g} px, "
-        f"{SSIM_WINDOW_PX} px wide, and a data range of {SSIM_RANGE_UM:g} µm. edge_mean and edge_p95 are "
-        "distances of the measured contours from the predicted ones at the heights half way between nominal "
-        f"levels, over the pieces whose partner lies within {SEARCH_UM:g} µm; the counts are of pieces: of "
-        "the measured contours with and without a partner, of the predicted contours without."
+        f"(index step {INDEX_STEP:g}). {metrics_text()}"
     )
 
 

@@ -19,8 +19,9 @@ from litho_models.frozen.card import Metric, ModelCard
 from litho_models.frozen.files import load_frozen
 from litho_models.scan_terms.background import BackgroundUse
 from litho_models.scan_terms.nuisance import Policy
+from litho_models.scoring.noise_floor import noise_floor
 from litho_models.scoring.records import ModelScores, Prediction
-from litho_models.scoring.scores import noise_floor, protocol_for, score_model
+from litho_models.scoring.scores import protocol_for, score_model
 from litho_models.simulator import Variant
 
 ZOO_MODELS = ("physics", "pbl", "fno")

@@ -22,7 +22,7 @@ from litho_models.noise.result import NoiseAnalysis, ReferencePrints
 from litho_models.noise.staircase import step_print
 from litho_models.noise.surface import BACKGROUNDS, SurfaceNoise, print_noise, surface_noise
 from litho_models.run_info import run_info
-from litho_models.scoring.scores import NoiseFloor
+from litho_models.scoring.noise_floor import NoiseFloor
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from litho_models.noise.calibration import SpreadAnalysis
 from litho_models.noise.dose import DoseMatrix
 from litho_models.noise.staircase import READABLE_AT, StepPrint
 from litho_models.noise.surface import without_background
-from litho_models.scoring.scores import NoiseFloor
+from litho_models.scoring.noise_floor import NoiseFloor
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

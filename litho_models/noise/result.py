@@ -14,7 +14,7 @@ from litho_models.noise.dose import DoseMatrix
 from litho_models.noise.staircase import StepPrint
 from litho_models.noise.surface import PrintNoise, SurfaceNoise
 from litho_models.run_info import RunInfo
-from litho_models.scoring.scores import NoiseFloor
+from litho_models.scoring.noise_floor import NoiseFloor
 
 
 class ReferencePrints(Record):

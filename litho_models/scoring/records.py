@@ -58,11 +58,11 @@ class PolicyError(Record):
     ci95_nm: Interval
 
 
-class ShapeFigures(Record):
-    """Figures of the shape of a map freed of its nuisances.
+class MetricValues(Record):
+    """Metrics beside the errors, of maps freed of their nuisances (``metric_registry``).
 
-    SSIM as in ``structural_similarity``, edges as in ``EdgePlacement``. None where there was nothing to
-    compare, or in results of before these were scored.
+    SSIM as in ``structural_similarity``, edges as in ``EdgePlacement``, one's own by name and unit under
+    ``metrics``. None where there was nothing to compare, or in older result files.
     """
 
     ssim: float | None = None
@@ -71,9 +71,14 @@ class ShapeFigures(Record):
     edge_matched: int | None = None
     edge_unmatched: int | None = None
     edge_unmatched_expected: int | None = None
+    metrics: dict[str, float | None] = Field(default_factory=dict)
+
+    def metric(self, key: str) -> float | None:
+        """The metric of that name in results; None where it was not measured."""
+        return self.metrics.get(key) if key not in MetricValues.model_fields else getattr(self, key)
 
 
-class ScanRow(ShapeFigures):
+class ScanRow(MetricValues):
     """The figures of one scan.
 
     Slope and intercept, the gain and offset of the print against the prediction, with standard errors and the
@@ -104,7 +109,7 @@ class ScanRow(ShapeFigures):
         return np.array([[a * a, shared * a * b], [shared * a * b, b * b]])
 
 
-class ModelScores(ShapeFigures):
+class ModelScores(MetricValues):
     """Everything reported about one model; means are over scans, counts are sums, intervals resample scans.
 
     ``without_background`` repeats ``by_policy`` without the background of the protocol, for the policies

@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.scan_terms.background import BackgroundUse
@@ -21,7 +18,7 @@ from litho_models.scan_terms.nuisance import (
     cross_fitted_residual,
     scan_line_index,
 )
-from litho_models.scoring.edges import edge_placement, mid_step_heights_um
+from litho_models.scoring.metric_registry import metrics_of, metrics_over_scans
 from litho_models.scoring.metrics import ScanScore, phase_waves, score_scan
 from litho_models.scoring.records import (
     Interval,
@@ -30,23 +27,12 @@ from litho_models.scoring.records import (
     PolicyError,
     Prediction,
     ScanRow,
-    ShapeFigures,
 )
-from litho_models.scoring.similarity import structural_similarity
 from litho_models.scoring.statistics import bootstrap_interval
 from litho_models.scoring.transfer import level_errors, transfer_curves
 
 # Policies without smooth terms of their own: only their errors know of a smooth background.
 _BLIND_POLICIES: tuple[Policy, ...] = ("none", "offset", "offset-gain")
-
-
-class NoiseFloor(Record):
-    """The error that roughness and microscope alone would leave; ``kind`` says how it is known."""
-
-    mae_nm: float | None
-    rmse_nm: float | None
-    kind: str
-    source: str
 
 
 def score_model(
@@ -81,13 +67,13 @@ def score_model(
         line = scan_line_index(scan.shape, scan.scan_to_layout, scan.pitch_um, scan.bend_um)
         rows.append(cross_fitted_residual(*arrays, "full+rows", **geometry).row_sd_um)
         lines.append(cross_fitted_residual(*arrays, "full+rows", scan_line=line, **geometry).row_sd_um)
-    shapes = [
-        _shape(scan, expected, residual)
-        for scan, expected, residual in zip(scans, maps, residuals, strict=True)
+    table = [
+        _row(scan, score, metrics_of(scan, expected, residual))
+        for scan, score, expected, residual in zip(scans, chosen, maps, residuals, strict=True)
     ]
     return ModelScores(
         model=name,
-        scans=[_row(scan, score, shape) for scan, score, shape in zip(scans, chosen, shapes, strict=True)],
+        scans=table,
         mae_abs_nm=_mean(chosen, "mae_abs_nm"),
         mae_abs_ci95_nm=interval([score.mae_abs_nm for score in chosen]),
         bias_nm=_mean(chosen, "bias_nm"),
@@ -100,7 +86,7 @@ def score_model(
             _policy_error(policy, _scan_scores(scans, heights, policy, geometry)) for policy in bare
         ],
         phase_rms_waves=phase_waves(_mean(chosen, "rmse_datum_free_nm") / NM_PER_UM),
-        **_over_scans(shapes),
+        **metrics_over_scans(table),
         by_level=level_errors(scans, residuals),
         transfer=transfer_curves(scans, maps),
         row_offset_sd_nm=NM_PER_UM * float(np.sqrt(np.mean(np.square(rows)))),
@@ -135,63 +121,13 @@ def interval(values: Sequence[float]) -> Interval:
     return bootstrap_interval(values) if len(values) > 1 else None
 
 
-def noise_floor(dataset_name: str, analysis: str | Path | None = None) -> NoiseFloor:
-    """What is known about the floor of a dataset: from its noise analysis, else from the literature.
-
-    Args:
-        dataset_name: name of the dataset whose errors are reported.
-        analysis: ``noise.json``, or its folder, of this dataset or of scans without one.
-
-    Raises:
-        InputError: no noise analysis there, or one of another dataset.
-    """
-    if analysis is not None:
-        from litho_models.noise.result import NoiseAnalysis
-
-        found = NoiseAnalysis.read(analysis)
-        if found.dataset is not None and found.dataset.name != dataset_name:
-            raise InputError(f"noise analysis {analysis}", got=found.dataset.name, wanted=dataset_name)
-        return found.noise_floor
-    if dataset_name == "neural-lithography":
-        # 0.798 σ is the mean absolute value of a Gaussian of standard deviation σ.
-        return NoiseFloor(
-            mae_nm=12.7,
-            rmse_nm=15.96,
-            kind="literature",
-            source="roughness of the paper's flat print (arXiv:2309.17343); MAE 0.798 σ if Gaussian; "
-            "its band and levelling are not those of these scans",
-        )
-    return NoiseFloor(
-        mae_nm=None, rmse_nm=None, kind="unknown", source="no flat or repeated print in the store"
-    )
-
-
-def _row(scan: PrintedScan, score: ScanScore, shape: ShapeFigures) -> ScanRow:
+def _row(scan: PrintedScan, score: ScanScore, metrics: dict[str, Any]) -> ScanRow:
     kept: dict[str, Any] = {
         key: None if value != value else value  # NaN: cannot be known
         for key, value in asdict(score).items()
         if key in ScanRow.model_fields
     }
-    return ScanRow(scan=scan.id, print=scan.print_id, **kept, **shape.model_dump())
-
-
-def _shape(scan: PrintedScan, expected_um: np.ndarray, residual_um: np.ndarray) -> ShapeFigures:
-    freed = expected_um + residual_um
-    heights = mid_step_heights_um(scan.levels, scan.level_height_um)
-    edges = edge_placement(freed, expected_um, heights, scan.pitch_um)
-    named = {f"edge_{key}": value for key, value in edges._asdict().items()}
-    return ShapeFigures(ssim=structural_similarity(freed, expected_um), **named)
-
-
-def _over_scans(shapes: Sequence[ShapeFigures]) -> dict[str, Any]:
-    """Means of what is known, sums of counts."""
-    figures: dict[str, Any] = {}
-    for name in ("ssim", "edge_mean_nm", "edge_p95_nm"):
-        known = [value for value in (getattr(shape, name) for shape in shapes) if value is not None]
-        figures[name] = float(np.mean(known)) if known else None
-    for name in ("edge_matched", "edge_unmatched", "edge_unmatched_expected"):
-        figures[name] = sum(getattr(shape, name) for shape in shapes)
-    return figures
+    return ScanRow(scan=scan.id, print=scan.print_id, **kept, **metrics)
 
 
 def _mean(scores: Sequence[ScanScore], field: str) -> float:

@@ -430,7 +430,7 @@ def store(tmp_path_factory):
 
 def test_a_store_without_references_gets_a_lower_bound_that_is_one(store, tmp_path):
     from litho_models.noise import NoiseAnalysis, noise
-    from litho_models.scoring.scores import noise_floor
+    from litho_models.scoring.noise_floor import noise_floor
 
     result = noise(store, tmp_path / "out")
     assert NoiseAnalysis.read(tmp_path / "out") == result

@@ -7,15 +7,23 @@ import pytest
 import torch
 from prints import make_scan, make_scans
 
+from litho_data.foundation.errors import InputError
 from litho_models.evaluation.diagnostics import tile_consistency
+from litho_models.evaluation.tables import metric_table, metric_text, scan_table
 from litho_models.models import build_model
 from litho_models.prediction.cost import measured_predictions
 from litho_models.prediction.tiles import predict_scan
-from litho_models.scoring.edges import edge_placement, mid_step_heights_um
+from litho_models.scoring import metric_registry
+from litho_models.scoring.metric_registry import register_metric
 from litho_models.scoring.metrics import phase_waves
-from litho_models.scoring.records import Prediction
+from litho_models.scoring.records import ModelScores, Prediction
 from litho_models.scoring.scores import protocol_for, score_model
-from litho_models.scoring.similarity import SSIM_WINDOW_PX, structural_similarity
+from litho_models.scoring.shapes import (
+    SSIM_WINDOW_PX,
+    edge_placement,
+    mid_step_heights_um,
+    structural_similarity,
+)
 
 PITCH_UM = 0.1
 HEIGHTS_UM = mid_step_heights_um(13, 0.1)
@@ -122,6 +130,51 @@ def test_the_scores_of_the_truth_with_a_constant_error():
     assert free.scans[0].edge_matched == free.edge_matched
     assert scores.ssim < free.ssim
     assert scores.edge_mean_nm > free.edge_mean_nm
+
+
+@pytest.fixture
+def own_metrics(monkeypatch):
+    """Whatever a test registers is forgotten after it."""
+    monkeypatch.setattr(metric_registry, "_MEASUREMENTS", [*metric_registry._MEASUREMENTS])
+
+
+def test_a_metric_of_one_s_own_is_in_results_tables_and_text(own_metrics):
+    register_metric("worst", "nm", lambda scan, z, r: 1000 * np.nanmax(np.abs(r)), "worst is the largest.")
+    register_metric("high", "1", lambda scan, z, r: (z > 0.5).sum(), "high counts.", over_scans="sum")
+    register_metric("never", "um", lambda scan, z, r: float("nan"), "never is not known.")
+    scans = make_scans(3, size_px=64)
+    scores = score_model("flat", scans, [Prediction(scan.layout_um) for scan in scans], protocol_for("none"))
+    rows = [row.metrics for row in scores.scans]
+    for scan, row in zip(scans, rows, strict=True):
+        error = np.abs(scan.height_um - scan.layout_um)[scan.valid]
+        assert row == {"worst_nm": pytest.approx(1000 * error.max()), "high": row["high"], "never_um": None}
+        assert row["high"] == (scan.layout_um > 0.5).sum()
+    assert scores.metrics == {
+        "worst_nm": pytest.approx(np.mean([row["worst_nm"] for row in rows])),
+        "high": sum(row["high"] for row in rows),
+        "never_um": None,
+    }
+    assert metric_table([scores])["worst_nm"].tolist() == [scores.metrics["worst_nm"]]
+    assert scan_table([scores])["high"].tolist() == [row["high"] for row in rows]
+    assert "worst is the largest." in metric_text()
+    assert ModelScores.model_validate_json(scores.model_dump_json()) == scores
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "over_scans"),
+    [("ssim", "1", "mean"), ("edge_mean", "nm", "mean"), ("bias", "nm", "mean"), ("transfer", "1", "mean"),
+     ("two words", "nm", "mean"), ("good", "n m", "mean"), ("good", "nm", "median")],
+)  # fmt: skip
+def test_metrics_that_cannot_be_told_apart_are_refused(own_metrics, name, unit, over_scans):
+    with pytest.raises(InputError):
+        register_metric(name, unit, lambda *scan: 0.0, "", over_scans=over_scans)
+
+
+def test_a_metric_has_to_be_a_number(own_metrics):
+    register_metric("map", "nm", lambda scan, z, r: r, "a map.")
+    scan = make_scan(0, 64)
+    with pytest.raises(InputError, match="metric map, got a ndarray"):
+        score_model("flat", [scan], [Prediction(scan.layout_um)], protocol_for("none"))
 
 
 @pytest.mark.parametrize("name", ["identity", "affine"])

@@ -8,6 +8,7 @@ from pydantic import SerializerFunctionWrapHandler, model_serializer
 
 from litho_data.foundation.results import Record, Result
 from litho_models.run_info import RunInfo
+from litho_models.scoring.noise_floor import NoiseFloor
 
 EffectVerdict = Literal["explained", "confusable", "traced-to-covariate"]
 Verdict = Literal["traced", "nothing-missing", "unexplained"]
@@ -38,13 +39,6 @@ class Nuisance(Record):
     k: int = 1
     block_px: int
     seed: int
-
-
-class NoiseFloor(Record):
-    mae_nm: float | None
-    rmse_nm: float | None
-    kind: Literal["measured", "lower-bound", "literature"]
-    source: str
 
 
 class Errors(Record):

@@ -13,7 +13,6 @@ from litho_models.loop.result.record import (
     CloseLoop,
     Dataset,
     Errors,
-    NoiseFloor,
     Nuisance,
     Residual,
     Shares,
@@ -23,6 +22,7 @@ from litho_models.loop.result.record import (
 from litho_models.loop.scoring import DATUM_FREE, Score
 from litho_models.run_info import run_info
 from litho_models.scan_terms.nuisance import BLOCK_PX
+from litho_models.scoring.noise_floor import NoiseFloor
 
 _NO_TERMS: frozenset[str] = frozenset()
 

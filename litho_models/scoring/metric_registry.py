@@ -1,0 +1,145 @@
+"""Metrics of a scan beside its errors: each says its name, unit and meaning once, and every report shows it.
+
+A metric sees one scan, what the model expects of it, and the residual freed of the scan's nuisances. Those
+that come with the package are fields of the results; one's own are listed there under ``metrics``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError
+from litho_data.store import PrintedScan
+from litho_models.scoring.records import ModelScores, ScanRow
+from litho_models.scoring.shapes import EDGES_TEXT, SIMILARITY_TEXT, edges_of_scan, similarity_of_scan
+
+Summary = Literal["mean", "sum"]
+MetricFunction = Callable[[PrintedScan, np.ndarray, np.ndarray], float | None]
+
+
+class Metric(NamedTuple):
+    """What one figure is called and how those of the scans become that of a model."""
+
+    name: str
+    unit: str
+    over_scans: Summary = "mean"
+
+    @property
+    def key(self) -> str:
+        """Name in results and tables: with the unit, unless the figure has none (``1``)."""
+        return self.name if self.unit == "1" else f"{self.name}_{self.unit}"
+
+
+class Measurement(NamedTuple):
+    """Metrics that one function gives together, in this order, and what they are, in a sentence."""
+
+    metrics: tuple[Metric, ...]
+    function: Callable[[PrintedScan, np.ndarray, np.ndarray], Sequence[float | None]]
+    explanation: str
+
+
+_MEASUREMENTS = [
+    Measurement((Metric("ssim", "1"),), lambda *scan: (similarity_of_scan(*scan),), SIMILARITY_TEXT),
+    Measurement(
+        (
+            Metric("edge_mean", "nm"),
+            Metric("edge_p95", "nm"),
+            Metric("edge_matched", "1", "sum"),
+            Metric("edge_unmatched", "1", "sum"),
+            Metric("edge_unmatched_expected", "1", "sum"),
+        ),
+        edges_of_scan,
+        EDGES_TEXT,
+    ),
+]
+
+
+def register_metric(
+    name: str, unit: str, function: MetricFunction, explanation: str, *, over_scans: Summary = "mean"
+) -> Metric:
+    """Add a metric to every evaluation and benchmark made from now on in this process.
+
+    ``function(scan, prediction_um, residual_um)`` gets the ``PrintedScan``, the predicted map and the
+    measured minus predicted map freed of its nuisances, (ny, nx) in µm, NaN where not scored. It returns a
+    number, or None where there is nothing to measure. Example::
+
+        register_metric(
+            "worst_pixel", "nm", lambda scan, prediction, residual: 1000 * np.nanmax(np.abs(residual)),
+            "worst_pixel is the largest error of a scan.",
+        )
+
+    Results list it by scan and by model as ``metrics: {"worst_pixel_nm": …}``.
+
+    Args:
+        name: letters, digits and underscores; ``unit``: of the figure, ``1`` if it has none.
+        function: as above.
+        explanation: a sentence for the report.
+        over_scans: what a model gets: the mean of what is known, or the sum.
+
+    Raises:
+        InputError: a name or unit that is no identifier, a name that is taken, or another summary.
+    """
+    metric = Metric(name, unit, over_scans)
+    if not (name.isidentifier() and (unit == "1" or unit.isidentifier())):
+        raise InputError("metric", got=f"{name!r} in {unit!r}", wanted="letters, digits and underscores")
+    if over_scans not in get_args(Summary):
+        raise InputError(f"over_scans of {name}", got=over_scans, wanted=", ".join(get_args(Summary)))
+    taken = {known.key for known in registered_metrics()} | ScanRow.model_fields.keys()
+    if metric.key in taken | ModelScores.model_fields.keys():
+        raise InputError("metric", got=metric.key, wanted="a name that no other figure has")
+    _MEASUREMENTS.append(Measurement((metric,), lambda *scan: (function(*scan),), explanation))
+    return metric
+
+
+def registered_metrics() -> list[Metric]:
+    """All metrics, in the order of the tables."""
+    return [metric for measurement in _MEASUREMENTS for metric in measurement.metrics]
+
+
+def metrics_text() -> str:
+    """What the metrics are, in sentences."""
+    return " ".join(measurement.explanation for measurement in _MEASUREMENTS)
+
+
+def metrics_of(scan: PrintedScan, prediction_um: np.ndarray, residual_um: np.ndarray) -> dict[str, Any]:
+    """All metrics of one scan, as fields of ``MetricValues``; arrays (ny, nx) in µm.
+
+    Raises:
+        InputError: a metric that returns no number.
+    """
+    values: dict[str, float | None] = {}
+    for measurement in _MEASUREMENTS:
+        found = measurement.function(scan, prediction_um, residual_um)
+        values |= {m.key: _number(m, value) for m, value in zip(measurement.metrics, found, strict=True)}
+    return _as_fields(values)
+
+
+def metrics_over_scans(rows: Sequence[ScanRow]) -> dict[str, Any]:
+    """The metrics of a model from those of its scans: means of what is known, or sums, as fields."""
+    values = {}
+    for metric in registered_metrics():
+        known = [value for value in (row.metric(metric.key) for row in rows) if value is not None]
+        mean = float(np.mean(known)) if known else None
+        values[metric.key] = sum(known) if metric.over_scans == "sum" else mean
+    return _as_fields(values)
+
+
+def _as_fields(values: Mapping[str, float | None]) -> dict[str, Any]:
+    """Metrics of the package as fields of their own, all others under ``metrics``."""
+    own = {key: value for key, value in values.items() if key in ScanRow.model_fields}
+    return {**own, "metrics": {key: value for key, value in values.items() if key not in own}}
+
+
+def _number(metric: Metric, value: Any) -> float | None:
+    if value is None or isinstance(value, int):
+        return value
+    try:
+        number = float(value)
+    except (TypeError, ValueError) as error:
+        got = type(value).__name__
+        raise InputError(f"metric {metric.name}", got=f"a {got}", wanted="a number or None") from error
+    return number if math.isfinite(number) else None
