@@ -8,10 +8,9 @@ they learn the values themselves. Fixed weights in float32 run with fewer multip
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from itertools import chain, pairwise
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,11 +24,10 @@ from litho_models.fast.one_channel import (
     from_one_channel,
     onto_one_channel,
 )
+from litho_models.fast.threads import one_thread_each
 
 if TYPE_CHECKING:
     from litho_models.fast.winograd import FixedStack
-
-_Made = TypeVar("_Made")
 
 # 64 channels of 96 x 96 pixels are 1.1 MiB in bfloat16; larger tiles leave the cache, smaller ones repeat
 # more halo. Fixed weights in float32 run on blocks of a tile, so that it may be larger (on the way back in
@@ -104,7 +102,7 @@ class _Stack(torch.autograd.Function):
             return onto_one_channel(features.to(field.dtype), weights[-1]), values
 
         kept: list[Tensor] = []
-        computed = _one_thread_each(compute, len(tiles), fixed is not None)
+        computed = one_thread_each(compute, len(tiles))
         for (inside, _), (heights, values) in zip(tiles, computed, strict=True):
             out[inside] = heights
             kept += values
@@ -162,7 +160,7 @@ class _Stack(torch.autograd.Function):
 
         total = torch.zeros_like(field)
         sums = [torch.zeros_like(parameter) for parameter in parameters]
-        computed = _one_thread_each(compute, len(tiles), fixed is not None)
+        computed = one_thread_each(compute, len(tiles))
         for (_, around), (by_field, shares) in zip(tiles, computed, strict=True):
             if by_field is not None:
                 total[around] += by_field
@@ -172,29 +170,6 @@ class _Stack(torch.autograd.Function):
         if fixed is not None:
             fixed.free_rooms()
         return total, None, None, *(sums if learns else [None] * count)
-
-
-def _one_thread_each(compute: Callable[[int], _Made], count: int, is_serial: bool) -> Iterator[_Made]:
-    """``compute(0)``, ``compute(1)``, ... in order, side by side on the threads that PyTorch may use.
-
-    With fewer of them than threads each may use all threads in turn, unless it ``is_serial``.
-
-    A tile stays with one thread: shared out operation by operation, its features would move from one
-    core's cache to another's, and all threads would wait for the slowest after each.
-    """
-    threads = torch.get_num_threads()
-    workers = min(threads, count)
-    if workers < 2 or (workers < threads and not is_serial):
-        yield from map(compute, range(count))
-        return
-    # It holds for this thread and for those made from here on.
-    torch.set_num_threads(1)
-    try:
-        with ThreadPoolExecutor(workers) as pool:
-            # A new thread records gradients, whatever this one does.
-            yield from pool.map(torch.no_grad()(compute), range(count))
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _fixed_stack(

@@ -113,9 +113,10 @@ def test_a_reduced_adjoint_leaves_the_height_alone_and_the_gradients_close(learn
     assert torch.equal(*heights)
     # bfloat16 rounds by up to 2^-9 of a value; weights, slopes, features and results of three layers
     # add up to at most 12 such roundings.
-    for exact, reduced in zip(*gradients, strict=True):
-        assert float((reduced - exact).norm() / exact.norm()) < 12 * 2**-9
-    assert not torch.equal(gradients[0][0], gradients[1][0])
+    off = [float((reduced - exact).norm() / exact.norm()) for exact, reduced in zip(*gradients, strict=True)]
+    assert max(off) < 12 * 2**-9
+    # float32 would come 2^15 times closer.
+    assert off[0] > 2**-14
 
 
 def test_without_a_gradient_nothing_is_kept():
