@@ -15,7 +15,8 @@ from typing import Any
 
 from benchmarks.markdown_table import markdown_table, with_interval
 from benchmarks.record import publish
-from litho_models.evaluation.benchmark import Benchmark, benchmark
+from litho_models.evaluation.benchmark import benchmark
+from litho_models.evaluation.results import Benchmark
 from litho_models.fitting.config import PAPER_BATCH, PAPER_CROPS, PAPER_EPOCHS
 from litho_models.scoring.pairs import paired_scores
 from litho_models.scoring.records import ModelScores

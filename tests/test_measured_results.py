@@ -10,7 +10,7 @@ from benchmarks.measured_loop import loop_table
 from benchmarks.record import published
 from litho_design.judging.compare import GapResult
 from litho_design.judging.score import ScoreResult
-from litho_models.evaluation.benchmark import Benchmark
+from litho_models.evaluation.results import Benchmark
 from litho_models.loop.result.record import CloseLoop
 from litho_models.noise.result import NoiseAnalysis
 

@@ -96,7 +96,7 @@ def evaluate(
 ) -> None:
     """Score one frozen model on a store; on the dataset it was trained on, without the locked scans."""
     from litho_models.evaluation.evaluate import evaluate as evaluate_model
-    from litho_models.evaluation.evaluation_report import lock_box_text
+    from litho_models.evaluation.reports import lock_box_text
 
     result = evaluate_model(
         model,
@@ -189,7 +189,7 @@ def freeze(
     ] = None,
 ) -> None:
     """Write the process model only: weights, card and a page for people."""
-    from litho_models.fitting.runs import freeze as freeze_run
+    from litho_models.frozen.freezing import freeze as freeze_run
 
     card = freeze_run(run, out, declare_process or [])
     typer.echo(f"{card.name}: {card.parameters} parameters, frozen in {out}")

@@ -8,52 +8,30 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
-from typing import Any, ClassVar, Literal
-
-from pydantic import Field
+from typing import Any
 
 from litho_data.foundation.commands import progress
-from litho_data.foundation.results import Result
 from litho_data.store import PrintedScan, open_store
 from litho_data.store.lock_box import ids_sha256
-from litho_models.evaluation.benchmark_report import write_benchmark_report
-from litho_models.evaluation.evaluate import SplitRecord
 from litho_models.evaluation.fit_cache import FitRecord, fit_or_load
+from litho_models.evaluation.reports import write_benchmark_report
+from litho_models.evaluation.results import Benchmark
 from litho_models.fitting import TrainingConfig
 from litho_models.fitting.fit import common_geometry
 from litho_models.fitting.runs import training_config
 from litho_models.frozen.card import DatasetName
 from litho_models.models import build_model, require_models
-from litho_models.run_info import RunInfo, run_info
+from litho_models.run_info import run_info
 from litho_models.scan_terms.background import BackgroundUse
 from litho_models.scan_terms.nuisance import Policy
-from litho_models.scoring.noise_floor import NoiseFloor, noise_floor
-from litho_models.scoring.pairs import Paired, paired_scores
-from litho_models.scoring.records import ModelScores, NuisanceProtocol, Prediction
+from litho_models.scoring.noise_floor import noise_floor
+from litho_models.scoring.pairs import paired_scores
+from litho_models.scoring.records import ModelScores, Prediction
 from litho_models.scoring.scores import protocol_for, score_model
-from litho_models.splits.folds import GROUPED_FOLDS, SplitKind, plan_folds
+from litho_models.splits.folds import GROUPED_FOLDS, ScoredSplit, SplitKind, plan_folds
 
 BASELINES = ("identity", "affine", "affine-mtf", "blur-table", "linear")
 DEFAULT_MODELS = (*BASELINES, "physics", "pbl", "fno")
-
-
-class Benchmark(Result):
-    """``benchmark.json``."""
-
-    SCHEMA: ClassVar[str] = "litho-models/benchmark/1"
-    FILE_NAME: ClassVar[str] = "benchmark.json"
-
-    schema_: Literal["litho-models/benchmark/1"] = Field("litho-models/benchmark/1", alias="schema")
-    run: RunInfo
-    dataset: DatasetName
-    split: SplitRecord
-    nuisance: NuisanceProtocol
-    noise_floor: NoiseFloor
-    training: dict[str, dict[str, Any]]
-    scores: list[ModelScores]
-    locked_scores: list[ModelScores] = Field(default_factory=list)
-    paired: list[Paired]
-    fits: list[FitRecord]
 
 
 def benchmark(
@@ -123,7 +101,7 @@ def benchmark(
         schema="litho-models/benchmark/1",
         run=run_info([seed], len(scans)),
         dataset=DatasetName(name=dataset.name, sha256=dataset.sha256),
-        split=SplitRecord(
+        split=ScoredSplit(
             kind=split,
             folds=sum(not fold.locked for fold in plan),
             seed=seed,

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from litho_data.foundation.errors import InputError
-from litho_models.evaluation.benchmark import Benchmark
-from litho_models.evaluation.evaluate import Evaluation
+from litho_models.evaluation.results import Benchmark, Evaluation
 from litho_models.scoring.pairs import paired_scores
 from litho_models.scoring.records import ModelScores
 

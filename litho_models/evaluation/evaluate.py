@@ -4,72 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import ClassVar, Literal
-
-import numpy as np
-import torch
-from pydantic import Field
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.results import Record, Result
-from litho_data.store import PrintedScan, Store, open_store
+from litho_data.store import open_store
 from litho_data.store.lock_box import ids_sha256
-from litho_models.evaluation.diagnostics import TileConsistency, device_of, tile_consistency
-from litho_models.evaluation.evaluation_report import write_evaluation_report
+from litho_models.evaluation.diagnostics import device_of, tile_consistency
+from litho_models.evaluation.reports import write_evaluation_report
+from litho_models.evaluation.results import Evaluation, ModelRecord
 from litho_models.frozen import zoo
 from litho_models.frozen.card import DatasetName
 from litho_models.frozen.files import load_frozen
-from litho_models.frozen.simulator import FrozenSimulator
-from litho_models.prediction.cost import PredictionCost, measured_predictions
-from litho_models.run_info import RunInfo, run_info
-from litho_models.scan_terms.background import Background, BackgroundUse
+from litho_models.frozen.on_store import (
+    card_background,
+    locked_by_the_card,
+    made_of_these_prints,
+    predict_frozen,
+    trained_ids,
+)
+from litho_models.prediction.cost import measured_predictions
+from litho_models.run_info import run_info
+from litho_models.scan_terms.background import BackgroundUse
 from litho_models.scan_terms.nuisance import Policy
-from litho_models.scoring.noise_floor import NoiseFloor, noise_floor
-from litho_models.scoring.records import ModelScores, NuisanceProtocol, Prediction
+from litho_models.scoring.noise_floor import noise_floor
+from litho_models.scoring.records import Prediction
 from litho_models.scoring.scores import protocol_for, score_model
-
-
-class SplitRecord(Record):
-    """Which scans were scored, and how that set came about.
-
-    ``lock_box``: the locked scans of the dataset, scored or not; ``lock_box_opened``: whether any was scored.
-    """
-
-    kind: str
-    folds: int = 0
-    seed: int = 0
-    scored_ids: list[str]
-    scored_ids_sha256: str
-    lock_box: list[str] = Field(default_factory=list)
-    lock_box_opened: bool = False
-
-
-class ModelRecord(Record):
-    """The frozen model that was scored, and what its predictions cost."""
-
-    name: str
-    sha256: str
-    extrapolated: bool
-    parameters: int | None = None
-    tiles: TileConsistency | None = None
-    cost: PredictionCost | None = None
-
-
-class Evaluation(Result):
-    """``evaluation.json``."""
-
-    SCHEMA: ClassVar[str] = "litho-models/evaluation/1"
-    FILE_NAME: ClassVar[str] = "evaluation.json"
-
-    schema_: Literal["litho-models/evaluation/1"] = Field("litho-models/evaluation/1", alias="schema")
-    run: RunInfo
-    dataset: DatasetName
-    model: ModelRecord
-    split: SplitRecord
-    nuisance: NuisanceProtocol
-    noise_floor: NoiseFloor
-    trained_on_scored_scans: list[str]
-    scores: ModelScores
+from litho_models.splits.folds import ScoredSplit
 
 
 def evaluate(
@@ -113,12 +72,12 @@ def evaluate(
     frozen = load_frozen(zoo.model_folder(model), device=device, extrapolate=extrapolate)
     frozen.check_geometry(dataset.pitch_um, dataset.level_height_um)
     every = dataset.scans()
-    kept = _locked_by_the_card(frozen, dataset)
+    kept = locked_by_the_card(frozen, dataset)
     locked = sorted({*dataset.locked_ids, *kept})
     if scan_ids is not None:
         scans = [dataset.scan(scan_id) for scan_id in scan_ids]
     else:
-        own = _of_these_prints(frozen, dataset)
+        own = made_of_these_prints(frozen, dataset)
         scans = [scan for scan in every if open_lock_box or not own or scan.id not in locked]
     if not scans:
         raise InputError(f"scans of {store}", got="none", wanted="at least one to score")
@@ -139,7 +98,7 @@ def evaluate(
             tiles=tile_consistency(frozen.simulator, scans[0]),
             cost=cost,
         ),
-        split=SplitRecord(
+        split=ScoredSplit(
             kind="given",
             scored_ids=ids,
             scored_ids_sha256=ids_sha256(ids),
@@ -154,43 +113,3 @@ def evaluate(
     result.write(out)
     write_evaluation_report(result, scans, [prediction.map_um for prediction in predictions], out)
     return result
-
-
-def trained_ids(model: FrozenSimulator, dataset: Store) -> set[str]:
-    """The scans that the model was trained on, none where it was made of other prints than the store's."""
-    return set(model.card["training"].get("scan_ids", [])) if _of_these_prints(model, dataset) else set()
-
-
-def _of_these_prints(model: FrozenSimulator, dataset: Store) -> bool:
-    """Whether a model was made of the prints in a store: the same dataset, or the same locked scans in it."""
-    same_dataset = (model.card["dataset"] or {}).get("sha256") == dataset.sha256
-    return same_dataset or bool(_locked_by_the_card(model, dataset))
-
-
-def _locked_by_the_card(model: FrozenSimulator, dataset: Store) -> list[str]:
-    """The scans of a store that were locked when the model was made, by their raw files.
-
-    Another recipe or registration changes every height of a store, a scan more or less the box that it
-    draws, but neither changes a raw file. A card that lists no files locks the ids of its box in a dataset of
-    the same name.
-    """
-    split = model.card["split"]
-    if files := split.get("lock_box_files_sha256"):
-        return [scan_id for scan_id, file in dataset.files_sha256(dataset.ids).items() if file in files]
-    same_name = (model.card["dataset"] or {}).get("name") == dataset.name
-    return [scan_id for scan_id in split.get("lock_box", []) if same_name and scan_id in dataset.ids]
-
-
-def card_background(model: FrozenSimulator, scans: Sequence[PrintedScan]) -> Background | None:
-    """The background in a model's card, if it has one and the scans are of the size it was learned on."""
-    stated = model.card["background"]
-    learned = Background.model_validate(stated) if stated is not None else None
-    return learned if learned is not None and all(learned.fits(scan) for scan in scans) else None
-
-
-def predict_frozen(model: FrozenSimulator, scan: PrintedScan) -> np.ndarray:
-    """Height that a frozen model expects for a scan, float32 (ny, nx) µm."""
-    device = next((p.device for p in model.parameters()), torch.device("cpu"))
-    with torch.no_grad():
-        layout = torch.from_numpy(scan.layout_um)[None, None].to(device)
-        return model(layout, pitch_um=scan.pitch_um, level_height_um=scan.level_height_um)[0, 0].cpu().numpy()

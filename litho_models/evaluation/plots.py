@@ -1,4 +1,4 @@
-"""Figures of the evaluation and benchmark reports."""
+"""Plots of the evaluation and benchmark reports."""
 
 from __future__ import annotations
 

@@ -11,12 +11,13 @@ from threadpoolctl import threadpool_limits
 
 from litho_data.foundation.errors import InputError
 from litho_data.store import PrintedScan, Store, open_store
-from litho_models.evaluation.evaluate import card_background, predict_frozen
 from litho_models.fitting.config import Recipe
-from litho_models.fitting.runs import MODEL_FOLDER, freeze, train
+from litho_models.fitting.runs import train
 from litho_models.frozen import zoo
 from litho_models.frozen.card import Metric, ModelCard
 from litho_models.frozen.files import load_frozen
+from litho_models.frozen.freezing import MODEL_FOLDER, freeze
+from litho_models.frozen.on_store import card_background, predict_frozen
 from litho_models.scan_terms.background import BackgroundUse
 from litho_models.scan_terms.nuisance import Policy
 from litho_models.scoring.noise_floor import noise_floor
@@ -144,7 +145,7 @@ def _metrics(scores: ModelScores, split: str, background: BackgroundUse) -> list
 
 
 def _out_of_fold(benchmark: str | Path, dataset: Store) -> dict[str, list[Metric]]:
-    from litho_models.evaluation.benchmark import Benchmark
+    from litho_models.evaluation.results import Benchmark
 
     result = Benchmark.read(benchmark)
     if (result.dataset.sha256, result.split.kind) != (dataset.sha256, "grouped"):

@@ -23,7 +23,7 @@ from litho_models.fitting.stochastic import train_network
 from litho_models.models import build_model
 from litho_models.prediction.tiles import predict_scan
 from litho_models.simulator import Simulator
-from litho_models.splits.splits import inner_validation
+from litho_models.splits.folds import inner_validation
 
 # Closed form and close to the data: from it a network gets its first nuisances.
 STIFF_MODEL = "linear"

@@ -1,4 +1,4 @@
-"""Run folders: train a model on a store, resumable, and freeze what came out."""
+"""Run folders: train a model on a store, resumable."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from litho_data.store.lock_box import ids_sha256
 from litho_models.fitting import TrainingConfig, fit_with_record
 from litho_models.fitting.checkpoint import RoundRecord
 from litho_models.fitting.config import Recipe
-from litho_models.frozen import zoo
-from litho_models.frozen.card import CARD_FILE, DatasetName, ModelCard
-from litho_models.frozen.files import load_simulator, save_frozen
+from litho_models.frozen.card import DatasetName
+from litho_models.frozen.files import save_frozen
+from litho_models.frozen.freezing import MODEL_FOLDER
 from litho_models.prediction.tiles import predict_scan
 from litho_models.run_info import RunInfo, run_info
 from litho_models.scan_terms.training import learn_background
 from litho_models.simulator import Variant
 
-MODEL_FOLDER, CHECKPOINT_FOLDER = "model", "checkpoint"
+CHECKPOINT_FOLDER = "checkpoint"
 
 
 class TrainingRun(Result):
@@ -133,58 +133,6 @@ def _require_same_run(folder: Path, facts: dict[str, Any]) -> None:
             wanted="a new folder, or the same run again",
             hint="choose another --out, or delete the folder",
         )
-
-
-def freeze(source: str | Path, out: str | Path, declare_process: Sequence[str] = ()) -> ModelCard:
-    """Write the process model of a run folder, or of a model folder, as a frozen model.
-
-    Args:
-        source: what ``train`` or ``close-loop`` wrote, or a frozen model (a folder, ``zoo:NAME``).
-        out: folder of the frozen model.
-        declare_process: effects of undetermined role that the user declares part of the printer; the
-            card records the declaration.
-
-    Raises:
-        InputError: no model there, or an effect that is not among the undetermined ones.
-    """
-    folder = zoo.model_folder(source)
-    folder = folder if (folder / CARD_FILE).exists() else folder / MODEL_FOLDER
-    if not (folder / CARD_FILE).exists():
-        raise InputError(f"no model in {source}", wanted="a folder of `litho-models train` or a frozen model")
-    card = ModelCard.read(folder / CARD_FILE)
-    undetermined = dict(card.undetermined_effects)
-    process = dict(card.process_effects)
-    for name in declare_process:
-        if name not in undetermined:
-            raise InputError(
-                "--declare-process", got=name, wanted=", ".join(undetermined) or "nothing to declare"
-            )
-        process[name] = undetermined.pop(name)
-    kept = card.model_dump(mode="json", by_alias=True, include=_CARRIED_FIELDS)
-    kept["undetermined_effects"] = undetermined
-    kept["declared_processes"] = [*card.declared_processes, *declare_process]
-    simulator = load_simulator(folder, card)
-    save_frozen(simulator, out, name=card.name, process_effects=process, **kept)
-    return ModelCard.read(Path(out) / CARD_FILE)
-
-
-_CARRIED_FIELDS = {
-    "training_level_share",
-    "dataset",
-    "training",
-    "command",
-    "split",
-    "nuisance",
-    "background",
-    "metrics",
-    "noise_floor",
-    "measurement_effects",
-    "confusable_sets",
-    "unexplained_fraction",
-    "fabrication_batch",
-    "optimiser_gap",
-    "limitations",
-}
 
 
 def training_config(recipe: Recipe, model: str, settings: dict[str, Any]) -> TrainingConfig:

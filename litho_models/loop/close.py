@@ -29,7 +29,7 @@ from litho_models.loop.single_scans.tests import MeasurementTest, measurement_te
 from litho_models.loop.state import State, fit_state
 from litho_models.loop.structure import covariate_tests, is_structured
 from litho_models.models import build_model
-from litho_models.splits.splits import grouped_folds
+from litho_models.splits.folds import grouped_folds
 
 
 def close_loop(

@@ -10,10 +10,10 @@ import numpy as np
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import Store
-from litho_models.evaluation.evaluate import card_background, predict_frozen, trained_ids
 from litho_models.frozen import zoo
 from litho_models.frozen.card import CARD_FILE
 from litho_models.frozen.files import load_frozen
+from litho_models.frozen.on_store import card_background, predict_frozen, trained_ids
 from litho_models.noise.calibration import Residuals
 from litho_models.scan_terms.nuisance import cross_fitted_residual
 from litho_models.scoring.records import NuisanceProtocol, Prediction
@@ -78,7 +78,7 @@ def disagreement_um(predictions_um: Sequence[np.ndarray]) -> np.ndarray:
 def _of_benchmarks(
     store: Store, folders: Sequence[Path], model: str | None
 ) -> tuple[str, Predictions, NuisanceProtocol]:
-    from litho_models.evaluation.benchmark import Benchmark
+    from litho_models.evaluation.results import Benchmark
 
     members: Predictions = {}
     chosen = model

@@ -1,4 +1,8 @@
-"""The folds of a benchmark: which scans are learned from and which are predicted."""
+"""Which scans are learned from and which are predicted; ``litho_data.store.lock_box`` says which stay locked.
+
+The unit is the whole scan, because the quadrants of one scan share its datum, tip and day. Every
+choice follows from a hash of the ids and a seed, so the same ids always give the same split.
+"""
 
 from __future__ import annotations
 
@@ -6,12 +10,50 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from pydantic import Field
+
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
-from litho_models.splits.splits import QUADRANTS, Crop, grouped_folds, leave_one_print_out, paper_draw
+from litho_data.store.lock_box import drawing_key, require_unique
 
 SplitKind = Literal["grouped", "paper", "leave-one-print-out"]
 GROUPED_FOLDS = 5
+QUADRANTS = (0, 1, 2, 3)
+
+
+class Split(Record):
+    """How a dataset was divided; ``lock_box``: its locked scans, scored or not."""
+
+    kind: str
+    folds: int = 0
+    lock_box: list[str] = Field(default_factory=list)
+
+
+class ScoredSplit(Split):
+    """Which scans were scored; ``lock_box_opened``: whether any locked one was."""
+
+    seed: int = 0
+    scored_ids: list[str]
+    scored_ids_sha256: str
+    lock_box_opened: bool = False
+
+
+@dataclass(frozen=True)
+class Crop:
+    """A quadrant of a scan: 0 top left, 1 top right, 2 bottom left, 3 bottom right."""
+
+    scan_id: str
+    quadrant: int
+
+    def slices(self, shape: tuple[int, int]) -> tuple[slice, slice]:
+        """Rows and columns of the quadrant in an array of ``shape`` (ny, nx)."""
+        half_y, half_x = shape[0] // 2, shape[1] // 2
+        row, column = divmod(self.quadrant, 2)
+        return (
+            slice(half_y, shape[0]) if row else slice(0, half_y),
+            slice(half_x, shape[1]) if column else slice(0, half_x),
+        )
 
 
 @dataclass(frozen=True)
@@ -70,6 +112,56 @@ def plan_folds(
     if open_lock_box:
         plan.append(Fold(len(plan), development, [scan for scan in scans if scan.id in locked], locked=True))
     return plan
+
+
+def grouped_folds(ids: Sequence[str], k: int = 5, seed: int = 0) -> list[list[str]]:
+    """Deal the scans into ``k`` folds; each fold lists the ids held out of its training.
+
+    Raises:
+        InputError: ids that repeat, fewer than two, or ``k`` outside 2 ... number of scans.
+    """
+    require_unique(ids)
+    if len(ids) < 2:
+        raise InputError("scans to deal into folds", got=len(ids), wanted="at least 2, one of them held out")
+    if not 2 <= k <= len(ids):
+        raise InputError("number of folds", got=k, wanted=f"2 to {len(ids)}, the number of scans")
+    shuffled = sorted(ids, key=lambda scan_id: drawing_key(scan_id, seed))
+    return [sorted(shuffled[fold::k]) for fold in range(k)]
+
+
+def leave_one_print_out(ids: Sequence[str], print_ids: Sequence[str]) -> list[list[str]]:
+    """One fold per print, in the order of the print names: all its scans are held out.
+
+    Raises:
+        InputError: fewer than two prints.
+    """
+    require_unique(ids)
+    prints = sorted(set(print_ids))
+    if len(prints) < 2:
+        raise InputError("leave-one-print-out", got=f"{len(prints)} print", wanted="at least 2 prints")
+    return [
+        sorted(scan_id for scan_id, name in zip(ids, print_ids, strict=True) if name == held_out)
+        for held_out in prints
+    ]
+
+
+def paper_draw(ids: Sequence[str], draw: int, held_out_fraction: float = 0.25) -> list[Crop]:
+    """The crops held out in one random draw over quadrants, as in the paper (24 of 96).
+
+    Quadrants of one scan land on both sides: leaky, for comparison with the paper only.
+    """
+    require_unique(ids)
+    crops = [Crop(scan_id, quadrant) for scan_id in ids for quadrant in QUADRANTS]
+    shuffled = sorted(crops, key=lambda crop: drawing_key(f"{crop.scan_id} {crop.quadrant}", draw))
+    held_out = shuffled[: round(held_out_fraction * len(crops))]
+    return sorted(held_out, key=lambda crop: (crop.scan_id, crop.quadrant))
+
+
+def inner_validation(ids: Sequence[str], count: int, seed: int = 0) -> list[str]:
+    """Training scans set aside to choose the checkpoint: ``count``, but at most a quarter of all."""
+    require_unique(ids)
+    shuffled = sorted(ids, key=lambda scan_id: drawing_key(f"validation {scan_id}", seed))
+    return sorted(shuffled[: min(count, len(ids) // 4)])
 
 
 def _quadrant(scan: PrintedScan, crop: Crop) -> PrintedScan:

@@ -13,8 +13,9 @@ from litho_models import load_frozen, save_frozen
 from litho_models.evaluation.benchmark import benchmark
 from litho_models.evaluation.compare import compare
 from litho_models.evaluation.evaluate import evaluate
-from litho_models.fitting.runs import freeze, train
+from litho_models.fitting.runs import train
 from litho_models.frozen.card import ModelCard
+from litho_models.frozen.freezing import freeze
 from litho_models.models import build_model
 from litho_models.scan_terms.background import Background
 from litho_models.scan_terms.nuisance import TERM_COUNT

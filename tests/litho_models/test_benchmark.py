@@ -17,11 +17,13 @@ from litho_data.store import open_store
 from litho_data.store.lock_box import locked_ids
 from litho_data.store.write import write_table
 from litho_data.virtual_fab import simulate
-from litho_models.evaluation.benchmark import Benchmark, benchmark
+from litho_models.evaluation.benchmark import benchmark
 from litho_models.evaluation.compare import compare
-from litho_models.evaluation.evaluate import Evaluation, evaluate
-from litho_models.fitting.runs import TrainingRun, freeze, train
+from litho_models.evaluation.evaluate import evaluate
+from litho_models.evaluation.results import Benchmark, Evaluation
+from litho_models.fitting.runs import TrainingRun, train
 from litho_models.frozen.card import DatasetName
+from litho_models.frozen.freezing import freeze
 from litho_models.splits.folds import plan_folds
 
 MODELS = ("identity", "affine", "linear")

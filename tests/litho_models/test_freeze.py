@@ -14,9 +14,9 @@ from safetensors.torch import load_file, save_file
 
 from litho_data.foundation.errors import InputError
 from litho_models import load_frozen, save_frozen
-from litho_models.fitting.runs import freeze
 from litho_models.frozen.card import CARD_FILE, ModelCard
 from litho_models.frozen.files import README_FILE, WEIGHTS_FILE
+from litho_models.frozen.freezing import freeze
 from litho_models.models import build_model
 
 

@@ -18,8 +18,7 @@ from litho_models.fitting.checkpoint import CheckpointFolder
 from litho_models.fitting.runs import TrainingRun, train
 from litho_models.frozen.card import ModelCard
 from litho_models.noise.residuals import read_residuals
-from litho_models.splits.folds import plan_folds
-from litho_models.splits.splits import grouped_folds
+from litho_models.splits.folds import grouped_folds, plan_folds
 
 QUICK = {"steps": 2, "rounds": 2, "batch": 1, "crop_px": 32, "nuisance": "offset"}
 

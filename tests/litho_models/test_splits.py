@@ -9,7 +9,7 @@ import pytest
 
 from litho_data.foundation.errors import InputError
 from litho_data.store.lock_box import lock_box, lock_box_size
-from litho_models.splits.splits import (
+from litho_models.splits.folds import (
     Crop,
     grouped_folds,
     inner_validation,

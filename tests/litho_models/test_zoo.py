@@ -98,8 +98,8 @@ def test_unknown_names_and_paths_are_refused(small_zoo):
 
 def test_every_command_that_takes_a_frozen_model_takes_it_from_the_zoo(store, tmp_path):
     from litho_data.store import open_store
-    from litho_models.evaluation.evaluate import Evaluation
-    from litho_models.fitting.runs import freeze
+    from litho_models.evaluation.results import Evaluation
+    from litho_models.frozen.freezing import freeze
     from litho_models.loop.run import _base_model
     from litho_models.noise.residuals import read_residuals
 
@@ -118,7 +118,7 @@ def test_every_command_that_takes_a_frozen_model_takes_it_from_the_zoo(store, tm
 
 
 def test_listing_the_zoo_loads_no_torch():
-    code = "import sys, litho_models; litho_models.frozen.zoo.list(); print('torch' in sys.modules)"
+    code = "import sys, litho_models; litho_models.zoo.list(); print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
 

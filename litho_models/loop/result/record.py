@@ -9,6 +9,7 @@ from pydantic import SerializerFunctionWrapHandler, model_serializer
 from litho_data.foundation.results import Record, Result
 from litho_models.run_info import RunInfo
 from litho_models.scoring.noise_floor import NoiseFloor
+from litho_models.splits.folds import Split
 
 EffectVerdict = Literal["explained", "confusable", "traced-to-covariate"]
 Verdict = Literal["traced", "nothing-missing", "unexplained"]
@@ -26,12 +27,6 @@ CandidateVerdict = Literal[
 class Dataset(Record):
     name: str
     sha256: str
-
-
-class Split(Record):
-    kind: Literal["grouped"] = "grouped"
-    folds: int
-    lock_box: list[str]
 
 
 class Nuisance(Record):

@@ -16,13 +16,13 @@ from litho_models.loop.result.record import (
     Nuisance,
     Residual,
     Shares,
-    Split,
     Verdict,
 )
 from litho_models.loop.scoring import DATUM_FREE, Score
 from litho_models.run_info import run_info
 from litho_models.scan_terms.nuisance import BLOCK_PX
 from litho_models.scoring.noise_floor import NoiseFloor
+from litho_models.splits.folds import Split
 
 _NO_TERMS: frozenset[str] = frozenset()
 
@@ -46,7 +46,7 @@ def summarise(closed: Closed, *, dataset: tuple[str, str], base_name: str, dropp
         run=run_info([closed.config.seed], len(closed.development) + len(closed.locked), dropped),
         dataset=Dataset(name=dataset[0], sha256=dataset[1]),
         base_model=base_name,
-        split=Split(folds=int(closed.fold_of.max()) + 1, lock_box=closed.lock_box),
+        split=Split(kind="grouped", folds=int(closed.fold_of.max()) + 1, lock_box=closed.lock_box),
         nuisance=Nuisance(block_px=BLOCK_PX, seed=closed.config.seed),
         prior_hypotheses=list(closed.config.prior_hypotheses),
         noise_floor=NoiseFloor(

@@ -1,0 +1,243 @@
+"""``report.html`` of an evaluation and of a benchmark."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from litho_data.foundation.report import Page
+from litho_data.store import PrintedScan
+from litho_models.evaluation import plots, tables
+from litho_models.evaluation.results import Benchmark, Evaluation, ModelRecord
+from litho_models.scoring.records import ModelScores, NuisanceProtocol, ScanRow
+from litho_models.splits.folds import ScoredSplit
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_PAPER_DATASET = "neural-lithography"
+_SPLIT_TEXT = {
+    "grouped": "whole scans are held out; scans of the lock box are in no fold",
+    "leave-one-print-out": "all scans of one print are held out at a time; the lock box is in no fold",
+    "paper": "a random quarter of the quadrants is held out: quadrants of one scan lie on both sides, so "
+    "this split is leaky and serves comparison with the paper only",
+}
+
+
+def write_evaluation_report(
+    result: Evaluation, scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray], out: str | Path
+) -> Path:
+    """Render the result into ``out``; returns the page."""
+    scores = result.scores
+    page = Page(
+        f"{result.model.name} on {result.dataset.name}",
+        f"{len(scores.scans)} scans, datum-free MAE {scores.mae_datum_free_nm:.2f} nm.",
+    )
+    page.tiles(
+        [
+            (f"{scores.mae_datum_free_nm:.2f} nm", "MAE, datum-free"),
+            (f"{scores.mae_abs_nm:.2f} nm", "MAE, no fit at test time"),
+            (f"{scores.bias_nm:.1f} nm", "bias"),
+        ]
+    )
+    if result.trained_on_scored_scans:
+        count = len(result.trained_on_scored_scans)
+        page.note(f"{count} of the scored scans were used in training: this is not a held-out error.")
+    page.note(lock_box_text(result.split))
+    if result.model.extrapolated:
+        page.note("Layouts beyond the calibrated range were accepted (extrapolate).")
+    page.paragraph(tables.protocol_text(result.nuisance))
+    page.figure(plots.error_bars([scores], result.noise_floor, False), "Error and noise floor.")
+    page.table(tables.headline_table([scores], result.noise_floor), "Error over scans.", "headline.csv")
+    page.paragraph(tables.floor_text(result.noise_floor))
+    _policies(page, [scores], result.nuisance)
+    page.table(tables.metric_table([scores]), "Phase, similarity, edges.", "shapes.csv", digits=3)
+    page.paragraph(tables.metric_text())
+    page.table(
+        _model(result.model),
+        "The same pixels in another crop; what predicting a scan costs on the machine that made this.",
+        "model.csv",
+    )
+    worst = max(range(len(scans)), key=lambda i: scores.scans[i].mae_datum_free_nm)
+    shown = {scores.model: predictions_um[worst]}
+    page.heading("The worst scan")
+    page.figure(plots.residual_maps(scans[worst], shown, result.nuisance), "Measured height and error.")
+    page.figure(plots.line_profiles(scans[worst], shown, result.nuisance), "Middle row.")
+    _by_level_and_frequency(page, [scores])
+    _all_numbers(page, [scores], "By scan.", "By level.")
+    page.code(result.run.command)
+    return page.write(out)
+
+
+def write_benchmark_report(
+    result: Benchmark,
+    scans: Sequence[PrintedScan],
+    predictions_um: Mapping[str, Mapping[str, np.ndarray]],
+    out: str | Path,
+) -> Path:
+    """Render the result into ``out``; ``predictions_um`` is model name -> scan id -> height."""
+    scores = sorted(result.scores, key=lambda s: -s.mae_datum_free_nm)
+    best = scores[-1]
+    on_paper_data = result.dataset.name == _PAPER_DATASET
+    page = Page(
+        f"Benchmark on {result.dataset.name}",
+        f"Best held-out model: {best.model}, {best.mae_datum_free_nm:.2f} nm datum-free MAE "
+        f"over {len(best.scans)} held-out {'quadrants' if result.split.kind == 'paper' else 'scans'}.",
+    )
+    page.paragraph(f"Split '{result.split.kind}': {_SPLIT_TEXT[result.split.kind]}.")
+    page.figure(plots.error_bars(scores, result.noise_floor, on_paper_data), "Held-out error of every model.")
+    page.table(tables.headline_table(scores, result.noise_floor), "Held-out error.", "benchmark.csv")
+    page.paragraph(tables.protocol_text(result.nuisance))
+    if on_paper_data:
+        page.note(paper_sentence(result.split.kind))
+    page.paragraph(tables.floor_text(result.noise_floor))
+    if result.locked_scores:
+        page.heading("Lock box")
+        page.table(
+            tables.headline_table(result.locked_scores, result.noise_floor),
+            "Trained on all development scans, scored once on the locked scans.",
+            "lock_box.csv",
+        )
+    _policies(page, scores, result.nuisance)
+    page.heading("Pairs of models")
+    page.table(
+        _pairs(result), "Datum-free MAE, first minus second, over the same scans.", "pairs.csv", digits=3
+    )
+    page.heading("Phase, similarity, edges")
+    page.table(tables.metric_table(scores), "Means over held-out scans.", "shapes.csv", digits=3)
+    page.paragraph(tables.metric_text())
+    page.heading("One scan")
+    middle = _median_scan(best.scans)
+    shown = {s.model: predictions_um[s.model][scans[middle].id] for s in scores}
+    page.figure(
+        plots.residual_maps(scans[middle], shown, result.nuisance),
+        f"{scans[middle].id}, the scan of median error: measured height and held-out errors.",
+    )
+    profiles = {name: shown[name] for name in [s.model for s in scores[-2:]]}
+    page.figure(plots.line_profiles(scans[middle], profiles, result.nuisance), "Its middle row.")
+    page.heading("Gain and offset of single prints")
+    page.figure(
+        plots.print_gains(best),
+        f"Line through measured against predicted height ({best.model}, nothing fitted to the scan before); "
+        "95 % ellipses from blocks of 32 px. Numbers in scans.csv.",
+    )
+    _by_level_and_frequency(page, scores)
+    page.heading("Training")
+    page.table(
+        _fits(result),
+        "Every fit: datum-free error on its training, inner-validation and held-out scans, all without a "
+        "background (policy offset), so that over-fitting shows; the largest and the RMS difference of the "
+        "same pixels in another crop; what training and predicting a scan cost on the machine at hand.",
+        "fits.csv",
+        digits=3,
+    )
+    curves = [fit for fit in result.fits if len(fit.steps) > 1]
+    if curves:
+        page.figure(plots.loss_curves(curves), "Error during training.")
+    _all_numbers(page, scores, "By model and scan.", "By model and level.")
+    page.code(result.run.command)
+    return page.write(out)
+
+
+def lock_box_text(split: ScoredSplit) -> str:
+    """What was done with the locked scans of the dataset."""
+    if not split.lock_box:
+        return "The dataset is too small for locked scans."
+    scored = [scan_id for scan_id in split.lock_box if scan_id in split.scored_ids]
+    if not scored:
+        return f"The {len(split.lock_box)} locked scans of the dataset were left out."
+    return f"Locked scans of the dataset are among the scored ones: {', '.join(scored)}."
+
+
+def paper_sentence(split: str) -> str:
+    """Why a figure here is or is not comparable with the paper's."""
+    shared = (
+        f"The paper reports {plots.PAPER_MAE_NM} nm for PBL on 24 of 96 random quadrants, on 8-bit heights "
+        "shifted to a minimum of zero, for the checkpoint chosen on those same quadrants. "
+    )
+    if split == "paper":
+        return shared + (
+            "This split is of the same kind, but heights are floating point and the checkpoint is not chosen "
+            "on the scored quadrants: close to comparable, with mae_abs, as a leaky figure."
+        )
+    return shared + (
+        "Here whole scans are held out and nothing is chosen on them; mae_abs carries the unknown datum of "
+        "each new scan and mae_datum_free does not. Neither is comparable with the paper's as a number."
+    )
+
+
+def _policies(page: Page, scores: Sequence[ModelScores], protocol: NuisanceProtocol) -> None:
+    page.table(
+        tables.policy_table(scores, protocol),
+        "MAE under every nuisance policy, with and without the background, nm.",
+        "policies.csv",
+    )
+
+
+def _by_level_and_frequency(page: Page, scores: Sequence[ModelScores]) -> None:
+    page.heading("By level and frequency")
+    page.figure(plots.level_bias(scores), "Error by printed level.")
+    page.figure(plots.transfer(scores), "Transfer, coherence and error by spatial frequency.")
+    page.table(
+        tables.band_table(scores),
+        "How far up in frequency the prediction follows the measurement, cycles/µm.",
+        "bands.csv",
+    )
+    page.paragraph(tables.band_text())
+
+
+def _all_numbers(page: Page, scores: Sequence[ModelScores], by_scan: str, by_level: str) -> None:
+    page.heading("Tables")
+    page.table(tables.scan_table(scores), by_scan, "scans.csv")
+    page.table(tables.level_table(scores), by_level, "levels.csv")
+    page.heading("Things worth knowing about these numbers")
+    for note in tables.caveats(scores):
+        page.paragraph(note)
+
+
+def _model(model: ModelRecord) -> pd.DataFrame:
+    import pandas as pd
+
+    assert model.cost is not None, "an evaluation measures its predictions"
+    columns = tables.prediction_columns(model.tiles, model.cost)
+    return pd.DataFrame([{"model": model.name, "parameters": model.parameters, **columns}])
+
+
+def _pairs(result: Benchmark) -> pd.DataFrame:
+    import pandas as pd
+
+    rows = [
+        {**pair.model_dump(exclude={"ci95_nm"}), "ci95_nm": tables.interval_text(pair.ci95_nm)}
+        for pair in result.paired
+    ]
+    return pd.DataFrame(rows)
+
+
+def _fits(result: Benchmark) -> pd.DataFrame:
+    import pandas as pd
+
+    rows = []
+    for fit in result.fits:
+        found = fit.diagnostics
+        assert found is not None, "a benchmark diagnoses every fit"
+        rows.append(
+            {
+                "model": fit.model,
+                "fold": fit.fold,
+                "training_nm": found.training_nm,
+                "inner_validation_nm": found.inner_validation_nm,
+                "held_out_nm": found.held_out_nm,
+                "parameters": fit.parameters,
+                "training_s": fit.seconds,
+                **tables.prediction_columns(found.tiles, found.cost),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def _median_scan(rows: Sequence[ScanRow]) -> int:
+    errors = np.array([row.mae_datum_free_nm for row in rows])
+    return int(np.argsort(errors)[len(errors) // 2])

@@ -1,0 +1,65 @@
+"""The results of this room: ``evaluation.json`` of one frozen model, ``benchmark.json`` of many fits."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field
+
+from litho_data.foundation.results import Record, Result
+from litho_models.evaluation.diagnostics import TileConsistency
+from litho_models.evaluation.fit_cache import FitRecord
+from litho_models.frozen.card import DatasetName
+from litho_models.prediction.cost import PredictionCost
+from litho_models.run_info import RunInfo
+from litho_models.scoring.noise_floor import NoiseFloor
+from litho_models.scoring.pairs import Paired
+from litho_models.scoring.records import ModelScores, NuisanceProtocol
+from litho_models.splits.folds import ScoredSplit
+
+
+class ModelRecord(Record):
+    """The frozen model that was scored, and what its predictions cost."""
+
+    name: str
+    sha256: str
+    extrapolated: bool
+    parameters: int | None = None
+    tiles: TileConsistency | None = None
+    cost: PredictionCost | None = None
+
+
+class Evaluation(Result):
+    """``evaluation.json``."""
+
+    SCHEMA: ClassVar[str] = "litho-models/evaluation/1"
+    FILE_NAME: ClassVar[str] = "evaluation.json"
+
+    schema_: Literal["litho-models/evaluation/1"] = Field("litho-models/evaluation/1", alias="schema")
+    run: RunInfo
+    dataset: DatasetName
+    model: ModelRecord
+    split: ScoredSplit
+    nuisance: NuisanceProtocol
+    noise_floor: NoiseFloor
+    trained_on_scored_scans: list[str]
+    scores: ModelScores
+
+
+class Benchmark(Result):
+    """``benchmark.json``."""
+
+    SCHEMA: ClassVar[str] = "litho-models/benchmark/1"
+    FILE_NAME: ClassVar[str] = "benchmark.json"
+
+    schema_: Literal["litho-models/benchmark/1"] = Field("litho-models/benchmark/1", alias="schema")
+    run: RunInfo
+    dataset: DatasetName
+    split: ScoredSplit
+    nuisance: NuisanceProtocol
+    noise_floor: NoiseFloor
+    training: dict[str, dict[str, Any]]
+    scores: list[ModelScores]
+    locked_scores: list[ModelScores] = Field(default_factory=list)
+    paired: list[Paired]
+    fits: list[FitRecord]

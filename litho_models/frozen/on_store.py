@@ -1,0 +1,52 @@
+"""A frozen model on the scans of a store: what it predicts, and which of them it has seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from litho_data.store import PrintedScan, Store
+from litho_models.frozen.simulator import FrozenSimulator
+from litho_models.scan_terms.background import Background
+
+
+def predict_frozen(model: FrozenSimulator, scan: PrintedScan) -> np.ndarray:
+    """Height that a frozen model expects for a scan, float32 (ny, nx) µm."""
+    device = next((p.device for p in model.parameters()), torch.device("cpu"))
+    with torch.no_grad():
+        layout = torch.from_numpy(scan.layout_um)[None, None].to(device)
+        return model(layout, pitch_um=scan.pitch_um, level_height_um=scan.level_height_um)[0, 0].cpu().numpy()
+
+
+def card_background(model: FrozenSimulator, scans: Sequence[PrintedScan]) -> Background | None:
+    """The background in a model's card, if it has one and the scans are of the size it was learned on."""
+    stated = model.card["background"]
+    learned = Background.model_validate(stated) if stated is not None else None
+    return learned if learned is not None and all(learned.fits(scan) for scan in scans) else None
+
+
+def trained_ids(model: FrozenSimulator, dataset: Store) -> set[str]:
+    """The scans that the model was trained on; none where it was made of other prints than the store's."""
+    return set(model.card["training"].get("scan_ids", [])) if made_of_these_prints(model, dataset) else set()
+
+
+def made_of_these_prints(model: FrozenSimulator, dataset: Store) -> bool:
+    """Whether a model was made of the prints in a store: the same dataset, or the same locked scans in it."""
+    same_dataset = (model.card["dataset"] or {}).get("sha256") == dataset.sha256
+    return same_dataset or bool(locked_by_the_card(model, dataset))
+
+
+def locked_by_the_card(model: FrozenSimulator, dataset: Store) -> list[str]:
+    """The scans of a store that were locked when the model was made, by their raw files.
+
+    Another recipe or registration changes every height of a store, a scan more or less the box that it
+    draws, but neither changes a raw file. A card that lists no files locks the ids of its box in a dataset of
+    the same name.
+    """
+    split = model.card["split"]
+    if files := split.get("lock_box_files_sha256"):
+        return [scan_id for scan_id, file in dataset.files_sha256(dataset.ids).items() if file in files]
+    same_name = (model.card["dataset"] or {}).get("name") == dataset.name
+    return [scan_id for scan_id in split.get("lock_box", []) if same_name and scan_id in dataset.ids]
