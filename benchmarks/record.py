@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import json
 import os
-import shlex
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from litho_data.foundation.commands import command_line
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
-from litho_data.foundation.results import software_versions
-from litho_data.provenance.steps import code_commit
+from litho_data.foundation.run_facts import run_facts
 
 NOT_MEASURED = "Not measured yet."
 
@@ -25,13 +23,7 @@ def usable_cores() -> int:
 
 def origin() -> dict[str, Any]:
     """Command line, commit and versions behind a result."""
-    module = sys.modules["__main__"].__spec__
-    started = ["python", "-m", module.name.removesuffix(".__main__")] if module else [Path(sys.argv[0]).name]
-    return {
-        "command": shlex.join([*started, *sys.argv[1:]]),
-        "commit": code_commit(),
-        "versions": software_versions(),
-    }
+    return {**run_facts(), "command": command_line()}
 
 
 def write_record(path: Path, record: Mapping[str, Any]) -> None:

@@ -52,6 +52,11 @@ def test_data_does_not_import_torch() -> None:
         assert not {n for n in _imports(file) if n.split(".")[0] == "torch"}, f"{file.name} imports torch"
 
 
+def test_only_the_entry_of_the_commands_reads_the_command_line() -> None:
+    readers = [file for package in ALLOWED for file in _sources(package) if "argv" in file.read_text("utf-8")]
+    assert readers == [ROOT / "litho_data" / "foundation" / "commands.py"]
+
+
 def test_design_uses_only_frozen_models() -> None:
     for file in _sources("litho_design"):
         for name in _imports(file):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import pandas as pd
 
 from benchmarks.blind_trials.records import Draws, Outcome, Planted, Scoreboard, Summary, Tally, Trial
-from litho_models.run_info import run_info
+from litho_data.foundation.run_facts import run_info
 
 # Effects of a smaller rms are in the table but not in the goal.
 COUNTS_FROM_RMS_NM = 8.0

@@ -18,7 +18,8 @@ from litho_data.build.operations import OPERATIONS, Done, perform
 from litho_data.build.quality import levelling_figures, noise_figures
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import file_sha256
-from litho_data.provenance.steps import code_record, record_sha256
+from litho_data.foundation.run_facts import software_record
+from litho_data.provenance.steps import record_sha256
 from litho_data.store.partial import Piece
 
 
@@ -100,7 +101,7 @@ class FieldJob:
             "steps": [done.step.to_record() for done in steps],
             "quality": quality,
             "read": facts["read-scan"],
-            "software": code_record(),
+            "software": software_record(),
         }
         return Piece(json.loads(json.dumps(record)), arrays)
 

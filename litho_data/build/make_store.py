@@ -23,8 +23,8 @@ from litho_data.build.report import write_report
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record, Result
+from litho_data.foundation.run_facts import software_record
 from litho_data.foundation.workers import run_jobs
-from litho_data.provenance.steps import code_record
 from litho_data.store.partial import partial_store
 
 # Pixels whose sides differ from the other scans' by more than this come from missing rows or columns.
@@ -124,7 +124,7 @@ def make_store(
             build={
                 "started": started.isoformat(),
                 "data_dir": _relative(source.data_dir, out.parent),
-                "software": code_record(),
+                "software": software_record(),
             },
         )
         sha256 = assemble(root, kept, partial.samples, campaign)
@@ -138,7 +138,7 @@ def make_store(
             reused=reused,
             seconds=round(time.perf_counter() - clock, 2),
             workers=workers,
-            software=code_record(),
+            software=software_record(),
         )
         write_report(result, partial.store, report_folder(out))
         partial.publish()

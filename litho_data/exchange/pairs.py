@@ -23,7 +23,8 @@ from litho_data.build.operations import OPERATIONS, perform
 from litho_data.build.quality import noise_figures
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import file_sha256
-from litho_data.provenance.steps import code_record, record_sha256
+from litho_data.foundation.run_facts import software_record
+from litho_data.provenance.steps import record_sha256
 from litho_data.store.partial import Piece
 
 GREY_MAX = 255
@@ -127,7 +128,7 @@ class PairsJob:
             "steps": [done.step.to_record()],
             "quality": noise_figures(done.arrays["raw_height_um"]) | {"valid_fraction": 1.0},
             "read": {"pitch_um": [pitch_um, pitch_um]},
-            "software": code_record(),
+            "software": software_record(),
         }
         return Piece(json.loads(json.dumps(record)), done.arrays)
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Iterable, Iterator
+from pathlib import Path
 from typing import TypeVar
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.run_facts import running_command
 
 T = TypeVar("T")
 
@@ -23,10 +26,23 @@ def new_app(help_text: str):
 def run_app(app, name: str) -> None:
     """Run a typer application; bad input becomes one line on stderr and exit code 2."""
     try:
-        app(prog_name=name)
+        with running_command(command_line(name)):
+            app(prog_name=name)
     except InputError as error:
         print(f"{name}: {error}", file=sys.stderr)
         raise SystemExit(2) from None
+
+
+def command_line(program: str | None = None) -> str:
+    """The command that this process was started with; ``program`` by default the script or module."""
+    if program is None:
+        module = sys.modules["__main__"].__spec__
+        started = (
+            ["python", "-m", module.name.removesuffix(".__main__")] if module else [Path(sys.argv[0]).name]
+        )
+    else:
+        started = [program]
+    return shlex.join([*started, *sys.argv[1:]])
 
 
 def progress(items: Iterable[T], what: str, total: int | None = None) -> Iterator[T]:

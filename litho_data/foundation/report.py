@@ -97,7 +97,9 @@ class Page:
         self._parts.append({"kind": "note", "text": text})
 
     def code(self, text: str) -> None:
-        """A command or another fixed-width text."""
+        """A command or another fixed-width text; nothing where it is empty."""
+        if not text:
+            return
         self._parts.append({"kind": "code", "text": text})
 
     def tiles(self, tiles: Sequence[tuple[str, str]]) -> None:

@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import json
-import platform
 import reprlib
-import sys
-from importlib import metadata
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -18,7 +15,6 @@ from litho_data.foundation.files import atomic_file
 # A value that does not belong may be of any size and nested to any depth.
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = 120
-_REPORTED_PACKAGES = ("litholoop", "numpy", "scipy", "torch", "opencv-python-headless", "xarray", "zarr")
 
 
 class Record(BaseModel):
@@ -77,14 +73,3 @@ def first_error(error: ValidationError) -> str:
 
 def _refuse(constant: str) -> None:
     raise ValueError(f"{constant} is no number of JSON")
-
-
-def software_versions() -> dict[str, str]:
-    """Versions of Python and of the packages that decide the numbers; what is absent is left out."""
-    versions = {"python": platform.python_version(), "platform": sys.platform}
-    for name in _REPORTED_PACKAGES:
-        try:
-            versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            continue
-    return versions

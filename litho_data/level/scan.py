@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from litho_data.foundation.files import atomic_file, file_sha256
-from litho_data.foundation.results import Result, software_versions
+from litho_data.foundation.results import Result
+from litho_data.foundation.run_facts import RunFacts, run_facts
 from litho_data.level import Recipe
 from litho_data.provenance.steps import array_sha256
 from litho_data.readers.scan_files import write_heights
@@ -15,7 +16,7 @@ from litho_data.scan import Scan
 _DIMS = ("y", "x")
 
 
-class LevelRecord(Result):
+class LevelRecord(RunFacts, Result):
     """What was levelled, how, and what came out; beside the levelled file as ``<file>.json``."""
 
     SCHEMA: ClassVar[str] = "litho-data/level/1"
@@ -30,7 +31,6 @@ class LevelRecord(Result):
     levelled_sha256: str
     removed: str
     removed_sha256: str
-    versions: dict[str, str]
 
 
 def level_scan(scan: Scan, recipe: Recipe, out: str | Path) -> LevelRecord:
@@ -51,6 +51,7 @@ def level_scan(scan: Scan, recipe: Recipe, out: str | Path) -> LevelRecord:
     write_heights(removed_file, removed, pitch_um=scan.pitch_um, title=f"{scan.name} removed")
     record = LevelRecord(
         schema=LevelRecord.SCHEMA,
+        **run_facts(),
         source=scan.source,
         source_sha256=file_sha256(scan.source),
         channel=scan.channel,
@@ -60,7 +61,6 @@ def level_scan(scan: Scan, recipe: Recipe, out: str | Path) -> LevelRecord:
         levelled_sha256=array_sha256(levelled, "µm", _DIMS),
         removed=removed_file.name,
         removed_sha256=array_sha256(removed, "µm", _DIMS),
-        versions=software_versions(),
     )
     with atomic_file(target.with_name(f"{target.name}.json")) as temporary:
         temporary.write_text(record.model_dump_json(by_alias=True, indent=1) + "\n", encoding="utf-8")

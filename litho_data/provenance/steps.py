@@ -1,4 +1,4 @@
-"""What makes a number traceable: hashes of arrays, records of steps, the software that ran them.
+"""What makes a number traceable: hashes of arrays and records of steps.
 
 A hash covers what decides a result; times, hosts and code versions are recorded beside it, so that two builds
 of the same files compare bit for bit.
@@ -8,16 +8,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-from litho_data.foundation.results import software_versions
 
 
 def array_sha256(array: np.ndarray, unit: str, dims: Sequence[str]) -> str:
@@ -90,34 +86,3 @@ def source_sha256(*paths: Path) -> str:
         for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
             digest.update(file.name.encode() + b"\0" + file.read_bytes() + b"\0")
     return digest.hexdigest()
-
-
-@cache
-def code_record() -> dict[str, Any]:
-    """Which software runs: package versions, the BLAS, and the commit of a source checkout."""
-    blas = np.show_config(mode="dicts")["Build Dependencies"]["blas"]
-    versions = {**software_versions(), "blas": f"{blas['name']} {blas['version']}"}
-    return {"versions": versions, **_checkout(Path(__file__).parents[2])}
-
-
-def code_commit() -> str:
-    """Commit of the source checkout that runs; empty for an installed wheel."""
-    return code_record()["commit"] or ""
-
-
-def _checkout(folder: Path) -> dict[str, Any]:
-    """Commit and cleanliness of the checkout that the packages lie in; nothing for an installed wheel."""
-    if not (folder / ".git").exists():
-        return {"commit": None, "dirty": None}
-    try:
-        commit = _git(folder, "rev-parse", "HEAD").strip()
-        changes = _git(folder, "status", "--porcelain", "--untracked-files=no", "--", "litho_data")
-    except (OSError, subprocess.CalledProcessError):
-        return {"commit": None, "dirty": None}
-    return {"commit": commit, "dirty": bool(changes.strip())}
-
-
-def _git(folder: Path, *arguments: str) -> str:
-    return subprocess.run(
-        ["git", "-C", folder, *arguments], capture_output=True, text=True, check=True
-    ).stdout

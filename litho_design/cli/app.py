@@ -11,7 +11,7 @@ from litho_data.foundation.commands import new_app, run_app
 from litho_data.foundation.errors import InputError
 from litho_design.cli.compare import compare
 from litho_design.cli.design import hoe, lens
-from litho_design.cli.options import Device, Extrapolate, Out, command_line, headline, load_printers
+from litho_design.cli.options import Device, Extrapolate, Out, headline, load_printers
 
 app = new_app("Design diffractive optics through a frozen model of the printer, score them, export them.")
 app.command()(hoe)
@@ -68,7 +68,6 @@ def score(
         camera=None
         if camera is None
         else PhotoSource(camera, camera_pitch_um or 0.0, camera_dark_level, camera_object),
-        command=command_line(),
         device=device,
     )
     for item in result.scores:

@@ -37,7 +37,6 @@ from litho_design.cli.options import (
     WavelengthSdUm,
     WavelengthUm,
     WindowPx,
-    command_line,
     hoe_settings,
     lens_settings,
     load_printers,
@@ -137,7 +136,7 @@ def compare(
         image, record = make_target(target, settings.layout.size_px)
 
         def designer(settings, printer, place):
-            return design_hoe(settings, printer, image, record, place, command=command_line())
+            return design_hoe(settings, printer, image, record, place)
     else:
         kind = "direct" if task == "lens-direct" else "computational"
         settings = lens_settings(variant, kind, window_px=window_px, object_px=object_px, **options)
@@ -145,9 +144,9 @@ def compare(
         settings, pictures = bring_objects(settings, *brought)
 
         def designer(settings, printer, place):
-            return design_lens(settings, printer, place, pictures=pictures, command=command_line())
+            return design_lens(settings, printer, place, pictures=pictures)
 
-    result = run_comparison(settings, designer, arms, judges, out, seeds=range(seeds), command=command_line())
+    result = run_comparison(settings, designer, arms, judges, out, seeds=range(seeds))
     for item in result.summary:
         if item.figure == HEADLINE[result.task][0]:
             print(f"designed with {item.arm}, printed by {item.judge}: {item.figure} {item.judged_mean:.3f}")

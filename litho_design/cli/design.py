@@ -42,7 +42,6 @@ from litho_design.cli.options import (
     WavelengthSdUm,
     WavelengthUm,
     WindowPx,
-    command_line,
     headline,
     hoe_settings,
     lens_settings,
@@ -106,9 +105,7 @@ def hoe(
     printer = load_printer(model, settings.layout, device=device, extrapolate=extrapolate)
     others = load_printers(ensemble or [], settings.layout, device, extrapolate)
     image, record = make_target(target, settings.layout.size_px)
-    design = design_hoe(
-        settings, printer, image, record, out, ensemble=list(others.values()), command=command_line()
-    )
+    design = design_hoe(settings, printer, image, record, out, ensemble=list(others.values()))
     _tell(design, out)
 
 
@@ -169,9 +166,7 @@ def lens(
     printer = load_printer(model, settings.layout, device=device, extrapolate=extrapolate)
     others = load_printers(ensemble or [], settings.layout, device, extrapolate)
     settings, pictures = bring_objects(settings, objects or [], held_out_objects or [])
-    design = design_lens(
-        settings, printer, out, ensemble=list(others.values()), pictures=pictures, command=command_line()
-    )
+    design = design_lens(settings, printer, out, ensemble=list(others.values()), pictures=pictures)
     _tell(design, out)
 
 

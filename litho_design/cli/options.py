@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -188,8 +187,3 @@ def headline(figures: dict[str, float]) -> str:
         return "MAE " + ", ".join(f"{name} {mae:.4f}" for name, mae in told.items() if mae is not None)
     text = f"{100 * figures['focusing_efficiency']:.1f} % in the focus, Strehl {figures['strehl']:.3f}"
     return text + (f", MAE {figures['mae_calibrated']:.4f}" if "mae_calibrated" in figures else "")
-
-
-def command_line() -> str:
-    """The command as it was given, for the records."""
-    return " ".join(["litho-design", *sys.argv[1:]])

@@ -12,8 +12,8 @@ import numpy as np
 from pydantic import Field
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.results import Record, Result, software_versions
-from litho_data.provenance.steps import code_commit
+from litho_data.foundation.results import Record, Result
+from litho_data.foundation.run_facts import RunFacts, run_facts
 from litho_design.judging.judge import Judging
 from litho_design.printers.printer import Printer, PrinterRecord
 from litho_design.reports.gap import write_gap_report
@@ -64,7 +64,7 @@ class PairedDifference(Record):
     ci95: tuple[float, float] | None
 
 
-class GapResult(Result):
+class GapResult(RunFacts, Result):
     """gap.json."""
 
     SCHEMA: ClassVar[str] = "litho-design/gap/1"
@@ -72,9 +72,6 @@ class GapResult(Result):
 
     schema_: Literal["litho-design/gap/1"] = Field(default="litho-design/gap/1", alias="schema")
     task: DesignTask
-    command: str
-    commit: str = ""
-    versions: dict[str, str]
     settings: HoeSettings | LensSettings
     target: str
     seeds: list[int]
@@ -96,7 +93,6 @@ def compare(
     out: str | Path,
     *,
     seeds: Sequence[int],
-    command: str = "",
 ) -> GapResult:
     """Design once per arm and seed with equal budgets, and print each layout with every judge.
 
@@ -143,9 +139,7 @@ def compare(
             )
     result = GapResult(
         task=design.task,
-        command=command,
-        commit=code_commit(),
-        versions=software_versions(),
+        **run_facts(),
         settings=settings,
         target=design.target.name if design.target else "",
         seeds=list(seeds),

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import file_sha256
-from litho_data.foundation.results import Record, Result, software_versions
-from litho_data.provenance.steps import code_commit
+from litho_data.foundation.results import Record, Result
+from litho_data.foundation.run_facts import RunFacts, run_facts
 from litho_design.judging.camera import CameraRecord, photo_score, photographed_image
 from litho_design.judging.judge import Judging
 from litho_design.judging.measured import MeasuredRecord, measured_print
@@ -61,16 +61,13 @@ class JudgedScore(Record):
     figures: dict[str, float]
 
 
-class ScoreResult(Result):
+class ScoreResult(RunFacts, Result):
     """score.json."""
 
     SCHEMA: ClassVar[str] = "litho-design/score/1"
     FILE_NAME: ClassVar[str] = "score.json"
 
     schema_: Literal["litho-design/score/1"] = Field(default="litho-design/score/1", alias="schema")
-    command: str
-    commit: str = ""
-    versions: dict[str, str]
     design: str
     design_sha256: str
     layout_sha256: str
@@ -91,7 +88,6 @@ def score_design(
     *,
     scan: MeasuredSource | None = None,
     camera: PhotoSource | None = None,
-    command: str = "",
     device: str | torch.device = "cpu",
 ) -> ScoreResult:
     """Score the layout of a design by every judge, and write ``score.json`` and a report.
@@ -134,9 +130,7 @@ def score_design(
             scores.append(_camera_score(photo, photo_score(image, judging.target)))
             pictures[f"photograph {photo.name}"] = image
     result = ScoreResult(
-        command=command,
-        commit=code_commit(),
-        versions=software_versions(),
+        **run_facts(),
         design=str(folder),
         design_sha256=file_sha256(Path(folder) / Design.FILE_NAME),
         layout_sha256=design.files[LEVELS_FILE],

@@ -45,7 +45,6 @@ def design_lens(
     *,
     ensemble: Sequence[Printer] = (),
     pictures: Mapping[str, np.ndarray] | None = None,
-    command: str = "",
     announce: bool = True,
 ) -> Design:
     """Optimise the layout of a lens so that its print focuses, or images after reconstruction.
@@ -62,7 +61,7 @@ def design_lens(
             without its pixels.
     """
     task = LensTask(settings, printer, ensemble, pictures)
-    return run_design(task, settings, settings, out, command=command, announce=announce)
+    return run_design(task, settings, settings, out, announce=announce)
 
 
 class LensTask:

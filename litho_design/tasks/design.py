@@ -12,6 +12,7 @@ from pydantic import Field
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file, file_sha256
 from litho_data.foundation.results import Record, Result
+from litho_data.foundation.run_facts import RunFacts
 from litho_design.optics import Optics, stroke_table
 from litho_design.optimisation.gauge import OutOfDistribution, Printability
 from litho_design.optimisation.parametrise import LayoutSettings
@@ -29,12 +30,9 @@ PICTURES_FILE = "object_pictures.npy"
 DesignTask = Literal["hoe", "lens-direct", "lens-computational"]
 
 
-class RunRecord(Record):
-    """What was run, with what, and how long it took; results of before commits were kept have none."""
+class RunRecord(RunFacts):
+    """What was run, with what, and how long it took; older result files may have no commit."""
 
-    command: str
-    commit: str = ""
-    versions: dict[str, str]
     device: str
     threads: int
     seconds: float

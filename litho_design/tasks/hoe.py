@@ -35,7 +35,6 @@ def design_hoe(
     out: str | Path,
     *,
     ensemble: Sequence[Printer] = (),
-    command: str = "",
     announce: bool = True,
 ) -> Design:
     """Optimise the layout of a hologram so that its print shows the wanted image.
@@ -56,7 +55,7 @@ def design_hoe(
     """
     _check_target(target, settings.layout)
     task = HoeTask(settings, printer, target, target_record, ensemble)
-    return run_design(task, settings, settings, out, command=command, announce=announce)
+    return run_design(task, settings, settings, out, announce=announce)
 
 
 class HoeTask:

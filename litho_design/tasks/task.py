@@ -16,8 +16,8 @@ from torch import Tensor
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import writable
-from litho_data.foundation.results import Record, software_versions
-from litho_data.provenance.steps import code_commit
+from litho_data.foundation.results import Record
+from litho_data.foundation.run_facts import run_facts
 from litho_design.optics import Optics
 from litho_design.optimisation.budget import Budget, measure_budget, peak_memory_gib
 from litho_design.optimisation.gauge import out_of_distribution, printability
@@ -111,7 +111,6 @@ def run_design(
     settings_record: Record,
     out: str | Path,
     *,
-    command: str = "",
     announce: bool = True,
 ) -> Design:
     """Optimise, polish and score one layout, and write the folder ``out``.
@@ -164,9 +163,7 @@ def run_design(
         variant=settings.variant,
         fingerprint=fingerprint,
         run=RunRecord(
-            command=command,
-            commit=code_commit(),
-            versions=software_versions(),
+            **run_facts(),
             device=str(height.device),
             threads=torch.get_num_threads(),
             seconds=outcome.seconds,

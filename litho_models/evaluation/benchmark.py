@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from litho_data.foundation.commands import progress
+from litho_data.foundation.run_facts import run_info
 from litho_data.store import PrintedScan, open_store
 from litho_data.store.lock_box import ids_sha256
 from litho_models.evaluation.fit_cache import FitRecord, fit_or_load
@@ -21,7 +22,6 @@ from litho_models.fitting.fit import common_geometry
 from litho_models.fitting.runs import training_config
 from litho_models.frozen.card import DatasetName
 from litho_models.models import build_model, require_models
-from litho_models.run_info import run_info
 from litho_models.scan_terms.background import BackgroundUse
 from litho_models.scan_terms.nuisance import Policy
 from litho_models.scoring.noise_floor import noise_floor

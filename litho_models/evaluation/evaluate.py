@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.run_facts import run_info
 from litho_data.store import open_store
 from litho_data.store.lock_box import ids_sha256
 from litho_models.evaluation.diagnostics import device_of, tile_consistency
@@ -22,7 +23,6 @@ from litho_models.frozen.on_store import (
     trained_ids,
 )
 from litho_models.prediction.cost import measured_predictions
-from litho_models.run_info import run_info
 from litho_models.scan_terms.background import BackgroundUse
 from litho_models.scan_terms.nuisance import Policy
 from litho_models.scoring.noise_floor import noise_floor

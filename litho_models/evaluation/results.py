@@ -7,11 +7,11 @@ from typing import Any, ClassVar, Literal
 from pydantic import Field
 
 from litho_data.foundation.results import Record, Result
+from litho_data.foundation.run_facts import RunInfo
 from litho_models.evaluation.diagnostics import TileConsistency
 from litho_models.evaluation.fit_cache import FitRecord
 from litho_models.frozen.card import DatasetName
 from litho_models.prediction.cost import PredictionCost
-from litho_models.run_info import RunInfo
 from litho_models.scoring.noise_floor import NoiseFloor
 from litho_models.scoring.pairs import Paired
 from litho_models.scoring.records import ModelScores, NuisanceProtocol

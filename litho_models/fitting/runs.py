@@ -12,6 +12,7 @@ from pydantic import Field, ValidationError
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
 from litho_data.foundation.results import Result, first_error
+from litho_data.foundation.run_facts import RunInfo, run_info
 from litho_data.store import PrintedScan, open_store
 from litho_data.store.lock_box import ids_sha256
 from litho_models.fitting import TrainingConfig, fit_with_record
@@ -21,7 +22,6 @@ from litho_models.frozen.card import DatasetName
 from litho_models.frozen.files import save_frozen
 from litho_models.frozen.freezing import MODEL_FOLDER
 from litho_models.prediction.tiles import predict_scan
-from litho_models.run_info import RunInfo, run_info
 from litho_models.scan_terms.training import learn_background
 from litho_models.simulator import Variant
 

@@ -9,6 +9,7 @@ from pydantic import ConfigDict, Field, JsonValue, field_validator
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record, Result
+from litho_data.foundation.run_facts import RunFacts
 from litho_models.scan_terms.background import Background, BackgroundUse
 
 CARD_FILE = "card.json"
@@ -37,7 +38,7 @@ class Metric(Record):
     background: BackgroundUse = "none"
 
 
-class ModelCard(Result):
+class ModelCard(RunFacts, Result):
     """All that is needed to load, use and judge a frozen model.
 
     ``background`` is what the microscope added to the training scans on average; only a comparison with
@@ -64,7 +65,6 @@ class ModelCard(Result):
     receptive_radius_um: float | None
     dataset: DatasetName | None = None
     training: dict[str, JsonValue] = Field(default_factory=dict)
-    command: str = ""
     split: dict[str, JsonValue] = Field(default_factory=dict)
     nuisance: dict[str, JsonValue] = Field(default_factory=dict)
     background: Background | None = None
@@ -79,7 +79,6 @@ class ModelCard(Result):
     fabrication_batch: str = ""
     optimiser_gap: float | None = None
     limitations: list[str] = Field(default_factory=list)
-    versions: dict[str, str] = Field(default_factory=dict)
 
     @field_validator("training", "split")
     @classmethod

@@ -19,7 +19,8 @@ from torch import Tensor, nn
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_folder, file_sha256
 from litho_data.foundation.outputs import require_replaceable_folder
-from litho_data.foundation.results import first_error, software_versions
+from litho_data.foundation.results import first_error
+from litho_data.foundation.run_facts import run_facts
 from litho_models.frozen.card import CARD_FILE, EffectValues, ModelCard
 from litho_models.frozen.readme import model_readme
 from litho_models.frozen.simulator import FrozenSimulator
@@ -70,8 +71,7 @@ def save_frozen(
                 calibrated_range_um=(0.0, config.full_height_um),
                 receptive_radius_um=None if process_effects else simulator.reach_um,
                 process_effects=process_effects or {},
-                versions=software_versions(),
-                **card_fields,
+                **{**run_facts(), **card_fields},
             )
         except ValidationError as error:
             raise InputError("model card", got=first_error(error), wanted=ModelCard.SCHEMA) from error

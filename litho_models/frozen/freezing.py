@@ -17,6 +17,8 @@ _CARRIED_FIELDS = {
     "dataset",
     "training",
     "command",
+    "commit",
+    "dirty",
     "split",
     "nuisance",
     "background",

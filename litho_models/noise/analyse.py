@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.run_facts import run_info
 from litho_data.readers import read_scan
 from litho_data.store import Store, open_store
 from litho_models.frozen.card import DatasetName
@@ -21,7 +22,6 @@ from litho_models.noise.residuals import read_residuals
 from litho_models.noise.result import NoiseAnalysis, ReferencePrints
 from litho_models.noise.staircase import step_print
 from litho_models.noise.surface import BACKGROUNDS, SurfaceNoise, print_noise, surface_noise
-from litho_models.run_info import run_info
 from litho_models.scoring.noise_floor import NoiseFloor
 
 

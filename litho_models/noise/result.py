@@ -7,13 +7,13 @@ from typing import ClassVar, Literal
 from pydantic import Field
 
 from litho_data.foundation.results import Record, Result
+from litho_data.foundation.run_facts import RunInfo
 from litho_models.frozen.card import DatasetName
 from litho_models.noise.bounds import NoiseBound
 from litho_models.noise.calibration import SpreadAnalysis
 from litho_models.noise.dose import DoseMatrix
 from litho_models.noise.staircase import StepPrint
 from litho_models.noise.surface import PrintNoise, SurfaceNoise
-from litho_models.run_info import RunInfo
 from litho_models.scoring.noise_floor import NoiseFloor
 
 

@@ -16,7 +16,7 @@ from benchmarks import build as build_benchmark
 from benchmarks import levelling as levelling_benchmark
 from benchmarks.record import NOT_MEASURED, publish, published
 from litho_data.foundation.errors import InputError
-from litho_data.provenance.steps import code_commit
+from litho_data.foundation.run_facts import run_facts
 
 
 @pytest.mark.parametrize("benchmark", [build_benchmark, levelling_benchmark])
@@ -49,7 +49,7 @@ def test_a_record_says_by_which_command_and_commit_it_was_made(tmp_path, monkeyp
     levelling_benchmark.main()
     record = json.loads(file.read_text())
     assert record["command"].endswith(" ".join(options))
-    assert record["commit"] == code_commit()
+    assert record["commit"] == run_facts()["commit"]
     assert record["versions"]["numpy"] == np.__version__
     # A module is named as it is started.
     asked = "from benchmarks.record import origin; print(origin()['command'])"

@@ -12,7 +12,7 @@ import tifffile
 import torch
 
 from litho_data.foundation.errors import InputError
-from litho_data.provenance.steps import code_commit
+from litho_data.foundation.run_facts import run_facts
 from litho_design.cli.app import app, main
 from litho_design.optimisation.gauge import OutOfDistribution
 from litho_design.optimisation.parametrise import LayoutSettings
@@ -145,7 +145,7 @@ def test_commands_design_score_and_compare(tmp_path, affine_folder):
     gap = json.loads((tmp_path / "gap" / "gap.json").read_text())
     assert gap["schema"] == "litho-design/gap/1"
     assert {entry["arm"] for entry in gap["entries"]} == {"none", "affine"}
-    assert {record.run.commit, score["commit"], gap["commit"]} == {code_commit()}
+    assert {record.run.commit, score["commit"], gap["commit"]} == {run_facts()["commit"]}
 
 
 @pytest.mark.parametrize(

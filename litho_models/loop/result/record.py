@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import SerializerFunctionWrapHandler, model_serializer
 
 from litho_data.foundation.results import Record, Result
-from litho_models.run_info import RunInfo
+from litho_data.foundation.run_facts import RunInfo
 from litho_models.scoring.noise_floor import NoiseFloor
 from litho_models.splits.folds import Split
 

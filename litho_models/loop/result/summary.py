@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from litho_data.foundation.run_facts import run_info
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import CATALOGUE
 from litho_models.loop.findings import Closed
@@ -19,7 +20,6 @@ from litho_models.loop.result.record import (
     Verdict,
 )
 from litho_models.loop.scoring import DATUM_FREE, Score
-from litho_models.run_info import run_info
 from litho_models.scan_terms.nuisance import BLOCK_PX
 from litho_models.scoring.noise_floor import NoiseFloor
 from litho_models.splits.folds import Split

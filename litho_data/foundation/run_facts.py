@@ -1,0 +1,100 @@
+"""What every result says about the run that made it: command, commit, versions, seeds, scans."""
+
+from __future__ import annotations
+
+import platform
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from litho_data.foundation.results import Record
+
+_PACKAGES = ("litholoop", "numpy", "scipy", "torch", "opencv-python-headless", "xarray", "zarr")
+_SOURCES = ("litho_data", "litho_models", "litho_design")
+_COMMAND: ContextVar[str] = ContextVar("command", default="")
+
+
+class RunFacts(Record):
+    """Command line and code behind a result.
+
+    ``command`` is empty where the result was made from Python. ``dirty`` says whether the source differed
+    from the commit; None without a checkout, and in older result files.
+    """
+
+    command: str = ""
+    commit: str = ""
+    dirty: bool | None = None
+    versions: dict[str, str] = Field(default_factory=dict)
+
+
+class RunInfo(RunFacts):
+    """Command line, code and scans behind a result; ``dropped`` lists scans left out, with the reason."""
+
+    seeds: list[int]
+    n_scans: int
+    dropped: list[str]
+
+
+def run_info(seeds: Sequence[int], n_scans: int, dropped: Sequence[str] = ()) -> RunInfo:
+    """The facts of the current run; see :class:`RunInfo`."""
+    return RunInfo(**run_facts(), seeds=list(seeds), n_scans=n_scans, dropped=list(dropped))
+
+
+def run_facts() -> dict[str, Any]:
+    """The fields of :class:`RunFacts` for the current run."""
+    software = software_record()
+    return {**software, "command": _COMMAND.get(), "commit": software["commit"] or ""}
+
+
+@contextmanager
+def running_command(command: str) -> Iterator[None]:
+    """Results made inside record this command line; library code has no other way to know it."""
+    token = _COMMAND.set(command)
+    try:
+        yield
+    finally:
+        _COMMAND.reset(token)
+
+
+@cache
+def software_record() -> dict[str, Any]:
+    """Which software runs: ``versions`` of packages and BLAS, ``commit`` and ``dirty`` of the checkout."""
+    blas = np.show_config(mode="dicts")["Build Dependencies"]["blas"]
+    versions = {"python": platform.python_version(), "platform": sys.platform}
+    for name in _PACKAGES:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            continue
+    versions["blas"] = f"{blas['name']} {blas['version']}"
+    return {"versions": versions, **checkout_state(Path(__file__).parents[2])}
+
+
+def checkout_state(folder: Path) -> dict[str, Any]:
+    """``commit`` of a checkout, and whether it is ``dirty``: a file of the packages changed or not in git.
+
+    Both are None where there is no checkout, as for an installed wheel.
+    """
+    if not (folder / ".git").exists():
+        return {"commit": None, "dirty": None}
+    try:
+        commit = _git(folder, "rev-parse", "HEAD").strip()
+        changes = _git(folder, "status", "--porcelain", "--", *_SOURCES)
+    except (OSError, subprocess.CalledProcessError):
+        return {"commit": None, "dirty": None}
+    return {"commit": commit, "dirty": bool(changes.strip())}
+
+
+def _git(folder: Path, *arguments: str) -> str:
+    return subprocess.run(
+        ["git", "-C", folder, *arguments], capture_output=True, text=True, check=True
+    ).stdout
