@@ -70,6 +70,13 @@ def test_virtual_fab_knows_no_model() -> None:
         assert not {n for n in _imports(file) if n.startswith("litho_models")}, file.name
 
 
+def test_the_convolutions_stand_behind_one_function() -> None:
+    room = ROOT / "litho_models" / "fast"
+    for file in (file for file in _sources("litho_models") if room not in file.parents):
+        inside = {name for name in _imports(file) if name.startswith("litho_models.fast")}
+        assert inside <= {"litho_models.fast.convolution_stack"}, file.relative_to(ROOT)
+
+
 @pytest.mark.parametrize("package", sorted(ALLOWED))
 def test_importing_a_package_loads_nothing_heavy(package: str) -> None:
     code = f"import sys, {package}; print(*[m for m in {HEAVY!r} if m in sys.modules])"

@@ -39,32 +39,35 @@ _VECTOR = 16
 _OTHER_INPUTS = 3
 
 
-class StackSettings(NamedTuple):
-    """How a stack runs.
-
-    Args:
-        leaky_slope: slope below zero, above 0.
-        hidden_dtype: of the layers between the first and the last; forwards these two keep the field's.
-        adjoint_dtype: of the same layers on the way back.
-    """
-
+class _Settings(NamedTuple):
     leaky_slope: float
     hidden_dtype: torch.dtype
     adjoint_dtype: torch.dtype
 
 
 def convolution_stack(
-    field: Tensor, weights: Sequence[Tensor], biases: Sequence[Tensor], settings: StackSettings
+    field: Tensor,
+    weights: Sequence[Tensor],
+    biases: Sequence[Tensor],
+    *,
+    leaky_slope: float,
+    hidden_dtype: torch.dtype,
+    adjoint_dtype: torch.dtype,
 ) -> Tensor:
     """Interior of ``field`` (b, 1, y, x): (b, 1, y - 2n, x - 2n) for n layers, leaky ReLU between them.
+
+    On one processor the result and its gradients are the same bits for every number of threads.
 
     Args:
         field: on the CPU, in the dtype of the weights; gradients flow back to it, once.
         weights: (outputs, inputs, 3, 3) per layer, 1 -> channels -> 1, two layers at least; they learn
             where one of them or of the biases wants a gradient.
         biases: (outputs,) per layer.
-        settings: slope and precision.
+        leaky_slope: slope below zero, above 0.
+        hidden_dtype: of the layers between the first and the last; forwards these two keep the field's.
+        adjoint_dtype: of the same layers on the way back.
     """
+    settings = _Settings(leaky_slope, hidden_dtype, adjoint_dtype)
     # Within the function gradients are always off.
     return _Stack.apply(field, settings, torch.is_grad_enabled(), *weights, *biases)
 
@@ -72,7 +75,7 @@ def convolution_stack(
 class _Stack(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, field: Tensor, settings: StackSettings, records: bool, *parameters: Tensor
+        ctx: Any, field: Tensor, settings: _Settings, records: bool, *parameters: Tensor
     ) -> Tensor:
         slope, dtype = settings.leaky_slope, settings.hidden_dtype
         weights, biases = _halves(parameters)
@@ -117,7 +120,7 @@ class _Stack(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        settings: StackSettings = ctx.settings
+        settings: _Settings = ctx.settings
         dtype, learns = settings.adjoint_dtype, ctx.learns
         count = len(ctx.needs_input_grad) - _OTHER_INPUTS
         field, *saved = ctx.saved_tensors

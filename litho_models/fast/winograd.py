@@ -47,7 +47,7 @@ _Signs = NDArray[np.int8]
 
 
 class FixedStack:
-    """The stack of ``areawise.convolution_stack``, 1 -> channels -> 1, for weights that do not learn.
+    """The stack of ``convolution_stack``, 1 -> channels -> 1, for weights that do not learn.
 
     Several threads may use it at a time.
 

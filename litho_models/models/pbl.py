@@ -16,7 +16,7 @@ from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
-from litho_models.fast.stack import StackSettings, convolution_stack
+from litho_models.fast import convolution_stack
 from litho_models.layers.gaussian import Edge, blur_interior, kernel_radius_px, pad_field
 from litho_models.layers.lookup import PointwiseNet
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
@@ -186,13 +186,14 @@ class AreawiseNet(nn.Module):
         layers = cast(list[nn.Conv2d], [*self.hidden, self.last])
         dtype = self.last.weight.dtype
         hidden = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else dtype
-        settings = StackSettings(self.leaky_slope, hidden, self.adjoint_dtype or hidden)
         with torch.autocast(device_type="cpu", enabled=False):
             return convolution_stack(
                 height_um.to(dtype),
                 [layer.weight for layer in layers],
                 [cast(Tensor, layer.bias) for layer in layers],
-                settings,
+                leaky_slope=self.leaky_slope,
+                hidden_dtype=hidden,
+                adjoint_dtype=self.adjoint_dtype or hidden,
             )
 
     def start_at_zero(self) -> None:

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Any
 
 import pytest
 import torch
 from torch.nn import functional
 
-from litho_models.fast.stack import StackSettings, convolution_stack
+from litho_models.fast import convolution_stack
 from litho_models.frozen.files import load_frozen, save_frozen
 from litho_models.models import build_model
 
 SLOPE = 0.02
-EXACT = StackSettings(SLOPE, torch.float64, torch.float64)
+
+
+def in_dtypes(hidden: torch.dtype, adjoint: torch.dtype) -> dict[str, Any]:
+    return {"leaky_slope": SLOPE, "hidden_dtype": hidden, "adjoint_dtype": adjoint}
+
+
+EXACT = in_dtypes(torch.float64, torch.float64)
 
 
 def make_parameters(
@@ -43,7 +50,7 @@ def test_it_is_the_plain_stack_and_its_gradients(shape, learns):
     weights, biases = make_parameters(learns)
     generator = torch.Generator().manual_seed(1)
     field = torch.randn(shape, generator=generator, dtype=torch.float64, requires_grad=True)
-    height, expected = convolution_stack(field, weights, biases, EXACT), by_autograd(field, weights, biases)
+    height, expected = convolution_stack(field, weights, biases, **EXACT), by_autograd(field, weights, biases)
     assert height.shape == (shape[0], 1, shape[2] - 8, shape[3] - 8)
     # The same sums in another order: 54 terms of order one in double precision.
     assert torch.allclose(height, expected, rtol=0, atol=1e-13)
@@ -70,11 +77,11 @@ def test_the_number_of_threads_changes_no_bit(learns, threads):
     weights, biases = make_parameters(learns, torch.float32)
     field = torch.randn(1, 1, 230, 310, generator=torch.Generator().manual_seed(4), requires_grad=True)
     wanted = [field, *weights, *biases] if learns else [field]
-    settings = StackSettings(SLOPE, torch.float32, torch.bfloat16)
+    settings = in_dtypes(torch.float32, torch.bfloat16)
     made = []
     for count in (1, 3):
         threads(count)
-        height = convolution_stack(field, weights, biases, settings)
+        height = convolution_stack(field, weights, biases, **settings)
         made.append([height.detach(), *torch.autograd.grad(height.square().sum(), wanted)])
         assert torch.get_num_threads() == count
     assert all(torch.equal(a, b) for a, b in zip(*made, strict=True))
@@ -85,7 +92,7 @@ def test_an_error_in_a_tile_is_raised_and_leaves_the_number_of_threads(threads):
     weights, biases = make_parameters(learns=False)
     weights[1] = weights[1][:, :-1]
     with pytest.raises(RuntimeError, match="channels"):
-        convolution_stack(torch.zeros(1, 1, 300, 300, dtype=torch.float64), weights, biases, EXACT)
+        convolution_stack(torch.zeros(1, 1, 300, 300, dtype=torch.float64), weights, biases, **EXACT)
     assert torch.get_num_threads() == 2
 
 
@@ -93,7 +100,7 @@ def test_weights_learn_from_a_field_that_wants_no_gradient():
     weights, biases = make_parameters(learns=True)
     field = torch.randn(1, 1, 30, 30, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     wanted = [*weights, *biases]
-    ours = torch.autograd.grad(convolution_stack(field, weights, biases, EXACT).square().sum(), wanted)
+    ours = torch.autograd.grad(convolution_stack(field, weights, biases, **EXACT).square().sum(), wanted)
     plain = torch.autograd.grad(by_autograd(field, weights, biases).square().sum(), wanted)
     for a, b in zip(ours, plain, strict=True):
         assert torch.allclose(a, b, rtol=1e-12, atol=1e-12)
@@ -106,8 +113,8 @@ def test_a_reduced_adjoint_leaves_the_height_alone_and_the_gradients_close(learn
     wanted = [field, *weights, *biases] if learns else [field]
     heights, gradients = [], []
     for adjoint in (torch.float32, torch.bfloat16):
-        settings = StackSettings(SLOPE, torch.float32, adjoint)
-        height = convolution_stack(field, weights, biases, settings)
+        settings = in_dtypes(torch.float32, adjoint)
+        height = convolution_stack(field, weights, biases, **settings)
         heights.append(height.detach())
         gradients.append(torch.autograd.grad(height.square().sum(), wanted))
     assert torch.equal(*heights)
@@ -121,7 +128,7 @@ def test_a_reduced_adjoint_leaves_the_height_alone_and_the_gradients_close(learn
 
 def test_without_a_gradient_nothing_is_kept():
     field = torch.zeros(1, 1, 20, 20, dtype=torch.float64)
-    assert convolution_stack(field, *make_parameters(learns=False), EXACT).grad_fn is None
+    assert convolution_stack(field, *make_parameters(learns=False), **EXACT).grad_fn is None
 
 
 def test_a_frozen_pbl_prints_what_the_trained_one_does(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,8 +11,7 @@ import torch
 from torch.autograd.function import FunctionCtx
 from torch.nn import functional
 
-from litho_models.fast import winograd
-from litho_models.fast.stack import StackSettings, convolution_stack
+from litho_models.fast import convolution_stack, winograd
 from litho_models.fast.winograd import FixedStack
 from litho_models.fast.winograd_passes import FRAME_PX, lift_back
 
@@ -169,12 +169,12 @@ def test_it_is_what_a_fixed_stack_runs_with_any_number_of_threads(adjoint, param
     heights = FixedStack.heights
     monkeypatch.setattr(FixedStack, "heights", lambda self, tile: uses.append(1) or heights(self, tile))
     field = random_field(2, 1, 150, 310).requires_grad_()
-    settings = StackSettings(SLOPE, torch.float32, adjoint)
+    settings = _in(torch.float32, adjoint)
     made = []
     # Two fields of 2 x 3 tiles: more of them than threads, and fewer.
     for count in (1, 3, 16):
         threads(count)
-        height = convolution_stack(field, *parameters, settings)
+        height = convolution_stack(field, *parameters, **settings)
         made.append([height.detach()])
         for _ in range(2):
             made[-1] += torch.autograd.grad(height.square().sum(), field, retain_graph=True)
@@ -182,7 +182,7 @@ def test_it_is_what_a_fixed_stack_runs_with_any_number_of_threads(adjoint, param
     for others in made[1:]:
         assert all(torch.equal(a, b) for a, b in zip(made[0], others, strict=True))
     assert torch.equal(made[0][1], made[0][2])
-    by_convolutions = convolution_stack(field.double(), *_double(parameters), _in(torch.float64))
+    by_convolutions = convolution_stack(field.double(), *_double(parameters), **_in(torch.float64))
     assert torch.allclose(made[0][0].double(), by_convolutions, atol=1e-5)
     (expected,) = torch.autograd.grad(by_convolutions.square().sum(), field)
     # Some of 10 million hidden values are within 1e-6 of zero and pass another slope there. bfloat16 rounds
@@ -204,10 +204,10 @@ def test_without_a_graph_any_number_of_threads_predicts_and_nothing_is_kept(
 
     monkeypatch.setattr(FunctionCtx, "save_for_backward", count)
     field = random_field(1, 1, 300, 300).requires_grad_()
-    expected = convolution_stack(field, *parameters, _in(torch.float32)).detach()
+    expected = convolution_stack(field, *parameters, **_in(torch.float32)).detach()
     threads(3)
     with without():
-        assert torch.equal(convolution_stack(field, *parameters, _in(torch.float32)), expected)
+        assert torch.equal(convolution_stack(field, *parameters, **_in(torch.float32)), expected)
     # The field, four weights, four biases; with a graph the signs of 3 x 3 tiles in three layers too.
     assert kept == [9 + 27, 9]
 
@@ -217,17 +217,17 @@ def test_weights_that_learn_and_odd_numbers_of_channels_are_convolved(parameters
     settings = _in(torch.float32)
     field = random_field(1, 1, 20, 20)
     learning = [[p.clone().requires_grad_() for p in half] for half in parameters]
-    height = convolution_stack(field, *learning, settings)
+    height = convolution_stack(field, *learning, **settings)
     assert height.requires_grad
     with torch.no_grad():
-        assert torch.equal(convolution_stack(field, *learning, settings), height)
+        assert torch.equal(convolution_stack(field, *learning, **settings), height)
     narrow = make_parameters(7, 16)
-    assert convolution_stack(field, *narrow, settings).shape == (1, 1, 14, 14)
+    assert convolution_stack(field, *narrow, **settings).shape == (1, 1, 14, 14)
 
 
 def _double(parameters) -> list[list[torch.Tensor]]:
     return [[tensor.double() for tensor in half] for half in parameters]
 
 
-def _in(dtype: torch.dtype) -> StackSettings:
-    return StackSettings(SLOPE, dtype, dtype)
+def _in(dtype: torch.dtype, adjoint: torch.dtype | None = None) -> dict[str, Any]:
+    return {"leaky_slope": SLOPE, "hidden_dtype": dtype, "adjoint_dtype": adjoint or dtype}
