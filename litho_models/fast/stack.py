@@ -74,9 +74,7 @@ def convolution_stack(
 
 class _Stack(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any, field: Tensor, settings: _Settings, records: bool, *parameters: Tensor
-    ) -> Tensor:
+    def forward(ctx: Any, field: Tensor, settings: _Settings, records: bool, *parameters: Tensor) -> Tensor:
         slope, dtype = settings.leaky_slope, settings.hidden_dtype
         weights, biases = _halves(parameters)
         hidden = _channels_last(weights[1:-1], dtype)
