@@ -18,6 +18,13 @@ ALLOWED = {
 }
 # What design may use of the models: what loads and calls a frozen one.
 FROZEN_ONLY = {"load_frozen", "frozen", "simulator"}
+# Rooms from the ground up: a room imports from those before it only. `simulator` is a module.
+ROOMS = {
+    "litho_models": (
+        "layers", "simulator", "prediction", "fast", "models", "scan_terms", "effects", "splits",
+        "frozen", "scoring", "fitting", "evaluation", "noise", "loop", "cli",
+    ),
+}  # fmt: skip
 HEAVY = ("torch", "cv2", "xarray", "zarr", "matplotlib", "pandas", "skimage", "SurfaceTopography")
 
 
@@ -63,6 +70,50 @@ def test_design_uses_only_frozen_models() -> None:
             parts = name.split(".")
             if parts[0] == "litho_models":
                 assert parts[1] in FROZEN_ONLY, f"{file.relative_to(ROOT)} imports {name}"
+
+
+@pytest.mark.parametrize("package", sorted(ROOMS))
+def test_modules_import_each_other_in_no_circle(package: str) -> None:
+    graph = _module_graph(package)
+    assert sum(map(len, graph.values())) > len(graph), (
+        "hardly an import found: the test would pass on nothing"
+    )
+    # What imports none of the rest, or is imported by none of it, is in no circle.
+    while loose := [
+        name
+        for name, imported in graph.items()
+        if not imported & graph.keys() or not any(name in others for others in graph.values())
+    ]:
+        for name in loose:
+            del graph[name]
+    assert not graph, f"these modules import each other in circles: {sorted(graph)}"
+
+
+@pytest.mark.parametrize("package", sorted(ROOMS))
+def test_rooms_import_only_from_those_before_them(package: str) -> None:
+    order = {room: place for place, room in enumerate(ROOMS[package])}
+    for name, imported in _module_graph(package).items():
+        for other in imported:
+            room, its = (module.split(".")[1] for module in (name, other))
+            assert order[its] <= order[room], f"{name} imports {other}: {its} lies above {room}"
+
+
+def _module_graph(package: str) -> dict[str, set[str]]:
+    """Per module of a package the modules of the package that it imports, anywhere in the file.
+
+    The package's own face is left out: it names everything, and nothing inside imports it.
+    """
+    modules = {}
+    for file in _sources(package):
+        parts = file.relative_to(ROOT).with_suffix("").parts
+        modules[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = file
+    del modules[package]
+    graph = {}
+    for name, file in modules.items():
+        # `from room.module import name` imports room.module; `from room import module` that module too.
+        whole = {n if n in modules else n.rpartition(".")[0] for n in _imports(file)}
+        graph[name] = (whole & modules.keys()) - {name}
+    return graph
 
 
 def test_virtual_fab_knows_no_model() -> None:

@@ -44,14 +44,13 @@ def noise(
     seed: Annotated[int, typer.Option(min=0, help="seed of the pixels drawn")] = 0,
 ) -> None:
     """Roughness, dose matrix, bounds on the noise, σ(x) and its calibration; lengths in µm, noise in nm."""
-    from litho_models.noise import noise as analyse
-    from litho_models.noise import noise_of_files
+    from litho_models.noise import analyse_noise, analyse_noise_of_files
 
     _check_given(context)
     if store is not None:
-        result = analyse(store, out, residuals=residuals or (), model=model, seed=seed)
+        result = analyse_noise(store, out, residuals=residuals or (), model=model, seed=seed)
     else:
-        result = noise_of_files(
+        result = analyse_noise_of_files(
             out,
             flat=Path(flat or ""),
             substrate=substrate,

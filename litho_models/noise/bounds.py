@@ -15,8 +15,8 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_data.roughness import split_noise
 from litho_data.store import PrintedScan, Store
 from litho_data.store.access import has_child
-from litho_models.noise.gaussian_law import GAUSSIAN_MAE
 from litho_models.noise.neighbourhoods import neighbourhood_noise
+from litho_models.noise.spread_scores import GAUSSIAN_MAE
 from litho_models.noise.surface import without_background
 from litho_models.scoring.statistics import bootstrap_interval
 

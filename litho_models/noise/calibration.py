@@ -11,15 +11,16 @@ from pydantic import Field
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
-from litho_models.noise.gaussian_law import (
+from litho_models.noise.spread_scores import (
     COVERAGE_LEVELS,
     coverage,
     crps,
     half_width,
     negative_log_likelihood,
+    normalised_calibration_error,
     probability_below,
+    sparsification_error,
 )
-from litho_models.noise.spread_scores import normalised_calibration_error, sparsification_error
 from litho_models.noise.variance import (
     SigmaBin,
     VarianceModel,

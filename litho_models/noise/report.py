@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from litho_data.foundation.report import Page
 from litho_models.evaluation.tables import interval_text
-from litho_models.noise import figures
+from litho_models.noise import plots
 from litho_models.noise.calibration import SpreadAnalysis
 from litho_models.noise.dose import DoseMatrix
 from litho_models.noise.staircase import StepPrint
@@ -16,7 +16,7 @@ from litho_models.noise.staircase import StepPrint
 if TYPE_CHECKING:
     import pandas as pd
 
-    from litho_models.noise.analyse import Reference
+    from litho_models.noise.references import Reference
     from litho_models.noise.result import NoiseAnalysis
 
 
@@ -41,7 +41,7 @@ def write_noise_report(result: NoiseAnalysis, references: Sequence[Reference], o
             "Each figure says how it errs. The lower bound holds if the printer is no sharper than stated; "
             "an upper bound counts topography as well."
         )
-        page.figure(figures.bounds(result.bounds, floor), "σ of each figure.")
+        page.figure(plots.bounds(result.bounds, floor), "σ of each figure.")
         page.table(_bounds(result), "What each contains, and what not.", "bounds.csv")
     if result.spread is not None:
         _spread(page, result.spread)
@@ -54,7 +54,7 @@ def _references(page: Page, result: NoiseAnalysis, references: Sequence[Referenc
 
     found = result.references
     page.heading("Reference prints")
-    page.figure(figures.surfaces(references), "Heights about their mean; substrate and flat share a scale.")
+    page.figure(plots.surfaces(references), "Heights about their mean; substrate and flat share a scale.")
     rows = [
         {"use": use, **surface.model_dump()}
         for use, group in (("substrate", found.substrates), ("flat", found.flats))
@@ -80,7 +80,7 @@ def _steps(page: Page, found: StepPrint) -> None:
     import pandas as pd
 
     page.heading(f"Steps of {found.id}")
-    page.figure(figures.steps(found), "Step heights and the smallest step that can be told from none.")
+    page.figure(plots.steps(found), "Step heights and the smallest step that can be told from none.")
     page.table(
         pd.DataFrame([{"step": n + 1, **step.model_dump()} for n, step in enumerate(found.steps)]),
         f"Steps along {found.axis}; tread σ {found.tread_sigma_nm:.2f} nm. Readability is height over σ; "
@@ -96,7 +96,7 @@ def _dose(page: Page, found: DoseMatrix) -> None:
     page.heading("Dose matrix")
     page.paragraph(f"Recommended dose: {found.recommended_dose:g}. Reason: {found.reason}.")
     page.figure(
-        figures.dose(found),
+        plots.dose(found),
         "Green: recommended. Shaded: steps are lost. Dashed: single pixels of two levels are told apart.",
     )
     rows = [{**row.model_dump(exclude={"levels", "scans"}), "scans": len(row.scans)} for row in found.rows]
@@ -128,8 +128,8 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
             "member freed of its mean). The fitted σ already holds the error that this disagreement is "
             "part of; the row with it added shows whether it tells more."
         )
-    page.figure(figures.spread(found), "Spread against level, slope, distance to the next edge, and radius.")
-    page.figure(figures.calibration(found), "Calibration on scans left out.")
+    page.figure(plots.spread(found), "Spread against level, slope, distance to the next edge, and radius.")
+    page.figure(plots.calibration(found), "Calibration on scans left out.")
     rows = [
         {
             "σ": one.name,

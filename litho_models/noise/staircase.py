@@ -11,7 +11,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.roughness import stair_steps
-from litho_models.noise.gaussian_law import half_width, probability_below
+from litho_models.noise.spread_scores import half_width, probability_below
 
 Axis = Literal["x", "y"]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
@@ -10,7 +11,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.roughness import amplitude_parameters, effective_samples
-from litho_models.noise.gaussian_law import GAUSSIAN_MAE
+from litho_models.noise.spread_scores import GAUSSIAN_MAE
 
 Background = Literal["offset", "quadratic"]
 BACKGROUNDS: tuple[Background, ...] = ("offset", "quadratic")
@@ -119,4 +120,22 @@ def print_noise(flat: SurfaceNoise, substrate: SurfaceNoise) -> PrintNoise:
         substrate_uncertainty_nm=substrate.sigma_uncertainty_nm,
         print_nm=print_nm,
         print_uncertainty_nm=uncertainty,
+    )
+
+
+def pooled(surfaces: Sequence[SurfaceNoise]) -> SurfaceNoise:
+    """Several surfaces of one kind as one: variances and mean absolute deviations averaged."""
+    if len(surfaces) == 1:
+        return surfaces[0]
+    sigma = float(np.sqrt(np.mean([one.sigma_nm**2 for one in surfaces])))
+    independent = float(np.sum([one.independent_heights for one in surfaces]))
+    return SurfaceNoise(
+        id="+".join(one.id for one in surfaces),
+        background=surfaces[0].background,
+        sigma_nm=sigma,
+        sigma_uncertainty_nm=sigma / float(np.sqrt(2 * max(1.0, independent))),
+        mae_nm=float(np.mean([one.mae_nm for one in surfaces])),
+        gaussian_mae_nm=float(np.mean([one.gaussian_mae_nm for one in surfaces])),
+        independent_heights=independent,
+        pixels=sum(one.pixels for one in surfaces),
     )

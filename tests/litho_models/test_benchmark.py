@@ -273,11 +273,11 @@ def test_a_training_error_is_not_compared_with_a_held_out_one(store, tmp_path):
 
 
 def test_the_floor_beside_the_errors_is_that_of_the_noise_analysis_given(store, tmp_path):
-    from litho_models.noise import NoiseAnalysis, noise_of_files
+    from litho_models.noise import NoiseAnalysis, analyse_noise_of_files
 
     flat = 0.016 * np.random.default_rng(0).standard_normal((64, 64))
     np.save(tmp_path / "flat.npy", flat)
-    noise_of_files(tmp_path / "noise", flat=tmp_path / "flat.npy", unit="um", size_um=(6.4, 6.4))
+    analyse_noise_of_files(tmp_path / "noise", flat=tmp_path / "flat.npy", unit="um", size_um=(6.4, 6.4))
     scored = benchmark(store, tmp_path / "b", models=["identity"], folds=2, noise=tmp_path / "noise")
     assert scored.noise_floor.kind == "measured"
     # 64² independent heights: relative standard error of σ is 1/√(2 · 64²) = 1.1 %; three of them.

@@ -16,15 +16,25 @@ from litho_data.store.lock_box import locked_ids
 from litho_models.noise.bounds import high_band_sigma_nm, repeated_prints
 from litho_models.noise.calibration import Residuals, analyse_spread, conformal_factor
 from litho_models.noise.dose import dose_matrix
-from litho_models.noise.gaussian_law import coverage, crps, half_width, negative_log_likelihood
 from litho_models.noise.neighbourhoods import neighbourhood_noise
 from litho_models.noise.residuals import disagreement_um
-from litho_models.noise.spread_scores import normalised_calibration_error, sparsification_error
+from litho_models.noise.spread_scores import (
+    coverage,
+    crps,
+    half_width,
+    negative_log_likelihood,
+    normalised_calibration_error,
+    sparsification_error,
+)
 from litho_models.noise.staircase import READABLE_AT, find_edges, step_print
 from litho_models.noise.surface import print_noise, surface_noise
 from litho_models.noise.variance import COVARIATES, covariate_maps, fit_log_variance, sigma_nm
 
-RANDOM = np.random.default_rng(0)
+
+@pytest.fixture
+def random():
+    """Draws of its own for every test, whatever ran before it."""
+    return np.random.default_rng(0)
 
 
 # --- closed forms -------------------------------------------------------------------------------
@@ -43,8 +53,8 @@ def test_crps_becomes_the_absolute_error_without_spread():
     assert np.allclose(crps(residual, 1e-9), np.abs(residual), atol=1e-8)
 
 
-def test_the_scores_are_best_at_the_true_spread():
-    residual = RANDOM.normal(0, 3.0, 40_000)
+def test_the_scores_are_best_at_the_true_spread(random):
+    residual = random.normal(0, 3.0, 40_000)
     for score in (negative_log_likelihood, crps):
         at = [score(residual, sigma).mean() for sigma in (2.4, 3.0, 3.6)]
         assert at[1] < at[0]
@@ -55,16 +65,16 @@ def test_the_scores_are_best_at_the_true_spread():
 
 
 @pytest.mark.parametrize("level", [0.5, 0.8, 0.9, 0.95])
-def test_coverage_of_a_gaussian_is_its_level(level):
-    residual = RANDOM.normal(0, 2.0, 100_000)
+def test_coverage_of_a_gaussian_is_its_level(level, random):
+    residual = random.normal(0, 2.0, 100_000)
     # Binomial sd √(p(1 − p)/n) ≤ 0.0016.
     assert coverage(residual, 2.0, level) == pytest.approx(level, abs=0.007)
 
 
-def test_ence_is_the_relative_error_of_sigma():
+def test_ence_is_the_relative_error_of_sigma(random):
     sigma = np.repeat([1.0, 2.0, 5.0, 9.0], 1000)
     # Residuals of ± σ have that rms in every bin.
-    residual = sigma * RANDOM.choice([-1.0, 1.0], sigma.size)
+    residual = sigma * random.choice([-1.0, 1.0], sigma.size)
     assert normalised_calibration_error(residual, sigma) == pytest.approx(0, abs=1e-12)
     assert normalised_calibration_error(residual, 2 * sigma) == pytest.approx(0.5)
     assert normalised_calibration_error(residual, sigma / 2) == pytest.approx(1.0)
@@ -73,16 +83,16 @@ def test_ence_is_the_relative_error_of_sigma():
     assert normalised_calibration_error(residual, constant) == pytest.approx(0, abs=1e-12)
     # Of a Gaussian the rms of n pixels has the relative sd 1/√(2n), so its mean deviation is 1/√(πn); ten
     # bins of 4,000 know that to a quarter.
-    steady = RANDOM.uniform(1, 9, 40_000)
-    gaussian = steady * RANDOM.normal(0, 1, steady.size)
+    steady = random.uniform(1, 9, 40_000)
+    gaussian = steady * random.normal(0, 1, steady.size)
     assert normalised_calibration_error(gaussian, steady) == pytest.approx(
         1 / np.sqrt(4000 * np.pi), abs=1 / np.sqrt(4000 * np.pi)
     )
 
 
-def test_ause_of_uniform_errors_has_closed_forms():
+def test_ause_of_uniform_errors_has_closed_forms(random):
     error = (np.arange(10_000) + 0.5) / 10_000
-    residual = RANDOM.permutation(error) * RANDOM.choice([-1.0, 1.0], error.size)
+    residual = random.permutation(error) * random.choice([-1.0, 1.0], error.size)
     size = np.abs(residual)
     # The lowest share q of errors uniform on 0 ... 1 has q times the mean, the highest 2 − q times: areas of
     # 1/2 and 3/2; any order of equal σ has 1. Sums over 10,000 pixels stand for the integrals.
@@ -429,10 +439,10 @@ def store(tmp_path_factory):
 
 
 def test_a_store_without_references_gets_a_lower_bound_that_is_one(store, tmp_path):
-    from litho_models.noise import NoiseAnalysis, noise
+    from litho_models.noise import NoiseAnalysis, analyse_noise
     from litho_models.scoring.noise_floor import noise_floor
 
-    result = noise(store, tmp_path / "out")
+    result = analyse_noise(store, tmp_path / "out")
     assert NoiseAnalysis.read(tmp_path / "out") == result
     # Planted: 4 nm of white noise.
     assert result.noise_floor.kind == "lower-bound"
@@ -448,24 +458,24 @@ def test_a_store_without_references_gets_a_lower_bound_that_is_one(store, tmp_pa
 
 
 def test_a_store_of_ordinary_layouts_with_doses_has_bounds_and_no_matrix(tmp_path):
-    from litho_models.noise import noise
+    from litho_models.noise import analyse_noise
 
     doses = (0.9, 1.0, 1.1, 0.9, 1.0, 1.1)
     scans = [replace(scan, dose=dose) for scan, dose in zip(make_scans(6, size_px=64), doses, strict=True)]
     for scan in scans:
         scan.mask_level[::2] = 0
-    result = noise(write_store(tmp_path / "dosed.zarr", scans), tmp_path / "out")
+    result = analyse_noise(write_store(tmp_path / "dosed.zarr", scans), tmp_path / "out")
     assert result.dose is None
     assert result.bounds
     assert any("No dose matrix: prints at dose 0.9, 1, 1.1" in note for note in result.notes)
 
 
 def test_a_locked_print_is_in_the_dose_matrix_and_in_nothing_else(tmp_path):
-    from litho_models.noise import noise
+    from litho_models.noise import analyse_noise
 
     doses = [0.8, 0.9, 1.0, 1.1, 1.2]
     prints = [replace(ladder(dose), order=number, print_id=str(number)) for number, dose in enumerate(doses)]
-    result = noise(write_store(tmp_path / "doses.zarr", prints), tmp_path / "out")
+    result = analyse_noise(write_store(tmp_path / "doses.zarr", prints), tmp_path / "out")
     (locked,) = locked_ids(prints)
     assert [row.scans for row in result.dose.rows] == [[scan.id] for scan in prints]
     assert result.run.dropped == [f"{locked}: lock box, in the dose matrix only"]
@@ -477,7 +487,7 @@ def test_a_locked_print_is_in_the_dose_matrix_and_in_nothing_else(tmp_path):
 
 def test_residuals_of_a_benchmark_are_out_of_fold_and_locked_scans_stay_out(store, tmp_path):
     from litho_models.evaluation.benchmark import benchmark
-    from litho_models.noise import noise
+    from litho_models.noise import analyse_noise
 
     folders = [tmp_path / "b0", tmp_path / "b1"]
     for seed, folder in enumerate(folders):
@@ -490,7 +500,7 @@ def test_residuals_of_a_benchmark_are_out_of_fold_and_locked_scans_stay_out(stor
             open_lock_box=True,
             seed=seed,
         )
-    result = noise(store, tmp_path / "out", residuals=folders)
+    result = analyse_noise(store, tmp_path / "out", residuals=folders)
     spread = result.spread
     assert (spread.model, spread.members, spread.held_out) == ("linear", 2, True)
     assert len(spread.calibrations) == 3
@@ -504,30 +514,30 @@ def test_residuals_of_a_benchmark_are_out_of_fold_and_locked_scans_stay_out(stor
         spread.calibrations[0].levels, spread.calibrations[0].scans[0].coverage, strict=True
     ):
         assert float(rows[0][f"coverage_{100 * level:.0f}"]) == pytest.approx(share, abs=5e-4)
-    chosen = noise(store, tmp_path / "affine", residuals=folders[:1], model="affine").spread
+    chosen = analyse_noise(store, tmp_path / "affine", residuals=folders[:1], model="affine").spread
     assert chosen.model == "affine"
     assert chosen.residual_rms_nm > spread.residual_rms_nm
     with pytest.raises(InputError, match="model of"):
-        noise(store, tmp_path / "none", residuals=folders, model="pbl")
+        analyse_noise(store, tmp_path / "none", residuals=folders, model="pbl")
     with pytest.raises(InputError, match="one source twice"):
-        noise(store, tmp_path / "none", residuals=[folders[0], folders[0]])
+        analyse_noise(store, tmp_path / "none", residuals=[folders[0], folders[0]])
     with pytest.raises(InputError, match="no residuals"):
-        noise(store, tmp_path / "none", model="linear")
+        analyse_noise(store, tmp_path / "none", model="linear")
     other = write_store(tmp_path / "other.zarr", make_scans(3, size_px=64))
     with pytest.raises(InputError, match="dataset of"):
-        noise(other, tmp_path / "none", residuals=folders)
+        analyse_noise(other, tmp_path / "none", residuals=folders)
 
 
 def test_residuals_of_a_frozen_model_say_what_it_saw(store, tmp_path):
     from litho_models.fitting.runs import train
-    from litho_models.noise import noise
+    from litho_models.noise import analyse_noise
 
     train(store, "linear", tmp_path / "run")
-    spread = noise(store, tmp_path / "out", residuals=[tmp_path / "run" / "model"]).spread
+    spread = analyse_noise(store, tmp_path / "out", residuals=[tmp_path / "run" / "model"]).spread
     assert not spread.held_out
     assert len(spread.calibrations[0].scans) == 7
     with pytest.raises(InputError, match="a frozen one"):
-        noise(store, tmp_path / "none", residuals=[tmp_path / "run" / "model"], model="linear")
+        analyse_noise(store, tmp_path / "none", residuals=[tmp_path / "run" / "model"], model="linear")
 
 
 def test_residuals_are_those_of_the_benchmark_and_of_the_evaluation(tmp_path):

@@ -1,4 +1,4 @@
-"""Figures of the noise report."""
+"""Plots of the noise report."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from litho_models.scoring.noise_floor import NoiseFloor
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from litho_models.noise.analyse import Reference
+    from litho_models.noise.references import Reference
 
 _COLOURS = {"lower bound": "#2d8a4e", "upper bound": "#c23b22", "estimate": "#0b6aa2", "control": "#9aa7b5"}
 

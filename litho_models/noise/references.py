@@ -1,0 +1,90 @@
+"""Scans made to measure the noise: bare substrate, flat print, steps; and what they say."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from litho_data.foundation.results import Record
+from litho_data.store import Store
+from litho_models.noise.staircase import StepPrint, step_print
+from litho_models.noise.surface import (
+    BACKGROUNDS,
+    PrintNoise,
+    SurfaceNoise,
+    pooled,
+    print_noise,
+    surface_noise,
+)
+
+
+@dataclass(frozen=True)
+class Reference:
+    """A scan made to measure the noise: ``use`` is substrate, flat or steps; heights and pitch in µm."""
+
+    id: str
+    use: str
+    height_um: np.ndarray
+    pitch_um: tuple[float, float]
+
+
+class ReferencePrints(Record):
+    """What the reference scans say: roughness of each surface, of the print alone, and the steps."""
+
+    substrates: list[SurfaceNoise] = Field(default_factory=list)
+    flats: list[SurfaceNoise] = Field(default_factory=list)
+    print_noise: list[PrintNoise] = Field(default_factory=list)
+    steps: list[StepPrint] = Field(default_factory=list)
+
+
+def store_references(store: Store) -> list[Reference]:
+    """The substrate, flat and step scans of a store, levelled, in their own frame."""
+    pitches = _recorded_pitches(store)
+    return [
+        Reference(
+            scan_id,
+            use,
+            store.scan_frame(scan_id, "levelled_height_um"),
+            pitches.get(scan_id, (store.pitch_um, store.pitch_um)),
+        )
+        for scan_id, use in store.references().items()
+    ]
+
+
+def reference_prints(references: Sequence[Reference], level_height_um: float) -> ReferencePrints:
+    """Roughness of substrates and flat prints under both backgrounds, the print alone, and the steps."""
+
+    def surfaces(use: str) -> list[SurfaceNoise]:
+        return [
+            surface_noise(one.id, one.height_um, background)
+            for one in references
+            if one.use == use
+            for background in BACKGROUNDS
+        ]
+
+    substrates, flats = surfaces("substrate"), surfaces("flat")
+    alone = [
+        print_noise(flat, pooled([s for s in substrates if s.background == flat.background]))
+        for flat in flats
+        if substrates
+    ]
+    steps = [
+        step_print(one.id, one.height_um, one.pitch_um, level_height_um)
+        for one in references
+        if one.use == "steps"
+    ]
+    return ReferencePrints(substrates=substrates, flats=flats, print_noise=alone, steps=steps)
+
+
+def _recorded_pitches(store: Store) -> dict[str, tuple[float, float]]:
+    """Pitch (y, x) of the scans as their reader recorded it, µm."""
+    pitches = {}
+    for row in store.manifest.get("files", []):
+        pitch = json.loads(row["read"] or "{}").get("pitch_um")
+        if pitch:
+            pitches[row["scan"]] = (float(pitch[0]), float(pitch[1]))
+    return pitches
