@@ -5,10 +5,21 @@ from typing import TYPE_CHECKING
 from litho_data.foundation.faces import lazy_face
 
 if TYPE_CHECKING:
+    from litho_models.evaluation.benchmark import benchmark as benchmark
+    from litho_models.evaluation.compare import compare as compare
+    from litho_models.evaluation.evaluate import evaluate as evaluate
+    from litho_models.fitting.runs import train as train
     from litho_models.frozen import zoo as zoo
     from litho_models.frozen.files import load_frozen as load_frozen
     from litho_models.frozen.files import save_frozen as save_frozen
+    from litho_models.frozen.freezing import freeze as freeze
     from litho_models.frozen.simulator import FrozenSimulator as FrozenSimulator
+    from litho_models.loop import LoopConfig as LoopConfig
+    from litho_models.loop import close_loop_on_store as close_loop
+    from litho_models.models import build_model as build_model
+    from litho_models.noise import analyse_noise as analyse_noise
+    from litho_models.scoring.metric_registry import register_metric as register_metric
+    from litho_models.simulator import Simulator as Simulator
 
     __version__: str
 else:
@@ -16,10 +27,38 @@ else:
         __name__,
         {
             "FrozenSimulator": "litho_models.frozen.simulator",
+            "LoopConfig": "litho_models.loop",
+            "Simulator": "litho_models.simulator",
+            "analyse_noise": "litho_models.noise",
+            "benchmark": "litho_models.evaluation.benchmark",
+            "build_model": "litho_models.models",
+            "close_loop": "litho_models.loop:close_loop_on_store",
+            "compare": "litho_models.evaluation.compare",
+            "evaluate": "litho_models.evaluation.evaluate",
+            "freeze": "litho_models.frozen.freezing",
             "load_frozen": "litho_models.frozen.files",
+            "register_metric": "litho_models.scoring.metric_registry",
             "save_frozen": "litho_models.frozen.files",
+            "train": "litho_models.fitting.runs",
             "zoo": "litho_models.frozen",
         },
     )
 
-__all__ = ["FrozenSimulator", "__version__", "load_frozen", "save_frozen", "zoo"]
+__all__ = [
+    "FrozenSimulator",
+    "LoopConfig",
+    "Simulator",
+    "__version__",
+    "analyse_noise",
+    "benchmark",
+    "build_model",
+    "close_loop",
+    "compare",
+    "evaluate",
+    "freeze",
+    "load_frozen",
+    "register_metric",
+    "save_frozen",
+    "train",
+    "zoo",
+]

@@ -21,8 +21,9 @@ def lazy_face(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], A
 
     Args:
         package: ``__name__`` of the package.
-        homes: per public name the module that ``from module import name`` takes it from. A public name
-            must not be that of a room of the package, because importing a room binds its name.
+        homes: per public name the module that ``from module import name`` takes it from, or
+            ``"module:other"`` where it has another name there. A public name must not be that of a room of
+            the package, because importing a room binds its name.
 
     ``__version__`` is always there: the version of the distribution, ``"0"`` where it is not installed.
     """
@@ -31,7 +32,8 @@ def lazy_face(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], A
         if name == "__version__":
             value: Any = _version()
         elif name in homes:
-            value = getattr(__import__(homes[name], fromlist=[name]), name)
+            module, _, inner = homes[name].partition(":")
+            value = getattr(__import__(module, fromlist=[inner or name]), inner or name)
         else:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         setattr(sys.modules[package], name, value)
