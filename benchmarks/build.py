@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks.record import origin, publish, usable_cores, write_record
+from litho_data.foundation.commands import run_script
 from litho_data.layouts import random_layout
 from litho_data.layouts.card_text import write_layout
 
@@ -186,4 +187,4 @@ def _resident_bytes(pid: int) -> int:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -27,6 +27,7 @@ from benchmarks.plain_pbl import PlainPbl
 from benchmarks.predict import SIDES, gradient_gflop
 from benchmarks.side_by_side import Arrays, Work
 from benchmarks.trained_pbl import load_pbl
+from litho_data.foundation.commands import run_script
 from litho_design.optimisation.optimise import make_parametrisation
 from litho_design.printers.source import load_printer
 from litho_design.tasks.hoe import HoeTask
@@ -113,4 +114,4 @@ def _propagate(height_um: Tensor, settings: HoeSettings) -> Tensor:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.record import origin, publish, usable_cores, write_record
+from litho_data.foundation.commands import run_script
 from litho_data.level import (
     align_rows,
     level_facet,
@@ -173,4 +174,4 @@ def timed_ms(run: Callable[[], object]) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

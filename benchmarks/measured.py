@@ -27,6 +27,7 @@ from benchmarks.measured_models import (
 )
 from benchmarks.record import publish
 from examples.demo import PAPER_SEEDS
+from litho_data.foundation.commands import run_script
 from litho_models.evaluation.zoo_making import ZOO_MODELS
 from litho_models.frozen import zoo
 from litho_models.frozen.card import ModelCard
@@ -95,4 +96,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -24,6 +24,7 @@ import numpy as np
 import torch
 
 from benchmarks.record import origin, publish, write_record
+from litho_data.foundation.commands import run_script
 from litho_data.layouts import random_layout
 from litho_data.store import PrintedScan
 from litho_data.virtual_fab.random_curves import line_roughness
@@ -157,4 +158,4 @@ def _file(cache: Path, seed: int) -> Path:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

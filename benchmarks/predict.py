@@ -19,6 +19,7 @@ from benchmarks import side_by_side
 from benchmarks.plain_pbl import PlainPbl
 from benchmarks.side_by_side import Arrays, Work
 from benchmarks.trained_pbl import areawise_gflop, load_pbl, random_layout
+from litho_data.foundation.commands import run_script
 from litho_models import load_frozen
 from litho_models.models.pbl import PblConfig
 
@@ -87,4 +88,4 @@ def _differences(ours: Arrays, plain: Arrays, reach_px: int) -> Mapping[str, flo
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -15,6 +15,7 @@ from typing import Any
 
 from benchmarks.markdown_table import markdown_table, with_interval
 from benchmarks.record import publish
+from litho_data.foundation.commands import run_script
 from litho_models.evaluation.benchmark import benchmark
 from litho_models.evaluation.results import Benchmark
 from litho_models.fitting.config import PAPER_BATCH, PAPER_CROPS, PAPER_EPOCHS
@@ -147,4 +148,4 @@ def _row(result: Benchmark, score: ModelScores, difference: tuple[str, str]) -> 
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

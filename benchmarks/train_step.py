@@ -20,6 +20,7 @@ from benchmarks import side_by_side
 from benchmarks.plain_pbl import PlainPbl
 from benchmarks.side_by_side import Arrays, Work
 from benchmarks.trained_pbl import areawise_gflop, load_pbl, random_layout
+from litho_data.foundation.commands import run_script
 from litho_models.fitting.crops import Window, in_passes
 from litho_models.models.pbl import PblConfig
 from litho_models.simulator import crop_border
@@ -94,4 +95,4 @@ def _differences(ours: Arrays, plain: Arrays) -> Mapping[str, float]:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

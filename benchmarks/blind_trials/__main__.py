@@ -18,6 +18,7 @@ from benchmarks.blind_trials.campaign import finished, open_campaign, run_campai
 from benchmarks.blind_trials.document import figures_of, publish
 from benchmarks.blind_trials.report import CSV_NAME, write_report
 from benchmarks.blind_trials.scoreboard import make_scoreboard
+from litho_data.foundation.commands import run_script
 from litho_data.foundation.errors import InputError
 
 # Drawn from once the loop was finished; development uses seed 0.
@@ -93,4 +94,4 @@ def _numbers(text: str) -> list[int]:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -23,6 +23,7 @@ from benchmarks.gap.jobs import run_jobs
 from benchmarks.gap.plan import Effort, Plan, open_plan
 from benchmarks.gap.steps import fab_jobs, model_jobs, proof_jobs
 from benchmarks.gap.tasks import Task, chosen, tasks
+from litho_data.foundation.commands import run_script
 from litho_data.foundation.errors import InputError
 from litho_models.frozen import zoo
 
@@ -112,4 +113,4 @@ def _arguments() -> argparse.Namespace:
 
 
 if __name__ == "__main__":
-    main()
+    run_script(main)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from litho_data.build.card import Card
-from litho_data.provenance.steps import array_sha256, canonical_json, record_sha256
+from litho_data.foundation.hashes import array_sha256, canonical_json, record_sha256
 from litho_data.store.schema import SAMPLE_VARIABLES, STORE_SCHEMA, dataset_sha256
 from litho_data.store.write import consolidate, write_samples, write_table
 

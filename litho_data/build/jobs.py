@@ -17,9 +17,8 @@ from litho_data.build.listing import Listing, PrintedField
 from litho_data.build.operations import OPERATIONS, Done, perform
 from litho_data.build.quality import levelling_figures, noise_figures
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import file_sha256
+from litho_data.foundation.hashes import file_sha256, record_sha256
 from litho_data.foundation.run_facts import software_record
-from litho_data.provenance.steps import record_sha256
 from litho_data.store.partial import Piece
 
 

@@ -26,6 +26,7 @@ from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import software_record
 from litho_data.foundation.workers import run_jobs
 from litho_data.store.partial import partial_store
+from litho_data.store.schema import DatasetId
 
 # Pixels whose sides differ from the other scans' by more than this come from missing rows or columns.
 _ASPECT_TOLERANCE = 1e-3
@@ -36,13 +37,6 @@ class LeftOut(Record):
 
     id: str
     reason: str
-
-
-class DatasetId(Record):
-    """Which dataset a result is about."""
-
-    name: str
-    sha256: str
 
 
 class BuildResult(Result):

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from litho_data.foundation.files import file_sha256
+from litho_data.foundation.hashes import file_sha256
 
 if TYPE_CHECKING:
     import pandas as pd

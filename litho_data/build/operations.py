@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import file_sha256
-from litho_data.provenance.steps import Step, array_sha256, source_sha256
+from litho_data.foundation.hashes import array_sha256, file_sha256, source_sha256
+from litho_data.provenance.steps import Step
 from litho_data.store.schema import VARIABLES
 
 if TYPE_CHECKING:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from litho_data.build.card import load_card
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import file_sha256
+from litho_data.foundation.hashes import file_sha256
 
 if TYPE_CHECKING:
     import pooch

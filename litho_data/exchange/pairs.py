@@ -22,9 +22,8 @@ from litho_data.build.make_store import BuildResult, Source, make_store
 from litho_data.build.operations import OPERATIONS, perform
 from litho_data.build.quality import noise_figures
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import file_sha256
+from litho_data.foundation.hashes import file_sha256, record_sha256
 from litho_data.foundation.run_facts import software_record
-from litho_data.provenance.steps import record_sha256
 from litho_data.store.partial import Piece
 
 GREY_MAX = 255

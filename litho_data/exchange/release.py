@@ -9,7 +9,8 @@ from typing import Any
 
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import atomic_file, atomic_folder, file_sha256
+from litho_data.foundation.files import atomic_file, atomic_folder
+from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.outputs import require_replaceable_folder
 from litho_data.store.read import Store, open_store
 

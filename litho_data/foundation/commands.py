@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TypeVar
 
@@ -31,6 +31,12 @@ def run_app(app, name: str) -> None:
     except InputError as error:
         print(f"{name}: {error}", file=sys.stderr)
         raise SystemExit(2) from None
+
+
+def run_script(main: Callable[[], T]) -> T:
+    """Run the main function of a script; the results that it makes record its command line."""
+    with running_command(command_line()):
+        return main()
 
 
 def command_line(program: str | None = None) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import shutil
 import tempfile
@@ -11,8 +10,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from litho_data.foundation.errors import InputError
-
-_BLOCK_BYTES = 1 << 20
 
 
 @contextmanager
@@ -75,15 +72,6 @@ def writable(target: Path) -> Iterator[None]:
         raise InputError(
             f"cannot write {target}", got=error.strerror or str(error), wanted="a place that can be written"
         ) from error
-
-
-def file_sha256(path: str | Path) -> str:
-    """Hex SHA-256 of the bytes of one file."""
-    digest = hashlib.sha256()
-    with open(path, "rb") as stream:
-        while block := stream.read(_BLOCK_BYTES):
-            digest.update(block)
-    return digest.hexdigest()
 
 
 def _umask() -> int:

@@ -1,7 +1,8 @@
-"""The door for folders that a command writes as a whole: what is not its own result is never replaced."""
+"""The door for folders that a command writes: what is not its own result is never replaced."""
 
 from __future__ import annotations
 
+import json
 from fnmatch import fnmatch
 from pathlib import Path
 
@@ -22,8 +23,7 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
     folder = Path(path)
     if folder.resolve() == Path.cwd():
         raise InputError("output", got=f"{folder}, the current folder", wanted="a folder in it, or elsewhere")
-    if folder.exists() and not folder.is_dir():
-        raise InputError("output", got=f"{folder}, which is a file", wanted="a new folder")
+    _refuse_a_file(folder)
     names = sorted(child.name for child in folder.iterdir()) if folder.exists() else []
     strangers = [name for name in names if not any(fnmatch(name, pattern) for pattern in holds)]
     if strangers:
@@ -32,3 +32,38 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
             got=f"{folder}, which holds {strangers[0]}",
             wanted="a new folder, or one with nothing but an older result, which is replaced",
         )
+
+
+def require_own_folder(path: str | Path, record: str) -> None:
+    """Accept a folder for the result whose record is the file ``record``, beside anything but another result.
+
+    A file is the record of a result if its schema names the kind that the file is called after, as in
+    ``close_loop.json`` with schema ``litho-models/close-loop/1``.
+
+    Raises:
+        InputError: a file, or the folder of a result of another kind, whose report would be overwritten.
+    """
+    folder = Path(path)
+    _refuse_a_file(folder)
+    for file in sorted(folder.glob("*.json")):
+        if file.name != record and _is_record(file):
+            raise InputError(
+                "output",
+                got=f"{folder}, which holds {file.name}",
+                wanted="a folder of its own",
+                hint=f"for example {folder / Path(record).stem}",
+            )
+
+
+def _refuse_a_file(folder: Path) -> None:
+    if folder.exists() and not folder.is_dir():
+        raise InputError("output", got=f"{folder}, which is a file", wanted="a new folder")
+
+
+def _is_record(file: Path) -> bool:
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return False
+    schema = content.get("schema") if isinstance(content, dict) else None
+    return isinstance(schema, str) and schema.split("/")[1:2] == [file.stem.replace("_", "-")]

@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, ClassVar
 
-from litho_data.foundation.files import atomic_file, file_sha256
+from litho_data.foundation.files import atomic_file
+from litho_data.foundation.hashes import array_sha256, file_sha256
 from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import RunFacts, run_facts
 from litho_data.level import Recipe
-from litho_data.provenance.steps import array_sha256
 from litho_data.readers.scan_files import write_heights
 from litho_data.scan import Scan
 

@@ -11,7 +11,7 @@ import numpy as np
 from litho_data.build.operations import OPERATIONS, perform
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import file_sha256
+from litho_data.foundation.hashes import file_sha256
 from litho_data.provenance.records import raw_folder, read_steps, steps_of, stored_array
 from litho_data.provenance.steps import Step
 from litho_data.store.read import open_store

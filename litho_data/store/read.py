@@ -25,7 +25,7 @@ from litho_data.store.access import (
 )
 from litho_data.store.contract import checked_arrays, checked_attributes, true_shapes
 from litho_data.store.lock_box import lock_box, lock_box_size
-from litho_data.store.schema import OPTIONAL_COLUMNS, SAMPLE_VARIABLES, VARIABLES, dataset_sha256
+from litho_data.store.schema import OPTIONAL_COLUMNS, SAMPLE_VARIABLES, VARIABLES, DatasetId, dataset_sha256
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -212,6 +212,11 @@ class Store:
         """Hash of the dataset, independent of chunking: the stored one, else computed from the arrays."""
         stored = self.root.attrs.get("dataset_sha256")
         return str(stored) if stored else self.computed_sha256()
+
+    @property
+    def dataset_id(self) -> DatasetId:
+        """Name and hash, for the results that are made from this dataset."""
+        return DatasetId(name=self.name, sha256=self.sha256)
 
     def computed_sha256(self) -> str:
         """Hash of the dataset from the arrays as they are now."""

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.provenance.steps import array_sha256, record_sha256
+from litho_data.foundation.hashes import array_sha256, record_sha256
+from litho_data.foundation.results import Record
 
 STORE_SCHEMA = "litho-data/store/1"
 
@@ -31,6 +32,13 @@ class Variable:
     def sample_sha256(self, sample: np.ndarray) -> str:
         """Hash of one scan's slice in its true shape, so that padding and chunking leave no trace."""
         return array_sha256(np.asarray(sample, dtype=self.dtype), self.unit, self.sample_dims)
+
+
+class DatasetId(Record):
+    """Which dataset a result is about: its name, and the hash of what a model can see of it."""
+
+    name: str
+    sha256: str
 
 
 SAMPLE_VARIABLES = (

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 from pydantic import Field
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import file_sha256
+from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Result
 from litho_design.optimisation.gauge import OutOfDistribution, Printability
 from litho_design.tasks.design import Design

@@ -12,13 +12,13 @@ import numpy as np
 from pydantic import Field
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.outputs import require_own_folder
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunFacts, run_facts
 from litho_design.judging.judge import Judging
 from litho_design.printers.printer import Printer, PrinterRecord
 from litho_design.reports.gap import write_gap_report
 from litho_design.tasks.design import Design, DesignTask
-from litho_design.tasks.result_folder import require_own_folder
 from litho_design.tasks.settings import HoeSettings, LensSettings
 
 HEADLINE = {

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import file_sha256
+from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Record
 from litho_design.judging.judge import Judging
 

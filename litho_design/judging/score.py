@@ -13,7 +13,8 @@ from pydantic import Field
 from torch import Tensor
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import file_sha256
+from litho_data.foundation.hashes import file_sha256
+from litho_data.foundation.outputs import require_own_folder
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunFacts, run_facts
 from litho_design.judging.camera import CameraRecord, photo_score, photographed_image
@@ -25,7 +26,6 @@ from litho_design.optimisation.parametrise import LayoutSettings
 from litho_design.printers.printer import Printer, PrinterRecord
 from litho_design.reports.score import write_score_report
 from litho_design.tasks.design import LEVELS_FILE, Design
-from litho_design.tasks.result_folder import require_own_folder
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import file_sha256
+from litho_data.foundation.hashes import file_sha256
 from litho_design.tasks.targets import TargetRecord, draw_target, read_image
 
 if TYPE_CHECKING:

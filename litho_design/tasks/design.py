@@ -10,7 +10,8 @@ import numpy as np
 from pydantic import Field
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import atomic_file, file_sha256
+from litho_data.foundation.files import atomic_file
+from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunFacts
 from litho_design.optics import Optics, stroke_table

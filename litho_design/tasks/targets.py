@@ -8,9 +8,8 @@ from typing import Literal, get_args
 import numpy as np
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import file_sha256
+from litho_data.foundation.hashes import array_sha256, file_sha256
 from litho_data.foundation.results import Record
-from litho_data.provenance.steps import array_sha256
 
 DrawnTarget = Literal["text", "ring", "chart", "spots", "letters"]
 _OVERSAMPLE = 4

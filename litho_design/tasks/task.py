@@ -16,6 +16,8 @@ from torch import Tensor
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import writable
+from litho_data.foundation.hashes import record_sha256
+from litho_data.foundation.outputs import require_own_folder
 from litho_data.foundation.results import Record
 from litho_data.foundation.run_facts import run_facts
 from litho_design.optics import Optics
@@ -43,8 +45,6 @@ from litho_design.tasks.design import (
     write_arrays,
     write_level_image,
 )
-from litho_design.tasks.fingerprint import record_sha256
-from litho_design.tasks.result_folder import require_own_folder
 from litho_design.tasks.targets import TargetRecord
 
 
@@ -130,8 +130,8 @@ def run_design(
     folder = Path(out)
     require_own_folder(folder, Design.FILE_NAME)
     hashes_before = [printer.weights_sha256() for printer in task.printers]
-    parts: list[Record | str] = [settings_record, *hashes_before, task.name]
-    fingerprint = record_sha256(*parts, *([task.target_record] if task.target_record else []))
+    target = task.target_record.model_dump(mode="json") if task.target_record else None
+    fingerprint = record_sha256([task.name, settings_record.model_dump(mode="json"), hashes_before, target])
     finished = _finished(folder, fingerprint)
     if finished is not None:
         return finished

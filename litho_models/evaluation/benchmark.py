@@ -20,7 +20,6 @@ from litho_models.evaluation.results import Benchmark
 from litho_models.fitting import TrainingConfig
 from litho_models.fitting.fit import common_geometry
 from litho_models.fitting.runs import training_config
-from litho_models.frozen.card import DatasetName
 from litho_models.models import build_model, require_models
 from litho_models.scan_terms.background import BackgroundUse
 from litho_models.scan_terms.nuisance import Policy
@@ -100,7 +99,7 @@ def benchmark(
     result = Benchmark(
         schema="litho-models/benchmark/1",
         run=run_info([seed], len(scans)),
-        dataset=DatasetName(name=dataset.name, sha256=dataset.sha256),
+        dataset=dataset.dataset_id,
         split=ScoredSplit(
             kind=split,
             folds=sum(not fold.locked for fold in plan),

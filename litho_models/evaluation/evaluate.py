@@ -13,7 +13,6 @@ from litho_models.evaluation.diagnostics import device_of, tile_consistency
 from litho_models.evaluation.reports import write_evaluation_report
 from litho_models.evaluation.results import Evaluation, ModelRecord
 from litho_models.frozen import zoo
-from litho_models.frozen.card import DatasetName
 from litho_models.frozen.files import load_frozen
 from litho_models.frozen.on_store import (
     card_background,
@@ -89,7 +88,7 @@ def evaluate(
     result = Evaluation(
         schema="litho-models/evaluation/1",
         run=run_info([protocol.seed], len(scans)),
-        dataset=DatasetName(name=dataset.name, sha256=dataset.sha256),
+        dataset=dataset.dataset_id,
         model=ModelRecord(
             name=frozen.name,
             sha256=frozen.sha256,

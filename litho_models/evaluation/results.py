@@ -8,9 +8,9 @@ from pydantic import Field
 
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunInfo
+from litho_data.store.schema import DatasetId
 from litho_models.evaluation.diagnostics import TileConsistency
 from litho_models.evaluation.fit_cache import FitRecord
-from litho_models.frozen.card import DatasetName
 from litho_models.prediction.cost import PredictionCost
 from litho_models.scoring.noise_floor import NoiseFloor
 from litho_models.scoring.pairs import Paired
@@ -37,7 +37,7 @@ class Evaluation(Result):
 
     schema_: Literal["litho-models/evaluation/1"] = Field("litho-models/evaluation/1", alias="schema")
     run: RunInfo
-    dataset: DatasetName
+    dataset: DatasetId
     model: ModelRecord
     split: ScoredSplit
     nuisance: NuisanceProtocol
@@ -54,7 +54,7 @@ class Benchmark(Result):
 
     schema_: Literal["litho-models/benchmark/1"] = Field("litho-models/benchmark/1", alias="schema")
     run: RunInfo
-    dataset: DatasetName
+    dataset: DatasetId
     split: ScoredSplit
     nuisance: NuisanceProtocol
     noise_floor: NoiseFloor

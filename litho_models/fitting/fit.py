@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from litho_data.foundation.errors import InputError
-from litho_data.provenance.steps import array_sha256
+from litho_data.foundation.hashes import array_sha256
 from litho_data.store import PrintedScan
 from litho_models.fitting.checkpoint import CheckpointFolder, RoundRecord
 from litho_models.fitting.config import TrainingConfig

@@ -15,10 +15,10 @@ from litho_data.foundation.results import Result, first_error
 from litho_data.foundation.run_facts import RunInfo, run_info
 from litho_data.store import PrintedScan, open_store
 from litho_data.store.lock_box import ids_sha256
+from litho_data.store.schema import DatasetId
 from litho_models.fitting import TrainingConfig, fit_with_record
 from litho_models.fitting.checkpoint import RoundRecord
 from litho_models.fitting.config import Recipe
-from litho_models.frozen.card import DatasetName
 from litho_models.frozen.files import save_frozen
 from litho_models.frozen.freezing import MODEL_FOLDER
 from litho_models.prediction.tiles import predict_scan
@@ -36,7 +36,7 @@ class TrainingRun(Result):
 
     schema_: Literal["litho-models/run/1"] = Field("litho-models/run/1", alias="schema")
     run: RunInfo
-    dataset: DatasetName
+    dataset: DatasetId
     model: str
     parameters: int
     config: TrainingConfig
@@ -76,7 +76,7 @@ def train(
     locked = [] if use_lock_box else lock_box
     used = [scan for scan in scans if scan.id not in locked]
     folder = Path(out)
-    named = DatasetName(name=dataset.name, sha256=dataset.sha256)
+    named = dataset.dataset_id
     _require_same_run(folder, {"dataset": named, "model": model, "config": config, "lock_box": locked})
     fitted = fit_with_record(model, used, config, checkpoint=folder / CHECKPOINT_FOLDER)
     record = TrainingRun(

@@ -10,6 +10,7 @@ from pydantic import ConfigDict, Field, JsonValue, field_validator
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunFacts
+from litho_data.store.schema import DatasetId
 from litho_models.scan_terms.background import Background, BackgroundUse
 
 CARD_FILE = "card.json"
@@ -18,13 +19,6 @@ EffectValues = dict[str, dict[str, float]]
 
 # What is looked up in the free facts of a training and of a split.
 _LISTS_OF_NAMES = ("scan_ids", "lock_box", "lock_box_files_sha256")
-
-
-class DatasetName(Record):
-    """A dataset by name and content hash."""
-
-    name: str
-    sha256: str
 
 
 class Metric(Record):
@@ -63,7 +57,7 @@ class ModelCard(RunFacts, Result):
     calibrated_range_um: tuple[float, float]
     training_level_share: list[float] = Field(default_factory=list)
     receptive_radius_um: float | None
-    dataset: DatasetName | None = None
+    dataset: DatasetId | None = None
     training: dict[str, JsonValue] = Field(default_factory=dict)
     split: dict[str, JsonValue] = Field(default_factory=dict)
     nuisance: dict[str, JsonValue] = Field(default_factory=dict)

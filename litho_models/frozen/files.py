@@ -17,7 +17,8 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import atomic_folder, file_sha256
+from litho_data.foundation.files import atomic_folder
+from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.outputs import require_replaceable_folder
 from litho_data.foundation.results import first_error
 from litho_data.foundation.run_facts import run_facts

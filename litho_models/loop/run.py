@@ -74,7 +74,7 @@ def close_loop_on_store(
         lock_box=opened.locked_ids,
         report=report,
     )
-    result = summarise(closed, dataset=(opened.name, opened.sha256), base_name=name, dropped=dropped)
+    result = summarise(closed, dataset=opened.dataset_id, base_name=name, dropped=dropped)
     with atomic_folder(out) as folder:
         result.write(folder)
         write_report(closed, result, folder)

@@ -9,7 +9,6 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import run_info
 from litho_data.readers import read_scan
 from litho_data.store import open_store
-from litho_models.frozen.card import DatasetName
 from litho_models.noise.bounds import NoiseBound, noise_bounds
 from litho_models.noise.calibration import analyse_spread
 from litho_models.noise.dose import dose_matrix
@@ -62,7 +61,7 @@ def analyse_noise(
     result = NoiseAnalysis(
         schema="litho-models/noise/1",
         run=run_info([seed], len(scans), dropped),
-        dataset=DatasetName(name=dataset.name, sha256=dataset.sha256),
+        dataset=dataset.dataset_id,
         noise_floor=floor_of(found, bounds),
         references=found,
         dose=dose,

@@ -9,7 +9,7 @@ from pydantic import Field
 
 from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import RunInfo
-from litho_models.frozen.card import DatasetName
+from litho_data.store.schema import DatasetId
 from litho_models.noise.bounds import NoiseBound
 from litho_models.noise.calibration import SpreadAnalysis
 from litho_models.noise.dose import DoseMatrix
@@ -26,7 +26,7 @@ class NoiseAnalysis(Result):
 
     schema_: Literal["litho-models/noise/1"] = Field("litho-models/noise/1", alias="schema")
     run: RunInfo
-    dataset: DatasetName | None
+    dataset: DatasetId | None
     noise_floor: NoiseFloor
     references: ReferencePrints
     dose: DoseMatrix | None

@@ -9,7 +9,7 @@ from pydantic import ConfigDict
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record, Result
-from litho_models.frozen.card import DatasetName
+from litho_data.store.schema import DatasetId
 
 NOISE_FILE = "noise.json"
 _PAPER_DATASET = "neural-lithography"
@@ -32,7 +32,7 @@ class _StatedFloor(Result):
     SCHEMA: ClassVar[str] = "litho-models/noise/1"
     FILE_NAME: ClassVar[str] = NOISE_FILE
 
-    dataset: DatasetName | None
+    dataset: DatasetId | None
     noise_floor: NoiseFloor
 
 

@@ -13,11 +13,10 @@ from typer.testing import CliRunner
 from litho_data.cli.scan import ScanFormat, inspect, level
 from litho_data.foundation.commands import new_app, run_app
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import file_sha256
+from litho_data.foundation.hashes import array_sha256, file_sha256
 from litho_data.foundation.scan_picture import terminal_preview, write_picture
 from litho_data.level import Recipe
 from litho_data.level.scan import LevelRecord, level_scan
-from litho_data.provenance.steps import array_sha256
 from litho_data.readers import FORMATS, read_scan
 from litho_data.readers.scan_files import write_heights
 from litho_data.scan import Scan

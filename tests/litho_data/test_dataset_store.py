@@ -10,7 +10,7 @@ import pytest
 import zarr
 
 from litho_data.foundation.errors import InputError
-from litho_data.provenance.steps import array_sha256, record_sha256
+from litho_data.foundation.hashes import array_sha256, record_sha256
 from litho_data.store import open_store
 from litho_data.store.access import array_of, values_of
 

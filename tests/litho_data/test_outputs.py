@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from litho_data.exchange.pairs_export import export_pairs
 from litho_data.exchange.release import export_ro_crate
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file, atomic_folder
+from litho_data.foundation.outputs import require_own_folder
 from litho_data.layouts import write_layout_set
 from litho_data.virtual_fab import simulate
 
@@ -63,3 +65,25 @@ def test_a_place_that_cannot_be_written_is_bad_input(campaign: Path, tmp_path: P
     with pytest.raises(InputError, match="cannot write"), atomic_file(tmp_path):
         pass
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize(
+    ("name", "schema", "is_a_record"),
+    [
+        ("design.json", "litho-design/design/1", True),
+        ("close_loop.json", "litho-models/close-loop/1", True),
+        ("gap.json", "litho-design/gap/1", False),  # an older result of the same kind
+        ("layout.json", "litho-design/export/1", False),  # a sidecar, no result of its own
+        ("notes.json", "somebody/else/1", False),
+    ],
+)
+def test_a_result_is_not_written_over_one_of_another_kind(
+    name: str, schema: str, is_a_record: bool, tmp_path: Path
+) -> None:
+    (tmp_path / name).write_text(json.dumps({"schema": schema}))
+    (tmp_path / "broken.json").write_text("{")
+    if not is_a_record:
+        require_own_folder(tmp_path, "gap.json")
+        return
+    with pytest.raises(InputError, match=f"which holds {name}"):
+        require_own_folder(tmp_path, "gap.json")

@@ -9,7 +9,7 @@ import pytest
 
 from litho_data.exchange.release import export_ro_crate, export_zip
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import file_sha256
+from litho_data.foundation.hashes import file_sha256
 from litho_data.provenance.verify import verify
 from litho_data.store import open_store
 

@@ -11,7 +11,7 @@ import torch
 from scipy.ndimage import map_coordinates
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import file_sha256
+from litho_data.foundation.hashes import file_sha256
 from litho_design.cli.app import main
 from litho_design.judging.judge import Judging
 from litho_design.judging.metrics import matched_scale

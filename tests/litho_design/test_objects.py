@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import file_sha256
+from litho_data.foundation.hashes import file_sha256
 from litho_design.cli.app import main
 from litho_design.judging.compare import GapResult
 from litho_design.judging.score import score_design

@@ -15,6 +15,7 @@ from litho_data.build.build import build
 from litho_data.foundation.errors import InputError
 from litho_data.store import open_store
 from litho_data.store.lock_box import locked_ids
+from litho_data.store.schema import DatasetId
 from litho_data.store.write import write_table
 from litho_data.virtual_fab import simulate
 from litho_models.evaluation.benchmark import benchmark
@@ -22,7 +23,6 @@ from litho_models.evaluation.compare import compare
 from litho_models.evaluation.evaluate import evaluate
 from litho_models.evaluation.results import Benchmark, Evaluation
 from litho_models.fitting.runs import TrainingRun, train
-from litho_models.frozen.card import DatasetName
 from litho_models.frozen.freezing import freeze
 from litho_models.splits.folds import plan_folds
 
@@ -290,7 +290,7 @@ def test_the_floor_beside_the_errors_is_that_of_the_noise_analysis_given(store, 
         == scored.noise_floor
     )
     assert "flat print" in (tmp_path / "e" / "report.html").read_text()
-    other = NoiseAnalysis.read(file).model_copy(update={"dataset": DatasetName(name="else", sha256="0" * 64)})
+    other = NoiseAnalysis.read(file).model_copy(update={"dataset": DatasetId(name="else", sha256="0" * 64)})
     other.write(tmp_path / "other")
     with pytest.raises(InputError, match="noise analysis"):
         benchmark(store, tmp_path / "c", models=["identity"], folds=2, noise=tmp_path / "other")

@@ -88,7 +88,7 @@ def truncate(folder):
 
 
 def rehash(folder):
-    from litho_data.foundation.files import file_sha256
+    from litho_data.foundation.hashes import file_sha256
 
     edit_card(folder, weights_sha256=file_sha256(folder / WEIGHTS_FILE))
 

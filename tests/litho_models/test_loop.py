@@ -13,6 +13,7 @@ from scipy.ndimage import gaussian_filter
 
 from litho_data.foundation.errors import InputError
 from litho_data.store.lock_box import lock_box, locked_ids
+from litho_data.store.schema import DatasetId
 from litho_models.effects import get_effect
 from litho_models.fitting.runs import train
 from litho_models.frozen.card import ModelCard
@@ -35,7 +36,9 @@ from tests.litho_models.prints import write_store
 def closed_on(scans, **config) -> tuple[Closed, CloseLoop]:
     start = build_model("physics", sigma_diffusion_init_um=0.4)
     closed = close_loop(scans, start, LoopConfig.model_validate(config))
-    return closed, summarise(closed, dataset=("made here", "0" * 64), base_name="physics", dropped=[])
+    return closed, summarise(
+        closed, dataset=DatasetId(name="made here", sha256="0" * 64), base_name="physics", dropped=[]
+    )
 
 
 def verdicts(result: CloseLoop) -> Mapping[str, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from litho_data.store.schema import DatasetId
 from litho_models.loop import LoopConfig, close_loop, corrected_chain
 from litho_models.loop.result.summary import summarise
 from tests.litho_models.loop_scans import printed_scans, true_model
@@ -17,7 +18,9 @@ def test_an_effect_is_added_to_or_absorbed_by_a_trained_model(carries_it: bool) 
     scans = printed_scans(EFFECT, seed=1)
     trained = true_model(EFFECT if carries_it else {}).requires_grad_(False)
     closed = close_loop(scans, trained, LoopConfig(), trainer=lambda training: trained)
-    result = summarise(closed, dataset=("made here", ""), base_name="trained", dropped=[])
+    result = summarise(
+        closed, dataset=DatasetId(name="made here", sha256=""), base_name="trained", dropped=[]
+    )
     verdict = {c.name: c.verdict for c in result.candidates}["vignetting"]
     if carries_it:
         assert verdict == "absorbed"

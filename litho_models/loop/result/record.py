@@ -8,6 +8,7 @@ from pydantic import SerializerFunctionWrapHandler, model_serializer
 
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunInfo
+from litho_data.store.schema import DatasetId
 from litho_models.scoring.noise_floor import NoiseFloor
 from litho_models.splits.folds import Split
 
@@ -22,11 +23,6 @@ CandidateVerdict = Literal[
     "below-noise",
     "traced-to-covariate",
 ]
-
-
-class Dataset(Record):
-    name: str
-    sha256: str
 
 
 class Nuisance(Record):
@@ -94,7 +90,7 @@ class CloseLoop(Result):
     FILE_NAME: ClassVar[str] = "close_loop.json"
 
     run: RunInfo
-    dataset: Dataset
+    dataset: DatasetId
     base_model: str
     split: Split
     nuisance: Nuisance

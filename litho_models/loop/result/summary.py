@@ -6,13 +6,13 @@ import numpy as np
 
 from litho_data.foundation.run_facts import run_info
 from litho_data.foundation.units import NM_PER_UM
+from litho_data.store.schema import DatasetId
 from litho_models.effects import CATALOGUE
 from litho_models.loop.findings import Closed
 from litho_models.loop.result.added_effects import added_effects
 from litho_models.loop.result.candidates import all_candidates
 from litho_models.loop.result.record import (
     CloseLoop,
-    Dataset,
     Errors,
     Nuisance,
     Residual,
@@ -27,12 +27,12 @@ from litho_models.splits.folds import Split
 _NO_TERMS: frozenset[str] = frozenset()
 
 
-def summarise(closed: Closed, *, dataset: tuple[str, str], base_name: str, dropped: list[str]) -> CloseLoop:
+def summarise(closed: Closed, *, dataset: DatasetId, base_name: str, dropped: list[str]) -> CloseLoop:
     """The result record of one run.
 
     Args:
         closed: what the loop found.
-        dataset: name and SHA-256 of the store; ``base_name``: the base model.
+        dataset: name and hash of the store; ``base_name``: the base model.
         dropped: scans left out, with reason.
     """
     locked = closed.locked_scores
@@ -44,7 +44,7 @@ def summarise(closed: Closed, *, dataset: tuple[str, str], base_name: str, dropp
     return CloseLoop(
         schema=CloseLoop.SCHEMA,
         run=run_info([closed.config.seed], len(closed.development) + len(closed.locked), dropped),
-        dataset=Dataset(name=dataset[0], sha256=dataset[1]),
+        dataset=dataset,
         base_model=base_name,
         split=Split(kind="grouped", folds=int(closed.fold_of.max()) + 1, lock_box=closed.lock_box),
         nuisance=Nuisance(block_px=BLOCK_PX, seed=closed.config.seed),

@@ -1,0 +1,61 @@
+"""SHA-256 of what decides a result: files, arrays, plain data, source code."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+_BLOCK_BYTES = 1 << 20
+
+
+def file_sha256(path: str | Path) -> str:
+    """Hex SHA-256 of the bytes of one file."""
+    digest = hashlib.sha256()
+    with open(path, "rb") as stream:
+        while block := stream.read(_BLOCK_BYTES):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+def array_sha256(array: np.ndarray, unit: str, dims: Sequence[str]) -> str:
+    """Hash of a decoded array: type, shape, values, unit and dimension names, however it is chunked.
+
+    Args:
+        array: any numeric or boolean array; every NaN counts as the same NaN.
+        unit: unit of the values as stored, "1" where there is none.
+        dims: one name per axis.
+
+    Returns:
+        Hex SHA-256 of ``little-endian dtype | shape | C-order bytes | unit | dims``.
+    """
+    little = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
+    if little.dtype.kind == "f" and np.isnan(little).any():
+        little = np.where(np.isnan(little), np.array(np.nan, little.dtype), little)
+    digest = hashlib.sha256(f"{little.dtype.str}|{array.shape}|".encode())
+    digest.update(little.tobytes())
+    digest.update(f"|{unit}|{','.join(dims)}".encode())
+    return digest.hexdigest()
+
+
+def record_sha256(record: Any) -> str:
+    """Hash of plain data (dicts, lists, strings, numbers): SHA-256 of its canonical JSON."""
+    return hashlib.sha256(canonical_json(record).encode()).hexdigest()
+
+
+def canonical_json(record: Any) -> str:
+    """JSON with sorted keys and no spaces: equal data, equal text."""
+    return json.dumps(record, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+
+
+def source_sha256(*paths: Path) -> str:
+    """Hash of Python source files; a folder stands for all ``.py`` files below it, in sorted order."""
+    digest = hashlib.sha256()
+    for path in paths:
+        for file in sorted(path.rglob("*.py")) if path.is_dir() else [path]:
+            digest.update(file.name.encode() + b"\0" + file.read_bytes() + b"\0")
+    return digest.hexdigest()
