@@ -104,7 +104,7 @@ EFFECTS = (
         name="hatch-ripple",
         title="ripples at the hatching pitch",
         stage="exposure",
-        role="process",
+        role="nuisance",
         acts_on="height",
         parameters={
             "cosine_um": Parameter("µm", -0.1, 0.1, 0.01),

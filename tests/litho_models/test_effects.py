@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from litho_data.foundation.errors import InputError
+from litho_data.virtual_fab.knobs import KNOBS
 from litho_models.effects import CATALOGUE, FieldContext, get_effect, in_forward_order, screened_effects
 from litho_models.effects.effect import Effect, Parameter
 
@@ -34,6 +35,34 @@ def test_the_catalogue_is_not_empty_and_holds_all_stages_and_roles() -> None:
     assert len(EFFECTS) >= 20
     assert {effect.stage for effect in EFFECTS} == {"exposure", "resist", "development", "measurement"}
     assert {effect.role for effect in EFFECTS} == {"process", "measurement", "nuisance", "undetermined"}
+
+
+# What belongs to whom, as known from print and microscope; a role decides what a design is computed with.
+BELONGS_TO = {
+    ("exposure", "process"): """elliptical-psf long-range-proximity dose-exponent galvo-lag vignetting
+        field-curvature layer-stacking interface-offset""",
+    ("exposure", "nuisance"): "laser-drift hatch-ripple line-roughness",
+    ("resist", "process"): "write-order-memory diffusion-blur threshold-softness height-saturation",
+    ("development", "process"): """vertical-shrinkage dose-dependent-shrinkage lateral-shrinkage
+        feature-collapse trench-residue""",
+    ("development", "undetermined"): "slope-thinning",
+    ("measurement", "measurement"): """datum-offset z-gain tilt-bow scan-line-stripes slow-drift
+        tip-dilation feedback-lag registration-residual piezo-nonlinearity resampling-blur""",
+}
+
+
+def test_every_effect_has_the_stage_and_role_of_the_table() -> None:
+    wanted = {name: key for key, names in BELONGS_TO.items() for name in names.split()}
+    assert len(wanted) > 30
+    # A new effect states its own role; those that are here keep theirs.
+    assert {name: (CATALOGUE[name].stage, CATALOGUE[name].role) for name in wanted} == wanted
+
+
+def test_fab_and_catalogue_agree_on_stage_and_role() -> None:
+    planted = [knob for knob in KNOBS.values() if knob.effect in CATALOGUE]
+    assert len(planted) > 20
+    for knob in planted:
+        assert (knob.stage, knob.role) == (CATALOGUE[knob.effect].stage, CATALOGUE[knob.effect].role), knob
 
 
 @PER_EFFECT

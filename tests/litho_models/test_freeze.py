@@ -187,6 +187,38 @@ def test_damaged_or_foreign_files_are_refused_in_one_line(folder, damage):
     assert len(str(caught.value)) < 1000
 
 
+def one_weight_a_little_off(weights):
+    state = load_file(weights)
+    first = min(state)
+    state[first] = state[first] + 1e-6 * (1 + state[first].abs())
+    save_file(state, weights)
+
+
+def lowest_bit_turned(weights):
+    data = bytearray(weights.read_bytes())
+    data[-4] ^= 1  # of the last float32
+    weights.write_bytes(data)
+
+
+def another_fit(weights):
+    other = save_frozen(build_model("physics", eta_init=0.2), weights.parent.parent / "other")
+    weights.write_bytes((other / WEIGHTS_FILE).read_bytes())
+
+
+@pytest.mark.parametrize("change", [one_weight_a_little_off, lowest_bit_turned, another_fit])
+def test_weights_other_than_those_of_the_card_are_refused(folder, tmp_path, change):
+    # Finite, of the right shapes and precision: only the hash in the card, left as it was, tells.
+    # Copies: what is loaded is a view of the file.
+    before = {key: value.clone() for key, value in load_file(folder / WEIGHTS_FILE).items()}
+    change(folder / WEIGHTS_FILE)
+    after = load_file(folder / WEIGHTS_FILE)
+    assert any(not torch.equal(after[key], before[key]) for key in before)
+    for door in (load_frozen, lambda f: freeze(f, tmp_path / "again")):
+        with pytest.raises(InputError, match="SHA-256"):
+            door(folder)
+    assert not (tmp_path / "again").exists()
+
+
 @pytest.mark.parametrize(
     ("name", "changes"),
     [

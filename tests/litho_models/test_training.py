@@ -153,13 +153,64 @@ def test_a_killed_run_ends_where_an_unbroken_one_does(tmp_path, monkeypatch):
     assert [r.training_mae_nm for r in whole.history] == [r.training_mae_nm for r in resumed.history]
 
 
-def test_a_checkpoint_of_another_run_is_refused(tmp_path):
-    scans = make_scans(4, size_px=64)
-    fit_with_record("pbl", scans, TrainingConfig(**QUICK), checkpoint=tmp_path, model_fields=SMALL_NETS)
+@pytest.fixture(scope="module")
+def quick_run(tmp_path_factory):
+    """Scans, and the checkpoint of a small PBL trained on them."""
+    scans, folder = make_scans(4, size_px=64), tmp_path_factory.mktemp("run")
+    fit_with_record("pbl", scans, TrainingConfig(**QUICK), checkpoint=folder, model_fields=SMALL_NETS)
+    return scans, folder
+
+
+def with_one_pixel(scan, **arrays):
+    """The scan with one pixel of some arrays changed."""
+    changed = {name: getattr(scan, name).copy() for name in arrays}
+    for name, value in arrays.items():
+        changed[name][3, 5] = value
+    return replace(scan, **changed)
+
+
+ANOTHER_RUN = {
+    "another model": lambda scans: ("fno", scans, {}, {"width": 4, "modes": (4, 4)}),
+    "another seed": lambda scans: ("pbl", scans, {"seed": 5}, SMALL_NETS),
+    "more steps": lambda scans: ("pbl", scans, {"steps": 24}, SMALL_NETS),
+    "other nuisances": lambda scans: ("pbl", scans, {"nuisance": "full"}, SMALL_NETS),
+    "another variant": lambda scans: ("pbl", scans, {"variant": "paper"}, SMALL_NETS),
+    "other layers": lambda scans: ("pbl", scans, {}, {**SMALL_NETS, "areawise_channels": (8, 8)}),
+    "another start": lambda scans: ("pbl", scans, {}, {**SMALL_NETS, "sigma_diffusion_init_um": 0.4}),
+    "a scan less": lambda scans: ("pbl", scans[1:], {}, SMALL_NETS),
+    "a scan by another name": lambda scans: (
+        "pbl", [replace(scans[0], id="P9F9"), *scans[1:]], {}, SMALL_NETS
+    ),
+    "two layouts swapped": lambda scans: (
+        "pbl",
+        [replace(scans[0], mask_level=scans[1].mask_level),
+         replace(scans[1], mask_level=scans[0].mask_level), *scans[2:]],
+        {},
+        SMALL_NETS,
+    ),
+    "one other height": lambda scans: (
+        "pbl", [with_one_pixel(scans[0], height_um=0.5), *scans[1:]], {}, SMALL_NETS
+    ),
+    "one other level": lambda scans: (
+        "pbl", [with_one_pixel(scans[0], mask_level=(scans[0].mask_level[3, 5] + 1) % 13), *scans[1:]], {},
+        SMALL_NETS,
+    ),
+    "one pixel not valid": lambda scans: (
+        "pbl", [with_one_pixel(scans[0], valid=False), *scans[1:]], {}, SMALL_NETS
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", list(ANOTHER_RUN))
+def test_a_checkpoint_of_another_run_is_refused(what, quick_run):
+    scans, folder = quick_run
+    model, given, settings, fields = ANOTHER_RUN[what](scans)
+    kept = {file.name: file.read_bytes() for file in folder.iterdir()}
     with pytest.raises(InputError, match="another model, configuration or dataset"):
         fit_with_record(
-            "pbl", scans, TrainingConfig(**QUICK, seed=5), checkpoint=tmp_path, model_fields=SMALL_NETS
+            model, given, TrainingConfig(**{**QUICK, **settings}), checkpoint=folder, model_fields=fields
         )
+    assert {file.name: file.read_bytes() for file in folder.iterdir()} == kept
 
 
 def test_the_checkpoint_is_chosen_on_inner_validation_scans_only():
