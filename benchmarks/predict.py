@@ -9,8 +9,9 @@ in bfloat16; ``bfloat16``, both so. --publish also writes the table into docs/sp
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
-from contextlib import nullcontext
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 
 import numpy as np
 import torch
@@ -55,16 +56,15 @@ def _work(side: str, arguments: argparse.Namespace) -> Work:
     layout_um = random_layout(pbl.config, arguments.size_px).requires_grad_()
     upstream = torch.randn(layout_um.shape, generator=torch.Generator().manual_seed(1))
     made: dict[str, np.ndarray] = {}
+    reduced: Callable[[], AbstractContextManager[None]] = nullcontext
     if side == side_by_side.PLAIN:
         model: torch.nn.Module = PlainPbl(pbl).requires_grad_(False)
     else:
-        model = load_frozen(arguments.model)
-        if side == "mixed":
-            model.simulator.mismatch.adjoint_dtype = torch.bfloat16
-    reduced = torch.autocast("cpu", torch.bfloat16) if side == "bfloat16" else nullcontext()
+        model = frozen = load_frozen(arguments.model)
+        reduced = partial(frozen.at_precision, side)
 
     def once() -> None:
-        with reduced:
+        with reduced():
             height_um = model(layout_um)
         (gradient,) = torch.autograd.grad(height_um, layout_um, upstream)
         made.update(height_um=height_um.detach().numpy(), gradient=gradient.numpy())

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any, Literal, cast
 
 import torch
@@ -73,7 +73,6 @@ class Printer(nn.Module):
         self.layout = layout
         self.source = source
         self.extrapolate = extrapolate
-        self._reduced = False
         self.name = name or ("none" if simulator is None else str(simulator.name))
         # The reach is a whole number of pixels times the pitch, give or take a rounding.
         self.guard_px = 0 if simulator is None else math.ceil(_guard_um(simulator) / layout.pitch_um - 1e-6)
@@ -154,23 +153,14 @@ class Printer(nn.Module):
             rms_nm=float(nm.square().mean().sqrt()),
         )
 
-    @contextmanager
-    def at_precision(self, precision: Precision) -> Iterator[None]:
-        """Run the networks of the model in ``precision`` inside the block.
+    def at_precision(self, precision: Precision) -> AbstractContextManager[None]:
+        """Run the networks of a frozen model in ``precision`` inside the block.
 
         ``mixed`` prints in float32 and sends gradients back through the areawise networks in bfloat16;
         ``bfloat16`` does both so. Other models, and heights, blurs and waves, stay in float32.
         """
-        networks: list[Any] = [network for network in self.modules() if hasattr(network, "adjoint_dtype")]
-        self._reduced = precision == "bfloat16"
-        for network in networks:
-            network.adjoint_dtype = torch.bfloat16 if precision == "mixed" else None
-        try:
-            yield
-        finally:
-            self._reduced = False
-            for network in networks:
-                network.adjoint_dtype = None
+        at_precision = getattr(self.simulator, "at_precision", None)
+        return nullcontext() if at_precision is None else at_precision(precision)
 
     def record(self) -> PrinterRecord:
         """Name, hashes and guard ring, for the results."""
@@ -211,13 +201,11 @@ class Printer(nn.Module):
     def _inside(self, height_um: Tensor, border_px: int) -> Tensor:
         """Print of ``height_um`` without its outer ``border_px``."""
         if border_px and self._interior is not None:
-            return self._simulate(height_um, self._interior)
-        printed = height_um if self.simulator is None else self._simulate(height_um, self.simulator)
+            return self._interior(height_um, pitch_um=self.layout.pitch_um)
+        printed = (
+            height_um if self.simulator is None else self.simulator(height_um, pitch_um=self.layout.pitch_um)
+        )
         return F.pad(printed, (-border_px,) * 4)
-
-    def _simulate(self, height_um: Tensor, call: Callable[..., Tensor]) -> Tensor:
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self._reduced):
-            return call(height_um, pitch_um=self.layout.pitch_um).to(height_um.dtype)
 
 
 def _guard_um(simulator: nn.Module) -> float:
@@ -227,7 +215,7 @@ def _guard_um(simulator: nn.Module) -> float:
 
 def _halo_px(simulator: nn.Module, guard_px: int) -> int:
     """What a patch needs around it: the guard, or a whole tile where the model runs on tiles."""
-    tile = getattr(getattr(simulator, "simulator", None), "tile", None)
+    tile = getattr(simulator, "tile", None)
     return guard_px if tile is None else max(guard_px, tile.size_px)
 
 
@@ -236,7 +224,7 @@ def _strip_halo_px(simulator: nn.Module, guard_px: int) -> int:
 
     A whole tile around them would only add tiles whose print is cut off again.
     """
-    tile = getattr(getattr(simulator, "simulator", None), "tile", None)
+    tile = getattr(simulator, "tile", None)
     if tile is None:
         return guard_px
     return max(guard_px, (2 * tile.size_px - 3 * tile.overlap_px) // 2 - 1)

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from litho_models.effects.effect import Effect, FieldContext
 from litho_models.effects.registry import get_effect, in_forward_order
+from litho_models.simulator import Simulator, Tile
 
 
 class EffectChain(nn.Module):
@@ -44,6 +45,11 @@ class EffectChain(nn.Module):
                 else:
                     self.register_parameter(_key(name, parameter), nn.Parameter(tensor))
                     self.fitted.append((name, parameter))
+
+    @property
+    def tile(self) -> Tile | None:
+        """The tile of the base model; the effects act on the whole field."""
+        return self.base.tile if isinstance(self.base, Simulator) else None
 
     def forward(self, layout_um: Tensor, context: FieldContext | None = None) -> Tensor:
         """Height (b, 1, y, x), µm; without a context the field is a write field of its own."""

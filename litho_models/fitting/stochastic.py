@@ -24,6 +24,7 @@ from litho_data.store import PrintedScan
 from litho_models.fitting.checkpoint import CheckpointFolder, RoundRecord, TrainingState
 from litho_models.fitting.config import TrainingConfig
 from litho_models.fitting.crops import Window, in_passes, plan_batch, stack
+from litho_models.layers.precision import Precision, network_precision, warn_where_slower
 from litho_models.prediction.tiles import blending_window, predict_scan
 from litho_models.scan_terms.training import estimate_nuisances
 from litho_models.scoring.metrics import score_scan
@@ -54,7 +55,9 @@ def train_network(
         config = config.model_copy(update={"crop_px": model.tile.size_px})
     fabric = _fabric()
     optimiser = _optimiser(model, config)
-    module, optimiser = fabric.setup(_Heights(model, config), optimiser)
+    heights = _Heights(model, config)
+    warn_where_slower(heights.precision, fabric.device.type)
+    module, optimiser = fabric.setup(heights, optimiser)
     state = TrainingState(model, optimiser)
     if checkpoints is not None:
         checkpoints.load(state)
@@ -116,7 +119,7 @@ class _Heights(nn.Module):
         random = config.crops == "random"
         self.tile = model.tile if random else None
         self._inside = random and (model.reach_px is not None or model.tile is not None)
-        self._mixed = config.precision == "bf16-mixed"
+        self.precision: Precision = "bfloat16" if config.precision == "bf16-mixed" else "float32"
 
     @property
     def margin_px(self) -> int:
@@ -125,7 +128,7 @@ class _Heights(nn.Module):
 
     def forward(self, layout_um: Tensor) -> Tensor:
         predict = self.model.interior if self._inside else self.model
-        with torch.autocast(layout_um.device.type, torch.bfloat16, enabled=self._mixed):
+        with network_precision(self.precision, layout_um.device.type):
             return predict(layout_um).float()
 
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from pydantic import ValidationError
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
-from torch import Tensor, nn
+from torch import Tensor
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_folder
@@ -27,6 +27,9 @@ from litho_models.frozen.readme import model_readme
 from litho_models.frozen.simulator import FrozenSimulator
 from litho_models.models import model_class
 from litho_models.simulator import Simulator
+
+if TYPE_CHECKING:
+    from litho_models.effects.chain import EffectChain
 
 WEIGHTS_FILE, README_FILE = "model.safetensors", "README.md"
 
@@ -99,7 +102,7 @@ def load_frozen(
     card = ModelCard.read(path)
     _check_effects(card)
     simulator = load_simulator(path, card)
-    model: nn.Module = simulator
+    model: Simulator | EffectChain = simulator
     if card.process_effects:
         from litho_models.effects.chain import EffectChain
 

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
 from litho_data.foundation.errors import InputError
 from litho_models.frozen.card import ModelCard
+from litho_models.layers.precision import Precision, network_precision, warn_where_slower
 from litho_models.prediction.tiles import predict_field, predict_interior
-from litho_models.simulator import Simulator
+from litho_models.simulator import Simulator, Tile
+
+if TYPE_CHECKING:
+    from litho_models.effects.chain import EffectChain
 
 # A level's height in float32 may exceed the range by rounding; a level off it differs by 100 nm.
 _ROUNDING_UM = 1e-5
@@ -23,7 +28,7 @@ class FrozenSimulator(nn.Module):
     ``model(layout_um, pitch_um=0.1)`` maps a layout (b, 1, y, x) in µm to its printed height.
     """
 
-    def __init__(self, simulator: nn.Module, card: ModelCard, sha256: str, extrapolate: bool):
+    def __init__(self, simulator: Simulator | EffectChain, card: ModelCard, sha256: str, extrapolate: bool):
         super().__init__()
         self.simulator = simulator
         self.card: Mapping[str, Any] = card.model_dump(mode="json", by_alias=True)
@@ -32,6 +37,7 @@ class FrozenSimulator(nn.Module):
         # Receptive radius, µm; None where a pixel depends on the whole image.
         self.reach_um = simulator.reach_um if isinstance(simulator, Simulator) else None
         self._lowest_um, self._highest_um = card.calibrated_range_um
+        self._precision: Precision = "float32"
         self.eval().requires_grad_(False)
 
     @property
@@ -43,6 +49,24 @@ class FrozenSimulator(nn.Module):
     def pitch_um(self) -> float:
         """Lateral sampling that the model is made for, µm."""
         return self.card["pitch_um"]
+
+    @property
+    def tile(self) -> Tile | None:
+        """The tile of a model that answers differently for another image size; None for all others."""
+        return self.simulator.tile
+
+    @contextmanager
+    def at_precision(self, precision: Precision) -> Iterator[None]:
+        """Print in ``precision`` inside the block, see ``network_precision``; float32 otherwise.
+
+        One line on stderr says where that is slower than float32.
+        """
+        warn_where_slower(precision, next(self.parameters(), torch.empty(0)).device.type)
+        before, self._precision = self._precision, precision
+        try:
+            yield
+        finally:
+            self._precision = before
 
     def train(self, mode: bool = True) -> FrozenSimulator:
         """Frozen models stay in eval mode."""
@@ -64,8 +88,8 @@ class FrozenSimulator(nn.Module):
         """
         self._check_layout(layout_um, pitch_um, level_height_um)
         if isinstance(self.simulator, Simulator):
-            return predict_field(self.simulator, layout_um)
-        return self.simulator(layout_um)
+            return self._in_precision(predict_field, self.simulator, layout_um)
+        return self._in_precision(self.simulator, layout_um)
 
     @property
     def has_interior(self) -> bool:
@@ -83,7 +107,13 @@ class FrozenSimulator(nn.Module):
         self._check_layout(layout_um, pitch_um, None)
         if not isinstance(self.simulator, Simulator):
             raise InputError(f"interior of a print by {self.name}", wanted="a model without added effects")
-        return predict_interior(self.simulator, layout_um)
+        return self._in_precision(predict_interior, self.simulator, layout_um)
+
+    def _in_precision(self, predict: Callable[..., Tensor], *given: Any) -> Tensor:
+        if self._precision == "float32":
+            return predict(*given)
+        with network_precision(self._precision, given[-1].device.type):
+            return predict(*given).to(given[-1].dtype)
 
     def _check_layout(self, layout_um: Tensor, pitch_um: float | None, level_height_um: float | None) -> None:
         self.check_geometry(pitch_um, level_height_um)

@@ -1,1 +1,1 @@
-"""Building blocks of the models: blurs and functions of one value."""
+"""Building blocks of the models: blurs, functions of one value, the precision of products."""

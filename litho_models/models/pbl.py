@@ -19,6 +19,7 @@ from torch.nn import functional
 from litho_models.fast import convolution_stack
 from litho_models.layers.gaussian import Edge, blur_interior, kernel_radius_px, pad_field
 from litho_models.layers.lookup import PointwiseNet
+from litho_models.layers.precision import adjoint_dtype
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 
 Channels = Annotated[int, Field(ge=1, le=1024)]
@@ -157,8 +158,6 @@ class AreawiseNet(nn.Module):
         self.hidden = nn.ModuleList(convolutions[:-1])
         self.last = convolutions[-1]
         self.leaky_slope = leaky_slope
-        # Of the hidden layers when a gradient is sent back on a CPU; None: as forwards.
-        self.adjoint_dtype: torch.dtype | None = None
         for convolution in convolutions:
             weight = convolution.weight
             weight.data = weight.data.contiguous(memory_format=torch.channels_last)
@@ -193,7 +192,7 @@ class AreawiseNet(nn.Module):
                 [cast(Tensor, layer.bias) for layer in layers],
                 leaky_slope=self.leaky_slope,
                 hidden_dtype=hidden,
-                adjoint_dtype=self.adjoint_dtype or hidden,
+                adjoint_dtype=adjoint_dtype() or hidden,
             )
 
     def start_at_zero(self) -> None:

@@ -1,0 +1,95 @@
+"""A frozen model prints in the precision it is asked for; one that loses on this processor is warned of."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from prints import make_scans
+
+from litho_models import load_frozen, save_frozen
+from litho_models.fitting import TrainingConfig, fit
+from litho_models.layers import precision as precisions
+from litho_models.layers.precision import has_bfloat16_unit
+from litho_models.models import build_model
+
+LAYOUT_UM = 0.1 * torch.randint(0, 13, (1, 1, 96, 96), generator=torch.Generator().manual_seed(0))
+SHRINKAGE = {"vertical-shrinkage": {"fraction": 0.1}}
+WARNING = "in bfloat16: float32 is faster on this processor, which has no bfloat16 unit"
+
+
+@pytest.fixture(scope="module")
+def pbl():
+    torch.manual_seed(0)
+    model = build_model("pbl", sigma_diffusion_init_um=0.2)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.add_(0.03 * torch.randn_like(parameter))
+    return model
+
+
+def off_by(value: torch.Tensor, reference: torch.Tensor) -> float:
+    return float((value - reference).norm() / reference.norm())
+
+
+@pytest.mark.parametrize("effects", [{}, SHRINKAGE])
+def test_precision_holds_inside_the_block_and_nowhere_else(effects, pbl, tmp_path):
+    frozen = load_frozen(save_frozen(pbl, tmp_path / "pbl", process_effects=effects))
+
+    def printed() -> tuple[torch.Tensor, torch.Tensor]:
+        layout = LAYOUT_UM.clone().requires_grad_()
+        height = frozen(layout)
+        assert height.dtype == torch.float32
+        return height.detach(), torch.autograd.grad(height.square().sum(), layout)[0]
+
+    before = printed()
+    with frozen.at_precision("mixed"):
+        mixed = printed()
+        with frozen.at_precision("bfloat16"):
+            reduced = printed()
+        assert torch.equal(printed()[1], mixed[1])
+    with pytest.raises(KeyError), frozen.at_precision("bfloat16"):
+        raise KeyError
+    assert all(torch.equal(a, b) for a, b in zip(printed(), before, strict=True))
+    assert torch.equal(mixed[0], before[0])
+    # Five layers of products that bfloat16 rounds by up to 2^-9, next to what does not pass the network.
+    assert 1e-5 < off_by(mixed[1], before[1]) < 0.03
+    assert 1e-6 < off_by(reduced[0], before[0]) < 0.01
+
+
+def test_a_frozen_model_states_its_tile_and_reach_also_with_effects(pbl, tmp_path):
+    fno = build_model("fno")
+    for model in (pbl, fno):
+        plain = load_frozen(save_frozen(model, tmp_path / model.name))
+        assert plain.tile == model.tile
+        assert plain.reach_um == model.reach_um
+        assert plain.has_interior == (model is pbl)
+    with_effects = load_frozen(save_frozen(fno, tmp_path / "effects", process_effects=SHRINKAGE))
+    assert with_effects.tile == fno.tile
+    assert with_effects.reach_um is None
+    assert not with_effects.has_interior
+
+
+@pytest.mark.parametrize(
+    ("found", "has_unit"),
+    [({"avx512_f": True, "avx512_bf16": False}, False), ({"amx_bf16": True}, True), ({"bf16": True}, True)],
+)
+def test_the_unit_is_told_by_what_pytorch_finds(found, has_unit, monkeypatch):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: found)
+    assert has_bfloat16_unit() == has_unit
+
+
+@pytest.mark.parametrize("has_unit", [False, True])
+def test_a_precision_that_loses_here_is_warned_of_once(has_unit, pbl, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(precisions, "has_bfloat16_unit", lambda: has_unit)
+    precisions._say.cache_clear()
+    frozen = load_frozen(save_frozen(pbl, tmp_path / "pbl"))
+    for precision in ("float32", "mixed", "bfloat16", "mixed"):
+        with frozen.at_precision(precision):
+            frozen(LAYOUT_UM)
+    told = [] if has_unit else [f"gradients of networks {WARNING}", f"networks {WARNING}"]
+    assert capsys.readouterr().err.splitlines() == told
+    precisions._say.cache_clear()
+    settings = {"steps": 2, "rounds": 1, "batch": 1, "crop_px": 16, "validation_scans": 0}
+    for precision in ("32-true", "bf16-mixed"):
+        fit("pbl", make_scans(2, size_px=32), TrainingConfig(**settings, precision=precision))
+    assert capsys.readouterr().err.splitlines() == told[1:]

@@ -1,0 +1,35 @@
+"""The processors that this one plays are those that they are called."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import processors
+import pytest
+
+CODE = """
+import torch
+from numba import types
+from litho_models.fast import winograd_passes as passes
+field = types.Array(types.float32, 3, "C")
+passes.to_frequencies.compile((field, types.int64, types.int64, types.int64, field))
+(assembly,) = passes.to_frequencies.inspect_asm().values()
+print(torch.backends.cpu.get_cpu_capability(), "zmm" in assembly)
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "vectors_of_16"), [("avx2", False), ("avx512", True)])
+def test_a_played_processor_uses_its_own_instructions(name, vectors_of_16, tmp_path):
+    if not processors.can_play(name):
+        pytest.skip(f"this processor cannot play {name}")
+    environment = {**os.environ, **processors.PROCESSORS[name].environment, "NUMBA_CACHE_DIR": str(tmp_path)}
+    told = subprocess.run([sys.executable, "-c", CODE], env=environment, capture_output=True, text=True)
+    assert told.stdout.split() == [name.upper(), str(vectors_of_16)], told.stderr
+
+
+def test_an_unknown_processor_is_refused(capsys):
+    assert processors.main(["avx3"]) == 2
+    assert "wanted avx2, avx512, native" in capsys.readouterr().err
