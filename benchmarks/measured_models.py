@@ -168,7 +168,7 @@ def noise_table(noise: dict[str, Any]) -> str:
     ]
     floor = noise["noise_floor"]
     return markdown_table(
-        ("figure", "of noise", "errs as", "σ", "MAE"),
+        ("estimate from", "noise", "what it is", "σ", "MAE"),
         rows,
         f"{noise['run']['n_scans']} development scans of the measured prints, 95 % intervals over scans. "
         f"No flat and no repeated print is among them: the floor, MAE {floor['mae_nm']:.2f} nm, is a "

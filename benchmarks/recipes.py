@@ -117,7 +117,7 @@ def paper_order(others: Sequence[Benchmark]) -> str:
             for worse in own[place + 1 :]
         ],
         "Paired differences of the runs with the paper's recipe in the table above. From best to worst: "
-        f"{', '.join(score.model for score in own)}. The paper has pbl as the best.",
+        f"{', '.join(score.model for score in own)}. In the paper pbl is the best.",
     )
 
 

@@ -52,8 +52,8 @@ def dose_table(found: NoiseAnalysis) -> str:
     return markdown_table(
         ("dose", "gain", "highest level", "roughness", "lost steps, low + high", "worst step"),
         rows,
-        f"Recommended: {found.dose.recommended_dose:g}, {found.dose.reason}. Left out of the other figures: "
-        f"{', '.join(found.run.dropped)}.",
+        f"Recommended: {found.dose.recommended_dose:g}, {found.dose.reason}. Left out of the other "
+        f"estimates: {', '.join(found.run.dropped)}.",
     )
 
 

@@ -54,7 +54,7 @@ def write_evaluation_report(
     page.table(tables.headline_table([scores], result.noise_floor), "Error over scans.", "headline.csv")
     page.paragraph(tables.floor_text(result.noise_floor))
     _policies(page, [scores], result.nuisance)
-    page.table(tables.metric_table([scores]), "Phase, similarity, edges.", "shapes.csv", digits=3)
+    page.table(tables.metric_table([scores]), "Phase, similarity, edges.", "metrics.csv", digits=3)
     page.paragraph(tables.metric_text())
     page.table(
         _model(result.model),
@@ -107,7 +107,7 @@ def write_benchmark_report(
         _pairs(result), "Datum-free MAE, first minus second, over the same scans.", "pairs.csv", digits=3
     )
     page.heading("Phase, similarity, edges")
-    page.table(tables.metric_table(scores), "Means over held-out scans.", "shapes.csv", digits=3)
+    page.table(tables.metric_table(scores), "Means over held-out scans.", "metrics.csv", digits=3)
     page.paragraph(tables.metric_text())
     page.heading("One scan")
     middle = _median_scan(best.scans)

@@ -184,9 +184,9 @@ def _bounds(result: NoiseAnalysis) -> pd.DataFrame:
     return pd.DataFrame(
         [
             {
-                "figure": bound.name,
+                "estimate from": bound.name,
                 "of": bound.of,
-                "errs as": bound.direction,
+                "what it is": bound.direction,
                 "sigma_nm": bound.sigma_nm,
                 "ci95_nm": interval_text(bound.ci95_nm),
                 "mae_nm": bound.mae_nm,

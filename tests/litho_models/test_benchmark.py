@@ -75,7 +75,7 @@ def test_the_result_is_complete_on_disk(result):
     assert (out / "report.html").stat().st_size > 50_000
     table = pd.read_csv(out / "benchmark.csv")
     assert list(table["model"]) == [*MODELS, "noise floor (unknown)"]
-    assert {"pairs.csv", "scans.csv", "levels.csv", "policies.csv", "fits.csv", "shapes.csv"} <= {
+    assert {"pairs.csv", "scans.csv", "levels.csv", "policies.csv", "fits.csv", "metrics.csv"} <= {
         p.name for p in out.iterdir()
     }
     best = [pair for pair in record.paired if {pair.first, pair.second} == {"affine", "linear"}]

@@ -1,0 +1,49 @@
+"""A metric of your own in the results, the report and the tables of an evaluation.
+
+    python examples/own_metric.py zoo:pbl STORE.zarr --out evaluation
+
+Registers the share of pixels that are wrong by more than half a level, then evaluates as `litho-models
+evaluate` does. Nothing else has to change: the metric is in the JSON, `report.html`, `metrics.csv` and
+`scans.csv`.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import numpy as np
+
+from litho_data.foundation.commands import run_script
+from litho_data.store import PrintedScan
+from litho_models import evaluate, register_metric
+
+
+def share_off_by_half_a_level(
+    scan: PrintedScan, prediction_um: np.ndarray, residual_um: np.ndarray
+) -> float | None:
+    """Share of the scored pixels whose error would move them to the neighbouring level, %."""
+    scored = residual_um[np.isfinite(residual_um)]
+    return 100 * float(np.mean(np.abs(scored) > scan.level_height_um / 2)) if scored.size else None
+
+
+def main() -> None:
+    """Register the metric, evaluate, print what came out."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("model", help="folder of a frozen model, or zoo:NAME")
+    parser.add_argument("store", help="dataset store")
+    parser.add_argument("--out", required=True, help="folder of the result")
+    given = parser.parse_args()
+    metric = register_metric(
+        "off_by_half_a_level",
+        "percent",
+        share_off_by_half_a_level,
+        "off_by_half_a_level is the share of pixels wrong by more than half a level.",
+    )
+    scores = evaluate(given.model, given.store, given.out).scores
+    print(f"{scores.model}: {scores.metrics[metric.key]:.1f} % of the pixels are off by half a level")
+
+
+if __name__ == "__main__":
+    run_script(main)
