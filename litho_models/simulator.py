@@ -13,6 +13,7 @@ from litho_models.layers.gaussian import pad_field
 
 Variant = Literal["default", "paper", "authors"]
 VARIANTS: tuple[str, ...] = get_args(Variant)
+SMALL_PARAMETERS = 64
 
 
 class SimulatorConfig(BaseModel):
@@ -63,9 +64,6 @@ class Simulator(nn.Module, ABC):
 
     name: ClassVar[str]
     Config: ClassVar[type[SimulatorConfig]] = SimulatorConfig
-    # Few parameters with a meaning each: fitted by Gauss-Newton unless the recipe is the paper's; otherwise
-    # by stochastic gradient.
-    is_small: ClassVar[bool] = True
     # The height is a linear function of the parameters: one Jacobian serves the whole fit.
     is_linear: ClassVar[bool] = False
 
@@ -109,6 +107,15 @@ class Simulator(nn.Module, ABC):
     def parameter_count(self) -> int:
         """Number of trained values."""
         return sum(parameter.numel() for parameter in self.parameters())
+
+
+def is_small(model: nn.Module) -> bool:
+    """Few enough trainable numbers for a column of derivatives each, at most ``SMALL_PARAMETERS``.
+
+    A small model is fitted by least squares (unless the recipe is the paper's), and in the loop together with
+    the effects; any other is trained by stochastic gradient, and the loop takes it as it is.
+    """
+    return sum(p.numel() for p in model.parameters() if p.requires_grad) <= SMALL_PARAMETERS
 
 
 def crop_border(field: Tensor, border_px: int) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields as fields_of
+from dataclasses import fields
 
 import numpy as np
 
@@ -13,9 +13,9 @@ from litho_data.register.resample import resample_to_layout
 from litho_data.store import Store
 from litho_data.virtual_fab import Fab, Job, KnobSetting, Microscope, Noise, Printer, Truth, scan_job
 from litho_data.virtual_fab.knobs import KnobBoard
-from litho_models.loop.prepared import prepare_fields
+from litho_models.loop.prepared import prepare_scans
 from litho_models.loop.result.record import CloseLoop
-from litho_models.loop.scoring import DATUM_FREE, names_to_terms, score
+from litho_models.loop.study import DATUM_FREE, names_to_terms, score
 
 # What no model can foretell: an offset drawn anew for every line is estimated from the other half of the
 # pixels, as the loop does it; rounding cannot be undone, and scars lie where chance put them. The few
@@ -47,13 +47,13 @@ def true_floor(truth: Truth, jobs: Sequence[Job], store: Store, result: CloseLoo
         predictions.append(np.where(valid, height, np.float32(np.nanmean(height))))
     stripes = any(knob.name == "scan-line-stripes" for knob in truth.knobs)
     terms = DATUM_FREE | names_to_terms(scan_terms(result) + ["scan-line-stripes"] * stripes)
-    errors = score(prepare_fields(scans), predictions, terms, result.nuisance.seed)
+    errors = score(prepare_scans(scans), predictions, terms, result.nuisance.blocks)
     return ErrorPair(mae_nm=errors.mean_mae_nm, rmse_nm=errors.rmse_nm)
 
 
 def _without_noise(truth: Truth) -> Fab:
     knobs = [KnobSetting(k.name, k.strength, k.seed) for k in truth.knobs if k.name not in _UNFORESEEABLE]
-    printer = {f.name: truth.printer[f.name] for f in fields_of(Printer)}
+    printer = {f.name: truth.printer[f.name] for f in fields(Printer)}
     printer["levels"] = int(printer["levels"])
     return Fab(
         printer=Printer(**printer),  # type: ignore[arg-type]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -42,6 +42,14 @@ def close_loop(
         Path | None,
         typer.Option("--cache", help="folder of trained folds, e.g. of a benchmark; beside --out by default"),
     ] = None,
+    loss: Annotated[
+        Literal["squares", "absolute"],
+        typer.Option("--loss", help="what fits minimise: squares, or absolute errors as in a benchmark"),
+    ] = "squares",
+    background: Annotated[
+        Literal["none", "training"],
+        typer.Option("--background", help="training: report errors with the background of a benchmark"),
+    ] = "none",
     seed: Annotated[int, typer.Option("--seed", min=0, help="folds and bootstrap, not the lock box")] = 0,
 ) -> None:
     """Find what a model lacks on measured prints, add it, and report the error on held-out scans (nm)."""
@@ -50,6 +58,8 @@ def close_loop(
     config = LoopConfig(
         folds=folds,
         seed=seed,
+        loss=loss,
+        background=background,
         open_lock_box=open_lock_box,
         prior_hypotheses=parse_priors(prior),
         inject=tuple(inject or ()),

@@ -21,12 +21,11 @@ from litho_models.fitting import TrainingConfig
 from litho_models.fitting.fit import common_geometry
 from litho_models.fitting.runs import training_config
 from litho_models.models import build_model, require_models
-from litho_models.scan_terms.background import BackgroundUse
-from litho_models.scan_terms.nuisance import Policy
+from litho_models.scan_terms import BackgroundUse, NuisanceProtocol, Policy
 from litho_models.scoring.noise_floor import noise_floor
 from litho_models.scoring.pairs import paired_scores
 from litho_models.scoring.records import ModelScores, Prediction
-from litho_models.scoring.scores import protocol_for, score_model
+from litho_models.scoring.scores import score_model
 from litho_models.splits.folds import GROUPED_FOLDS, ScoredSplit, SplitKind, plan_folds
 
 BASELINES = ("identity", "affine", "affine-mtf", "blur-table", "linear")
@@ -86,7 +85,7 @@ def benchmark(
             (scan.id, Prediction.beside(learned, height))
             for scan, height in zip(fold.held_out, heights, strict=True)
         )
-    protocol = protocol_for(policy, seed, background)
+    protocol = NuisanceProtocol.of_policy(policy, seed, background)
     scored = [scan for fold in plan if not fold.locked for scan in fold.held_out]
     boxed = [scan for fold in plan if fold.locked for scan in fold.held_out]
 

@@ -11,8 +11,7 @@ from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
 from litho_models.prediction.cost import PredictionCost, measured_predictions
 from litho_models.prediction.tiles import predict_scan, tile_difference
-from litho_models.scan_terms.background import Background
-from litho_models.scan_terms.training import learn_background
+from litho_models.scan_terms.background import Background, learn_background
 from litho_models.scoring.metrics import score_scan
 from litho_models.simulator import Simulator
 

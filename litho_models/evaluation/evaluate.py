@@ -22,11 +22,10 @@ from litho_models.frozen.on_store import (
     trained_ids,
 )
 from litho_models.prediction.cost import measured_predictions
-from litho_models.scan_terms.background import BackgroundUse
-from litho_models.scan_terms.nuisance import Policy
+from litho_models.scan_terms import BackgroundUse, NuisanceProtocol, Policy
 from litho_models.scoring.noise_floor import noise_floor
 from litho_models.scoring.records import Prediction
-from litho_models.scoring.scores import protocol_for, score_model
+from litho_models.scoring.scores import score_model
 from litho_models.splits.folds import ScoredSplit
 
 
@@ -84,7 +83,7 @@ def evaluate(
     learned = card_background(frozen, scans) if background == "training" else None
     heights, cost = measured_predictions(lambda scan: predict_frozen(frozen, scan), scans, device_of(frozen))
     predictions = [Prediction.beside(learned, height) for height in heights]
-    protocol = protocol_for(policy, background="training" if learned else "none")
+    protocol = NuisanceProtocol.of_policy(policy, background="training" if learned else "none")
     result = Evaluation(
         schema="litho-models/evaluation/1",
         run=run_info([protocol.seed], len(scans)),

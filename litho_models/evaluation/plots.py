@@ -9,9 +9,9 @@ import numpy as np
 
 from litho_data.foundation.report import new_figure
 from litho_data.store import PrintedScan
-from litho_models.scan_terms.nuisance import cross_fitted_residual
+from litho_models.scan_terms import NuisanceProtocol, cross_fit, policy_terms
 from litho_models.scoring.noise_floor import NoiseFloor
-from litho_models.scoring.records import ModelScores, NuisanceProtocol
+from litho_models.scoring.records import ModelScores
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -171,15 +171,8 @@ def loss_curves(fits: Sequence[FitRecord]) -> Figure:
 
 def residual_um(scan: PrintedScan, prediction_um: np.ndarray, protocol: NuisanceProtocol) -> np.ndarray:
     """Cross-fitted residual of one scan under the protocol, µm."""
-    return cross_fitted_residual(
-        scan.height_um,
-        prediction_um,
-        scan.valid,
-        protocol.policy,
-        block_px=protocol.block_px,
-        buffer_px=protocol.buffer_px,
-        seed=protocol.seed,
-    ).residual_um
+    terms = policy_terms(protocol.policy)
+    return cross_fit(scan.height_um, prediction_um, scan.valid, terms, protocol.blocks).residual_um
 
 
 def print_gains(score: ModelScores) -> Figure:

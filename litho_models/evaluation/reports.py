@@ -12,7 +12,8 @@ from litho_data.foundation.report import Page
 from litho_data.store import PrintedScan
 from litho_models.evaluation import plots, tables
 from litho_models.evaluation.results import Benchmark, Evaluation, ModelRecord
-from litho_models.scoring.records import ModelScores, NuisanceProtocol, ScanRow
+from litho_models.scan_terms import NuisanceProtocol
+from litho_models.scoring.records import ModelScores, ScanRow
 from litho_models.splits.folds import ScoredSplit
 
 if TYPE_CHECKING:

@@ -12,9 +12,10 @@ from litho_data.store.schema import DatasetId
 from litho_models.evaluation.diagnostics import TileConsistency
 from litho_models.evaluation.fit_cache import FitRecord
 from litho_models.prediction.cost import PredictionCost
+from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.noise_floor import NoiseFloor
 from litho_models.scoring.pairs import Paired
-from litho_models.scoring.records import ModelScores, NuisanceProtocol
+from litho_models.scoring.records import ModelScores
 from litho_models.splits.folds import ScoredSplit
 
 

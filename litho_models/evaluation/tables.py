@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.metric_registry import metrics_text, registered_metrics
 from litho_models.scoring.metrics import INDEX_STEP, WAVELENGTH_UM
 from litho_models.scoring.noise_floor import NoiseFloor
-from litho_models.scoring.records import Interval, ModelScores, NuisanceProtocol
+from litho_models.scoring.records import Interval, ModelScores
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -18,11 +18,10 @@ from litho_models.frozen.card import Metric, ModelCard
 from litho_models.frozen.files import load_frozen
 from litho_models.frozen.freezing import MODEL_FOLDER, freeze
 from litho_models.frozen.on_store import card_background, predict_frozen
-from litho_models.scan_terms.background import BackgroundUse
-from litho_models.scan_terms.nuisance import Policy
+from litho_models.scan_terms import BackgroundUse, NuisanceProtocol, Policy
 from litho_models.scoring.noise_floor import noise_floor
 from litho_models.scoring.records import ModelScores, Prediction
-from litho_models.scoring.scores import protocol_for, score_model
+from litho_models.scoring.scores import score_model
 from litho_models.simulator import Variant
 
 ZOO_MODELS = ("physics", "pbl", "fno")
@@ -73,7 +72,7 @@ def make_zoo(
         described = {
             "metrics": metrics,
             "command": _command(dataset.name, name, recipe, variant, given),
-            "nuisance": protocol_for("offset", background="training").model_dump(mode="json"),
+            "nuisance": NuisanceProtocol.of_policy("offset", background="training").model_dump(mode="json"),
             "noise_floor": noise_floor(dataset.name).model_dump(mode="json"),
             "limitations": _limitations(metrics),
         }
@@ -89,7 +88,7 @@ def scored_metrics(model: str | Path, scans: Sequence[PrintedScan], split: str) 
     """The errors of a frozen model on scans, as they stand in its card, whatever the number of threads."""
     frozen = load_frozen(model)
     learned = card_background(frozen, scans)
-    protocol = protocol_for("offset", background="training" if learned else "none")
+    protocol = NuisanceProtocol.of_policy("offset", background="training" if learned else "none")
     # Threads that share a sum add it up in another order, and its last bits differ.
     with threadpool_limits(1):
         predictions = [Prediction.beside(learned, predict_frozen(frozen, scan)) for scan in scans]

@@ -7,8 +7,8 @@ from typing import Any, Literal, Self, get_args
 from pydantic import BaseModel, ConfigDict, Field
 
 from litho_data.foundation.errors import InputError
-from litho_models.scan_terms.nuisance import Policy
-from litho_models.simulator import Simulator, Variant
+from litho_models.scan_terms import Policy
+from litho_models.simulator import Simulator, Variant, is_small
 
 Recipe = Literal["fast", "paper"]
 RECIPES: tuple[str, ...] = get_args(Recipe)
@@ -90,7 +90,7 @@ class TrainingConfig(BaseModel):
 
         A model with many parameters always is; a small one where the paper trains it so.
         """
-        return not model.is_small or (self.recipe == "paper" and model.name in PAPER_LEARNING_RATE)
+        return not is_small(model) or (self.recipe == "paper" and model.name in PAPER_LEARNING_RATE)
 
     def used_by(self, model: Simulator) -> dict[str, Any]:
         """The settings that decide a fit of ``model``, for its record."""

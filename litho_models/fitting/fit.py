@@ -18,15 +18,15 @@ from litho_data.foundation.hashes import array_sha256
 from litho_data.store import PrintedScan
 from litho_models.fitting.checkpoint import CheckpointFolder, RoundRecord
 from litho_models.fitting.config import TrainingConfig
-from litho_models.fitting.gauss_newton import fit_gauss_newton
+from litho_models.fitting.small_models import fit_small_model
 from litho_models.fitting.stochastic import train_network
 from litho_models.models import build_model
 from litho_models.prediction.tiles import predict_scan
 from litho_models.simulator import Simulator
 from litho_models.splits.folds import inner_validation
 
-# Closed form and close to the data: from it a network gets its first nuisances.
-STIFF_MODEL = "linear"
+# Closed form and close to the data: from it a network gets its first scan terms.
+FIRST_MODEL = "linear"
 
 
 @dataclass(frozen=True)
@@ -83,10 +83,10 @@ def fit_with_record(
         training = [scan for scan in scans if scan.id not in validation_ids]
         validation = [scan for scan in scans if scan.id in validation_ids]
         history = train_network(
-            model, training, validation, config, lambda: _stiff_predictions(training, config), folder
+            model, training, validation, config, lambda: _first_predictions(training, config), folder
         )
     else:
-        fit_gauss_newton(model, scans, config.nuisance, config.free_gain)
+        fit_small_model(model, scans, config.nuisance, config.free_gain)
     return Fitted(
         model=model.eval(),
         training_ids=[scan_id for scan_id in ids if scan_id not in validation_ids],
@@ -109,12 +109,12 @@ def fit_in_cache(
     return fit_with_record(model_name, scans, config, checkpoint=cache / f"{name}.checkpoint")
 
 
-def _stiff_predictions(scans: Sequence[PrintedScan], config: TrainingConfig) -> list[np.ndarray]:
-    """Heights of a stiff model fitted to the scans, from which a network's first nuisances come."""
-    stiff = build_model(STIFF_MODEL, **common_geometry(scans))
+def _first_predictions(scans: Sequence[PrintedScan], config: TrainingConfig) -> list[np.ndarray]:
+    """Heights of a small model fitted to the scans, from which a network's first scan terms come."""
+    small = build_model(FIRST_MODEL, **common_geometry(scans))
     if config.nuisance != "none":
-        fit_gauss_newton(stiff, scans, config.nuisance, config.free_gain)
-    return [predict_scan(stiff, scan) for scan in scans]
+        fit_small_model(small, scans, config.nuisance, config.free_gain)
+    return [predict_scan(small, scan) for scan in scans]
 
 
 def run_key(

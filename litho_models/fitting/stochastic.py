@@ -1,6 +1,6 @@
 """Models with many parameters: stochastic gradient on random crops, in rounds.
 
-Between rounds the per-scan nuisances are estimated anew from whole-scan predictions, the inner
+Between rounds the scan terms are estimated anew from whole-scan predictions, the inner
 validation scans are scored and a checkpoint is written; inside a round the targets are fixed. All
 that is random is a function of seed and step, so a killed run continues to the same result.
 """
@@ -26,7 +26,7 @@ from litho_models.fitting.config import TrainingConfig
 from litho_models.fitting.crops import Window, in_passes, plan_batch, stack
 from litho_models.layers.precision import Precision, network_precision, warn_where_slower
 from litho_models.prediction.tiles import blending_window, predict_scan
-from litho_models.scan_terms.training import estimate_nuisances
+from litho_models.scan_terms.training import estimate_scan_terms, training_terms
 from litho_models.scoring.metrics import score_scan
 from litho_models.simulator import Simulator
 
@@ -48,7 +48,7 @@ def train_network(
     """Train ``model`` in place; it ends with the weights of the best round on ``validation``.
 
     Without validation scans the last round counts. ``first_predictions_um`` makes the
-    heights of a stiff model on the training scans, from which the first nuisances are estimated; a run
+    heights of a small model on the training scans, from which the first scan terms are estimated; a run
     that continues has no need of it.
     """
     if model.tile is not None and config.crops == "random":
@@ -68,8 +68,9 @@ def train_network(
             continue
         started = time.monotonic()
         predictions = [predict_scan(model, scan) for scan in training] if first else first_predictions_um()
-        nuisances = estimate_nuisances(training, predictions, config.nuisance, config.free_gain)
-        targets = _Targets(training, nuisances, _overhang_px(model, training, config))
+        terms = training_terms(config.nuisance, config.free_gain)
+        added = estimate_scan_terms(training, predictions, terms)
+        targets = _Targets(training, added, _overhang_px(model, training, config))
         losses = []
         for step in progress(range(first, last), f"training {model.name} to step {config.steps}"):
             losses.append(_step(fabric, module, optimiser, targets, config, step))
@@ -89,19 +90,19 @@ def train_network(
 
 
 class _Targets:
-    """Layouts and nuisance-free heights of the training scans; what is not measured has no weight.
+    """Layouts of the training scans, their heights free of scan terms; what is not measured has no weight.
 
     Around each scan the outermost pixels of its layout continue for ``overhang_px``, without weight.
     """
 
-    def __init__(self, scans: Sequence[PrintedScan], nuisances_um: Sequence[np.ndarray], overhang_px: int):
+    def __init__(self, scans: Sequence[PrintedScan], added_um: Sequence[np.ndarray], overhang_px: int):
         self.layouts_um = [np.pad(scan.layout_um, overhang_px, mode="edge") for scan in scans]
         self.shapes = [layout.shape for layout in self.layouts_um]
         usable = [scan.valid & np.isfinite(scan.height_um) for scan in scans]
         self.weights = [np.pad(mask.astype(np.float32), overhang_px) for mask in usable]
         heights = [
-            np.where(mask, scan.height_um - nuisance, 0).astype(np.float32)
-            for scan, nuisance, mask in zip(scans, nuisances_um, usable, strict=True)
+            np.where(mask, scan.height_um - added, 0).astype(np.float32)
+            for scan, added, mask in zip(scans, added_um, usable, strict=True)
         ]
         self.heights_um = [np.pad(height, overhang_px) for height in heights]
 

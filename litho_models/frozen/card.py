@@ -11,7 +11,8 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunFacts
 from litho_data.store.schema import DatasetId
-from litho_models.scan_terms.background import Background, BackgroundUse
+from litho_models.scan_terms import BackgroundUse
+from litho_models.scan_terms.background import Background
 
 CARD_FILE = "card.json"
 

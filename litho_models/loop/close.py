@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from torch import nn
@@ -14,21 +15,24 @@ from litho_data.store.lock_box import locked_ids
 from litho_data.store.read import PrintedScan
 from litho_models.effects import CATALOGUE, UNTESTABLE, get_effect
 from litho_models.effects.chain import EffectChain
-from litho_models.loop.findings import Closed, LoopConfig
-from litho_models.loop.fitting import predict
-from litho_models.loop.flexible import Trainer, carry_over, same_for_all, train_folds
+from litho_models.loop.findings import LoopConfig, LoopFindings
+from litho_models.loop.flexible import carry_over
+from litho_models.loop.fold_fits import predict
+from litho_models.loop.folded_base import Trainer, same_for_all, train_folds
 from litho_models.loop.identifiability import identifiability, profiles
-from litho_models.loop.parameters import is_stiff
-from litho_models.loop.prepared import Field, prepare_fields
+from litho_models.loop.parameters import is_refitted
+from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.loop.probes import Probed, probe_residual
-from litho_models.loop.scoring import DATUM_FREE, Score, names_to_terms, score
 from litho_models.loop.screening.power import parse_injection, plant
 from litho_models.loop.selection.search import search_effects
+from litho_models.loop.single_scans.nested_tests import MeasurementTest, measurement_tests
 from litho_models.loop.single_scans.observed import observe
-from litho_models.loop.single_scans.tests import MeasurementTest, measurement_tests
-from litho_models.loop.state import State, fit_state
 from litho_models.loop.structure import covariate_tests, is_structured
+from litho_models.loop.study import DATUM_FREE, Score, State, Study, fit_state, names_to_terms, score
 from litho_models.models import build_model
+from litho_models.scan_terms import Terms
+from litho_models.scan_terms.background import learn_background
+from litho_models.scoring.records import Prediction
 from litho_models.splits.folds import grouped_folds
 
 
@@ -41,7 +45,7 @@ def close_loop(
     rounding_um: Mapping[str, float] | None = None,
     lock_box: Sequence[str] | None = None,
     report: Callable[[str], None] = lambda message: None,
-) -> Closed:
+) -> LoopFindings:
     """Find what the base model lacks on these scans, add it, and measure the error on held-out scans.
 
     Args:
@@ -64,90 +68,64 @@ def close_loop(
         get_effect(name)
     for text in config.inject:
         parse_injection(text)
-    fields = [field for field in prepare_fields(scans) if len(field.sample) >= 64]
+    prepared = [scan for scan in prepare_scans(scans) if len(scan.sample) >= 64]
     lock_box = locked_ids(scans) if lock_box is None else list(lock_box)
-    development = [field for field in fields if field.id not in lock_box]
-    locked = [field for field in fields if field.id in lock_box]
+    development = [scan for scan in prepared if scan.id not in lock_box]
+    locked = [scan for scan in prepared if scan.id in lock_box]
     if len(development) < 2:
         raise InputError(
             "scans to close the loop on",
             got=f"{len(development)} usable and not locked",
             wanted="at least 2",
         )
-    fold_of = _folds(development, config)
+    study = Study(development, _folds(development, config), config.seed, config.loss, report=report)
     first = development[0]
-    stiff = is_stiff(base)
+    refitted = is_refitted(base)
     chain = EffectChain(
-        copy.deepcopy(base) if stiff else _stiff_guide(first.scan),
+        copy.deepcopy(base) if refitted else _small_guide(first.stored),
         {},
         full_height_um=first.context.full_height_um,
         pitch_um=first.context.pitch_um,
     )
     report(f"fitting the base model on {len(development)} scans")
-    start = fit_state(chain, development, fold_of)
+    start = fit_state(chain, study)
     untestable = dict(UNTESTABLE) | _untestable(development)
     floor = noise_lower_bound_nm(development, start.predictions)
-
-    def test_single_scans(state: State) -> list[MeasurementTest]:
-        return measurement_tests(
-            development, state.predictions, fold_of, floor_nm2=floor[0] ** 2, seed=config.seed
-        )
-
+    study = replace(study, floor_nm2=floor[0] ** 2)
     report("testing what single scans add")
-    first_tests = test_single_scans(start)
+    first_tests = measurement_tests(study, start.predictions)
     terms = DATUM_FREE | names_to_terms(_passed(first_tests))
-    search = search_effects(
-        start,
-        development,
-        fold_of,
-        terms,
-        exclude=untestable,
-        floor_nm2=floor[0] ** 2,
-        seed=config.seed,
-        report=report,
-    )
+    search = search_effects(start, study, terms, exclude=untestable)
     guide = search.state
-    if not stiff:
+    if not refitted:
         report("training the base model" if trainer else "predicting with the base model as it is")
-        folded = train_folds(development, fold_of, trainer) if trainer else same_for_all(base, development)
-        start, search = carry_over(
-            search,
-            folded,
-            development,
-            fold_of,
-            terms,
-            floor_nm2=floor[0] ** 2,
-            seed=config.seed,
-            report=report,
+        folded = (
+            train_folds(study.scans, study.fold_of, trainer) if trainer else same_for_all(base, study.scans)
         )
+        start, search = carry_over(search, folded, study, terms)
         # What single scans add to the model that is reported, not to the guide.
-        first_tests = test_single_scans(start)
+        first_tests = measurement_tests(study, start.predictions)
     report("testing what is left for structure")
     # Effects that displace a print leave a shift in every scan, which its registration then takes up.
-    between = first_tests if search.state is start else test_single_scans(search.state)
+    between = first_tests if search.state is start else measurement_tests(study, search.state.predictions)
     left = covariate_tests(development, search.state.predictions)
     probed = probe_residual(
         search.state,
-        development,
-        fold_of,
+        study,
         DATUM_FREE | names_to_terms(_passed(between)),
-        floor_nm2=floor[0] ** 2,
-        seed=config.seed,
         search=bool(is_structured(left)),
-        report=report,
     )
     final = probed.state
-    last_tests = test_single_scans(final) if probed.added else between
+    last_tests = measurement_tests(study, final.predictions) if probed.added else between
     accepted = _passed(last_tests)
     planted = []
     for text in config.inject:
         report(f"planting {text}")
-        planted += plant(text, guide, development, fold_of, terms, config.seed)
-    return Closed(
-        development=development,
+        planted += plant(text, guide, study, terms)
+    return LoopFindings(
+        study=replace(study, background=config.background),
         locked=locked,
         lock_box=lock_box,
-        fold_of=fold_of,
         base=start,
         final=final,
         search=search,
@@ -158,19 +136,16 @@ def close_loop(
         floor_nm=noise_lower_bound_nm(development, final.predictions),
         left_by_named=left,
         structure=covariate_tests(development, final.predictions) if probed.added else left,
-        locked_scores=_locked_scores(locked, start, probed, accepted, config)
+        locked_scores=_locked_scores(
+            locked, start, probed, accepted, replace(study, background=config.background)
+        )
         if config.open_lock_box
         else None,
         observed=observe(
-            development,
-            final.predictions,
-            DATUM_FREE | names_to_terms(accepted),
-            probed.defects,
-            rounding_um,
-            config.seed,
+            study, final.predictions, DATUM_FREE | names_to_terms(accepted), probed.defects, rounding_um
         ),
         identifiability=identifiability(search.state.fits),
-        profiles=profiles(search.state.fits, [field.window for field in development]),
+        profiles=profiles(search.state.fits, study.windows),
         untestable=untestable,
         planted=planted,
         config=config,
@@ -181,15 +156,17 @@ def _passed(tests: Sequence[MeasurementTest]) -> list[str]:
     return [test.effect.name for test in tests if test.confirmation.passed]
 
 
-def noise_lower_bound_nm(fields: Sequence[Field], predictions: Sequence[np.ndarray]) -> tuple[float, float]:
+def noise_lower_bound_nm(
+    scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray]
+) -> tuple[float, float]:
     """Pixel noise from second differences along x, (rms, mean absolute) in nm: blind to correlated noise.
 
     For white noise of variance s², x[i-1] - 2 x[i] + x[i+1] has variance 6 s². The median over pixels
     keeps edges of the print out; a Gaussian shape is assumed for the conversion.
     """
     variances = []
-    for field, prediction in zip(fields, predictions, strict=True):
-        residual = np.where(field.usable, field.scan.height_um - prediction, np.nan)
+    for scan, prediction in zip(scans, predictions, strict=True):
+        residual = np.where(scan.usable, scan.stored.height_um - prediction, np.nan)
         second = residual[:, 2:] - 2 * residual[:, 1:-1] + residual[:, :-2]
         spread = float(np.nanmedian(np.abs(second))) / 0.6745
         variances.append(spread**2 / 6)
@@ -197,41 +174,50 @@ def noise_lower_bound_nm(fields: Sequence[Field], predictions: Sequence[np.ndarr
     return rms, rms * float(np.sqrt(2 / np.pi))
 
 
-def _stiff_guide(scan: PrintedScan) -> nn.Module:
+def _small_guide(scan: PrintedScan) -> nn.Module:
     return build_model(
         "physics", pitch_um=scan.pitch_um, level_height_um=scan.level_height_um, levels=scan.levels
     )
 
 
-def _folds(fields: Sequence[Field], config: LoopConfig) -> np.ndarray:
-    ids = [field.id for field in fields]
+def _folds(scans: Sequence[PreparedScan], config: LoopConfig) -> np.ndarray:
+    ids = [scan.id for scan in scans]
     folds = grouped_folds(ids, min(config.folds, len(ids)), config.seed)
     fold = {scan_id: number for number, members in enumerate(folds) for scan_id in members}
     return np.array([fold[scan_id] for scan_id in ids])
 
 
-def _untestable(fields: Sequence[Field]) -> dict[str, str]:
+def _untestable(scans: Sequence[PreparedScan]) -> dict[str, str]:
     reasons = {}
-    one_level = all(field.scan.mask_level.min() == field.scan.mask_level.max() for field in fields)
+    one_level = all(scan.stored.mask_level.min() == scan.stored.mask_level.max() for scan in scans)
     for effect in CATALOGUE.values():
         if effect.per_scan:
             continue
         if one_level:
             reasons[effect.name] = "every layout has one level only: nothing in the print varies with it"
-        elif "order" in effect.needs and len({field.context.order for field in fields}) < 3:
+        elif "order" in effect.needs and len({scan.context.order for scan in scans}) < 3:
             reasons[effect.name] = "the writing order of the scans is not known"
     return reasons
 
 
 def _locked_scores(
-    locked: Sequence[Field], start: State, probed: Probed, accepted: Sequence[str], config: LoopConfig
+    locked: Sequence[PreparedScan], start: State, probed: Probed, accepted: Sequence[str], study: Study
 ) -> tuple[tuple[Score, Score], tuple[Score, Score]] | None:
+    """Errors of the locked scans before and after, by the fits to all development scans."""
     if not locked:
         return None
-    before, after = ([predict(s.fits.chain, s.fits.common, f) for f in locked] for s in (start, probed.state))
-    after = [probed.apply(f, p) for f, p in zip(locked, after, strict=True)]
-    terms = DATUM_FREE | names_to_terms(accepted)
-    return (
-        (score(locked, before, frozenset(), config.seed), score(locked, before, DATUM_FREE, config.seed)),
-        (score(locked, after, frozenset(), config.seed), score(locked, after, terms, config.seed)),
-    )
+
+    def before(scan: PreparedScan) -> np.ndarray:
+        return predict(start.fits.chain, start.fits.common, scan)
+
+    def after(scan: PreparedScan) -> np.ndarray:
+        return probed.apply(scan, predict(probed.state.fits.chain, probed.state.fits.common, scan))
+
+    def scores(of: Callable[[PreparedScan], np.ndarray], terms: Terms) -> tuple[Score, Score]:
+        learned = None
+        if study.background == "training":
+            learned = learn_background([s.stored for s in study.scans], [of(s) for s in study.scans])
+        maps = [Prediction.beside(learned, of(scan)).map_um for scan in locked]
+        return score(locked, maps, frozenset(), study.blocks), score(locked, maps, terms, study.blocks)
+
+    return scores(before, DATUM_FREE), scores(after, DATUM_FREE | names_to_terms(accepted))

@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict
 from pydantic import Field as Setting
 
 from litho_models.effects.chain import EffectChain
-from litho_models.loop.flexible import FoldedBase
+from litho_models.fitting.least_squares import Loss
+from litho_models.loop.folded_base import FoldedBase
 from litho_models.loop.identifiability import Identifiability, Profile
-from litho_models.loop.parameters import set_vector
-from litho_models.loop.prepared import Field
+from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.probes import Probed
-from litho_models.loop.scoring import DATUM_FREE, Score, Terms, names_to_terms, score
 from litho_models.loop.screening.power import Planted
 from litho_models.loop.selection.search import Search
+from litho_models.loop.single_scans.nested_tests import MeasurementTest
 from litho_models.loop.single_scans.observed import Observed
-from litho_models.loop.single_scans.tests import MeasurementTest
-from litho_models.loop.state import State
 from litho_models.loop.structure import CovariateTest, is_structured
+from litho_models.loop.study import DATUM_FREE, Score, State, Study, names_to_terms
+from litho_models.scan_terms import BackgroundUse, Terms
 
 
 class LoopConfig(BaseModel):
@@ -31,17 +31,21 @@ class LoopConfig(BaseModel):
 
     folds: int = Setting(6, ge=2, description="outer folds by scan")
     seed: int = Setting(0, ge=0, description="folds, calibration blocks, bootstrap")
+    loss: Loss = Setting("squares", description="what fits minimise; absolute, as in a benchmark")
+    background: BackgroundUse = Setting(
+        "none", description="training: reported errors with the background that a benchmark learns"
+    )
     open_lock_box: bool = False
     prior_hypotheses: tuple[str, ...] = ()
     inject: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
-class Closed:
+class LoopFindings:
     """Everything that the report and ``close_loop.json`` are made from.
 
     Attributes:
-        development, locked: prepared scans; ``fold_of``: fold of each development scan.
+        study: development scans, their folds and how they are judged; ``locked``: the other scans.
         lock_box: ids of the locked scans, those that cannot be used among them.
         base, final: fitted states before and after; ``search``: how it got there.
         probed: generic terms where no named effect won; ``final`` predicts with them.
@@ -55,10 +59,9 @@ class Closed:
         untestable: effect to reason; ``planted``: power of the screening, if asked for.
     """
 
-    development: list[Field]
-    locked: list[Field]
+    study: Study
+    locked: list[PreparedScan]
     lock_box: list[str]
-    fold_of: np.ndarray
     base: State
     final: State
     search: Search
@@ -76,10 +79,10 @@ class Closed:
     untestable: dict[str, str]
     planted: list[Planted]
     config: LoopConfig
-    # Scoring takes seconds, and every verdict asks for it; a state is kept so that its id stays its own.
-    _scores: dict[tuple[int, Terms], tuple[State, Score]] = field(
-        default_factory=dict, init=False, repr=False, compare=False
-    )
+
+    @property
+    def development(self) -> Sequence[PreparedScan]:
+        return self.study.scans
 
     @property
     def structured(self) -> list[CovariateTest]:
@@ -92,17 +95,12 @@ class Closed:
 
     def errors(self, state: State, terms: Terms) -> Score:
         """Held-out errors of a state over the development scans."""
-        key = id(state), terms
-        if key not in self._scores:
-            found = score(self.development, state.predictions, terms, self.config.seed)
-            self._scores[key] = state, found
-        return self._scores[key][1]
+        return state.score(self.study, terms)
 
 
-def corrected_chain(closed: Closed) -> EffectChain:
+def corrected_chain(findings: LoopFindings) -> EffectChain:
     """The final model at the parameters fitted on all development scans, a copy."""
-    chain = copy.deepcopy(closed.final.fits.chain)
-    set_vector(chain, closed.final.fits.common)
+    chain = copy.deepcopy(findings.final.fits.chain)
     if isinstance(chain.base, FoldedBase):
         effects, common = chain.values(), chain.base.common
         geometry = {"full_height_um": chain.full_height_um, "pitch_um": chain.pitch_um}

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import get_effect
 from litho_models.effects.chain import EffectChain
-from litho_models.loop.fitting import FoldFits, Linearisation, predict
-from litho_models.loop.linear import solve_damped
-from litho_models.loop.parameters import effect_slots, is_stiff, room, set_vector
-from litho_models.loop.prepared import Field
+from litho_models.fitting.least_squares import eliminated, solve_damped
+from litho_models.loop.fold_fits import TERM_WEIGHT, FoldFits, predict
+from litho_models.loop.parameters import effect_slots, is_refitted, room
+from litho_models.loop.prepared import PreparedScan
 
 PROFILE_POINTS = 9
 # Standard errors on either side of the fitted value.
@@ -57,7 +57,7 @@ class Profile:
 
 def identifiability(fits: FoldFits) -> Identifiability | None:
     """Conditioning at the fit to all development scans; None where nothing is fitted."""
-    normal = np.sum([part.normal()[0] for part in fits.linear], axis=0)
+    normal = np.sum([eliminated(part, TERM_WEIGHT)[0] for part in fits.linear], axis=0)
     names = _names(fits.chain)
     free = np.diag(normal) > 0
     if not free.any():
@@ -75,12 +75,12 @@ def identifiability(fits: FoldFits) -> Identifiability | None:
     )
 
 
-def profiles(fits: FoldFits, fields: Sequence[Field]) -> list[Profile]:
+def profiles(fits: FoldFits, scans: Sequence[PreparedScan]) -> list[Profile]:
     """Profile likelihood of every fitted number of every effect, up to nine values within its range.
 
     Args:
         fits: the fitted chain.
-        fields: development scans that it was fitted to.
+        scans: development scans that it was fitted to.
     """
     found = []
     for (effect, parameter), slot in effect_slots(fits.chain).items():
@@ -89,15 +89,14 @@ def profiles(fits: FoldFits, fields: Sequence[Field]) -> list[Profile]:
         fitted = float(fits.common[slot])
         around = fitted + error * np.linspace(-_REACH, _REACH, PROFILE_POINTS)
         values = np.unique(np.clip(around, limits.lower, limits.upper))
-        squares = np.array([_squares_with(fits, fields, slot, value) for value in values])
-        count = sum(len(field.sample) for field in fields)
+        squares = np.array([_squares_with(fits, scans, slot, value) for value in values])
+        count = sum(len(scan.sample) for scan in scans)
         rmse_nm = np.sqrt(squares / count) * NM_PER_UM
         found.append(Profile(effect, parameter, limits.unit, fitted, values, rmse_nm))
-    set_vector(fits.chain, fits.common)
     return found
 
 
-def _squares_with(fits: FoldFits, fields: Sequence[Field], slot: int, value: float) -> float:
+def _squares_with(fits: FoldFits, scans: Sequence[PreparedScan], slot: int, value: float) -> float:
     """Weighted sum of squares with one number held and the others stepped with the common derivatives."""
     vector = fits.common.copy()
     vector[slot] = value
@@ -105,10 +104,11 @@ def _squares_with(fits: FoldFits, fields: Sequence[Field], slot: int, value: flo
     best = np.inf
     for _ in range(_STEPS):
         parts = [
-            Linearisation(
-                field.height - field.at_sample(predict(fits.chain, vector, field)), own.jacobian, own.basis
-            ).normal()
-            for field, own in zip(fields, fits.linear, strict=True)
+            eliminated(
+                replace(own, residual=scan.height - scan.at_sample(predict(fits.chain, vector, scan))),
+                TERM_WEIGHT,
+            )
+            for scan, own in zip(scans, fits.linear, strict=True)
         ]
         total = sum(part[2] for part in parts)
         if total > (1 - _GAIN) * best or not others.any():
@@ -124,7 +124,7 @@ def _squares_with(fits: FoldFits, fields: Sequence[Field], slot: int, value: flo
 def _names(chain: EffectChain) -> list[str]:
     """Names of what ``get_vector`` returns."""
     names = []
-    for name, parameter in chain.base.named_parameters() if is_stiff(chain.base) else ():
+    for name, parameter in chain.base.named_parameters() if is_refitted(chain.base) else ():
         if parameter.requires_grad:
             places = [""] if parameter.numel() == 1 else [f"[{i}]" for i in range(parameter.numel())]
             names += [f"base: {name}{place}" for place in places]

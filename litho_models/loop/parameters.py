@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import torch
 from torch import nn
 
 from litho_models.effects import get_effect
 from litho_models.effects.chain import EffectChain
+from litho_models.loop.folded_base import FoldedBase
+from litho_models.simulator import is_small
 
-STIFF_PARAMETERS = 16
 _RELATIVE_STEP = 5e-3
 # Base parameters are lengths in µm or logits of order 1. Beyond 4 a logit has no slope left, and a
 # fit that has run there (on scans that a fold holds out, say) could not come back.
@@ -17,25 +20,33 @@ _LONGEST_STEP, _LARGEST_VALUE = 1.0, 4.0
 _AT_BOUND = 1e-6
 
 
-def is_stiff(base: nn.Module) -> bool:
-    """Few enough trainable numbers to be fitted jointly with the effects."""
-    return 0 < sum(p.numel() for p in base.parameters() if p.requires_grad) <= STIFF_PARAMETERS
+def is_refitted(base: nn.Module) -> bool:
+    """Whether the base has parameters, and few enough to be fitted together with the effects."""
+    return is_small(base) and any(p.requires_grad for p in base.parameters())
 
 
 def get_vector(chain: EffectChain) -> np.ndarray:
-    """All fitted numbers: the base's (if stiff), then the effects'."""
+    """All fitted numbers: the base's (if it is refitted), then the effects'."""
     return np.concatenate([p.detach().numpy().reshape(-1) for p in _fitted(chain)] or [np.empty(0)]).astype(
         np.float64
     )
 
 
-def set_vector(chain: EffectChain, vector: np.ndarray) -> None:
-    """Set what ``get_vector`` returns."""
+def chain_at(chain: EffectChain, vector: np.ndarray) -> EffectChain:
+    """A copy of the chain with these numbers, what ``get_vector`` returns; a base that is kept is shared."""
+    shared = {} if is_refitted(chain.base) else {id(chain.base): chain.base}
+    moved = copy.deepcopy(chain, shared)
     at = 0
-    for parameter in _fitted(chain):
+    for parameter in _fitted(moved):
         values = vector[at : at + parameter.numel()]
         parameter.data.copy_(torch.as_tensor(values, dtype=parameter.dtype).reshape(parameter.shape))
         at += parameter.numel()
+    return moved
+
+
+def model_for(base: nn.Module, scan_id: str) -> nn.Module:
+    """The model that predicts a scan: the base, or of one per fold the one that has not seen the scan."""
+    return base.of_scan(scan_id) if isinstance(base, FoldedBase) else base
 
 
 def effect_slots(chain: EffectChain) -> dict[tuple[str, str], int]:
@@ -71,7 +82,7 @@ def difference_steps(chain: EffectChain, vector: np.ndarray) -> np.ndarray:
 
 
 def _fitted(chain: EffectChain) -> list[nn.Parameter]:
-    base = [p for p in chain.base.parameters() if p.requires_grad] if is_stiff(chain.base) else []
+    base = [p for p in chain.base.parameters() if p.requires_grad] if is_refitted(chain.base) else []
     effects = [
         chain.get_parameter(f"{name.replace('-', '_')}__{parameter}") for name, parameter in chain.fitted
     ]

@@ -16,16 +16,15 @@ from litho_models.fitting.runs import level_share
 from litho_models.frozen import zoo
 from litho_models.frozen.files import save_frozen
 from litho_models.loop.close import close_loop
-from litho_models.loop.findings import Closed, LoopConfig, corrected_chain
-from litho_models.loop.flexible import Trainer
-from litho_models.loop.parameters import is_stiff
+from litho_models.loop.findings import LoopConfig, LoopFindings, corrected_chain
+from litho_models.loop.folded_base import Trainer
 from litho_models.loop.report.page import write_report
 from litho_models.loop.result.exporting import exported_effects, write_measurement_model
 from litho_models.loop.result.record import CloseLoop
 from litho_models.loop.result.summary import summarise
 from litho_models.loop.single_scans.observed import rounding_step_um
 from litho_models.models import MODELS, build_model
-from litho_models.simulator import Simulator
+from litho_models.simulator import Simulator, is_small
 
 MODEL_FOLDER, MEASUREMENT_FILE = "model", "measurement_model.json"
 
@@ -63,9 +62,9 @@ def close_loop_on_store(
     kept = {scan.id for scan in usable}
     dropped = [f"{scan.id}: fewer than 1024 measured pixels" for scan in scans if scan.id not in kept]
     trainer = None
-    if base in MODELS and not is_stiff(simulator):
+    if base in MODELS and not is_small(simulator):
         trainer = _trainer(base, config, steps, Path(cache or f"{out}-cache"))
-    closed = close_loop(
+    findings = close_loop(
         usable,
         simulator,
         config,
@@ -74,12 +73,12 @@ def close_loop_on_store(
         lock_box=opened.locked_ids,
         report=report,
     )
-    result = summarise(closed, dataset=opened.dataset_id, base_name=name, dropped=dropped)
+    result = summarise(findings, dataset=opened.dataset_id, base_name=name, dropped=dropped)
     with atomic_folder(out) as folder:
         result.write(folder)
-        write_report(closed, result, folder)
-        _save_process_model(closed, result, opened, folder / MODEL_FOLDER)
-        write_measurement_model(closed, result, folder / MEASUREMENT_FILE)
+        write_report(findings, result, folder)
+        _save_process_model(findings, result, opened, folder / MODEL_FOLDER)
+        write_measurement_model(findings, result, folder / MEASUREMENT_FILE)
     return result
 
 
@@ -131,14 +130,14 @@ def _base_model(base: str, store: Store) -> tuple[Simulator, str]:
     return load_simulator(folder, card), card.name
 
 
-def _save_process_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) -> None:
-    chain = corrected_chain(closed)
+def _save_process_model(findings: LoopFindings, result: CloseLoop, store: Store, folder: Path) -> None:
+    chain = corrected_chain(findings)
     groups = exported_effects(chain, result)
     assert isinstance(chain.base, Simulator)
     save_frozen(
         chain.base,
         folder,
-        name=f"{result.base_model}, loop closed",
+        name=f"{result.base_model}, loop findings",
         process_effects=groups["process"],
         measurement_effects=groups["measurement"],
         undetermined_effects=groups["undetermined"],
@@ -146,11 +145,11 @@ def _save_process_model(closed: Closed, result: CloseLoop, store: Store, folder:
         command=result.run.command,
         split={
             **result.split.model_dump(),
-            "lock_box_files_sha256": sorted(store.files_sha256(closed.lock_box).values()),
+            "lock_box_files_sha256": sorted(store.files_sha256(findings.lock_box).values()),
         },
         nuisance=result.nuisance.model_dump(),
         noise_floor=result.noise_floor.model_dump(),
-        training_level_share=level_share([field.scan for field in closed.development]),
+        training_level_share=level_share([scan.stored for scan in findings.development]),
         confusable_sets=[[e.name, *e.confusable_with] for e in result.effects if e.confusable_with],
         unexplained_fraction=result.shares.unexplained_structured,
         metrics=[

@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.linear import without_scan_terms
-from litho_models.loop.prepared import Field
+from litho_models.loop.prepared import PreparedScan
 from litho_models.scoring.statistics import sign_flip_statistics
 
 BINS = 8
@@ -43,19 +43,19 @@ class CovariateTest:
     share: float
 
 
-def covariate_tests(fields: Sequence[Field], predictions: Sequence[np.ndarray]) -> list[CovariateTest]:
+def covariate_tests(scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray]) -> list[CovariateTest]:
     """Test the residual at the sampled pixels against level, slopes, surroundings and place."""
     cleaned = []
-    for field, prediction in zip(fields, predictions, strict=True):
-        residual = field.height - field.at_sample(prediction)
-        cleaned.append(without_scan_terms(residual, field, prediction, gain=True))
-    covariates = [_covariates(f, p) for f, p in zip(fields, predictions, strict=True)]
+    for scan, prediction in zip(scans, predictions, strict=True):
+        residual = scan.height - scan.at_sample(prediction)
+        cleaned.append(without_scan_terms(residual, scan, prediction))
+    covariates = [_covariates(f, p) for f, p in zip(scans, predictions, strict=True)]
     tests = []
     for name in covariates[0] if covariates else ():
         values = [c[name] for c in covariates]
         tests.append(_binned(name, values, _quantiles(values), cleaned))
-    tests.append(_binned(PLACE, [_cell(f) for f in fields], np.arange(_CELLS**2 + 1) - 0.5, cleaned))
-    tests.append(_stencil(fields, cleaned, predictions))
+    tests.append(_binned(PLACE, [_cell(f) for f in scans], np.arange(_CELLS**2 + 1) - 0.5, cleaned))
+    tests.append(_stencil(scans, cleaned, predictions))
     return tests
 
 
@@ -64,29 +64,29 @@ def is_structured(tests: Sequence[CovariateTest]) -> list[CovariateTest]:
     return [t for t in tests if t.p * len(tests) <= STRUCTURED_P and t.share >= STRUCTURED_SHARE]
 
 
-def _covariates(field: Field, prediction: np.ndarray) -> dict[str, np.ndarray]:
-    layout = np.asarray(field.scan.layout_um, np.float64)
-    slopes = np.gradient(prediction.astype(np.float64), field.scan.pitch_um)
-    along_y, along_x = (field.at_sample(np.asarray(slope)) for slope in slopes)
-    near = gaussian_filter(layout, 1.0 / field.scan.pitch_um, mode="nearest")
-    far = gaussian_filter(layout, 3.0 / field.scan.pitch_um, mode="nearest")
-    y, x = field.position
+def _covariates(scan: PreparedScan, prediction: np.ndarray) -> dict[str, np.ndarray]:
+    layout = np.asarray(scan.stored.layout_um, np.float64)
+    slopes = np.gradient(prediction.astype(np.float64), scan.stored.pitch_um)
+    along_y, along_x = (scan.at_sample(np.asarray(slope)) for slope in slopes)
+    near = gaussian_filter(layout, 1.0 / scan.stored.pitch_um, mode="nearest")
+    far = gaussian_filter(layout, 3.0 / scan.stored.pitch_um, mode="nearest")
+    y, x = scan.position
     return {
-        "level": field.at_sample(layout) / field.scan.level_height_um,
+        "level": scan.at_sample(layout) / scan.stored.level_height_um,
         "slope along x (µm/µm)": np.abs(along_x),
         "slope along y (µm/µm)": np.abs(along_y),
         "signed slope along x (µm/µm)": along_x,
         "signed slope along y (µm/µm)": along_y,
-        "height above surroundings of 1 µm (µm)": field.at_sample(np.asarray(layout - near)),
-        "mean layout within 3 µm (µm)": field.at_sample(far),
+        "height above surroundings of 1 µm (µm)": scan.at_sample(np.asarray(layout - near)),
+        "mean layout within 3 µm (µm)": scan.at_sample(far),
         "x over the scan": x,
         "y over the scan": y,
     }
 
 
-def _cell(field: Field) -> np.ndarray:
+def _cell(scan: PreparedScan) -> np.ndarray:
     """Number of the cell of the scan that holds each sampled pixel, row by row."""
-    row, column = np.floor((field.position + 1) / 2 * _CELLS).clip(0, _CELLS - 1)
+    row, column = np.floor((scan.position + 1) / 2 * _CELLS).clip(0, _CELLS - 1)
     return row * _CELLS + column
 
 
@@ -117,17 +117,17 @@ def _binned(
 
 
 def _stencil(
-    fields: Sequence[Field], residuals: Sequence[np.ndarray], predictions: Sequence[np.ndarray]
+    scans: Sequence[PreparedScan], residuals: Sequence[np.ndarray], predictions: Sequence[np.ndarray]
 ) -> CovariateTest:
     """Linear response to the layout at a grid of displacements: a kernel that the model lacks."""
     offsets = [(dy, dx) for dy in STENCIL_PX for dx in STENCIL_PX]
     grams = []
-    for field, residual, prediction in zip(fields, residuals, predictions, strict=True):
-        layout = field.scan.layout_um.astype(np.float64)
+    for scan, residual, prediction in zip(scans, residuals, predictions, strict=True):
+        layout = scan.stored.layout_um.astype(np.float64)
         columns = np.stack(
-            [field.at_sample(np.roll(layout, (-dy, -dx), (0, 1))) for dy, dx in offsets] + [residual], axis=1
+            [scan.at_sample(np.roll(layout, (-dy, -dx), (0, 1))) for dy, dx in offsets] + [residual], axis=1
         )
-        columns = without_scan_terms(columns, field, prediction, gain=True)
+        columns = without_scan_terms(columns, scan, prediction)
         grams.append(columns.T @ columns)
     stacked = np.stack(grams)
     p = _joint_p(stacked[:, :-1, -1])
@@ -138,7 +138,7 @@ def _stencil(
     for own in stacked:
         kernel = np.linalg.solve(normal - own[:-1, :-1], pooled[:-1, -1] - own[:-1, -1])
         gain += 2 * kernel @ own[:-1, -1] - kernel @ own[:-1, :-1] @ kernel
-    share = max(0.0, float(gain / max(pooled[-1, -1], 1e-300))) if len(fields) > 1 else 0.0
+    share = max(0.0, float(gain / max(pooled[-1, -1], 1e-300))) if len(scans) > 1 else 0.0
     return CovariateTest(LINEAR_RESPONSE, np.empty(0), np.empty(0), np.empty(0), p, share)
 
 

@@ -71,7 +71,6 @@ class Fno(Simulator):
     name = "fno"
     Config = FnoConfig
     config: FnoConfig
-    is_small = False
 
     def __init__(self, config: FnoConfig):
         super().__init__(config)

@@ -63,7 +63,6 @@ class Pbl(Simulator):
     name = "pbl"
     Config = PblConfig
     config: PblConfig
-    is_small = False
 
     def __init__(self, config: PblConfig):
         super().__init__(config)

@@ -30,7 +30,7 @@ from litho_models.noise.variance import (
     sigma_nm,
     variance_model,
 )
-from litho_models.scoring.records import NuisanceProtocol
+from litho_models.scan_terms import NuisanceProtocol
 
 _FOLDS = 5
 _PIXELS_PER_SCAN = 20_000

@@ -15,9 +15,8 @@ from litho_models.frozen.card import CARD_FILE
 from litho_models.frozen.files import load_frozen
 from litho_models.frozen.on_store import card_background, predict_frozen, trained_ids
 from litho_models.noise.calibration import Residuals
-from litho_models.scan_terms.nuisance import cross_fitted_residual
-from litho_models.scoring.records import NuisanceProtocol, Prediction
-from litho_models.scoring.scores import protocol_for
+from litho_models.scan_terms import NuisanceProtocol, cross_fit, policy_terms
+from litho_models.scoring.records import Prediction
 
 Predictions = dict[str, list[np.ndarray]]
 
@@ -57,10 +56,10 @@ def read_residuals(store: Store, sources: Sequence[str | Path], model: str | Non
         raise InputError("residuals", got="no scan of the store", wanted="predictions of its scans")
     count = min(len(members[scan.id]) for scan in scans)
     residuals = []
-    geometry = protocol.model_dump(include={"block_px", "buffer_px", "seed"})
+    terms = policy_terms(protocol.policy)
     for scan in scans:
         mean = np.mean(members[scan.id], axis=0)
-        fit = cross_fitted_residual(scan.height_um, mean, scan.valid, protocol.policy, **geometry)
+        fit = cross_fit(scan.height_um, mean, scan.valid, terms, protocol.blocks)
         residuals.append(NM_PER_UM * fit.residual_um)
     spread = [NM_PER_UM * disagreement_um(members[scan.id]) for scan in scans] if count > 1 else None
     return Residuals(name, scans, residuals, spread, count, held_out, protocol)
@@ -135,6 +134,6 @@ def _of_frozen(store: Store, folders: Sequence[Path]) -> tuple[str, Predictions,
         ]
         for scan in scans
     }
-    protocol = protocol_for("offset", background="training" if any(learned) else "none")
+    protocol = NuisanceProtocol.of_policy("offset", background="training" if any(learned) else "none")
     name = "+".join(sorted({frozen.name for frozen in models}))
     return name, members, protocol, not trained_on & set(members)

@@ -7,7 +7,7 @@ and added to a prediction of the *measured* map. It is no part of the printer: n
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Sequence
 
 import numpy as np
 from pydantic import ConfigDict
@@ -15,9 +15,9 @@ from pydantic import ConfigDict
 from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
-from litho_models.scan_terms.nuisance import FloatMap, smooth_shapes
-
-BackgroundUse = Literal["none", "training"]
+from litho_models.scan_terms.cross_fit import fitted_terms
+from litho_models.scan_terms.policies import POLICIES
+from litho_models.scan_terms.term import FloatMap, smooth_shapes
 
 # Relative; a bow taken from a field 1 % larger or smaller is wrong by 2 %.
 _SAME_SIZE = 0.01
@@ -53,3 +53,24 @@ class Background(Record):
 def field_um(scan: PrintedScan) -> tuple[float, float]:
     """Size (y, x) of a scan's field, µm."""
     return scan.shape[0] * scan.pitch_um, scan.shape[1] * scan.pitch_um
+
+
+def learn_background(scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray]) -> Background:
+    """The smooth background that the scans have in common beside a fitted model's heights.
+
+    Each scan is fitted with all terms of policy ``full``, offset and gain included, on its valid pixels;
+    the mean over the scans of the five smooth terms is kept.
+
+    Args:
+        scans: the scans that the model was fitted to, of one size; ``predictions_um``: its heights (ny, nx).
+    """
+    coefficients = [
+        fitted_terms(scan.height_um, prediction, scan.valid & np.isfinite(scan.height_um), POLICIES["full"])[
+            0
+        ]
+        for scan, prediction in zip(scans, predictions_um, strict=True)
+    ]
+    x, y, xx, xy, yy = (NM_PER_UM * np.mean(coefficients, axis=0)[2:]).tolist()
+    return Background(
+        x_nm=x, y_nm=y, xx_nm=xx, xy_nm=xy, yy_nm=yy, field_um=field_um(scans[0]), scans=len(scans)
+    )

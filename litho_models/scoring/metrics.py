@@ -8,7 +8,7 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
-from litho_models.scan_terms.nuisance import BLOCK_PX, BUFFER_PX, Policy, cross_fitted_residual
+from litho_models.scan_terms import Blocks, LineIndex, Policy, cross_fit, policy_terms
 from litho_models.scoring.print_gain import print_gain
 
 # The step of index from air to the resist, at a red helium-neon line: where its elements are used.
@@ -47,29 +47,18 @@ def score_scan(
     prediction_um: np.ndarray,
     valid: np.ndarray,
     policy: Policy = "offset",
+    blocks: Blocks | None = None,
     *,
-    block_px: int = BLOCK_PX,
-    buffer_px: int = BUFFER_PX,
-    seed: int = 0,
-    scan_line: np.ndarray | None = None,
+    scan_line: LineIndex | None = None,
 ) -> ScanScore:
-    """Score one prediction against one scan; arrays (ny, nx) in µm, the rest as in ``cross_fitted_residual``.
+    """Score one prediction against one scan; arrays (ny, nx) in µm, the rest as in ``cross_fit``.
 
     Slope and intercept, the gain and offset of the print, are those of ``print_gain``.
 
     Raises:
-        InputError: what ``cross_fitted_residual`` refuses, or no valid pixel.
+        InputError: what ``cross_fit`` refuses, or no valid pixel.
     """
-    free = cross_fitted_residual(
-        height_um,
-        prediction_um,
-        valid,
-        policy,
-        block_px=block_px,
-        buffer_px=buffer_px,
-        seed=seed,
-        scan_line=scan_line,
-    )
+    free = cross_fit(height_um, prediction_um, valid, policy_terms(policy), blocks, scan_line=scan_line)
     scored = np.isfinite(free.residual_um)
     if not scored.any():
         raise InputError(f"scan {scan_id}", got="no valid pixel", wanted="at least one to score")

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from litho_models.scan_terms.nuisance import BLOCK_PX
+from litho_models.scan_terms import Blocks
 
 
 class PrintGain(NamedTuple):
@@ -23,7 +23,7 @@ class PrintGain(NamedTuple):
 
 
 def print_gain(
-    height_um: np.ndarray, prediction_um: np.ndarray, used: np.ndarray, *, block_px: int = BLOCK_PX
+    height_um: np.ndarray, prediction_um: np.ndarray, used: np.ndarray, *, block_px: int = Blocks().block_px
 ) -> PrintGain:
     """Least-squares line through the used pixels of a scan.
 

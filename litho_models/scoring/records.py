@@ -8,27 +8,11 @@ import numpy as np
 from pydantic import Field
 
 from litho_data.foundation.results import Record
-from litho_models.scan_terms.background import Background, BackgroundUse
-from litho_models.scan_terms.nuisance import BLOCK_PX, BUFFER_PX, Policy
+from litho_models.scan_terms import Policy
+from litho_models.scan_terms.background import Background
 from litho_models.scoring.transfer import LevelError, TransferCurves
 
 Interval = tuple[float, float] | None
-
-
-class NuisanceProtocol(Record):
-    """What a scan may be freed of before it is scored, and on which pixels that was fitted.
-
-    ``k``: smooth terms per scan; line offsets of ``full+rows`` come on top, by their effective number, which
-    depends on the prediction (``PolicyError.k``). ``background``: ``training`` if the smooth background
-    learned on the training scans was added to the predictions; nothing of it is fitted to the scored scan.
-    """
-
-    policy: Policy = "offset"
-    k: float = 1.0
-    block_px: int = BLOCK_PX
-    buffer_px: int = BUFFER_PX
-    seed: int = 0
-    background: BackgroundUse = "none"
 
 
 class Prediction(NamedTuple):

@@ -10,20 +10,12 @@ import numpy as np
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
-from litho_models.scan_terms.background import BackgroundUse
-from litho_models.scan_terms.nuisance import (
-    POLICIES,
-    TERM_COUNT,
-    Policy,
-    cross_fitted_residual,
-    scan_line_index,
-)
+from litho_models.scan_terms import POLICIES, Blocks, NuisanceProtocol, Policy, cross_fit, scan_line_index
 from litho_models.scoring.metric_registry import metrics_of, metrics_over_scans
 from litho_models.scoring.metrics import ScanScore, phase_waves, score_scan
 from litho_models.scoring.records import (
     Interval,
     ModelScores,
-    NuisanceProtocol,
     PolicyError,
     Prediction,
     ScanRow,
@@ -54,19 +46,20 @@ def score_model(
     Raises:
         InputError: predictions that are not finite, or a scan too small for the policies.
     """
-    geometry: dict[str, Any] = protocol.model_dump(include={"block_px", "buffer_px", "seed"})
+    blocks = protocol.blocks
     maps = [prediction.map_um for prediction in predictions]
     heights = [prediction.height_um for prediction in predictions]
-    scores = {policy: _scan_scores(scans, maps, policy, geometry) for policy in POLICIES}
+    scores = {policy: _scan_scores(scans, maps, policy, blocks) for policy in POLICIES}
     chosen = scores[protocol.policy]
     bare = _BLIND_POLICIES if protocol.background == "training" else ()
     residuals, rows, lines = [], [], []
     for scan, expected in zip(scans, maps, strict=True):
         arrays = (scan.height_um, expected, scan.valid)
-        residuals.append(cross_fitted_residual(*arrays, protocol.policy, **geometry).residual_um)
+        residuals.append(cross_fit(*arrays, POLICIES[protocol.policy], blocks).residual_um)
         line = scan_line_index(scan.shape, scan.scan_to_layout, scan.pitch_um, scan.bend_um)
-        rows.append(cross_fitted_residual(*arrays, "full+rows", **geometry).row_sd_um)
-        lines.append(cross_fitted_residual(*arrays, "full+rows", scan_line=line, **geometry).row_sd_um)
+        rows.append(cross_fit(*arrays, POLICIES["full+rows"], blocks).line_sd_um)
+        along_lines = POLICIES["full"] | {"scan-lines"}
+        lines.append(cross_fit(*arrays, along_lines, blocks, scan_line=line).line_sd_um)
     table = [
         _row(scan, score, metrics_of(scan, expected, residual))
         for scan, score, expected, residual in zip(scans, chosen, maps, residuals, strict=True)
@@ -83,7 +76,7 @@ def score_model(
         rmse_datum_free_ci95_nm=interval([score.rmse_datum_free_nm for score in chosen]),
         by_policy=[_policy_error(policy, scores[policy]) for policy in POLICIES],
         without_background=[
-            _policy_error(policy, _scan_scores(scans, heights, policy, geometry)) for policy in bare
+            _policy_error(policy, _scan_scores(scans, heights, policy, blocks)) for policy in bare
         ],
         phase_rms_waves=phase_waves(_mean(chosen, "rmse_datum_free_nm") / NM_PER_UM),
         **metrics_over_scans(table),
@@ -97,10 +90,10 @@ def score_model(
 
 
 def _scan_scores(
-    scans: Sequence[PrintedScan], maps_um: Sequence[np.ndarray], policy: Policy, geometry: dict[str, Any]
+    scans: Sequence[PrintedScan], maps_um: Sequence[np.ndarray], policy: Policy, blocks: Blocks
 ) -> list[ScanScore]:
     return [
-        score_scan(scan.id, scan.height_um, prediction, scan.valid, policy, **geometry)
+        score_scan(scan.id, scan.height_um, prediction, scan.valid, policy, blocks)
         for scan, prediction in zip(scans, maps_um, strict=True)
     ]
 
@@ -109,11 +102,6 @@ def _policy_error(policy: Policy, scores: Sequence[ScanScore]) -> PolicyError:
     values = [score.mae_datum_free_nm for score in scores]
     freedom = float(np.mean([score.degrees_of_freedom for score in scores]))
     return PolicyError(policy=policy, k=freedom, mae_nm=float(np.mean(values)), ci95_nm=interval(values))
-
-
-def protocol_for(policy: Policy, seed: int = 0, background: BackgroundUse = "none") -> NuisanceProtocol:
-    """The standard protocol of a policy."""
-    return NuisanceProtocol(policy=policy, k=float(TERM_COUNT[policy]), seed=seed, background=background)
 
 
 def interval(values: Sequence[float]) -> Interval:

@@ -37,7 +37,7 @@ from litho_data.virtual_fab import KNOBS, Fab, Microscope, Noise, Printer, Truth
 from litho_data.virtual_fab.knobs import KnobBoard
 from litho_models.effects import CATALOGUE
 from litho_models.loop.result.record import AddedEffect, Candidate, CloseLoop, Residual
-from litho_models.scan_terms.nuisance import least_squares, nuisance_basis
+from litho_models.scan_terms import POLICIES, TermPixels, least_squares, term_maps
 
 DEVELOPMENT_SEED = 0
 
@@ -97,7 +97,7 @@ def test_a_knob_reaches_the_drawn_rms_after_the_projection_of_policy_full():
             ).noiseless_um
             for knobs in (settings([planted], draw.seed), [])
         )
-        basis = nuisance_basis(without, "full").reshape(7, -1)
+        basis = term_maps(TermPixels(without), POLICIES["full"])
         change = (with_knob - without).ravel()
         squares.append(np.mean((change - least_squares(basis, change) @ basis) ** 2))
     rms_nm = 1e3 * np.sqrt(np.mean(squares))

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from litho_data.store.read import PrintedScan
 from litho_models.effects.chain import EffectChain
-from litho_models.loop.prepared import prepare_fields
+from litho_models.loop.prepared import prepare_scans
 from litho_models.models import build_model
 
 LEVELS, LEVEL_HEIGHT_UM, PITCH_UM = 13, 0.1, 0.1
@@ -41,9 +41,9 @@ def printed_scans(
     blank = [_scan(i, _layout(rng, n), order) for i, n in enumerate(sizes)]
     chain = true_model(effects or {})
     scans = []
-    for field in prepare_fields(blank):
+    for scan in prepare_scans(blank):
         with torch.no_grad():
-            clean = chain(field.layout, field.context)[0, 0].numpy()
+            clean = chain(scan.layout, scan.context)[0, 0].numpy()
         ny, nx = clean.shape
         rough = gaussian_filter(rng.normal(size=clean.shape), 1.0)
         rough *= noise_um / rough.std()
@@ -51,7 +51,7 @@ def printed_scans(
         tilt = 0.003 * (rng.normal() * x + rng.normal() * y)
         lines = stripes_um * rng.normal(size=(ny, 1))
         height = clean + rough + datum_um * rng.normal() + tilt + lines
-        scans.append(_with_height(field.scan, height))
+        scans.append(_with_height(scan.stored, height))
     return scans
 
 

@@ -17,11 +17,10 @@ from litho_models.fitting.runs import train
 from litho_models.frozen.card import ModelCard
 from litho_models.frozen.freezing import freeze
 from litho_models.models import build_model
-from litho_models.scan_terms.background import Background
-from litho_models.scan_terms.nuisance import TERM_COUNT
-from litho_models.scan_terms.training import learn_background
+from litho_models.scan_terms import NuisanceProtocol
+from litho_models.scan_terms.background import Background, learn_background
 from litho_models.scoring.records import Prediction
-from litho_models.scoring.scores import protocol_for, score_model
+from litho_models.scoring.scores import score_model
 from litho_models.splits.folds import plan_folds
 
 BOW_NM = 40.0
@@ -96,7 +95,7 @@ def test_both_figures_are_told_and_only_policies_without_smooth_terms_differ(res
             if ours.policy in SMOOTH:
                 # Their own terms span the background: least squares finds the same residual.
                 assert ours.mae_nm == pytest.approx(theirs.mae_nm, abs=1e-6)
-            elif TERM_COUNT[ours.policy]:
+            elif ours.policy != "none":
                 assert ours.mae_nm < theirs.mae_nm
     table = (out / "policies.csv").read_text().splitlines()
     assert [line.split(",")[:2] for line in table[1:3]] == [["identity", "training"], ["identity", "none"]]
@@ -110,7 +109,7 @@ def test_with_the_true_print_and_background_only_the_noise_is_left(scans):
         "truth",
         scans,
         [Prediction(truth(scan), bow) for scan in scans],
-        protocol_for("offset", background="training"),
+        NuisanceProtocol.of_policy("offset", background="training"),
     )
     # White noise of 4 nm has a mean absolute value of 3.19 nm.
     assert scores.mae_datum_free_nm == pytest.approx(3.19, rel=0.01)

@@ -24,6 +24,7 @@ from litho_models.evaluation.evaluate import evaluate
 from litho_models.evaluation.results import Benchmark, Evaluation
 from litho_models.fitting.runs import TrainingRun, train
 from litho_models.frozen.freezing import freeze
+from litho_models.scan_terms import NuisanceProtocol
 from litho_models.splits.folds import plan_folds
 
 MODELS = ("identity", "affine", "linear")
@@ -307,7 +308,7 @@ def test_a_model_of_another_geometry_is_refused(store, tmp_path):
 
 def test_line_offsets_are_attributed_to_their_frame():
     from litho_models.scoring.records import Prediction
-    from litho_models.scoring.scores import protocol_for, score_model
+    from litho_models.scoring.scores import score_model
 
     scans = make_scans(1, size_px=256, noise_um=0.005)
     angle = np.deg2rad(1.0)
@@ -317,7 +318,7 @@ def test_line_offsets_are_attributed_to_their_frame():
 
     scan = replace(scans[0], height_um=scans[0].height_um + stripes, scan_to_layout=turned)
     truth = printed_height_um(scan.layout_um).astype(np.float32)
-    scores = score_model("truth", [scan], [Prediction(truth)], protocol_for("offset"))
+    scores = score_model("truth", [scan], [Prediction(truth)], NuisanceProtocol.of_policy("offset"))
     # Stripes of 10 nm along the layout's rows; along scan lines turned by 1° they average out over
     # 57 px, of which 256 px hold 4.5: a half to a third is left.
     assert scores.row_offset_sd_nm == pytest.approx(10, abs=1.5)

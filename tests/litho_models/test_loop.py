@@ -18,27 +18,27 @@ from litho_models.effects import get_effect
 from litho_models.fitting.runs import train
 from litho_models.frozen.card import ModelCard
 from litho_models.loop import LoopConfig, close_loop, close_loop_on_store, parse_priors
-from litho_models.loop.findings import Closed
-from litho_models.loop.fitting import fit_folds, predict
+from litho_models.loop.findings import LoopFindings
+from litho_models.loop.fold_fits import fit_folds, predict
 from litho_models.loop.parameters import get_vector
-from litho_models.loop.prepared import LARGE_PX, prepare_fields
+from litho_models.loop.prepared import LARGE_PX, prepare_scans
 from litho_models.loop.result.exporting import exported_effects
 from litho_models.loop.result.record import CloseLoop
 from litho_models.loop.result.summary import summarise
 from litho_models.loop.screening.power import parse_injection
-from litho_models.loop.single_scans.tests import measurement_tests
+from litho_models.loop.single_scans.nested_tests import measurement_tests
 from litho_models.loop.structure import covariate_tests, is_structured
+from litho_models.loop.study import Study
 from litho_models.models import build_model
 from tests.litho_models.loop_scans import printed_scans, true_model
 from tests.litho_models.prints import write_store
 
 
-def closed_on(scans, **config) -> tuple[Closed, CloseLoop]:
+def closed_on(scans, **config) -> tuple[LoopFindings, CloseLoop]:
     start = build_model("physics", sigma_diffusion_init_um=0.4)
-    closed = close_loop(scans, start, LoopConfig.model_validate(config))
-    return closed, summarise(
-        closed, dataset=DatasetId(name="made here", sha256="0" * 64), base_name="physics", dropped=[]
-    )
+    findings = close_loop(scans, start, LoopConfig.model_validate(config))
+    dataset = DatasetId(name="made here", sha256="0" * 64)
+    return findings, summarise(findings, dataset=dataset, base_name="physics", dropped=[])
 
 
 def verdicts(result: CloseLoop) -> Mapping[str, str]:
@@ -46,20 +46,20 @@ def verdicts(result: CloseLoop) -> Mapping[str, str]:
 
 
 @pytest.fixture(scope="module")
-def null() -> tuple[Closed, CloseLoop]:
+def null() -> tuple[LoopFindings, CloseLoop]:
     return closed_on(printed_scans(count=14))
 
 
 @pytest.fixture(scope="module")
-def planted() -> tuple[Closed, CloseLoop]:
+def planted() -> tuple[LoopFindings, CloseLoop]:
     scans = printed_scans({"vignetting": {"strength": 0.2}}, seed=1)
     return closed_on(scans, open_lock_box=True, prior_hypotheses=("datum-offset",))
 
 
 def test_nothing_is_found_where_nothing_is_missing(null) -> None:
-    closed, result = null
+    findings, result = null
     assert result.verdict == "nothing-missing"
-    assert not closed.search.added
+    assert not findings.search.added
     # Without structure and yet not at the floor: a lower bound of the noise cannot show that.
     assert (result.residual.state, result.noise_floor.kind) == ("undecided", "lower-bound")
     # Roughness of 6 nm is all that is left: E|n| = 0.8 sd, the tilt of single scans adds a little.
@@ -76,8 +76,8 @@ def test_the_datum_of_the_scans_is_recognised(null) -> None:
 
 
 def test_a_missing_effect_is_named_with_its_size(planted) -> None:
-    closed, result = planted
-    assert [a.effect.name for a in closed.search.added] == ["vignetting"]
+    findings, result = planted
+    assert [a.effect.name for a in findings.search.added] == ["vignetting"]
     entry = next(e for e in result.effects if e.name == "vignetting")
     assert entry.verdict == "explained"
     assert entry.parameters["strength"].value == pytest.approx(0.2, abs=0.02)
@@ -117,8 +117,8 @@ def test_every_candidate_has_a_verdict_and_a_reason(planted) -> None:
 
 
 def test_only_printer_effects_are_exported(planted) -> None:
-    closed, result = planted
-    groups = exported_effects(closed.final.fits.chain, result)
+    findings, result = planted
+    groups = exported_effects(findings.final.fits.chain, result)
     assert list(groups["process"]) == ["vignetting"]
     assert not groups["undetermined"]
     alike = result.model_copy(
@@ -129,7 +129,7 @@ def test_only_printer_effects_are_exported(planted) -> None:
             ]
         }
     )
-    assert list(exported_effects(closed.final.fits.chain, alike)["undetermined"]) == ["vignetting"]
+    assert list(exported_effects(findings.final.fits.chain, alike)["undetermined"]) == ["vignetting"]
 
 
 @pytest.mark.slow
@@ -147,14 +147,14 @@ def test_a_profile_that_all_scans_share_is_not_put_down_to_their_lines() -> None
     rng = np.random.default_rng(8)
     profile = 0.008 * gaussian_filter(rng.normal(size=(160, 1)), (2.0, 0.0))
     profile *= 0.008 / profile.std()
-    fields = prepare_fields(
+    scans = prepare_scans(
         [
             replace(scan, height_um=(scan.height_um + profile).astype(np.float32))
             for scan in printed_scans(count=10, size_px=160, seed=3)
         ]
     )
-    predictions = [_truth(f) for f in fields]
-    tests = measurement_tests(fields, predictions, np.arange(10) % 5, floor_nm2=0, seed=0)
+    predictions = [_truth(f) for f in scans]
+    tests = measurement_tests(Study(scans, np.arange(10) % 5), predictions)
     lines = [t for t in tests if t.effect.name in ("scan-line-stripes", "line-roughness")]
     assert len(lines) == 2
     assert not any(t.confirmation.passed for t in lines)
@@ -162,10 +162,10 @@ def test_a_profile_that_all_scans_share_is_not_put_down_to_their_lines() -> None
 
 def test_line_offsets_are_told_from_columns() -> None:
     scans = printed_scans(count=10, size_px=160, stripes_um=0.006, seed=3)
-    fields = prepare_fields(scans)
-    predictions = [_truth(f) for f in fields]
+    scans = prepare_scans(scans)
+    predictions = [_truth(f) for f in scans]
     fold_of = np.arange(10) % 5
-    tests = {t.effect.name: t for t in measurement_tests(fields, predictions, fold_of, floor_nm2=0, seed=0)}
+    tests = {t.effect.name: t for t in measurement_tests(Study(scans, fold_of), predictions)}
     stripes = tests["scan-line-stripes"]
     assert stripes.confirmation.passed
     # No scan is turned: the lines could as well have been written so.
@@ -175,8 +175,8 @@ def test_line_offsets_are_told_from_columns() -> None:
     sd_um, (low, high), _ = stripes.spread["sd_um"]
     assert 0.004 < sd_um < 0.0065
     assert low <= sd_um <= high
-    plain = prepare_fields(printed_scans(count=10, size_px=160, seed=4))
-    without = measurement_tests(plain, [_truth(f) for f in plain], fold_of, floor_nm2=0, seed=0)
+    plain = prepare_scans(printed_scans(count=10, size_px=160, seed=4))
+    without = measurement_tests(Study(plain, fold_of), [_truth(f) for f in plain])
     assert not {t.effect.name: t for t in without}["scan-line-stripes"].confirmation.passed
 
 
@@ -184,16 +184,16 @@ def test_line_offsets_are_told_from_columns() -> None:
 def test_a_distortion_belongs_to_the_registration_where_it_differs_between_scans(shared: bool) -> None:
     effect, random = get_effect("registration-residual"), np.random.default_rng(2)
     bent = []
-    for field in prepare_fields(printed_scans(count=10, size_px=96, seed=6)):
+    for scan in prepare_scans(printed_scans(count=10, size_px=96, seed=6)):
         # 0.1 µm at the rim against the middle, freed of its mean; one sign for all, or one for each.
         size_um = 0.1 if shared else 0.1 * random.choice([-1, 1])
         values = {name: torch.zeros(()) for name in effect.parameters}
         values |= {"x_by_xx_um": torch.tensor(size_um), "shift_x_um": torch.tensor(-size_um / 3)}
-        height = torch.from_numpy(field.scan.height_um)[None, None]
-        moved = effect.apply(height, values, field.context)[0, 0].numpy()
-        bent.append(replace(field.scan, height_um=moved))
-    fields = prepare_fields(bent)
-    found = measurement_tests(fields, [_truth(f) for f in fields], np.arange(10) % 5, floor_nm2=0, seed=0)
+        height = torch.from_numpy(scan.stored.height_um)[None, None]
+        moved = effect.apply(height, values, scan.context)[0, 0].numpy()
+        bent.append(replace(scan.stored, height_um=moved))
+    scans = prepare_scans(bent)
+    found = measurement_tests(Study(scans, np.arange(10) % 5), [_truth(f) for f in scans])
     test = {t.effect.name: t for t in found}["registration-residual"]
     assert test.confirmation.passed is not shared
     # The random signs of ten scans have a standard deviation of about one.
@@ -210,12 +210,14 @@ def test_lines_of_the_print_are_told_from_lines_of_the_scan(written: bool) -> No
     scans = [replace(s, scan_to_layout=turned) for s in printed_scans(count=10, size_px=160, seed=3)]
     random = np.random.default_rng(5)
     striped = []
-    for field in prepare_fields(scans):
-        line = np.indices(field.scan.shape)[0] if written else field.line
+    for scan in prepare_scans(scans):
+        line = np.indices(scan.stored.shape)[0] if written else scan.line
         offsets = 0.006 * random.normal(size=int(line.max()) + 1)
-        striped.append(replace(field.scan, height_um=field.scan.height_um + offsets[line].astype(np.float32)))
-    fields = prepare_fields(striped)
-    found = measurement_tests(fields, [_truth(f) for f in fields], np.arange(10) % 5, floor_nm2=0, seed=0)
+        striped.append(
+            replace(scan.stored, height_um=scan.stored.height_um + offsets[line].astype(np.float32))
+        )
+    scans = prepare_scans(striped)
+    found = measurement_tests(Study(scans, np.arange(10) % 5), [_truth(f) for f in scans])
     tests = {t.effect.name: t for t in found}
     right, wrong = ("line-roughness", "scan-line-stripes")[:: 1 if written else -1]
     assert tests[right].confirmation.passed
@@ -278,14 +280,14 @@ def test_scans_of_different_sizes_are_taken_together() -> None:
 
 
 def test_fold_fits_do_not_depend_on_the_scans_they_hold_out() -> None:
-    fields = prepare_fields(printed_scans(count=4, seed=5))
-    spoiled = list(fields)
+    scans = prepare_scans(printed_scans(count=4, seed=5))
+    spoiled = list(scans)
     from dataclasses import replace
 
-    spoiled[0] = replace(fields[0], height=0.95 * fields[0].height + 0.01)
+    spoiled[0] = replace(scans[0], height=0.95 * scans[0].height + 0.01)
     chain, fold_of = true_model({}), np.arange(4) % 2
-    clean, changed = (fit_folds(chain, f, fold_of) for f in (fields, spoiled))
-    held_out = fields[0]
+    clean, changed = (fit_folds(chain, f, fold_of) for f in (scans, spoiled))
+    held_out = scans[0]
     a, b = (predict(c.chain, c.per_fold[0], held_out) for c in (clean, changed))
     moved = predict(changed.chain, changed.common, held_out) - predict(clean.chain, clean.common, held_out)
     # The common fit follows the spoiled scan; the fit without it may differ by how far its iteration
@@ -296,23 +298,23 @@ def test_fold_fits_do_not_depend_on_the_scans_they_hold_out() -> None:
 
 
 def test_a_covariate_that_the_model_lacks_is_seen_in_what_is_left() -> None:
-    fields = prepare_fields(printed_scans(count=10, seed=6))
-    predictions = [_truth(f) for f in fields]
-    assert not is_structured(covariate_tests(fields, predictions))
-    bent = [replace(f, height=f.height + 0.01 * (f.at_sample(f.scan.mask_level) == 6)) for f in fields]
+    scans = prepare_scans(printed_scans(count=10, seed=6))
+    predictions = [_truth(f) for f in scans]
+    assert not is_structured(covariate_tests(scans, predictions))
+    bent = [replace(f, height=f.height + 0.01 * (f.at_sample(f.stored.mask_level) == 6)) for f in scans]
     names = {t.name for t in is_structured(covariate_tests(bent, predictions))}
     assert "level" in names
 
 
 def test_large_scans_are_fitted_on_quadrants_in_turn() -> None:
     scans = printed_scans(count=4, size_px=LARGE_PX)
-    fields = prepare_fields(scans)
-    corners = {f.window.context.origin_px for f in fields}
+    scans = prepare_scans(scans)
+    corners = {f.window.context.origin_px for f in scans}
     assert len(corners) == 4
-    for field in fields:
-        y, x = (v.numpy() for v in field.window.context.centred_um())
-        row, column = field.window.context.origin_px
-        full_y, full_x = (v.numpy() for v in field.context.centred_um())
+    for scan in scans:
+        y, x = (v.numpy() for v in scan.window.context.centred_um())
+        row, column = scan.window.context.origin_px
+        full_y, full_x = (v.numpy() for v in scan.context.centred_um())
         # Centres are computed in float32 µm: 2e-6 relative.
         assert np.allclose(y[:, 0], full_y[row : row + len(y), 0], atol=1e-4)
         assert np.allclose(x[0], full_x[0, column : column + x.shape[1]], atol=1e-4)
@@ -328,8 +330,8 @@ def test_priors_and_injections_are_read_and_refused(tmp_path) -> None:
             parse_injection(text)
 
 
-def _truth(field) -> np.ndarray:
+def _truth(scan) -> np.ndarray:
     import torch
 
     with torch.no_grad():
-        return true_model({})(field.layout, field.context)[0, 0].numpy()
+        return true_model({})(scan.layout, scan.context)[0, 0].numpy()

@@ -11,19 +11,19 @@ from scipy.ndimage import gaussian_filter
 
 from litho_models.effects import FieldContext, get_effect
 from litho_models.loop import LoopConfig, close_loop
-from litho_models.loop.fitting import FoldFits
-from litho_models.loop.prepared import prepare_fields
+from litho_models.loop.fold_fits import FoldFits
+from litho_models.loop.prepared import prepare_scans
 from litho_models.loop.screening.directions import blocks_of
 from litho_models.loop.selection.rivals import generic_rival, remainder_of
-from litho_models.loop.state import State
+from litho_models.loop.study import State, Study
 from litho_models.models import build_model
 from tests.litho_models.loop_scans import printed_scans, true_model
 
 
 def added_to(scans) -> dict[str, list[str]]:
     start = build_model("physics", sigma_diffusion_init_um=0.4)
-    closed = close_loop(scans, start, LoopConfig())
-    return {entry.effect.name: entry.confusable_with for entry in closed.search.added}
+    findings = close_loop(scans, start, LoopConfig())
+    return {entry.effect.name: entry.confusable_with for entry in findings.search.added}
 
 
 def test_an_elliptical_spot_is_not_taken_for_diffusion() -> None:
@@ -54,44 +54,44 @@ def test_a_tilt_that_all_prints_share_is_found_though_every_scan_may_have_its_ow
 def test_a_tip_gives_way_to_a_table_over_the_slope_unless_it_is_the_cause(planted) -> None:
     """A bead grows with the slope, the lift of a blunt tip with its square: near each other, not equal."""
     tip, chain = get_effect("tip-dilation"), true_model({})
-    fields, before, after = prepare_fields(printed_scans(count=12, size_px=96, seed=6)), [], []
+    scans, before, after = prepare_scans(printed_scans(count=12, size_px=96, seed=6)), [], []
     changed = []
-    for field in fields:
+    for scan in scans:
         with torch.no_grad():
-            clean = chain(field.layout, field.context)
-            dilated = tip(clean, {"radius_um": 0.3}, field.context)
+            clean = chain(scan.layout, scan.context)
+            dilated = tip(clean, {"radius_um": 0.3}, scan.context)
         before.append(clean[0, 0].numpy())
         after.append(dilated[0, 0].numpy())
-        bead = 0.06 * np.hypot(*np.gradient(before[-1], field.scan.pitch_um))
+        bead = 0.06 * np.hypot(*np.gradient(before[-1], scan.stored.pitch_um))
         lift = after[-1] - before[-1] if planted == "tip-dilation" else bead
-        changed.append(replace(field.scan, height_um=(field.scan.height_um + lift).astype(np.float32)))
-    fields = prepare_fields(changed)
+        changed.append(replace(scan.stored, height_um=(scan.stored.height_um + lift).astype(np.float32)))
+    scans = prepare_scans(changed)
     nothing = np.empty(0)
     fits = FoldFits(chain, nothing, np.empty((4, 0)), np.zeros(4), np.empty((0, 0)), [])
-    rival = generic_rival(State(fits, before), State(fits, after), fields, np.arange(12) % 4)
+    rival = generic_rival(State(fits, before), State(fits, after), Study(scans, np.arange(12) % 4))
     assert rival == (None if planted == "tip-dilation" else "slope-table")
 
 
 @pytest.mark.parametrize("left_over", [True, False])
 def test_what_the_form_of_a_named_effect_leaves_over_is_no_further_effect(left_over: bool) -> None:
-    fields = prepare_fields(printed_scans(count=8))
+    scans = prepare_scans(printed_scans(count=8))
     fits = FoldFits(true_model({}), np.empty(0), np.empty((4, 0)), np.zeros(4), np.empty((0, 0)), [])
     random = np.random.default_rng(5)
     plain, named, further = [], [], []
-    for field in fields:
-        base = gaussian_filter(field.scan.layout_um, 3.0)
+    for scan in scans:
+        base = gaussian_filter(scan.stored.layout_um, 3.0)
         slope_y, slope_x = np.gradient(base)
         change = -8 * slope_x**2
         plain.append(base)
         named.append(base + change)
         # The machine blurs what the catalogue does not, or heights are lost along the other axis too.
         missing = gaussian_filter(change, 3.0) - change if left_over else -2 * slope_y**2
-        field.scan.height_um[:] = base + change + missing + random.normal(0, 1e-4, size=base.shape)
+        scan.stored.height_um[:] = base + change + missing + random.normal(0, 1e-4, size=base.shape)
         # A candidate that is near what is missing, and not quite the same.
         further.append(base + change + 0.8 * gaussian_filter(missing, 1.0))
-    fields = prepare_fields([f.scan for f in fields])
+    scans = prepare_scans([f.stored for f in scans])
     states = [State(fits, p) for p in (plain, named, further)]
-    reason = remainder_of((states[0], states[1]), states[1], states[2], fields)
+    reason = remainder_of((states[0], states[1]), states[1], states[2], Study(scans, np.arange(8) % 4))
     assert ("another shape" in reason) == left_over
     assert bool(reason) == left_over
 

@@ -17,14 +17,13 @@ EFFECT = {"vignetting": {"strength": 0.2}}
 def test_an_effect_is_added_to_or_absorbed_by_a_trained_model(carries_it: bool) -> None:
     scans = printed_scans(EFFECT, seed=1)
     trained = true_model(EFFECT if carries_it else {}).requires_grad_(False)
-    closed = close_loop(scans, trained, LoopConfig(), trainer=lambda training: trained)
-    result = summarise(
-        closed, dataset=DatasetId(name="made here", sha256=""), base_name="trained", dropped=[]
-    )
+    findings = close_loop(scans, trained, LoopConfig(), trainer=lambda training: trained)
+    dataset = DatasetId(name="made here", sha256="")
+    result = summarise(findings, dataset=dataset, base_name="trained", dropped=[])
     verdict = {c.name: c.verdict for c in result.candidates}["vignetting"]
     if carries_it:
         assert verdict == "absorbed"
         assert result.verdict == "nothing-missing"
     else:
         assert verdict == "explained"
-        assert corrected_chain(closed).values()["vignetting"]["strength"] == pytest.approx(0.2, abs=0.02)
+        assert corrected_chain(findings).values()["vignetting"]["strength"] == pytest.approx(0.2, abs=0.02)

@@ -6,27 +6,29 @@ import numpy as np
 import pytest
 
 from litho_models.effects import get_effect
+from litho_models.fitting.least_squares import eliminated
+from litho_models.loop.fold_fits import TERM_WEIGHT
 from litho_models.loop.identifiability import PROFILE_POINTS, identifiability, profiles
 from litho_models.loop.parameters import effect_slots, get_vector
-from litho_models.loop.prepared import prepare_fields
-from litho_models.loop.state import fit_state
+from litho_models.loop.prepared import prepare_scans
+from litho_models.loop.study import Study, fit_state
 from tests.litho_models.loop_scans import printed_scans, true_model
 
 FOLDS = np.arange(8) % 4
 
 
 def fitted(planted: dict, effects: dict):
-    fields = prepare_fields(printed_scans(planted, count=8, size_px=64, seed=4))
-    return fit_state(true_model(effects), fields, FOLDS).fits, fields
+    scans = prepare_scans(printed_scans(planted, count=8, size_px=64, seed=4))
+    return fit_state(true_model(effects), Study(scans, FOLDS)).fits, scans
 
 
 def test_the_profile_of_a_linear_amplitude_is_the_parabola_of_its_information() -> None:
     planted = {"slope-thinning": {"along_x_um": 0.3, "along_y_um": 0.1}}
-    fits, fields = fitted(planted, planted)
-    found = {one.parameter: one for one in profiles(fits, fields)}
-    normal = np.sum([part.normal()[0] for part in fits.linear], axis=0)
+    fits, scans = fitted(planted, planted)
+    found = {one.parameter: one for one in profiles(fits, scans)}
+    normal = np.sum([eliminated(part, TERM_WEIGHT)[0] for part in fits.linear], axis=0)
     inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
-    count = sum(len(field.sample) for field in fields)
+    count = sum(len(scan.sample) for scan in scans)
     slot = effect_slots(fits.chain)["slope-thinning", "along_x_um"]
     one = found["along_x_um"]
     squares = count * (one.rmse_nm / 1e3) ** 2
@@ -54,19 +56,19 @@ def test_two_blurs_are_known_together_only() -> None:
 
 
 def test_without_fitted_numbers_there_is_nothing_to_tell() -> None:
-    fits, fields = fitted({}, {})
+    fits, scans = fitted({}, {})
     for parameter in fits.chain.base.parameters():
         parameter.requires_grad = False
-    frozen = fit_state(fits.chain, fields, FOLDS).fits
+    frozen = fit_state(fits.chain, Study(scans, FOLDS)).fits
     assert identifiability(frozen) is None
-    assert profiles(frozen, fields) == []
+    assert profiles(frozen, scans) == []
 
 
 def test_a_single_number_has_a_profile_though_nothing_else_is_fitted() -> None:
     planted = {"vertical-shrinkage": {"fraction": 0.1}}
-    fields = prepare_fields(printed_scans(planted, count=8, size_px=64, seed=4))
+    scans = prepare_scans(printed_scans(planted, count=8, size_px=64, seed=4))
     chain = true_model(planted)
     for parameter in chain.base.parameters():
         parameter.requires_grad = False
-    (one,) = profiles(fit_state(chain, fields, FOLDS).fits, fields)
+    (one,) = profiles(fit_state(chain, Study(scans, FOLDS)).fits, scans)
     assert one.rmse_nm.argmin() == PROFILE_POINTS // 2

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from litho_models.effects import get_effect
-from litho_models.loop.prepared import prepare_fields
+from litho_models.loop.prepared import prepare_scans
 from litho_models.loop.result.added_effects import doubtful_effects
-from litho_models.loop.scoring import Score
 from litho_models.loop.selection.confirming import confirm
 from litho_models.loop.selection.contest import Added
-from litho_models.loop.selection.search import FORM_ERROR, Search, why_nameless
-from litho_models.loop.state import State, fit_state
+from litho_models.loop.selection.search import FORM_ERROR, Search, rejection_reason
+from litho_models.loop.study import Score, State, Study, fit_state
 from tests.litho_models.loop_scans import printed_scans, true_model
 
 FOLDS = np.arange(8) % 4
@@ -28,33 +27,33 @@ def added(name: str, before_nm2: float, after_nm2: float) -> Added:
 
 @pytest.fixture(scope="module")
 def chosen() -> tuple[Search, State, list]:
-    """A search that has named a loss of height on slopes, and a further state that adds a field tilt."""
+    """A search that has named a loss of height on slopes, and a further state that tilts the field."""
     planted = {"slope-thinning": {"along_x_um": 0.3, "along_y_um": 0.1}}
     tilt = {"field-curvature": get_effect("field-curvature").off_values() | {"tilt_x_um": 0.05}}
-    fields = prepare_fields(printed_scans(planted | tilt, count=8, size_px=64, seed=4))
+    scans = prepare_scans(printed_scans(planted | tilt, count=8, size_px=64, seed=4))
     base, first, second = (
-        fit_state(true_model(effects), fields, FOLDS) for effects in ({}, planted, planted | tilt)
+        fit_state(true_model(effects), Study(scans, FOLDS)) for effects in ({}, planted, planted | tilt)
     )
     search = Search(base)
     search.add(added("slope-thinning", 2000.0, 1000.0), first, before=base)
-    return search, second, fields
+    return search, second, scans
 
 
 @pytest.mark.parametrize(("share", "refused"), [(0.5, True), (2.0, False)])
 def test_an_effect_far_smaller_than_one_named_before_gets_no_name(chosen, share, refused) -> None:
-    search, state, fields = chosen
+    search, state, scans = chosen
     gain = share * FORM_ERROR**2 * 1000.0
     winner = added("field-curvature", 1000.0, 1000.0 - gain)
-    reason = why_nameless((winner, state), search.state, search, fields, FOLDS)
+    reason = rejection_reason((winner, state), search.state, search, Study(scans, FOLDS))
     assert ("small beside slope-thinning" in reason) == refused
     assert bool(reason) == refused
 
 
 def test_an_effect_that_was_dropped_stands_in_nobodys_way(chosen) -> None:
-    search, state, fields = chosen
+    search, state, scans = chosen
     winner = added("field-curvature", 1000.0, 999.0)
     without = search.steps["slope-thinning"][0]
-    assert "small beside" not in why_nameless((winner, state), without, search, fields, FOLDS)
+    assert "small beside" not in rejection_reason((winner, state), without, search, Study(scans, FOLDS))
 
 
 def test_what_a_doubtful_filter_took_up_was_left_by_the_filters_before_it() -> None:

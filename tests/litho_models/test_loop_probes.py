@@ -12,8 +12,8 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
-from litho_models.loop.fitting import FoldFits
-from litho_models.loop.prepared import Field, prepare_fields
+from litho_models.loop.fold_fits import FoldFits
+from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.loop.probes import Probed, figures, probe_residual
 from litho_models.loop.probes.defects import find_defects
 from litho_models.loop.probes.kernel import off_centre_peak, resampled
@@ -21,7 +21,7 @@ from litho_models.loop.probes.places import drawn, drawn_profile
 from litho_models.loop.probes.selection import _anchor, _corrected
 from litho_models.loop.probes.tables import SPOT_UM
 from litho_models.loop.probes.trend import order_trends
-from litho_models.loop.state import State
+from litho_models.loop.study import State, Study
 from tests.litho_models.loop_scans import printed_scans, true_model
 
 COUNT, SIZE_PX, NOISE_UM = 10, 128, 0.006
@@ -29,56 +29,56 @@ FOLD_OF = np.arange(COUNT) % 5
 
 
 def scene(
-    change: Callable[[Field], np.ndarray] | None = None, seed: int = 3
-) -> tuple[list[Field], list[np.ndarray]]:
+    change: Callable[[PreparedScan], np.ndarray] | None = None, seed: int = 3
+) -> tuple[list[PreparedScan], list[np.ndarray]]:
     """Scans of a known model with a change added to their height, and the known model's predictions."""
     scans = printed_scans(count=COUNT, size_px=SIZE_PX, noise_um=NOISE_UM, seed=seed)
     chain = true_model({})
     predictions = []
-    for field in prepare_fields(scans):
+    for scan in prepare_scans(scans):
         with torch.no_grad():
-            predictions.append(chain(field.layout, field.context)[0, 0].numpy())
+            predictions.append(chain(scan.layout, scan.context)[0, 0].numpy())
     if change is not None:
         scans = [
-            replace(f.scan, height_um=(f.scan.height_um + change(f)).astype(np.float32))
-            for f in prepare_fields(scans)
+            replace(f.stored, height_um=(f.stored.height_um + change(f)).astype(np.float32))
+            for f in prepare_scans(scans)
         ]
-    return prepare_fields(scans), predictions
+    return prepare_scans(scans), predictions
 
 
-def probed(fields: list[Field], predictions: list[np.ndarray]) -> Probed:
+def probed(scans: list[PreparedScan], predictions: list[np.ndarray]) -> Probed:
     nothing = np.empty(0)
     fits = FoldFits(true_model({}), nothing, np.empty((5, 0)), np.zeros(5), np.empty((0, 0)), [])
     return probe_residual(
-        State(fits, predictions), fields, FOLD_OF, frozenset({"offset", "bow"}),
-        floor_nm2=(1e3 * NOISE_UM) ** 2, seed=0, search=True,
+        State(fits, predictions), Study(scans, FOLD_OF, floor_nm2=(1e3 * NOISE_UM) ** 2),
+        frozenset({"offset", "bow"}), search=True,
     )  # fmt: skip
 
 
 def test_a_correction_moves_no_offset_gain_tilt_or_bow_that_all_scans_share() -> None:
-    fields = prepare_fields(printed_scans(count=3, size_px=64, seed=3))
+    scans = prepare_scans(printed_scans(count=3, size_px=64, seed=3))
     random = np.random.default_rng(0)
     y, x = np.meshgrid(*2 * [np.linspace(-1, 1, 64)], indexing="ij")
-    predictions = [gaussian_filter(random.random((64, 64)), 3).astype(np.float32) for _ in fields]
+    predictions = [gaussian_filter(random.random((64, 64)), 3).astype(np.float32) for _ in scans]
     shared = [np.stack([np.ones_like(p), p, x, y, x * x, x * y, y * y]).reshape(7, -1) for p in predictions]
     amounts = np.array([0.3, -0.2, 0.1, 0.4, -0.3, 0.2, 0.1])
-    own = {f.id: random.normal(size=(64, 64)) for f in fields}
-    of = {f.id: (amounts @ s).reshape(64, 64) for f, s in zip(fields, shared, strict=True)}
+    own = {f.id: random.normal(size=(64, 64)) for f in scans}
+    of = {f.id: (amounts @ s).reshape(64, 64) for f, s in zip(scans, shared, strict=True)}
     changes: list[list[np.ndarray]] = []
     for scale in (0.0, 1.0):
         probe: Any = SimpleNamespace(
-            correction=lambda parameters, field, prediction: parameters * own[field.id] + of[field.id]
+            correction=lambda parameters, scan, prediction: parameters * own[scan.id] + of[scan.id]
         )
         parameters = np.array(scale)
-        anchor = _anchor(probe, parameters, fields, predictions)
-        both = zip(fields, predictions, strict=True)
+        anchor = _anchor(probe, parameters, scans, predictions)
+        both = zip(scans, predictions, strict=True)
         changes.append([_corrected(probe, parameters, anchor, f, p) - p for f, p in both])
     # What is shared alone vanishes, to the float32 of a prediction.
     assert max(np.abs(change).max() for change in changes[0]) < 1e-5
     # Of anything else nothing shared is left where the probe is estimated.
     left = sum(
         np.stack([f.at_sample(row.reshape(64, 64)) for row in s]) @ f.at_sample(change) / len(f.sample)
-        for f, s, change in zip(fields, shared, changes[1], strict=True)
+        for f, s, change in zip(scans, shared, changes[1], strict=True)
     )
     assert np.abs(left).max() < 1e-5
     assert all(change.std() > 0.5 for change in changes[1])
@@ -94,7 +94,7 @@ def test_nothing_is_taken_where_nothing_is_missing() -> None:
 @pytest.mark.slow
 def test_a_response_displaced_from_the_layout_comes_back_in_place_and_size() -> None:
     """A ghost of 3 % of the layout, 0.8 µm down and 0.6 µm to the left."""
-    found = probed(*scene(lambda f: 0.03 * np.roll(f.scan.layout_um, (8, -6), (0, 1))))
+    found = probed(*scene(lambda f: 0.03 * np.roll(f.stored.layout_um, (8, -6), (0, 1))))
     assert found.added[0].probe.name == "missing-kernel"
     entry = found.added[0]
     values = {name: value for name, (value, _, _) in figures(entry.probe, entry.estimate).items()}
@@ -109,12 +109,12 @@ def test_a_response_displaced_from_the_layout_comes_back_in_place_and_size() -> 
 def test_a_wrong_level_comes_back_at_its_level() -> None:
     """Level 6 printed 50 nm too high, spread by the spot like everything printed."""
 
-    def one_level(field: Field) -> np.ndarray:
-        sigma_px = SPOT_UM / field.scan.pitch_um
-        return 0.05 * gaussian_filter((field.scan.mask_level == 6).astype(float), sigma_px, mode="nearest")
+    def one_level(scan: PreparedScan) -> np.ndarray:
+        sigma_px = SPOT_UM / scan.stored.pitch_um
+        return 0.05 * gaussian_filter((scan.stored.mask_level == 6).astype(float), sigma_px, mode="nearest")
 
-    fields, predictions = scene(one_level)
-    found = probed(fields, predictions)
+    scans, predictions = scene(one_level)
+    found = probed(scans, predictions)
     entry = next(e for e in found.added if e.probe.name == "level-table")
     values = figures(entry.probe, entry.estimate)
     heights = np.array([value for value, _, _ in values.values()])
@@ -123,7 +123,7 @@ def test_a_wrong_level_comes_back_at_its_level() -> None:
     assert levels[int(np.argmax(heights))] == 6
     # What all scans share stays where it was: a datum that a probe cannot know is not made up.
     before, after = (
-        np.mean([np.mean(f.scan.height_um - p) for f, p in zip(fields, one, strict=True)])
+        np.mean([np.mean(f.stored.height_um - p) for f, p in zip(scans, one, strict=True)])
         for one in (predictions, found.state.predictions)
     )
     assert abs(after) <= abs(before) + 1e-3
@@ -134,10 +134,10 @@ def test_a_wrong_level_comes_back_at_its_level() -> None:
 @pytest.mark.slow
 def test_what_grows_with_the_slope_along_one_axis_comes_back_as_a_table_of_that_axis() -> None:
     """Lost heights of 40 nm per unit slope along x, none along y."""
-    fields, predictions = scene()
+    scans, predictions = scene()
     along_x = {
-        f.id: np.abs(np.gradient(p.astype(float), f.scan.pitch_um, axis=1))
-        for f, p in zip(fields, predictions, strict=True)
+        f.id: np.abs(np.gradient(p.astype(float), f.stored.pitch_um, axis=1))
+        for f, p in zip(scans, predictions, strict=True)
     }
     found = probed(*scene(lambda f: -0.04 * along_x[f.id]))
     entry = found.added[0]
@@ -156,10 +156,10 @@ def test_what_grows_with_the_slope_along_one_axis_comes_back_as_a_table_of_that_
 @pytest.mark.slow
 def test_what_grows_with_the_slope_comes_back_as_a_table_over_the_slope() -> None:
     """A bead of 20 nm per unit slope, on edges of any direction: no effect of the catalogue."""
-    fields, predictions = scene()
+    scans, predictions = scene()
     steepness = {
-        f.id: np.hypot(*np.gradient(p.astype(float), f.scan.pitch_um))
-        for f, p in zip(fields, predictions, strict=True)
+        f.id: np.hypot(*np.gradient(p.astype(float), f.stored.pitch_um))
+        for f, p in zip(scans, predictions, strict=True)
     }
     found = probed(*scene(lambda f: 0.02 * steepness[f.id]))
     entry = found.added[0]
@@ -173,8 +173,8 @@ def test_what_grows_with_the_slope_comes_back_as_a_table_over_the_slope() -> Non
 
 @pytest.mark.slow
 def test_a_map_that_all_scans_share_is_found_and_drawn() -> None:
-    def ripple(field: Field) -> np.ndarray:
-        y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in field.scan.shape), indexing="ij")
+    def ripple(scan: PreparedScan) -> np.ndarray:
+        y, x = np.meshgrid(*(np.linspace(-1, 1, n) for n in scan.stored.shape), indexing="ij")
         return 0.012 * np.sin(3 * x + 1) * np.cos(3.5 * y)
 
     found = probed(*scene(ripple))
@@ -203,10 +203,10 @@ def test_a_profile_of_the_dose_over_one_axis_is_found_and_drawn(along: str) -> N
     _, predictions = scene()
     by_scan = {f.id: p for f, p in zip(scene()[0], predictions, strict=True)}
 
-    def uneven(field: Field) -> np.ndarray:
-        ny, nx = field.scan.shape
+    def uneven(scan: PreparedScan) -> np.ndarray:
+        ny, nx = scan.stored.shape
         profile = wave(ny)[:, None] if along == "row" else wave(nx)[None, :]
-        return profile * by_scan[field.id]
+        return profile * by_scan[scan.id]
 
     found = probed(*scene(uneven))
     entry = found.added[0]
@@ -221,15 +221,15 @@ def test_blobs_are_found_and_their_place_is_told() -> None:
     """Blobs of 8 robust standard deviations: EFFECTS asks for a recall of 0.9."""
     spots = [(20, 30), (60, 90), (100, 40)]
 
-    def blobs(field: Field) -> np.ndarray:
-        change = np.zeros(field.scan.shape)
+    def blobs(scan: PreparedScan) -> np.ndarray:
+        change = np.zeros(scan.stored.shape)
         for y, x in spots:
             change[y - 2 : y + 3, x - 2 : x + 3] = 8 * NOISE_UM * (1 if y != 60 else -1)
         return change
 
-    fields, predictions = scene(blobs)
-    found = find_defects(fields, predictions)
-    first = [b for b in found.blobs if b.scan == fields[0].id]
+    scans, predictions = scene(blobs)
+    found = find_defects(scans, predictions)
+    first = [b for b in found.blobs if b.scan == scans[0].id]
     near = [
         min((abs(b.y_um - y / 10) + abs(b.x_um - x / 10) for b in first), default=9.0) < 0.2 for y, x in spots
     ]
@@ -243,10 +243,10 @@ def test_blobs_are_found_and_their_place_is_told() -> None:
 
 def test_a_step_in_the_order_of_printing_is_told_from_none() -> None:
     later = {f.id for f in scene()[0][6:]}
-    fields, predictions = scene(lambda f: np.full(f.scan.shape, 0.06 * (f.id in later)))
-    offset, gain = order_trends(fields, predictions)
+    scans, predictions = scene(lambda f: np.full(f.stored.shape, 0.06 * (f.id in later)))
+    offset, gain = order_trends(scans, predictions)
     assert offset.step_p < 0.05
-    assert offset.step_after == fields[5].id
+    assert offset.step_after == scans[5].id
     # Ten datums of 20 nm: the two means differ by 20 sqrt(1/6 + 1/4) = 13 nm, three of which are allowed.
     assert offset.step == pytest.approx(60, abs=39)
     assert gain.step_p > 0.05

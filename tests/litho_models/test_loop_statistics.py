@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from litho_models.loop.linear import gram, orthonormal, solve_damped
+from litho_models.fitting.least_squares import gram, orthonormal, solve_damped
 from litho_models.loop.selection.confirming import binomial_p, confirm, confirm_variance
 from litho_models.scoring.statistics import (
     family_wise_p,

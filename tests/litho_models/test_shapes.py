@@ -13,11 +13,12 @@ from litho_models.evaluation.tables import metric_table, metric_text, scan_table
 from litho_models.models import build_model
 from litho_models.prediction.cost import measured_predictions
 from litho_models.prediction.tiles import predict_scan
+from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring import metric_registry
 from litho_models.scoring.metric_registry import register_metric
 from litho_models.scoring.metrics import phase_waves
 from litho_models.scoring.records import ModelScores, Prediction
-from litho_models.scoring.scores import protocol_for, score_model
+from litho_models.scoring.scores import score_model
 from litho_models.scoring.shapes import (
     SSIM_WINDOW_PX,
     edge_placement,
@@ -119,10 +120,10 @@ def test_the_paper_s_error_in_waves():
 def test_the_scores_of_the_truth_with_a_constant_error():
     scan = make_scan(0, 128, noise_um=0.0, datum_um=0.0)
     constant = Prediction(scan.height_um - np.float32(0.05))
-    scores = score_model("truth", [scan], [constant], protocol_for("none"))
+    scores = score_model("truth", [scan], [constant], NuisanceProtocol.of_policy("none"))
     # Waves are those of 50 nm; float32 heights of 1 µm are good to 1e-4 nm.
     assert scores.phase_rms_waves == pytest.approx(0.05 * 0.548 / 0.6328, rel=1e-5)
-    free = score_model("truth", [scan], [constant], protocol_for("offset"))
+    free = score_model("truth", [scan], [constant], NuisanceProtocol.of_policy("offset"))
     assert free.phase_rms_waves == pytest.approx(0, abs=1e-6)
     assert free.ssim == pytest.approx(1, abs=1e-6)
     assert free.edge_mean_nm == pytest.approx(0, abs=0.1)
@@ -143,7 +144,9 @@ def test_a_metric_of_one_s_own_is_in_results_tables_and_text(own_metrics):
     register_metric("high", "1", lambda scan, z, r: (z > 0.5).sum(), "high counts.", over_scans="sum")
     register_metric("never", "um", lambda scan, z, r: float("nan"), "never is not known.")
     scans = make_scans(3, size_px=64)
-    scores = score_model("flat", scans, [Prediction(scan.layout_um) for scan in scans], protocol_for("none"))
+    scores = score_model(
+        "flat", scans, [Prediction(scan.layout_um) for scan in scans], NuisanceProtocol.of_policy("none")
+    )
     rows = [row.metrics for row in scores.scans]
     for scan, row in zip(scans, rows, strict=True):
         error = np.abs(scan.height_um - scan.layout_um)[scan.valid]
@@ -174,7 +177,7 @@ def test_a_metric_has_to_be_a_number(own_metrics):
     register_metric("map", "nm", lambda scan, z, r: r, "a map.")
     scan = make_scan(0, 64)
     with pytest.raises(InputError, match="metric map, got a ndarray"):
-        score_model("flat", [scan], [Prediction(scan.layout_um)], protocol_for("none"))
+        score_model("flat", [scan], [Prediction(scan.layout_um)], NuisanceProtocol.of_policy("none"))
 
 
 @pytest.mark.parametrize("name", ["identity", "affine"])

@@ -19,12 +19,12 @@ from litho_models.fitting import stochastic as network
 from litho_models.fitting.checkpoint import CheckpointFolder
 from litho_models.fitting.config import FAST_STEPS, PAPER_LEARNING_RATE
 from litho_models.fitting.crops import Window, cut, plan_batch
-from litho_models.fitting.gauss_newton import fit_gauss_newton
+from litho_models.fitting.small_models import fit_small_model
 from litho_models.fitting.stochastic import learning_rate
 from litho_models.models import build_model
 from litho_models.models.pbl import Pbl
 from litho_models.prediction.tiles import predict_scan
-from litho_models.scan_terms.training import estimate_nuisances
+from litho_models.scan_terms.training import estimate_scan_terms, training_terms
 
 QUICK = {"steps": 12, "rounds": 3, "batch": 2, "crop_px": 32, "precision": "32-true"}
 SMALL_NETS = {"pointwise_channels": (8, 4), "areawise_channels": (8, 4), "sigma_diffusion_init_um": 0.3}
@@ -39,7 +39,7 @@ def test_gauss_newton_recovers_an_affine_printer_exactly():
     scans = make_scans(4, noise_um=0.0, datum_um=0.0)
     exact = [replace(scan, height_um=(0.8 * scan.layout_um - 0.05).astype(np.float32)) for scan in scans]
     model = build_model("affine")
-    fit_gauss_newton(model, exact, "none")
+    fit_small_model(model, exact, "none")
     # float32 heights carry 6e-8 µm.
     assert float(model.gain.detach()) == pytest.approx(0.8, abs=1e-5)
     assert float(model.offset_um.detach()) == pytest.approx(-0.05, abs=1e-5)
@@ -95,7 +95,7 @@ def test_physics_recovers_a_printer_of_its_own_kind():
 def test_training_nuisances_are_pinned_to_the_process():
     scans = make_scans(4, noise_um=0.0, datum_um=0.03, bow_um=0.02)
     predictions = [printed_height_um(scan.layout_um) for scan in scans]
-    maps = estimate_nuisances(scans, predictions, "full")
+    maps = estimate_scan_terms(scans, predictions, training_terms("full"))
     assert abs(np.mean([m.mean() for m in maps])) < 1e-6
     for scan, prediction, nuisance in zip(scans, predictions, maps, strict=True):
         rest = scan.height_um - prediction - nuisance

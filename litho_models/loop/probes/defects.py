@@ -9,9 +9,8 @@ import numpy as np
 from scipy.ndimage import find_objects, label
 
 from litho_data.foundation.units import NM_PER_UM
-from litho_models.loop.prepared import Field
-from litho_models.loop.scoring import term_maps
-from litho_models.scan_terms.nuisance import least_squares
+from litho_models.loop.prepared import PreparedScan
+from litho_models.scan_terms import POLICIES, fitted_terms
 
 FAR_SD = 5.0
 FEWEST_PX = 9
@@ -48,51 +47,47 @@ class Defects:
         return [i for i, share in enumerate(self.share_of_pixels) if share > SUSPICIOUS_SHARE]
 
 
-def find_defects(fields: Sequence[Field], predictions: Sequence[np.ndarray]) -> Defects:
+def find_defects(scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray]) -> Defects:
     """Connected pixels farther than 5 robust standard deviations from a scan's own background.
 
     Args:
-        fields, predictions: scans and their held-out predictions (y, x) µm.
+        scans, predictions: scans and their held-out predictions (y, x) µm.
     """
     blobs, masks, shares = [], [], []
     inside = total = 0.0
-    for field, prediction in zip(fields, predictions, strict=True):
-        residual = _freed(field, prediction)
-        seen = residual[field.usable]
+    for scan, prediction in zip(scans, predictions, strict=True):
+        residual = _freed(scan, prediction)
+        seen = residual[scan.usable]
         spread = 1.4826 * float(np.median(np.abs(seen - np.median(seen))))
-        numbered, count = label(field.usable & (np.abs(residual) > FAR_SD * spread))
+        numbered, count = label(scan.usable & (np.abs(residual) > FAR_SD * spread))
         sizes = np.bincount(numbered.ravel(), minlength=count + 1)
         large = np.flatnonzero(sizes >= FEWEST_PX)
         large = large[large > 0]
         mask = np.isin(numbered, large)
         boxes = find_objects(numbered)
-        blobs += [_describe(field, residual, numbered == n, boxes[n - 1]) for n in large]
+        blobs += [_describe(scan, residual, numbered == n, boxes[n - 1]) for n in large]
         masks.append(mask)
-        shares.append(float(mask.sum() / max(field.usable.sum(), 1)))
+        shares.append(float(mask.sum() / max(scan.usable.sum(), 1)))
         inside += float((residual[mask] ** 2).sum())
         total += float((seen**2).sum())
     return Defects(blobs, masks, shares, inside / max(total, np.finfo(float).tiny))
 
 
-def _freed(field: Field, prediction: np.ndarray) -> np.ndarray:
-    difference = np.where(field.usable, field.scan.height_um - prediction, 0.0).astype(np.float64)
-    basis = term_maps(prediction, frozenset({"offset", "gain", "bow"}))
-    use = field.usable
-    return np.where(
-        use, difference - np.tensordot(least_squares(basis[:, use], difference[use]), basis, axes=1), 0.0
-    )
+def _freed(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
+    _, own = fitted_terms(scan.stored.height_um, prediction, scan.usable, POLICIES["full"])
+    return np.where(scan.usable, scan.stored.height_um - prediction - own, 0.0)
 
 
 def _describe(
-    field: Field, residual: np.ndarray, blob: np.ndarray, box: tuple[slice, slice] | None
+    scan: PreparedScan, residual: np.ndarray, blob: np.ndarray, box: tuple[slice, slice] | None
 ) -> Defect:
     assert box is not None
     y, x = np.nonzero(blob)
     values = residual[blob]
-    pitch = field.scan.pitch_um
+    pitch = scan.stored.pitch_um
     height, width = (part.stop - part.start for part in box)
     return Defect(
-        scan=field.id,
+        scan=scan.id,
         y_um=float(y.mean() * pitch),
         x_um=float(x.mean() * pitch),
         area_um2=float(blob.sum() * pitch**2),

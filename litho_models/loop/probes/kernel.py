@@ -15,10 +15,9 @@ from scipy.ndimage import label
 from scipy.signal import fftconvolve
 
 from litho_data.foundation.units import NM_PER_UM
-from litho_models.loop.prepared import Field
+from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.probes.probe import Estimate
-from litho_models.loop.scoring import term_maps
-from litho_models.scan_terms.nuisance import least_squares
+from litho_models.scan_terms import POLICIES, TermPixels, least_squares, term_maps
 
 SUPPORT_UM = 5.0
 # The regularisation, relative to the median power of the layouts.
@@ -37,9 +36,9 @@ class MissingKernel:
     """Residual = k * layout with one kernel for all scans.
 
     Attributes:
-        layouts, residuals: spectra (scans, fy, fx) of the tapered fields, µm, in the band.
-        size: (y, x) of the fields in pixels of ``pitch_um``, the pitch of the band.
-        pixels: squared taper summed over a field, in pixels of the band.
+        layouts, residuals: spectra (scans, fy, fx) of the tapered scans, µm, in the band.
+        size: (y, x) of the scans in pixels of ``pitch_um``, the pitch of the band.
+        pixels: squared taper summed over a scan, in pixels of the band.
         pitch_um: sampling that the band needs.
     """
 
@@ -89,11 +88,11 @@ class MissingKernel:
         sizes = np.sqrt((weight * np.abs(first) ** 2).sum() * (weight * np.abs(second) ** 2).sum())
         return float((weight * first * np.conj(second)).real.sum() / max(sizes, np.finfo(float).tiny))
 
-    def correction(self, parameters: np.ndarray, field: Field, prediction: np.ndarray) -> np.ndarray:
+    def correction(self, parameters: np.ndarray, scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
         """The layout filtered by the kernel, its mean left to the datum, (y, x) µm."""
-        kernel = resampled(parameters.reshape(self.size), self.pitch_um, field.scan.pitch_um)
+        kernel = resampled(parameters.reshape(self.size), self.pitch_um, scan.stored.pitch_um)
         radius = kernel.shape[0] // 2
-        layout = field.scan.layout_um.astype(np.float64)
+        layout = scan.stored.layout_um.astype(np.float64)
         padded = np.pad(layout - layout.mean(), radius, mode="edge")
         return fftconvolve(padded, kernel, mode="valid").astype(np.float32)
 
@@ -146,24 +145,24 @@ class MissingKernel:
 
 
 def missing_kernel(
-    fields: Sequence[Field], predictions: Sequence[np.ndarray], defects: Sequence[np.ndarray]
+    scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray], defects: Sequence[np.ndarray]
 ) -> MissingKernel:
     """Measure the spectra of layouts and residuals, both freed of what a scan may add by itself.
 
     Args:
-        fields, predictions: scans and their held-out predictions (y, x) µm.
+        scans, predictions: scans and their held-out predictions (y, x) µm.
         defects: bool (y, x) per scan, left out.
     """
-    size = tuple(min(field.scan.shape[axis] for field in fields) for axis in (0, 1))
-    pitch_um = fields[0].scan.pitch_um
+    size = tuple(min(scan.stored.shape[axis] for scan in scans) for axis in (0, 1))
+    pitch_um = scans[0].stored.pitch_um
     taper = np.outer(np.hanning(size[0]), np.hanning(size[1]))
     band = tuple(_band_size(n, pitch_um) for n in size)
     layouts: list[np.ndarray] = []
     residuals: list[np.ndarray] = []
-    for field, prediction, defect in zip(fields, predictions, defects, strict=True):
-        usable = field.usable & ~defect
-        layout = field.scan.layout_um.astype(np.float64)
-        residual = np.where(usable, field.scan.height_um - prediction, 0.0).astype(np.float64)
+    for scan, prediction, defect in zip(scans, predictions, defects, strict=True):
+        usable = scan.usable & ~defect
+        layout = scan.stored.layout_um.astype(np.float64)
+        residual = np.where(usable, scan.stored.height_um - prediction, 0.0).astype(np.float64)
         # The gain is taken from the residual alone: a layout without its low frequencies, which the
         # prediction holds, could not say how much of them the kernel needs.
         for target, freed in (
@@ -225,12 +224,12 @@ def off_centre_peak(kernel: np.ndarray, pitch_um: float) -> tuple[float, float, 
 
 def _freed(values: np.ndarray, prediction: np.ndarray | None, usable: np.ndarray) -> np.ndarray:
     """Values minus their fit by plane, bow and (if given) prediction; zero where nothing was measured."""
-    terms = frozenset({"offset", "bow"}) if prediction is None else frozenset({"offset", "bow", "gain"})
-    basis = term_maps(values if prediction is None else prediction, terms)
+    terms = POLICIES["full"] - (frozenset() if prediction is not None else {"gain"})
+    basis = term_maps(TermPixels(values if prediction is None else prediction), terms)
     inside = np.flatnonzero(usable)
     thinned = inside[:: max(1, len(inside) // _FITTED_PX)]
-    coefficients = least_squares(basis.reshape(len(basis), -1)[:, thinned], values.ravel()[thinned])
-    return np.where(usable, values - np.tensordot(coefficients, basis, axes=1), 0.0)
+    coefficients = least_squares(basis[:, thinned], values.ravel()[thinned])
+    return np.where(usable, values - (coefficients @ basis).reshape(values.shape), 0.0)
 
 
 def _band_size(size: int, pitch_um: float) -> int:
@@ -238,13 +237,13 @@ def _band_size(size: int, pitch_um: float) -> int:
     return min(size, 2 * round(size * min(1.0, 2 * pitch_um * _BAND_CYCLES_PER_UM) / 2))
 
 
-def _in_band(field: np.ndarray, band: tuple[int, ...]) -> np.ndarray:
-    """Half spectrum (fy, fx) of a field at the coarser sampling that its band needs."""
-    spectrum = rfft2(field)
+def _in_band(scan: np.ndarray, band: tuple[int, ...]) -> np.ndarray:
+    """Half spectrum (fy, fx) of a scan at the coarser sampling that its band needs."""
+    spectrum = rfft2(scan)
     ny, nx = band
     half = ny // 2
     rows = np.concatenate([spectrum[: ny - half], spectrum[len(spectrum) - half :]])
-    return rows[:, : nx // 2 + 1] * (ny * nx / field.size)
+    return rows[:, : nx // 2 + 1] * (ny * nx / scan.size)
 
 
 def _weights(shape: tuple[int, ...], size: tuple[int, int]) -> np.ndarray:

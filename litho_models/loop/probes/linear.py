@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from litho_data.foundation.units import NM_PER_UM
-from litho_models.loop.linear import nuisance_columns, orthonormal
-from litho_models.loop.prepared import Field
+from litho_models.fitting.least_squares import orthonormal
+from litho_models.loop.linear import ALL_FREE
+from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.probes.probe import Estimate
 
 # Relative to the mean information per column; the grid is wide, its choice is made on training scans.
@@ -18,7 +19,7 @@ RIDGES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 _IDLE = 1e-6
 
 Summary = Callable[[np.ndarray], dict[str, tuple[float, str]]]
-ColumnsOf = Callable[[Field, np.ndarray], np.ndarray]
+ColumnsOf = Callable[[PreparedScan, np.ndarray], np.ndarray]
 Shuffle = Callable[[np.random.Generator, int], np.ndarray]
 
 
@@ -27,7 +28,7 @@ class LinearProbe:
     """Residual = columns · coefficients, the same coefficients for all scans.
 
     Attributes:
-        columns_of: (field, prediction (y, x) µm) -> maps (m, y, x).
+        columns_of: (scan, prediction (y, x) µm) -> maps (m, y, x).
         penalty: (m, m), what a ridge fit keeps small.
         shuffle: (generator, m) -> order of the columns of one scan under the probe's control.
         summary: coefficients -> figures for people, name to (value, unit).
@@ -66,9 +67,9 @@ class LinearProbe:
         sizes = np.sqrt(max(first @ pooled @ first, 0.0) * max(second @ pooled @ second, 0.0))
         return float(first @ pooled @ second / max(sizes, np.finfo(float).tiny))
 
-    def correction(self, parameters: np.ndarray, field: Field, prediction: np.ndarray) -> np.ndarray:
+    def correction(self, parameters: np.ndarray, scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
         """Height to add (y, x), µm."""
-        return np.tensordot(parameters, self.columns_of(field, prediction), axes=1).astype(np.float32)
+        return np.tensordot(parameters, self.columns_of(scan, prediction), axes=1).astype(np.float32)
 
 
 def linear_probe(
@@ -77,22 +78,22 @@ def linear_probe(
     penalty: np.ndarray,
     shuffle: Shuffle,
     summary: Summary,
-    fields: Sequence[Field],
+    scans: Sequence[PreparedScan],
     predictions: Sequence[np.ndarray],
     kept: Sequence[np.ndarray],
 ) -> LinearProbe:
     """Measure a probe's inner products with the residual on the sampled pixels.
 
     Args:
-        fields, predictions: scans and their held-out predictions (y, x) µm.
+        scans, predictions: scans and their held-out predictions (y, x) µm.
         kept: bool (n,) per scan, sampled pixels to use: defects are left out.
     """
     grams, rights = [], []
-    for field, prediction, use in zip(fields, predictions, kept, strict=True):
-        maps = columns_of(field, prediction)
-        columns = np.stack([field.at_sample(m) for m in maps] + [field.height - field.at_sample(prediction)])
+    for scan, prediction, use in zip(scans, predictions, kept, strict=True):
+        maps = columns_of(scan, prediction)
+        columns = np.stack([scan.at_sample(m) for m in maps] + [scan.height - scan.at_sample(prediction)])
         columns = columns[:, use].T
-        basis = orthonormal(nuisance_columns(field, prediction, gain=True)[use])
+        basis = orthonormal(scan.terms_at_sample(prediction, ALL_FREE)[:, use].T)
         columns -= basis @ (basis.T @ columns)
         products = columns.T @ columns
         grams.append(products[:-1, :-1])

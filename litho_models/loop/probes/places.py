@@ -1,4 +1,4 @@
-"""Places: a smooth map over the field, or a profile over its rows or columns, added or times the height."""
+"""Places: a smooth map over the scan, or a profile over its rows or columns, added or times the height."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from litho_data.foundation.units import NM_PER_UM
-from litho_models.loop.prepared import Field
+from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.probes.linear import LinearProbe, linear_probe, second_differences
 
 SPLINES = 5
-# One per µm in a field of 25 µm: what is finer is one line's, not the field's.
+# One per µm in a scan of 25 µm: what is finer is one line's, not the scan's.
 PROFILE_SPLINES = 24
 _FLIPS: tuple[Callable[[np.ndarray], np.ndarray], ...] = tuple(
     partial(lambda grid, turns, mirror: np.rot90(grid.T if mirror else grid, turns), turns=t, mirror=m)
@@ -24,7 +24,7 @@ _FLIPS: tuple[Callable[[np.ndarray], np.ndarray], ...] = tuple(
 
 
 def position_map(
-    fields: Sequence[Field],
+    scans: Sequence[PreparedScan],
     predictions: Sequence[np.ndarray],
     kept: Sequence[np.ndarray],
     *,
@@ -40,14 +40,14 @@ def position_map(
         _roughness(SPLINES),
         _turned,
         partial(_size, times_height=times_height),
-        fields,
+        scans,
         predictions,
         kept,
     )
 
 
 def profile(
-    fields: Sequence[Field],
+    scans: Sequence[PreparedScan],
     predictions: Sequence[np.ndarray],
     kept: Sequence[np.ndarray],
     *,
@@ -61,7 +61,7 @@ def profile(
         second_differences(PROFILE_SPLINES) + 1e-2 * np.eye(PROFILE_SPLINES),
         _rolled,
         partial(_profile_size, times_height=times_height),
-        fields,
+        scans,
         predictions,
         kept,
     )
@@ -94,18 +94,18 @@ def _spread(values: np.ndarray, times_height: bool) -> dict[str, tuple[float, st
     }
 
 
-def _map_columns(field: Field, prediction: np.ndarray, times_height: bool) -> np.ndarray:
+def _map_columns(scan: PreparedScan, prediction: np.ndarray, times_height: bool) -> np.ndarray:
     """Products of splines along y and x over the scan (25, y, x)."""
-    along_y, along_x = (_splines(n) for n in field.scan.shape)
-    maps = np.einsum("iy,jx->ijyx", along_y, along_x).reshape(-1, *field.scan.shape)
+    along_y, along_x = (_splines(n) for n in scan.stored.shape)
+    maps = np.einsum("iy,jx->ijyx", along_y, along_x).reshape(-1, *scan.stored.shape)
     return maps * prediction if times_height else maps
 
 
 def _profile_columns(
-    field: Field, prediction: np.ndarray, along: Literal["row", "column"], times_height: bool
+    scan: PreparedScan, prediction: np.ndarray, along: Literal["row", "column"], times_height: bool
 ) -> np.ndarray:
     """Splines over the rows or the columns (24, y, x)."""
-    ny, nx = field.scan.shape
+    ny, nx = scan.stored.shape
     splines = _splines(ny if along == "row" else nx, PROFILE_SPLINES)
     maps = splines[:, :, None] if along == "row" else splines[:, None, :]
     return np.broadcast_to(maps, (PROFILE_SPLINES, ny, nx)) * (prediction if times_height else 1.0)

@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from litho_models.loop.prepared import Field
+from litho_models.loop.prepared import PreparedScan
 
 
 @dataclass(frozen=True)
@@ -60,5 +60,5 @@ class Probe(Protocol):
     def summary(self, parameters: np.ndarray) -> dict[str, tuple[float, str]]:
         """Figures for people: name to (value, unit)."""
 
-    def correction(self, parameters: np.ndarray, field: Field, prediction: np.ndarray) -> np.ndarray:
+    def correction(self, parameters: np.ndarray, scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
         """Height to add (y, x), µm, to a prediction (y, x), µm."""

@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from litho_models.loop.prepared import Field
+from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.probes.defects import Defects, find_defects
 from litho_models.loop.probes.kernel import missing_kernel
 from litho_models.loop.probes.places import position_map, profile
 from litho_models.loop.probes.probe import Estimate, Probe
 from litho_models.loop.probes.tables import axis_slope_table, level_table, slope_table
 from litho_models.loop.probes.trend import OrderTrend, order_trends
-from litho_models.loop.scoring import Score, Terms, score
 from litho_models.loop.selection.confirming import SMALLEST_SHARE, Confirmation, confirm
-from litho_models.loop.state import State
-from litho_models.scan_terms.nuisance import nuisance_basis
+from litho_models.loop.study import Correction, Score, State, Study
+from litho_models.scan_terms import Terms
+from litho_models.scan_terms.term import smooth_shapes
 
 CONTROLS = 199
 CONTROL_QUANTILE = 0.95
@@ -61,40 +61,36 @@ class Probed:
     defects: Defects
     trends: list[OrderTrend]
 
-    def apply(self, field: Field, prediction: np.ndarray) -> np.ndarray:
+    def apply(self, scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
         """Add the accepted terms, estimated on all development scans, to the prediction of a new scan."""
         for entry in self.added:
-            prediction = _corrected(entry.probe, entry.estimate.common, entry.anchor, field, prediction)
+            prediction = _corrected(entry.probe, entry.estimate.common, entry.anchor, scan, prediction)
         return prediction
 
 
 def probe_residual(
     state: State,
-    fields: Sequence[Field],
-    fold_of: np.ndarray,
+    study: Study,
     terms: Terms,
     *,
-    floor_nm2: float,
-    seed: int,
     search: bool,
-    report: Callable[[str], None] = lambda message: None,
 ) -> Probed:
     """Look for what has no name in the residual that the named effects leave.
 
     Args:
-        state: the model after the named effects; ``fields``: development scans.
-        fold_of: fold that holds each scan out; ``terms``: per-scan terms of the scoring.
-        floor_nm2: squared noise floor or its lower bound.
+        state: the model after the named effects; ``terms``: scan terms of the scoring.
         search: whether the residual is structured; otherwise only defects and trends are looked at.
     """
-    defects = find_defects(fields, state.predictions)
-    trends = order_trends(fields, state.predictions, seed)
+    defects = find_defects(study.scans, state.predictions)
+    trends = order_trends(study.scans, state.predictions, study.seed)
     added: list[AddedProbe] = []
     tests: dict[str, ProbeTest] = {}
     while search:
         taken = {entry.probe.name for entry in added}
-        candidates = [p for p in generic_terms(fields, state.predictions, defects) if p.name not in taken]
-        found = _best(candidates, state, fields, fold_of, terms, floor_nm2, seed, tests, report)
+        candidates = [
+            p for p in generic_terms(study.scans, state.predictions, defects) if p.name not in taken
+        ]
+        found = _best(candidates, state, study, terms, tests)
         if found is None:
             break
         entry, state = found
@@ -103,39 +99,36 @@ def probe_residual(
 
 
 def generic_terms(
-    fields: Sequence[Field], predictions: Sequence[np.ndarray], defects: Defects
+    scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray], defects: Defects
 ) -> list[Probe]:
     """All probes, measured on the residual of these held-out predictions."""
-    kept = [~mask.reshape(-1)[field.sample] for mask, field in zip(defects.masks, fields, strict=True)]
-    table = level_table(fields, predictions, kept)
+    kept = [~mask.reshape(-1)[scan.sample] for mask, scan in zip(defects.masks, scans, strict=True)]
+    table = level_table(scans, predictions, kept)
     places: list[Probe] = []
     for times in (False, True):
-        places.append(position_map(fields, predictions, kept, times_height=times))
+        places.append(position_map(scans, predictions, kept, times_height=times))
         places += [
-            profile(fields, predictions, kept, along=along, times_height=times) for along in ("row", "column")
+            profile(scans, predictions, kept, along=along, times_height=times) for along in ("row", "column")
         ]
-    kernel = missing_kernel(fields, predictions, defects.masks)
-    slopes = [make(fields, predictions, kept) for make in (slope_table, axis_slope_table)]
+    kernel = missing_kernel(scans, predictions, defects.masks)
+    slopes = [make(scans, predictions, kept) for make in (slope_table, axis_slope_table)]
     return [*([table] if table else []), *slopes, *places, kernel]
 
 
 def _best(
     candidates: Sequence[Probe],
     state: State,
-    fields: Sequence[Field],
-    fold_of: np.ndarray,
+    study: Study,
     terms: Terms,
-    floor_nm2: float,
-    seed: int,
     tests: dict[str, ProbeTest],
-    report: Callable[[str], None],
 ) -> tuple[AddedProbe, State] | None:
     """The probe with the largest held-out gain that passes every rule, and the state with it.
 
     Probes are estimated free of each scan's own gain and bow, so they are judged free of them too.
     """
     terms = terms | {"gain", "bow"}
-    before = score(fields, state.predictions, terms, seed)
+    fold_of, scans = study.fold_of, study.scans
+    before = state.score(study, terms)
     estimates = [(probe, probe.held_out(fold_of)) for probe in candidates]
     for probe, estimate in sorted(estimates, key=lambda e: -e[1].mean_gain_nm2):
         gain = estimate.mean_gain_nm2
@@ -143,19 +136,24 @@ def _best(
         if gain < SMALLEST_SHARE * before.mse_nm2.mean():
             tests[probe.name] = replace(nothing, reason="gain on held-out scans too small to matter")
             continue
-        report(f"probing with {probe.name}")
-        random = np.random.default_rng([seed, 7])
+        study.report(f"probing with {probe.name}")
+        random = np.random.default_rng([study.seed, 7])
         controls = np.array([probe.control(fold_of, random) for _ in range(CONTROLS)])
         limit = float(np.quantile(controls, CONTROL_QUANTILE))
         agreement = probe.agreement()
-        anchors = [_anchor(probe, own, fields, state.predictions) for own in estimate.per_fold]
+        anchors = [_anchor(probe, own, scans, state.predictions) for own in estimate.per_fold]
         corrected = [
-            _corrected(probe, estimate.per_fold[fold], anchors[fold], field, p)
-            for field, p, fold in zip(fields, state.predictions, fold_of, strict=True)
+            _corrected(probe, estimate.per_fold[fold], anchors[fold], scan, p)
+            for scan, p, fold in zip(scans, state.predictions, fold_of, strict=True)
         ]
-        after = score(fields, corrected, terms, seed)
+        after = study.score(corrected, terms)
         confirmation = confirm(
-            before.mse_nm2, after.mse_nm2, before.mae_nm, after.mae_nm, floor_nm2=floor_nm2, seed=seed
+            before.mse_nm2,
+            after.mse_nm2,
+            before.mae_nm,
+            after.mae_nm,
+            floor_nm2=study.floor_nm2,
+            seed=study.seed,
         )
         reasons = [confirmation.reason] if confirmation.reason else []
         if gain <= limit:
@@ -165,27 +163,34 @@ def _best(
         tests[probe.name] = ProbeTest(probe.name, gain, limit, agreement, "; ".join(reasons))
         if not reasons:
             p_control = float((1 + (controls >= gain).sum()) / (CONTROLS + 1))
-            anchor = _anchor(probe, estimate.common, fields, state.predictions)
+            anchor = _anchor(probe, estimate.common, scans, state.predictions)
             entry = AddedProbe(probe, estimate, anchor, before, after, confirmation, p_control)
-            return entry, State(state.fits, corrected)
+            return entry, State(
+                state.fits, corrected, (*state.corrections, _correction(probe, estimate, anchors))
+            )
     return None
 
 
+def _correction(probe: Probe, estimate: Estimate, anchors: Sequence[np.ndarray]) -> Correction:
+    return lambda fold, scan, prediction: _corrected(
+        probe, estimate.per_fold[fold], anchors[fold], scan, prediction
+    )
+
+
 def _corrected(
-    probe: Probe, parameters: np.ndarray, anchor: np.ndarray, field: Field, prediction: np.ndarray
+    probe: Probe, parameters: np.ndarray, anchor: np.ndarray, scan: PreparedScan, prediction: np.ndarray
 ) -> np.ndarray:
     shared = np.tensordot(anchor, _shared_maps(prediction), axes=1).astype(np.float32)
-    return prediction + probe.correction(parameters, field, prediction) + shared
+    return prediction + probe.correction(parameters, scan, prediction) + shared
 
 
 def _shared_maps(prediction: np.ndarray) -> np.ndarray:
     """1, the prediction, and plane and bow over the scan: (7, y, x)."""
-    offset, _, *bow = nuisance_basis(prediction, "full")
-    return np.stack([offset, prediction, *bow])
+    return np.stack([np.ones_like(prediction), prediction, *smooth_shapes(prediction.shape)])
 
 
 def _anchor(
-    probe: Probe, parameters: np.ndarray, fields: Sequence[Field], predictions: Sequence[np.ndarray]
+    probe: Probe, parameters: np.ndarray, scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray]
 ) -> np.ndarray:
     """Minus the offset, gain, plane and bow that the correction has in the mean over scans.
 
@@ -194,9 +199,9 @@ def _anchor(
     """
     count = len(_shared_maps(predictions[0]))
     normal, right = np.zeros((count, count)), np.zeros(count)
-    for field, prediction in zip(fields, predictions, strict=True):
-        correction = field.at_sample(probe.correction(parameters, field, prediction))
-        columns = np.stack([field.at_sample(shared) for shared in _shared_maps(prediction)])
+    for scan, prediction in zip(scans, predictions, strict=True):
+        correction = scan.at_sample(probe.correction(parameters, scan, prediction))
+        columns = np.stack([scan.at_sample(shared) for shared in _shared_maps(prediction)])
         normal += columns @ columns.T / len(correction)
         right -= columns @ correction / len(correction)
     return np.linalg.lstsq(normal, right, rcond=1e-10)[0]

@@ -9,71 +9,71 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from litho_data.foundation.units import NM_PER_UM
-from litho_models.loop.prepared import Field
+from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.probes.linear import ColumnsOf, LinearProbe, linear_probe, second_differences
 
 # The level that reaches a pixel is spread by the printer's spot.
 SPOT_UM = 0.2
 SLOPE_KNOTS = 8
 _FEWEST_SCANS, _SMALLEST_SHARE = 5, 0.01
-Steepness = Callable[[Field, np.ndarray], np.ndarray]
+Steepness = Callable[[PreparedScan, np.ndarray], np.ndarray]
 
 
 def level_table(
-    fields: Sequence[Field], predictions: Sequence[np.ndarray], kept: Sequence[np.ndarray]
+    scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray], kept: Sequence[np.ndarray]
 ) -> LinearProbe | None:
     """One height correction per printed level; None where fewer than four levels can be estimated.
 
     Offset and slope over the levels belong to each scan's datum and gain and are projected out with them.
     Levels in fewer than 5 scans or 1 % of the pixels are left alone.
     """
-    levels = estimated_levels(fields)
+    levels = estimated_levels(scans)
     if len(levels) < 4:
         return None
     entries = [f"level_{level}" for level in levels]
     columns_of = partial(_level_columns, levels=levels)
-    return _table("level-table", entries, columns_of, fields, predictions, kept)
+    return _table("level-table", entries, columns_of, scans, predictions, kept)
 
 
-def estimated_levels(fields: Sequence[Field]) -> list[int]:
+def estimated_levels(scans: Sequence[PreparedScan]) -> list[int]:
     """Levels that enough scans and pixels hold."""
-    highest = max(int(field.scan.levels) for field in fields)
+    highest = max(int(scan.stored.levels) for scan in scans)
     counts = np.stack(
-        [np.bincount(field.scan.mask_level.ravel().astype(int), minlength=highest) for field in fields]
+        [np.bincount(scan.stored.mask_level.ravel().astype(int), minlength=highest) for scan in scans]
     )
     shares = counts.sum(axis=0) / counts.sum()
-    enough = (counts > 0).sum(axis=0) >= min(_FEWEST_SCANS, len(fields))
+    enough = (counts > 0).sum(axis=0) >= min(_FEWEST_SCANS, len(scans))
     return [int(level) for level in np.flatnonzero(enough & (shares >= _SMALLEST_SHARE))]
 
 
 def slope_table(
-    fields: Sequence[Field], predictions: Sequence[np.ndarray], kept: Sequence[np.ndarray]
+    scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray], kept: Sequence[np.ndarray]
 ) -> LinearProbe:
     """One height correction per steepness of the predicted print, linear in between."""
-    knots = _slope_knots(_steepness, fields, predictions)
+    knots = _slope_knots(_steepness, scans, predictions)
     entries = [f"slope_{knot:.2f}" for knot in knots]
     columns_of = partial(_slope_columns, steepness=_steepness, knots=knots)
-    return _table("slope-table", entries, columns_of, fields, predictions, kept)
+    return _table("slope-table", entries, columns_of, scans, predictions, kept)
 
 
 def axis_slope_table(
-    fields: Sequence[Field], predictions: Sequence[np.ndarray], kept: Sequence[np.ndarray]
+    scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray], kept: Sequence[np.ndarray]
 ) -> LinearProbe:
     """One height correction per steepness along y and one per steepness along x, added.
 
     What a slope does along one axis and not along the other no table over the steepness can follow.
     """
-    knots = {axis: _slope_knots(of, fields, predictions) for axis, of in _ALONG.items()}
+    knots = {axis: _slope_knots(of, scans, predictions) for axis, of in _ALONG.items()}
     entries = [f"along_{axis}_{knot:.2f}" for axis, places in knots.items() for knot in places]
     columns_of = partial(_axis_slope_columns, knots=knots)
-    return _table("axis-slope-table", entries, columns_of, fields, predictions, kept, blocks=len(knots))
+    return _table("axis-slope-table", entries, columns_of, scans, predictions, kept, blocks=len(knots))
 
 
 def _table(
     name: str,
     entries: Sequence[str],
     columns_of: ColumnsOf,
-    fields: Sequence[Field],
+    scans: Sequence[PreparedScan],
     predictions: Sequence[np.ndarray],
     kept: Sequence[np.ndarray],
     blocks: int = 1,
@@ -88,50 +88,52 @@ def _table(
         lambda heights: {
             entry: (float(height) * NM_PER_UM, "nm") for entry, height in zip(entries, heights, strict=True)
         },
-        fields,
+        scans,
         predictions,
         kept,
     )
 
 
-def _level_columns(field: Field, prediction: np.ndarray, levels: Sequence[int]) -> np.ndarray:
+def _level_columns(scan: PreparedScan, prediction: np.ndarray, levels: Sequence[int]) -> np.ndarray:
     """Blurred indicators (levels, y, x)."""
-    sigma = SPOT_UM / field.scan.pitch_um
-    level = field.scan.mask_level
+    sigma = SPOT_UM / scan.stored.pitch_um
+    level = scan.stored.mask_level
     return np.stack(
         [gaussian_filter((level == one).astype(np.float64), sigma, mode="nearest") for one in levels]
     )
 
 
-def _steepness(field: Field, prediction: np.ndarray) -> np.ndarray:
+def _steepness(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
     """|grad H| (y, x), µm/µm."""
-    return np.hypot(*np.gradient(prediction.astype(np.float64), field.scan.pitch_um))
+    return np.hypot(*np.gradient(prediction.astype(np.float64), scan.stored.pitch_um))
 
 
-def _along(field: Field, prediction: np.ndarray, axis: int) -> np.ndarray:
+def _along(scan: PreparedScan, prediction: np.ndarray, axis: int) -> np.ndarray:
     """|dH/dy| or |dH/dx| (y, x), µm/µm."""
-    return np.abs(np.gradient(prediction.astype(np.float64), field.scan.pitch_um, axis=axis))
+    return np.abs(np.gradient(prediction.astype(np.float64), scan.stored.pitch_um, axis=axis))
 
 
 _ALONG: Mapping[str, Steepness] = {"y": partial(_along, axis=0), "x": partial(_along, axis=1)}
 
 
 def _slope_knots(
-    steepness: Steepness, fields: Sequence[Field], predictions: Sequence[np.ndarray]
+    steepness: Steepness, scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray]
 ) -> np.ndarray:
     """From flat to what 1 % of the pixels exceed, so that no knot rests on a few edges."""
-    sampled = [f.at_sample(steepness(f, p)) for f, p in zip(fields, predictions, strict=True)]
+    sampled = [f.at_sample(steepness(f, p)) for f, p in zip(scans, predictions, strict=True)]
     steepest = float(np.quantile(np.concatenate(sampled), 0.99))
     return np.linspace(0.0, max(steepest, np.finfo(float).tiny), SLOPE_KNOTS)
 
 
 def _slope_columns(
-    field: Field, prediction: np.ndarray, steepness: Steepness, knots: np.ndarray
+    scan: PreparedScan, prediction: np.ndarray, steepness: Steepness, knots: np.ndarray
 ) -> np.ndarray:
     """Tents (knots, y, x): 1 at a knot, 0 at its neighbours, constant beyond the ends."""
-    place = np.interp(steepness(field, prediction), knots, np.arange(len(knots)))
+    place = np.interp(steepness(scan, prediction), knots, np.arange(len(knots)))
     return np.maximum(0.0, 1.0 - np.abs(place - np.arange(len(knots))[:, None, None]))
 
 
-def _axis_slope_columns(field: Field, prediction: np.ndarray, knots: Mapping[str, np.ndarray]) -> np.ndarray:
-    return np.concatenate([_slope_columns(field, prediction, of, knots[axis]) for axis, of in _ALONG.items()])
+def _axis_slope_columns(
+    scan: PreparedScan, prediction: np.ndarray, knots: Mapping[str, np.ndarray]
+) -> np.ndarray:
+    return np.concatenate([_slope_columns(scan, prediction, of, knots[axis]) for axis, of in _ALONG.items()])

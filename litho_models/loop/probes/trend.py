@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from litho_data.foundation.units import NM_PER_UM
-from litho_models.loop.prepared import Field
-from litho_models.loop.single_scans.tests import scan_parameters
+from litho_models.loop.prepared import PreparedScan
+from litho_models.loop.single_scans.nested_tests import scan_parameters
 
 PERMUTATIONS = 1999
 # Fewer scans than this on one side of a step fit anything.
@@ -38,22 +38,22 @@ class OrderTrend:
 
 
 def order_trends(
-    fields: Sequence[Field], predictions: Sequence[np.ndarray], seed: int = 0
+    scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray], seed: int = 0
 ) -> list[OrderTrend]:
     """Test offset and gain of the scans; empty where the order is not known or the scans are few.
 
     Args:
-        fields, predictions: scans and held-out predictions (y, x) µm.
+        scans, predictions: scans and held-out predictions (y, x) µm.
         seed: of the permutations.
     """
-    order = np.array([field.context.order for field in fields])
-    if len(fields) < 2 * _SHORTEST_SIDE + 2 or len(np.unique(order)) < len(fields):
+    order = np.array([scan.context.order for scan in scans])
+    if len(scans) < 2 * _SHORTEST_SIDE + 2 or len(np.unique(order)) < len(scans):
         return []
     rank = np.argsort(order)
-    prints = [fields[i].scan.print_id for i in rank]
-    values = scan_parameters(fields, predictions, frozenset({"offset", "gain"}))[rank]
+    prints = [scans[i].stored.print_id for i in rank]
+    values = scan_parameters(scans, predictions, frozenset({"offset", "gain"}))[rank]
     place = np.linspace(-0.5, 0.5, len(rank))
-    names = [fields[i].id for i in rank]
+    names = [scans[i].id for i in rank]
     return [
         _trend(term, unit, values[:, column] * scale, place, names, prints, seed)
         for column, (term, unit, scale) in enumerate((("offset", "nm", NM_PER_UM), ("gain", "1", 1.0)))

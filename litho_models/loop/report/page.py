@@ -9,20 +9,21 @@ import pandas as pd
 
 from litho_data.foundation.report import Page
 from litho_data.foundation.units import NM_PER_UM
-from litho_models.loop.findings import Closed
+from litho_models.loop.findings import LoopFindings
 from litho_models.loop.report.plots import curve_figure, map_figure, probe_figure, staircase_figure
 from litho_models.loop.report.power import identifiability_section, power_section
 from litho_models.loop.report.wording import plain_words, warnings_for
 from litho_models.loop.result.record import CloseLoop
-from litho_models.loop.scoring import DATUM_FREE, Score, Terms, names_to_terms, scan_parameter_names
-from litho_models.loop.single_scans.tests import scan_parameters
+from litho_models.loop.single_scans.nested_tests import scan_parameters
 from litho_models.loop.structure import PLACE
+from litho_models.loop.study import DATUM_FREE, Score, names_to_terms
+from litho_models.scan_terms import Terms, parameter_names
 
 
-def write_report(closed: Closed, result: CloseLoop, folder: Path) -> Path:
+def write_report(findings: LoopFindings, result: CloseLoop, folder: Path) -> Path:
     """Write ``report.html`` and the CSV tables into ``folder``; returns the page's path."""
-    before = closed.errors(closed.base, DATUM_FREE)
-    after = closed.errors(closed.final, closed.terms)
+    before = findings.errors(findings.base, DATUM_FREE)
+    after = findings.errors(findings.final, findings.terms)
     page = Page(
         f"Closing the loop: {result.dataset.name}, base model {result.base_model}",
         "From the residual of the model on scans it was not fitted on, to causes, to a corrected model.",
@@ -42,40 +43,40 @@ def write_report(closed: Closed, result: CloseLoop, folder: Path) -> Path:
             ),
         ]
     )
-    page.paragraph(plain_words(closed, result))
-    for warning in warnings_for(closed, result):
+    page.paragraph(plain_words(findings, result))
+    for warning in warnings_for(findings, result):
         page.note(warning)
-    _error_section(page, closed, result)
+    _error_section(page, findings, result)
     _effect_section(page, result)
     _candidate_section(page, result)
     page.heading("Residual maps")
     page.figure(
-        map_figure(closed, before, after),
+        map_figure(findings, before, after),
         "Measured minus predicted on held-out scans: the worst, the median and the best scan before; one "
         "colour "
         "scale for all. Per-scan terms were fitted on other pixels.",
     )
-    _probe_section(page, closed)
-    _rest_section(page, closed, result)
-    identifiability_section(page, closed)
-    power_section(page, closed)
-    _scan_section(page, closed, before, after)
+    _probe_section(page, findings)
+    _rest_section(page, findings, result)
+    identifiability_section(page, findings)
+    power_section(page, findings)
+    _scan_section(page, findings, before, after)
     page.heading("How it was run")
     page.code(result.run.command or "litho_models.loop.close_loop")
     return page.write(folder)
 
 
-def _error_section(page: Page, closed: Closed, result: CloseLoop) -> None:
+def _error_section(page: Page, findings: LoopFindings, result: CloseLoop) -> None:
     page.heading("Error, step by step")
-    rows = _staircase(closed)
+    rows = _staircase(findings)
     frame = pd.DataFrame(
         [
             {
                 "model": label,
                 "terms per scan": s.degrees_of_freedom,
                 "MAE (nm)": s.mean_mae_nm,
-                "low": s.interval_nm(closed.config.seed)[0],
-                "high": s.interval_nm(closed.config.seed)[1],
+                "low": s.interval_nm(findings.config.seed)[0],
+                "high": s.interval_nm(findings.config.seed)[1],
                 "RMSE (nm)": s.rmse_nm,
             }
             for label, s in rows
@@ -101,17 +102,17 @@ def _error_section(page: Page, closed: Closed, result: CloseLoop) -> None:
     )
 
 
-def _staircase(closed: Closed) -> list[tuple[str, Score]]:
+def _staircase(findings: LoopFindings) -> list[tuple[str, Score]]:
     steps: list[tuple[str, Terms]] = [("no fit", frozenset()), ("datum", DATUM_FREE)]
     names: list[str] = []
-    for name in closed.accepted:
+    for name in findings.accepted:
         names.append(name)
         terms = DATUM_FREE | names_to_terms(names)
         if terms != steps[-1][1]:
             steps.append((f"+ {name}", terms))
-    rows = [(f"base: {label}", closed.errors(closed.base, terms)) for label, terms in steps]
-    if closed.search.added or closed.probed.added:
-        rows += [(f"corrected: {label}", closed.errors(closed.final, terms)) for label, terms in steps]
+    rows = [(f"base: {label}", findings.errors(findings.base, terms)) for label, terms in steps]
+    if findings.search.added or findings.probed.added:
+        rows += [(f"corrected: {label}", findings.errors(findings.final, terms)) for label, terms in steps]
     return rows
 
 
@@ -192,8 +193,8 @@ def _candidate_section(page: Page, result: CloseLoop) -> None:
     )
 
 
-def _probe_section(page: Page, closed: Closed) -> None:
-    probed = closed.probed
+def _probe_section(page: Page, findings: LoopFindings) -> None:
+    probed = findings.probed
     page.heading("What has no name")
     for entry in probed.added:
         page.figure(
@@ -222,7 +223,7 @@ def _probe_section(page: Page, closed: Closed) -> None:
         page.table(pd.DataFrame([vars(b) for b in defects.blobs]), "Every blob.", "defects.csv", digits=2)
 
 
-def _rest_section(page: Page, closed: Closed, result: CloseLoop) -> None:
+def _rest_section(page: Page, findings: LoopFindings, result: CloseLoop) -> None:
     page.heading("What is left")
     state = result.residual.state
     page.paragraph(
@@ -235,7 +236,7 @@ def _rest_section(page: Page, closed: Closed, result: CloseLoop) -> None:
         pd.DataFrame(
             [
                 {"covariate": t.name, "p": t.p, "share of squared error (%)": 100 * t.share}
-                for t in closed.structure
+                for t in findings.structure
             ]
         ),
         "Sign-flip p over scans (largest of the bins); part of the squared error that the mean curve "
@@ -243,7 +244,7 @@ def _rest_section(page: Page, closed: Closed, result: CloseLoop) -> None:
         "structure.csv",
         digits=4,
     )
-    curves = [t for t in closed.structure if len(t.curve_nm) and t.name != PLACE]
+    curves = [t for t in findings.structure if len(t.curve_nm) and t.name != PLACE]
     if curves:
         page.figure(
             curve_figure(curves),
@@ -251,20 +252,20 @@ def _rest_section(page: Page, closed: Closed, result: CloseLoop) -> None:
         )
 
 
-def _scan_section(page: Page, closed: Closed, before: Score, after: Score) -> None:
+def _scan_section(page: Page, findings: LoopFindings, before: Score, after: Score) -> None:
     page.heading("Scan by scan")
     frame = pd.DataFrame(
         {
-            "scan": [f.id for f in closed.development],
-            "print": [f.scan.print_id for f in closed.development],
-            "fold": closed.fold_of,
+            "scan": [f.id for f in findings.development],
+            "print": [f.stored.print_id for f in findings.development],
+            "fold": findings.study.fold_of,
             "MAE before (nm)": before.mae_nm,
             "MAE after (nm)": after.mae_nm,
         }
     )
-    terms = closed.terms
-    coefficients = scan_parameters(closed.development, closed.final.predictions, terms)
-    for name, values in zip(scan_parameter_names(terms), coefficients.T, strict=True):
+    terms = findings.terms
+    coefficients = scan_parameters(findings.development, findings.final.predictions, terms)
+    for name, values in zip(parameter_names(terms), coefficients.T, strict=True):
         frame[name] = values * NM_PER_UM if name.endswith("(nm)") else values
     page.table(
         frame,

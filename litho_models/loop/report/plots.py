@@ -10,14 +10,14 @@ import pandas as pd
 
 from litho_data.foundation.report import new_figure
 from litho_data.foundation.units import NM_PER_UM
-from litho_models.loop.findings import Closed
+from litho_models.loop.findings import LoopFindings
 from litho_models.loop.identifiability import Profile
 from litho_models.loop.probes import AddedProbe, figures
 from litho_models.loop.probes.kernel import MissingKernel
 from litho_models.loop.probes.places import drawn, drawn_profile
 from litho_models.loop.result.record import CloseLoop
-from litho_models.loop.scoring import Score
 from litho_models.loop.structure import CovariateTest
+from litho_models.loop.study import Score
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -54,28 +54,28 @@ def staircase_figure(frame: pd.DataFrame, result: CloseLoop) -> Figure:
     return figure
 
 
-def map_figure(closed: Closed, before: Score, after: Score) -> Figure:
+def map_figure(findings: LoopFindings, before: Score, after: Score) -> Figure:
     """Residual of the worst, the median and the best scan, before and after, on one scale."""
     ranking = np.argsort(-before.mse_nm2)
     picked = ranking[np.unique(np.linspace(0, len(ranking) - 1, _MAPS).astype(int))]
     limit = 2.5 * before.rmse_nm
     figure = new_figure(4.1 * len(picked) + 0.8, 8.2)
     axes = figure.subplots(2, len(picked), squeeze=False)
-    for column, scan in enumerate(picked):
-        field = closed.development[scan]
+    for column, at in enumerate(picked):
+        scan = findings.development[at]
         extent_um = [
             0,
-            field.usable.shape[1] * field.scan.pitch_um,
-            field.usable.shape[0] * field.scan.pitch_um,
+            scan.usable.shape[1] * scan.stored.pitch_um,
+            scan.usable.shape[0] * scan.stored.pitch_um,
             0,
         ]
         for row, (label, s) in enumerate((("before", before), ("after", after))):
             panel = axes[row, column]
             panel.imshow(
-                s.residual_um[scan] * NM_PER_UM, cmap="RdBu_r", vmin=-limit, vmax=limit, extent=extent_um,
+                s.residual_um[at] * NM_PER_UM, cmap="RdBu_r", vmin=-limit, vmax=limit, extent=extent_um,
                 interpolation="nearest",
             )  # fmt: skip
-            panel.set_title(f"{field.id} {label}: {s.mae_nm[scan]:.1f} nm", fontsize=10)
+            panel.set_title(f"{scan.id} {label}: {s.mae_nm[at]:.1f} nm", fontsize=10)
             panel.set_xlabel("x (µm)" if row else "")
             panel.set_ylabel("" if column else "y (µm)")
     figure.colorbar(axes[0, 0].images[0], ax=axes, label="measured - predicted (nm)", shrink=0.6)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import pandas as pd
 
 from litho_data.foundation.report import Page
-from litho_models.loop.findings import Closed
+from litho_models.loop.findings import LoopFindings
 from litho_models.loop.report.plots import profile_figure
 
 
-def identifiability_section(page: Page, closed: Closed) -> None:
+def identifiability_section(page: Page, findings: LoopFindings) -> None:
     """Variance inflation of every fitted number, the least determined combination, and profiles."""
-    found = closed.identifiability
+    found = findings.identifiability
     if found is None:
         return
     page.heading("How well these scans pin the fit down")
@@ -29,10 +29,10 @@ def identifiability_section(page: Page, closed: Closed) -> None:
         "identifiability.csv",
         digits=2,
     )
-    if not closed.profiles:
+    if not findings.profiles:
         return
     page.figure(
-        profile_figure(closed.profiles),
+        profile_figure(findings.profiles),
         "Profile of each number of each effect: root mean square residual, on the scans it was fitted to, "
         "with the number held there and all others fitted again. Steep sides: determined; flat: not.",
     )
@@ -47,7 +47,7 @@ def identifiability_section(page: Page, closed: Closed) -> None:
                     "RMSE (nm)": one.rmse_nm,
                 }
             )
-            for one in closed.profiles
+            for one in findings.profiles
         ),
         "The same in numbers.",
         "profiles.csv",
@@ -55,13 +55,13 @@ def identifiability_section(page: Page, closed: Closed) -> None:
     )
 
 
-def power_section(page: Page, closed: Closed) -> None:
+def power_section(page: Page, findings: LoopFindings) -> None:
     """The smallest planted amounts that were found, and the power at every amount."""
-    if not closed.planted:
+    if not findings.planted:
         return
     page.heading("How small an effect would have been found")
-    for name in dict.fromkeys(p.name for p in closed.planted):
-        found = [p for p in closed.planted if p.name == name and p.found]
+    for name in dict.fromkeys(p.name for p in findings.planted):
+        found = [p for p in findings.planted if p.name == name and p.found]
         smallest = min(found, key=lambda p: p.rms_nm, default=None)
         page.paragraph(
             f"{name}: found from {smallest.amount:.3g} {smallest.unit} ({smallest.rms_nm:.1f} nm rms) "
@@ -70,7 +70,7 @@ def power_section(page: Page, closed: Closed) -> None:
             else f"{name}: not found at any of the planted amounts."
         )
     page.table(
-        pd.DataFrame([vars(p) for p in closed.planted]),
+        pd.DataFrame([vars(p) for p in findings.planted]),
         "The effect planted in copies of the development scans. Power: share of the training sets whose best "
         "candidate it is, or one with the same signature.",
         "power.csv",

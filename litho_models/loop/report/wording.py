@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from litho_models.effects import get_effect
-from litho_models.loop.findings import Closed
+from litho_models.loop.findings import LoopFindings
 from litho_models.loop.result.record import AddedEffect, CloseLoop
 from litho_models.loop.selection.confirming import FEWEST_SCANS
 
 
-def plain_words(closed: Closed, result: CloseLoop) -> str:
+def plain_words(findings: LoopFindings, result: CloseLoop) -> str:
     """One paragraph for a process engineer."""
     traced = [e for e in result.effects if e.verdict == "traced-to-covariate"]
     named = [e for e in result.effects if e.verdict != "traced-to-covariate"]
     scan_terms = [e for e in named if get_effect(e.name).per_scan]
     causes = [e for e in named if not get_effect(e.name).per_scan]
-    total = len(closed.development)
+    total = len(findings.development)
     parts = [
         f"On {total} scans, each predicted by a fit that has not seen it, the model is wrong by "
         f"{result.before.mae_abs_nm:.0f} nm as it stands and by {result.before.mae_datum_free_nm:.1f} nm "
@@ -41,7 +41,7 @@ def plain_words(closed: Closed, result: CloseLoop) -> str:
             parts.append(f"To be sure: {e.separating_experiment}.")
     parts += [
         f"Seen without a model [{seen.name}]: {seen.evidence}."
-        for seen in closed.observed.values()
+        for seen in findings.observed.values()
         if seen.seen
     ]
     if not causes:
@@ -59,28 +59,28 @@ def plain_words(closed: Closed, result: CloseLoop) -> str:
     return " ".join(parts)
 
 
-def warnings_for(closed: Closed, result: CloseLoop) -> list[str]:
+def warnings_for(findings: LoopFindings, result: CloseLoop) -> list[str]:
     warnings = []
-    if len(closed.development) < FEWEST_SCANS:
+    if len(findings.development) < FEWEST_SCANS:
         warnings.append(
-            f"Only {len(closed.development)} scans to work on, and nothing can be confirmed below "
+            f"Only {len(findings.development)} scans to work on, and nothing can be confirmed below "
             f"{FEWEST_SCANS}: errors are given, verdicts are withheld."
         )
     if result.run.dropped:
         warnings.append(f"Scans left out: {'; '.join(result.run.dropped)}")
-    if closed.development[0].scan.write is None:
+    if findings.development[0].stored.write is None:
         warnings.append(
             "The card says nothing about the write field: each scan is taken as a write field of its "
             "own, its "
             "lines written along x, one below the other."
         )
-    if len({field.context.order for field in closed.development}) > 2:
+    if len({scan.context.order for scan in findings.development}) > 2:
         warnings.append(
             "Effects of the writing order rest on the order given in the card; where it gives none, the "
             "sorted "
             "names of the scans stand for it, which is an assumption."
         )
-    flagged = [closed.development[i].id for i in closed.probed.defects.suspicious]
+    flagged = [findings.development[i].id for i in findings.probed.defects.suspicious]
     if flagged:
         warnings.append(f"More than 2 % of the pixels lie in localised defects: {', '.join(flagged)}.")
     if result.prior_hypotheses:

@@ -6,13 +6,13 @@ import math
 from collections.abc import Sequence
 
 from litho_models.effects import Effect
-from litho_models.loop.findings import Closed
+from litho_models.loop.findings import LoopFindings
 from litho_models.loop.parameters import effect_slots
 from litho_models.loop.probes import AddedProbe, figures
 from litho_models.loop.result.record import AddedEffect, EffectVerdict, ParameterEstimate
 from litho_models.loop.selection.contest import Added
 from litho_models.loop.selection.search import separating_experiment
-from litho_models.loop.single_scans.tests import MeasurementTest
+from litho_models.loop.single_scans.nested_tests import MeasurementTest
 from litho_models.loop.structure import LINEAR_RESPONSE, is_structured
 
 # Their parameters lie in the span of what every scan may add: nested tests, error without other fits.
@@ -21,24 +21,24 @@ _SPAN_EFFECTS = {"datum-offset", "z-gain", "tilt-bow"}
 _DOUBTFUL_SHARE = 0.1
 
 
-def added_effects(closed: Closed) -> list[AddedEffect]:
+def added_effects(findings: LoopFindings) -> list[AddedEffect]:
     """Measurement terms seen from the start, then the process effects, then terms seen only after them."""
-    first = {t.effect.name: t for t in closed.first_tests if t.confirmation.passed}
-    last = {t.effect.name: t for t in closed.last_tests if t.confirmation.passed}
-    early = [_added_measurement(closed, first[name]) for name in first if name in last]
-    late = [_added_measurement(closed, last[name]) for name in last if name not in first]
-    process = [_added_process(closed, entry) for entry in closed.search.added]
-    return early + process + [_added_probe(entry) for entry in closed.probed.added] + late
+    first = {t.effect.name: t for t in findings.first_tests if t.confirmation.passed}
+    last = {t.effect.name: t for t in findings.last_tests if t.confirmation.passed}
+    early = [_added_measurement(findings, first[name]) for name in first if name in last]
+    late = [_added_measurement(findings, last[name]) for name in last if name not in first]
+    process = [_added_process(findings, entry) for entry in findings.search.added]
+    return early + process + [_added_probe(entry) for entry in findings.probed.added] + late
 
 
-def _added_measurement(closed: Closed, test: MeasurementTest) -> AddedEffect:
+def _added_measurement(findings: LoopFindings, test: MeasurementTest) -> AddedEffect:
     effect = test.effect
     return AddedEffect(
         name=effect.name,
         stage=effect.stage,
         role=effect.role,
         verdict="confusable" if test.confusable_with else "explained",
-        prior_hypothesis=effect.name in closed.config.prior_hypotheses,
+        prior_hypothesis=effect.name in findings.config.prior_hypotheses,
         parameters={
             name if name.startswith("sd") else f"{name}_sd_between_scans": ParameterEstimate(
                 value=value, unit=unit, ci95=interval
@@ -74,31 +74,34 @@ def doubtful_effects(added: Sequence[Added], left_nm2: float) -> set[str]:
     return doubtful
 
 
-def _left_for_a_filter_nm2(closed: Closed) -> float:
+def _left_for_a_filter_nm2(findings: LoopFindings) -> float:
     # A kernel added as a generic term takes it away; a table added before may bring it out.
     left = [0.0]
-    for tests, state in ((closed.left_by_named, closed.search.state), (closed.structure, closed.final)):
+    for tests, state in (
+        (findings.left_by_named, findings.search.state),
+        (findings.structure, findings.final),
+    ):
         share = sum(t.share for t in is_structured(tests) if t.name == LINEAR_RESPONSE)
-        left.append(share * float(closed.errors(state, closed.terms).mse_nm2.mean()))
+        left.append(share * float(findings.errors(state, findings.terms).mse_nm2.mean()))
     return max(left)
 
 
-def verdict_on(closed: Closed, entry: Added) -> EffectVerdict:
+def verdict_on(findings: LoopFindings, entry: Added) -> EffectVerdict:
     """Of an added effect: a cause, one of a set, or near the cause."""
-    if entry.effect.name in doubtful_effects(closed.search.added, _left_for_a_filter_nm2(closed)):
+    if entry.effect.name in doubtful_effects(findings.search.added, _left_for_a_filter_nm2(findings)):
         return "traced-to-covariate"
     return "confusable" if entry.confusable_with else "explained"
 
 
-def _added_process(closed: Closed, entry: Added) -> AddedEffect:
-    effect, verdict = entry.effect, verdict_on(closed, entry)
+def _added_process(findings: LoopFindings, entry: Added) -> AddedEffect:
+    effect, verdict = entry.effect, verdict_on(findings, entry)
     return AddedEffect(
         name=effect.name,
         stage=effect.stage,
         role="undetermined" if verdict == "traced-to-covariate" else effect.role,
         verdict=verdict,
-        prior_hypothesis=effect.name in closed.config.prior_hypotheses,
-        parameters=_parameter_estimates(closed, effect),
+        prior_hypothesis=effect.name in findings.config.prior_hypotheses,
+        parameters=_parameter_estimates(findings, effect),
         metric="mae_datum_free",
         before_nm=entry.before.mean_mae_nm,
         after_nm=entry.after.mean_mae_nm,
@@ -135,13 +138,13 @@ def _added_probe(entry: AddedProbe) -> AddedEffect:
     )
 
 
-def _parameter_estimates(closed: Closed, effect: Effect) -> dict[str, ParameterEstimate]:
+def _parameter_estimates(findings: LoopFindings, effect: Effect) -> dict[str, ParameterEstimate]:
     """Final values on all development scans, intervals from the spread over scans; choices have none."""
     from scipy.stats import t
 
-    fits = closed.final.fits
+    fits = findings.final.fits
     slots = effect_slots(fits.chain)
-    reach = float(t.ppf(0.975, max(len(closed.development) - 1, 1)))
+    reach = float(t.ppf(0.975, max(len(findings.development) - 1, 1)))
     choices = fits.chain.values()[effect.name]
     estimates = {}
     for name, parameter in effect.parameters.items():

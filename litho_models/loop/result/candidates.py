@@ -5,25 +5,25 @@ from __future__ import annotations
 import math
 
 from litho_models.effects import CATALOGUE
-from litho_models.loop.findings import Closed
+from litho_models.loop.findings import LoopFindings
 from litho_models.loop.probes import ProbeTest
 from litho_models.loop.result.added_effects import verdict_on
 from litho_models.loop.result.record import Candidate, CandidateVerdict
 from litho_models.loop.screening.score_test import FAMILY_P, SMALLEST_RETAINED, Screened
 from litho_models.loop.selection.confirming import FEWEST_SCANS
 from litho_models.loop.selection.contest import Added
-from litho_models.loop.single_scans.tests import MeasurementTest
+from litho_models.loop.single_scans.nested_tests import MeasurementTest
 
 
-def all_candidates(closed: Closed, added: set[str]) -> list[Candidate]:
+def all_candidates(findings: LoopFindings, added: set[str]) -> list[Candidate]:
     rows = []
-    tests = {t.effect.name: t for t in closed.first_tests} | {t.effect.name: t for t in closed.last_tests}
-    sets = {name: entry for entry in closed.search.added for name in entry.confusable_with}
-    for name in [*CATALOGUE, *(n for n in closed.untestable if n not in CATALOGUE)]:
-        seen = closed.observed.get(name)
+    tests = {t.effect.name: t for t in findings.first_tests} | {t.effect.name: t for t in findings.last_tests}
+    sets = {name: entry for entry in findings.search.added for name in entry.confusable_with}
+    for name in [*CATALOGUE, *(n for n in findings.untestable if n not in CATALOGUE)]:
+        seen = findings.observed.get(name)
         # A term of single scans is one form of an effect; what is shorter, or already mended, is seen only.
         if name in tests and (name in added or seen is None or not seen.seen):
-            rows.append(_measurement_candidate(closed, tests[name], name in added))
+            rows.append(_measurement_candidate(findings, tests[name], name in added))
         elif seen is not None:
             rows.append(
                 Candidate(
@@ -34,23 +34,23 @@ def all_candidates(closed: Closed, added: set[str]) -> list[Candidate]:
                     gain_nm=None,
                 )
             )
-        elif name in closed.untestable:
+        elif name in findings.untestable:
             rows.append(
                 Candidate(
                     name=name,
                     verdict="not-testable",
-                    reason=closed.untestable[name],
+                    reason=findings.untestable[name],
                     p_screen=None,
                     gain_nm=None,
                 )
             )
         else:
-            rows.append(_process_candidate(closed, name, added, sets))
-    return rows + [_probe_candidate(closed, test) for test in closed.probed.tests]
+            rows.append(_process_candidate(findings, name, added, sets))
+    return rows + [_probe_candidate(findings, test) for test in findings.probed.tests]
 
 
-def _probe_candidate(closed: Closed, test: ProbeTest) -> Candidate:
-    entry = next((e for e in closed.probed.added if e.probe.name == test.name), None)
+def _probe_candidate(findings: LoopFindings, test: ProbeTest) -> Candidate:
+    entry = next((e for e in findings.probed.added if e.probe.name == test.name), None)
     if entry is not None:
         better, count = entry.confirmation.improved
         reason = (
@@ -64,13 +64,13 @@ def _probe_candidate(closed: Closed, test: ProbeTest) -> Candidate:
             p_screen=entry.p_control,
             gain_nm=entry.confirmation.gain_nm,
         )
-    mse = float(closed.errors(closed.final, closed.terms).mse_nm2.mean())
+    mse = float(findings.errors(findings.final, findings.terms).mse_nm2.mean())
     gain = math.sqrt(mse) - math.sqrt(max(mse - test.gain_nm2, 0.0))
     return Candidate(name=test.name, verdict="below-noise", reason=test.reason, p_screen=None, gain_nm=gain)
 
 
-def _measurement_candidate(closed: Closed, test: MeasurementTest, added: bool) -> Candidate:
-    too_few = len(closed.development) < FEWEST_SCANS
+def _measurement_candidate(findings: LoopFindings, test: MeasurementTest, added: bool) -> Candidate:
+    too_few = len(findings.development) < FEWEST_SCANS
     reason = test.evidence if added else f"{test.evidence}; {test.confirmation.reason}"
     verdict: CandidateVerdict = "not-testable" if too_few else "below-noise"
     if added or test.confirmation.reason.startswith("cannot be told"):
@@ -84,19 +84,21 @@ def _measurement_candidate(closed: Closed, test: MeasurementTest, added: bool) -
     )
 
 
-def _process_candidate(closed: Closed, name: str, added: set[str], sets: dict[str, Added]) -> Candidate:
-    search = closed.search
+def _process_candidate(
+    findings: LoopFindings, name: str, added: set[str], sets: dict[str, Added]
+) -> Candidate:
+    search = findings.search
     entry = next((a for a in search.added if a.effect.name == name), None)
     screened = search.last.get(name) or search.first.get(name)
     first = search.first.get(name)
     p = first.p if first else None
-    gain = _predicted_gain_nm(closed, screened) if screened else None
+    gain = _predicted_gain_nm(findings, screened) if screened else None
     verdict: CandidateVerdict
     if entry is not None:
         better, count = entry.confirmation.improved
         reason = f"confirmed on {better} of {count} held-out scans"
         gain = entry.confirmation.gain_nm
-        verdict = verdict_on(closed, entry)
+        verdict = verdict_on(findings, entry)
         if verdict == "traced-to-covariate":
             reason += "; but what it leaves still follows the layout, so it is near the cause, not the cause"
     elif name in search.absorbed:
@@ -106,21 +108,21 @@ def _process_candidate(closed: Closed, name: str, added: set[str], sets: dict[st
         reason = f"cannot be told from {sets[name].effect.name}, which was added"
     elif screened is None:
         verdict, reason = "not-testable", "not screened"
-    elif len(closed.development) < FEWEST_SCANS:
+    elif len(findings.development) < FEWEST_SCANS:
         verdict = "not-testable"
-        reason = f"{len(closed.development)} scans to select and confirm on, at least {FEWEST_SCANS} needed"
+        reason = f"{len(findings.development)} scans to select and confirm on, at least {FEWEST_SCANS} needed"
     elif screened.retained < SMALLEST_RETAINED:
         verdict = "not-testable"
         reason = "on these layouts it changes nothing that the base model or the per-scan terms do not"
     elif wrong := next((s for s in (screened, first) if s and s.p <= FAMILY_P and not s.in_range), None):
         verdict, reason = "contradicted", f"best value leaves the physical range: {_values(wrong)}"
     else:
-        verdict, reason = "below-noise", _why_not(closed, name, screened)
+        verdict, reason = "below-noise", _why_not(findings, name, screened)
     return Candidate(name=name, verdict=verdict, reason=reason, p_screen=p, gain_nm=gain)
 
 
-def _why_not(closed: Closed, name: str, screened: Screened) -> str:
-    search = closed.search
+def _why_not(findings: LoopFindings, name: str, screened: Screened) -> str:
+    search = findings.search
     first = search.first[name]
     if name in search.dropped:
         return search.dropped[name]
@@ -134,9 +136,9 @@ def _why_not(closed: Closed, name: str, screened: Screened) -> str:
     return f"no evidence (z = {screened.z:.1f}); {detectable}"
 
 
-def _predicted_gain_nm(closed: Closed, screened: Screened) -> float:
+def _predicted_gain_nm(findings: LoopFindings, screened: Screened) -> float:
     """Gain in RMSE that the score test predicts for held-out scans, nm."""
-    mse = float(closed.errors(closed.final, closed.terms).mse_nm2.mean())
+    mse = float(findings.errors(findings.final, findings.terms).mse_nm2.mean())
     return math.sqrt(mse) - math.sqrt(max(mse - screened.mean_gain_nm2, 0.0))
 
 

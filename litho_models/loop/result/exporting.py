@@ -10,10 +10,10 @@ import numpy as np
 from litho_data.foundation.files import atomic_file
 from litho_models.effects import get_effect
 from litho_models.effects.chain import EffectChain
-from litho_models.loop.findings import Closed
+from litho_models.loop.findings import LoopFindings
 from litho_models.loop.result.record import CloseLoop
-from litho_models.loop.scoring import scan_parameter_names
-from litho_models.loop.single_scans.tests import scan_parameters
+from litho_models.loop.single_scans.nested_tests import scan_parameters
+from litho_models.scan_terms import parameter_names
 
 EffectValues = dict[str, dict[str, float]]
 
@@ -34,10 +34,10 @@ def exported_effects(chain: EffectChain, result: CloseLoop) -> dict[str, EffectV
     return groups
 
 
-def write_measurement_model(closed: Closed, result: CloseLoop, path: Path) -> None:
+def write_measurement_model(findings: LoopFindings, result: CloseLoop, path: Path) -> None:
     """Shared measurement effects and the terms of each scan, as JSON beside the process model."""
-    names = scan_parameter_names(closed.terms)
-    coefficients = scan_parameters(closed.development, closed.final.predictions, closed.terms)
+    names = parameter_names(findings.terms)
+    coefficients = scan_parameters(findings.development, findings.final.predictions, findings.terms)
     scale = np.array([1e3 if name.endswith("(nm)") else 1.0 for name in names])
     content = {
         "schema": "litho-models/measurement-model/1",
@@ -47,10 +47,10 @@ def write_measurement_model(closed: Closed, result: CloseLoop, path: Path) -> No
             for e in result.effects
             if e.role == "measurement" and not get_effect(e.name).per_scan
         },
-        "accepted": closed.accepted,
+        "accepted": findings.accepted,
         "scans": {
-            field.id: dict(zip(names, (row * scale).tolist(), strict=True))
-            for field, row in zip(closed.development, coefficients, strict=True)
+            scan.id: dict(zip(names, (row * scale).tolist(), strict=True))
+            for scan, row in zip(findings.development, coefficients, strict=True)
         },
     }
     with atomic_file(path) as temporary:

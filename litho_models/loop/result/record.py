@@ -9,6 +9,7 @@ from pydantic import SerializerFunctionWrapHandler, model_serializer
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunInfo
 from litho_data.store.schema import DatasetId
+from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.noise_floor import NoiseFloor
 from litho_models.splits.folds import Split
 
@@ -23,13 +24,6 @@ CandidateVerdict = Literal[
     "below-noise",
     "traced-to-covariate",
 ]
-
-
-class Nuisance(Record):
-    policy: Literal["offset"] = "offset"
-    k: int = 1
-    block_px: int
-    seed: int
 
 
 class Errors(Record):
@@ -93,7 +87,7 @@ class CloseLoop(Result):
     dataset: DatasetId
     base_model: str
     split: Split
-    nuisance: Nuisance
+    nuisance: NuisanceProtocol
     prior_hypotheses: list[str]
     noise_floor: NoiseFloor
     before: Errors

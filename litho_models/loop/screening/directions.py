@@ -10,15 +10,17 @@ import torch
 
 from litho_models.effects import Effect
 from litho_models.effects.chain import EffectChain
-from litho_models.loop.fitting import Linearisation
-from litho_models.loop.linear import gram_inside, nuisance_columns, orthonormal
-from litho_models.loop.parameters import set_vector
-from litho_models.loop.prepared import Field
+from litho_models.fitting.least_squares import gram_inside
+from litho_models.loop.fold_fits import FoldFits
+from litho_models.loop.linear import ALL_FREE, free_basis
+from litho_models.loop.parameters import model_for
+from litho_models.loop.prepared import PreparedScan
+from litho_models.scan_terms import Terms
 
-PROJECTIONS: Mapping[str, Mapping[str, bool]] = {
-    "full": {"gain": True},
-    "no-gain": {"gain": False},
-    "no-bow": {"gain": True, "bow": False},
+PROJECTIONS: Mapping[str, Terms] = {
+    "full": ALL_FREE,
+    "no-gain": ALL_FREE - {"gain"},
+    "no-bow": ALL_FREE - {"bow"},
 }
 
 
@@ -82,38 +84,36 @@ def blocks_of(effects: Sequence[Effect]) -> list[Block]:
 
 
 def measure_directions(
-    chain: EffectChain,
-    vector: np.ndarray,
-    linear: Sequence[Linearisation],
-    fields: Sequence[Field],
+    fits: FoldFits,
+    scans: Sequence[PreparedScan],
     residuals: Sequence[np.ndarray],
     effects: Sequence[Effect],
 ) -> Directions:
     """Secants of all trials and their inner products with the residual, for each scan.
 
     Args:
-        chain, vector: the model so far; ``linear``: its derivatives per scan.
-        fields: scans; ``residuals``: out-of-fold residual (n,) µm at the sampled pixels.
+        fits: the model so far.
+        scans: scans; ``residuals``: out-of-fold residual (n,) µm at the sampled pixels.
         effects: candidates, none of them in the chain.
     """
-    set_vector(chain, vector)
+    chain, linear = fits.chain, fits.linear
     blocks = blocks_of(effects)
     extended = [chain.with_effects(_with_trial(chain, b, t)) for b in blocks for t in b.trials]
     acts_on = [b.effect.acts_on for b in blocks for _ in b.trials]
     stacked: dict[str, list[np.ndarray]] = {name: [] for name in ("raw", *PROJECTIONS)}
-    for field, part, residual in zip(fields, linear, residuals, strict=True):
-        prediction, secants = _secants(chain, extended, acts_on, field)
-        columns = np.column_stack([residual, part.jacobian, *secants])
+    for scan, part, residual in zip(scans, linear, residuals, strict=True):
+        prediction, secants = _secants(chain, extended, acts_on, scan)
+        columns = np.column_stack([residual, part.jacobian.T, *secants])
         raw = columns.T @ columns
         stacked["raw"].append(raw)
         for name, terms in PROJECTIONS.items():
-            basis = orthonormal(nuisance_columns(field, prediction, **terms))
+            basis = free_basis(scan, prediction, terms)
             stacked[name].append(raw - gram_inside(columns, basis))
     return Directions(
         blocks=blocks,
         grams={name: np.stack(grams) for name, grams in stacked.items()},
-        parameters=linear[0].jacobian.shape[1],
-        pixels=np.array([len(field.sample) for field in fields]),
+        parameters=len(linear[0].jacobian),
+        pixels=np.array([len(scan.sample) for scan in scans]),
     )
 
 
@@ -147,16 +147,17 @@ def _with_trial(
 
 
 def _secants(
-    chain: EffectChain, extended: Sequence[EffectChain], acts_on: Sequence[str], field: Field
+    chain: EffectChain, extended: Sequence[EffectChain], acts_on: Sequence[str], scan: PreparedScan
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     with torch.no_grad():
-        before = chain.base(chain.before_base(field.layout, field.context))
-        here = chain.after_base(before, field.context)
+        before = model_for(chain.base, scan.id)(chain.before_base(scan.layout, scan.context))
+        here = chain.after_base(before, scan.context)
         secants = []
         for other, where in zip(extended, acts_on, strict=True):
             if where == "height":
-                moved = other.after_base(before, field.context)
+                moved = other.after_base(before, scan.context)
             else:
-                moved = other(field.layout, field.context)
-            secants.append(field.at_sample(moved - here))
+                base = model_for(other.base, scan.id)
+                moved = other.after_base(base(other.before_base(scan.layout, scan.context)), scan.context)
+            secants.append(scan.at_sample(moved - here))
     return here[0, 0].numpy(), secants

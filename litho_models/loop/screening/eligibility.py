@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from litho_models.loop.scoring import LINE_TERMS, Terms
-from litho_models.loop.screening.directions import Directions
+from litho_models.loop.screening.directions import PROJECTIONS, Directions
 from litho_models.loop.screening.score_test import FAMILY_P, SAME_COSINE, SMALLEST_RETAINED, Screened, cosine
 from litho_models.loop.selection.confirming import SMALLEST_SHARE
+from litho_models.scan_terms import Terms, line_terms
 
 # Promising this part of the best predicted gain is enough to be fitted.
 CONTENDER_SHARE = 0.5
 MOST_CONTENDERS, MOST_RELATIVES = 4, 3
-_FREE_WITHOUT = {"no-gain": "gain", "no-bow": "bow"}
 
 
 def may_be(s: Screened) -> bool:
@@ -37,8 +36,10 @@ def terms_for(terms: Terms, screened: Sequence[Screened]) -> Terms:
     be hidden by the scans' own.
     """
     free = (terms | {"warp"}) - {"distortion"}
-    free -= {_FREE_WITHOUT[s.projection] for s in screened if s.projection in _FREE_WITHOUT}
-    return free - LINE_TERMS if any(s.effect.along_lines for s in screened) else free
+    for s in screened:
+        free -= PROJECTIONS["full"] - PROJECTIONS[s.projection]
+    lines = {term.name for term in line_terms(free)}
+    return free - lines if any(s.effect.along_lines for s in screened) else free
 
 
 def shortlist(

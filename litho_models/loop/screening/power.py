@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,14 +10,12 @@ import torch
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import Effect, get_effect, screened_effects
-from litho_models.loop.linear import nuisance_columns, orthonormal
-from litho_models.loop.parameters import set_vector
-from litho_models.loop.prepared import Field
-from litho_models.loop.scoring import Terms, score
+from litho_models.loop.linear import without_scan_terms
 from litho_models.loop.screening.directions import measure_directions
 from litho_models.loop.screening.eligibility import is_eligible
 from litho_models.loop.screening.score_test import SAME_COSINE, best_by_fold, cosine, screen
-from litho_models.loop.state import State, held_out_residuals
+from litho_models.loop.study import State, Study, held_out_residuals
+from litho_models.scan_terms import Terms
 
 MULTIPLES = (0.125, 0.25, 0.5, 1.0)
 FOLDS_THAT_MUST_AGREE = 5 / 6
@@ -60,19 +57,15 @@ def parse_injection(text: str) -> tuple[Effect, float]:
     return effect, amount
 
 
-def plant(
-    text: str, state: State, fields: Sequence[Field], fold_of: np.ndarray, terms: Terms, seed: int
-) -> list[Planted]:
+def plant(text: str, state: State, study: Study, terms: Terms) -> list[Planted]:
     """Screen copies of the scans with the effect at several parts of the stated amount."""
     effect, amount = parse_injection(text)
     amplitude = effect.amplitudes[0]
     parameter = effect.parameters[amplitude]
     fits = state.fits
-    mse_nm2 = float(score(fields, state.predictions, terms, seed).mse_nm2.mean())
+    mse_nm2 = float(state.score(study, terms).mse_nm2.mean())
     candidates = [e for e in screened_effects() if e.name not in fits.chain.names]
-    windows = [field.window for field in fields]
-    held_out = held_out_residuals(state, windows, fold_of)
-    set_vector(fits.chain, fits.common)
+    windows, held_out = study.windows, held_out_residuals(state, study)
     outcomes = []
     for multiple in MULTIPLES:
         value = parameter.null + multiple * (amount - parameter.null)
@@ -89,15 +82,15 @@ def plant(
                 change = planted_chain(window.layout, window.context) - here
             added = window.at_sample(change)
             residuals.append(residual + added)
-            basis = orthonormal(nuisance_columns(window, here[0, 0].numpy(), gain=True))
-            squares.append(float(np.mean((added - basis @ (basis.T @ added)) ** 2)))
-        directions = measure_directions(fits.chain, fits.common, fits.linear, windows, residuals, candidates)
-        screened = screen(directions, fold_of)
+            freed = without_scan_terms(added, window, here[0, 0].numpy())
+            squares.append(float(np.mean(freed**2)))
+        directions = measure_directions(fits, windows, residuals, candidates)
+        screened = screen(directions, study.fold_of)
         own = next(s for s in screened if s.effect.name == effect.name)
         eligible = [s for s in screened if is_eligible(s, mse_nm2)]
         alike = {s.effect.name for s in eligible if abs(cosine(directions, own, s)) >= SAME_COSINE}
-        winners = best_by_fold(directions, eligible, fold_of) if eligible else []
-        power = sum(winner in alike | {effect.name} for winner in winners) / (int(fold_of.max()) + 1)
+        winners = best_by_fold(directions, eligible, study.fold_of) if eligible else []
+        power = sum(winner in alike | {effect.name} for winner in winners) / study.folds
         outcomes.append(
             Planted(
                 name=effect.name,

@@ -7,17 +7,15 @@ a good part of the best gain are fitted in full before one is chosen.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from litho_models.effects import Effect
-from litho_models.loop.fitting import FoldFits
+from litho_models.loop.fold_fits import FREE_TERMS, FoldFits
 from litho_models.loop.linear import pooled_cosine, without_scan_terms
 from litho_models.loop.parameters import effect_slots
-from litho_models.loop.prepared import Field
-from litho_models.loop.scoring import Score, Terms, score
 from litho_models.loop.screening.directions import Directions, measure_directions
 from litho_models.loop.screening.eligibility import is_eligible, shortlist, terms_for
 from litho_models.loop.screening.score_test import (
@@ -27,7 +25,8 @@ from litho_models.loop.screening.score_test import (
     screen,
 )
 from litho_models.loop.selection.confirming import BINOMIAL_P, SMALLEST_SHARE, Confirmation, confirm
-from litho_models.loop.state import State, fit_state, held_out_residuals
+from litho_models.loop.study import Score, State, Study, fit_state, held_out_residuals
+from litho_models.scan_terms import Terms
 
 TRIES_PER_ROUND = 3
 # Where none of the most promising is confirmed, the next ones are fitted.
@@ -84,36 +83,26 @@ class Contest:
 def hold_contest(
     state: State,
     candidates: Sequence[Effect],
-    fields: Sequence[Field],
-    fold_of: np.ndarray,
+    study: Study,
     terms: Terms,
     *,
-    floor_nm2: float,
-    seed: int,
     holder: tuple[str, State] | None = None,
-    report: Callable[[str], None] = lambda message: None,
 ) -> Contest:
     """Screen the candidates, fit those that stand out, and confirm the one the training sets agree on.
 
     Args:
         state: the model without any of the candidates.
         candidates: effects that are not in it.
-        fields: development scans; ``fold_of``: fold that holds each out.
-        terms: per-scan terms of the scoring.
-        floor_nm2: squared noise floor or its lower bound.
+        terms: scan terms of the scoring.
         holder: a candidate that takes part whatever its screening says, and the fitted model with it.
-        report: told in a sentence what happens.
     """
     if not candidates:
         return Contest([])
-    windows = [f.window for f in fields]
-    residuals = held_out_residuals(state, windows, fold_of)
-    fits = state.fits
-    directions = measure_directions(fits.chain, fits.common, fits.linear, windows, residuals, candidates)
-    found = Contest(screen(directions, fold_of))
-    mse_nm2 = float(score(fields, state.predictions, terms, seed).mse_nm2.mean())
+    directions = measure_directions(state.fits, study.windows, held_out_residuals(state, study), candidates)
+    found = Contest(screen(directions, study.fold_of))
+    mse_nm2 = float(state.score(study, terms).mse_nm2.mean())
     eligible = [s for s in found.screened if is_eligible(s, mse_nm2)]
-    report(f"{len(eligible)} of {len(found.screened)} candidates stand out")
+    study.report(f"{len(eligible)} of {len(found.screened)} candidates stand out")
     worth = WORTH_FITTING * SMALLEST_SHARE * mse_nm2
     for s in eligible:
         if s.mean_gain_nm2 < worth:
@@ -128,11 +117,11 @@ def hold_contest(
             [s for s in group if s.effect.name not in entered]
             for group in shortlist(found.screened, remaining, directions)
         )
-        entrants += _fitted(state, entering, fields, fold_of, report)
+        entrants += _fitted(state, entering, study)
         standing = sorted(
             (e for e in entrants if e.name not in rejected), key=lambda e: float(e.training_error.sum())
         )
-        changes = {e.name: _changes(state, e.state, fields) for e in standing}
+        changes = {e.name: _changes(state, e.state, study) for e in standing}
         for attempt, entrant in enumerate(standing[:TRIES_PER_ROUND]):
             alike = [
                 rival
@@ -140,13 +129,13 @@ def hold_contest(
                 if rival is not entrant
                 and pooled_cosine(changes[entrant.name], changes[rival.name]) >= SAME_COSINE
             ]
-            untold = [r.name for r in alike if not _told_apart(state, entrant, r, fields, terms, seed)]
-            untold += _untold_unfitted(entrant.screened, relatives, directions)
-            agreeing, folds = _agreement(standing[attempt:], {entrant.name, *untold})
+            confusable = [r.name for r in alike if not _told_apart(state, entrant, r, study, terms)]
+            confusable += _confusable_unfitted(entrant.screened, relatives, directions)
+            agreeing, folds = _agreement(standing[attempt:], {entrant.name, *confusable})
             if agreeing < folds - 1:
                 found.failures[entrant.name] = f"the best in only {agreeing} of {folds} training sets"
                 continue
-            added = judged(state, entrant, untold, fields, terms, floor_nm2=floor_nm2, seed=seed)
+            added = judged(state, entrant, confusable, study, terms)
             if added.confirmation.passed:
                 found.winner = added, entrant.state
                 found.failures.pop(entrant.name, None)
@@ -171,51 +160,44 @@ def fold_amplitudes(fits: FoldFits, effect: Effect) -> dict[str, np.ndarray]:
     return amplitudes
 
 
-def _fitted(
-    state: State,
-    entering: Sequence[Screened],
-    fields: Sequence[Field],
-    fold_of: np.ndarray,
-    report: Callable[[str], None],
-) -> list[Entrant]:
+def _fitted(state: State, entering: Sequence[Screened], study: Study) -> list[Entrant]:
     entrants, chain = [], state.fits.chain
     for s in entering:
-        report(f"fitting {s.effect.name}")
+        study.report(f"fitting {s.effect.name}")
         extended = chain.with_effects({**chain.values(), s.effect.name: s.values})
-        entrants.append(Entrant(s, fit_state(extended, fields, fold_of)))
+        entrants.append(Entrant(s, fit_state(extended, study)))
     return entrants
 
 
-def _untold_unfitted(winner: Screened, relatives: Sequence[Screened], directions: Directions) -> list[str]:
+def _confusable_unfitted(
+    winner: Screened, relatives: Sequence[Screened], directions: Directions
+) -> list[str]:
     """What cannot be told from the winner without having been fitted itself."""
-    untold = [s.effect.name for s in relatives if abs(cosine(directions, winner, s)) >= SAME_COSINE]
+    alike = [s.effect.name for s in relatives if abs(cosine(directions, winner, s)) >= SAME_COSINE]
     # The same tilt and bow in all scans: printed so, or measured so.
-    return [*untold, "tilt-bow"] if winner.projection == "no-bow" else untold
+    return [*alike, "tilt-bow"] if winner.projection == "no-bow" else alike
 
 
 def judged(
     state: State,
     entrant: Entrant,
-    untold: Sequence[str],
-    fields: Sequence[Field],
+    confusable: Sequence[str],
+    study: Study,
     terms: Terms,
-    *,
-    floor_nm2: float,
-    seed: int,
 ) -> Added:
     """The entrant as it would be added to ``state``, with its confirmation on the scans left out."""
     effect, own = entrant.screened.effect, terms_for(terms, [entrant.screened])
-    before, after = (score(fields, s.predictions, own, seed) for s in (state, entrant.state))
+    before, after = (s.score(study, own) for s in (state, entrant.state))
     confirmation = confirm(
         before.mse_nm2,
         after.mse_nm2,
         before.mae_nm,
         after.mae_nm,
-        floor_nm2=floor_nm2,
+        floor_nm2=study.floor_nm2,
         amplitudes=fold_amplitudes(entrant.state.fits, effect),
-        seed=seed,
+        seed=study.seed,
     )
-    return Added(effect, sorted(untold), before, after, confirmation, entrant.screened.p)
+    return Added(effect, sorted(confusable), before, after, confirmation, entrant.screened.p)
 
 
 def _agreement(entrants: Sequence[Entrant], names: set[str]) -> tuple[int, int]:
@@ -224,22 +206,18 @@ def _agreement(entrants: Sequence[Entrant], names: set[str]) -> tuple[int, int]:
     return sum(entrants[i].name in names for i in best), len(best)
 
 
-def _told_apart(
-    state: State, winner: Entrant, rival: Entrant, fields: Sequence[Field], terms: Terms, seed: int
-) -> bool:
+def _told_apart(state: State, winner: Entrant, rival: Entrant, study: Study, terms: Terms) -> bool:
     """The rival is worse in nearly every held-out scan, by a good part of the gain."""
     own = terms_for(terms, [winner.screened, rival.screened])
-    before, best, other = (
-        score(fields, s.predictions, own, seed) for s in (state, winner.state, rival.state)
-    )
-    verdict = confirm(other.mse_nm2, best.mse_nm2, other.mae_nm, best.mae_nm, seed=seed)
+    before, best, other = (s.score(study, own) for s in (state, winner.state, rival.state))
+    verdict = confirm(other.mse_nm2, best.mse_nm2, other.mae_nm, best.mae_nm, seed=study.seed)
     gain, lost = before.mse_nm2.mean() - best.mse_nm2.mean(), other.mse_nm2.mean() - best.mse_nm2.mean()
     return verdict.p <= BINOMIAL_P and lost >= TOLD_APART_SHARE * gain
 
 
-def _changes(before: State, after: State, fields: Sequence[Field]) -> list[np.ndarray]:
+def _changes(before: State, after: State, study: Study) -> list[np.ndarray]:
     """What a candidate changes in the held-out predictions, freed of what single scans may add, µm."""
     changes = []
-    for f, old, new in zip(fields, before.predictions, after.predictions, strict=True):
-        changes.append(without_scan_terms(f.at_sample(new - old), f, old, gain=False))
+    for f, old, new in zip(study.scans, before.predictions, after.predictions, strict=True):
+        changes.append(without_scan_terms(f.at_sample(new - old), f, old, FREE_TERMS))
     return changes

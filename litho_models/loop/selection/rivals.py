@@ -15,10 +15,9 @@ from scipy.ndimage import gaussian_filter
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.linear import without_scan_terms
-from litho_models.loop.prepared import Field
 from litho_models.loop.probes.defects import find_defects
 from litho_models.loop.probes.selection import generic_terms
-from litho_models.loop.state import State
+from litho_models.loop.study import State, Study
 
 # A generic term has to gain this much more: its own estimate is noisy, too.
 _BETTER = 1.05
@@ -29,29 +28,28 @@ _REMAINDER = 0.5
 _RESHAPING_BLURS_UM = (0.2, 0.6)
 
 
-def generic_rival(before: State, after: State, fields: Sequence[Field], fold_of: np.ndarray) -> str | None:
+def generic_rival(before: State, after: State, study: Study) -> str | None:
     """Name of a generic term that contains what the effect does, and gains more on the scans left out.
 
     Args:
         before, after: the model without and with the effect.
-        fields: development scans; ``fold_of``: fold that holds each out.
     """
     changes = [new - old for old, new in zip(before.predictions, after.predictions, strict=True)]
-    own = _freed(before, changes, fields)
-    defects = find_defects(fields, before.predictions)
-    for probe in generic_terms(fields, before.predictions, defects):
-        estimate = probe.held_out(fold_of)
+    own = _freed(before, changes, study)
+    defects = find_defects(study.scans, before.predictions)
+    for probe in generic_terms(study.scans, before.predictions, defects):
+        estimate = probe.held_out(study.fold_of)
         corrections = [
-            probe.correction(estimate.per_fold[fold], field, prediction)
-            for field, prediction, fold in zip(fields, before.predictions, fold_of, strict=True)
+            probe.correction(estimate.per_fold[fold], scan, prediction)
+            for scan, prediction, fold in zip(study.scans, before.predictions, study.fold_of, strict=True)
         ]
-        generic = _freed(before, corrections, fields)
+        generic = _freed(before, corrections, study)
         if _gain(generic) > _BETTER * _gain(own) and _is_contained(own, generic):
             return probe.name
     return None
 
 
-def remainder_of(named: tuple[State, State], before: State, after: State, fields: Sequence[Field]) -> str:
+def remainder_of(named: tuple[State, State], before: State, after: State, study: Study) -> str:
     """Why a further effect may be no more than the error in the form of one named before; empty if not.
 
     Another shape: the change by the first effect scaled, squared, growing with the height, blurred,
@@ -62,15 +60,14 @@ def remainder_of(named: tuple[State, State], before: State, after: State, fields
     Args:
         named: the model without and with the effect named before.
         before, after: the model without and with the further effect.
-        fields: development scans.
     """
     grams = []
-    for at, field in enumerate(fields):
+    for at, scan in enumerate(study.scans):
         prediction = before.predictions[at]
         change = named[1].predictions[at] - named[0].predictions[at]
-        maps = [*_reshaped(change, prediction, field.context.pitch_um), after.predictions[at] - prediction]
-        columns = [*map(field.at_sample, maps), field.height - field.at_sample(prediction)]
-        freed = without_scan_terms(np.column_stack(columns), field, prediction, gain=True)
+        maps = [*_reshaped(change, prediction, scan.context.pitch_um), after.predictions[at] - prediction]
+        columns = [*map(scan.at_sample, maps), scan.height - scan.at_sample(prediction)]
+        freed = without_scan_terms(np.column_stack(columns), scan, prediction)
         grams.append(freed.T @ freed)
     gram = np.sum(grams, axis=0)
     both = np.arange(len(gram) - 1)
@@ -108,10 +105,10 @@ def _gain(freed: Sequence[np.ndarray]) -> float:
     return float(np.mean(gains)) * NM_PER_UM**2
 
 
-def _freed(state: State, changes: Sequence[np.ndarray], fields: Sequence[Field]) -> list[np.ndarray]:
+def _freed(state: State, changes: Sequence[np.ndarray], study: Study) -> list[np.ndarray]:
     """Change and residual (n, 2) at the sampled pixels, free of what single scans may add, µm."""
     freed = []
-    for field, prediction, change in zip(fields, state.predictions, changes, strict=True):
-        columns = np.column_stack([field.at_sample(change), field.height - field.at_sample(prediction)])
-        freed.append(without_scan_terms(columns, field, prediction, gain=True))
+    for scan, prediction, change in zip(study.scans, state.predictions, changes, strict=True):
+        columns = np.column_stack([scan.at_sample(change), scan.height - scan.at_sample(prediction)])
+        freed.append(without_scan_terms(columns, scan, prediction))
     return freed

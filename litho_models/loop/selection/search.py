@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-import numpy as np
-
 from litho_models.effects import get_effect, screened_effects
-from litho_models.loop.prepared import Field
-from litho_models.loop.scoring import Terms
 from litho_models.loop.screening.score_test import Screened
 from litho_models.loop.selection.contest import Added, Contest, hold_contest
 from litho_models.loop.selection.rivals import generic_rival, remainder_of
-from litho_models.loop.state import State, fit_state
+from litho_models.loop.study import State, Study, fit_state
+from litho_models.scan_terms import Terms
 
 MOST_EFFECTS = 8
 # Of the amplitude of an effect: as well as a formula of the catalogue can be trusted.
@@ -59,26 +56,13 @@ class Search:
             self.failures.pop(contest.winner[0].effect.name, None)
 
 
-def search_effects(
-    start: State,
-    fields: Sequence[Field],
-    fold_of: np.ndarray,
-    terms: Terms,
-    *,
-    exclude: Mapping[str, str],
-    floor_nm2: float,
-    seed: int,
-    report: Callable[[str], None] = lambda message: None,
-) -> Search:
+def search_effects(start: State, study: Study, terms: Terms, *, exclude: Mapping[str, str]) -> Search:
     """Add effects one at a time while one is confirmed and no generic term does the same, and better.
 
     Args:
         start: the base model.
-        fields: development scans; ``fold_of``: fold that holds each out.
-        terms: per-scan terms of the scoring.
+        terms: scan terms of the scoring.
         exclude: effects that cannot be tested here, with the reason.
-        floor_nm2: squared noise floor or its lower bound.
-        report: told in a sentence what happens.
     """
     found = Search(start)
 
@@ -86,17 +70,7 @@ def search_effects(
         candidates = [
             effect for effect in screened_effects() if effect.name not in {*exclude, *state.fits.chain.names}
         ]
-        return hold_contest(
-            state,
-            candidates,
-            fields,
-            fold_of,
-            terms,
-            floor_nm2=floor_nm2,
-            seed=seed,
-            holder=holder,
-            report=report,
-        )
+        return hold_contest(state, candidates, study, terms, holder=holder)
 
     def select() -> bool:
         """Add winners while they earn a name; whether the last one was refused."""
@@ -105,9 +79,9 @@ def search_effects(
             found.note(held)
             if held.winner is None:
                 return False
-            if nameless := why_nameless(held.winner, found.state, found, fields, fold_of):
+            if rejected := rejection_reason(held.winner, found.state, found, study):
                 # Smaller effects cannot be named while the largest part of what is missing has no name.
-                found.failures[held.winner[0].effect.name] = nameless
+                found.failures[held.winner[0].effect.name] = rejected
                 return True
             found.add(*held.winner, before=found.state)
         return False
@@ -115,21 +89,15 @@ def search_effects(
     refused = select()
     chosen = found.names
     for entry in list(found.added[:-1]):
-        report(f"deciding once more on {entry.effect.name}")
-        _decide_again(found, entry, contest, fields, fold_of)
+        study.report(f"deciding once more on {entry.effect.name}")
+        _decide_again(found, entry, contest, study)
     if refused and found.names != chosen:
         # What it was refused for may be gone.
         select()
     return found
 
 
-def why_nameless(
-    winner: tuple[Added, State],
-    before: State,
-    found: Search,
-    fields: Sequence[Field],
-    fold_of: np.ndarray,
-) -> str:
+def rejection_reason(winner: tuple[Added, State], before: State, found: Search, study: Study) -> str:
     """Why a winner gets no name: a generic term, or the error in an earlier one's form, does as much."""
     added, state = winner
     for earlier in found.added:
@@ -138,9 +106,9 @@ def why_nameless(
             continue
         if added.gain_nm2 < FORM_ERROR**2 * earlier.gain_nm2:
             return f"small beside {name}, whose form no catalogue knows to {100 * FORM_ERROR:.0f} %"
-        if reason := remainder_of(found.steps[name], before, state, fields):
+        if reason := remainder_of(found.steps[name], before, state, study):
             return reason.format(name)
-    rival = generic_rival(before, state, fields, fold_of)
+    rival = generic_rival(before, state, study)
     return f"{rival} does the same, and better, without a name" if rival else ""
 
 
@@ -148,13 +116,12 @@ def _decide_again(
     found: Search,
     entry: Added,
     contest: Callable[..., Contest],
-    fields: Sequence[Field],
-    fold_of: np.ndarray,
+    study: Study,
 ) -> None:
     """An effect was chosen before those that came later: with them in place it defends its place."""
     name, chain = entry.effect.name, found.state.fits.chain
     kept = {other: values for other, values in chain.values().items() if other != name}
-    without = fit_state(chain.with_effects(kept), fields, fold_of)
+    without = fit_state(chain.with_effects(kept), study)
     held = contest(without, (name, found.state))
     if held.winner is None:
         found.added.remove(entry)
@@ -166,7 +133,7 @@ def _decide_again(
         # Where it stands in the order stays; with what it can be confused is known better now.
         found.added[found.added.index(entry)] = replace(entry, confusable_with=added.confusable_with)
         return
-    if why_nameless(held.winner, without, found, fields, fold_of):
+    if rejection_reason(held.winner, without, found, study):
         return
     found.dropped[name] = f"{added.effect.name} does better once the others were added"
     found.added.remove(entry)

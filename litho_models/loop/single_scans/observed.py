@@ -11,11 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from litho_data.foundation.units import NM_PER_UM
-from litho_models.loop.prepared import Field
+from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.probes.defects import Defects
-from litho_models.loop.scoring import LINE_TERMS, Terms, score
 from litho_models.loop.selection.confirming import BINOMIAL_P, SMALLEST_RMSE_NM
-from litho_models.scan_terms.nuisance import row_index
+from litho_models.loop.study import Study
+from litho_models.scan_terms import Terms, line_terms, row_index
+from litho_models.scan_terms.lines import axis_along
 from litho_models.scoring.statistics import one_sided_flip_p
 
 # Heights closer than this are one value of a file that rounds in single precision.
@@ -64,10 +65,10 @@ def quantisation(rounding_um: Sequence[float]) -> Observed:
     return Observed("quantisation", noise_nm >= SMALLEST_RMSE_NM, text)
 
 
-def scars(fields: Sequence[Field], defects: Defects) -> Observed:
+def scars(scans: Sequence[PreparedScan], defects: Defects) -> Observed:
     """Outliers drawn out along the scan lines, against those drawn out across them, scan by scan."""
     along, across = (
-        np.array([sum(b.scan == f.id and getattr(b, kind) for b in defects.blobs) for f in fields])
+        np.array([sum(b.scan == f.id and getattr(b, kind) for b in defects.blobs) for f in scans])
         for kind in ("row_limited", "column_limited")
     )
     p = one_sided_flip_p((along - across).astype(float))
@@ -79,16 +80,17 @@ def scars(fields: Sequence[Field], defects: Defects) -> Observed:
     return Observed("scars-and-spikes", bool(seen), text)
 
 
-def line_roughness(
-    fields: Sequence[Field], predictions: Sequence[np.ndarray], terms: Terms, seed: int
-) -> Observed:
+def line_roughness(study: Study, predictions: Sequence[np.ndarray], terms: Terms) -> Observed:
     """Residual that neighbours along a scan line share and neighbours across do not, in flat places.
 
     The mean of every line, of the scan and of the layout, is taken out first: offsets of whole lines are
     a term of single scans. Slopes are left out: what a model misses there is not noise.
     """
-    residuals = score(fields, predictions, terms - LINE_TERMS, seed).residual_um
-    shared = np.array([_shared_nm2(f, p, r) for f, p, r in zip(fields, predictions, residuals, strict=True)])
+    lines = {term.name for term in line_terms(terms)}
+    residuals = study.score(predictions, terms - lines).residual_um
+    shared = np.array(
+        [_shared_nm2(f, p, r) for f, p, r in zip(study.scans, predictions, residuals, strict=True)]
+    )
     along, across = shared.T
     p = one_sided_flip_p(along - across)
     rms_nm = float(np.sqrt(max((along - across).mean(), 0.0)))
@@ -100,27 +102,27 @@ def line_roughness(
     return Observed("line-roughness", bool(p <= BINOMIAL_P and rms_nm >= SMALLEST_RMSE_NM), text)
 
 
-def bends(fields: Sequence[Field]) -> Observed:
+def bends(scans: Sequence[PreparedScan]) -> Observed:
     """Scans that registration found bent, and straightened: the loop sees them without their bend."""
-    found_um = [f.scan.bend_um.largest for f in fields if f.scan.bend_um is not None]
-    text = f"registration straightened {len(found_um)} of {len(fields)} scans"
+    found_um = [f.stored.bend_um.largest for f in scans if f.stored.bend_um is not None]
+    text = f"registration straightened {len(found_um)} of {len(scans)} scans"
     if found_um:
         text += f", bent by up to {max(found_um):.2f} µm (median {np.median(found_um):.2f} µm)"
     return Observed("registration-residual", bool(found_um), text)
 
 
-def _shared_nm2(field: Field, prediction: np.ndarray, residual_um: np.ndarray) -> tuple[float, float]:
+def _shared_nm2(scan: PreparedScan, prediction: np.ndarray, residual_um: np.ndarray) -> tuple[float, float]:
     """Mean product of residuals some lags apart, along the lines and across them, nm²."""
     slope = np.hypot(*np.gradient(prediction))
     flat = np.isfinite(residual_um) & (slope <= np.median(slope))
     values = np.where(flat, residual_um, 0.0) * NM_PER_UM
-    for line in (field.line, row_index(flat.shape)):
+    for line in (scan.line, row_index(flat.shape)):
         # In the sample: what this takes off too much makes neighbours along a line share less, not more.
         total, count = (
             np.bincount(line[flat], weights=w, minlength=line.max() + 1) for w in (values[flat], None)
         )
         values = np.where(flat, values - (total / np.maximum(count, 1))[line], 0.0)
-    first, last = (max(1, round(lag / field.context.pitch_um)) for lag in _LINE_LAGS_UM)
+    first, last = (max(1, round(lag / scan.context.pitch_um)) for lag in _LINE_LAGS_UM)
     lags = range(first, last + 1)
 
     def mean_product(v: np.ndarray, w: np.ndarray) -> float:
@@ -131,28 +133,25 @@ def _shared_nm2(field: Field, prediction: np.ndarray, residual_um: np.ndarray) -
     weight = flat.astype(float)
     by_axis = mean_product(values.T, weight.T), mean_product(values, weight)
     # A scan turned by 90 degrees has its lines along y.
-    steps = [float(np.abs(np.diff(field.line, axis=axis)).mean()) for axis in (0, 1)]
-    return (by_axis[1], by_axis[0]) if steps[0] >= steps[1] else by_axis
+    return (by_axis[1], by_axis[0]) if axis_along(scan.line) else by_axis
 
 
 def observe(
-    fields: Sequence[Field],
+    study: Study,
     predictions: Sequence[np.ndarray],
     terms: Terms,
     defects: Defects,
     rounding_um: Mapping[str, float] | None,
-    seed: int,
 ) -> dict[str, Observed]:
     """All effects that are seen directly; without the raw files nothing is said about their rounding.
 
     Args:
-        fields: development scans; ``predictions``: held-out heights (y, x), µm, of the final model.
-        terms: per-scan terms that were accepted.
+        predictions: held-out heights (y, x), µm, of the final model.
+        terms: scan terms that were accepted.
         defects: outliers of the scans.
         rounding_um: step of the heights in each scan's raw file, by id, if known.
-        seed: of the halves on which per-scan terms are fitted and scored.
     """
-    seen = [scars(fields, defects), line_roughness(fields, predictions, terms, seed), bends(fields)]
+    seen = [scars(study.scans, defects), line_roughness(study, predictions, terms), bends(study.scans)]
     if rounding_um is not None:
-        seen.append(quantisation([rounding_um[f.id] for f in fields]))
+        seen.append(quantisation([rounding_um[f.id] for f in study.scans]))
     return {one.name: one for one in seen}

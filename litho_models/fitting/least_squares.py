@@ -1,0 +1,257 @@
+"""One least squares for small models: damped Gauss-Newton with the terms of single scans solved for beside.
+
+The loss is a sum of squares, or of absolute values by reweighting: weights 1/sqrt(r² + δ²) turn squares into
+absolute values. What is fitted (a model of the zoo, or the loop's model with effects) and how its derivatives
+are had is the problem's own business; where it may go is the problem's ``room``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+from scipy.optimize import lsq_linear
+
+Loss = Literal["absolute", "squares"]
+Room = tuple[np.ndarray, np.ndarray]
+
+# Residuals below this count squared: far below the noise of a print (16 nm).
+ABSOLUTE_WIDTH_UM = 0.002
+_DAMPING_START = 1e-3
+# Squared size below which a combination of unit columns is round-off.
+_SMALLEST_EIGENVALUE = 1e-10
+_WEAKEST_INFLUENCE = 1e-8
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """One scan at given parameters, µm, at n pixels.
+
+    Attributes:
+        residual: measured minus predicted, (n,).
+        jacobian: derivatives of the prediction, (p, n).
+        basis: what the scan may add by itself, (k, n).
+    """
+
+    residual: np.ndarray
+    jacobian: np.ndarray
+    basis: np.ndarray
+
+
+class Problem(Protocol):
+    """What is fitted, scan by scan."""
+
+    def linearise(self, vector: np.ndarray) -> list[Linearised]:
+        """All scans at these parameters."""
+
+    def residuals(self, vector: np.ndarray) -> list[np.ndarray]:
+        """Measured minus predicted (n,) of all scans, µm."""
+
+    def room(self, vector: np.ndarray) -> Room | None:
+        """Smallest and largest step (p,) allowed from here; None where only its length has a bound."""
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How a fit is made.
+
+    Attributes:
+        loss: what is minimised.
+        term_weight: weight left to what the scans may add by themselves, with ``squares``: enough to fix what
+            only these terms carry (the common datum), too little to let one scan pull the parameters.
+        pinned: leading scan terms whose mean over the scans is held at zero, with ``absolute``.
+        steps: at most so many; ``relative_gain``: a smaller gain of one step ends the fit.
+        tries: of a step, each with ten times the damping; ``lowest_damping``: never less than this.
+        step_limit: largest change of a parameter in one step, where the problem has no ``room``.
+    """
+
+    loss: Loss
+    term_weight: float = 1e-3
+    pinned: int = 0
+    steps: int = 12
+    relative_gain: float = 5e-4
+    tries: int = 4
+    lowest_damping: float = 0.0
+    step_limit: float = np.inf
+
+
+@dataclass(frozen=True)
+class LeastSquaresFit:
+    """Fitted parameters (p,), the scans at them, and the loss after each step."""
+
+    vector: np.ndarray
+    linear: list[Linearised]
+    losses: list[float]
+
+
+def fit_least_squares(problem: Problem, start: np.ndarray, rules: Rules) -> LeastSquaresFit:
+    """Fit the parameters of a problem from ``start``; steps keep its dtype."""
+    vector, linear = start, problem.linearise(start)
+    if not len(start):
+        return LeastSquaresFit(vector, linear, [])
+    terms = np.zeros((len(linear), len(linear[0].basis))) if rules.loss == "absolute" else None
+    damping, losses = _DAMPING_START, []
+    for _ in range(rules.steps):
+        equations = NormalEquations.at(linear, terms, rules)
+        room = problem.room(vector)
+        for _ in range(rules.tries):
+            step, term_step = equations.solve(damping, room, rules.step_limit)
+            trial = vector + step.astype(start.dtype)
+            moved = None if terms is None else terms + term_step
+            loss = _total_loss(problem.residuals(trial), linear, moved, rules)
+            if loss <= equations.loss:
+                break
+            damping *= 10
+        else:
+            break
+        gained = equations.loss - loss
+        vector, terms, damping = trial, moved, max(damping / 10, rules.lowest_damping)
+        losses.append(loss)
+        linear = problem.linearise(vector)
+        if gained < rules.relative_gain * loss:
+            break
+    return LeastSquaresFit(vector, linear, losses)
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """Parameters first, then the terms of each scan, then the rows that pin the leading ones.
+
+    With ``squares`` the terms of the scans are eliminated and only the parameters are left.
+    """
+
+    matrix: np.ndarray
+    right: np.ndarray
+    count: int
+    term_shape: tuple[int, int]
+    loss: float
+
+    @classmethod
+    def at(cls, linear: Sequence[Linearised], terms: np.ndarray | None, rules: Rules) -> NormalEquations:
+        """The equations at linearised scans with the present ``terms`` (scans, k)."""
+        count = len(linear[0].jacobian)
+        if terms is None:
+            parts = [eliminated(part, rules.term_weight) for part in linear]
+            matrix, right = np.sum([p[0] for p in parts], axis=0), np.sum([p[1] for p in parts], axis=0)
+            return cls(matrix, right, count, (len(linear), 0), sum(p[2] for p in parts))
+        each, pinned = terms.shape[1], rules.pinned
+        size = count + terms.size
+        matrix, right = np.zeros((size + pinned, size + pinned)), np.zeros(size + pinned)
+        losses = []
+        for number, part in enumerate(linear):
+            design = np.concatenate([part.jacobian, part.basis])
+            residual = part.residual - terms[number] @ part.basis
+            magnitude = _magnitude(residual)
+            first = count + number * each
+            own = np.r_[0:count, first : first + each]
+            matrix[np.ix_(own, own)] += (design / magnitude) @ design.T / residual.size
+            right[own] += design @ (residual / magnitude) / residual.size
+            for term in range(pinned):
+                matrix[size + term, first + term] = matrix[first + term, size + term] = 1
+            losses.append(magnitude.mean())
+        return cls(matrix, right, count, terms.shape, float(np.mean(losses)))
+
+    def solve(self, damping: float, room: Room | None, step_limit: float) -> tuple[np.ndarray, np.ndarray]:
+        """Changes of the parameters within their room, and of the terms (scans, k)."""
+        count = self.count
+        if room is not None:
+            step = solve_damped(*self._parameters_only(), damping, room)
+        else:
+            damped = self.matrix.copy()
+            diagonal = np.arange(count)
+            scale = damped[diagonal, diagonal]
+            damped[diagonal, diagonal] += damping * np.maximum(scale, 1e-9 * scale.max())
+            step = np.linalg.lstsq(damped, self.right, rcond=1e-14)[0][:count].clip(-step_limit, step_limit)
+        # The best terms for the step as it is taken, not as it was asked for.
+        rest = self.right[count:] - self.matrix[count:, :count] @ step
+        scans, each = self.term_shape
+        if not scans * each:
+            return step, np.zeros(self.term_shape)
+        terms = np.linalg.lstsq(self.matrix[count:, count:], rest, rcond=1e-14)[0]
+        return step, terms[: scans * each].reshape(scans, each)
+
+    def _parameters_only(self) -> tuple[np.ndarray, np.ndarray]:
+        """The equations with the terms of the scans eliminated."""
+        count = self.count
+        if len(self.matrix) == count:
+            return self.matrix, self.right
+        columns = np.column_stack([self.matrix[count:, :count], self.right[count:]])
+        solved = np.linalg.lstsq(self.matrix[count:, count:], columns, rcond=1e-14)[0]
+        across = self.matrix[:count, count:] @ solved
+        return self.matrix[:count, :count] - across[:, :-1], self.right[:count] - across[:, -1]
+
+
+def eliminated(part: Linearised, term_weight: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """Normal matrix, right side and weighted sum of squares of one scan, its own terms eliminated."""
+    full = gram(np.vstack([part.jacobian, part.residual]).T, part.basis.T, term_weight)
+    return full[:-1, :-1], full[:-1, -1], float(full[-1, -1])
+
+
+def solve_damped(
+    normal: np.ndarray, right: np.ndarray, damping: float, room: Room | None = None
+) -> np.ndarray:
+    """Minimise x·A·x / 2 - b·x + damping x·diag(A)·x / 2 inside a box; robust against idle parameters.
+
+    A step that is cut to its bounds afterwards would leave the other parameters where only the uncut
+    step was best, and a fit whose optimum lies on a bound would creep; inside the box they follow.
+
+    Args:
+        normal, right: A (p, p), positive semi-definite, and b (p,).
+        damping: relative to the diagonal.
+        room: lowest and highest x, (p,) each; none by default.
+    """
+    diagonal = np.diag(normal).copy()
+    floor = max(_WEAKEST_INFLUENCE * diagonal.max(), np.finfo(float).tiny)
+    scale = np.sqrt(np.maximum(diagonal, floor))
+    scaled = normal / np.outer(scale, scale) + damping * np.eye(len(normal))
+    step = np.linalg.lstsq(scaled, right / scale, rcond=1e-9)[0] / scale
+    if room is None or ((step >= room[0]) & (step <= room[1])).all():
+        return step
+    factor = np.linalg.cholesky(scaled + _SMALLEST_EIGENVALUE * np.eye(len(normal)))
+    target = np.linalg.solve(factor, right / scale)
+    # lsq_linear wants room between the bounds; a parameter without any stays where it is.
+    width = np.maximum(room[1] - room[0], 1e-12)
+    box = (room[0] * scale, (room[0] + width) * scale)
+    return lsq_linear(factor.T, target, box, method="bvls").x / scale
+
+
+def orthonormal(columns: np.ndarray) -> np.ndarray:
+    """Orthonormal basis (n, k') of the span of the columns; columns without content are dropped."""
+    if not columns.shape[1]:
+        return columns
+    scaled = columns / np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny)
+    sizes, directions = np.linalg.eigh(scaled.T @ scaled)
+    kept = sizes > _SMALLEST_EIGENVALUE * max(sizes.max(), np.finfo(float).tiny)
+    return scaled @ (directions[:, kept] / np.sqrt(sizes[kept]))
+
+
+def gram(columns: np.ndarray, basis: np.ndarray, weight_in_basis: float = 0.0) -> np.ndarray:
+    """Inner products (m, m) of the columns (n, m), the part inside the basis (n, k) weighted down."""
+    return columns.T @ columns - (1 - weight_in_basis) * gram_inside(columns, basis)
+
+
+def gram_inside(columns: np.ndarray, basis: np.ndarray) -> np.ndarray:
+    """Inner products (m, m) of the columns' parts inside an orthonormal basis (n, k)."""
+    inside = basis.T @ columns
+    return inside.T @ inside
+
+
+def _total_loss(
+    residuals: Sequence[np.ndarray], linear: Sequence[Linearised], terms: np.ndarray | None, rules: Rules
+) -> float:
+    if terms is None:
+        weight = rules.term_weight
+        return sum(
+            float(gram(r[:, None], part.basis.T, weight)[0, 0])
+            for r, part in zip(residuals, linear, strict=True)
+        )
+    losses = [
+        _magnitude(r - own @ part.basis).mean() for r, own, part in zip(residuals, terms, linear, strict=True)
+    ]
+    return float(np.mean(losses))
+
+
+def _magnitude(residual_um: np.ndarray) -> np.ndarray:
+    return np.sqrt(residual_um**2 + ABSOLUTE_WIDTH_UM**2)

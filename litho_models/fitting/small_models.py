@@ -1,0 +1,159 @@
+"""Small models of the zoo fitted to printed scans: a window of each, derivatives in forward mode."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from litho_data.store import PrintedScan
+from litho_models.fitting.crops import Window, cut, stack
+from litho_models.fitting.least_squares import Linearised, Rules, fit_least_squares
+from litho_models.scan_terms import Policy, TermPixels, Terms, line_terms, term_maps
+from litho_models.scan_terms.training import PINNED, training_terms
+from litho_models.simulator import Simulator
+
+# A small model needs no more than a quarter of each scan: another quadrant from scan to scan.
+WINDOW_PX = 256
+THINNING_PX = 2
+# Parameters are heights in µm, logits or logarithms: one step beyond a unit would leave the range in
+# which the linearisation means anything, and a sigmoid's flat end is never left again.
+STEP_LIMIT = 1.0
+RULES = Rules("absolute", term_weight=0.0, steps=30, relative_gain=1e-4, tries=10, lowest_damping=1e-3)
+
+
+def fit_small_model(
+    model: Simulator, scans: Sequence[PrintedScan], policy: Policy, free_gain: bool = False
+) -> list[float]:
+    """Fit ``model`` in place to the mean absolute error, on every second row and column of a window per scan.
+
+    Line offsets of ``full+rows`` are left out: they average out over a scan and cannot move a small model.
+
+    Returns:
+        mean absolute residual after each step, µm, the terms of the scans taken out.
+    """
+    parameters = list(model.parameters())
+    if not parameters:
+        return []
+    terms = training_terms(policy, free_gain)
+    terms -= {term.name for term in line_terms(terms)}
+    limit = np.inf if model.is_linear else STEP_LIMIT
+    rules = Rules(**{**vars(RULES), "pinned": len(PINNED & terms), "step_limit": limit})
+    fitted = fit_least_squares(ModelProblem(model, scans, terms), _vector(model), rules)
+    _load(model, fitted.vector)
+    return fitted.losses
+
+
+class ModelProblem:
+    """A model on windows of scans; works on a copy of the model of its own.
+
+    Args:
+        model: the model; ``scans``: what it is fitted to; ``terms``: what each may add.
+    """
+
+    def __init__(self, model: Simulator, scans: Sequence[PrintedScan], terms: Terms):
+        self._model = copy.deepcopy(model)
+        self._samples = [_Sample(scan, number) for number, scan in enumerate(scans)]
+        self._terms = terms
+
+    def linearise(self, vector: np.ndarray) -> list[Linearised]:
+        """All scans at these parameters."""
+        _load(self._model, vector)
+        return [sample.linearise(self._model, self._terms) for sample in self._samples]
+
+    def residuals(self, vector: np.ndarray) -> list[np.ndarray]:
+        """Measured minus predicted of all scans, µm."""
+        _load(self._model, vector)
+        return [sample.residual(sample.height_um(self._model)) for sample in self._samples]
+
+    def room(self, vector: np.ndarray) -> None:
+        """No bounds: the models' own parameters are free."""
+
+
+class _Sample:
+    """One window of a scan on every second row and column."""
+
+    def __init__(self, scan: PrintedScan, number: int):
+        size = min(WINDOW_PX, *scan.shape)
+        row, column = divmod(number % 4, 2)
+        y, x = ((length - size) * far for length, far in zip(scan.shape, (row, column), strict=True))
+        self._window = Window(0, y, x, size)
+        self._layout_um = scan.layout_um
+        height = cut(scan.height_um, self._window)
+        used = np.zeros(height.shape, bool)
+        used[::THINNING_PX, ::THINNING_PX] = True
+        self._used = np.flatnonzero(used & cut(scan.valid, self._window) & np.isfinite(height))
+        self._height = height.reshape(-1)[self._used].astype(np.float64)
+        self._expansion: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+
+    def linearise(self, model: Simulator, terms: Terms) -> Linearised:
+        """The scan at the model as it is; a linear model is differentiated once."""
+        if model.is_linear and self._expansion is not None:
+            height, jacobian = self.height_um(model), self._expansion[2]
+        else:
+            height, jacobian = self.height_um(model), _jacobian(model, self)
+            if model.is_linear:
+                self._expansion = _vector(model).astype(np.float64), height, jacobian
+        basis = term_maps(TermPixels(height, at=self._used), terms)
+        return Linearised(self.residual(height), self._thinned(jacobian), basis)
+
+    def height_um(self, model: Simulator) -> np.ndarray:
+        """Height of the window (y, x), µm, float64."""
+        if model.is_linear and self._expansion is not None:
+            here, value, jacobian = self._expansion
+            return value + np.tensordot(_vector(model) - here, jacobian, axes=1)
+        with torch.no_grad():
+            return self.predict(model).double().numpy()
+
+    def predict(self, model: Simulator) -> Tensor:
+        """Height of the window, (y, x) µm, its surroundings taken into account."""
+        if model.reach_px is None:
+            return model(stack([self._layout_um], [self._window]))[0, 0]
+        return model.interior(stack([self._layout_um], [self._window], model.reach_px))[0, 0]
+
+    def residual(self, height_um: np.ndarray) -> np.ndarray:
+        """Measured minus predicted at the used pixels, µm."""
+        return self._height - self._thinned(height_um)
+
+    def _thinned(self, fields: np.ndarray) -> np.ndarray:
+        return fields.reshape(*fields.shape[:-2], -1)[..., self._used]
+
+
+def _jacobian(model: Simulator, sample: _Sample) -> np.ndarray:
+    """Derivatives (parameters, y, x) of the window, one column per parameter in forward mode, float64."""
+    prediction = _WindowPrediction(model, sample)
+    named = {f"model.{name}": parameter for name, parameter in model.named_parameters()}
+    sizes = [parameter.numel() for parameter in named.values()]
+
+    def predict(vector: Tensor) -> Tensor:
+        parts = zip(named.items(), vector.split(sizes), strict=True)
+        values = {name: part.reshape(parameter.shape) for (name, parameter), part in parts}
+        return torch.func.functional_call(prediction, values, ())
+
+    here = torch.nn.utils.parameters_to_vector(list(named.values())).detach()
+    columns = [torch.func.jvp(predict, (here,), (direction,))[1] for direction in torch.eye(here.numel())]
+    return torch.stack(columns).detach().double().numpy()
+
+
+def _vector(model: Simulator) -> np.ndarray:
+    return torch.nn.utils.parameters_to_vector(list(model.parameters())).detach().numpy().copy()
+
+
+def _load(model: Simulator, vector: np.ndarray) -> None:
+    with torch.no_grad():
+        torch.nn.utils.vector_to_parameters(torch.as_tensor(vector, dtype=torch.float32), model.parameters())
+
+
+class _WindowPrediction(torch.nn.Module):
+    """``sample.predict`` as a module, the form in which torch swaps parameters for tangents."""
+
+    def __init__(self, model: Simulator, sample: _Sample):
+        super().__init__()
+        self.model = model
+        self._sample = sample
+
+    def forward(self) -> Tensor:
+        return self._sample.predict(self.model)

@@ -1,0 +1,48 @@
+"""A base model that is trained elsewhere, one per fold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from torch import nn
+
+from litho_data.store import PrintedScan
+from litho_models.loop.prepared import PreparedScan
+
+Trainer = Callable[[Sequence[PrintedScan]], nn.Module]
+
+
+class FoldedBase(nn.Module):
+    """One trained model per fold; each scan is predicted by the one that has not seen it.
+
+    Args:
+        models: by fold; ``fold_of``: scan id to fold; ``common``: for every other scan.
+    """
+
+    def __init__(self, models: Sequence[nn.Module], fold_of: Mapping[str, int], common: nn.Module):
+        super().__init__()
+        self.models = nn.ModuleList(models)
+        self.common = common
+        self.fold_of = dict(fold_of)
+        self.eval().requires_grad_(False)
+
+    def of_scan(self, scan_id: str) -> nn.Module:
+        """The model that has not seen this scan."""
+        fold = self.fold_of.get(scan_id)
+        return self.common if fold is None else self.models[fold]
+
+
+def train_folds(scans: Sequence[PreparedScan], fold_of: np.ndarray, trainer: Trainer) -> FoldedBase:
+    """Train once without each fold and once on all development scans."""
+    models = [
+        trainer([scan.stored for scan, own in zip(scans, fold_of, strict=True) if own != fold])
+        for fold in range(int(fold_of.max()) + 1)
+    ]
+    assigned = {scan.id: int(fold) for scan, fold in zip(scans, fold_of, strict=True)}
+    return FoldedBase(models, assigned, trainer([scan.stored for scan in scans]))
+
+
+def same_for_all(model: nn.Module, scans: Sequence[PreparedScan]) -> FoldedBase:
+    """A model trained elsewhere, on scans that nobody here knows."""
+    return FoldedBase([model], {scan.id: 0 for scan in scans}, model)

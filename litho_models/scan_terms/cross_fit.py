@@ -1,0 +1,142 @@
+"""A scan freed of its terms, which are fitted on pixels that are not scored.
+
+A microscope's datum or a bow says nothing about the printer, so an error figure may be freed of it. Every
+figure in the project that is freed of anything comes from ``cross_fit``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError
+from litho_models.scan_terms.blocks import Blocks, BoolMap, checkerboard, line_cells
+from litho_models.scan_terms.lines import axis_along, shrunk_line_offsets
+from litho_models.scan_terms.term import (
+    FloatMap,
+    LineIndex,
+    ScanTerm,
+    TermPixels,
+    Terms,
+    chosen_terms,
+    line_terms,
+    term_maps,
+)
+
+
+@dataclass(frozen=True)
+class CrossFit:
+    """A scan freed of its terms.
+
+    Attributes:
+        residual_um: measured minus predicted minus terms, (ny, nx) µm, NaN where not scored.
+        degrees_of_freedom: fitted per pixel scored; the shrunk offsets of lines count with their weight.
+        line_sd_um: standard deviation of the offsets of lines, 0 without them.
+    """
+
+    residual_um: FloatMap
+    degrees_of_freedom: float
+    line_sd_um: float
+
+
+def cross_fit(
+    height_um: np.ndarray,
+    prediction_um: np.ndarray,
+    valid: np.ndarray,
+    terms: Terms,
+    blocks: Blocks | None = None,
+    *,
+    scan_line: LineIndex | None = None,
+) -> CrossFit:
+    """Residual of one scan with its terms estimated on other pixels than those scored.
+
+    Args:
+        height_um: measured height (ny, nx), µm; NaN allowed where not valid.
+        prediction_um: the model's height (ny, nx), µm.
+        valid: bool (ny, nx), pixels that count.
+        terms: names of the catalogue; see ``POLICIES`` for the usual sets.
+        blocks: which pixels are fitted on; the standard ones by default.
+        scan_line: index of the scan line of each pixel (ny, nx), from 0; rows of the array if None.
+
+    Raises:
+        InputError: an unknown term, shapes that differ, a prediction that is not finite, or a scan that is
+            too small for the terms.
+    """
+    blocks = blocks or Blocks()
+    chosen_terms(terms)
+    height, prediction = np.asarray(height_um, np.float64), np.asarray(prediction_um, np.float64)
+    if not height.shape == prediction.shape == valid.shape:
+        shapes = f"height {height.shape}, prediction {prediction.shape}, valid {valid.shape}"
+        raise InputError("shapes of one scan differ", got=shapes, wanted="one (ny, nx)")
+    if scan_line is not None and (scan_line.shape != height.shape or scan_line.min() < 0):
+        wanted = f"indices from 0, shape {height.shape}"
+        raise InputError("scan_line", got=f"shape {scan_line.shape}", wanted=wanted)
+    usable = blocks.inside(np.asarray(valid, bool) & np.isfinite(height))
+    bad = int(np.sum(~np.isfinite(prediction[usable])))
+    if bad:
+        raise InputError("prediction", got=f"{bad} non-finite pixels", wanted="none")
+    difference = np.where(usable, height - prediction, 0.0)
+    residual = np.full(height.shape, np.nan)
+    if not terms:
+        residual[usable] = difference[usable]
+        return CrossFit(residual, 0.0, 0.0)
+    basis = term_maps(TermPixels(prediction, scan_line), terms).reshape(-1, *height.shape)
+    lines = [(term, _lines(term, height.shape, scan_line)) for term in line_terms(terms)]
+    freedom, variances = [], []
+    for half in checkerboard(height.shape, blocks):
+        rest = difference - _fitted(basis, difference, half.calibrate & usable)
+        for cell in line_cells(height.shape, (axis_along(line) for _, line in lines), blocks.line_gap_px):
+            freed, weights = rest, 0.0
+            for _, line in lines:
+                other = cell.other_side[axis_along(line)] & usable
+                offsets, weight, variance = shrunk_line_offsets(freed, other, line, blocks.block_px)
+                freed = freed - offsets[line]
+                weights += float(weight.sum())
+                variances.append(variance)
+            scored = half.score & cell.score & usable
+            residual[scored] = freed[scored]
+            freedom.append(len(basis) + weights)
+    line_sd = float(np.sqrt(np.mean(variances))) if variances else 0.0
+    return CrossFit(residual, float(np.mean(freedom)), line_sd)
+
+
+def fitted_terms(
+    height_um: np.ndarray,
+    prediction_um: np.ndarray,
+    used: BoolMap,
+    terms: Terms,
+    scan_line: LineIndex | None = None,
+) -> tuple[FloatMap, FloatMap]:
+    """Smooth terms fitted to all used pixels: coefficients (k,) and the map that they add, (ny, nx) µm.
+
+    For training, pictures and defects; a reported error takes its terms from ``cross_fit``.
+    """
+    basis = term_maps(TermPixels(prediction_um, scan_line), terms).reshape(-1, *prediction_um.shape)
+    target = (height_um - prediction_um)[used].astype(np.float64)
+    coefficients = least_squares(basis[:, used], target) if len(basis) else np.zeros(0)
+    return coefficients, np.tensordot(coefficients, basis, axes=1)
+
+
+def least_squares(design: FloatMap, target: FloatMap) -> FloatMap:
+    """Coefficients (k,) of ``design`` (k, n) that come closest to ``target`` (n,); smallest if not unique."""
+    return np.linalg.lstsq(design @ design.T, design @ target, rcond=1e-12)[0].astype(np.float64)
+
+
+def _fitted(basis: FloatMap, difference: FloatMap, calibrate: BoolMap) -> FloatMap:
+    if not len(basis):
+        return np.zeros_like(difference)
+    design = basis[:, calibrate]
+    if design.shape[1] <= 2 * len(basis):
+        raise InputError(
+            "too few calibration pixels for the scan terms",
+            got=f"{design.shape[1]} pixels for {len(basis)} terms",
+            wanted=f"more than {2 * len(basis)}",
+            hint="use a larger field, a smaller block_px, or policy 'none'",
+        )
+    return np.tensordot(least_squares(design, difference[calibrate]), basis, axes=1)
+
+
+def _lines(term: ScanTerm, shape: tuple[int, ...], scan_line: LineIndex | None) -> LineIndex:
+    assert term.lines is not None
+    return term.lines(shape, scan_line)

@@ -1,0 +1,81 @@
+"""Offsets of lines: which line a pixel belongs to, and what the lines of a scan are displaced by."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from litho_models.scan_terms.blocks import BoolMap
+from litho_models.scan_terms.term import FloatMap, LineIndex
+
+if TYPE_CHECKING:
+    from litho_data.register import Bend
+
+
+def scan_line_index(
+    shape: tuple[int, int], scan_to_layout: np.ndarray, pitch_um: float, bend_um: Bend | None = None
+) -> LineIndex:
+    """Index of the scan line (constant y in the scan's frame) under each layout pixel, (ny, nx), from 0.
+
+    Args:
+        shape: (ny, nx) of the layout.
+        scan_to_layout: 3 x 3, maps (x_um, y_um, 1) of the scan frame to the layout frame.
+        pitch_um: layout pitch; lines are counted in the same steps.
+        bend_um: of a bent scan, which ``scan_to_layout`` does not contain.
+    """
+    y, x = np.meshgrid(*((np.arange(n) + 0.5) * pitch_um for n in shape), indexing="ij")
+    inverse = np.linalg.inv(np.asarray(scan_to_layout, np.float64))
+    scan_x, scan_y, depth = (row[0] * x + row[1] * y + row[2] for row in inverse)
+    scan_x, scan_y = scan_x / depth, scan_y / depth
+    if bend_um is not None:
+        # What the scan does not show is given to its first or last line; the end itself is beyond the last.
+        end = 2 * bend_um.half[1] * (1 - 1e-9)
+        scan_y = np.clip(bend_um.undo(scan_x, scan_y)[1], 0, end)
+    line = np.floor(scan_y / pitch_um).astype(np.intp)
+    return line - line.min()
+
+
+def axis_along(line: LineIndex) -> int:
+    """The axis that lines run along: 1 for lines along x; a scan turned by 90 degrees has them along y."""
+    down, across = (float(np.abs(np.diff(line, axis=axis)).mean()) for axis in (0, 1))
+    return 1 if down >= across else 0
+
+
+def shrunk_line_offsets(
+    residual_um: FloatMap, used: BoolMap, line: LineIndex, block_px: int
+) -> tuple[FloatMap, FloatMap, float]:
+    """Offsets of the lines as a variance component: best linear prediction of s_i ~ N(0, v).
+
+    The means of blocks within a line give the noise of a line's mean (correlation along the line included);
+    what the line means vary beyond it is v. For equal counts this moment estimate is the REML one. A line
+    without used pixels gets 0.
+
+    Args:
+        residual_um: (ny, nx), µm; ``used``: the pixels that count; ``line``: the line of each pixel.
+        block_px: length of a block along the lines.
+
+    Returns:
+        offsets (lines,) µm, their shrinkage weights (lines,) in 0 ... 1, and v in µm².
+    """
+    line_count = int(line.max()) + 1
+    along = np.arange(residual_um.shape[axis_along(line)]) // block_px
+    block = np.broadcast_to(along[None, :] if axis_along(line) else along[:, None], residual_um.shape)
+    block_count = int(block.max()) + 1
+    cell = (line * block_count + block)[used]
+    count = np.bincount(cell, minlength=line_count * block_count).reshape(line_count, block_count)
+    total = np.bincount(cell, residual_um[used], minlength=count.size).reshape(count.shape)
+    # Blocks with a handful of pixels (the edge of the scan) would count as much as full ones.
+    filled = count >= max(1, count.max() // 2)
+    means = np.where(filled, total / np.maximum(count, 1), 0.0)
+    blocks = filled.sum(axis=1)
+    line_mean = means.sum(axis=1) / np.maximum(blocks, 1)
+    within = (np.where(filled, means - line_mean[:, None], 0.0) ** 2).sum()
+    freedom = np.maximum(blocks - 1, 0).sum()
+    seen = blocks > 0
+    if freedom < 1 or seen.sum() < 3:
+        return np.zeros(line_count), np.zeros(line_count), 0.0
+    noise = within / freedom / np.maximum(blocks, 1)
+    variance = max(0.0, float(np.var(line_mean[seen], ddof=1) - noise[seen].mean()))
+    weight = np.where(seen, variance / np.maximum(variance + noise, np.finfo(float).tiny), 0.0)
+    return weight * (line_mean - line_mean[seen].mean()), weight, variance

@@ -1,0 +1,248 @@
+"""The catalogue of what a single scan adds to the height, each term stated once.
+
+A term is a handful of smooth maps over the scan (datum, gain, bow, ...), or one offset for every line of it.
+Benchmark, training, noise and loop all take their terms from here; ``register_scan_term`` adds one of your
+own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from litho_data.foundation.errors import InputError
+
+FloatMap = NDArray[np.float64]
+LineIndex = NDArray[np.intp]
+Terms = frozenset[str]
+
+
+@dataclass(frozen=True)
+class TermPixels:
+    """The predicted height of a scan, and the pixels at which terms are wanted.
+
+    Attributes:
+        prediction_um: predicted height (ny, nx), µm.
+        line: index of the scan line under each pixel (ny, nx); the rows of the array if None.
+        at: flat indices of the wanted pixels; all of them, in order, if None.
+    """
+
+    prediction_um: np.ndarray
+    line: LineIndex | None = None
+    at: np.ndarray | None = None
+
+    @cached_property
+    def height(self) -> FloatMap:
+        """Predicted height at the pixels minus its mean over the whole scan, (n,) µm."""
+        prediction = np.asarray(self.prediction_um, np.float64)
+        return self._taken(prediction) - float(prediction.mean())
+
+    @cached_property
+    def slopes(self) -> tuple[FloatMap, FloatMap]:
+        """Change of the predicted height per pixel along y and along x, (n,) µm each."""
+        slopes = np.gradient(np.asarray(self.prediction_um, np.float64))
+        return self._taken(slopes[0]), self._taken(slopes[1])
+
+    @cached_property
+    def smooth(self) -> FloatMap:
+        """``smooth_shapes`` at the pixels, (5, n)."""
+        shapes = smooth_shapes(self.prediction_um.shape)
+        return np.stack([self._taken(shape) for shape in shapes])
+
+    @cached_property
+    def time(self) -> FloatMap:
+        """Moment of the scan at which each pixel was measured: 0 first line, 1 last, (n,)."""
+        line = row_index(self.prediction_um.shape) if self.line is None else self.line
+        return self._taken(line) / max(int(line.max()), 1)
+
+    def _taken(self, field: NDArray[Any]) -> FloatMap:
+        flat = field.reshape(-1)
+        return flat if self.at is None else flat[self.at]
+
+
+@dataclass(frozen=True)
+class ScanTerm:
+    """One thing that a scan adds to the height.
+
+    Attributes:
+        name: as it stands in sets of terms.
+        effect: the effect that it stands for; several terms may share one. None for a control.
+        unit: of its coefficients: ``µm`` of height, ``1``, or ``px`` of displacement.
+        labels: what each map is, in words; a term of lines has one label.
+        maps: pixels to (k, n), each map of zero mean over the scan unless it is the datum itself.
+        lines: for offsets of lines: (shape, scan line index) to the index of the line under each pixel.
+        frame: for offsets of lines: whose lines they are.
+        may_be_shared: whether the mean over scans could be a property of the printer.
+        role: whose it is.
+    """
+
+    name: str
+    effect: str | None
+    unit: Literal["µm", "1", "px"]
+    labels: tuple[str, ...]
+    maps: Callable[[TermPixels], FloatMap] | None = None
+    lines: Callable[[tuple[int, ...], LineIndex | None], LineIndex] | None = None
+    frame: str = ""
+    may_be_shared: bool = False
+    role: Literal["measurement", "nuisance", "control"] = "measurement"
+
+
+def term_maps(pixels: TermPixels, terms: Iterable[str]) -> FloatMap:
+    """The smooth maps of some terms, in the order of the catalogue: (k, n)."""
+    chosen = [term.maps(pixels) for term in chosen_terms(terms) if term.maps is not None]
+    count = pixels.prediction_um.size if pixels.at is None else len(pixels.at)
+    return np.concatenate(chosen) if chosen else np.empty((0, count))
+
+
+def parameter_names(terms: Iterable[str]) -> list[str]:
+    """What the coefficients of ``term_maps`` are, with the unit in which people read them."""
+    shown = {"µm": " (nm)", "px": " (px)", "1": ""}
+    return [
+        label + shown[term.unit]
+        for term in chosen_terms(terms)
+        if term.maps is not None
+        for label in term.labels
+    ]
+
+
+def chosen_terms(names: Iterable[str]) -> list[ScanTerm]:
+    """The terms of these names, in the order of the catalogue.
+
+    Raises:
+        InputError: a name that is not in the catalogue.
+    """
+    wanted = set(names)
+    if unknown := wanted - SCAN_TERMS.keys():
+        raise InputError("scan terms", got=", ".join(sorted(unknown)), wanted=", ".join(SCAN_TERMS))
+    return [term for name, term in SCAN_TERMS.items() if name in wanted]
+
+
+def line_terms(names: Iterable[str]) -> list[ScanTerm]:
+    """Those among these terms that are offsets of lines."""
+    return [term for term in chosen_terms(names) if term.lines is not None]
+
+
+def terms_of_effect(effect: str) -> Terms:
+    """The terms that stand for an effect; empty where it is none of single scans."""
+    return frozenset(term.name for term in SCAN_TERMS.values() if term.effect == effect)
+
+
+def register_scan_term(term: ScanTerm) -> ScanTerm:
+    """Add a term to the catalogue; returns it.
+
+    Raises:
+        InputError: a name that is taken, or neither or both of maps and lines.
+    """
+    if term.name in SCAN_TERMS:
+        raise InputError("scan term", got=f"{term.name}, which exists", wanted="a new name")
+    if (term.maps is None) == (term.lines is None):
+        raise InputError(f"scan term {term.name}", got="maps and lines", wanted="one of the two")
+    SCAN_TERMS[term.name] = term
+    return term
+
+
+@lru_cache(maxsize=8)
+def smooth_shapes(shape: tuple[int, ...]) -> FloatMap:
+    """x, y, x², xy, y² on -1 ... 1 over a scan (ny, nx), each of zero mean: (5, ny, nx), read-only."""
+    ny, nx = shape
+    y, x = np.meshgrid(np.linspace(-1, 1, ny), np.linspace(-1, 1, nx), indexing="ij")
+    shapes = np.stack([term - term.mean() for term in (x, y, x * x, x * y, y * y)])
+    shapes.setflags(write=False)
+    return shapes
+
+
+def row_index(shape: tuple[int, ...]) -> LineIndex:
+    """Row number of each pixel, (ny, nx)."""
+    return np.broadcast_to(np.arange(shape[0], dtype=np.intp)[:, None], shape)
+
+
+def _column_index(shape: tuple[int, ...]) -> LineIndex:
+    return np.broadcast_to(np.arange(shape[1], dtype=np.intp)[None, :], shape)
+
+
+def _drift(pixels: TermPixels) -> FloatMap:
+    """Exponential creep after the scan starts; what is slower still lies in the bow."""
+    time = pixels.time
+    ends = TermPixels(pixels.prediction_um, pixels.line).time if pixels.at is not None else time
+    return np.stack([np.exp(-time / d) - np.exp(-ends / d).mean() for d in CREEP_DECAYS.values()])
+
+
+def _warp(pixels: TermPixels) -> FloatMap:
+    """What an affine error of the registration changes."""
+    x, y = pixels.smooth[:2]
+    return np.stack([slope * by for slope in pixels.slopes for by in (np.ones_like(x), y, x)])
+
+
+def _distortion(pixels: TermPixels) -> FloatMap:
+    """Its quadratic part, centred: a distortion that all scans have in common then brings no shift along."""
+    x, y = pixels.smooth[:2]
+    return np.stack([slope * by for slope in pixels.slopes for by in (y * y - 1 / 3, x * y, x * x - 1 / 3)])
+
+
+# Decay of the two parts of a creep, in scan times.
+CREEP_DECAYS = {"fast_creep_um": 0.05, "slow_creep_um": 0.2}
+
+# In the order in which they are tested.
+_BUILT_IN = (
+    ScanTerm("offset", "datum-offset", "µm", ("offset",), maps=lambda p: np.ones((1, len(p.height)))),
+    ScanTerm("gain", "z-gain", "1", ("gain",), maps=lambda p: p.height[None], may_be_shared=True),
+    ScanTerm(
+        "bow", "tilt-bow", "µm", ("x", "y", "x²", "xy", "y²"), maps=lambda p: p.smooth, may_be_shared=True
+    ),
+    ScanTerm(
+        "drift",
+        "slow-drift",
+        "µm",
+        tuple(f"creep over {decay:g} of the scan" for decay in CREEP_DECAYS.values()),
+        maps=_drift,
+        may_be_shared=True,
+    ),
+    ScanTerm(
+        "warp",
+        "registration-residual",
+        "px",
+        tuple(f"shift {axis}{by}" for axis in "yx" for by in ("", " by y", " by x")),
+        maps=_warp,
+    ),
+    ScanTerm(
+        "distortion",
+        "registration-residual",
+        "px",
+        tuple(f"shift {axis} by {by}" for axis in "yx" for by in ("y² - 1/3", "xy", "x² - 1/3")),
+        maps=_distortion,
+        may_be_shared=True,
+    ),
+    ScanTerm(
+        "scan-lines",
+        "scan-line-stripes",
+        "µm",
+        ("offset of a scan line",),
+        lines=lambda shape, line: row_index(shape) if line is None else line,
+        frame="the scan lines",
+    ),
+    ScanTerm(
+        "layout-rows",
+        "line-roughness",
+        "µm",
+        ("offset of a row",),
+        lines=lambda shape, line: row_index(shape),
+        frame="the layout's rows",
+        role="nuisance",
+    ),
+    ScanTerm(
+        "layout-columns",
+        None,
+        "µm",
+        ("offset of a column",),
+        lines=lambda shape, line: _column_index(shape),
+        frame="the layout's columns",
+        role="control",
+    ),
+)
+
+SCAN_TERMS: dict[str, ScanTerm] = {term.name: term for term in _BUILT_IN}
