@@ -20,6 +20,10 @@ ALLOWED = {
 FROZEN_ONLY = {"load_frozen", "frozen", "simulator"}
 # Rooms from the ground up: a room imports from those before it only. `simulator` is a module.
 ROOMS = {
+    "litho_data": (
+        "foundation", "scan", "readers", "register", "level", "roughness", "store", "cards", "layouts",
+        "virtual_fab", "build", "provenance", "exchange", "cli",
+    ),
     "litho_models": (
         "layers", "simulator", "prediction", "fast", "models", "scan_terms", "effects", "splits",
         "frozen", "scoring", "fitting", "evaluation", "noise", "loop", "cli",

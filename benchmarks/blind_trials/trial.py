@@ -13,7 +13,7 @@ from benchmarks.blind_trials.floor import true_floor
 from benchmarks.blind_trials.judging import judge, named_outside_span, scan_terms, strangers
 from benchmarks.blind_trials.planting import plant, settings, trial_jobs
 from benchmarks.blind_trials.records import Cost, Draw, ErrorPair, Outcome, Planted, Trial, TrialErrors
-from litho_data.build.build import build
+from litho_data.build.build import build_dataset
 from litho_data.store import open_store
 from litho_data.virtual_fab import Truth, simulate
 from litho_models.loop.result.record import CloseLoop, Errors
@@ -62,7 +62,7 @@ def run_trial(
         shutil.move(fab / "truth", hidden)
         store, clock = folder / "store.zarr", time.perf_counter()
         report("building the store")
-        built = build(card, store)
+        built = build_dataset(card, store)
         build_s, clock = time.perf_counter() - clock, time.perf_counter()
         result = close_loop_on_store(store, folder / "loop", base="physics", report=report)
         loop_s = time.perf_counter() - clock

@@ -1,18 +1,36 @@
-"""``build``: raw files and a card in, a dataset store and a report out."""
+"""``build_dataset``: raw files and a card in, a dataset store and a report out."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+import shutil
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from litho_data.build.jobs import field_jobs
-from litho_data.build.listing import Listing, list_fields
-from litho_data.build.make_store import BuildResult, Source, make_store
+from litho_data.build.assemble import Campaign, assemble, files_table, records_of_use
+from litho_data.build.jobs import Job, Skipped, attempt, field_jobs
 from litho_data.build.operations import load_recipe
+from litho_data.build.report import write_report
+from litho_data.build.result import BuildResult, LeftOut, report_folder
+from litho_data.cards.card import Card
+from litho_data.cards.listing import Listing, list_fields
+from litho_data.foundation.commands import progress
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.run_facts import software_record
+from litho_data.foundation.workers import run_jobs
+from litho_data.store.partial import partial_store
+from litho_data.store.schema import DatasetId
+
+# Pixels whose sides differ from the other scans' by more than this come from missing rows or columns.
+_ASPECT_TOLERANCE = 1e-3
 
 
-def build(
+def build_dataset(
     card_path: str | Path,
     out: str | Path,
     *,
@@ -65,3 +83,131 @@ def _source(listing: Listing, recipe: Mapping[str, Any], seed: int) -> Source:
         unpaired={one.id: one.reason for one in listing.left_aside if one.unpaired},
         refused={one.id: one.reason for one in listing.left_aside if not one.unpaired},
     )
+
+
+@dataclass(frozen=True)
+class Source:
+    """Everything a store is made from, with the raw files by id for the manifest.
+
+    ``files`` maps each id to its raw files by recorded name; ``unpaired`` and ``refused`` map ids to reasons.
+    """
+
+    card: Card
+    jobs: Sequence[Job]
+    data_dir: Path
+    files: Mapping[str, Mapping[str, Path]]
+    recipe: Mapping[str, Any] = field(default_factory=lambda: load_recipe(None))
+    seed: int = 0
+    assumptions: Sequence[str] = ()
+    unpaired: Mapping[str, str] = field(default_factory=dict)
+    refused: Mapping[str, str] = field(default_factory=dict)
+
+
+def make_store(
+    source: Source, out: Path, *, workers: int = 1, dask: str | None = None, strict: bool = False
+) -> BuildResult:
+    """Run the jobs of a source and put the store and its report in place; see ``build_dataset``."""
+    started, clock = datetime.now(UTC), time.perf_counter()
+    with partial_store(out) as partial:
+        root = partial.open()
+        try:
+            records = partial.finished(root, {job.id: job.key for job in source.jobs})
+            reused = len(records)
+            skipped = dict(source.refused)
+            for scan_id, reason in skipped.items():
+                _report_skipped(scan_id, reason)
+            todo = [job for job in source.jobs if job.id not in records]
+            finished = run_jobs(attempt, todo, workers, dask)
+            for outcome in progress(finished, f"building {source.card.name}", total=len(todo)):
+                if isinstance(outcome, Skipped):
+                    # Recorded names: the manifest must not depend on where the raw files lie.
+                    skipped[outcome.id] = outcome.reason.replace(f"{source.data_dir}{os.sep}", "")
+                    _report_skipped(outcome.id, skipped[outcome.id])
+                else:
+                    partial.add(root, outcome)
+                    records[outcome.record["id"]] = dict(outcome.record)
+            for scan_id, reason in _odd_pixels(records, source.card).items():
+                skipped[scan_id] = reason
+                _report_skipped(scan_id, reason)
+                del records[scan_id]
+                shutil.rmtree(partial.store / "scans" / scan_id)
+            _require_enough(records, skipped, strict, out)
+        except InputError:
+            partial.discard()
+            raise
+        kept = [records[scan_id] for scan_id in sorted(records)]
+        campaign = Campaign(
+            card=source.card,
+            recipe=source.recipe,
+            seed=source.seed,
+            assumptions=source.assumptions,
+            files=files_table(source.files, records, skipped, source.unpaired),
+            build={
+                "started": started.isoformat(),
+                "data_dir": _relative(source.data_dir, out.parent),
+                "software": software_record(),
+            },
+        )
+        sha256 = assemble(root, kept, partial.samples, campaign)
+        result = BuildResult(
+            store=out.name,
+            dataset=DatasetId(name=source.card.name, sha256=sha256),
+            n_scans=len(records_of_use(kept)),
+            n_references=len(kept) - len(records_of_use(kept)),
+            skipped=_left_out(skipped),
+            unpaired=_left_out(source.unpaired),
+            reused=reused,
+            seconds=round(time.perf_counter() - clock, 2),
+            workers=workers,
+            software=software_record(),
+        )
+        write_report(result, partial.store, report_folder(out))
+        partial.publish()
+    return result
+
+
+def _relative(folder: Path, start: Path) -> str:
+    """Where the raw files are as seen from the store's folder, so that both can move together."""
+    try:
+        return Path(os.path.relpath(folder, start)).as_posix()
+    except ValueError:  # another drive
+        return str(folder)
+
+
+def _odd_pixels(records: Mapping[str, Mapping[str, Any]], card: Card) -> dict[str, str]:
+    """Scans whose pixels have another aspect than most, where the card and not the file gives the size.
+
+    Rows missing at the end of a text file leave a readable matrix; the stated size then stretches its pixels.
+    """
+    if card.scan.size_um is None:
+        return {}
+    aspects = {
+        key: record["read"]["pitch_um"][0] / record["read"]["pitch_um"][1] for key, record in records.items()
+    }
+    ordered = sorted(aspects.values())
+    most = ordered[len(ordered) // 2] if ordered else 1.0
+    odd = {key: value for key, value in aspects.items() if abs(value / most - 1) > _ASPECT_TOLERANCE}
+    if 2 * len(odd) >= len(aspects):
+        return {}
+    reason = "pixel sides y/x {:.4g} where most scans have {:.4g}: rows or columns are missing"
+    return {key: reason.format(value, most) for key, value in odd.items()}
+
+
+def _report_skipped(scan_id: str, reason: str) -> None:
+    print(f"skipped {scan_id}: {reason}", file=sys.stderr)
+
+
+def _require_enough(
+    records: Mapping[str, Mapping[str, Any]], skipped: Mapping[str, str], strict: bool, out: Path
+) -> None:
+    shown = "; ".join(f"{scan_id}: {reason}" for scan_id, reason in sorted(skipped.items())[:2])
+    if strict and skipped:
+        raise InputError(
+            f"{out} not built: {len(skipped)} scans cannot be used", got=shown, wanted="all, with --strict"
+        )
+    if not records_of_use(list(records.values())):
+        raise InputError(f"{out} not built: no scan can be used", got=shown, wanted="at least one good scan")
+
+
+def _left_out(reasons: Mapping[str, str]) -> list[LeftOut]:
+    return [LeftOut(id=scan_id, reason=reason) for scan_id, reason in sorted(reasons.items())]

@@ -12,10 +12,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from litho_data.build.card import Card
-from litho_data.build.listing import Listing, PrintedField
-from litho_data.build.operations import OPERATIONS, Done, perform
+from litho_data.build.operations import OPERATIONS
 from litho_data.build.quality import levelling_figures, noise_figures
+from litho_data.build.step import Done
+from litho_data.cards.card import Card
+from litho_data.cards.listing import Listing, PrintedField
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256, record_sha256
 from litho_data.foundation.run_facts import software_record
@@ -109,10 +110,10 @@ class FieldJob:
         layout: dict[str, np.ndarray] = {}
         if self.field.layout is not None and self.layout_name is not None:
             file = {self.layout_name: self.field.layout}
-            done = perform("read-layout", {"levels": self.card.layout.levels}, file, {})
+            done = OPERATIONS["read-layout"].run({"levels": self.card.layout.levels}, file, {})
             layout = done.arrays
             yield done
-        read = perform("read-scan", self._read_params, {self.scan_name: self.field.scan}, {})
+        read = OPERATIONS["read-scan"].run(self._read_params, {self.scan_name: self.field.scan}, {})
         yield read
         pitch = {"scan_pitch_um": read.facts["pitch_um"]}
         pitches = {**pitch, "layout_pitch_um": self.card.layout.pitch_um}
@@ -123,18 +124,18 @@ class FieldJob:
             if not layout:
                 raise InputError("layout-aware levelling", got="a scan without layout", wanted="a layout")
             raw = {"raw_height_um": read.arrays["raw_height_um"]}
-            located = perform("locate", register_params, {}, {**layout, **raw})
+            located = OPERATIONS["locate"].run(register_params, {}, {**layout, **raw})
             level_inputs |= located.arrays
             yield located
-        levelled = perform("level", {**pitch, "recipe": self.recipe}, {}, level_inputs)
+        levelled = OPERATIONS["level"].run({**pitch, "recipe": self.recipe}, {}, level_inputs)
         yield levelled
         if self.field.use != "dataset":
             return
         height = {"levelled_height_um": levelled.arrays["levelled_height_um"]}
-        registered = perform("register", register_params, {}, {**layout, **height})
+        registered = OPERATIONS["register"].run(register_params, {}, {**layout, **height})
         yield registered
         shape = {"layout_shape": list(layout["mask_level"].shape)}
-        yield perform("resample", {**pitches, **shape}, {}, {**height, **registered.arrays})
+        yield OPERATIONS["resample"].run({**pitches, **shape}, {}, {**height, **registered.arrays})
 
     @property
     def _read_params(self) -> dict[str, Any]:

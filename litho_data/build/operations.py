@@ -5,80 +5,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass
-from functools import cache
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from litho_data.build.step import Arrays, Facts, Operation
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.hashes import array_sha256, file_sha256, source_sha256
-from litho_data.provenance.steps import Step
-from litho_data.store.schema import VARIABLES
 
 if TYPE_CHECKING:
     from litho_data.register import Registration
 
-PACKAGE = Path(__file__).parents[1]
-Arrays = dict[str, np.ndarray]
-Facts = dict[str, Any]
 # Beyond it a failed registration asks whether rows are missing.
 _OBLONG = 0.01
-
-
-@dataclass(frozen=True)
-class Operation:
-    """``run(params, files, arrays) -> (arrays, facts)``; ``code`` is what its result depends on."""
-
-    version: str
-    run: Callable[[Mapping[str, Any], Sequence[Path], Mapping[str, np.ndarray]], tuple[Arrays, Facts]]
-    code: tuple[str, ...]
-
-    @property
-    def code_sha256(self) -> str:
-        """Hash of the source that the operation's result depends on."""
-        return _code_sha256(self.code)
-
-
-@dataclass(frozen=True)
-class Done:
-    """A finished step with its arrays and with what it found out."""
-
-    step: Step
-    arrays: Arrays
-    facts: Facts
-
-
-def perform(
-    op: str, params: Mapping[str, Any], files: Mapping[str, Path], arrays: Mapping[str, np.ndarray]
-) -> Done:
-    """Run one operation and record it.
-
-    Args:
-        op: key of ``OPERATIONS``.
-        params: explicit parameters, plain data.
-        files: raw files by their recorded name, in the order that the operation expects.
-        arrays: input arrays by their name in the store.
-
-    Raises:
-        InputError: whatever is wrong with the input; a missing or unreadable file included.
-    """
-    operation = OPERATIONS[op]
-    try:
-        inputs = [{"name": name, "sha256": file_sha256(path)} for name, path in files.items()]
-        inputs += [
-            {"name": name, "sha256": VARIABLES[name].sample_sha256(array)} for name, array in arrays.items()
-        ]
-        with _one_thread():
-            made, facts = operation.run(params, list(files.values()), arrays)
-    except OSError as error:
-        raise InputError(f"cannot read {', '.join(map(str, files.values()))}", got=str(error)) from error
-    outputs = [_described(name, array) for name, array in made.items()]
-    step = Step(op, operation.version, dict(params), tuple(inputs), tuple(outputs), operation.code_sha256)
-    return Done(step, made, facts)
 
 
 def load_recipe(path: Path | None) -> dict[str, Any]:
@@ -86,36 +27,6 @@ def load_recipe(path: Path | None) -> dict[str, Any]:
     from litho_data.level import Recipe
 
     return (Recipe() if path is None else Recipe.from_toml(path)).canonical()
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """One thread for numerical libraries: sums do not depend on the cores, workers do not compete."""
-    import cv2
-    import scipy.linalg  # noqa: F401 - brings a BLAS of its own, which must be there to be limited
-    from threadpoolctl import threadpool_limits
-
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        with threadpool_limits(limits=1):
-            yield
-    finally:
-        cv2.setNumThreads(threads)
-
-
-def _described(name: str, array: np.ndarray) -> dict[str, Any]:
-    variable = VARIABLES[name]
-    dims, unit = variable.sample_dims, variable.unit
-    sha256 = array_sha256(array, unit, dims)
-    return {
-        "name": name,
-        "sha256": sha256,
-        "dtype": str(array.dtype),
-        "shape": list(array.shape),
-        "unit": unit,
-        "dims": list(dims),
-    }
 
 
 def _read_layout(
@@ -232,24 +143,22 @@ def _resample(
 def _stitch_pairs(
     params: Mapping[str, Any], files: Sequence[Path], _: Mapping[str, np.ndarray]
 ) -> tuple[Arrays, Facts]:
-    from litho_data.exchange.pairs import stitch_field
+    from litho_data.readers.pairs import stitch_field
 
     return stitch_field(files, params["quadrants"], params["full_scale_um"], params["levels"]), {}
 
 
-OPERATIONS: dict[str, Operation] = {
-    "read-layout": Operation("1", _read_layout, ("readers", "build/operations.py")),
-    "read-scan": Operation(
-        "1", _read_scan, ("readers", "scan.py", "foundation/units.py", "build/operations.py")
-    ),
-    "locate": Operation("1", _locate, ("register", "level", "build/operations.py")),
-    "level": Operation("1", _level, ("level", "build/operations.py")),
-    "register": Operation("1", _register, ("register", "build/operations.py")),
-    "resample": Operation("1", _resample, ("register", "build/operations.py")),
-    "stitch-pairs": Operation("1", _stitch_pairs, ("exchange/pairs.py", "readers", "build/operations.py")),
+OPERATIONS = {
+    operation.name: operation
+    for operation in (
+        Operation("read-layout", "1", _read_layout, ("readers", "build/operations.py")),
+        Operation(
+            "read-scan", "1", _read_scan, ("readers", "scan.py", "foundation/units.py", "build/operations.py")
+        ),
+        Operation("locate", "1", _locate, ("register", "level", "build/operations.py")),
+        Operation("level", "1", _level, ("level", "build/operations.py")),
+        Operation("register", "1", _register, ("register", "build/operations.py")),
+        Operation("resample", "1", _resample, ("register", "build/operations.py")),
+        Operation("stitch-pairs", "1", _stitch_pairs, ("readers", "build/operations.py")),
+    )
 }
-
-
-@cache
-def _code_sha256(names: tuple[str, ...]) -> str:
-    return source_sha256(*(PACKAGE / name for name in names))

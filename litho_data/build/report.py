@@ -8,15 +8,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from litho_data.foundation.colour_image import colour_bar_png, coloured_png
 from litho_data.foundation.files import atomic_file
-from litho_data.foundation.report import Page
+from litho_data.foundation.report import Page, colour_bar_png, coloured_png
 from litho_data.store.read import PrintedScan, Store, open_store
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from litho_data.build.make_store import BuildResult
+    from litho_data.build.result import BuildResult
 
 _MAX_SCANS_SHOWN = 48
 _THUMBNAIL_PX = 180

@@ -48,7 +48,7 @@ def fetch(
     into: Annotated[Path | None, typer.Option(help="folder to fill; by default the user cache")] = None,
 ) -> None:
     """Download a known dataset, or find it in $LITHO_DATA_DIR or the user cache; checks every SHA-256."""
-    from litho_data.exchange.fetch import fetch as fetch_dataset
+    from litho_data.cards.fetch import fetch as fetch_dataset
 
     typer.echo(fetch_dataset(name, into))
 
@@ -68,10 +68,10 @@ def build(
     seed: Annotated[int, typer.Option(min=0, help="seed of the robust registration")] = 0,
 ) -> None:
     """Read, level, register and store all scans of a card; writes the store and a report beside it."""
-    from litho_data.build.build import build as build_store
-    from litho_data.build.make_store import report_folder
+    from litho_data.build.build import build_dataset
+    from litho_data.build.result import report_folder
 
-    result = build_store(card, out, data_dir=data_dir, workers=workers, dask=dask, strict=strict, seed=seed)
+    result = build_dataset(card, out, data_dir=data_dir, workers=workers, dask=dask, strict=strict, seed=seed)
     typer.echo(f"{out}: {result.n_scans} scans, {len(result.skipped)} skipped, {result.seconds:.1f} s")
     typer.echo(f"dataset sha256 {result.dataset.sha256}")
     typer.echo(f"report {report_folder(out) / 'report.html'}")
@@ -142,7 +142,7 @@ def export(
 
         export_ro_crate(store, target)
     else:
-        from litho_data.exchange.pairs_export import export_pairs
+        from litho_data.exchange.pairs import export_pairs
 
         for note in export_pairs(store, target):
             print(note, file=sys.stderr)
@@ -161,7 +161,7 @@ def import_pairs(
     strict: Strict = False,
 ) -> None:
     """Build a store from the authors' 8-bit pair format; four quadrants of one name become one field."""
-    from litho_data.build.make_store import report_folder
+    from litho_data.build.result import report_folder
     from litho_data.exchange.pairs import import_pairs as build_from_pairs
 
     target = out or folder.resolve().with_suffix(".zarr")

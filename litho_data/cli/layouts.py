@@ -100,7 +100,7 @@ def simulate(
     """The virtual fab: print layouts, scan the prints with an AFM, and write what a laboratory would."""
     from litho_data.foundation.errors import InputError
     from litho_data.virtual_fab import jobs_of_card, simulate
-    from litho_data.virtual_fab.presets import preset as named_preset
+    from litho_data.virtual_fab.settings import preset as named_preset
 
     if layouts is not None and any(value is not None for value in (count, size, write_field_um)):
         wanted = "no --count, --size or --write-field-um: the card's layouts have them"

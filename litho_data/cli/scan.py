@@ -2,33 +2,23 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from litho_data.foundation.errors import InputError
+from litho_data.readers.registry import formats
 
 if TYPE_CHECKING:
-    from litho_data.readers.channel import Channel
+    from litho_data.readers.reader import Channel
     from litho_data.scan import Scan
 
 
-class ScanFormat(StrEnum):
-    """How a scan is read."""
-
-    auto = "auto"
-    text_matrix = "text-matrix"
-    tiff = "tiff"
-    npy = "npy"
-    gsf = "gsf"
-    gwy = "gwy"
-    vendor = "vendor"
-
-
 ScanPath = Annotated[Path, typer.Argument(help="a scan in any supported format")]
-Format = Annotated[ScanFormat, typer.Option(help="by default judged by the content of the file")]
+Format = Annotated[
+    str, typer.Option(help=f"auto judges the content of the file; else {', '.join(formats())}")
+]
 Unit = Annotated[str | None, typer.Option(help="unit of the heights where the file states none, e.g. m, nm")]
 Size = Annotated[
     tuple[float, float] | None,
@@ -45,7 +35,7 @@ def level(
     scan: ScanPath,
     recipe: Annotated[Path, typer.Option(help="levelling recipe (TOML)")],
     out: Annotated[Path, typer.Option(help="file to write: .gsf (opens in Gwyddion) or .npy (µm)")],
-    format: Format = ScanFormat.auto,
+    format: Format = "auto",
     unit: Unit = None,
     size_um: Size = None,
     channel: ChannelName = None,
@@ -68,7 +58,7 @@ def level(
 
 def inspect(
     file: ScanPath,
-    format: Format = ScanFormat.auto,
+    format: Format = "auto",
     unit: Unit = None,
     size_um: Size = None,
     channel: ChannelName = None,
@@ -128,7 +118,7 @@ def _print_channels(console, file: Path, channels: list[Channel]) -> None:
 def _print_scan(console, scan: Scan, picture: Path | None) -> None:
     import numpy as np
 
-    from litho_data.foundation.scan_picture import terminal_preview, write_picture
+    from litho_data.cli.scan_picture import terminal_preview, write_picture
 
     pitch = f"{scan.pitch_um[0]:.6g} × {scan.pitch_um[1]:.6g} µm" if scan.pitch_um else "unknown"
     low, high = np.nanmin(scan.height_um), np.nanmax(scan.height_um)

@@ -1,8 +1,7 @@
-"""The authors' pair format: 8-bit layouts and registered heights, a field cut into four quadrants.
+"""Folders in the authors' pair format, in and out; ``litho_data.readers.pairs`` says what it can hold.
 
-``mask/<id><q>.tif`` holds levels, ``afm/<id><q>.tif`` heights as value / 255 · full scale, with the full
-scales in metres in ``src_max_dict.txt``; q is 1 top left, 2 top right, 3 bottom left, 4 bottom right. The
-format has no validity, no negative heights and 256 grey values, so that going through it costs accuracy.
+``mask/<id><q>.tif`` holds levels, ``afm/<id><q>.tif`` heights, with the full scales in metres in
+``src_max_dict.txt``; q is 1 top left, 2 top right, 3 bottom left, 4 bottom right.
 """
 
 from __future__ import annotations
@@ -16,17 +15,23 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.build.card import Card, check_card
-from litho_data.build.card_files import SAFE_ID, read_full_scales
-from litho_data.build.make_store import BuildResult, Source, make_store
-from litho_data.build.operations import OPERATIONS, perform
+from litho_data.build.build import Source, make_store
+from litho_data.build.operations import OPERATIONS
 from litho_data.build.quality import noise_figures
+from litho_data.build.result import BuildResult
+from litho_data.cards.card import Card, check_card
+from litho_data.cards.tables import SAFE_ID, read_full_scales
+from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import atomic_folder
 from litho_data.foundation.hashes import file_sha256, record_sha256
+from litho_data.foundation.outputs import require_replaceable_folder
 from litho_data.foundation.run_facts import software_record
+from litho_data.readers.pairs import GREY_MAX, quadrant_slices
 from litho_data.store.partial import Piece
+from litho_data.store.read import open_store
 
-GREY_MAX = 255
+_QUADRANTS = (1, 2, 3, 4)
 SCALES_FILE = "src_max_dict.txt"
 _AUTHORS_IDS = r"FOV(?P<print>\d)(?P<field>\d)\d?"
 
@@ -115,7 +120,7 @@ class PairsJob:
 
     def run(self) -> Piece:
         """The stitched field as a piece."""
-        done = perform("stitch-pairs", self._params, self.files, {})
+        done = OPERATIONS["stitch-pairs"].run(self._params, self.files, {})
         pitch_um = self.card.layout.pitch_um
         record = {
             "id": self.id,
@@ -138,44 +143,6 @@ class PairsJob:
             "full_scale_um": [self.scales_um[name] for name in self.quadrants.values()],
             "levels": self.card.layout.levels,
         }
-
-
-def stitch_field(
-    files: Sequence[Path], quadrants: Sequence[int], full_scale_um: Sequence[float], levels: int
-) -> dict[str, np.ndarray]:
-    """One field from its layouts and heights (first all layouts, then all heights, in quadrant order).
-
-    Raises:
-        InputError: unreadable files, quadrants of different sizes, levels above the stated number.
-    """
-    from litho_data.readers import read_layout
-
-    images = [read_layout(path) for path in files]
-    if len({image.shape for image in images}) != 1:
-        raise InputError(
-            f"sizes of {', '.join(path.name for path in files)}", got={image.shape for image in images}
-        )
-    mask = _join(images[: len(quadrants)], quadrants)
-    if mask.max() >= levels:
-        raise InputError(
-            f"layout {files[0]}: highest level", got=int(mask.max()), wanted=f"at most {levels - 1}"
-        )
-    scaled = [
-        (image.astype(np.float64) / GREY_MAX * scale).astype(np.float32)
-        for image, scale in zip(images[len(quadrants) :], full_scale_um, strict=True)
-    ]
-    height = _join(scaled, quadrants)
-    arrays = {"mask_level": mask, "raw_height_um": height, "height_um": height}
-    return {**arrays, "valid": np.ones(height.shape, dtype=bool), "scan_to_layout": np.eye(3)}
-
-
-def quadrant_slices(quadrant: int, shape: tuple[int, ...]) -> tuple[slice, slice]:
-    """Rows and columns of a quadrant in a field of this shape; quadrant 0 is the whole field."""
-    if quadrant == 0:
-        return slice(None), slice(None)
-    ny, nx = shape[0] // 2, shape[1] // 2
-    row, column = divmod(quadrant - 1, 2)
-    return slice(row * ny, (row + 1) * ny), slice(column * nx, (column + 1) * nx)
 
 
 def _fields(root: Path, scales: Mapping[str, float]) -> tuple[dict[str, dict[int, str]], dict[str, str]]:
@@ -212,10 +179,60 @@ def _card(name: str, pitch_um: float, level_height_um: float, levels: int, ids: 
     return check_card(content, "import-pairs")
 
 
-def _join(parts: Sequence[np.ndarray], quadrants: Sequence[int]) -> np.ndarray:
-    factor = 1 if len(parts) == 1 else 2
-    shape = (parts[0].shape[0] * factor, parts[0].shape[1] * factor)
-    field = np.empty(shape, dtype=parts[0].dtype)
-    for part, quadrant in zip(parts, quadrants, strict=True):
-        field[quadrant_slices(quadrant, shape)] = part
-    return field
+def export_pairs(store_path: str | Path, out: str | Path) -> list[str]:
+    """Write a store in the pair format; returns a note for whatever a scan lost on the way.
+
+    Heights are rounded to the nearest grey value; pixels that were not measured become 0.
+
+    Raises:
+        InputError: a store whose fields cannot be cut into quadrants, or a folder with something else in it.
+    """
+    store = open_store(store_path)
+    notes: list[str] = []
+    scales: dict[str, float] = {}
+    require_replaceable_folder(out, "mask", "afm", SCALES_FILE)
+    with atomic_folder(out) as folder:
+        for name in ("mask", "afm"):
+            (folder / name).mkdir()
+        for scan_id in progress(store.ids, "exporting pairs"):
+            scan = store.scan(scan_id)
+            if scan.shape[0] % 2 or scan.shape[1] % 2:
+                raise InputError(
+                    f"size of field {scan_id}", got=scan.shape, wanted="even numbers of pixels, for quadrants"
+                )
+            height_um, lift_um = _positive(scan.height_um)
+            if lift_um:
+                notes.append(
+                    f"{scan_id}: raised by {lift_um * 1e3:.1f} nm, the format has no negative heights"
+                )
+            if unmeasured := int(np.isnan(height_um).sum()):
+                notes.append(
+                    f"{scan_id}: {unmeasured} pixels without measurement became 0, the format has no gaps"
+                )
+            full_scale_um = max(float(np.nanmax(height_um, initial=0)), 1e-6)
+            grey = np.rint(np.nan_to_num(height_um) / full_scale_um * GREY_MAX).astype(np.uint8)
+            for quadrant in _QUADRANTS:
+                name = f"{scan_id}{quadrant}.tif"
+                _write_tiff(
+                    folder / "mask" / name, np.repeat(_cut(scan.mask_level, quadrant)[..., None], 3, axis=2)
+                )
+                _write_tiff(folder / "afm" / name, _cut(grey, quadrant))
+                scales[name] = full_scale_um * 1e-6
+        (folder / SCALES_FILE).write_text(json.dumps(scales), encoding="utf-8")
+    return notes
+
+
+def _positive(height_um: np.ndarray) -> tuple[np.ndarray, float]:
+    lowest = float(np.nanmin(height_um, initial=0))
+    return (height_um - lowest, -lowest) if lowest < 0 else (height_um, 0.0)
+
+
+def _cut(image: np.ndarray, quadrant: int) -> np.ndarray:
+    return image[quadrant_slices(quadrant, image.shape)]
+
+
+def _write_tiff(path: Path, image: np.ndarray) -> None:
+    import tifffile
+
+    photometric = "rgb" if image.ndim == 3 else "minisblack"
+    tifffile.imwrite(path, np.ascontiguousarray(image), compression="lzw", photometric=photometric)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.build.card import check_card
+from litho_data.cards.card import check_card
 
 CARD_NAME = "card.toml"
 TABLE_NAME = "scans.csv"

@@ -1,14 +1,14 @@
-"""Planes: Gwyddion's Plane Level and Three Point Level."""
+"""Datum and tilt: where zero lies, and planes by least squares, three points or rotation, as in Gwyddion."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.level.polynomial import Terms, fit_terms
-from litho_data.level.selection import Levelled, Masking, as_height, select, subtract_product
+from litho_data.level.selection import Levelled, Masking, as_height, select, subtract, subtract_product
 
 PLANE: Terms = ((0, 0), (1, 0), (0, 1))
 
@@ -92,3 +92,74 @@ def _disc_mean(z: np.ndarray, chosen: np.ndarray | None, point: tuple[float, flo
     if not disc.any():
         raise InputError("three-point levelling", got=f"no selected pixel within {radius} px of {point}")
     return float(z[disc].mean())
+
+
+def level_rotate(
+    height_um: np.ndarray,
+    *,
+    pitch_um: tuple[float, float],
+    mask: np.ndarray | None = None,
+    masking: Masking = "exclude",
+) -> Levelled:
+    """Rotate by the angles of the least-squares plane, first every row, then every column.
+
+    Subtracting a plane shears the surface, which stretches steep flanks; rotating keeps their
+    shape. Each profile turns about its middle pixel and is interpolated linearly at the old
+    positions; what turns out of the image is continued by the outermost value.
+
+    Args:
+        height_um: (ny, nx), µm; every pixel must be measured.
+        pitch_um: (y, x) sampling, µm, in the unit of the heights.
+
+    Raises:
+        InputError: missing pixels, or an angle at which the surface would overhang.
+    """
+    z = as_height(height_um)
+    if not np.isfinite(z).all():
+        raise InputError("rotation of a scan with missing pixels", wanted="every pixel measured")
+    chosen = select(z, mask, masking)
+    weights = None if chosen is None else chosen.astype(np.float64)
+    slope_x, slope_y = slopes_per_px(fit_terms(z, weights, PLANE), z.shape)
+    turned = _rotate_rows(z, slope_x / pitch_um[1], pitch_um[1])
+    turned = _rotate_rows(turned.T, slope_y / pitch_um[0], pitch_um[0]).T
+    return Levelled(np.ascontiguousarray(turned), z - turned)
+
+
+def _rotate_rows(z: np.ndarray, slope: float, pitch_um: float) -> np.ndarray:
+    angle = -np.arctan(slope)
+    position = (np.arange(z.shape[1]) - (z.shape[1] - 1) / 2) * pitch_um
+    # Rotating about the profile's own middle keeps the height there, whatever the datum.
+    last = z.shape[1] - 1
+    pivot = 0.5 * (z[:, last // 2] + z[:, (last + 1) // 2])[:, None]
+    moved_x = position * np.cos(angle) - (z - pivot) * np.sin(angle)
+    moved_z = position * np.sin(angle) + (z - pivot) * np.cos(angle) + pivot
+    if (np.diff(moved_x, axis=1) <= 0).any():
+        raise InputError(
+            "rotation makes the surface overhang", got=f"{np.degrees(angle):.3g}°", wanted="level_plane"
+        )
+    return np.stack([np.interp(position, x, row) for x, row in zip(moved_x, moved_z, strict=True)])
+
+
+def fix_zero(height: np.ndarray, *, mask: np.ndarray | None = None, masking: Masking = "exclude") -> Levelled:
+    """Move the lowest selected pixel to zero; an order statistic of one pixel, not a physical datum."""
+    return _shift(height, np.min, mask, masking)
+
+
+def zero_mean(
+    height: np.ndarray, *, mask: np.ndarray | None = None, masking: Masking = "exclude"
+) -> Levelled:
+    """Move the mean of the selected pixels to zero."""
+    return _shift(height, np.mean, mask, masking)
+
+
+def zero_max(height: np.ndarray, *, mask: np.ndarray | None = None, masking: Masking = "exclude") -> Levelled:
+    """Move the highest selected pixel to zero."""
+    return _shift(height, np.max, mask, masking)
+
+
+def _shift(
+    height: np.ndarray, statistic: Callable[[np.ndarray], float], mask: np.ndarray | None, masking: Masking
+) -> Levelled:
+    z = as_height(height)
+    chosen = select(z, mask, masking)
+    return subtract(z, np.broadcast_to(np.float64(statistic(z if chosen is None else z[chosen])), z.shape))

@@ -11,9 +11,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import first_error
-from litho_data.level.recipe_steps import AnyStep
+from litho_data.level.recipe_steps import AnyStep, State
 from litho_data.level.selection import Levelled, as_height
-from litho_data.level.step import State
 from litho_data.scan import Scan
 
 

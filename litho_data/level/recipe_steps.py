@@ -2,23 +2,68 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Annotated, Any, Literal
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
 
+from litho_data.foundation.errors import InputError
 from litho_data.level.facet import level_facet
 from litho_data.level.features import Side, mark_features, mask_and_relevel
 from litho_data.level.layout_aware import level_layout_aware
-from litho_data.level.plane import level_plane, level_three_point
+from litho_data.level.plane import fix_zero, level_plane, level_rotate, level_three_point, zero_max, zero_mean
 from litho_data.level.polynomial import MAX_DEGREE, level_polynomial
 from litho_data.level.robust import Loss, level_robust
-from litho_data.level.rotate import level_rotate
 from litho_data.level.row_statistics import MEDIAN_TRIM
 from litho_data.level.rows import MAX_ROW_DEGREE, Direction, RowMethod, align_rows
 from litho_data.level.scars import ScarSign, mark_scars, remove_scars
-from litho_data.level.step import State, Step
-from litho_data.level.zero import fix_zero, zero_max, zero_mean
+from litho_data.level.selection import Masking
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """What passes from step to step: heights (µm), the current mask, pitch and layout."""
+
+    height_um: np.ndarray
+    mask: np.ndarray | None
+    pitch_um: tuple[float, float] | None
+    layout_level: np.ndarray | None
+
+    def need(self, name: str) -> Any:
+        """The pitch or the layout; raises InputError where it is unknown."""
+        if (value := getattr(self, name)) is None:
+            wanted = "the pixel pitch" if name == "pitch_um" else "the layout in the scan's frame"
+            raise InputError(f"{wanted} is unknown", wanted=name)
+        return value
+
+
+class Step(BaseModel):
+    """Base of all steps: its fields are the arguments of ``function``.
+
+    ``masking`` says how the current mask is used: the mask of the scan at first, then that of the
+    latest step that marks something.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    function: ClassVar[Callable[..., Any]]
+    needs: ClassVar[tuple[str, ...]] = ()
+
+    op: str
+    masking: Masking = "exclude"
+
+    def run(self, state: State) -> State:
+        """The state with the levelled map."""
+        return replace(state, height_um=self.call(state).height)
+
+    def call(self, state: State) -> Any:
+        """What ``function`` returns for the state."""
+        arguments = {name: getattr(self, name) for name in type(self).model_fields if name != "op"}
+        arguments |= {name: state.need(name) for name in self.needs}
+        return type(self).function(state.height_um, mask=state.mask, **arguments)
+
 
 Degree = Annotated[int, Field(ge=0, le=MAX_DEGREE)]
 Point = tuple[float, float]

@@ -5,14 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
+
+from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
 from litho_data.foundation.hashes import array_sha256, file_sha256
 from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import RunFacts, run_facts
 from litho_data.level import Recipe
-from litho_data.readers.scan_files import write_heights
+from litho_data.readers.gsf import gsf_bytes
 from litho_data.scan import Scan
 
+SUFFIXES = (".gsf", ".npy")
 _DIMS = ("y", "x")
 
 
@@ -65,3 +69,29 @@ def level_scan(scan: Scan, recipe: Recipe, out: str | Path) -> LevelRecord:
     with atomic_file(target.with_name(f"{target.name}.json")) as temporary:
         temporary.write_text(record.model_dump_json(by_alias=True, indent=1) + "\n", encoding="utf-8")
     return record
+
+
+def write_heights(
+    path: str | Path,
+    height_um: np.ndarray,
+    *,
+    pitch_um: tuple[float, float] | None,
+    title: str = "",
+) -> Path:
+    """Write a height map; the suffix says how.
+
+    ``.gsf`` holds float32 metres with size and title, and opens in Gwyddion; ``.npy`` holds
+    float64 µm and nothing else. Missing pixels are NaN in both.
+
+    Raises:
+        InputError: another suffix.
+    """
+    file = Path(path)
+    if file.suffix not in SUFFIXES:
+        raise InputError(f"{file}: file type", got=repr(file.suffix), wanted=" or ".join(SUFFIXES))
+    with atomic_file(file) as temporary, temporary.open("wb") as stream:
+        if file.suffix == ".npy":
+            np.save(stream, np.asarray(height_um, dtype=np.float64))
+        else:
+            stream.write(gsf_bytes(height_um, pitch_um, title))
+    return file

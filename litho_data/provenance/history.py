@@ -1,4 +1,4 @@
-"""``history``: where the arrays of a scan come from."""
+"""``history``: where the arrays of a scan come from; and what a store records for it."""
 
 from __future__ import annotations
 
@@ -6,9 +6,14 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
-from litho_data.provenance.records import read_steps, steps_of
-from litho_data.provenance.steps import Step
-from litho_data.store.read import open_store
+import numpy as np
+
+from litho_data.build.step import Step
+from litho_data.cards.fetch import known_folders
+from litho_data.foundation.errors import InputError
+from litho_data.store.access import group_of, read_table
+from litho_data.store.read import Store, open_store
+from litho_data.store.schema import SCAN_VARIABLES
 
 _HASH_DIGITS = 12
 
@@ -52,3 +57,63 @@ def _overview(recorded: dict[str, list[tuple[str, Step]]]) -> Iterator[str]:
         last = steps[-1][1].outputs[0]
         chain = " -> ".join(step.op for _, step in steps)
         yield f"{scan_id}: {', '.join(raw)} -> {chain} -> {last['name']} {last['sha256'][:_HASH_DIGITS]}"
+
+
+def read_steps(store: Store) -> dict[str, list[tuple[str, Step]]]:
+    """Recorded steps of every scan in order, each with the id it was recorded under.
+
+    Raises:
+        InputError: a store without provenance, or a record that is no JSON.
+    """
+    steps: dict[str, list[tuple[str, Step]]] = {}
+    for row in read_table(group_of(store.root, "provenance"), "scan").to_dict("records"):
+        try:
+            steps.setdefault(row["scan"], []).append(
+                (row["step_id"], Step.from_record(json.loads(row["record"])))
+            )
+        except (ValueError, TypeError, KeyError) as error:
+            raise InputError(f"record of step {row['op']} of scan {row['scan']}", got=str(error)) from error
+    return steps
+
+
+def steps_of(recorded: dict[str, list[tuple[str, Step]]], scan_id: str) -> list[tuple[str, Step]]:
+    """The recorded steps of one scan; InputError where there is no such scan."""
+    if scan_id not in recorded:
+        raise InputError("scan", got=repr(scan_id), wanted=f"one of {', '.join(list(recorded)[:30])}")
+    return recorded[scan_id]
+
+
+def raw_folder(store: Store, data_dir: str | Path | None = None) -> Path | None:
+    """Where the raw files of a store are; None where they are not to be found.
+
+    Raises:
+        InputError: ``data_dir`` is given and is no folder.
+    """
+    if data_dir is not None:
+        return require_folder(data_dir)
+    names = [row["path"] for row in store.manifest["files"] if row["status"] == "ok"]
+    recorded = store.path.parent / store.manifest["build"]["data_dir"]
+    for folder in (recorded, *known_folders(store.name)):
+        if any((folder / name).is_file() for name in names):
+            return folder.resolve()
+    return None
+
+
+def require_folder(data_dir: str | Path) -> Path:
+    """The folder that the user named; InputError where there is none."""
+    if not Path(data_dir).is_dir():
+        raise InputError("folder of raw files", got=str(data_dir), wanted="an existing folder")
+    return Path(data_dir)
+
+
+def stored_array(store: Store, scan_id: str, name: str) -> np.ndarray | None:
+    """A scan's array by name, from the arrays over all scans or from its own group.
+
+    None for the one thing that is not kept, the layout of a reference scan.
+
+    Raises:
+        InputError: no such array, or a stored chunk that does not decode.
+    """
+    if name in {variable.name for variable in SCAN_VARIABLES}:
+        return store.scan_frame(scan_id, name)
+    return store.sample(name, store.ids.index(scan_id)) if scan_id in store.ids else None

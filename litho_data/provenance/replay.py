@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from litho_data.build.operations import OPERATIONS, perform
+from litho_data.build.operations import OPERATIONS
+from litho_data.build.step import Step
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256
-from litho_data.provenance.records import raw_folder, read_steps, steps_of, stored_array
-from litho_data.provenance.steps import Step
+from litho_data.provenance.history import raw_folder, read_steps, steps_of, stored_array
 from litho_data.store.read import open_store
 from litho_data.store.schema import VARIABLES
 
@@ -86,7 +86,7 @@ def _recomputed(steps: Sequence[Step], folder: Path) -> Iterator[tuple[str, np.n
             if one["name"] in files:
                 _require_same(files[one["name"]], one["sha256"])
         inputs = {one["name"]: made[one["name"]] for one in step.inputs if one["name"] not in files}
-        done = perform(step.op, step.params, files, inputs)
+        done = OPERATIONS[step.op].run(step.params, files, inputs)
         made |= done.arrays
         yield from done.arrays.items()
 

@@ -13,11 +13,11 @@ import numpy as np
 
 from litho_data.build.assemble import root_attributes, table_sha256
 from litho_data.build.operations import OPERATIONS
+from litho_data.build.step import Step
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256, record_sha256
-from litho_data.provenance.records import raw_folder, read_steps, require_folder, stored_array
-from litho_data.provenance.steps import Step
+from litho_data.provenance.history import raw_folder, read_steps, require_folder, stored_array
 from litho_data.store.access import array_of, decoded, group_of, open_root, read_table, values_of
 from litho_data.store.read import Store, open_store
 from litho_data.store.schema import SAMPLE_VARIABLES, STORE_SCHEMA, VARIABLES

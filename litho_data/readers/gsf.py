@@ -1,4 +1,4 @@
-"""Gwyddion Simple Field: a text header, NUL padding to four bytes, little-endian float32 rows."""
+"""Gwyddion Simple Field, read and written: a text header, NUL padding, little-endian float32 rows."""
 
 from __future__ import annotations
 
@@ -8,10 +8,11 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import is_length, um_per
-from litho_data.readers.channel import Channel
+from litho_data.readers.reader import Channel, Reader
 
 _MAGIC = b"Gwyddion Simple Field 1.0\n"
 _ITEM = 4
+_UM_PER_M = 1e6
 
 
 def read_channels(path: Path) -> list[Channel]:
@@ -76,3 +77,17 @@ def _size_um(header: dict[str, str]) -> tuple[float, float] | None:
     except (KeyError, ValueError):
         return None
     return size if all(np.isfinite(size)) and min(size) > 0 else None
+
+
+def gsf_bytes(height_um: np.ndarray, pitch_um: tuple[float, float] | None, title: str = "") -> bytes:
+    """A GSF file of heights (ny, nx) in µm, stored as float32 metres; NaN where not measured."""
+    ny, nx = height_um.shape
+    fields = {"XRes": str(nx), "YRes": str(ny), "ZUnits": "m", "Title": " ".join(title.split())}
+    if pitch_um is not None:
+        size_m = {"XReal": nx * pitch_um[1] / _UM_PER_M, "YReal": ny * pitch_um[0] / _UM_PER_M}
+        fields |= {"XYUnits": "m"} | {key: repr(float(size)) for key, size in size_m.items()}
+    text = _MAGIC + "".join(f"{key} = {value}\n" for key, value in fields.items() if value).encode()
+    return text + b"\0" * (_ITEM - len(text) % _ITEM) + (height_um / _UM_PER_M).astype("<f4").tobytes()
+
+
+READER = Reader("gsf", lambda path, head: head.startswith(_MAGIC[:21]), read_channels)

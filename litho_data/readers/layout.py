@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from litho_data.foundation.errors import InputError
-from litho_data.readers.detect import detect_format, require_file
 from litho_data.readers.npy import load_array
+from litho_data.readers.registry import detect_format, require_file
 from litho_data.readers.tiff import open_tiff, single_sample
 
 _LARGEST_LEVEL = 255

@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from litho_data.foundation.errors import InputError
-from litho_data.readers.channel import Channel
-from litho_data.readers.foreign import foreign_parser
+from litho_data.readers.reader import Channel, Reader, foreign_parser
 
 
 def read_channels(path: Path) -> list[Channel]:
@@ -48,3 +47,6 @@ def load_array(path: Path) -> np.ndarray:
             wanted="integers or real numbers",
         )
     return array
+
+
+READER = Reader("npy", lambda path, head: head.startswith(b"\x93NUMPY"), read_channels, self_describing=False)

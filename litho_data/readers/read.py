@@ -8,20 +8,9 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import um_per
-from litho_data.readers import gsf, gwy, npy, text_matrix, tiff, vendor
-from litho_data.readers.channel import Channel
-from litho_data.readers.detect import detect_format, require_file
+from litho_data.readers.reader import Channel, Reader
+from litho_data.readers.registry import PICTURE, detect_format, reader_of, require_file
 from litho_data.scan import Axis, Scan
-
-_READERS = {
-    "text-matrix": text_matrix.read_channels,
-    "tiff": tiff.read_channels,
-    "npy": npy.read_channels,
-    "gsf": gsf.read_channels,
-    "gwy": gwy.read_channels,
-    "vendor": vendor.read_channels,
-}
-FORMATS = ("auto", *_READERS)
 
 # Sizes that files state are rounded to a few digits when they are written.
 _SIZE_TOLERANCE = 1e-4
@@ -41,7 +30,7 @@ def read_scan(
 
     Args:
         path: the instrument's file.
-        format: one of ``FORMATS``; ``"auto"`` judges the content.
+        format: one of ``formats()``, or ``"auto"``, which judges the content.
         unit: of the heights, needed where the file states none.
         size_um: (y, x) extent from edge to edge, µm, for files that state none; without it the
             pitch stays unknown (None).
@@ -55,8 +44,8 @@ def read_scan(
             size, nothing finite in the map.
     """
     file = require_file(path)
-    kind = _settle_format(file, format)
-    chosen = _choose(file, _READERS[kind](file), channel)
+    reader = _settle_format(file, format)
+    chosen = _choose(file, reader.read_channels(file), channel)
     values, mask = chosen.load()
     stated_unit, factor = _settle_unit(file, chosen, unit, full_scale_um)
     return Scan(
@@ -69,7 +58,7 @@ def read_scan(
         mask=mask,
         header=chosen.header,
         source=str(file),
-        format=kind,
+        format=reader.name,
     )
 
 
@@ -80,16 +69,14 @@ def list_channels(path: str | Path, *, format: str = "auto") -> list[Channel]:
         InputError: unreadable or of unknown format.
     """
     file = require_file(path)
-    return _READERS[_settle_format(file, format)](file)
+    return _settle_format(file, format).read_channels(file)
 
 
-def _settle_format(file: Path, format: str) -> str:
-    if format not in FORMATS:
-        raise InputError("scan format", got=repr(format), wanted=" | ".join(FORMATS))
+def _settle_format(file: Path, format: str) -> Reader:
     kind = detect_format(file) if format == "auto" else format
-    if kind not in _READERS:
+    if kind == PICTURE:
         raise InputError(f"{file}: format", got=f"a picture ({kind})", wanted="a file with heights")
-    return kind
+    return reader_of(kind)
 
 
 def _choose(file: Path, channels: list[Channel], name: str | None) -> Channel:

@@ -11,12 +11,12 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import is_length, um_per
-from litho_data.readers.channel import Channel, Loaded
-from litho_data.readers.foreign import foreign_parser
+from litho_data.readers.reader import Channel, Loaded, Reader, foreign_parser
 
 if TYPE_CHECKING:
     from tifffile import TiffFile
 
+_MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _XRESOLUTION, _YRESOLUTION = 282, 283
 _JPK_FILE_FORMAT_VERSION = 0x8000
 
@@ -42,15 +42,6 @@ def open_tiff(path: Path) -> Iterator[TiffFile]:
 
     with foreign_parser(path, "TIFF"), tifffile.TiffFile(path) as file:
         yield file
-
-
-def is_jpk(path: Path) -> bool:
-    """Whether a TIFF is a JPK file: its first page then carries JPK's private tags."""
-    try:
-        with open_tiff(path) as file:
-            return _JPK_FILE_FORMAT_VERSION in file.pages.first.tags
-    except InputError:  # reported by the reader that will be tried on it
-        return False
 
 
 def _channel(path: Path, index: int, page: Any, imagej: dict[str, Any]) -> Channel:
@@ -107,3 +98,19 @@ def single_sample(path: Path, pixels: np.ndarray) -> np.ndarray:
     if pixels.ndim != 2:
         raise InputError(f"{path}: shape", got=pixels.shape, wanted="a two-dimensional image")
     return pixels
+
+
+def _recognises(path: Path, head: bytes) -> bool:
+    return head.startswith(_MAGIC) and not _is_jpk(path)
+
+
+def _is_jpk(path: Path) -> bool:
+    """Whether a TIFF is a JPK file: its first page then carries JPK's private tags."""
+    try:
+        with open_tiff(path) as file:
+            return _JPK_FILE_FORMAT_VERSION in file.pages.first.tags
+    except InputError:  # reported by the reader that will be tried on it
+        return False
+
+
+READER = Reader("tiff", _recognises, read_channels, self_describing=False)

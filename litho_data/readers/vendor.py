@@ -12,9 +12,8 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import is_length, um_per
-from litho_data.readers.channel import Channel, Loaded, with_unique_names
-from litho_data.readers.foreign import foreign_parser
-from litho_data.readers.vendor_headers import fast_axis, layer_names, vendor_header
+from litho_data.readers.reader import Channel, Loaded, Reader, foreign_parser, with_unique_names
+from litho_data.scan import Axis
 
 # Left out: formats with readers of our own, plain text, and two that have no signature and would
 # take any bytes of a fitting length for a map.
@@ -22,6 +21,9 @@ _NOT_OURS = {"npy", "npz", "gwy", "asc", "xyz", "hgt", "nms"}
 _HEAD_BYTES = 512
 # Deflate, the strongest compression in use, packs at most 1032 bytes into one.
 _MOST_PIXELS_PER_BYTE = 1032
+_ANGLE_TOLERANCE_DEG = 1.0
+_NANOSCOPE_END = b"\\*File list end"
+_LONGEST_HEADER = 1 << 20
 
 
 def read_channels(path: Path) -> list[Channel]:
@@ -31,7 +33,7 @@ def read_channels(path: Path) -> list[Channel]:
         InputError: no reader recognises the file, it is damaged, or it holds no map.
     """
     kind = _recognise(path)
-    header = vendor_header(path, kind)
+    header = _vendor_header(path, kind)
     with foreign_parser(path, kind), _open(path, kind) as reader:
         channels = [_channel(path, kind, info, header) for info in reader.channels if info.dim == 2]
     size = path.stat().st_size
@@ -41,7 +43,7 @@ def read_channels(path: Path) -> list[Channel]:
             raise InputError(f"{path} ({kind})", got=got, wanted="more", hint="the file may be damaged")
     if not channels:
         raise InputError(f"{path} ({kind}) holds no two-dimensional channel")
-    names = layer_names(path, kind)
+    names = _layer_names(path, kind)
     if len(names) == len(channels) == 1 and names[0]:
         channels = [replace(channels[0], name=names[0])]
     return with_unique_names(channels)
@@ -85,7 +87,7 @@ def _channel(path: Path, kind: str, info: Any, header: dict[str, str]) -> Channe
         unit=unit,
         size_um=_size_um(sizes, lateral_unit),
         load=lambda: _load(path, kind, info.index, sizes is None),
-        fast_axis=fast_axis(header),
+        fast_axis=_fast_axis(header),
         header=header or dict(_flatten(info.info.get("raw_metadata", info.info))),
     )
 
@@ -114,3 +116,72 @@ def _flatten(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str
             yield from _flatten(value, f"{name}/")
         else:
             yield name, str(value)
+
+
+def _vendor_header(path: Path, kind: str) -> dict[str, str]:
+    """The header of an Igor wave or a Nanoscope file, word by word; empty for other formats.
+
+    SurfaceTopography passes these headers on only in part.
+    """
+    if kind == "ibw":
+        return _igor_note(path)
+    return _nanoscope_header(path) if kind == "di" else {}
+
+
+def _fast_axis(header: dict[str, str]) -> Axis | None:
+    """``"x"`` where an Asylum note gives a scan angle of 0° or 180°.
+
+    At other angles the lines of the file may follow the scanner or the scan; the caller has to say.
+    """
+    try:
+        angle = float(header["ScanAngle"]) % 180
+    except (KeyError, ValueError):
+        return None
+    return "x" if min(angle, 180 - angle) < _ANGLE_TOLERANCE_DEG else None
+
+
+def _layer_names(path: Path, kind: str) -> list[str]:
+    """The labels of an Igor wave's layers: SurfaceTopography drops the label of a single one."""
+    if kind != "ibw":
+        return []
+    return [label.decode("utf-8", errors="replace").strip("\0 ") for label in _igor_wave(path)["labels"][2]]
+
+
+def _igor_wave(path: Path) -> dict[str, Any]:
+    from igor2 import binarywave
+
+    with foreign_parser(path, "ibw"):
+        return {"note": b"", "labels": [[], [], [], []]} | binarywave.load(str(path))["wave"]
+
+
+def _igor_note(path: Path) -> dict[str, str]:
+    text = _igor_wave(path)["note"].decode("utf-8", errors="replace")
+    note = {}
+    for number, line in enumerate(text.splitlines(), start=1):
+        key, colon, value = line.partition(":")
+        note[key.strip() if colon else f"line {number}"] = value.strip() if colon else line
+    return {key: value for key, value in note.items() if key and value}
+
+
+def _nanoscope_header(path: Path) -> dict[str, str]:
+    """``section/key`` for every entry; sections of one name are numbered."""
+    with path.open("rb") as stream:
+        raw = stream.read(_LONGEST_HEADER)
+    text = raw[: max(raw.find(_NANOSCOPE_END), 0)].decode("latin-1")
+    header: dict[str, str] = {}
+    seen: dict[str, int] = {}
+    section = ""
+    for line in text.splitlines():
+        entry = line.removeprefix("\\")
+        if entry.startswith("*"):
+            name = entry[1:]
+            seen[name] = seen.get(name, 0) + 1
+            section = name if seen[name] == 1 else f"{name} #{seen[name]}"
+        elif entry:
+            key, _, value = entry.partition(": ")
+            header[f"{section}/{key}"] = value
+    return header
+
+
+# Asked last: which of its many formats a file is in, SurfaceTopography finds out by trying.
+READER = Reader("vendor", lambda path, head: True, read_channels)

@@ -23,9 +23,17 @@ from litho_data.store.access import (
     read_table,
     values_of,
 )
-from litho_data.store.contract import checked_arrays, checked_attributes, true_shapes
 from litho_data.store.lock_box import lock_box, lock_box_size
-from litho_data.store.schema import OPTIONAL_COLUMNS, SAMPLE_VARIABLES, VARIABLES, DatasetId, dataset_sha256
+from litho_data.store.schema import (
+    OPTIONAL_COLUMNS,
+    SAMPLE_VARIABLES,
+    VARIABLES,
+    DatasetId,
+    checked_arrays,
+    checked_attributes,
+    dataset_sha256,
+    true_shapes,
+)
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -9,8 +9,8 @@ from typing import cast
 
 import numpy as np
 
-from litho_data.build.card import load_card
-from litho_data.build.card_files import read_table
+from litho_data.cards.card import load_card
+from litho_data.cards.tables import read_table
 from litho_data.foundation.errors import InputError
 from litho_data.layouts.random_layout import random_layout
 from litho_data.readers import read_layout

@@ -15,12 +15,12 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_folder
 from litho_data.foundation.outputs import require_replaceable_folder
 from litho_data.layouts.card_text import CardText, write_layout, write_table
+from litho_data.readers.text_matrix import write_text_matrix
 from litho_data.virtual_fab.fab import Fab, FabScan, scan_job
 from litho_data.virtual_fab.jobs import PRINT_PATTERN, Plan, random_jobs
 from litho_data.virtual_fab.knobs import KnobBoard, KnobSetting
 from litho_data.virtual_fab.printer import Job
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
-from litho_data.virtual_fab.text_matrix import write_text_matrix
 from litho_data.virtual_fab.truth import KnobTruth, ScanTruth, Truth, noise_floor
 
 T = TypeVar("T")

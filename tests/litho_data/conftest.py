@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 from campaigns import write_campaign
 
-from litho_data.build.build import build
+from litho_data.build.build import build_dataset
 
 
 @pytest.fixture(scope="session")
 def campaign(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with ``card.toml``, three scans, and ``prints.zarr`` built from them; not to be changed."""
     folder = tmp_path_factory.mktemp("campaign")
-    build(write_campaign(folder), folder / "prints.zarr")
+    build_dataset(write_campaign(folder), folder / "prints.zarr")
     return folder
 
 

@@ -16,13 +16,13 @@ import pytest
 import tifffile
 from campaigns import LEVEL_HEIGHT_UM, MARGIN_PX, NOISE_UM, height_of, layout_of, write_campaign, write_scan
 
-from litho_data.build.build import build
+from litho_data.build.build import build_dataset
 from litho_data.build.jobs import attempt, field_jobs
-from litho_data.build.listing import list_fields
-from litho_data.build.make_store import BuildResult, report_folder
 from litho_data.build.operations import load_recipe
+from litho_data.build.result import BuildResult, report_folder
+from litho_data.cards.listing import list_fields
 from litho_data.foundation.errors import InputError
-from litho_data.provenance.records import read_steps
+from litho_data.provenance.history import read_steps
 from litho_data.provenance.replay import replay
 from litho_data.provenance.verify import verify
 from litho_data.store import open_store
@@ -61,7 +61,7 @@ def test_raw_heights_are_kept_as_read(campaign: Path) -> None:
 def test_building_again_with_other_workers_gives_the_same(own_campaign: Path) -> None:
     first = open_store(own_campaign / "prints.zarr")
     hashes = first.sha256, first.root.attrs["manifest_sha256"]
-    result = build(own_campaign / "card.toml", own_campaign / "prints.zarr", workers=2)
+    result = build_dataset(own_campaign / "card.toml", own_campaign / "prints.zarr", workers=2)
     again = open_store(own_campaign / "prints.zarr")
     assert result.reused == 0
     assert (again.sha256, again.root.attrs["manifest_sha256"]) == hashes
@@ -74,14 +74,16 @@ def test_a_dask_cluster_gives_the_same(campaign: Path, tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed")
     cluster = distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None)
     with cluster:
-        result = build(campaign / "card.toml", tmp_path / "prints.zarr", dask=cluster.scheduler_address)
+        result = build_dataset(
+            campaign / "card.toml", tmp_path / "prints.zarr", dask=cluster.scheduler_address
+        )
     assert result.dataset.sha256 == open_store(campaign / "prints.zarr").sha256
 
 
 def test_no_scheduler_is_bad_input(campaign: Path, tmp_path: Path) -> None:
     pytest.importorskip("distributed")
     with pytest.raises(InputError, match="Dask scheduler"):
-        build(campaign / "card.toml", tmp_path / "prints.zarr", dask="nonsense://")
+        build_dataset(campaign / "card.toml", tmp_path / "prints.zarr", dask="nonsense://")
     assert not list(tmp_path.iterdir())
 
 
@@ -102,7 +104,7 @@ def test_bad_scans_are_skipped_with_their_reason(tmp_path: Path, capsys: pytest.
     tifffile.imwrite(tmp_path / "layouts" / "P35.tif", layout_of(0) + 4)
     write_scan(tmp_path / "scans" / "P36.txt", height_of(layout_of(6), 6))  # without layout
 
-    result = build(card, tmp_path / "prints.zarr")
+    result = build_dataset(card, tmp_path / "prints.zarr")
     skipped = {one.id: one.reason for one in result.skipped}
     assert result.n_scans == 3
     assert set(skipped) == set(bad)
@@ -122,7 +124,7 @@ def test_bad_scans_are_skipped_with_their_reason(tmp_path: Path, capsys: pytest.
     assert BuildResult.read(report_folder(tmp_path / "prints.zarr")) == result
 
     with pytest.raises(InputError, match="6 scans cannot be used"):
-        build(card, tmp_path / "strict.zarr", strict=True)
+        build_dataset(card, tmp_path / "strict.zarr", strict=True)
     assert not [path for path in tmp_path.iterdir() if "strict" in path.name]
 
 
@@ -136,7 +138,7 @@ def test_the_manifest_does_not_depend_on_where_the_raw_files_lie(
             shutil.copytree(campaign / part, folder / part)
         shutil.copy(campaign / "card.toml", folder)
         (folder / "scans" / "P21.txt").write_text("1\t2\n3")
-        build(folder / "card.toml", folder / "prints.zarr")
+        build_dataset(folder / "card.toml", folder / "prints.zarr")
         store = open_store(folder / "prints.zarr")
         hashes.add(store.root.attrs["manifest_sha256"])
         assert "reason: P21: scans/P21.txt line 2" in [
@@ -152,7 +154,7 @@ def test_isolated_gaps_are_not_valid(tmp_path: Path) -> None:
     row, column = 40, 60
     height[row + MARGIN_PX, column + MARGIN_PX] = np.nan
     write_scan(tmp_path / "scans" / "P11.txt", height)
-    build(card, tmp_path / "prints.zarr")
+    build_dataset(card, tmp_path / "prints.zarr")
     scan = open_store(tmp_path / "prints.zarr").scan("P11")
     assert not scan.valid[row, column]
     # The gap and the pixels whose interpolation reaches it: at most 6 x 6, never the rest of the field.
@@ -165,7 +167,7 @@ def test_no_good_scan_leaves_nothing(tmp_path: Path) -> None:
     (tmp_path / "scans" / "P11.txt").write_text("1\t2\n3")
     before = {path.name for path in tmp_path.iterdir()}
     with pytest.raises(InputError, match=r"no scan can be used.*P11"):
-        build(card, tmp_path / "prints.zarr")
+        build_dataset(card, tmp_path / "prints.zarr")
     assert {path.name for path in tmp_path.iterdir()} == before
 
 
@@ -177,7 +179,7 @@ def test_smaller_layouts_are_padded_and_cut_again(tmp_path: Path) -> None:
     margin = MARGIN_PX + 8
     height = np.pad(height_of(small, 5)[:, MARGIN_PX:-MARGIN_PX], ((0, 0), (margin, margin)), mode="edge")
     write_scan(tmp_path / "scans" / "P12.txt", height)
-    build(card, tmp_path / "prints.zarr")
+    build_dataset(card, tmp_path / "prints.zarr")
     store = open_store(tmp_path / "prints.zarr")
     np.testing.assert_array_equal(store.scan("P12").mask_level, small)
     assert store.scan("P12").height_um.shape == (144, 128)
@@ -190,7 +192,7 @@ def test_references_are_kept_apart_from_the_dataset(tmp_path: Path) -> None:
     card = write_campaign(tmp_path, count=1, more='table = "scans.csv"')
     (tmp_path / "scans.csv").write_text("id,use\nP11,dataset\nbare,substrate\n", encoding="utf-8")
     write_scan(tmp_path / "scans" / "bare.txt", 0.001 * np.random.default_rng(0).standard_normal((128, 128)))
-    result = build(card, tmp_path / "prints.zarr")
+    result = build_dataset(card, tmp_path / "prints.zarr")
     store = open_store(tmp_path / "prints.zarr")
     assert (result.n_scans, result.n_references) == (1, 1)
     assert store.ids == ["P11"]
@@ -207,7 +209,7 @@ def test_a_levelling_recipe_is_applied_and_recorded(tmp_path: Path) -> None:
     height = height_of(layout_of(0), 0)
     tilt_um = 0.3 * (np.arange(128) / 128 - 0.5)
     write_scan(tmp_path / "scans" / "P11.txt", height + tilt_um)
-    build(card, tmp_path / "prints.zarr")
+    build_dataset(card, tmp_path / "prints.zarr")
     store = open_store(tmp_path / "prints.zarr")
     removed = store.scan_frame("P11", "removed_um").astype(float)
     raw, levelled = (
@@ -227,7 +229,7 @@ def test_layout_aware_levelling_knows_where_the_layout_lies(tmp_path: Path) -> N
     height = height_of(layout_of(0), 0)
     tilt_um = 0.3 * (np.arange(128) / 128 - 0.5)
     write_scan(tmp_path / "scans" / "P11.txt", height + tilt_um)
-    build(card, tmp_path / "prints.zarr")
+    build_dataset(card, tmp_path / "prints.zarr")
     removed = open_store(tmp_path / "prints.zarr").scan_frame("P11", "removed_um").astype(float)
     # The margin has no layout and the response is piecewise linear: 5 % of the tilt is left to them.
     np.testing.assert_allclose(np.polyfit(np.arange(128), removed.mean(axis=0), 1)[0] * 128, 0.3, rtol=0.05)
@@ -239,7 +241,8 @@ def test_layout_aware_levelling_knows_where_the_layout_lies(tmp_path: Path) -> N
 def test_a_killed_build_is_finished_by_the_next(campaign: Path, tmp_path: Path) -> None:
     out = tmp_path / "prints.zarr"
     pieces = tmp_path / ".prints.zarr.partial" / "pieces"
-    code = f"from litho_data.build.build import build; build({str(campaign / 'card.toml')!r}, {str(out)!r})"
+    call = f"build_dataset({str(campaign / 'card.toml')!r}, {str(out)!r})"
+    code = f"from litho_data.build.build import build_dataset; {call}"
     process = subprocess.Popen([sys.executable, "-c", code])
     deadline = time.monotonic() + 60
     while not list(pieces.glob("*.json")) and process.poll() is None and time.monotonic() < deadline:
@@ -249,7 +252,7 @@ def test_a_killed_build_is_finished_by_the_next(campaign: Path, tmp_path: Path) 
     assert not out.exists()
     finished = len(list(pieces.glob("*.json")))
     assert finished >= 1
-    result = build(campaign / "card.toml", out)
+    result = build_dataset(campaign / "card.toml", out)
     assert result.reused == finished
     assert result.dataset.sha256 == open_store(campaign / "prints.zarr").sha256
     assert verify(out).findings == ()
@@ -271,7 +274,7 @@ def test_a_damaged_or_outdated_piece_is_made_again(campaign: Path, own_campaign:
         damaged.write_bytes(content)
     text = (own_campaign / "scans" / "P12.txt").read_text()
     (own_campaign / "scans" / "P12.txt").write_text(text.replace("\t", " ", 1))
-    result = build(own_campaign / "card.toml", out)
+    result = build_dataset(own_campaign / "card.toml", out)
     assert result.reused == 1
     assert result.dataset.sha256 == open_store(campaign / "prints.zarr").sha256
 
@@ -292,9 +295,9 @@ def test_a_changed_card_is_another_piece(campaign: Path) -> None:
 
 def test_another_build_or_a_foreign_folder_is_left_alone(campaign: Path, tmp_path: Path) -> None:
     with partial_store(tmp_path / "busy.zarr"), pytest.raises(InputError, match="another process"):
-        build(campaign / "card.toml", tmp_path / "busy.zarr")
+        build_dataset(campaign / "card.toml", tmp_path / "busy.zarr")
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter.txt").write_text("years of work")
     with pytest.raises(InputError, match="no store of ours"):
-        build(campaign / "card.toml", tmp_path / "thesis")
+        build_dataset(campaign / "card.toml", tmp_path / "thesis")
     assert (tmp_path / "thesis" / "chapter.txt").read_text() == "years of work"

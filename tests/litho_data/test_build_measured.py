@@ -10,17 +10,17 @@ from pathlib import Path
 
 import pytest
 
-from litho_data.build.build import build
-from litho_data.exchange.fetch import find_card
+from litho_data.build.build import build_dataset
+from litho_data.cards.fetch import find_card
 from litho_data.provenance.verify import verify
 from litho_data.store import open_store
 from litho_data.store.schema import SAMPLE_VARIABLES
 
 _BUILD = """
 import json, resource, sys
-from litho_data.build.build import build
+from litho_data.build.build import build_dataset
 if __name__ == "__main__":
-    result = build(sys.argv[1], sys.argv[2], workers=int(sys.argv[3]))
+    result = build_dataset(sys.argv[1], sys.argv[2], workers=int(sys.argv[3]))
     whose = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
     peaks = [resource.getrusage(one).ru_maxrss / 1024 for one in whose]
     print(json.dumps([result.dataset.sha256, result.n_scans, result.seconds, *peaks]))
@@ -53,7 +53,7 @@ def test_all_measured_scans_build_in_bounded_memory(measured_prints: Path, tmp_p
     for name in ("afm_ug/FOV42.txt", "afm_ug/FOV72.txt", "mask_ug/FOV42.tif", "mask_ug/FOV72.tif"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         shutil.copy(measured_prints / name, tmp_path / name)
-    build(find_card("neural-lithography"), tmp_path / "two.zarr", data_dir=tmp_path, workers=1)
+    build_dataset(find_card("neural-lithography"), tmp_path / "two.zarr", data_dir=tmp_path, workers=1)
     two = open_store(tmp_path / "two.zarr")
     for scan_id in two.ids:
         for variable in SAMPLE_VARIABLES:

@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from campaigns import card_text
 
-from litho_data.build.card import check_card, load_card
-from litho_data.exchange.fetch import known_cards
+from litho_data.cards.card import check_card, load_card
+from litho_data.cards.fetch import known_cards
 from litho_data.foundation.errors import InputError
 
 GOOD: dict[str, Any] = tomllib.loads(card_text())

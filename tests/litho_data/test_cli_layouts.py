@@ -9,13 +9,13 @@ import pytest
 from scipy.ndimage import maximum_filter, minimum_filter
 from typer.testing import CliRunner
 
-from litho_data.build.build import build
+from litho_data.build.build import build_dataset
 from litho_data.cli.layouts import masks, simulate
 from litho_data.foundation.commands import new_app
 from litho_data.foundation.errors import InputError
 from litho_data.store import open_store
 from litho_data.virtual_fab import KNOBS, Truth
-from litho_data.virtual_fab.presets import PRESETS
+from litho_data.virtual_fab.settings import PRESETS
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +50,7 @@ def test_a_dose_matrix_becomes_heights_against_dose(app, tmp_path):
     made = run(app, "masks", "--out", tmp_path / "m", "--pattern", "dose-matrix", "--count", 3, "--size", 192)
     printed = run(app, "simulate", "--out", tmp_path / "s", "--layouts", tmp_path / "m" / "card.toml")
     assert made.exit_code == printed.exit_code == 0
-    result = build(tmp_path / "s" / "raw" / "card.toml", tmp_path / "s.zarr", strict=True)
+    result = build_dataset(tmp_path / "s" / "raw" / "card.toml", tmp_path / "s.zarr", strict=True)
     assert (result.n_scans, result.n_references) == (3, 0)
     scans = open_store(tmp_path / "s.zarr").scans()
     assert [scan.dose for scan in scans] == pytest.approx([0.7, 1.0, 1.3])

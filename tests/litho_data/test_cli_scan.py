@@ -10,15 +10,14 @@ import pytest
 from afm_files import HEIGHT_UM, SIZE_UM
 from typer.testing import CliRunner
 
-from litho_data.cli.scan import ScanFormat, inspect, level
+from litho_data.cli.scan import inspect, level
+from litho_data.cli.scan_picture import terminal_preview, write_picture
 from litho_data.foundation.commands import new_app, run_app
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import array_sha256, file_sha256
-from litho_data.foundation.scan_picture import terminal_preview, write_picture
 from litho_data.level import Recipe
-from litho_data.level.scan import LevelRecord, level_scan
-from litho_data.readers import FORMATS, read_scan
-from litho_data.readers.scan_files import write_heights
+from litho_data.level.scan import LevelRecord, level_scan, write_heights
+from litho_data.readers import formats, read_scan
 from litho_data.scan import Scan
 
 RECIPE = '[[step]]\nop = "plane"\n[[step]]\nop = "fix-zero"\n'
@@ -67,17 +66,18 @@ def test_level_writes_heights_removed_surface_and_record(app, scan_file: Path, s
     assert Recipe.from_dict(record.recipe).canonical() == Recipe.from_toml(recipe_file).canonical()
 
 
-def test_the_command_offers_what_the_reader_reads() -> None:
-    assert tuple(ScanFormat) == FORMATS
+def test_the_command_offers_what_the_reader_reads(app, scan_file: Path) -> None:
+    said = CliRunner().invoke(app, ["inspect", str(scan_file), "--format", "nonsense"]).exception
+    assert [name for name in formats() if name not in str(said)] == []
 
 
 def test_gsf_keeps_missing_pixels(tmp_path: Path) -> None:
     holed = HEIGHT_UM.copy()
     holed[2, 3] = np.nan
-    write_heights(tmp_path / "a.gsf", holed, pitch_um=None, title="two\nlines", header={"Note": "kept"})
+    write_heights(tmp_path / "a.gsf", holed, pitch_um=None, title="two\nlines")
     scan = read_scan(tmp_path / "a.gsf")
     np.testing.assert_array_equal(np.isnan(scan.height_um), np.isnan(holed))
-    assert (scan.pitch_um, scan.channel, scan.header["Note"]) == (None, "two lines", "kept")
+    assert (scan.pitch_um, scan.channel) == (None, "two lines")
 
 
 def test_inspect_lists_channels_and_writes_a_picture(app, tmp_path: Path) -> None:

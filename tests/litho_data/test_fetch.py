@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 import litho_data
-from litho_data.exchange.fetch import CARDS, fetch
+from litho_data.cards.fetch import CARDS, fetch
 from litho_data.foundation.errors import InputError
 
 CONTENT = {"scans/P11.txt": b"1\t2\n3\t4\n", "layouts/P11.tif": b"levels", "elsewhere.bmp": b"picture"}

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from litho_data.build.card import load_card
-from litho_data.build.card_files import read_table
+from litho_data.cards.card import load_card
+from litho_data.cards.tables import read_table
 from litho_data.foundation.errors import InputError
 from litho_data.layouts import (
     PATTERNS,

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from campaigns import card_text
 
-from litho_data.build.listing import list_fields
+from litho_data.cards.listing import list_fields
 from litho_data.foundation.errors import InputError
 
 

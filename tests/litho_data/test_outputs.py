@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from litho_data.exchange.pairs_export import export_pairs
+from litho_data.exchange.pairs import export_pairs
 from litho_data.exchange.release import export_ro_crate
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file, atomic_folder

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import tifffile
 
-from litho_data.build.build import build
-from litho_data.exchange.pairs import import_pairs
-from litho_data.exchange.pairs_export import export_pairs
+from litho_data.build.build import build_dataset
+from litho_data.exchange.pairs import export_pairs, import_pairs
 from litho_data.foundation.errors import InputError
 from litho_data.provenance.verify import verify
 from litho_data.store import open_store
@@ -39,7 +38,7 @@ def test_gaps_are_filled_with_a_note(own_campaign: Path, tmp_path: Path) -> None
     rows = [line.split() for line in scan.read_text().splitlines()]
     rows[60][60] = "nan"
     scan.write_text("\n".join("\t".join(row) for row in rows))
-    build(own_campaign / "card.toml", own_campaign / "prints.zarr")
+    build_dataset(own_campaign / "card.toml", own_campaign / "prints.zarr")
     gaps = int(np.isnan(open_store(own_campaign / "prints.zarr").scan("P12").height_um).sum())
     notes = export_pairs(own_campaign / "prints.zarr", tmp_path / "pairs")
     assert [note.split(",")[0] for note in notes if "became" in note] == [

@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from litho_data.foundation.errors import InputError
-from litho_data.readers import FORMATS, list_channels, read_layout, read_scan
+from litho_data.readers import formats, list_channels, read_layout, read_scan
 
 SIGNATURES = [
     b"Gwyddion Simple Field 1.0\n",
@@ -68,7 +68,7 @@ def refused(path: Path, content: bytes, format: str) -> None:
     assert len(str(caught.value)) < 1000
 
 
-@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("format", ["auto", *formats()])
 def test_random_bytes(folder: Path, format: str) -> None:
     @settings(deadline=None, max_examples=40)
     @given(content=st.binary(max_size=600))

@@ -9,10 +9,10 @@ import pytest
 from register_phantoms import LEVEL_HEIGHT_UM, PITCH_UM, PRINT_BLUR_PX, random_layout, warp_about_centre
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from litho_data.build.build import build
+from litho_data.build.build import build_dataset
 from litho_data.exchange.release import export_zip
 from litho_data.level import layout_in_scan_frame
-from litho_data.provenance.records import read_steps
+from litho_data.provenance.history import read_steps
 from litho_data.provenance.replay import replay
 from litho_data.provenance.verify import verify
 from litho_data.register import Bend, Registration, apply_transform, register_scan, resample_to_layout
@@ -235,7 +235,7 @@ def test_a_bent_campaign_is_built_verified_and_replayed_from_its_raw_files(tmp_p
     strength_um = 0.4
     knobs = [KnobSetting("registration-residual", strength_um)]
     card = simulate(tmp_path / "fab", count=3, size_px=256, seed=5, knobs=knobs)
-    result = build(card, tmp_path / "bent.zarr", strict=True)
+    result = build_dataset(card, tmp_path / "bent.zarr", strict=True)
     store = open_store(tmp_path / "bent.zarr")
     assert (result.n_scans, len(store)) == (3, 3)
     truth = Truth.read(tmp_path / "fab" / "truth")

@@ -8,10 +8,11 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from litho_data.build.card import load_card
-from litho_data.build.listing import list_fields
+from litho_data.cards.card import load_card
+from litho_data.cards.listing import list_fields
 from litho_data.foundation.errors import InputError
 from litho_data.readers import read_layout, read_scan
+from litho_data.readers.text_matrix import write_text_matrix
 from litho_data.roughness import amplitude_parameters, correlation_length_um, stair_steps
 from litho_data.virtual_fab import (
     Fab,
@@ -31,7 +32,6 @@ from litho_data.virtual_fab.geometry import sample_surface
 from litho_data.virtual_fab.jobs import Plan, random_jobs
 from litho_data.virtual_fab.knobs import KnobBoard
 from litho_data.virtual_fab.printer import print_clean
-from litho_data.virtual_fab.text_matrix import write_text_matrix
 from litho_data.virtual_fab.truth import noise_floor, quadratic_surface
 
 NO_KNOBS = KnobBoard((), 0)

@@ -11,7 +11,7 @@ import pytest
 import zarr
 from prints import make_scans, write_store
 
-from litho_data.build.build import build
+from litho_data.build.build import build_dataset
 from litho_data.foundation.errors import InputError
 from litho_data.store import open_store
 from litho_data.store.lock_box import locked_ids
@@ -216,7 +216,7 @@ def test_a_store_built_anew_from_the_same_files_keeps_its_lock_box_and_other_fil
         card = simulate(tmp_path / name, count=count, seed=seed, **settings)
         with card.open("a", encoding="utf-8") as stream:
             stream.write(f'\n[process]\nregistration = "{registration}"\n')
-        build(card, tmp_path / f"{name}.zarr")
+        build_dataset(card, tmp_path / f"{name}.zarr")
         return tmp_path / f"{name}.zarr"
 
     # The scan more is one that the new store draws, instead of the one that the first drew.

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import get_args
 
-from litho_data.build.card import Use
+from litho_data.cards.card import Use
 from litho_data.foundation.errors import InputError
 from litho_data.store.schema import OPTIONAL_COLUMNS
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import cast
 
-from litho_data.build.card import Card, Use, load_card
-from litho_data.build.card_files import SAFE_ID, read_full_scales, read_table
-from litho_data.exchange.fetch import known_folders
+from litho_data.cards.card import Card, Use, load_card
+from litho_data.cards.fetch import known_folders
+from litho_data.cards.tables import SAFE_ID, read_full_scales, read_table
 from litho_data.foundation.errors import InputError
 from litho_data.store.schema import OPTIONAL_COLUMNS
 

@@ -12,12 +12,10 @@ from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_va
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record, first_error
 from litho_data.foundation.units import um_per
+from litho_data.readers.registry import formats, reader_of
 
-ScanFormat = Literal["auto", "text-matrix", "tiff", "npy", "gsf", "gwy", "vendor"]
 Use = Literal["dataset", "flat", "substrate", "steps"]
 Registration = Literal["affine", "homography", "ladder"]
-
-_WITHOUT_SIZE = ("text-matrix", "tiff", "npy")
 
 
 def load_card(path: str | Path) -> Card:
@@ -54,6 +52,12 @@ def _positive(value: float) -> float:
 
 def _known_unit(value: str) -> str:
     um_per(value)
+    return value
+
+
+def _known_format(value: str) -> str:
+    if value not in ("auto", *formats()):
+        raise ValueError(f"wanted one of auto, {', '.join(formats())}")
     return value
 
 
@@ -99,7 +103,7 @@ class ScanFiles(Record):
     """What the microscope wrote. ``size_um`` is (y, x), for formats that do not carry it."""
 
     files: FilePattern
-    format: ScanFormat = "auto"
+    format: Annotated[str, AfterValidator(_known_format)] = "auto"
     unit: Annotated[str, AfterValidator(_known_unit)] | None = None
     size_um: tuple[Length, Length] | None = None
     channel: str | None = None
@@ -110,7 +114,7 @@ class ScanFiles(Record):
     def _complete(self) -> Self:
         if self.full_scale_file is not None and self.unit is not None:
             raise ValueError("wanted either unit or full_scale_file, which is in metres")
-        if self.format in _WITHOUT_SIZE:
+        if self.format != "auto" and not reader_of(self.format).self_describing:
             if self.unit is None and self.full_scale_file is None:
                 raise ValueError(
                     f"unit is missing: a {self.format} file does not carry it, wanted e.g. unit = 'm'"

@@ -1,9 +1,13 @@
-"""What every reader hands over: the channels of a file, described before they are loaded."""
+"""What a reader is: it recognises a file and describes its channels before they are loaded."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+import logging
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -13,6 +17,8 @@ from litho_data.scan import Axis
 
 # 2 GiB as float64: beyond it a damaged header is far likelier than a scan.
 _MAX_PIXELS = 2**28
+_LOGGERS = ("tifffile", "igor2", "SurfaceTopography")
+_LONGEST_MESSAGE = 160
 
 Loaded = tuple[np.ndarray, np.ndarray | None]
 
@@ -61,13 +67,56 @@ class Channel:
         return f"{self.name!r} ({self.shape[0]} x {self.shape[1]}, {unit})"
 
 
+@dataclass(frozen=True)
+class Reader:
+    """How one file format is recognised and read.
+
+    Args:
+        name: as in ``format = "…"`` of a card and ``--format`` of the commands.
+        recognises: ``recognises(path, head)``: whether a file has this format; ``head`` is its first 64 KiB.
+        read_channels: the channels of a file, in the order of the file; InputError where it is damaged.
+        self_describing: whether such files can state the unit of their heights and their size; where they
+            cannot, a card has to.
+    """
+
+    name: str
+    recognises: Callable[[Path, bytes], bool]
+    read_channels: Callable[[Path], list[Channel]]
+    self_describing: bool = True
+
+
 def with_unique_names(channels: list[Channel]) -> list[Channel]:
     """Number the channels that share a name, such as trace and retrace, so that each can be chosen."""
-    from dataclasses import replace
-
     seen: dict[str, int] = {}
     unique = []
     for channel in channels:
         count = seen[channel.name] = seen.get(channel.name, 0) + 1
         unique.append(channel if count == 1 else replace(channel, name=f"{channel.name} #{count}"))
     return unique
+
+
+@contextmanager
+def foreign_parser(path: Path, kind: str) -> Iterator[None]:
+    """Run a parser that is not ours; any exception becomes one InputError about the file.
+
+    Parsers of binary formats raise struct, index, key, value, memory, decode, assertion and own
+    errors on damaged files, and log to stderr besides; a caller can act on none of it.
+    """
+    loggers = [logging.getLogger(name) for name in _LOGGERS]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.CRITICAL + 1)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    except InputError:
+        raise
+    except Exception as error:
+        reason = f"{type(error).__name__}: {error}"[:_LONGEST_MESSAGE]
+        raise InputError(
+            f"cannot read {path} as {kind}", got=reason, hint="the file may be damaged"
+        ) from error
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)

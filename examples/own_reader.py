@@ -1,0 +1,59 @@
+"""A reader of one's own: files that begin with TOYAFM are read, by Python, by cards and by the commands.
+
+In a project of one's own this file is all there is to write. In this package the reader is a module of
+`litho_data/readers/` with `READER = Reader(...)` at its end, and one entry in `formats.py`.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError
+from litho_data.readers import Channel, Reader, add_reader, read_scan
+
+MAGIC = b"TOYAFM"
+
+
+def read_channels(path: Path) -> list[Channel]:
+    """One channel: a line `TOYAFM ny nx y_um x_um`, then float32 heights in nm, row 0 on top."""
+    head, _, data = path.read_bytes().partition(b"\n")
+    try:
+        ny, nx, y_um, x_um = (float(text) for text in head.split()[1:])
+        height_nm = np.frombuffer(data, "<f4").reshape(int(ny), int(nx))
+    except ValueError as error:
+        raise InputError(f"cannot read {path} as TOYAFM", got=str(error)) from error
+    return [
+        Channel(
+            name="height",
+            shape=(int(ny), int(nx)),
+            unit="nm",
+            size_um=(y_um, x_um),
+            load=lambda: (height_nm, None),
+            header={"first line": head.decode("latin-1")},
+        )
+    ]
+
+
+def write_toy(path: Path, height_nm: np.ndarray, size_um: tuple[float, float]) -> None:
+    """Write such a file."""
+    ny, nx = height_nm.shape
+    head = f"TOYAFM {ny} {nx} {size_um[0]} {size_um[1]}\n".encode()
+    path.write_bytes(head + height_nm.astype("<f4").tobytes())
+
+
+TOY = Reader("toy", lambda path, head: head.startswith(MAGIC), read_channels)
+
+
+def main() -> None:
+    add_reader(TOY)
+    file = Path("runs") / "toy.afm"
+    file.parent.mkdir(exist_ok=True)
+    write_toy(file, 100 * np.random.default_rng(0).random((64, 64)), (6.4, 6.4))
+    scan = read_scan(file)
+    print(f"{scan.name}: {scan.shape} pixels of {scan.pitch_um} µm, up to {scan.height_um.max():.3f} µm")
+
+
+if __name__ == "__main__":
+    main()

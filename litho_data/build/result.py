@@ -1,0 +1,42 @@
+"""``build.json``: what a build made and what it left out."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field
+
+from litho_data.foundation.results import Record, Result
+from litho_data.store.schema import DatasetId
+
+
+class LeftOut(Record):
+    """An id that is not in the store, and why."""
+
+    id: str
+    reason: str
+
+
+class BuildResult(Result):
+    """What a build made and what it left out. ``reused`` scans were finished by an earlier build."""
+
+    SCHEMA: ClassVar[str] = "litho-data/build/1"
+    FILE_NAME: ClassVar[str] = "build.json"
+
+    schema_: Literal["litho-data/build/1"] = Field(default="litho-data/build/1", alias="schema")
+    store: str
+    dataset: DatasetId
+    n_scans: int
+    n_references: int
+    skipped: list[LeftOut]
+    unpaired: list[LeftOut]
+    reused: int
+    seconds: float
+    workers: int
+    software: dict[str, Any]
+
+
+def report_folder(out: str | Path) -> Path:
+    """Where the report of a store is: ``<name>-report`` beside it."""
+    return Path(out).parent / f"{Path(out).stem}-report"

@@ -1,0 +1,146 @@
+"""One step of a build: an operation, run and recorded, so that its arrays can be traced and made again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.hashes import array_sha256, file_sha256, record_sha256, source_sha256
+from litho_data.store.schema import VARIABLES
+
+PACKAGE = Path(__file__).parents[1]
+Arrays = dict[str, np.ndarray]
+Facts = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Step:
+    """One operation on one scan: what went in, with which parameters, and what came out.
+
+    ``inputs`` are ``{"name", "sha256"}`` (a file's name is its path below the data folder), ``outputs``
+    are ``{"name", "sha256", "dtype", "shape", "unit", "dims"}``. ``code_sha256`` identifies the source that
+    ran; it is recorded beside the identity, because moving a comment does not change a result.
+    """
+
+    op: str
+    op_version: str
+    params: Mapping[str, Any]
+    inputs: tuple[Mapping[str, str], ...]
+    outputs: tuple[Mapping[str, Any], ...]
+    code_sha256: str
+
+    @property
+    def id(self) -> str:
+        """Hash of operation, version, parameters and input hashes: equal ids must give equal outputs."""
+        inputs = [[one["name"], one["sha256"]] for one in self.inputs]
+        return record_sha256([self.op, self.op_version, self.params, inputs])
+
+    def to_record(self) -> dict[str, Any]:
+        """Plain data, with the id."""
+        return {"id": self.id, **asdict(self)}
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> Step:
+        """The step of a record; the recorded id is not taken over, so that it can be compared."""
+        fields = {key: value for key, value in record.items() if key != "id"}
+        return cls(**{**fields, "inputs": tuple(fields["inputs"]), "outputs": tuple(fields["outputs"])})
+
+
+@dataclass(frozen=True)
+class Done:
+    """A finished step with its arrays and with what it found out."""
+
+    step: Step
+    arrays: Arrays
+    facts: Facts
+
+
+@dataclass(frozen=True)
+class Operation:
+    """A pure function of recorded parameters and inputs.
+
+    Args:
+        name: as it stands in the records.
+        version: another one wherever the function may give other results.
+        function: ``function(params, files, arrays) -> (arrays, facts)``.
+        code: files and folders of this package that the result depends on.
+    """
+
+    name: str
+    version: str
+    function: Callable[[Mapping[str, Any], Sequence[Path], Mapping[str, np.ndarray]], tuple[Arrays, Facts]]
+    code: tuple[str, ...]
+
+    @property
+    def code_sha256(self) -> str:
+        """Hash of the source that the result depends on."""
+        return _code_sha256(self.code)
+
+    def run(
+        self, params: Mapping[str, Any], files: Mapping[str, Path], arrays: Mapping[str, np.ndarray]
+    ) -> Done:
+        """Run the operation and record it.
+
+        Args:
+            params: explicit parameters, plain data.
+            files: raw files by their recorded name, in the order that the operation expects.
+            arrays: input arrays by their name in the store.
+
+        Raises:
+            InputError: whatever is wrong with the input; a missing or unreadable file included.
+        """
+        try:
+            inputs = [{"name": name, "sha256": file_sha256(path)} for name, path in files.items()]
+            inputs += [
+                {"name": name, "sha256": VARIABLES[name].sample_sha256(array)}
+                for name, array in arrays.items()
+            ]
+            with _one_thread():
+                made, facts = self.function(params, list(files.values()), arrays)
+        except OSError as error:
+            raise InputError(f"cannot read {', '.join(map(str, files.values()))}", got=str(error)) from error
+        outputs = tuple(_described(name, array) for name, array in made.items())
+        step = Step(self.name, self.version, dict(params), tuple(inputs), outputs, self.code_sha256)
+        return Done(step, made, facts)
+
+
+@cache
+def _code_sha256(names: tuple[str, ...]) -> str:
+    return source_sha256(*(PACKAGE / name for name in names))
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """One thread for numerical libraries: sums do not depend on the cores, workers do not compete."""
+    import cv2
+    import scipy.linalg  # noqa: F401 - brings a BLAS of its own, which must be there to be limited
+    from threadpoolctl import threadpool_limits
+
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        with threadpool_limits(limits=1):
+            yield
+    finally:
+        cv2.setNumThreads(threads)
+
+
+def _described(name: str, array: np.ndarray) -> dict[str, Any]:
+    variable = VARIABLES[name]
+    dims, unit = variable.sample_dims, variable.unit
+    sha256 = array_sha256(array, unit, dims)
+    return {
+        "name": name,
+        "sha256": sha256,
+        "dtype": str(array.dtype),
+        "shape": list(array.shape),
+        "unit": unit,
+        "dims": list(dims),
+    }

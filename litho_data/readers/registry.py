@@ -1,0 +1,76 @@
+"""The formats that are read, and which of them a file has, judged by its content and never by its suffix."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from litho_data.foundation.errors import InputError
+from litho_data.readers import gsf, gwy, npy, text_matrix, tiff, vendor
+from litho_data.readers.reader import Reader
+
+# In the order in which they are asked.
+_READERS = [gsf.READER, gwy.READER, npy.READER, tiff.READER, text_matrix.READER, vendor.READER]
+PICTURE = "image"
+_PICTURE_MAGIC = (b"\x89PNG\r\n\x1a\n", b"BM")
+_HEAD_BYTES = 1 << 16
+
+
+def formats() -> tuple[str, ...]:
+    """The names of all formats, in the order in which a file is tried on them."""
+    return tuple(reader.name for reader in _READERS)
+
+
+def add_reader(reader: Reader) -> Reader:
+    """Read files of another format from now on; a new reader is asked before those that are there.
+
+    A build in several processes needs the call in a module that each of them imports, such as the top level
+    of the script that starts the build.
+
+    Raises:
+        InputError: a format of that name is there already.
+    """
+    if reader.name in ("auto", PICTURE, *formats()):
+        raise InputError("reader to add", got=f"{reader.name!r}, which is there", wanted="another name")
+    _READERS.insert(0, reader)
+    return reader
+
+
+def reader_of(format: str) -> Reader:
+    """The reader of that name.
+
+    Raises:
+        InputError: there is none.
+    """
+    for reader in _READERS:
+        if reader.name == format:
+            return reader
+    raise InputError("scan format", got=repr(format), wanted=" | ".join(("auto", *formats())))
+
+
+def detect_format(path: Path) -> str:
+    """Name of the first format that recognises the file; ``"image"`` for PNG and BMP, pictures at most."""
+    with path.open("rb") as stream:
+        head = stream.read(_HEAD_BYTES)
+    if head.startswith(_PICTURE_MAGIC):
+        return PICTURE
+    return next(reader.name for reader in _READERS if reader.recognises(path, head))
+
+
+def require_file(path: str | Path) -> Path:
+    """The path, if it is a file with something in it.
+
+    Raises:
+        InputError: no such file, a folder, not readable, or empty.
+    """
+    file = Path(path)
+    try:
+        if not file.exists():
+            raise InputError(f"no such file: {file}")
+        if not file.is_file():
+            raise InputError(f"{file} is not a file")
+        with file.open("rb") as stream:
+            if not stream.read(1):
+                raise InputError(f"{file} is empty")
+    except OSError as error:
+        raise InputError(f"cannot open {file}", got=error.strerror) from error
+    return file

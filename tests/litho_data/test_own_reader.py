@@ -1,0 +1,68 @@
+"""A reader from a file outside the package: asked first, and taken by cards and commands."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+from campaigns import MARGIN_PX, PITCH_UM, height_of, layout_of, write_campaign
+from typer.testing import CliRunner
+
+from litho_data.build.build import build_dataset
+from litho_data.cli.app import app
+from litho_data.foundation.errors import InputError
+from litho_data.readers import Reader, add_reader, formats, read_scan, registry
+from litho_data.store import open_store
+
+
+@pytest.fixture
+def example(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """`examples/own_reader.py`, its reader added for one test."""
+    path = Path(__file__).parents[2] / "examples" / "own_reader.py"
+    spec = importlib.util.spec_from_file_location("own_reader", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    monkeypatch.setattr(registry, "_READERS", [*registry._READERS])
+    add_reader(module.TOY)
+    return module
+
+
+def test_it_is_read_by_its_content_and_offered_by_the_commands(example: ModuleType, tmp_path: Path) -> None:
+    height_nm = np.arange(12.0).reshape(3, 4)
+    example.write_toy(tmp_path / "scan.anything", height_nm, (0.3, 0.4))
+    scan = read_scan(tmp_path / "scan.anything")
+    np.testing.assert_allclose(scan.height_um, height_nm * 1e-3)
+    assert (scan.format, scan.pitch_um) == ("toy", pytest.approx((0.1, 0.1)))
+    said = CliRunner().invoke(app, ["inspect", str(tmp_path / "scan.anything"), "--format", "toy"])
+    assert "read as toy" in said.output
+
+
+def test_a_card_may_name_it_and_a_dataset_is_built_with_it(example: ModuleType, tmp_path: Path) -> None:
+    card = write_campaign(tmp_path, count=1)
+    layout = layout_of(0)
+    side_um = (layout.shape[0] + 2 * MARGIN_PX) * PITCH_UM
+    example.write_toy(tmp_path / "scans" / "P11.toy", 1e3 * height_of(layout, 0), (side_um, side_um))
+    text = card.read_text().replace("{id}.txt", "{id}.toy").replace("text-matrix", "toy")
+    card.write_text("\n".join(line for line in text.splitlines() if not line.startswith(("unit", "size_um"))))
+    build_dataset(card, tmp_path / "prints.zarr")
+    assert open_store(tmp_path / "prints.zarr").manifest["card"]["scan"]["format"] == "toy"
+
+
+def test_it_is_asked_before_the_readers_that_are_there(example: ModuleType, tmp_path: Path) -> None:
+    np.savetxt(tmp_path / "scan.txt", np.ones((3, 3)))
+    greedy = Reader("greedy", lambda path, head: path.suffix == ".txt", example.read_channels)
+    add_reader(greedy)
+    assert formats()[0] == "greedy"
+    with pytest.raises(InputError, match="as TOYAFM"):
+        read_scan(tmp_path / "scan.txt")
+
+
+@pytest.mark.parametrize("name", ["toy", "gsf", "auto", "image"])
+def test_a_name_that_is_taken_is_refused(example: ModuleType, name: str) -> None:
+    with pytest.raises(InputError, match="another name"):
+        add_reader(Reader(name, lambda path, head: True, example.read_channels))
