@@ -28,12 +28,12 @@ from benchmarks.predict import SIDES, gradient_gflop
 from benchmarks.side_by_side import Arrays, Work
 from benchmarks.trained_pbl import load_pbl
 from litho_data.foundation.commands import run_script
-from litho_design.optimisation.optimise import make_parametrisation
+from litho_design.holograms.loss import hologram_loss
+from litho_design.holograms.settings import HologramSettings, hologram_settings
+from litho_design.holograms.task import HologramTask
+from litho_design.images.targets import load_target
+from litho_design.optimisation.search import make_parametrisation
 from litho_design.printers.source import load_printer
-from litho_design.tasks.hoe import HoeTask
-from litho_design.tasks.hologram import image_error
-from litho_design.tasks.settings import HoeSettings, hoe_preset
-from litho_design.tasks.targets import make_target
 
 NAME = "hoe_iteration"
 
@@ -54,28 +54,27 @@ def main() -> None:
 
 
 def _work(side: str, arguments: argparse.Namespace) -> Work:
-    settings = hoe_preset("default")
+    settings = hologram_settings("default")
     layout = settings.layout.model_copy(update={"size_px": arguments.size_px})
     settings = settings.model_copy(update={"layout": layout})
-    target, record = make_target("text", arguments.size_px)
+    target = load_target("text", arguments.size_px)
     parameters = make_parametrisation(layout, settings.search)
     parameters.start_random(0)
     reduced: Callable[[], AbstractContextManager[None]] = nullcontext
     if side == side_by_side.PLAIN:
         pbl = PlainPbl(load_pbl(arguments.model)).requires_grad_(False)
-        wanted = torch.from_numpy(target)
+        wanted = torch.from_numpy(target.pixels)
 
         def prints(level: Tensor) -> Tensor:
             return pbl(level * layout.level_height_um)
 
         def objective(level: Tensor) -> tuple[Tensor, dict[str, float]]:
             share = _propagate(prints(level)[0, 0], settings)
-            rmse, efficiency = image_error(share, wanted, settings.loss.scale)
-            return rmse + settings.loss.efficiency_weight * (1 - efficiency), {}
+            return hologram_loss(share, wanted, settings.loss)
 
     else:
         printer = load_printer(str(arguments.model), layout)
-        prints, objective = printer, HoeTask(settings, printer, target, record).objective
+        prints, objective = printer, HologramTask(settings, printer, target).objective
         reduced = partial(printer.at_precision, side)
 
     def once() -> None:
@@ -98,7 +97,7 @@ def _differences(ours: Arrays, plain: Arrays, reach_px: int) -> Mapping[str, flo
     return {"largest_difference_nm": 1000 * float(np.abs(off_um).max())}
 
 
-def _propagate(height_um: Tensor, settings: HoeSettings) -> Tensor:
+def _propagate(height_um: Tensor, settings: HologramSettings) -> Tensor:
     """Share of the incident power per pixel of the image, by one convolution with a kernel made here."""
     optics, pitch_um = settings.optics, settings.layout.pitch_um
     size = height_um.shape[-1]

@@ -28,6 +28,10 @@ ROOMS = {
         "layers", "simulator", "prediction", "fast", "models", "scan_terms", "effects", "splits",
         "frozen", "scoring", "fitting", "evaluation", "noise", "loop", "cli",
     ),
+    "litho_design": (
+        "optics", "images", "printers", "optimisation", "tasks", "holograms", "lenses", "judging", "exports",
+        "reports", "workflows", "cli",
+    ),
 }  # fmt: skip
 HEAVY = ("torch", "cv2", "xarray", "zarr", "matplotlib", "pandas", "skimage", "SurfaceTopography")
 

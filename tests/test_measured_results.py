@@ -8,7 +8,7 @@ from benchmarks import recipes
 from benchmarks.measured import FOLDER, PAGES, RESULTS, texts
 from benchmarks.measured_loop import loop_table
 from benchmarks.record import published
-from litho_design.judging.compare import GapResult
+from litho_design.judging.gap import GapResult
 from litho_design.judging.score import ScoreResult
 from litho_models.evaluation.results import Benchmark
 from litho_models.loop.result.record import CloseLoop

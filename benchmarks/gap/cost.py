@@ -37,7 +37,7 @@ def run_trial(out: Path, task: Task, arm: str) -> None:
     Weights do not change the time: an untrained model stands for an arm that is not trained yet. What a
     design costs beside its iterations is the same optics for every arm, and is timed with the arm ``none``.
     """
-    from litho_design.optimisation.optimise import make_parametrisation
+    from litho_design.optimisation.search import make_parametrisation
 
     torch.set_num_threads(1)
     source = task.models[arm]
@@ -71,8 +71,8 @@ def _iterate(design: Any, parameters: Any) -> None:
 
 def _beside_s(design: Any, parameters: Any, height: torch.Tensor) -> float:
     """Start, reference, yield curve, focus window of a lens, and report of one design."""
-    from litho_design.judging.process_window import focus_window
-    from litho_design.lens.bench import LensBench
+    from litho_design.lenses.bench import LensBench
+    from litho_design.lenses.focus_window import focus_window
 
     seconds = _cpu_s(lambda: design.start(parameters, design.printer.level_heights_um()))
     seconds += _cpu_s(design.reference_efficiency)
@@ -99,7 +99,7 @@ def estimate(
         iterations = task.iterations
         optics = records[task.kind, "none"]
         judges = len(task.models) + len(task.judges)
-        judging = sum(records[task.kind, arm]["print_s"] for arm in task.models) + judges * optics["score_s"]
+        loaded = sum(records[task.kind, arm]["print_s"] for arm in task.models) + judges * optics["score_s"]
         for arm in task.models:
             cost = records[task.kind, arm]
             # The polish costs up to eleven evaluations with gradient more.
@@ -111,7 +111,7 @@ def estimate(
                     "designs": task.seeds,
                     "iterations": iterations,
                     "iteration_s": cost["iteration_s"],
-                    "minutes": task.seeds * (seconds + judging) / 60,
+                    "minutes": task.seeds * (seconds + loaded) / 60,
                     "peak_gib": cost["peak_gib"],
                 }
             )
@@ -159,27 +159,21 @@ def _untrained(arm: str, folder: Path) -> Path:
 
 def _task(task: Task, source: str) -> tuple[Any, Any]:
     """The task with its printer, from the options that its commands get."""
-    from litho_design.cli.options import hoe_settings, lens_settings
-    from litho_design.lens.lens import LensTask
+    from litho_design.cli.options import option_paths
+    from litho_design.holograms.settings import HologramSettings, hologram_settings
+    from litho_design.holograms.task import HologramTask
+    from litho_design.images.targets import load_target
+    from litho_design.lenses.settings import LensSettings, lens_settings
+    from litho_design.lenses.task import LensTask
     from litho_design.printers.source import load_printer
-    from litho_design.tasks.hoe import HoeTask
-    from litho_design.tasks.targets import make_target
 
-    options: dict[str, Any] = {
-        name.removeprefix("--").replace("-", "_"): _number(value)
-        for name, value in zip(task.options[::2], task.options[1::2], strict=True)
-    }
+    options = dict(zip(task.options[::2], task.options[1::2], strict=True))
+    target = options.pop("--target", "")
+    paths = option_paths(HologramSettings() if task.kind == "hoe" else LensSettings())
+    changes = {paths[name]: value for name, value in options.items()}
     if task.kind == "hoe":
-        target = options.pop("target")
-        settings: Any = hoe_settings("default", **options)
-        printer = load_printer(source, settings.layout)
-        return HoeTask(settings, printer, *make_target(target, settings.layout.size_px)), settings
-    settings = lens_settings("default", task.kind, **options)
-    return LensTask(settings, load_printer(source, settings.layout)), settings
-
-
-def _number(text: str) -> Any:
-    try:
-        return float(text) if "." in text else int(text)
-    except ValueError:
-        return text
+        hologram = hologram_settings(changes=changes)
+        wanted = load_target(target, hologram.layout.size_px)
+        return HologramTask(hologram, load_printer(source, hologram.layout), wanted), hologram
+    lens = lens_settings(task.kind, changes=changes)  # type: ignore[arg-type]
+    return LensTask(lens, load_printer(source, lens.layout)), lens

@@ -16,7 +16,7 @@ from benchmarks.gap.steps import proof_folders
 from benchmarks.gap.tables import SHOWN, as_markdown, figure_file
 from benchmarks.gap.tasks import Task
 from benchmarks.record import origin, publish, usable_cores, write_record
-from litho_design.judging.compare import HEADLINE, GapResult
+from litho_design.judging.gap import HEADLINE, GapResult
 from litho_design.judging.score import ScoreResult
 from litho_design.tasks.design import Design
 

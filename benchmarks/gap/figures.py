@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from litho_data.foundation.report import new_figure
-from litho_design.judging.compare import GapResult, design_folder
-from litho_design.judging.judge import Judging
+from litho_design.judging.gap import GapResult, design_folder
+from litho_design.judging.loaded import LoadedDesign
 from litho_design.printers.printer import Printer
 from litho_design.printers.source import load_printer
 
@@ -67,7 +67,7 @@ def draw_lens(folder: Path, gap: GapResult, judge: tuple[str, str] | None, path:
 
 def _judged(
     folder: Path, gap: GapResult, judge: tuple[str, str] | None
-) -> dict[str, tuple[Judging, Printer]]:
+) -> dict[str, tuple[LoadedDesign, Printer]]:
     """Every arm's first design with the printer that judges it; without a judge, the last other arm."""
     names = list(gap.arms)
     judged = {}
@@ -78,7 +78,7 @@ def _judged(
         else:
             name, source = judge
         printer = load_printer(source, gap.settings.layout, name=name)
-        judged[arm] = (Judging(design_folder(folder, arm, gap.seeds[0])), printer)
+        judged[arm] = (LoadedDesign(design_folder(folder, arm, gap.seeds[0])), printer)
     return judged
 
 

@@ -11,8 +11,6 @@ from benchmarks.gap.plan import ARMS, Effort, model
 from litho_data.foundation.errors import InputError
 
 ZOO_ARMS = ("none", "physics", "fno", "pbl")
-# ``lens`` calls its distance what it is; ``compare`` has one name for both tasks.
-_FOCAL = {"--distance-um": "--focal-length-um"}
 
 
 @dataclass(frozen=True)
@@ -35,10 +33,11 @@ class Task:
         """One design, at the place where ``compare`` looks for it."""
         folder = out / self.name / "designs" / arm / f"seed{seed}"
         words = ["hoe"] if self.kind == "hoe" else ["lens", "--task", self.kind]
-        options = [_FOCAL.get(word, word) for word in self.options] if self.kind != "hoe" else self.options
         return Job(
             f"{self.name}/{arm}/seed{seed}",
-            design_command(*words, "--model", self.models[arm], *options, "--seed", seed, "--out", folder),
+            design_command(
+                *words, "--model", self.models[arm], *self.options, "--seed", seed, "--out", folder
+            ),
             folder / "design.json",
         )
 

@@ -9,14 +9,14 @@ import typer
 
 from litho_data.foundation.commands import new_app, run_app
 from litho_data.foundation.errors import InputError
-from litho_design.cli.compare import compare
-from litho_design.cli.design import hoe, lens
-from litho_design.cli.options import Device, Extrapolate, Out, headline, load_printers
+from litho_design.cli.design import compare, hoe, lens, settings
+from litho_design.cli.options import Device, Extrapolate, Out
 
 app = new_app("Design diffractive optics through a frozen model of the printer, score them, export them.")
 app.command()(hoe)
 app.command()(lens)
 app.command()(compare)
+app.command()(settings)
 
 
 @app.command()
@@ -46,8 +46,9 @@ def score(
     extrapolate: Extrapolate = False,
 ) -> None:
     """Score a design as printed by models, as measured by AFM, or as photographed."""
-    from litho_design.judging.score import MeasuredSource, PhotoSource, score_design
-    from litho_design.tasks.design import Design
+    from litho_design.judging.score import MeasuredSource, PhotoSource
+    from litho_design.reports.advice import headline
+    from litho_design.workflows.score import score as score_design
 
     if not judge and scan is None and camera is None:
         raise InputError("score", got="nothing to judge with", wanted="--judge, --scan or --camera")
@@ -57,18 +58,17 @@ def score(
         )
     if camera is None and camera_object is not None:
         raise InputError("--camera-object", got="no --camera", wanted="the photograph of it")
-    layout = Design.read(design).layout
-    judges = list(load_printers(judge or [], layout, device, extrapolate).values())
     size = None if scan_size_um is None else (scan_size_um, scan_size_um)
     result = score_design(
         design,
-        judges,
         out,
+        judges=judge or (),
         scan=None if scan is None else MeasuredSource(scan, scan_unit, size),
         camera=None
         if camera is None
         else PhotoSource(camera, camera_pitch_um or 0.0, camera_dark_level, camera_object),
         device=device,
+        extrapolate=extrapolate,
     )
     for item in result.scores:
         print(f"{item.kind} {item.judge.name}: {headline(item.figures)}")
@@ -90,7 +90,8 @@ def export(
     ] = "cumulative",
 ) -> None:
     """Write the layout for the printer, with the sidecar that gives it heights and size."""
-    from litho_design.export import export_design, sidecar_path
+    from litho_design.exports.files import export as export_design
+    from litho_design.exports.sidecar import sidecar_path
 
     file = export_design(
         design,

@@ -1,177 +1,184 @@
-"""Commands `hoe` and `lens`: parse options, call one function, say where the result is."""
+"""Commands `hoe`, `lens`, `compare`, `settings`: parse options, call one function, say what came of it."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
 
+from litho_data.foundation.settings import changed
 from litho_design.cli.options import (
-    TARGET_HELP,
-    BlurSdUm,
-    CellUm,
-    DefocusSdUm,
     Device,
-    Ensemble,
-    EnsembleWeight,
     Extrapolate,
-    GainSd,
-    HeldOutObjects,
-    IndexStep,
-    Iterations,
-    LearningRate,
-    LevelHeight,
-    Levels,
-    ObjectPx,
-    Objects,
+    Given,
     Out,
-    Parametrisation,
-    PitchUm,
-    Risk,
-    RiskTail,
-    RiskWeight,
-    RobustSamples,
-    SearchPrecision,
-    Seed,
-    SizePx,
-    SpreadOf,
-    Start,
-    Variant,
-    WavelengthSdUm,
-    WavelengthUm,
-    WindowPx,
-    headline,
-    hoe_settings,
-    lens_settings,
-    load_printers,
+    as_toml,
+    takes_settings,
 )
+from litho_design.holograms.settings import HologramSettings, hologram_settings
+from litho_design.lenses.settings import LensSettings, lens_settings
+from litho_design.optimisation.settings import DesignSettings
 
 if TYPE_CHECKING:
     from litho_design.tasks.design import Design
 
+S = TypeVar("S", bound=DesignSettings)
+
+_TARGET_HELP = "an image file, or a drawing: text, ring, chart, spots, letters"
 Model = Annotated[
     str, typer.Option(help="Folder of a frozen model, zoo:NAME, or `none` for nominal heights.")
 ]
+Target = Annotated[str, typer.Option(help=f"Wanted image: {_TARGET_HELP}.")]
+SpreadOf = Annotated[
+    Path | None,
+    typer.Option(
+        help="Dataset store: take the spread of gain and offset from its measured prints, the locked "
+        "scans left out."
+    ),
+]
+Ensemble = Annotated[
+    list[str] | None, typer.Option(help="NAME=MODEL of a further model in the loss; may be repeated.")
+]
+Objects = Annotated[
+    list[Path] | None,
+    typer.Option(
+        help="Computational lens: picture, or folder of pictures, to image instead of the drawings; may be "
+        "repeated. Without --held-out-objects the last quarter by name, two at least, is held out."
+    ),
+]
+HeldOutObjects = Annotated[
+    list[Path] | None,
+    typer.Option(
+        help="Computational lens: picture or folder of pictures that is only scored; may be repeated."
+    ),
+]
 
 
+@takes_settings(HologramSettings())
 def hoe(
     model: Model,
     out: Out,
-    target: Annotated[str, typer.Option(help=TARGET_HELP)] = "text",
-    variant: Variant = "default",
-    size_px: SizePx = None,
-    pitch_um: PitchUm = None,
-    distance_um: Annotated[float | None, typer.Option(help="Distance to the image plane, µm.")] = None,
-    wavelength_um: WavelengthUm = None,
-    index_step: IndexStep = None,
-    cell_um: CellUm = None,
-    levels: Levels = None,
-    level_height_um: LevelHeight = None,
-    iterations: Iterations = None,
-    start: Start = None,
-    parametrisation: Parametrisation = None,
-    learning_rate: LearningRate = None,
-    precision: SearchPrecision = "float32",
-    robust_samples: RobustSamples = None,
-    risk: Risk = None,
-    risk_weight: RiskWeight = None,
-    risk_tail: RiskTail = None,
-    gain_sd: GainSd = None,
-    blur_sd_um: BlurSdUm = None,
-    defocus_sd_um: DefocusSdUm = None,
-    wavelength_sd_um: WavelengthSdUm = None,
+    given: Given,
+    target: Target = "text",
     spread_of: SpreadOf = None,
     ensemble: Ensemble = None,
-    ensemble_weight: EnsembleWeight = None,
-    seed: Seed = 0,
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
     """Design a holographic element; an interrupted run in OUT is continued."""
-    from litho_design.printers.source import load_printer
-    from litho_design.tasks.hoe import design_hoe
-    from litho_design.tasks.targets import make_target
+    settings = _settings(given, _hologram, "hoe", spread_of)
+    from litho_design.workflows.design import design_hologram
 
-    settings = hoe_settings(
-        variant, size_px=size_px, pitch_um=pitch_um, distance_um=distance_um, wavelength_um=wavelength_um,
-        index_step=index_step, cell_um=cell_um, levels=levels, level_height_um=level_height_um,
-        iterations=iterations, start=start, parametrisation=parametrisation, learning_rate=learning_rate,
-        precision=precision, samples=robust_samples, risk=risk, weight=risk_weight, tail=risk_tail,
-        gain_sd=gain_sd, blur_sd_um=blur_sd_um, defocus_sd_um=defocus_sd_um,
-        wavelength_sd_um=wavelength_sd_um, spread_of=spread_of, ensemble_weight=ensemble_weight, seed=seed,
+    design = design_hologram(
+        target, model, out, settings=settings, ensemble=ensemble or (), device=device,
+        extrapolate=extrapolate,
     )  # fmt: skip
-    printer = load_printer(model, settings.layout, device=device, extrapolate=extrapolate)
-    others = load_printers(ensemble or [], settings.layout, device, extrapolate)
-    image, record = make_target(target, settings.layout.size_px)
-    design = design_hoe(settings, printer, image, record, out, ensemble=list(others.values()))
     _tell(design, out)
 
 
+@takes_settings(LensSettings())
 def lens(
     model: Model,
     out: Out,
-    task: Annotated[
-        Literal["direct", "computational"],
-        typer.Option(help="Focus light, or image after Richardson-Lucy."),
-    ] = "direct",
-    variant: Variant = "default",
-    size_px: SizePx = None,
-    pitch_um: PitchUm = None,
-    focal_length_um: Annotated[float | None, typer.Option(help="Focal length, µm.")] = None,
-    wavelength_um: WavelengthUm = None,
-    index_step: IndexStep = None,
-    cell_um: CellUm = None,
-    levels: Levels = None,
-    level_height_um: LevelHeight = None,
-    window_px: WindowPx = None,
-    object_px: ObjectPx = None,
+    given: Given,
     objects: Objects = None,
     held_out_objects: HeldOutObjects = None,
-    iterations: Iterations = None,
-    start: Start = None,
-    parametrisation: Parametrisation = None,
-    learning_rate: LearningRate = None,
-    precision: SearchPrecision = "float32",
-    robust_samples: RobustSamples = None,
-    risk: Risk = None,
-    risk_weight: RiskWeight = None,
-    risk_tail: RiskTail = None,
-    gain_sd: GainSd = None,
-    blur_sd_um: BlurSdUm = None,
-    defocus_sd_um: DefocusSdUm = None,
-    wavelength_sd_um: WavelengthSdUm = None,
     spread_of: SpreadOf = None,
     ensemble: Ensemble = None,
-    ensemble_weight: EnsembleWeight = None,
-    seed: Seed = 0,
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
     """Design a multi-level diffractive lens; an interrupted run in OUT is continued."""
-    from litho_design.lens.lens import design_lens
-    from litho_design.lens.objects import bring_objects
-    from litho_design.printers.source import load_printer
+    settings = _settings(given, _lens, "lens", spread_of)
+    from litho_design.workflows.design import design_lens
 
-    settings = lens_settings(
-        variant, task, size_px=size_px, pitch_um=pitch_um, distance_um=focal_length_um,
-        wavelength_um=wavelength_um, index_step=index_step, cell_um=cell_um, levels=levels,
-        level_height_um=level_height_um, window_px=window_px, object_px=object_px, iterations=iterations,
-        start=start, parametrisation=parametrisation, learning_rate=learning_rate, precision=precision,
-        samples=robust_samples, risk=risk, weight=risk_weight, tail=risk_tail, gain_sd=gain_sd,
-        blur_sd_um=blur_sd_um, defocus_sd_um=defocus_sd_um, wavelength_sd_um=wavelength_sd_um,
-        spread_of=spread_of, ensemble_weight=ensemble_weight, seed=seed,
+    design = design_lens(
+        model, out, settings=settings, objects=objects or (), held_out_objects=held_out_objects or (),
+        ensemble=ensemble or (), device=device, extrapolate=extrapolate,
     )  # fmt: skip
-    printer = load_printer(model, settings.layout, device=device, extrapolate=extrapolate)
-    others = load_printers(ensemble or [], settings.layout, device, extrapolate)
-    settings, pictures = bring_objects(settings, objects or [], held_out_objects or [])
-    design = design_lens(settings, printer, out, ensemble=list(others.values()), pictures=pictures)
     _tell(design, out)
 
 
+@takes_settings(HologramSettings(), LensSettings(), leave_out=("task", "search.seed", "ensemble.weight"))
+def compare(
+    models: Annotated[
+        str, typer.Option(help="Arms, comma-separated: none, NAME=MODEL or MODEL (a folder, or zoo:NAME).")
+    ],
+    out: Out,
+    given: Given,
+    judge: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Further judges, NAME=MODEL or MODEL (or truth/ of a virtual fab); may be repeated."
+        ),
+    ] = None,
+    task: Annotated[
+        Literal["hoe", "lens-direct", "lens-computational"], typer.Option(help="What is designed.")
+    ] = "hoe",
+    target: Annotated[str, typer.Option(help=f"For hoe: {_TARGET_HELP}.")] = "text",
+    objects: Objects = None,
+    held_out_objects: HeldOutObjects = None,
+    spread_of: SpreadOf = None,
+    seeds: Annotated[int, typer.Option(help="Number of seeds: 0, 1, 2 …")] = 3,
+    device: Device = "cpu",
+    extrapolate: Extrapolate = False,
+) -> None:
+    """Design with every arm, print with every judge: the design-to-manufacturing gap."""
+    settings: Any
+    if task == "hoe":
+        settings = _settings(given, _hologram, task, spread_of)
+    else:
+        kind = {"task": task.removeprefix("lens-")}
+        settings = _settings(given, lambda changes: _lens({**changes, **kind}), task, spread_of)
+    from litho_design.judging.gap import HEADLINE
+    from litho_design.workflows.compare import compare as run_comparison
+
+    result = run_comparison(
+        settings, models.split(","), out, judges=judge or (), target=target, objects=objects or (),
+        held_out_objects=held_out_objects or (), seeds=range(seeds), device=device,
+        extrapolate=extrapolate,
+    )  # fmt: skip
+    for item in result.summary:
+        if item.figure == HEADLINE[result.task][0]:
+            print(f"designed with {item.arm}, printed by {item.judge}: {item.figure} {item.judged_mean:.3f}")
+    print(out / "report.html")
+
+
+@takes_settings(HologramSettings(), LensSettings())
+def settings(
+    element: Annotated[Literal["hoe", "lens"], typer.Argument(help="What would be designed.")], given: Given
+) -> None:
+    """Print all settings with their meaning, as a file for --config; nothing is designed."""
+    print(as_toml(_settings(given, _hologram if element == "hoe" else _lens, element)), end="")
+
+
+def _hologram(changes: Mapping[str, Any]) -> HologramSettings:
+    return hologram_settings(changes=changes)
+
+
+def _lens(changes: Mapping[str, Any]) -> LensSettings:
+    return lens_settings(changes=changes)
+
+
+def _settings(
+    given: Given, make: Callable[[Mapping[str, Any]], S], task: str, spread_of: Path | None = None
+) -> S:
+    """A preset under the settings file, the measured spreads, and what the command line says."""
+    made = make(given.over(make({}), task))
+    if spread_of is None:
+        return made
+    from litho_data.store import open_store
+    from litho_design.optimisation.process_window import measured_window
+
+    measured = made.model_copy(update={"window": measured_window(open_store(spread_of), made.window)})
+    return changed(measured, given.options)
+
+
 def _tell(design: Design, out: Path) -> None:
-    from litho_design.reports.design import distribution_warning, stroke_advice
+    from litho_design.reports.advice import distribution_warning, headline, stroke_advice
 
     warning = distribution_warning(design)
     if warning:

@@ -1,21 +1,20 @@
-"""Options that several commands of `litho-design` share, and what they are turned into."""
+"""Options made from the fields of the settings, so that a setting is stated in one place."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import functools
+import inspect
+import json
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 import typer
+from pydantic import BaseModel
 
 from litho_data.foundation.errors import InputError
-
-if TYPE_CHECKING:
-    from litho_design.optimisation.parametrise import LayoutSettings
-    from litho_design.printers.printer import Printer
-    from litho_design.tasks.settings import HoeSettings, LensSettings
-
-TARGET_HELP = "an image file, or a drawing: text, ring, chart, spots, letters"
+from litho_data.foundation.settings import Leaf, assigned, flattened, leaves, read_settings
 
 Out = Annotated[Path, typer.Option(help="Folder of the result.")]
 Device = Annotated[str, typer.Option(help="cpu, cuda, cuda:0 …")]
@@ -25,165 +24,141 @@ Extrapolate = Annotated[
         "--extrapolate", help="Accept heights beyond the model's calibration; stamped into the result."
     ),
 ]
-Variant = Annotated[
-    Literal["default", "paper", "authors"],
-    typer.Option(help="Preset: ours, as printed in the paper, or as in the authors' code."),
-]
-SizePx = Annotated[int | None, typer.Option(help="Side of the element, pixels.")]
-PitchUm = Annotated[
-    float | None, typer.Option(help="Side of a pixel, µm: that of the model; 0.1 by default.")
-]
-Levels = Annotated[int | None, typer.Option(help="Number of printable levels.")]
-LevelHeight = Annotated[float | None, typer.Option(help="Height of one level, µm.")]
-CellUm = Annotated[
-    float | None, typer.Option(help="Side of one free cell (hologram) or width of one ring (lens), µm.")
-]
-WavelengthUm = Annotated[float | None, typer.Option(help="Wavelength, µm.")]
-IndexStep = Annotated[float | None, typer.Option(help="Refractive index of the resist minus that around it.")]
-Iterations = Annotated[int | None, typer.Option(help="Iterations of the search.")]
-Start = Annotated[
-    Literal["random", "gs", "wgs", "fresnel"] | None,
-    typer.Option(help="Start of the search: random, gs or wgs for holograms, fresnel for lenses."),
-]
-Parametrisation = Annotated[Literal["gumbel", "direct"] | None, typer.Option(help="Free parameters.")]
-LearningRate = Annotated[float | None, typer.Option(help="Step of the optimiser, levels or logits.")]
-SearchPrecision = Annotated[
-    Literal["float32", "mixed", "bfloat16"],
-    typer.Option(
-        help="Networks of the model in the search: float32; mixed, with their gradient in bfloat16; or "
-        "bfloat16. Scores are always in float32."
-    ),
-]
-Seed = Annotated[int, typer.Option(help="Seed of start and sampling.")]
-WindowPx = Annotated[int | None, typer.Option(help="Lens: side of the PSF window, pixels.")]
-ObjectPx = Annotated[int | None, typer.Option(help="Computational lens: side of the objects, sensor pixels.")]
-Objects = Annotated[
-    list[Path] | None,
-    typer.Option(
-        help="Computational lens: picture, or folder of pictures, to image instead of the drawings; may be "
-        "repeated. Without --held-out-objects the last quarter by name, two at least, is held out."
-    ),
-]
-HeldOutObjects = Annotated[
-    list[Path] | None,
-    typer.Option(
-        help="Computational lens: picture or folder of pictures that is only scored; may be repeated."
-    ),
-]
-RobustSamples = Annotated[
-    int | None,
-    typer.Option(help="Draws of the process window in the loss; 0 designs for the print as modelled."),
-]
-Risk = Annotated[
-    Literal["cvar", "mean-sd"] | None,
-    typer.Option(help="Loss over the draws: mean of the worst share, or mean + weight * sd."),
-]
-RiskWeight = Annotated[float | None, typer.Option(help="Weight of the standard deviation for mean-sd.")]
-RiskTail = Annotated[float | None, typer.Option(help="Worst share of the draws for cvar, 0 to 1.")]
-GainSd = Annotated[float | None, typer.Option(help="Spread of the print's gain, relative.")]
-BlurSdUm = Annotated[float | None, typer.Option(help="Scale of the extra blur, µm.")]
-DefocusSdUm = Annotated[float | None, typer.Option(help="Spread of the distance, µm.")]
-WavelengthSdUm = Annotated[float | None, typer.Option(help="Spread of the wavelength, µm.")]
-SpreadOf = Annotated[
+_Config = Annotated[
     Path | None,
     typer.Option(
-        help="Dataset store: take the spread of gain and offset from its measured prints, the locked "
-        "scans left out."
+        "--config", help="TOML or JSON file of settings, as `litho-design settings` prints it; options win."
     ),
 ]
-Ensemble = Annotated[
+_Set = Annotated[
     list[str] | None,
-    typer.Option(help="NAME=MODEL of a further model in the loss; may be repeated."),
-]
-EnsembleWeight = Annotated[
-    float | None, typer.Option(help="Weight of the models' disagreement, per wave of height.")
-]
-
-
-def hoe_settings(variant: Any, **options: Any) -> HoeSettings:
-    """A preset of the hologram with the options that were given (those that are not None)."""
-    from litho_design.tasks.settings import HoeSettings, hoe_preset
-
-    return _changed(HoeSettings, hoe_preset(variant), options)
-
-
-def lens_settings(variant: Any, task: Any, **options: Any) -> LensSettings:
-    """A preset of the lens with the options that were given (those that are not None)."""
-    from litho_design.tasks.settings import LensSettings, lens_preset
-
-    return _changed(LensSettings, lens_preset(variant, task), options)
-
-
-# Which part of the settings an option belongs to; options of the search are the rest.
-_PART = {
-    **dict.fromkeys(("size_px", "pitch_um", "cell_um", "levels", "level_height_um"), "layout"),
-    **dict.fromkeys(("distance_um", "wavelength_um", "index_step"), "optics"),
-    "window_px": "view",
-    "object_px": "imaging",
-    "ensemble_weight": "ensemble",
-    **dict.fromkeys(
-        ("samples", "risk", "weight", "tail", "gain_sd", "blur_sd_um", "defocus_sd_um", "wavelength_sd_um"),
-        "window",
+    typer.Option(
+        "--set",
+        help="PATH=VALUE for any setting, such as loss.efficiency_weight=0.2; may be repeated. "
+        "`litho-design settings` lists all of them.",
     ),
-}
+]
 
 
-def _changed(kind: Any, preset: Any, options: dict[str, Any]) -> Any:
-    """``preset`` with ``options``, validated as a whole."""
-    from pydantic import ValidationError
+@dataclass(frozen=True)
+class Given:
+    """What a command line says of the settings.
 
-    from litho_data.foundation.results import first_error
+    Attributes:
+        options: values by path, of options and of ``--set``.
+        names: how each of them was given, for messages.
+        config: settings file.
+    """
 
-    settings = preset.model_dump()
-    spread_of = options.pop("spread_of", None)
-    for name, value in options.items():
-        if value is not None:
-            settings[_PART.get(name, "search")][name.removeprefix("ensemble_")] = value
-    try:
-        changed = kind.model_validate(settings)
-    except ValidationError as error:
-        raise InputError("settings", got=first_error(error)) from None
-    if spread_of is None:
-        return changed
-    from litho_data.store import open_store
-    from litho_design.optimisation.robust import measured_window
+    options: Mapping[str, Any]
+    names: Mapping[str, str]
+    config: Path | None
 
-    return changed.model_copy(update={"window": measured_window(open_store(spread_of), changed.window)})
+    def over(self, preset: BaseModel, task: str) -> dict[str, Any]:
+        """Values by path, those of the file first and those of the command line over them.
 
+        Args:
+            preset: settings that have the paths.
+            task: what is designed, for messages.
 
-def load_printers(
-    specs: Iterable[str], layout: LayoutSettings, device: str, extrapolate: bool
-) -> dict[str, Printer]:
-    """Printers by name from NAME=MODEL, MODEL or `none`."""
-    from litho_design.printers.source import load_printer
-
-    printers: dict[str, Printer] = {}
-    for spec in specs:
-        name, _, source = spec.strip().partition("=")
-        if not name:
-            raise InputError("models", got=f"{spec!r}", wanted="none, MODEL or NAME=MODEL")
-        printer = load_printer(
-            source or name, layout, name=name if source else "", device=device, extrapolate=extrapolate
-        )
-        if printer.name in printers:
-            raise InputError(
-                "models", got=f"{printer.name!r} twice", wanted="one name each", hint="use NAME=MODEL"
-            )
-        printers[printer.name] = printer
-    return printers
+        Raises:
+            InputError: an option of another task, or a file with an unknown name.
+        """
+        known = {leaf.path for leaf in leaves(preset)}
+        for path, name in self.names.items():
+            if name != "--set" and path not in known:
+                raise InputError(name, got=f"the {task} task", wanted="a task that has this setting")
+        content = {} if self.config is None else read_settings(self.config)
+        return flattened(preset, content, f"{self.config}:") | flattened(preset, self.options)
 
 
-def headline(figures: dict[str, float]) -> str:
-    """The two or three figures that a command ends with."""
-    if "eff_signal" in figures:
-        return (
-            f"{100 * figures['eff_signal']:.1f} % on the signal, {figures['si_psnr_db']:.2f} dB, "
-            f"SSIM {figures['ssim']:.3f}"
-        )
-    if "speckle_contrast" in figures:
-        return f"{figures['si_psnr_db']:.2f} dB, SSIM {figures['ssim']:.3f}"
-    if "focusing_efficiency" not in figures:
-        told = {name: figures.get(f"mae_{name}") for name in ("direct", "design", "calibrated")}
-        return "MAE " + ", ".join(f"{name} {mae:.4f}" for name, mae in told.items() if mae is not None)
-    text = f"{100 * figures['focusing_efficiency']:.1f} % in the focus, Strehl {figures['strehl']:.3f}"
-    return text + (f", MAE {figures['mae_calibrated']:.4f}" if "mae_calibrated" in figures else "")
+def takes_settings(
+    *presets: BaseModel, leave_out: Collection[str] = ()
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Give a command the options of all settings that name one, ``--set`` and ``--config``.
+
+    The command takes them as its argument ``given``, a ``Given``.
+
+    Args:
+        presets: settings, one record for each task; their values are shown as defaults.
+        leave_out: paths without an option here.
+    """
+    found: dict[str, list[Leaf]] = {}
+    for leaf in (leaf for preset in presets for leaf in leaves(preset)):
+        if leaf.options and leaf.path not in leave_out:
+            found.setdefault(leaf.path, []).append(leaf)
+    paths = {path.replace(".", "_"): path for path in found}
+    extra = [_parameter(name, found[path], len(presets)) for name, path in paths.items()]
+    extra += [_keyword("config", _Config), _keyword("set_", _Set)]
+
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        @functools.wraps(command)
+        def run(**values: Any) -> None:
+            config, words = values.pop("config"), assigned(values.pop("set_") or [])
+            said = {path: values.pop(name) for name, path in paths.items()}
+            options = {path: value for path, value in said.items() if value is not None}
+            twice = sorted(set(options) & set(words))
+            if twice:
+                raise InputError("--set", got=f"{twice[0]}, which an option sets too", wanted="one of them")
+            unused = sorted(set(leave_out) & set(words))
+            if unused:
+                raise InputError("--set", got=unused[0], wanted="a setting that this command leaves open")
+            names = {path: found[path][0].options[0] for path in options} | dict.fromkeys(words, "--set")
+            command(**values, given=Given({**options, **words}, names, config))
+
+        own = inspect.signature(command, eval_str=True).parameters.values()
+        shown = [*(parameter for parameter in own if parameter.name != "given"), *extra]
+        # Typer reads both.
+        run.__signature__ = inspect.Signature(shown)  # type: ignore[attr-defined]
+        run.__annotations__ = {parameter.name: parameter.annotation for parameter in shown}
+        return run
+
+    return decorate
+
+
+def option_paths(preset: BaseModel) -> dict[str, str]:
+    """The path of the setting behind every option."""
+    return {name: leaf.path for leaf in leaves(preset) for name in leaf.options}
+
+
+def as_toml(settings: BaseModel) -> str:
+    """Settings as a file for ``--config``, each with its meaning, unit, choices and option."""
+    lines: list[str] = []
+    table = ""
+    for leaf in sorted(leaves(settings), key=lambda leaf: "." in leaf.path):
+        place, _, name = leaf.path.rpartition(".")
+        if place != table:
+            lines += ["", f"[{place}]"]
+            table = place
+        notes = [_described(leaf)]
+        if get_origin(leaf.kind) is Literal:
+            notes.append(", ".join(map(str, get_args(leaf.kind))))
+        notes += [" or ".join(leaf.options)] if leaf.options else []
+        value = leaf.value.model_dump() if isinstance(leaf.value, BaseModel) else leaf.value
+        lines += [f"# {'; '.join(notes)}", f"{name} = {json.dumps(value, ensure_ascii=False)}"]
+    return "\n".join(lines) + "\n"
+
+
+def _parameter(name: str, same: Sequence[Leaf], presets: int) -> inspect.Parameter:
+    """One option for a setting that one or several presets have."""
+    leaf = same[0]
+    values = list(dict.fromkeys(_shown(one.value) for one in same))
+    option = typer.Option(
+        *leaf.options,
+        help=f"{_described(leaf)}.",
+        show_default=" or ".join(values),
+        rich_help_panel=leaf.group or None,
+    )
+    return _keyword(name, Annotated[leaf.kind | None, option])
+
+
+def _keyword(name: str, annotation: Any) -> inspect.Parameter:
+    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
+
+
+def _described(leaf: Leaf) -> str:
+    return f"{leaf.help}, {leaf.unit}" if leaf.unit else leaf.help
+
+
+def _shown(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)

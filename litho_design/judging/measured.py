@@ -11,7 +11,7 @@ from torch import Tensor
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Record
-from litho_design.judging.judge import Judging
+from litho_design.judging.loaded import LoadedDesign
 
 # Below this share of measured pixels the figures would be those of the filling, not of the print.
 _SMALLEST_COVERAGE = 0.8
@@ -28,7 +28,7 @@ class MeasuredRecord(Record):
 
 
 def measured_print(
-    judging: Judging,
+    loaded: LoadedDesign,
     scan_file: str | Path,
     *,
     unit: str | None = None,
@@ -40,7 +40,7 @@ def measured_print(
     median agrees with the designed print. Pixels without a measurement take the designed print.
 
     Args:
-        judging: the design.
+        loaded: the design.
         scan_file: any format that ``litho-data inspect`` reads.
         unit, size_um: for files that do not carry them.
 
@@ -55,8 +55,8 @@ def measured_print(
 
     scan = read_scan(scan_file, unit=unit, size_um=size_um)
     pitch = scan.require_pitch()
-    layout = judging.design.layout
-    levels = judging.level.cpu().numpy()
+    layout = loaded.record.layout
+    levels = loaded.level.cpu().numpy()
     registration = register_scan(
         scan.height_um, levels, scan_pitch_um=pitch, layout_pitch_um=layout.pitch_um, model="affine"
     )
@@ -81,7 +81,7 @@ def measured_print(
             wanted=f"at least {100 * _SMALLEST_COVERAGE:.0f} %",
             hint="a hologram needs its whole area; stitch the scans first",
         )
-    expected = judging.expected_um.cpu().numpy()
+    expected = loaded.expected_um.cpu().numpy()
     offset = float(np.median(height[valid] - expected[valid]))
     complete = np.where(valid, height - offset, expected).astype(np.float32)
     record = MeasuredRecord(
@@ -91,4 +91,4 @@ def measured_print(
         registration_ncc=float(np.corrcoef(height[valid], expected[valid])[0, 1]),
         height_offset_um=offset,
     )
-    return torch.from_numpy(complete).to(judging.device), record
+    return torch.from_numpy(complete).to(loaded.device), record

@@ -1,22 +1,36 @@
 """Scalar diffraction: pure, differentiable, tested against closed forms."""
 
-from litho_design.optics.angular_spectrum import ASMPropagator
-from litho_design.optics.blaze import blaze_efficiency, stroke_table
-from litho_design.optics.radial import RadialPropagator
-from litho_design.optics.rayleigh_sommerfeld import RSPropagator
-from litho_design.optics.sampling import centred_grid, check_distance, sampling_limit_um
-from litho_design.optics.thin_element import Optics, element_field, intensity_share
+from __future__ import annotations
 
-__all__ = [
-    "ASMPropagator",
-    "Optics",
-    "RSPropagator",
-    "RadialPropagator",
-    "blaze_efficiency",
-    "centred_grid",
-    "check_distance",
-    "element_field",
-    "intensity_share",
-    "sampling_limit_um",
-    "stroke_table",
-]
+from typing import TYPE_CHECKING
+
+from litho_data.foundation.faces import lazy_face
+
+if TYPE_CHECKING:
+    from litho_design.optics.angular_spectrum import ASMPropagator as ASMPropagator
+    from litho_design.optics.radial import RadialPropagator as RadialPropagator
+    from litho_design.optics.rayleigh_sommerfeld import RSPropagator as RSPropagator
+    from litho_design.optics.sampling import centred_grid as centred_grid
+    from litho_design.optics.sampling import check_distance as check_distance
+    from litho_design.optics.sampling import sampling_limit_um as sampling_limit_um
+    from litho_design.optics.stroke import blaze_efficiency as blaze_efficiency
+    from litho_design.optics.thin_element import Optics as Optics
+    from litho_design.optics.thin_element import element_field as element_field
+    from litho_design.optics.thin_element import intensity_share as intensity_share
+else:
+    # Loaded when used: the command line reads the settings in `Optics` without torch.
+    __getattr__, __dir__ = lazy_face(
+        __name__,
+        {
+            "ASMPropagator": "litho_design.optics.angular_spectrum",
+            "Optics": "litho_design.optics.thin_element",
+            "RSPropagator": "litho_design.optics.rayleigh_sommerfeld",
+            "RadialPropagator": "litho_design.optics.radial",
+            "blaze_efficiency": "litho_design.optics.stroke",
+            "centred_grid": "litho_design.optics.sampling",
+            "check_distance": "litho_design.optics.sampling",
+            "element_field": "litho_design.optics.thin_element",
+            "intensity_share": "litho_design.optics.thin_element",
+            "sampling_limit_um": "litho_design.optics.sampling",
+        },
+    )

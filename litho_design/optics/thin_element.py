@@ -3,21 +3,31 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
-import torch
-from pydantic import PositiveFloat
-from torch import Tensor
-
-from litho_data.foundation.grid import PixelGrid
 from litho_data.foundation.results import Record
+from litho_data.foundation.settings import setting
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from litho_data.foundation.grid import PixelGrid
 
 
 class Optics(Record):
     """What the light sees: wavelength, index step and the distance to the output plane, µm."""
 
-    wavelength_um: PositiveFloat = 0.6328
-    index_step: PositiveFloat = 0.548
-    distance_um: PositiveFloat = 300.0
+    wavelength_um: float = setting(0.6328, "Wavelength", unit="µm", option="--wavelength-um", gt=0)
+    index_step: float = setting(
+        0.548, "Refractive index of the resist minus that of its surroundings", option="--index-step", gt=0
+    )
+    distance_um: float = setting(
+        300.0,
+        "Distance to the image plane; the focal length of a lens",
+        unit="µm",
+        option=("--distance-um", "--focal-length-um"),
+        gt=0,
+    )
 
     @property
     def wave_height_um(self) -> float:
@@ -42,6 +52,8 @@ def element_field(
     Returns:
         complex (..., ny, nx), 1/µm.
     """
+    import torch  # the command line reads `Optics` without it
+
     phase = height_um * (2 * math.pi / optics.wave_height_um)
     area = math.prod(grid.pitch_um)
     if aperture is None:

@@ -9,8 +9,9 @@ import torch
 from torch import nn
 
 from litho_data.foundation.results import Record
-from litho_design.optimisation.optimise import Objective, SearchSettings
-from litho_design.optimisation.parametrise import Parametrisation
+from litho_design.optimisation.parameters import Parametrisation
+from litho_design.optimisation.search import Objective
+from litho_design.optimisation.settings import SearchSettings
 
 _KIB_PER_GIB = 1 << 20
 

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from litho_data.foundation.commands import progress
-from litho_design.optimisation.optimise import Objective
-from litho_design.optimisation.parametrise import CellMap
+from litho_design.optimisation.parameters import CellMap
+from litho_design.optimisation.search import Objective
 
 # Up to this many cells every single change is tried; beyond it the gradient proposes.
 _EXHAUSTIVE_CELLS = 64

@@ -1,123 +1,19 @@
-"""Process window: how a design fares when the print and the bench are not exactly as modelled."""
+"""One loss for several prints of a layout: over the draws of a process window, and by several models."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
-import numpy as np
 import torch
-from pydantic import Field
 from torch import Tensor
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.grid import PixelGrid
 from litho_data.foundation.results import Record
-from litho_design.optics import Optics, sampling_limit_um
+from litho_design.optimisation.process_window import Draw, ProcessWindow, risk
+from litho_design.printers.printer import Printer, PrinterRecord
 
-_NARROWEST_BLUR_PX = 0.2
-_UNSEEN_STREAM = 1
-YIELD_DRAWS = 16
-
-
-class ProcessWindow(Record):
-    """Spread of print and bench, and how a search weighs it.
-
-    ``gain_sd`` is relative to the printed height, ``blur_sd_um`` the scale of a half-normal extra
-    blur. A search with ``samples`` above 0 minimises mean + weight * sd of the loss over as many
-    draws (``mean-sd``), or the mean of the worst ``tail`` share of them (``cvar``); the draws are
-    the same in every iteration. The defaults are a guess to be replaced by figures of the own
-    printer: the fields of one measured data set spread by 13 % in gain, the microscope's scale included.
-    """
-
-    gain_sd: float = Field(default=0.03, ge=0)
-    offset_sd_um: float = Field(default=0.02, ge=0)
-    gain_offset_correlation: float = Field(default=0.0, ge=-1, le=1)
-    blur_sd_um: float = Field(default=0.05, ge=0)
-    defocus_sd_um: float = Field(default=3.0, ge=0)
-    wavelength_sd_um: float = Field(default=0.0, ge=0)
-    samples: int = Field(default=0, ge=0)
-    risk: Literal["mean-sd", "cvar"] = "cvar"
-    weight: float = Field(default=1.0, ge=0)
-    tail: float = Field(default=0.25, gt=0, le=1)
-    seed: int = 0
-
-
-@dataclass(frozen=True)
-class Draw:
-    """One print on one bench."""
-
-    gain: float
-    offset_um: float
-    blur_um: float
-    optics: Optics
-
-    def apply(self, height_um: Tensor, pitch_um: float) -> Tensor:
-        """The height (size, size), or of rings (n,) from the centre outwards, µm, as this draw prints it.
-
-        A uniform offset is a uniform phase and changes no image; it is kept for scores of heights.
-        Rings are blurred along the radius only, which is exact where they are much wider than the blur
-        or far from the centre.
-        """
-        changed = height_um * self.gain + self.offset_um
-        sigma_px = self.blur_um / pitch_um
-        if sigma_px < _NARROWEST_BLUR_PX:
-            return changed
-        return _blur(changed, sigma_px) if changed.dim() == 2 else _blur_rings(changed, sigma_px)
-
-
-def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = False) -> list[Draw]:
-    """``count`` draws from ``window.seed``; the first ``k`` of a longer list are those of a shorter one.
-
-    ``unseen`` draws come from a stream of their own: a yield must hold for prints that no search saw.
-    """
-    shared = window.gain_offset_correlation
-    seed = [window.seed, _UNSEEN_STREAM] if unseen else window.seed
-    normal = np.random.default_rng(seed).standard_normal((count, 5)).tolist()
-    return [
-        Draw(
-            gain=1 + window.gain_sd * gain,
-            offset_um=window.offset_sd_um * (shared * gain + math.sqrt(1 - shared**2) * offset),
-            blur_um=abs(window.blur_sd_um * blur),
-            optics=optics.model_copy(
-                update={
-                    "distance_um": optics.distance_um + window.defocus_sd_um * defocus,
-                    "wavelength_um": optics.wavelength_um + window.wavelength_sd_um * wavelength,
-                }
-            ),
-        )
-        for gain, offset, blur, defocus, wavelength in normal
-    ]
-
-
-def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target: PixelGrid) -> None:
-    """Refuse spreads that carry a draw of the search or of the yield out of what can be propagated.
-
-    Raises:
-        InputError: a draw below the sampling limit of the propagator between ``source`` and ``target``,
-            or without a positive wavelength.
-    """
-    drawn = draws(window, optics, window.samples) + draws(window, optics, YIELD_DRAWS, unseen=True)
-    nearest_um = min(draw.optics.distance_um for draw in drawn)
-    shortest_um = min(draw.optics.wavelength_um for draw in drawn)
-    if shortest_um <= 0:
-        raise InputError(
-            f"wavelength {optics.wavelength_um:g} µm with a spread of {window.wavelength_sd_um:g} µm",
-            got=f"{shortest_um:.4g} µm in a draw of the process window",
-            wanted="a positive wavelength",
-            hint="lower --wavelength-sd-um",
-        )
-    limit_um = max(sampling_limit_um(source, target, draw.optics.wavelength_um) for draw in drawn)
-    if nearest_um < limit_um:
-        raise InputError(
-            f"distance {optics.distance_um:g} µm with a defocus spread of {window.defocus_sd_um:g} µm",
-            got=f"{nearest_um:.4g} µm in a draw of the process window",
-            wanted=f"at least {limit_um:.4g} µm",
-            hint="lower --defocus-sd-um",
-        )
-
+# (1e-6 µm)^2: keeps the root differentiable where all models agree, and is far below any height.
+_SMALLEST_VARIANCE_UM2 = 1e-12
 
 Loss = Callable[[Tensor, Any], tuple[Tensor, dict[str, float]]]
 
@@ -154,68 +50,49 @@ def windowed_loss(
     return risk(together, window), {"mean": float(seen.mean()), "worst": float(seen.max())}
 
 
-def risk(losses: Tensor, window: ProcessWindow) -> Tensor:
-    """One figure of many losses: mean + weight * sd, or the mean of the worst share."""
-    if window.risk == "mean-sd":
-        return losses.mean() + window.weight * losses.std(correction=0)
-    worst = max(1, round(window.tail * losses.numel()))
-    return losses.topk(worst).values.mean()
+class EnsembleRecord(Record):
+    """The further models of a design, and how far all of them are apart on its layout."""
+
+    members: list[PrinterRecord]
+    disagreement_nm: float
+    disagreement_waves: float
 
 
-def measured_window(store: Any, window: ProcessWindow) -> ProcessWindow:
-    """``window`` with the spread of gain and offset, and their correlation, of measured prints.
+def disagreement_um(heights_um: Tensor, area: Tensor | None = None) -> Tensor:
+    """RMS over the area of the standard deviation between models, µm; differentiable.
 
-    Each scan is fitted as height = gain * nominal + offset; the spread between scans is that of the
-    process, of the microscope's own scale from scan to scan, and of what else the fit leaves in:
-    an upper bound of what one print differs from another. The locked scans are left out: whatever a
-    design is judged by later, its search has not seen them.
+    A constant height is a constant phase, so every print is first freed of its mean.
 
     Args:
-        store: a ``litho_data`` store with at least three scans outside its lock box.
-
-    Raises:
-        InputError: fewer scans, or layouts without structure.
+        heights_um: prints of one layout by k models, (k, ...).
+        area: what each height stands for, (...), in any unit: rings grow outwards; None for pixels.
     """
-    locked = store.locked_ids
-    fits = []
-    for scan in store.scans():
-        if scan.id in locked:
-            continue
-        nominal, height = scan.layout_um[scan.valid], scan.height_um[scan.valid]
-        if nominal.std() > 0:
-            fits.append(np.polyfit(nominal.astype(float), height.astype(float), 1))
-    if len(fits) < 3:
-        raise InputError(
-            "process window",
-            got=f"{len(fits)} scans with structure, {len(locked)} locked ones left out",
-            wanted="three at least",
-        )
-    gain, offset = np.array(fits).T
-    return window.model_copy(
-        update={
-            "gain_sd": float(gain.std(ddof=1) / gain.mean()),
-            "offset_sd_um": float(offset.std(ddof=1)),
-            "gain_offset_correlation": float(np.corrcoef(gain, offset)[0, 1]),
-        }
+    flat = heights_um.flatten(1)
+    share = torch.ones_like(flat[0]) if area is None else area.flatten()
+    share = share / share.sum()
+    free = flat - (flat * share).sum(1, keepdim=True)
+    return ((free.var(0, correction=0) * share).sum() + _SMALLEST_VARIANCE_UM2).sqrt()
+
+
+def penalised(
+    loss: Tensor, heights_um: list[Tensor], weight: float, wave_height_um: float, area: Tensor | None = None
+) -> Tensor:
+    """``loss`` + weight * disagreement in waves; the loss itself where there is one model only."""
+    if len(heights_um) == 1 or weight == 0:
+        return loss
+    return loss + weight * disagreement_um(torch.stack(heights_um), area) / wave_height_um
+
+
+@torch.no_grad()
+def measure_disagreement(
+    printers: Sequence[Printer], level: Tensor, wave_height_um: float
+) -> EnsembleRecord | None:
+    """How far the models are apart on a layout (1, 1, size, size); None for a single model."""
+    if len(printers) == 1:
+        return None
+    apart_um = float(disagreement_um(torch.stack([printer(level)[0, 0] for printer in printers])))
+    return EnsembleRecord(
+        members=[printer.record() for printer in printers[1:]],
+        disagreement_nm=1000 * apart_um,
+        disagreement_waves=apart_um / wave_height_um,
     )
-
-
-def _blur_rings(height: Tensor, sigma_px: float) -> Tensor:
-    """Gaussian blur along the radius; the centre continues as its mirror, the edge as it is."""
-    half = min(int(4 * sigma_px) + 1, height.numel() - 1)
-    x = torch.arange(-half, half + 1, dtype=height.dtype, device=height.device)
-    kernel = torch.exp(-(x**2) / (2 * sigma_px**2))
-    kernel = kernel / kernel.sum()
-    padded = torch.cat([height[:half].flip(0), height, height[-1:].expand(half)])
-    return torch.nn.functional.conv1d(padded[None, None], kernel.view(1, 1, -1))[0, 0]
-
-
-def _blur(image: Tensor, sigma_px: float) -> Tensor:
-    """Gaussian blur with mirrored borders."""
-    half = int(4 * sigma_px) + 1
-    x = torch.arange(-half, half + 1, dtype=image.dtype, device=image.device)
-    kernel = torch.exp(-(x**2) / (2 * sigma_px**2))
-    kernel = kernel / kernel.sum()
-    padded = torch.nn.functional.pad(image[None, None], (half,) * 4, mode="reflect")
-    rows = torch.nn.functional.conv2d(padded, kernel.view(1, 1, 1, -1))
-    return torch.nn.functional.conv2d(rows, kernel.view(1, 1, -1, 1))[0, 0]

@@ -19,7 +19,7 @@ from litho_data.virtual_fab import Job, KnobSetting, Noise, Printer, Truth
 from litho_data.virtual_fab.canvas import GUARD_PX, Canvas, cut_layout
 from litho_data.virtual_fab.knobs import KnobBoard
 from litho_data.virtual_fab.printer import print_clean, surface_noise
-from litho_design.optimisation.parametrise import LayoutSettings
+from litho_design.printers.layout import LayoutSettings
 
 # A stream of its own: no scan of the run that the truth file describes has this roughness.
 _ROUGHNESS_STREAM = 2

@@ -13,8 +13,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from litho_data.foundation.results import Record
-from litho_design.optimisation.parametrise import LayoutSettings
 from litho_design.printers.fab import FabSimulator
+from litho_design.printers.layout import LayoutSettings
 
 _GUARD_UM = 6.4
 

@@ -2,45 +2,83 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 import torch
 
 from litho_data.foundation.errors import InputError
-from litho_design.optimisation.parametrise import LayoutSettings
 from litho_design.printers.fab import is_fab, load_fab
+from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
+
+Device = str | torch.device
 
 
 def load_printer(
-    source: str,
+    source: str | Path | Printer,
     layout: LayoutSettings,
     *,
     name: str = "",
-    device: str | torch.device = "cpu",
+    device: Device = "cpu",
     extrapolate: bool = False,
 ) -> Printer:
     """The printer for ``source``: a folder of a frozen model, ``zoo:NAME``, or ``none`` for nominal heights.
 
     The folder ``truth`` of a virtual fab is a printer that can only judge. ``name`` is what results
-    call it; the model's own name by default.
+    call it; the model's own name by default. A printer that is loaded is returned as it is.
 
     Raises:
         InputError: no frozen model there, another pitch, levels the model was not calibrated for, or a
             device that this machine does not have.
     """
+    if isinstance(source, Printer):
+        return source
     check_device(device)
+    source = str(source)
     if source == "none":
         return Printer(None, layout, source=source, name=name).to(device)
     if is_fab(source):
         return Printer(load_fab(source, layout), layout, source=source, name=name).to(device)
     simulator = _load_simulator(source, device, extrapolate)
     _check_calibration(simulator.card, layout, extrapolate)
-    return Printer(simulator, layout, source=str(source), name=name, extrapolate=extrapolate).to(device)
+    return Printer(simulator, layout, source=source, name=name, extrapolate=extrapolate).to(device)
 
 
-def _load_simulator(source: str, device: str | torch.device, extrapolate: bool) -> Any:
+def load_printers(
+    sources: Mapping[str, str | Path | Printer] | Iterable[str | Printer],
+    layout: LayoutSettings,
+    *,
+    device: Device = "cpu",
+    extrapolate: bool = False,
+) -> dict[str, Printer]:
+    """Printers by name, from a mapping, or from NAME=MODEL, MODEL, ``none`` and loaded printers.
+
+    Raises:
+        InputError: one without a name, two of the same name, or what ``load_printer`` refuses.
+    """
+    fit: Any = {"device": device, "extrapolate": extrapolate}
+    if isinstance(sources, Mapping):
+        return {name: load_printer(source, layout, name=name, **fit) for name, source in sources.items()}
+    printers: dict[str, Printer] = {}
+    for item in sources:
+        source, name = item, ""
+        if isinstance(item, str):
+            first, _, rest = item.strip().partition("=")
+            source, name = (rest, first) if rest else (first, "")
+            if not first:
+                raise InputError("models", got=f"{item!r}", wanted="none, MODEL or NAME=MODEL")
+        printer = load_printer(source, layout, name=name, **fit)
+        if printer.name in printers:
+            raise InputError(
+                "models", got=f"{printer.name!r} twice", wanted="one name each", hint="use NAME=MODEL"
+            )
+        printers[printer.name] = printer
+    return printers
+
+
+def _load_simulator(source: str, device: Device, extrapolate: bool) -> Any:
     from litho_models import load_frozen
     from litho_models.frozen import zoo
 
@@ -69,7 +107,7 @@ def _check_calibration(card: Mapping[str, Any], layout: LayoutSettings, extrapol
         )
 
 
-def check_device(device: str | torch.device) -> None:
+def check_device(device: Device) -> None:
     """Refuse a device that this machine does not have.
 
     Raises:

@@ -10,26 +10,23 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from litho_data.foundation.report import Page, new_figure
-from litho_design.judging.judge import Judging
+from litho_design.holograms.bench import HologramScore
+from litho_design.judging.gap import HEADLINE, GapResult, design_folder
+from litho_design.judging.loaded import LoadedDesign
+from litho_design.lenses.score import ImagingLensScore
 from litho_design.printers.printer import Printer
-from litho_design.reports.design import SCORE_LABELS
-from litho_design.reports.lens import LENS_LABELS
-from litho_design.reports.plots import image_grid
+from litho_design.reports.parts import image_grid, meanings
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from litho_design.judging.compare import GapResult
-
 # Side of the cut-out that shows layout against print; features of some pixels must stay visible.
 _DETAIL_PX = 160
-_LABELS = {**SCORE_LABELS, **LENS_LABELS}
+_LABELS = meanings(HologramScore) | meanings(ImagingLensScore)
 
 
 def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Printer]) -> Path:
     """Write ``report.html`` and one CSV per table."""
-    from litho_design.judging.compare import HEADLINE
-
     what = f"hologram of “{result.target}”" if result.task == "hoe" else result.task.replace("-", ", ")
     page = Page(
         "The design-to-manufacturing gap",
@@ -96,34 +93,32 @@ def _matrix(result: GapResult, figure: str) -> pd.DataFrame:
 
 def _judged(
     folder: Path, result: GapResult, printers: Mapping[str, Printer]
-) -> dict[str, tuple[Judging, dict[str, np.ndarray]]]:
+) -> dict[str, tuple[LoadedDesign, dict[str, np.ndarray]]]:
     """For every arm the image (or PSF) that each judge's print gives, first seed."""
-    from litho_design.judging.compare import design_folder
-
     images = {}
     for arm, own in printers.items():
         if arm not in result.arms:
             continue
-        judging = Judging(design_folder(folder, arm, result.seeds[0]), device=own.device)
+        loaded = LoadedDesign(design_folder(folder, arm, result.seeds[0]), device=own.device)
         images[arm] = (
-            judging,
-            {name: judging.image(judging.printed_um(judge)) for name, judge in printers.items()},
+            loaded,
+            {name: loaded.image(loaded.printed_um(judge)) for name, judge in printers.items()},
         )
     return images
 
 
-def _pictures(result: GapResult, judged: dict[str, tuple[Judging, dict[str, np.ndarray]]]):
+def _pictures(result: GapResult, judged: dict[str, tuple[LoadedDesign, dict[str, np.ndarray]]]):
     images, titles, side_um = [], [], 0.0
-    for arm, (judging, by_judge) in judged.items():
-        images.append([judging.display(image) for image in by_judge.values()])
+    for arm, (loaded, by_judge) in judged.items():
+        images.append([loaded.display(image) for image in by_judge.values()])
         titles.append([f"{arm}: in design" if name == arm else f"printed by {name}" for name in by_judge])
-        side_um = judging.window_um
+        side_um = loaded.window_um
     return image_grid(images, titles, list(judged), side_um)
 
 
 def _prints(
     result: GapResult,
-    judged: dict[str, tuple[Judging, dict[str, np.ndarray]]],
+    judged: dict[str, tuple[LoadedDesign, dict[str, np.ndarray]]],
     printers: Mapping[str, Printer],
 ):
     """The layout (nominal heights) and what every judge prints of it, cut out around the centre."""
@@ -134,9 +129,9 @@ def _prints(
     extent = (0, side * layout.pitch_um, side * layout.pitch_um, 0)
     figure = new_figure(2.3 * (len(printers) + 1) + 0.6, 2.45 * len(judged))
     axes = figure.subplots(len(judged), len(printers) + 1, squeeze=False)
-    for (arm, (judging, _)), row in zip(judged.items(), axes, strict=True):
-        maps = {"layout, nominal": judging.level.cpu().numpy() * layout.level_height_um}
-        maps |= {f"printed by {name}": judging.printed_um(p).cpu().numpy() for name, p in printers.items()}
+    for (arm, (loaded, _)), row in zip(judged.items(), axes, strict=True):
+        maps = {"layout, nominal": loaded.level.cpu().numpy() * layout.level_height_um}
+        maps |= {f"printed by {name}": loaded.printed_um(p).cpu().numpy() for name, p in printers.items()}
         highest = max(float(height[middle].max()) for height in maps.values())
         for axis, (name, height) in zip(row, maps.items(), strict=True):
             shown = axis.imshow(height[middle], cmap="viridis", vmin=0, vmax=highest, extent=extent)
@@ -147,7 +142,7 @@ def _prints(
     return figure
 
 
-def _profiles(result: GapResult, judged: dict[str, tuple[Judging, dict[str, np.ndarray]]]):
+def _profiles(result: GapResult, judged: dict[str, tuple[LoadedDesign, dict[str, np.ndarray]]]):
     figure = new_figure(9, 2.6 * len(judged))
     axes = figure.subplots(len(judged), 2, squeeze=False, sharey="col")
     for (arm, (_, by_judge)), (left, right) in zip(judged.items(), axes, strict=True):

@@ -3,47 +3,26 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from litho_data.foundation.report import Page, new_figure
-from litho_design.judging.process_window import focus_window
-from litho_design.lens.metrics import mtf
-from litho_design.optimisation.robust import ProcessWindow
-from litho_design.reports.design import add_gauge, add_notes, progress_figure, stroke_advice, stroke_frame
-from litho_design.reports.window import add_focus_window, add_yield
+from litho_design.lenses.bench import LensBench
+from litho_design.lenses.focus_window import FocusWindow, focus_window
+from litho_design.lenses.score import ImagingLensScore, mtf
+from litho_design.optimisation.process_window import ProcessWindow
+from litho_design.reports.advice import stroke_advice
+from litho_design.reports.parts import (
+    add_gauge,
+    add_notes,
+    add_yield,
+    level_table,
+    meanings,
+    progress_figure,
+    score_table,
+)
 from litho_design.tasks.design import HEIGHT_FILE, IMAGE_FILE, LEVELS_FILE, Design
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from litho_design.lens.bench import LensBench
-
-LENS_LABELS = {
-    "focusing_efficiency": "power within the focusing radius, share of the aperture's",
-    "focusing_radius_um": "focusing radius: 3 x ideal FWHM, µm",
-    "strehl": "peak over the peak of a perfect lens",
-    "mtf_volume_ratio": "volume of the MTF over that of a perfect lens",
-    "mtf_half_cutoff": "MTF at half the cut-off NA / wavelength",
-    "fwhm_um": "full width at half maximum, µm",
-    "fwhm_ideal_um": "the same of a perfect lens, µm",
-    "cbr": "centre-to-background ratio",
-    "cbr_ceiling": "the same of a perfect lens: the ceiling",
-    "eff_window": "power in the PSF window, share of the aperture's",
-    "mae_direct": "test objects: MAE of the sensor image, best scale",
-    "mae_design": "test objects: MAE, deconvolved with the designed PSF",
-    "mae_calibrated": "test objects: MAE, deconvolved with the print's own PSF",
-    "mae_calibrated_sd": "its standard deviation over objects and noise seeds",
-    "psnr_direct_db": "PSNR of the sensor image, best scale, dB",
-    "psnr_design_db": "PSNR with the designed PSF, dB",
-    "psnr_calibrated_db": "PSNR with the print's own PSF, dB",
-    "ssim_direct": "SSIM of the sensor image",
-    "ssim_design": "SSIM with the designed PSF",
-    "ssim_calibrated": "SSIM with the print's own PSF",
-    "ssim_calibrated_sd": "its standard deviation over objects and noise seeds",
-}
 
 
 def write_lens_report(
@@ -57,7 +36,7 @@ def write_lens_report(
     levels, height, psf = (np.load(folder / name) for name in (LEVELS_FILE, HEIGHT_FILE, IMAGE_FILE))
     with torch.no_grad():
         ideal = bench(bench.ideal_height_um()).cpu().numpy()
-    figures = design.predicted
+    figures, labels = design.predicted, meanings(ImagingLensScore)
     page = Page(
         "Multi-level diffractive lens",
         f"Designed through the printer model “{design.printer.name}”; "
@@ -79,7 +58,7 @@ def write_lens_report(
     page.figure(
         _curves(design, height, psf, ideal, bench), "Print along the central row, PSF profile, and MTF."
     )
-    page.table(lens_table(figures), "Scores of the argmax layout", "scores.csv", digits=4)
+    page.table(score_table(figures, labels), "Scores of the argmax layout", "scores.csv", digits=4)
     if design.reference_efficiency:
         reached = figures["focusing_efficiency"] / design.reference_efficiency
         page.paragraph(
@@ -90,26 +69,16 @@ def write_lens_report(
     page.figure(
         progress_figure(history, design), "Loss of the sampled layout and of the printable (argmax) layout."
     )
-    shown = {name: (figures[name], LENS_LABELS[name]) for name in ("strehl", "cbr")}
+    shown = {name: (figures[name], labels[name]) for name in ("strehl", "cbr")}
     add_yield(page, window, ProcessWindow.model_validate(design.settings["window"]), shown)
-    add_focus_window(page, focus_window(bench, torch.from_numpy(height).to(bench.aperture.device)))
+    _add_focus_window(page, focus_window(bench, torch.from_numpy(height).to(bench.aperture.device)))
     page.heading("What the print makes of the levels")
-    page.table(
-        stroke_frame(design), "Printed height of a uniform field of each level", "levels.csv", digits=3
-    )
+    page.table(level_table(design), "Printed height of a uniform field of each level", "levels.csv", digits=3)
     page.paragraph(stroke_advice(design))
     add_gauge(page, design)
     page.heading("Settings")
     page.code(design.model_dump_json(indent=1, include={"settings", "printer", "run", "notes"}))
     return page.write(folder)
-
-
-def lens_table(figures: dict[str, float]) -> pd.DataFrame:
-    """One row per figure, with its meaning."""
-    import pandas as pd
-
-    rows = [(name, value, LENS_LABELS[name]) for name, value in figures.items()]
-    return pd.DataFrame(rows, columns=["name", "value", "meaning"])
 
 
 def _pictures(design: Design, levels: np.ndarray, height: np.ndarray, psf: np.ndarray):
@@ -162,3 +131,37 @@ def _curves(design: Design, height: np.ndarray, psf: np.ndarray, ideal: np.ndarr
     for axis in axes:
         axis.legend(fontsize=8)
     return figure
+
+
+def _add_focus_window(page: Page, window: FocusWindow) -> None:
+    """Bossung curves of FWHM and peak, and the map of the peak."""
+    import pandas as pd
+
+    page.paragraph(
+        f"Through focus and print gain (gain stands for dose): the peak keeps 80 % of its best value over "
+        f"{window.depth_of_focus_um:.1f} µm of defocus at the modelled gain, and over a gain range of "
+        f"{window.gain_latitude:.2f} in focus; the ends of the sweep cut both."
+    )
+    strehl, width = np.array(window.strehl), np.array(window.fwhm_um)
+    figure = new_figure(13, 3.6)
+    axes = figure.subplots(1, 3)
+    for row, gain in enumerate(window.gain):
+        for axis, values in ((axes[0], width), (axes[1], strehl)):
+            axis.plot(window.defocus_um, values[row], marker="o", markersize=3, label=f"gain {gain:g}")
+    axes[0].set_ylabel("FWHM, µm")
+    axes[1].set_ylabel("peak over that of a perfect lens")
+    axes[1].legend(fontsize=8)
+    share = strehl / strehl.max()
+    shown = axes[2].contourf(window.defocus_um, window.gain, share, levels=np.linspace(0, 1, 11))
+    axes[2].contour(window.defocus_um, window.gain, share, levels=[0.8], colors="white")
+    axes[2].set_ylabel("print gain over the modelled one")
+    figure.colorbar(shown, ax=axes[2], label="peak over the best of the sweep")
+    for axis in axes:
+        axis.set_xlabel("defocus, µm")
+    page.figure(figure, "Left and middle: one curve per gain. Right: the window, its 80 % line in white.")
+    rows = [
+        {"gain": gain, "defocus_um": shift, "strehl": strehl[row, column], "fwhm_um": width[row, column]}
+        for row, gain in enumerate(window.gain)
+        for column, shift in enumerate(window.defocus_um)
+    ]
+    page.table(pd.DataFrame(rows), "Sweep", "focus_window.csv", digits=3)

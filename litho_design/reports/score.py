@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from litho_data.foundation.report import Page
-from litho_design.reports.design import SCORE_LABELS
-from litho_design.reports.lens import LENS_LABELS
-from litho_design.reports.plots import image_grid
-
-if TYPE_CHECKING:
-    from litho_design.judging.score import ScoreResult
+from litho_design.holograms.bench import HologramScore
+from litho_design.judging.photographs import LensPhotoScore
+from litho_design.judging.score import ScoreResult
+from litho_design.lenses.score import ImagingLensScore
+from litho_design.reports.parts import image_grid, meanings
 
 
 def write_score_report(
@@ -52,7 +50,8 @@ def write_score_report(
             for name in names
         ]
     )
-    labels = SCORE_LABELS if result.task == "hoe" else LENS_LABELS
+    of_lens = meanings(LensPhotoScore) | meanings(ImagingLensScore)
+    labels = meanings(HologramScore) if result.task == "hoe" else of_lens
     table["meaning"] = [labels[name] for name in names]
     page.table(table, "Figures by judge", "scores.csv", digits=3)
     page.figure(

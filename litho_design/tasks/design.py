@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
@@ -12,14 +11,14 @@ from pydantic import Field
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
 from litho_data.foundation.hashes import file_sha256
-from litho_data.foundation.results import Record, Result
+from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import RunFacts
-from litho_design.optics import Optics, stroke_table
-from litho_design.optimisation.gauge import OutOfDistribution, Printability
-from litho_design.optimisation.parametrise import LayoutSettings
-from litho_design.printers.ensemble import EnsembleRecord
+from litho_design.images.targets import TargetRecord
+from litho_design.optics import Optics
+from litho_design.optics.stroke import Stroke
+from litho_design.optimisation.robust import EnsembleRecord
+from litho_design.printers.layout import LayoutSettings, OutOfDistribution, Printability
 from litho_design.printers.printer import PrinterRecord, TilingCheck
-from litho_design.tasks.targets import TargetRecord
 
 LEVELS_FILE = "layout_level.npy"
 HEIGHT_FILE = "predicted_height_um.npy"
@@ -27,8 +26,7 @@ IMAGE_FILE = "image_share.npy"
 TARGET_FILE = "target.npy"
 PICTURES_FILE = "object_pictures.npy"
 
-
-DesignTask = Literal["hoe", "lens-direct", "lens-computational"]
+TaskName = Literal["hoe", "lens-direct", "lens-computational"]
 
 
 class RunRecord(RunFacts):
@@ -41,19 +39,6 @@ class RunRecord(RunFacts):
     peak_memory_gib: float
 
 
-class Stroke(Record):
-    """What the print makes of the levels."""
-
-    printed_height_um: list[float]
-    stroke_um: float
-    stroke_waves: float
-    print_gain: float
-    blaze_order_1: float
-    blaze_order_0: float
-    levels_for_one_wave: float | None
-    level_height_for_one_wave_um: float | None
-
-
 class Design(Result):
     """design.json."""
 
@@ -61,7 +46,7 @@ class Design(Result):
     FILE_NAME: ClassVar[str] = "design.json"
 
     schema_: Literal["litho-design/design/1"] = Field(default="litho-design/design/1", alias="schema")
-    task: DesignTask
+    task: TaskName
     variant: str
     fingerprint: str
     run: RunRecord
@@ -85,13 +70,6 @@ class Design(Result):
     reference_efficiency: float | None = None
     predicted: dict[str, float]
     files: dict[str, str]
-
-
-def make_stroke(level_heights_um: list[float], optics: Optics, layout: LayoutSettings) -> Stroke:
-    """The advisor's figures as a record; what no level count can reach is None."""
-    _, advice = stroke_table(level_heights_um, optics.wave_height_um, level_height_um=layout.level_height_um)
-    reachable = {name: value if math.isfinite(value) else None for name, value in advice.items()}
-    return Stroke.model_validate({"printed_height_um": level_heights_um, **reachable})
 
 
 def write_arrays(folder: Path, arrays: dict[str, np.ndarray]) -> dict[str, str]:

@@ -11,10 +11,10 @@ import torch.nn.functional as F
 from torch import nn
 
 from litho_design.cli.app import main
+from litho_design.holograms.settings import HologramSettings, hologram_settings
 from litho_design.optics import Optics
-from litho_design.optimisation.parametrise import LayoutSettings
+from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
-from litho_design.tasks.settings import HoeSettings, hoe_preset
 
 
 class BlurPrinter(nn.Module):
@@ -47,9 +47,9 @@ def make_printer():
 
 
 @pytest.fixture
-def small_settings() -> HoeSettings:
+def small_settings() -> HologramSettings:
     """A hologram of 12.8 µm at 30 µm, 30 iterations."""
-    default = hoe_preset("default")
+    default = hologram_settings("default")
     return default.model_copy(
         update={
             "layout": LayoutSettings(size_px=128),

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from litho_design.optics import Optics, RSPropagator, blaze_efficiency, centred_grid, stroke_table
+from litho_design.optics import Optics, RSPropagator, blaze_efficiency, centred_grid
+from litho_design.optics.stroke import measure_stroke
 
 WAVELENGTH_UM = 0.6328
 
@@ -60,9 +61,9 @@ def test_advice_closes_the_wave():
     wave_height = Optics().wave_height_um
     assert wave_height == pytest.approx(1.1547, abs=5e-5)
     printed = [0.164 + 0.62 * 0.1 * level for level in range(13)]
-    table, advice = stroke_table(printed, wave_height, level_height_um=0.1)
-    assert advice["print_gain"] == pytest.approx(0.62)
-    assert table["printed_waves"].iloc[-1] == pytest.approx(advice["stroke_waves"])
+    stroke = measure_stroke(printed, wave_height, level_height_um=0.1)
+    assert stroke.print_gain == pytest.approx(0.62)
+    assert stroke.stroke_waves == pytest.approx(12 * 0.062 / wave_height)
     # 19 steps of 0.062 µm are the first to reach 1.1547 µm.
-    assert advice["levels_for_one_wave"] == 19
-    assert 13 * 0.62 * advice["level_height_for_one_wave_um"] == pytest.approx(wave_height)
+    assert stroke.levels_for_one_wave == 19
+    assert 13 * 0.62 * stroke.level_height_for_one_wave_um == pytest.approx(wave_height)

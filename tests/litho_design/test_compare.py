@@ -6,21 +6,9 @@ import numpy as np
 import pytest
 
 from litho_data.foundation.errors import InputError
-from litho_design.judging.compare import (
-    HEADLINE,
-    GapResult,
-    compare,
-    interval95,
-    paired_differences,
-    summarise,
-)
+from litho_design.judging.gap import HEADLINE, GapResult, interval95, paired_differences, summarise
 from litho_design.printers.printer import Printer
-from litho_design.tasks.hoe import design_hoe
-from litho_design.tasks.targets import make_target
-
-
-def ring_designer(settings, printer, place):
-    return design_hoe(settings, printer, *make_target("ring", 128), place, announce=False)
+from litho_design.workflows.compare import compare
 
 
 def test_interval_is_students():
@@ -36,7 +24,7 @@ def test_matrix_gap_and_resume(tmp_path, small_settings, make_printer):
     settings = small_settings.model_copy(update={"search": search})
     arms = {"none": Printer(None, settings.layout, source="none"), "blur": make_printer(settings.layout)}
     judges = {"fab": make_printer(settings.layout, sigma_um=0.22, gain=0.6)}
-    result = compare(settings, ring_designer, arms, judges, tmp_path, seeds=(0, 1))
+    result = compare(settings, arms, tmp_path, judges=judges, target="ring", seeds=(0, 1), announce=False)
     assert {(e.arm, e.seed, e.judge) for e in result.entries} == {
         (arm, seed, judge) for arm in arms for seed in (0, 1) for judge in ("none", "blur", "fab")
     }
@@ -53,13 +41,13 @@ def test_matrix_gap_and_resume(tmp_path, small_settings, make_printer):
     assert paired_differences(result.entries, HEADLINE["hoe"]) == result.paired
     assert GapResult.read(tmp_path) == result
     written = (tmp_path / "designs" / "blur" / "seed1" / "design.json").stat().st_mtime_ns
-    compare(settings, ring_designer, arms, judges, tmp_path, seeds=(0, 1))
+    compare(settings, arms, tmp_path, judges=judges, target="ring", seeds=(0, 1), announce=False)
     assert (tmp_path / "designs" / "blur" / "seed1" / "design.json").stat().st_mtime_ns == written
 
 
 def test_a_judge_may_not_carry_the_name_of_an_arm(tmp_path, small_settings, make_printer):
     printer = make_printer(small_settings.layout)
     with pytest.raises(InputError, match="twice"):
-        compare(small_settings, ring_designer, {"a": printer}, {"a": printer}, tmp_path, seeds=(0,))
+        compare(small_settings, {"a": printer}, tmp_path, judges={"a": printer}, seeds=(0,))
     with pytest.raises(InputError, match="at least one"):
-        compare(small_settings, ring_designer, {"a": printer}, {}, tmp_path, seeds=())
+        compare(small_settings, {"a": printer}, tmp_path, seeds=())

@@ -14,27 +14,30 @@ import pytest
 import torch
 
 from litho_data.foundation.errors import InputError
-from litho_design.judging.score import score_design
+from litho_design.holograms.task import HologramTask
+from litho_design.images.targets import load_target
 from litho_design.optics import Optics, RSPropagator, centred_grid, element_field, intensity_share
 from litho_design.optimisation.budget import Budget
-from litho_design.optimisation.optimise import SearchSettings, make_parametrisation, search_layout
-from litho_design.optimisation.parametrise import CellMap, LayoutSettings
+from litho_design.optimisation.parameters import CellMap
 from litho_design.optimisation.polish import polish_levels
+from litho_design.optimisation.search import make_parametrisation, search_layout
+from litho_design.optimisation.settings import SearchSettings
+from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 from litho_design.tasks.design import Design, read_array
-from litho_design.tasks.hoe import HoeTask, design_hoe
-from litho_design.tasks.targets import make_target
+from litho_design.workflows.design import design_hologram
+from litho_design.workflows.score import score as score_design
 
 
 @pytest.fixture
 def target():
-    return make_target("ring", 128)
+    return load_target("ring", 128)
 
 
 def test_a_design_beats_its_start_and_leaves_the_model_alone(tmp_path, small_settings, make_printer, target):
     printer = make_printer(small_settings.layout)
     before = printer.weights_sha256()
-    design = design_hoe(small_settings, printer, *target, tmp_path, announce=False)
+    design = design_hologram(target, printer, tmp_path, settings=small_settings, announce=False)
     assert design.printer_unchanged
     assert printer.weights_sha256() == before == design.printer.sha256
     assert all(p.grad is None and not p.requires_grad for p in printer.parameters())
@@ -44,7 +47,7 @@ def test_a_design_beats_its_start_and_leaves_the_model_alone(tmp_path, small_set
     blocks = levels.reshape(32, 4, 32, 4)
     assert (blocks == blocks[:, :1, :, :1]).all()
     assert levels.max() <= 12
-    own = score_design(tmp_path, [printer], tmp_path / "score").scores[0]
+    own = score_design(tmp_path, tmp_path / "score", judges=[printer]).scores[0]
     assert not own.independent
     # The same layout through the same model: the stored expectation must come out again.
     assert own.figures == pytest.approx(design.predicted, rel=1e-5)
@@ -57,21 +60,27 @@ def test_an_interrupted_run_ends_as_if_it_had_never_stopped(
 ):
     search = small_settings.search.model_copy(update={"parametrisation": parametrisation})
     settings = small_settings.model_copy(update={"search": search})
-    whole = design_hoe(settings, make_printer(settings.layout), *target, tmp_path / "whole", announce=False)
-    original, calls = HoeTask.objective, itertools.count()
+    whole = design_hologram(
+        target, make_printer(settings.layout), tmp_path / "whole", settings=settings, announce=False
+    )
+    original, calls = HologramTask.objective, itertools.count()
 
     def stop_at_25(self, level):
         if next(calls) == 25:
             raise KeyboardInterrupt
         return original(self, level)
 
-    monkeypatch.setattr(HoeTask, "objective", stop_at_25)
+    monkeypatch.setattr(HologramTask, "objective", stop_at_25)
     with pytest.raises(KeyboardInterrupt):
-        design_hoe(settings, make_printer(settings.layout), *target, tmp_path / "cut", announce=False)
-    monkeypatch.setattr(HoeTask, "objective", original)
+        design_hologram(
+            target, make_printer(settings.layout), tmp_path / "cut", settings=settings, announce=False
+        )
+    monkeypatch.setattr(HologramTask, "objective", original)
     assert (tmp_path / "cut" / "checkpoint.pt").exists()
     assert not (tmp_path / "cut" / "design.json").exists()
-    resumed = design_hoe(settings, make_printer(settings.layout), *target, tmp_path / "cut", announce=False)
+    resumed = design_hologram(
+        target, make_printer(settings.layout), tmp_path / "cut", settings=settings, announce=False
+    )
     assert resumed.files == whole.files
     assert resumed.predicted == whole.predicted
 
@@ -79,7 +88,7 @@ def test_an_interrupted_run_ends_as_if_it_had_never_stopped(
 def test_a_damaged_checkpoint_is_refused(tmp_path, small_settings, make_printer, target):
     (tmp_path / "checkpoint.pt").write_text("half a file")
     with pytest.raises(InputError, match=r"checkpoint\.pt.*damaged.*delete it"):
-        design_hoe(small_settings, make_printer(small_settings.layout), *target, tmp_path)
+        design_hologram(target, make_printer(small_settings.layout), tmp_path, settings=small_settings)
 
 
 def test_a_checkpoint_cut_short_is_damaged_and_one_that_cannot_be_read_is_not(tmp_path):
@@ -118,7 +127,7 @@ def test_a_model_that_changes_while_it_prints_leaves_no_design(
 
     printer.simulator.forward = forward
     with pytest.raises(InputError, match=r"^model blur, got weights or buffers that changed"):
-        design_hoe(settings, printer, *target, tmp_path, announce=False)
+        design_hologram(target, printer, tmp_path, settings=settings, announce=False)
     assert not (tmp_path / "design.json").exists()
 
 
@@ -166,15 +175,15 @@ def test_a_finished_folder_is_reused_and_a_foreign_one_refused(
     search = small_settings.search.model_copy(update={"iterations": 2, "polish_rounds": 0})
     settings = small_settings.model_copy(update={"search": search})
     printer = make_printer(settings.layout)
-    first = design_hoe(settings, printer, *target, tmp_path, announce=False)
-    assert design_hoe(settings, printer, *target, tmp_path, announce=False) == first
+    first = design_hologram(target, printer, tmp_path, settings=settings, announce=False)
+    assert design_hologram(target, printer, tmp_path, settings=settings, announce=False) == first
     other = settings.model_copy(update={"search": search.model_copy(update={"seed": 1})})
     with pytest.raises(InputError, match="other settings"):
-        design_hoe(other, printer, *target, tmp_path, announce=False)
+        design_hologram(target, printer, tmp_path, settings=other, announce=False)
     changed = np.load(tmp_path / "layout_level.npy") + 1
     np.save(tmp_path / "layout_level.npy", changed)
     with pytest.raises(InputError, match="changed after the design"):
-        score_design(tmp_path, [printer], tmp_path / "score")
+        score_design(tmp_path, tmp_path / "score", judges=[printer])
 
 
 def test_toy_reaches_the_true_optimum():
@@ -215,7 +224,7 @@ def test_toy_reaches_the_true_optimum():
 
 
 def test_polish_of_many_cells_never_raises_the_loss(small_settings, make_printer, target):
-    task = HoeTask(small_settings, make_printer(small_settings.layout), *target)
+    task = HologramTask(small_settings, make_printer(small_settings.layout), target)
     cells = CellMap(small_settings.layout)
     levels = torch.randint(0, 13, (32, 32), generator=torch.Generator().manual_seed(0))
     polished, losses = polish_levels(levels, cells, task.objective, level_count=13, rounds=15)
@@ -252,18 +261,22 @@ def test_none_prints_nominal_heights_and_a_guard_ring_isolates_the_element(small
     ],
 )
 def test_bad_targets_are_refused_before_anything_is_written(tmp_path, small_settings, target, spoil, message):
-    image, record = target
     printer = Printer(None, small_settings.layout, source="none")
     with pytest.raises(InputError, match=message):
-        design_hoe(small_settings, printer, spoil(image), record, tmp_path / "out", announce=False)
+        design_hologram(
+            spoil(target.pixels), printer, tmp_path / "out", settings=small_settings, announce=False
+        )
     assert not (tmp_path / "out").exists()
 
 
 def test_a_hologram_smaller_than_the_window_of_its_score_is_refused(small_settings):
     settings = small_settings.model_copy(update={"layout": LayoutSettings(size_px=8)})
     with pytest.raises(InputError, match="at least 11"):
-        design_hoe(
-            settings, Printer(None, settings.layout, source="none"), *make_target("ring", 8), "nowhere"
+        design_hologram(
+            load_target("ring", 8),
+            Printer(None, settings.layout, source="none"),
+            "nowhere",
+            settings=settings,
         )
 
 
@@ -273,15 +286,15 @@ def test_a_place_that_holds_something_else_is_refused(tmp_path, small_settings, 
     printer = make_printer(settings.layout)
     (tmp_path / "file").write_text("mine")
     with pytest.raises(InputError, match="which is a file"):
-        design_hoe(settings, printer, *target, tmp_path / "file", announce=False)
-    design_hoe(settings, printer, *target, tmp_path / "design", announce=False)
+        design_hologram(target, printer, tmp_path / "file", settings=settings, announce=False)
+    design_hologram(target, printer, tmp_path / "design", settings=settings, announce=False)
     report = (tmp_path / "design" / "report.html").read_bytes()
     # Both write a report.html: the score would replace that of the design.
     with pytest.raises(InputError, match=r"which holds design\.json"):
-        score_design(tmp_path / "design", [printer], tmp_path / "design")
+        score_design(tmp_path / "design", tmp_path / "design", judges=[printer])
     assert (tmp_path / "design" / "report.html").read_bytes() == report
-    score_design(tmp_path / "design", [printer], tmp_path / "design" / "score")
+    score_design(tmp_path / "design", tmp_path / "design" / "score", judges=[printer])
     with pytest.raises(InputError, match=r"which holds score\.json"):
-        design_hoe(settings, printer, *target, tmp_path / "design" / "score", announce=False)
+        design_hologram(target, printer, tmp_path / "design" / "score", settings=settings, announce=False)
     with pytest.raises(InputError, match="device"):
-        score_design(tmp_path / "design", [], tmp_path / "other", device="cuda:99")
+        score_design(tmp_path / "design", tmp_path / "other", judges=[], device="cuda:99")

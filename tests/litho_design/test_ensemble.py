@@ -6,16 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from litho_design.lens.bench import LensView, RadialLensBench
-from litho_design.lens.lens import design_lens
+from litho_design.holograms.task import HologramTask
+from litho_design.images.targets import load_target
+from litho_design.lenses.bench import RadialLensBench
+from litho_design.lenses.settings import LensView, lens_settings
 from litho_design.optics import Optics
-from litho_design.optimisation.parametrise import CellMap, LayoutSettings
-from litho_design.printers.ensemble import disagreement_um, penalised
+from litho_design.optimisation.parameters import CellMap
+from litho_design.optimisation.robust import disagreement_um, penalised
+from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 from litho_design.tasks.design import LEVELS_FILE, Design
-from litho_design.tasks.hoe import HoeTask, design_hoe
-from litho_design.tasks.settings import lens_preset
-from litho_design.tasks.targets import make_target
+from litho_design.workflows.design import design_hologram, design_lens
 
 
 def test_disagreement_is_the_rms_spread_without_the_datum():
@@ -52,7 +53,7 @@ def test_where_all_models_agree_there_is_no_penalty_and_a_finite_gradient():
 
 
 def test_the_penalty_brings_the_models_together(tmp_path, small_settings, make_printer):
-    target = make_target("ring", 128)
+    target = load_target("ring", 128)
     layout = small_settings.layout
 
     def models() -> tuple[Printer, Printer]:
@@ -63,8 +64,8 @@ def test_the_penalty_brings_the_models_together(tmp_path, small_settings, make_p
         ensemble = small_settings.ensemble.model_copy(update={"weight": weight})
         settings = small_settings.model_copy(update={"ensemble": ensemble})
         main, other = models()
-        design = design_hoe(
-            settings, main, *target, tmp_path / f"{weight:g}", ensemble=[other], announce=False
+        design = design_hologram(
+            target, main, tmp_path / f"{weight:g}", settings=settings, ensemble=[other], announce=False
         )
         assert design.printer_unchanged
         assert [member.name for member in design.ensemble.members] == ["wide"]
@@ -74,15 +75,15 @@ def test_the_penalty_brings_the_models_together(tmp_path, small_settings, make_p
     # The mean over the members, not the first one's loss alone.
     main, other = models()
     level = torch.from_numpy(np.load(tmp_path / "0" / LEVELS_FILE)).float()[None, None]
-    alone = [float(HoeTask(small_settings, p, *target).objective(level)[0]) for p in (main, other)]
+    alone = [float(HologramTask(small_settings, p, target).objective(level)[0]) for p in (main, other)]
     free = small_settings.ensemble.model_copy(update={"weight": 0.0})
-    both = HoeTask(small_settings.model_copy(update={"ensemble": free}), main, *target, [other])
+    both = HologramTask(small_settings.model_copy(update={"ensemble": free}), main, target, [other])
     assert float(both.objective(level)[0]) == pytest.approx(sum(alone) / 2, rel=1e-5)
 
 
 def test_a_lens_takes_an_ensemble_too(tmp_path, make_printer):
     layout = LayoutSettings(size_px=128, cell_um=0.1, symmetry="radial")
-    default = lens_preset("default", "direct")
+    default = lens_settings("direct")
     settings = default.model_copy(
         update={
             "layout": layout,
@@ -93,7 +94,7 @@ def test_a_lens_takes_an_ensemble_too(tmp_path, make_printer):
         }
     )
     other = make_printer(layout, sigma_um=0.3, name="wide")
-    design = design_lens(settings, make_printer(layout), tmp_path, ensemble=[other], announce=False)
+    design = design_lens(make_printer(layout), tmp_path, settings=settings, ensemble=[other], announce=False)
     assert design.ensemble is not None
     assert design.ensemble.disagreement_nm > 0
     assert (tmp_path / "focus_window.csv").exists()

@@ -10,15 +10,16 @@ import pytest
 import tifffile
 
 from litho_data.foundation.errors import InputError
-from litho_design.export import export_design, import_levels, sidecar_path
-from litho_design.export.gds import rectangles, write_gds
-from litho_design.export.image import read_published_bmp, write_bmp, write_png16, write_tiff
-from litho_design.export.stl import read_stl_triangles, write_stl
-from litho_design.optimisation.gauge import out_of_distribution, printability
-from litho_design.optimisation.parametrise import LayoutSettings
+from litho_design.exports.files import export as export_design
+from litho_design.exports.files import import_levels
+from litho_design.exports.gds import rectangles, write_gds
+from litho_design.exports.image import read_published_bmp, write_bmp, write_png16, write_tiff
+from litho_design.exports.sidecar import sidecar_path
+from litho_design.exports.stl import read_stl_triangles, write_stl
+from litho_design.images.targets import load_target
+from litho_design.printers.layout import LayoutSettings, out_of_distribution, printability
 from litho_design.tasks.design import Design
-from litho_design.tasks.hoe import design_hoe
-from litho_design.tasks.targets import make_target
+from litho_design.workflows.design import design_hologram
 
 FORMATS = ["png16", "bmp", "tiff", "stl", "gds"]
 # An "F" has no symmetry: any flip or rotation shows.
@@ -27,11 +28,11 @@ LETTER = np.array([[1, 1, 1, 1], [1, 0, 0, 0], [1, 1, 1, 0], [1, 0, 0, 0], [1, 0
 
 @pytest.fixture(scope="module")
 def design(tmp_path_factory):
+    from litho_design.holograms.settings import hologram_settings
     from litho_design.optics import Optics
     from litho_design.printers.printer import Printer
-    from litho_design.tasks.settings import hoe_preset
 
-    default = hoe_preset("default")
+    default = hologram_settings("default")
     layout = LayoutSettings(size_px=64)
     search = default.search.model_copy(update={"iterations": 3, "polish_rounds": 0})
     settings = default.model_copy(
@@ -39,7 +40,7 @@ def design(tmp_path_factory):
     )
     folder = tmp_path_factory.mktemp("design")
     printer = Printer(None, layout, source="none")
-    design_hoe(settings, printer, *make_target("ring", 64), folder, announce=False)
+    design_hologram(load_target("ring", 64), printer, folder, settings=settings, announce=False)
     return folder
 
 

@@ -13,12 +13,12 @@ from litho_data.virtual_fab.knobs import KnobBoard, KnobSetting
 from litho_data.virtual_fab.printer import Job
 from litho_data.virtual_fab.settings import Microscope, Noise
 from litho_data.virtual_fab.settings import Printer as FabPrinter
-from litho_design.judging.score import score_design
-from litho_design.optimisation.parametrise import LayoutSettings
+from litho_design.images.targets import load_target
+from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.source import load_printer
 from litho_design.tasks.design import Design
-from litho_design.tasks.hoe import design_hoe
-from litho_design.tasks.targets import make_target
+from litho_design.workflows.design import design_hologram
+from litho_design.workflows.score import score as score_design
 
 KNOBS = ("write-order-memory=0.2", "slope-thinning-x=0.4", "edge-bead=0.1")
 LAYOUT = LayoutSettings(size_px=64)
@@ -68,14 +68,14 @@ def test_roughness_is_the_default_noise_and_the_same_for_every_layout(tmp_path):
 
 def test_designs_are_scored_by_it_and_never_made_through_it(tmp_path, small_settings, make_printer):
     truth = truth_folder(tmp_path / "fab", noise="default")
-    layout, target = small_settings.layout, make_target("ring", 128)
+    layout, target = small_settings.layout, load_target("ring", 128)
     fab = load_printer(str(truth), layout, name="fab")
     with pytest.raises(InputError, match="only judges"):
-        design_hoe(small_settings, fab, *target, tmp_path / "through", announce=False)
+        design_hologram(target, fab, tmp_path / "through", settings=small_settings, announce=False)
     search = small_settings.search.model_copy(update={"iterations": 2, "polish_rounds": 0})
     settings = small_settings.model_copy(update={"search": search})
-    design_hoe(settings, make_printer(layout), *target, tmp_path / "design", announce=False)
-    (score,) = score_design(tmp_path / "design", [fab], tmp_path / "score").scores
+    design_hologram(target, make_printer(layout), tmp_path / "design", settings=settings, announce=False)
+    (score,) = score_design(tmp_path / "design", tmp_path / "score", judges=[fab]).scores
     assert score.independent
     assert score.judge.name == "fab"
     assert score.figures != Design.read(tmp_path / "design").predicted

@@ -6,13 +6,12 @@ import pytest
 import torch
 
 from litho_data.foundation.grid import PixelGrid
-from litho_design.judging.score import score_design
-from litho_design.lens.lens import design_lens
+from litho_design.images.targets import load_target
+from litho_design.lenses.settings import lens_settings
 from litho_design.optics import ASMPropagator, RadialPropagator, RSPropagator, centred_grid
-from litho_design.optimisation.parametrise import LayoutSettings
-from litho_design.tasks.hoe import design_hoe
-from litho_design.tasks.settings import lens_preset
-from litho_design.tasks.targets import make_target
+from litho_design.printers.layout import LayoutSettings
+from litho_design.workflows.design import design_hologram, design_lens
+from litho_design.workflows.score import score as score_design
 
 GPU = "cuda"
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU on this machine")
@@ -59,20 +58,20 @@ def test_a_hologram_is_designed_and_scores_the_same(
     )
     printer = make_printer(settings.layout).to(GPU)
     other = make_printer(settings.layout, sigma_um=0.3, name="wide").to(GPU)
-    design = design_hoe(
-        settings, printer, *make_target("ring", 128), tmp_path / "d", ensemble=[other], announce=False
+    design = design_hologram(
+        load_target("ring", 128), printer, tmp_path / "d", settings=settings, ensemble=[other], announce=False
     )
     assert design.run.device.startswith(GPU)
     assert design.polished_loss < design.start_loss
     # Convolutions on a GPU may round their factors to 10 bits: a nanometre of height, a per cent of a figure.
-    (score,) = score_design(tmp_path / "d", [make_printer(settings.layout)], tmp_path / "s").scores
+    (score,) = score_design(tmp_path / "d", tmp_path / "s", judges=[make_printer(settings.layout)]).scores
     assert score.figures == pytest.approx(design.predicted, rel=1e-2, abs=1e-3)
 
 
 @pytest.mark.parametrize("path", ["radial", "plane"])
 def test_a_lens_is_designed_and_scores_the_same(tmp_path, make_printer, path):
     layout = LayoutSettings(size_px=128, cell_um=0.1, symmetry="radial")
-    default = lens_preset("default", "computational")
+    default = lens_settings("computational")
     settings = default.model_copy(
         update={
             "layout": layout,
@@ -82,9 +81,9 @@ def test_a_lens_is_designed_and_scores_the_same(tmp_path, make_printer, path):
             "imaging": default.imaging.model_copy(update={"object_px": 32, "iterations": 10}),
         }
     )
-    design = design_lens(settings, make_printer(layout).to(GPU), tmp_path / "d", announce=False)
+    design = design_lens(make_printer(layout).to(GPU), tmp_path / "d", settings=settings, announce=False)
     assert design.run.device.startswith(GPU)
     assert design.polished_loss <= design.start_loss
     # As above.
-    (score,) = score_design(tmp_path / "d", [make_printer(layout)], tmp_path / "s").scores
+    (score,) = score_design(tmp_path / "d", tmp_path / "s", judges=[make_printer(layout)]).scores
     assert score.figures == pytest.approx(design.predicted, rel=1e-2, abs=1e-3)

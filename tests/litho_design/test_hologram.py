@@ -9,21 +9,15 @@ import numpy as np
 import pytest
 import torch
 
-from litho_design.judging.metrics import (
-    SSIM_WINDOW_PX,
-    CameraView,
-    hologram_score,
-    matched_scale,
-    si_psnr_db,
-    ssim,
-    through_aperture,
-)
-from litho_design.lens.metrics import image_figures
+from litho_design.holograms.bench import HologramBench, hologram_score, through_aperture
+from litho_design.holograms.loss import HologramLoss, hologram_loss
+from litho_design.holograms.settings import CameraView
+from litho_design.images.similarity import SSIM_WINDOW_PX, matched_scale, si_psnr_db, similarity, ssim
+from litho_design.images.targets import draw_target
 from litho_design.optics import Optics, RSPropagator, centred_grid, element_field, intensity_share
-from litho_design.optimisation.initialise import fresnel_lens_phase, gerchberg_saxton
-from litho_design.optimisation.parametrise import CellMap, LayoutSettings
-from litho_design.tasks.hologram import HologramBench, image_error
-from litho_design.tasks.targets import draw_target
+from litho_design.optimisation.parameters import CellMap
+from litho_design.optimisation.phases import fresnel_lens_phase, gerchberg_saxton
+from litho_design.printers.layout import LayoutSettings
 
 WAVELENGTH_UM = 0.6328
 
@@ -35,8 +29,7 @@ def test_gradient_from_mask_through_print_and_field_to_loss(make_printer):
     target = torch.from_numpy(draw_target("ring", 16)).double()
 
     def loss(level):
-        rmse, efficiency = image_error(bench(printer(level)[0, 0]), target, "paper")
-        return rmse + 0.1 * (1 - efficiency)
+        return hologram_loss(bench(printer(level)[0, 0]), target, HologramLoss())[0]
 
     level = (torch.rand(1, 1, 16, 16, dtype=torch.float64) * 12).requires_grad_()
     assert torch.autograd.gradcheck(loss, (level,), atol=1e-6)
@@ -49,11 +42,13 @@ def test_the_efficiency_term_is_alive(scale):
     target[2:4, 2:4] = 1
     share = torch.rand(8, 8).double() / 64
     share[2:4, 2:4] = 0.1
-    rmse, efficiency = image_error(share, target, scale)
-    dimmer_rmse, dimmer = image_error(share / 2, target, scale)
-    assert float(efficiency) == pytest.approx(0.4, rel=1e-12)
-    assert float(dimmer) == pytest.approx(0.2, rel=1e-12)
-    assert float(dimmer_rmse) == pytest.approx(float(rmse), rel=1e-12)
+    settings = HologramLoss(scale=scale, efficiency_weight=0.3)
+    loss, parts = hologram_loss(share, target, settings)
+    dimmer_loss, dimmer = hologram_loss(share / 2, target, settings)
+    assert parts["efficiency"] == pytest.approx(0.4, rel=1e-12)
+    assert dimmer["efficiency"] == pytest.approx(0.2, rel=1e-12)
+    assert dimmer["rmse"] == pytest.approx(parts["rmse"], rel=1e-12)
+    assert float(dimmer_loss - loss) == pytest.approx(0.3 * 0.2, rel=1e-9)
 
 
 def test_incident_power_is_one_with_and_without_an_aperture():
@@ -105,7 +100,7 @@ def test_psnr_equals_scikit_image(kind):
     reference = peak_signal_noise_ratio(image, scaled, data_range=1.0) if image.any() else 300.0
     # A dark target is met exactly by the scale 0: the error's floor of 1e-30 is 300 dB.
     assert si_psnr_db(seen, target) == pytest.approx(reference, abs=1e-6)
-    figures = image_figures(seen, target)
+    figures = similarity(seen, target)
     assert figures.psnr_db == pytest.approx(peak_signal_noise_ratio(image, other, data_range=1.0), abs=1e-6)
 
 

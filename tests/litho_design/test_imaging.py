@@ -7,9 +7,8 @@ import pytest
 import torch
 from scipy.signal import convolve2d
 
-from litho_design.optics.deconvolve import richardson_lucy
-from litho_design.optics.imaging import Blur, bin_pixels
-from litho_design.tasks.targets import draw_target
+from litho_design.images.targets import draw_target
+from litho_design.optics.imaging import Blur, bin_pixels, richardson_lucy
 
 
 def gaussian_psf(size, sigma, energy=1.0, shift=(0.0, 0.0)):

@@ -9,21 +9,16 @@ import torch
 from pydantic import ValidationError
 
 from litho_data.foundation.errors import InputError
-from litho_design.judging.judge import Judging
-from litho_design.judging.score import score_design
-from litho_design.lens.bench import (
-    ImagingSettings,
-    LensBench,
-    LensView,
-    RadialLensBench,
-    centre_to_background,
-)
-from litho_design.lens.lens import LensTask, design_lens
-from litho_design.lens.metrics import half_maximum_width_um, lens_score
+from litho_design.judging.loaded import LoadedDesign
+from litho_design.lenses.bench import LensBench, RadialLensBench, centre_to_background
+from litho_design.lenses.score import half_maximum_width_um, lens_score
+from litho_design.lenses.settings import ImagingSettings, LensView, lens_settings
+from litho_design.lenses.task import LensTask
 from litho_design.optics import Optics, blaze_efficiency
-from litho_design.optimisation.parametrise import LayoutSettings
+from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
-from litho_design.tasks.settings import lens_preset
+from litho_design.workflows.design import design_lens
+from litho_design.workflows.score import score as score_design
 
 LAYOUT = LayoutSettings(size_px=300, cell_um=0.1, symmetry="radial")
 OPTICS = Optics(distance_um=100.0)
@@ -31,7 +26,7 @@ OPTICS = Optics(distance_um=100.0)
 
 @pytest.fixture
 def settings():
-    default = lens_preset("default", "direct")
+    default = lens_settings("direct")
     search = default.search.model_copy(update={"iterations": 20, "polish_rounds": 2})
     view = default.view.model_copy(update={"window_px": 128})
     imaging = default.imaging.model_copy(update={"object_px": 48, "iterations": 10})
@@ -75,7 +70,7 @@ def test_airy_power_inside_the_focusing_radius():
 @pytest.mark.parametrize(("levels", "step_um"), [(13, 0.1), (8, 0.1443), (2, 0.57735)])
 def test_staircase_lens_loses_what_the_blaze_formula_says(levels, step_um):
     layout = LAYOUT.model_copy(update={"size_px": 600, "levels": levels, "level_height_um": step_um})
-    base = lens_preset("default", "direct")
+    base = lens_settings("direct")
     task = LensTask(
         base.model_copy(
             update={
@@ -86,7 +81,7 @@ def test_staircase_lens_loses_what_the_blaze_formula_says(levels, step_um):
         ),
         Printer(None, layout, source="none"),
     )
-    from litho_design.optimisation.optimise import make_parametrisation
+    from litho_design.optimisation.search import make_parametrisation
 
     parameters = make_parametrisation(layout, task.settings.search)
     task.start(parameters, task.printer.level_heights_um())
@@ -100,7 +95,7 @@ def test_staircase_lens_loses_what_the_blaze_formula_says(levels, step_um):
 def test_ring_path_sees_what_the_plane_path_sees(make_printer):
     view = LensView(window_px=128, path="radial")
     bench, rings = LensBench(LAYOUT, OPTICS, view), RadialLensBench(LAYOUT, OPTICS, view)
-    base = lens_preset("default", "direct")
+    base = lens_settings("direct")
     task = LensTask(
         base.model_copy(update={"layout": LAYOUT, "optics": OPTICS, "view": view}), make_printer(LAYOUT)
     )
@@ -183,11 +178,11 @@ def test_objects_of_the_score_are_held_out(objects, message):
 def test_lens_design_improves_and_is_judged_with_both_psfs(tmp_path, settings, make_printer, task):
     settings = settings.model_copy(update={"task": task})
     printer = make_printer(LAYOUT)
-    design = design_lens(settings, printer, tmp_path / "design", announce=False)
+    design = design_lens(printer, tmp_path / "design", settings=settings, announce=False)
     assert design.polished_loss <= design.start_loss
     assert design.printer_unchanged
     other = make_printer(LAYOUT, sigma_um=0.3, gain=0.5, name="other")
-    own, foreign = score_design(tmp_path / "design", [printer, other], tmp_path / "score").scores
+    own, foreign = score_design(tmp_path / "design", tmp_path / "score", judges=[printer, other]).scores
     assert own.figures == pytest.approx(design.predicted, rel=1e-5)
     assert foreign.independent
     assert foreign.figures["strehl"] < own.figures["strehl"]
@@ -195,7 +190,7 @@ def test_lens_design_improves_and_is_judged_with_both_psfs(tmp_path, settings, m
         # One PSF on both sides in design; after another print only calibration knows the right one.
         assert own.figures["mae_design"] == pytest.approx(own.figures["mae_calibrated"], rel=1e-6)
         assert foreign.figures["mae_design"] != foreign.figures["mae_calibrated"]
-    assert Judging(tmp_path / "design").target is None
+    assert LoadedDesign(tmp_path / "design").target is None
 
 
 @pytest.mark.parametrize(

@@ -13,20 +13,20 @@ from scipy.ndimage import map_coordinates
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256
 from litho_design.cli.app import main
-from litho_design.judging.judge import Judging
-from litho_design.judging.metrics import matched_scale
-from litho_design.judging.score import MeasuredSource, PhotoSource, ScoreResult, score_design
-from litho_design.lens.bench import reconstruct, sensor_psf
-from litho_design.lens.lens import design_lens
-from litho_design.lens.metrics import image_figures
-from litho_design.lens.objects import object_stack, read_object
-from litho_design.lens.photo import score_lens_photo
+from litho_design.images.similarity import matched_scale, similarity
+from litho_design.images.targets import TargetRecord
+from litho_design.judging.loaded import LoadedDesign
+from litho_design.judging.photographs import score_lens_photo
+from litho_design.judging.score import MeasuredSource, PhotoSource, ScoreResult
+from litho_design.lenses.bench import reconstruct, sensor_psf
+from litho_design.lenses.objects import object_stack, read_object
+from litho_design.lenses.settings import lens_settings
 from litho_design.optics import Optics
 from litho_design.optics.imaging import Blur
-from litho_design.optimisation.parametrise import LayoutSettings
+from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
-from litho_design.tasks.settings import lens_preset
-from litho_design.tasks.targets import TargetRecord
+from litho_design.workflows.design import design_lens
+from litho_design.workflows.score import score as score_design
 
 SENSOR_UM, CAMERA_UM, DARK, WHITE, NOISE = 0.2, 0.15, 300.0, 30000.0, 100.0
 OBJECT_PX, PHOTO_PX = 96, 160
@@ -38,7 +38,7 @@ DEAD, HOT = ((23, 40), (23, 60), (40, 73)), ((10, 12), (80, 140), (61, 90))
 def lens(tmp_path_factory):
     """A lens of 20 µm, f = 40 µm: full width at half maximum 1.4 µm, seven sensor pixels."""
     layout = LayoutSettings(size_px=200, cell_um=0.1, symmetry="radial")
-    default = lens_preset("default", "direct")
+    default = lens_settings("direct")
     settings = default.model_copy(
         update={
             "layout": layout,
@@ -49,7 +49,7 @@ def lens(tmp_path_factory):
         }
     )
     folder = tmp_path_factory.mktemp("lens") / "design"
-    design_lens(settings, Printer(None, layout, source="none"), folder, announce=False)
+    design_lens(Printer(None, layout, source="none"), folder, settings=settings, announce=False)
     return folder
 
 
@@ -64,9 +64,9 @@ def picture(tmp_path):
     return tmp_path / "object.png"
 
 
-def photographed(path, judging, height_um, wanted, *, turn_degrees=2.0, scale=1.03, shift_um=(1.1, -0.7)):
+def photographed(path, loaded, height_um, wanted, *, turn_degrees=2.0, scale=1.03, shift_um=(1.1, -0.7)):
     """Write the photograph of ``wanted`` (n, n) behind a print; returns the PSF and photo-to-window map."""
-    psf = sensor_psf(judging.bench(height_um), 2)
+    psf = sensor_psf(loaded.bench(height_um), 2)
     seen = Blur(psf, (OBJECT_PX, OBJECT_PX)).forward(wanted).double().numpy()
     turn = np.deg2rad(turn_degrees)
     linear = scale * CAMERA_UM / SENSOR_UM * np.array(
@@ -86,24 +86,24 @@ def photographed(path, judging, height_um, wanted, *, turn_degrees=2.0, scale=1.
     return psf, np.hstack([linear, offset[:, None]])
 
 
-def estimate(judging, recorded, psf, wanted):
+def estimate(loaded, recorded, psf, wanted):
     """What deconvolution makes of an image that needs no registration, at the scale of least error."""
-    found = reconstruct(recorded, psf, judging.lens.imaging.iterations)
+    found = reconstruct(recorded, psf, loaded.lens.imaging.iterations)
     return found * matched_scale(found, wanted)
 
 
 @torch.no_grad()
 def test_a_photograph_is_deconvolved_with_the_designed_and_the_measured_psf(tmp_path, lens, picture):
-    judging = Judging(lens)
+    loaded = LoadedDesign(lens)
     wanted = torch.from_numpy(read_object(picture, OBJECT_PX)[0])
     # The print is too low towards its rim, so that its PSF is wider and lower than the designed one.
     radius = torch.from_numpy(np.hypot(*np.mgrid[-99.5:100, -99.5:100]) / 100).float()
-    printed = judging.expected_um * (1 - 0.5 * radius.square())
+    printed = loaded.expected_um * (1 - 0.5 * radius.square())
     np.savetxt(tmp_path / "scan.txt", (printed.double().numpy() + 0.2) * 1e-6)
-    psf, to_window = photographed(tmp_path / "photo.png", judging, printed, wanted)
+    psf, to_window = photographed(tmp_path / "photo.png", loaded, printed, wanted)
     photo = PhotoSource(tmp_path / "photo.png", CAMERA_UM, DARK, str(picture))
     scan = MeasuredSource(tmp_path / "scan.txt", "m", (20.0, 20.0))
-    measured, score = score_design(lens, [], tmp_path / "score", scan=scan, camera=photo).scores
+    measured, score = score_design(lens, tmp_path / "score", judges=[], scan=scan, camera=photo).scores
     assert (measured.kind, score.kind) == ("scan", "camera")
     assert ScoreResult.read(tmp_path / "score").scores[1] == score
     assert score.judge.imaged.sha256 == file_sha256(picture)
@@ -123,14 +123,14 @@ def test_a_photograph_is_deconvolved_with_the_designed_and_the_measured_psf(tmp_
     # error and its root of the mean square, whose distances obey the triangle inequality. The noise, 0.3 %
     # of white, is taken as it is: deconvolution amplifies it, more camera than sensor pixels average it.
     seen = Blur(psf, (OBJECT_PX, OBJECT_PX)).forward(wanted)
-    design_psf = sensor_psf(judging.bench(judging.expected_um), 2)
+    design_psf = sensor_psf(loaded.bench(loaded.expected_um), 2)
     for name, image in {
         "direct": seen * matched_scale(seen, wanted),
-        "design": estimate(judging, seen, design_psf, wanted),
-        "calibrated": estimate(judging, seen, psf, wanted),
+        "design": estimate(loaded, seen, design_psf, wanted),
+        "calibrated": estimate(loaded, seen, psf, wanted),
     }.items():
         gradient = np.hypot(*np.gradient(image.numpy()))
-        ideal = image_figures(image, wanted)
+        ideal = similarity(image, wanted)
         change = float(displaced_px * gradient.mean() + NOISE / WHITE)
         assert score.figures[f"mae_{name}"] == pytest.approx(ideal.mae, abs=change)
         rms, rms_ideal = (10 ** (-db / 20) for db in (score.figures[f"psnr_{name}_db"], ideal.psnr_db))
@@ -143,10 +143,10 @@ def test_a_photograph_is_deconvolved_with_the_designed_and_the_measured_psf(tmp_
 
 @torch.no_grad()
 def test_an_object_of_the_design_is_known_by_name(tmp_path, lens):
-    judging = Judging(lens)
+    loaded = LoadedDesign(lens)
     wanted = object_stack(["text"], OBJECT_PX)[0]
-    photographed(tmp_path / "photo.png", judging, judging.expected_um, wanted)
-    score, record, shown = score_lens_photo(judging, tmp_path / "photo.png", CAMERA_UM, "text")
+    photographed(tmp_path / "photo.png", loaded, loaded.expected_um, wanted)
+    score, record, shown = score_lens_photo(loaded, tmp_path / "photo.png", CAMERA_UM, "text")
     assert record.imaged == "text"
     # The percentile of a dark surround with noise: two or three of its standard deviations below the level.
     assert DARK - 3 * NOISE < record.dark_level < DARK + NOISE
@@ -155,16 +155,16 @@ def test_an_object_of_the_design_is_known_by_name(tmp_path, lens):
     assert score.mae_design < score.mae_direct
     # It is this object that was photographed: another one does not match, or is further off.
     with pytest.raises(InputError, match="correlation"):
-        score_lens_photo(judging, tmp_path / "photo.png", CAMERA_UM, "spots")
+        score_lens_photo(loaded, tmp_path / "photo.png", CAMERA_UM, "spots")
 
 
 def test_a_name_that_two_objects_have_is_refused(lens):
-    judging = Judging(lens)
+    loaded = LoadedDesign(lens)
     one, other = (TargetRecord(name="a.png", sha256=sha256, adaptation="") for sha256 in ("1" * 64, "2" * 64))
-    imaging = judging.lens.imaging.model_copy(update={"objects": (one,), "test_objects": (other, "ring")})
-    judging.lens = judging.lens.model_copy(update={"imaging": imaging})
+    imaging = loaded.lens.imaging.model_copy(update={"objects": (one,), "test_objects": (other, "ring")})
+    loaded.lens = loaded.lens.model_copy(update={"imaging": imaging})
     with pytest.raises(InputError, match="two objects"):
-        score_lens_photo(judging, "photo.png", CAMERA_UM, "a.png")
+        score_lens_photo(loaded, "photo.png", CAMERA_UM, "a.png")
 
 
 @pytest.mark.parametrize(
@@ -186,10 +186,10 @@ def test_bad_photographs_are_one_line_and_exit_code_2(tmp_path, lens, monkeypatc
 
 
 def test_the_command_tells_the_errors(tmp_path, lens, picture, monkeypatch, capsys):
-    judging = Judging(lens)
+    loaded = LoadedDesign(lens)
     wanted = torch.from_numpy(read_object(picture, OBJECT_PX)[0])
     with torch.no_grad():
-        photographed(tmp_path / "photo.png", judging, judging.expected_um, wanted)
+        photographed(tmp_path / "photo.png", loaded, loaded.expected_um, wanted)
     words = ("--camera", tmp_path / "photo.png", "--camera-pitch-um", CAMERA_UM, "--camera-object", picture)
     arguments = map(str, ("score", lens, *words, "--out", tmp_path / "score"))
     monkeypatch.setattr(sys, "argv", ["litho-design", *arguments])

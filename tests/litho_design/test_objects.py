@@ -12,15 +12,16 @@ import torch
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256
 from litho_design.cli.app import main
-from litho_design.judging.compare import GapResult
-from litho_design.judging.score import score_design
-from litho_design.lens.lens import LensTask, design_lens
-from litho_design.lens.objects import bring_objects, object_name, object_stack, picture_records
+from litho_design.images.targets import draw_target, object_name
+from litho_design.judging.gap import GapResult
+from litho_design.lenses.objects import bring_objects, object_stack, picture_records
+from litho_design.lenses.settings import lens_settings
+from litho_design.lenses.task import LensTask
 from litho_design.optics import Optics
-from litho_design.optimisation.parametrise import LayoutSettings
+from litho_design.printers.layout import LayoutSettings
 from litho_design.tasks.design import HEIGHT_FILE, Design, read_array
-from litho_design.tasks.settings import lens_preset
-from litho_design.tasks.targets import draw_target
+from litho_design.workflows.design import design_lens
+from litho_design.workflows.score import score as score_design
 
 SMALL = (
     *("--size-px", "128", "--window-px", "64", "--object-px", "32", "--iterations", "2"),
@@ -30,7 +31,7 @@ SMALL = (
 
 @pytest.fixture
 def settings():
-    default = lens_preset("default", "computational")
+    default = lens_settings("computational")
     return default.model_copy(
         update={
             "layout": LayoutSettings(size_px=128, cell_um=0.1, symmetry="radial"),
@@ -108,9 +109,8 @@ def test_the_last_quarter_by_name_is_held_out(tmp_path, settings, count, held_ou
 
 
 def test_a_design_with_pictures_is_scored_without_their_files(tmp_path, folder, settings, make_printer):
-    brought, pictures = bring_objects(settings, [folder], [])
     printer = make_printer(settings.layout)
-    design = design_lens(brought, printer, tmp_path / "d", pictures=pictures, announce=False)
+    design = design_lens(printer, tmp_path / "d", settings=settings, objects=[folder], announce=False)
     assert "held out: d.png, e.png" in design.notes[-1]
     told = design.settings["imaging"]
     assert [item["name"] for item in told["objects"]] == ["a.png", "b.png", "c.png"]
@@ -119,7 +119,7 @@ def test_a_design_with_pictures_is_scored_without_their_files(tmp_path, folder, 
     ]  # fmt: skip
     for file in folder.iterdir():
         file.unlink()
-    own = score_design(tmp_path / "d", [printer], tmp_path / "score").scores[0]
+    own = score_design(tmp_path / "d", tmp_path / "score", judges=[printer]).scores[0]
     assert own.figures == pytest.approx(design.predicted, rel=1e-5)
     # The same print images the drawings with another error.
     drawn = LensTask(settings, printer).score(torch.from_numpy(read_array(tmp_path / "d", HEIGHT_FILE)))
@@ -128,27 +128,27 @@ def test_a_design_with_pictures_is_scored_without_their_files(tmp_path, folder, 
 
 def test_another_set_of_objects_is_another_design(tmp_path, folder, settings, make_printer, monkeypatch):
     printer = make_printer(settings.layout)
-    every, one_less = [folder], [folder / f"{name}.png" for name in "abde"]
-    brought, pictures = bring_objects(settings, every, [])
-    other, other_pictures = bring_objects(settings, one_less, [])
-    design_lens(brought, printer, tmp_path / "done", pictures=pictures, announce=False)
-    with pytest.raises(InputError, match="other settings"):
-        design_lens(other, printer, tmp_path / "done", pictures=other_pictures, announce=False)
-    # The same name with other pixels is another object too.
-    cv2.imwrite(str(folder / "a.png"), np.eye(24, dtype=np.uint8))
-    changed, changed_pictures = bring_objects(settings, every, [])
-    with pytest.raises(InputError, match="other settings"):
-        design_lens(changed, printer, tmp_path / "done", pictures=changed_pictures, announce=False)
+    one_less = [folder / f"{name}.png" for name in "abde"]
+
+    def design(place, objects):
+        design_lens(printer, tmp_path / place, settings=settings, objects=objects, announce=False)
 
     def stop(self, height_um):
         raise KeyboardInterrupt
 
+    design("done", [folder])
+    with pytest.raises(InputError, match="other settings"):
+        design("done", one_less)
     with monkeypatch.context() as cut:
         cut.setattr(LensTask, "arrays", stop)
         with pytest.raises(KeyboardInterrupt):
-            design_lens(brought, printer, tmp_path / "cut", pictures=pictures, announce=False)
+            design("cut", [folder])
     with pytest.raises(InputError, match="checkpoint"):
-        design_lens(other, printer, tmp_path / "cut", pictures=other_pictures, announce=False)
+        design("cut", one_less)
+    # The same name with other pixels is another object too.
+    cv2.imwrite(str(folder / "a.png"), np.eye(24, dtype=np.uint8))
+    with pytest.raises(InputError, match="other settings"):
+        design("done", [folder])
 
 
 def test_pixels_must_belong_to_the_settings(folder, settings, make_printer):

@@ -8,13 +8,9 @@ import pytest
 import torch
 
 from litho_data.foundation.errors import InputError
-from litho_design.optimisation.parametrise import (
-    CellMap,
-    DirectLevels,
-    GumbelLevels,
-    LayoutSettings,
-    nearest_levels,
-)
+from litho_design.optimisation.parameters import CellMap, DirectLevels, GumbelLevels
+from litho_design.optimisation.phases import nearest_levels
+from litho_design.printers.layout import LayoutSettings
 
 SQUARE = LayoutSettings(size_px=16, cell_um=0.4, levels=5)
 RINGS = LayoutSettings(size_px=15, cell_um=0.1, levels=5, symmetry="radial")

@@ -8,11 +8,12 @@ import torch
 
 from litho_data.foundation.errors import InputError
 from litho_data.store.lock_box import locked_ids
-from litho_design.judging.process_window import focus_window, range_above
-from litho_design.lens.bench import LensBench, LensView
+from litho_design.lenses.bench import LensBench
+from litho_design.lenses.focus_window import focus_window, range_above
+from litho_design.lenses.settings import LensView
 from litho_design.optics import Optics
-from litho_design.optimisation.parametrise import LayoutSettings
-from litho_design.optimisation.robust import Draw, ProcessWindow, draws, measured_window
+from litho_design.optimisation.process_window import Draw, ProcessWindow, draws, measured_window
+from litho_design.printers.layout import LayoutSettings
 
 
 def test_range_above_a_limit_is_linear_between_samples():

@@ -12,13 +12,13 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.grid import PixelGrid
 from litho_design.optics import (
     ASMPropagator,
+    Optics,
     RSPropagator,
     centred_grid,
     element_field,
     intensity_share,
     sampling_limit_um,
 )
-from litho_design.optics.thin_element import Optics
 
 WAVELENGTH_UM = 0.6328
 

@@ -7,12 +7,13 @@ import pytest
 import torch
 
 from litho_data.foundation.errors import InputError
+from litho_design.holograms.bench import HologramBench
+from litho_design.holograms.task import HologramTask
+from litho_design.images.targets import load_target
 from litho_design.optics import Optics
-from litho_design.optimisation.robust import Draw, ProcessWindow, draws, risk
+from litho_design.optimisation.process_window import Draw, ProcessWindow, draws, risk
 from litho_design.tasks.design import HEIGHT_FILE
-from litho_design.tasks.hoe import HoeTask, design_hoe
-from litho_design.tasks.hologram import HologramBench
-from litho_design.tasks.targets import make_target
+from litho_design.workflows.design import design_hologram
 
 
 def test_draws_have_their_spread_and_repeat():
@@ -30,7 +31,7 @@ def test_a_yield_is_of_prints_that_no_search_saw(small_settings, make_printer):
     searched, unseen = draws(window, Optics(), 16), draws(window, Optics(), 16, unseen=True)
     assert not {draw.gain for draw in searched} & {draw.gain for draw in unseen}
     assert unseen[:3] == draws(window, Optics(), 3, unseen=True)
-    task = HoeTask(small_settings, make_printer(small_settings.layout), *make_target("ring", 128))
+    task = HologramTask(small_settings, make_printer(small_settings.layout), load_target("ring", 128))
     height = torch.rand(128, 128, generator=torch.Generator().manual_seed(0))
     told = [score["eff_signal"] for score in task.window_scores(height, 2)]
     seen_by_score = draws(small_settings.window, small_settings.optics, 2, unseen=True)
@@ -42,7 +43,7 @@ def test_a_yield_is_of_prints_that_no_search_saw(small_settings, make_printer):
 def test_a_spread_without_a_positive_wavelength_is_refused(small_settings, make_printer):
     wide = small_settings.model_copy(update={"window": ProcessWindow(wavelength_sd_um=1.0)})
     with pytest.raises(InputError, match=r"spread of 1 µm.*wavelength-sd-um"):
-        HoeTask(wide, make_printer(wide.layout), *make_target("ring", 128))
+        HologramTask(wide, make_printer(wide.layout), load_target("ring", 128))
 
 
 def test_risk_formulas():
@@ -68,10 +69,12 @@ def test_a_spread_that_reaches_the_element_is_refused_before_the_search(
     # A third of a standard deviation below 1 µm lies the element: some of 16 draws are behind it.
     settings = small_settings.model_copy(update={"optics": Optics(distance_um=1.0)})
     with pytest.raises(InputError, match=r"defocus spread of 3 µm.*defocus-sd-um"):
-        design_hoe(settings, make_printer(settings.layout), *make_target("ring", 128), tmp_path / "near")
+        design_hologram(
+            load_target("ring", 128), make_printer(settings.layout), tmp_path / "near", settings=settings
+        )
     assert not (tmp_path / "near").exists()
     calm = settings.model_copy(update={"window": ProcessWindow(defocus_sd_um=0.1)})
-    HoeTask(calm, make_printer(settings.layout), *make_target("ring", 128))
+    HologramTask(calm, make_printer(settings.layout), load_target("ring", 128))
 
 
 def test_a_robust_search_lowers_the_risk_it_minimises(tmp_path, small_settings, make_printer):
@@ -79,13 +82,15 @@ def test_a_robust_search_lowers_the_risk_it_minimises(tmp_path, small_settings, 
     search = small_settings.search.model_copy(update={"iterations": 60})
     nominal = small_settings.model_copy(update={"search": search})
     robust = nominal.model_copy(update={"window": spread})
-    target = make_target("ring", 128)
+    target = load_target("ring", 128)
     risks = {}
     # Other draws than those of the search: what it gained must hold for prints it has not seen.
     unseen = robust.model_copy(update={"window": spread.model_copy(update={"seed": 1})})
-    judge = HoeTask(unseen, make_printer(robust.layout), *target)
+    judge = HologramTask(unseen, make_printer(robust.layout), target)
     for name, settings in (("nominal", nominal), ("robust", robust)):
-        design_hoe(settings, make_printer(settings.layout), *target, tmp_path / name, announce=False)
+        design_hologram(
+            target, make_printer(settings.layout), tmp_path / name, settings=settings, announce=False
+        )
         height = torch.from_numpy(np.load(tmp_path / name / HEIGHT_FILE))
         losses = torch.tensor([score["loss"] for score in judge.window_scores(height, 24)])
         risks[name] = float(risk(losses, spread))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from litho_data.foundation.errors import InputError
-from litho_design.tasks.targets import draw_target, make_target
+from litho_design.images.targets import draw_target, load_target
 
 
 @pytest.mark.parametrize("name", ["text", "ring", "chart", "spots"])
@@ -29,7 +29,8 @@ def test_another_size_and_shape_are_adapted_and_said(tmp_path):
     picture = np.zeros((60, 100), np.uint8)
     picture[10:30, 20:60] = 200
     cv2.imwrite(str(tmp_path / "wide.png"), picture)
-    image, record = make_target(str(tmp_path / "wide.png"), 200)
+    target = load_target(str(tmp_path / "wide.png"), 200)
+    image, record = target.pixels, target.record
     assert image.shape == (200, 200)
     assert "60 x 100" in record.adaptation
     assert "from 100 to 200" in record.adaptation
@@ -45,6 +46,6 @@ def test_what_is_no_image_or_has_no_light_is_refused(tmp_path):
     cv2.imwrite(str(tmp_path / "black.png"), np.zeros((8, 8), np.uint8))
     for name, message in (("note.txt", "an image"), ("black.png", "bright pixels")):
         with pytest.raises(InputError, match=message):
-            make_target(str(tmp_path / name), 64)
+            load_target(str(tmp_path / name), 64)
     with pytest.raises(InputError, match="text, ring, chart, spots"):
-        make_target("no such thing", 64)
+        load_target("no such thing", 64)

@@ -1,0 +1,190 @@
+"""Settings that are stated once: a field of a record holds its default, limits, unit, help and option.
+
+The command lines make their options from these fields, and every field can be changed by its dotted path.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, Field, ValidationError
+
+from litho_data.foundation.errors import InputError
+
+M = TypeVar("M", bound=BaseModel)
+
+
+def setting(
+    default: Any, help: str, *, unit: str = "", option: str | tuple[str, ...] = (), **limits: Any
+) -> Any:
+    """A field of a settings record.
+
+    Args:
+        default: its value where nothing is said; ``...`` for none.
+        help: what it is, in a few words without a full stop.
+        unit: of the value, such as µm.
+        option: name or names on the command line, such as ``--pitch-um``; none for settings that are
+            reached by their dotted path only.
+        limits: as for pydantic's ``Field`` (``ge``, ``gt``, ``le``, ``lt``).
+    """
+    options: Any = [option] if isinstance(option, str) else list(option)
+    return Field(
+        default=default, description=help, json_schema_extra={"unit": unit, "options": options}, **limits
+    )
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """One setting of a record and its parts, found by ``leaves``.
+
+    Attributes:
+        path: dotted, as in ``layout.pitch_um``.
+        kind: annotation of the field, without its limits.
+        value: what the record holds.
+        options: names on the command line.
+        group: what the record calls the part that the setting is in; empty at the root.
+    """
+
+    path: str
+    kind: Any
+    value: Any
+    help: str
+    unit: str
+    options: tuple[str, ...]
+    group: str = ""
+
+
+def leaves(settings: BaseModel, prefix: str = "", group: str = "") -> Iterator[Leaf]:
+    """Every setting of a record, those of its parts included."""
+    for name, field in type(settings).model_fields.items():
+        value, path = getattr(settings, name), f"{prefix}{name}"
+        if isinstance(value, BaseModel):
+            yield from leaves(value, f"{path}.", field.description or name)
+            continue
+        extra = field.json_schema_extra if isinstance(field.json_schema_extra, dict) else {}
+        yield Leaf(
+            path=path,
+            kind=field.annotation,
+            value=value,
+            help=field.description or "",
+            unit=str(extra.get("unit", "")),
+            options=tuple(map(str, extra.get("options", ()))),  # type: ignore[arg-type]
+            group=group,
+        )
+
+
+def flattened(settings: BaseModel, content: Mapping[str, Any], what: str = "setting") -> dict[str, Any]:
+    """Values by dotted path, of nested or dotted keys.
+
+    Args:
+        settings: a record whose names the keys must be.
+        content: as read from a file, or ``{"layout.pitch_um": 0.2}``.
+        what: what messages call one of them.
+
+    Raises:
+        InputError: a name that the record does not have; the message lists those that it has.
+    """
+    flat: dict[str, Any] = {}
+    for key, value in content.items():
+        part = _find(settings, key, what)
+        if not isinstance(part, BaseModel):
+            flat[key] = value
+        elif isinstance(value, Mapping):
+            flat |= flattened(settings, {f"{key}.{name}": inner for name, inner in value.items()}, what)
+        else:
+            raise InputError(f"{what} {key}", got=repr(value), wanted=f"one of {_names(part, key)}")
+    return flat
+
+
+def _find(settings: BaseModel, path: str, what: str) -> Any:
+    part: Any = settings
+    done: list[str] = []
+    for name in path.split("."):
+        above = ".".join(done)
+        if not isinstance(part, BaseModel):
+            raise InputError(
+                f"{what} {path}", got=f"a name below {above}", wanted=f"{above}, which is a value"
+            )
+        if name not in type(part).model_fields:
+            raise InputError(f"{what} {path}", got="an unknown name", wanted=f"one of {_names(part, above)}")
+        part = getattr(part, name)
+        done.append(name)
+    return part
+
+
+def _names(part: BaseModel, above: str) -> str:
+    return ", ".join(f"{above}.{name}" if above else name for name in type(part).model_fields)
+
+
+def changed(settings: M, changes: Mapping[str, Any]) -> M:
+    """``settings`` with values by dotted path, checked as a whole.
+
+    Raises:
+        InputError: an unknown name, or a value that the record does not accept.
+    """
+    content = settings.model_dump()
+    for path, value in flattened(settings, changes).items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise InputError(f"setting {path}", got=value, wanted="a finite number")
+        *parts, last = path.split(".")
+        place = content
+        for part in parts:
+            place = place[part]
+        place[last] = value
+    try:
+        return type(settings).model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+    where, said = ".".join(map(str, first["loc"])), first["msg"]
+    if said.startswith("Input should be "):
+        raise InputError(f"setting {where}", got=repr(first["input"]), wanted=said[len("Input should be ") :])
+    raise InputError(f"setting {where}", got=said.removeprefix("Value error, "))
+
+
+def assigned(words: Iterable[str]) -> dict[str, Any]:
+    """Values by dotted path of words ``path=value``; a value is JSON where it can be, a string otherwise.
+
+    Raises:
+        InputError: a word without ``=``, or a path that is there twice.
+    """
+    values: dict[str, Any] = {}
+    for word in words:
+        path, equals, text = word.partition("=")
+        if not equals or not path.strip():
+            raise InputError("--set", got=repr(word), wanted="PATH=VALUE, such as layout.pitch_um=0.1")
+        if path.strip() in values:
+            raise InputError("--set", got=f"{path.strip()} twice", wanted="each setting once")
+        try:
+            values[path.strip()] = json.loads(text)
+        except ValueError:
+            values[path.strip()] = text
+    return values
+
+
+def read_settings(path: str | Path) -> dict[str, Any]:
+    """The content of a settings file, TOML or JSON by its suffix.
+
+    Raises:
+        InputError: no such file, another suffix, or text that is not what the suffix says.
+    """
+    file = Path(path)
+    read = {".toml": tomllib.loads, ".json": json.loads}.get(file.suffix.lower())
+    if read is None:
+        raise InputError("settings file", got=str(file), wanted="a file .toml or .json")
+    try:
+        content = read(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(
+            f"settings file {file}", got=error.strerror, wanted="a file that can be read"
+        ) from None
+    except ValueError as error:
+        raise InputError(f"settings file {file}", got=str(error), wanted=file.suffix[1:].upper()) from None
+    if not isinstance(content, dict):
+        raise InputError(f"settings file {file}", got=type(content).__name__, wanted="settings by name")
+    return content

@@ -1,0 +1,1 @@
+"""Files for the printer, each with its sidecar, and the way back."""

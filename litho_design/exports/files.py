@@ -1,0 +1,133 @@
+"""Export of a design in one of the formats, and the exact import of what was exported."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import writable
+from litho_data.foundation.outputs import require_replaceable_folder
+from litho_design.exports.gds import GdsLayers, read_gds_levels, write_gds
+from litho_design.exports.image import read_image_levels, write_bmp, write_png16, write_tiff
+from litho_design.exports.sidecar import Format, Sidecar, make_sidecar, read_sidecar, sidecar_path
+from litho_design.exports.stl import read_stl_levels, write_stl
+from litho_design.judging.loaded import LoadedDesign
+from litho_design.tasks.design import LEVELS_FILE, Design, read_array
+
+_SUFFIX: dict[str, str] = {"png16": ".png", "bmp": ".bmp", "tiff": ".tif", "stl": ".stl", "gds": ".gds"}
+
+
+def export(
+    design: str | Path | LoadedDesign,
+    format: Format,
+    out: str | Path,
+    *,
+    pedestal_um: float = 1.0,
+    slicing_um: float = 0.1,
+    hatching_um: float = 0.1,
+    gds_layers: GdsLayers = "cumulative",
+) -> Path:
+    """Write the layout of a design for the printer, and ``<file>.json`` beside it.
+
+    The file is read back before the export counts as done.
+
+    Args:
+        design: its folder, or what ``load_design`` gives.
+        format: png16, bmp, tiff, stl or gds.
+        out: folder of the export; exports of the same layout in other formats stay in it.
+        pedestal_um: base under level 0 (part of the STL; told to the operator otherwise).
+        slicing_um, hatching_um: recorded for the job.
+
+    Returns:
+        Path of the exported file.
+
+    Raises:
+        InputError: an incomplete design, a format that cannot hold it, job settings below zero, or a
+            folder that holds something else.
+    """
+    if format not in _SUFFIX:
+        raise InputError("format", got=repr(format), wanted=", ".join(_SUFFIX))
+    job = {"pedestal_um": pedestal_um, "slicing_um": slicing_um, "hatching_um": hatching_um}
+    for setting, value in job.items():
+        # Only a closed solid needs a base.
+        may_be_zero = setting == "pedestal_um" and format != "stl"
+        if not 0 <= value < math.inf or (value == 0 and not may_be_zero):
+            raise InputError(setting, got=f"{value:g} µm", wanted="a positive length")
+    folder = design.folder if isinstance(design, LoadedDesign) else Path(design)
+    record = Design.read(folder)
+    levels = read_array(folder, LEVELS_FILE)
+    name = f"layout{_SUFFIX[format]}"
+    require_replaceable_folder(out, "layout*")
+    place = Path(out)
+    _require_same_layout(place, name, record.files[LEVELS_FILE])
+    with writable(place):
+        place.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix="layout.", suffix=".partial", dir=place) as temporary:
+        file = Path(temporary) / name
+        step = _write(file, format, levels, record, pedestal_um, gds_layers)
+        sidecar = make_sidecar(
+            folder, record, file, format, pedestal_um=pedestal_um, slicing_um=slicing_um,
+            hatching_um=hatching_um, grey_per_level=step, gds_layers=gds_layers if format == "gds" else None,
+        )  # fmt: skip
+        sidecar.write(temporary).rename(sidecar_path(file))
+        back, _ = import_levels(file)
+        if not np.array_equal(back, levels):
+            raise AssertionError(f"{format} export does not read back as it was written")
+        # The sidecar last: without it, or with an older one, the file is refused.
+        for part in sorted(Path(temporary).iterdir(), key=lambda part: part.suffix == ".json"):
+            part.replace(place / part.name)
+    return place / name
+
+
+def import_levels(file: str | Path) -> tuple[np.ndarray, Sidecar]:
+    """The level map of an exported file, uint8 (ny, nx), row 0 on top, and its sidecar.
+
+    Raises:
+        InputError: no sidecar, or a file that was changed.
+    """
+    path = Path(file)
+    sidecar = read_sidecar(path)
+    if sidecar.format == "stl":
+        cell_px = _cell_px(sidecar)
+        shape = (sidecar.shape_px[0] // cell_px, sidecar.shape_px[1] // cell_px)
+        cells = read_stl_levels(
+            path, shape, cell_px * sidecar.pitch_um, sidecar.level_height_um, sidecar.pedestal_um
+        )
+        return cells.repeat(cell_px, 0).repeat(cell_px, 1), sidecar
+    if sidecar.format == "gds":
+        assert sidecar.gds_layers is not None
+        return read_gds_levels(path, sidecar.shape_px, sidecar.pitch_um, sidecar.gds_layers), sidecar
+    assert sidecar.grey_per_level is not None
+    return read_image_levels(path, sidecar.grey_per_level), sidecar
+
+
+def _require_same_layout(place: Path, name: str, layout_sha256: str) -> None:
+    for older in sorted(place.glob("layout.*.json")):
+        if older.name != f"{name}.json" and Sidecar.read(older).layout_sha256 != layout_sha256:
+            raise InputError(
+                "output", got=f"{older}, which is of another layout", wanted="a folder for this layout only"
+            )
+
+
+def _write(
+    file: Path, kind: Format, levels: np.ndarray, design: Design, pedestal_um: float, gds_layers: GdsLayers
+) -> int | None:
+    layout = design.layout
+    if kind == "stl":
+        cell_px = 1 if layout.symmetry == "radial" else layout.cell_px
+        cells = levels[::cell_px, ::cell_px]
+        write_stl(file, cells, cell_px * layout.pitch_um, layout.level_height_um, pedestal_um)
+        return None
+    if kind == "gds":
+        write_gds(file, levels, layout.pitch_um, gds_layers)
+        return None
+    return {"png16": write_png16, "bmp": write_bmp, "tiff": write_tiff}[kind](file, levels, layout)
+
+
+def _cell_px(sidecar: Sidecar) -> int:
+    layout = sidecar.settings["layout"]
+    return 1 if layout["symmetry"] == "radial" else round(layout["cell_um"] / layout["pitch_um"])

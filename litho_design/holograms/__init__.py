@@ -1,0 +1,1 @@
+"""Holograms: settings, loss, optics and the task of designing one."""

@@ -1,0 +1,131 @@
+"""The optics of a holographic element: from a printed height map to an image and its score."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from litho_data.foundation.grid import PixelGrid
+from litho_data.foundation.results import Record
+from litho_design.holograms.settings import CameraView
+from litho_design.images.similarity import SSIM_WINDOW_PX, matched_scale, paper_rmse, si_psnr_db, ssim
+from litho_design.optics import Optics, RSPropagator, centred_grid, element_field, intensity_share
+from litho_design.printers.layout import LayoutSettings
+
+
+class HologramBench(nn.Module):
+    """Light through a printed element onto the image plane (element and window of equal size)."""
+
+    def __init__(self, layout: LayoutSettings, optics: Optics, *, dtype: torch.dtype = torch.complex64):
+        super().__init__()
+        self.optics = optics
+        self.grid = centred_grid((layout.size_px, layout.size_px), layout.pitch_um)
+        self.propagator = RSPropagator(
+            self.grid, self.grid, optics.distance_um, optics.wavelength_um, dtype=dtype
+        )
+
+    def forward(self, height_um: Tensor) -> Tensor:
+        """Share of the incident power on each pixel of the window, of heights (..., size, size) in µm."""
+        return intensity_share(self.propagator(element_field(height_um, self.grid, self.optics)), self.grid)
+
+    @torch.no_grad()
+    def score(self, height_um: Tensor, target: Tensor, camera: CameraView) -> HologramScore:
+        """Score printed heights (size, size), µm, against ``target`` (size, size)."""
+        element = element_field(height_um, self.grid, self.optics)
+        return hologram_score(self.propagator(element), element, target, self.grid, self.optics, camera)
+
+
+class HologramScore(Record):
+    """Efficiencies are shares of the power incident on the element."""
+
+    eff_signal: float = Field(description="power on the signal (T > 0.5), share of incident")
+    eff_paper: float = Field(description="power where T > 0, share of incident")
+    eff_window: float = Field(description="power in the window, share of incident")
+    zero_order_share: float = Field(description="zero order, share of incident")
+    si_psnr_db: float = Field(description="scale-invariant PSNR, dB")
+    rmse_paper: float = Field(description="RMSE at the paper's scale")
+    ssim: float = Field(description="SSIM")
+    clipped_share: float = Field(description="pixels clipped for SSIM, share")
+    ssim_camera: float = Field(description="SSIM as the camera sees it")
+    speckle_contrast: float = Field(description="speckle contrast on the signal")
+    uniformity: float = Field(description="uniformity on the signal")
+    background_ratio: float = Field(description="mean signal over mean background")
+
+
+def hologram_score(
+    field: Tensor, element: Tensor, target: Tensor, grid: PixelGrid, optics: Optics, camera: CameraView
+) -> HologramScore:
+    """Score the wave in the image plane against the wanted image.
+
+    S = {T > 0.5}; scale before comparison c = sum(I T) / sum(I^2); SSIM with an 11 px Gaussian
+    window, sigma 1.5, data range 1, on c I clipped to [0, 1].
+
+    Args:
+        field: complex (m, m) in the image plane, for unit incident power, 1/µm.
+        element: complex (n, n) just behind the element on the same pixels; its mean gives the
+            zero order, the share of power that goes straight on as a plane wave.
+        target: real (m, m) in [0, 1].
+        grid: geometry of ``field``.
+    """
+    area = math.prod(grid.pitch_um)
+    share = field.abs().square().double() * area
+    wanted = target.double()
+    signal = wanted > 0.5
+    scaled = matched_scale(share, wanted) * share
+    lit, dark = share[signal], share[~signal]
+    low, high = (float(torch.quantile(lit, q)) for q in (0.05, 0.95))
+    return HologramScore(
+        eff_signal=float(lit.sum()),
+        eff_paper=float(share[wanted > 0].sum()),
+        eff_window=float(share.sum()),
+        zero_order_share=zero_order_share(element),
+        si_psnr_db=si_psnr_db(share, wanted),
+        rmse_paper=float(paper_rmse(share, wanted)),
+        ssim=ssim(scaled.clamp(0, 1), wanted),
+        clipped_share=float((scaled > 1).double().mean()),
+        ssim_camera=_camera_ssim(field, wanted, grid, optics, camera),
+        speckle_contrast=float(lit.std(correction=0) / lit.mean()),
+        uniformity=1 - (high - low) / (high + low),
+        background_ratio=float(lit.mean() / dark.mean()),
+    )
+
+
+def zero_order_share(element: Tensor) -> float:
+    """Share of the power behind the element that is its mean: the undiffracted plane wave."""
+    power = element.abs().square().double().mean()
+    return float(element.to(torch.complex128).mean().abs().square() / power)
+
+
+def _camera_ssim(field: Tensor, target: Tensor, grid: PixelGrid, optics: Optics, camera: CameraView) -> float:
+    import cv2
+
+    seen = through_aperture(field, grid, optics.wavelength_um, camera.numerical_aperture).abs().square()
+    pixels = tuple(max(SSIM_WINDOW_PX, round(size / camera.pitch_um)) for size in reversed(grid.size_um))
+
+    def sample(image: Tensor) -> Tensor:
+        return torch.from_numpy(
+            cv2.resize(image.double().cpu().numpy(), pixels, interpolation=cv2.INTER_AREA)
+        )
+
+    image, wanted = sample(seen), sample(target)
+    return ssim((matched_scale(image, wanted) * image).clamp(0, 1), wanted)
+
+
+def through_aperture(
+    field: Tensor, grid: PixelGrid, wavelength_um: float, numerical_aperture: float
+) -> Tensor:
+    """The field after an ideal objective: spatial frequencies above NA / wavelength removed.
+
+    The window is mirrored once so that its edges do not meet across the period of the transform.
+    """
+    rows, columns = field.shape
+    mirrored = torch.cat([field, field.flip(0)], 0)
+    mirrored = torch.cat([mirrored, mirrored.flip(1)], 1)
+    fy, fx = (np.fft.fftfreq(2 * n, p) for n, p in zip((rows, columns), grid.pitch_um, strict=True))
+    passed = torch.from_numpy(np.hypot(fy[:, None], fx[None, :]) <= numerical_aperture / wavelength_um)
+    filtered = torch.fft.ifft2(torch.fft.fft2(mirrored) * passed.to(field.device))
+    return filtered[:rows, :columns]

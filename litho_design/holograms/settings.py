@@ -1,0 +1,68 @@
+"""All settings of a hologram, by preset: what the paper leaves open is written down here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from litho_data.foundation.results import Record
+from litho_data.foundation.settings import changed, setting
+from litho_design.holograms.loss import HologramLoss
+from litho_design.optics import Optics
+from litho_design.optimisation.settings import PAPER_SEARCH, DesignSettings, Variant, check_variant
+from litho_design.printers.layout import LayoutSettings
+
+
+class CameraView(Record):
+    """The camera that looks at the image: its pixel in object space, µm, and the objective's aperture.
+
+    The default is a 3.45 µm pixel behind a 10x / 0.3 objective; the paper does not state its own.
+    """
+
+    pitch_um: float = setting(0.345, "Pixel of the camera in the image plane", unit="µm", gt=0)
+    numerical_aperture: float = setting(0.3, "Numerical aperture of its objective", gt=0)
+
+
+class HologramSettings(DesignSettings):
+    """All settings of one hologram."""
+
+    loss: HologramLoss = setting(HologramLoss(), "Loss")
+    camera: CameraView = setting(CameraView(), "Camera of the score")
+
+
+def hologram_settings(
+    variant: Variant = "default", changes: Mapping[str, Any] | None = None
+) -> HologramSettings:
+    """A preset of the hologram with ``changes`` by path, such as ``{"layout.size_px": 256}``.
+
+    ``paper``: as printed (13 levels, Gumbel-Softmax at temperature 0.5, random start, 1000 Adam
+    iterations at 0.1, expected levels). ``authors``: as in the published code (12 levels,
+    temperature 1, wavelength 0.633 and index step 0.545; its efficiency term is constant and
+    therefore left out; its truncated, half-pixel-shifted kernel is not reproduced). ``default``:
+    one height per cell with straight-through rounding, and a polish of the printable layout.
+
+    Args:
+        variant: the preset; ``variant`` among the changes replaces it.
+        changes: values by dotted path, or nested as in a settings file.
+
+    Raises:
+        InputError: a change of a setting that does not exist, or to a value that it does not accept.
+    """
+    given = dict(changes or {})
+    return changed(_preset(given.pop("variant", variant)), given)
+
+
+def _preset(variant: Variant) -> HologramSettings:
+    check_variant(variant)
+    if variant == "default":
+        return HologramSettings()
+    search = PAPER_SEARCH.model_copy(update={"learning_rate": 0.1})
+    if variant == "paper":
+        return HologramSettings(variant="paper", search=search)
+    return HologramSettings(
+        variant="authors",
+        layout=LayoutSettings(levels=12),
+        optics=Optics(wavelength_um=0.633, index_step=0.545),
+        search=search.model_copy(update={"temperature_start": 1.0, "temperature_end": 1.0}),
+        loss=HologramLoss(efficiency_weight=0.0),
+    )

@@ -1,0 +1,66 @@
+"""How alike two images are, with the definitions written down."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+SSIM_WINDOW_PX = 11
+
+
+def matched_scale(image: Tensor, target: Tensor) -> Tensor:
+    """The factor c = sum(I T) / sum(I^2) that brings ``image`` closest to ``target``."""
+    return (image * target).sum() / image.square().sum().clamp(min=torch.finfo(image.dtype).tiny)
+
+
+def si_psnr_db(image: Tensor, target: Tensor) -> float:
+    """-10 log10 mean((c I - T)^2): unchanged by any scale of the image; peak is 1 by definition."""
+    error = (matched_scale(image, target) * image - target).square().mean()
+    return float(-10 * torch.log10(error.clamp(min=1e-30)))
+
+
+def paper_rmse(image: Tensor, target: Tensor) -> Tensor:
+    """RMSE of I / I_avg against T, with I_avg = sum(I T) / sum(T), the mean over the wanted light."""
+    average = (image * target).sum() / target.sum()
+    return (image / average - target).square().mean().sqrt()
+
+
+def ssim(image: Tensor, target: Tensor) -> float:
+    """Structural similarity of two images in [0, 1] (Wang et al. 2004), window 11, sigma 1.5.
+
+    Windows that reach over the edge do not count.
+    """
+    from skimage.metrics import structural_similarity
+
+    return float(
+        structural_similarity(
+            image.double().cpu().numpy(),
+            target.double().cpu().numpy(),
+            data_range=1.0,
+            gaussian_weights=True,
+            sigma=1.5,
+            use_sample_covariance=False,
+        )
+    )
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """How far an estimate is from the object: mean absolute error, PSNR in dB, SSIM."""
+
+    mae: float
+    psnr_db: float
+    ssim: float
+
+
+def similarity(estimate: Tensor, wanted: Tensor) -> Similarity:
+    """Errors of an estimate (n, n) of an object (n, n) in [0, 1]; PSNR and SSIM clip it to that range."""
+    clipped = estimate.clamp(0, 1)
+    error = (clipped - wanted).square().mean().clamp(min=1e-12)
+    return Similarity(
+        mae=float((estimate - wanted).abs().mean()),
+        psnr_db=float(-10 * torch.log10(error)),
+        ssim=ssim(clipped, wanted),
+    )

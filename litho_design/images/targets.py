@@ -1,0 +1,184 @@
+"""Wanted images: drawn by code, or read from a picture, in [0, 1] on a square grid."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.hashes import array_sha256, file_sha256
+from litho_data.foundation.results import Record
+
+DrawnTarget = Literal["text", "ring", "chart", "spots", "letters"]
+_OVERSAMPLE = 4
+
+
+class TargetRecord(Record):
+    """Where a target came from, and what was done to fit it."""
+
+    name: str
+    sha256: str
+    adaptation: str = ""
+
+
+# What a lens images: a drawing by its name, or a picture whose pixels travel beside the settings.
+ImagedObject = str | TargetRecord
+
+
+def object_name(item: ImagedObject) -> str:
+    """Name of the drawing, or of the picture's file."""
+    return item if isinstance(item, str) else item.name
+
+
+@dataclass(frozen=True)
+class Target:
+    """A wanted image: float32 (size, size) in [0, 1], row 0 on top, and its record."""
+
+    pixels: np.ndarray
+    record: TargetRecord
+
+
+def load_target(source: str | Path | np.ndarray | Target, size_px: int) -> Target:
+    """A wanted image of ``size_px`` by name of a drawing, by path of a picture, or from an array.
+
+    Args:
+        source: text, ring, chart, spots or letters; an image file, whose grey values are fitted to the
+            square; or an array (size_px, size_px) in [0, 1], which is taken as it is.
+
+    Raises:
+        InputError: neither a drawing nor a readable image, or an image without any light.
+    """
+    if isinstance(source, Target):
+        return source
+    if isinstance(source, np.ndarray):
+        pixels = np.ascontiguousarray(source, np.float32)
+        return Target(pixels, _record("array", pixels))
+    name = str(source)
+    if name in get_args(DrawnTarget):
+        pixels = draw_target(name, size_px)
+        return Target(pixels, _record(name, pixels))
+    if not Path(name).is_file():
+        drawings = ", ".join(get_args(DrawnTarget))
+        raise InputError("target", got=repr(name), wanted=f"an image file, or one of {drawings}")
+    pixels, notes = read_image(Path(name), size_px, "target")
+    record = TargetRecord(name=Path(name).name, sha256=file_sha256(name), adaptation="; ".join(notes))
+    return Target(pixels, record)
+
+
+def _record(name: str, pixels: np.ndarray) -> TargetRecord:
+    return TargetRecord(name=name, sha256=array_sha256(pixels, "1", ("y", "x")))
+
+
+def draw_target(name: str, size_px: int) -> np.ndarray:
+    """Draw a target with anti-aliased edges: float32 (size, size) in [0, 1]."""
+    fine = size_px * _OVERSAMPLE
+    y, x = np.mgrid[0:fine, 0:fine]
+    # Unit square with the origin in the middle, y down.
+    y, x = (y + 0.5) / fine - 0.5, (x + 0.5) / fine - 0.5
+    picture = {"text": _text, "ring": _ring, "chart": _chart, "spots": _spots, "letters": _letters}[name](
+        y, x
+    )
+    blocks = picture.reshape(size_px, _OVERSAMPLE, size_px, _OVERSAMPLE)
+    return blocks.mean((1, 3)).astype(np.float32)
+
+
+def _text(y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    return _words(len(y), ((0.44, "LITHO"), (0.72, "LOOP")), 150)
+
+
+def _letters(y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Rows of small letters and digits: fine detail of many directions."""
+    return _words(len(y), ((0.25, "RSWKG"), (0.5, "28395"), (0.75, "aekxm")), 130)
+
+
+def _words(size: int, rows: tuple[tuple[float, str], ...], line_height: float) -> np.ndarray:
+    import cv2
+
+    canvas = np.zeros((size, size), np.uint8)
+    for row, word in rows:
+        scale = size / line_height
+        thickness = max(1, round(size / 45))
+        (width, _), _ = cv2.getTextSize(word, cv2.FONT_HERSHEY_SIMPLEX, scale, thickness)
+        where = (int((size - width) / 2), int(row * size))
+        cv2.putText(canvas, word, where, cv2.FONT_HERSHEY_SIMPLEX, scale, 255, thickness, cv2.LINE_8)
+    return canvas / 255.0
+
+
+def _ring(y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    radius = np.hypot(y, x)
+    return ((radius > 0.2) & (radius < 0.28)).astype(float)
+
+
+def _chart(y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Bars of four widths, along and across, and a spoke target."""
+    picture = np.zeros_like(x)
+    for index, width in enumerate((0.032, 0.024, 0.016, 0.01)):
+        top = -0.36 + 0.19 * index
+        for left, along, across in ((-0.36, x, y), (-0.17, y, x)):
+            start_along, start_across = (left, top) if along is x else (top, left)
+            stripe = np.floor((along - start_along) / width).astype(int)
+            inside = (
+                (stripe >= 0) & (stripe < 5) & (across >= start_across) & (across < start_across + 5 * width)
+            )
+            picture[inside & (stripe % 2 == 0)] = 1
+    spoke_y, spoke_x = y + 0.0, x - 0.22
+    radius, angle = np.hypot(spoke_y, spoke_x), np.arctan2(spoke_y, spoke_x)
+    picture[(radius > 0.03) & (radius < 0.17) & (np.sin(10 * angle) > 0)] = 1
+    return picture
+
+
+def _spots(y: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """A 7 x 7 fan-out without its centre."""
+    picture = np.zeros_like(x)
+    for row in range(-3, 4):
+        for column in range(-3, 4):
+            if (row, column) != (0, 0):
+                picture[np.hypot(y - 0.11 * row, x - 0.11 * column) < 0.016] = 1
+    return picture
+
+
+def read_image(path: Path, size_px: int, what: str) -> tuple[np.ndarray, list[str]]:
+    """A picture in grey on a black square, divided by its brightest value.
+
+    Args:
+        path: any format and bit depth that OpenCV reads; grey values are taken as brightness.
+        size_px: side of the square.
+        what: what the errors call it.
+
+    Returns:
+        float32 (size, size) in [0, 1], and what was done to fit it, one phrase each.
+
+    Raises:
+        InputError: not a readable image, values that are no numbers, or no light.
+    """
+    import cv2
+
+    picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) if path.is_file() else None
+    if picture is None:
+        raise InputError(what, got=str(path), wanted="an image that OpenCV can read (PNG, TIFF, JPEG, BMP)")
+    grey: np.ndarray = picture.astype(np.float32)
+    if not np.isfinite(grey).all():
+        raise InputError(what, got=f"{path} with values that are no numbers", wanted="finite brightness")
+    if grey.max() <= 0:
+        raise InputError(what, got=f"{path} without any light", wanted="an image with bright pixels")
+    notes = []
+    stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    if stored is not None and stored.ndim == 3:
+        notes.append("colour to grey (ITU-R BT.601 luma)")
+    height, width = grey.shape
+    if height != width:
+        side = max(height, width)
+        square = np.zeros((side, side), np.float32)
+        top, left = (side - height) // 2, (side - width) // 2
+        square[top : top + height, left : left + width] = grey
+        grey = square
+        notes.append(f"{height} x {width} px centred on a black square")
+    if grey.shape[0] != size_px:
+        shrink = grey.shape[0] > size_px
+        method = cv2.INTER_AREA if shrink else cv2.INTER_LINEAR
+        notes.append(f"resampled from {grey.shape[0]} to {size_px} px")
+        grey = cv2.resize(grey, (size_px, size_px), interpolation=method)
+    return np.clip(grey / grey.max(), 0, 1).astype(np.float32), notes

@@ -1,0 +1,142 @@
+"""The design-to-manufacturing gap: every arm's designs as printed by every judge, over seeds."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import numpy as np
+from pydantic import Field
+
+from litho_data.foundation.results import Record, Result
+from litho_data.foundation.run_facts import RunFacts
+from litho_design.holograms.settings import HologramSettings
+from litho_design.lenses.settings import LensSettings
+from litho_design.printers.printer import PrinterRecord
+from litho_design.tasks.design import TaskName
+
+HEADLINE = {
+    "hoe": ("si_psnr_db", "ssim", "ssim_camera", "eff_signal", "speckle_contrast"),
+    "lens-direct": ("cbr", "strehl", "focusing_efficiency", "fwhm_um"),
+    "lens-computational": ("mae_design", "mae_calibrated", "ssim_calibrated", "strehl", "cbr"),
+}
+
+
+class GapEntry(Record):
+    """One design (arm, seed) printed by one judge; ``designed`` is the arm's own expectation."""
+
+    arm: str
+    seed: int
+    judge: str
+    self_judged: bool
+    designed: dict[str, float]
+    judged: dict[str, float]
+    rms_height_gap_um: float
+
+
+class GapSummary(Record):
+    """One figure of one arm under one judge: mean over seeds with its 95 % interval."""
+
+    arm: str
+    judge: str
+    figure: str
+    designed_mean: float
+    judged_mean: float
+    judged_ci95: tuple[float, float] | None
+    gap_mean: float
+    seeds: int
+
+
+class PairedDifference(Record):
+    """One figure of one arm minus that of another under the same judge, paired by seed."""
+
+    judge: str
+    figure: str
+    arm: str
+    against: str
+    mean: float
+    ci95: tuple[float, float] | None
+
+
+class GapResult(RunFacts, Result):
+    """gap.json."""
+
+    SCHEMA: ClassVar[str] = "litho-design/gap/1"
+    FILE_NAME: ClassVar[str] = "gap.json"
+
+    schema_: Literal["litho-design/gap/1"] = Field(default="litho-design/gap/1", alias="schema")
+    task: TaskName
+    settings: HologramSettings | LensSettings
+    target: str
+    seeds: list[int]
+    arms: dict[str, PrinterRecord]
+    judges: dict[str, PrinterRecord]
+    entries: list[GapEntry]
+    summary: list[GapSummary]
+    paired: list[PairedDifference]
+
+
+def design_folder(out: Path, arm: str, seed: int) -> Path:
+    """Where the design of one arm and seed lies."""
+    return out / "designs" / arm / f"seed{seed}"
+
+
+def summarise(entries: Sequence[GapEntry]) -> list[GapSummary]:
+    """Mean, interval and gap of every figure for every arm and judge."""
+    summary = []
+    for (arm, judge), group in _grouped(entries).items():
+        for figure in group[0].judged:
+            judged = np.array([entry.judged[figure] for entry in group])
+            designed = np.array([entry.designed[figure] for entry in group])
+            summary.append(
+                GapSummary(
+                    arm=arm,
+                    judge=judge,
+                    figure=figure,
+                    designed_mean=float(designed.mean()),
+                    judged_mean=float(judged.mean()),
+                    judged_ci95=interval95(judged),
+                    gap_mean=float((designed - judged).mean()),
+                    seeds=len(group),
+                )
+            )
+    return summary
+
+
+def paired_differences(entries: Sequence[GapEntry], figures: Sequence[str]) -> list[PairedDifference]:
+    """The given figures of every arm against every other one, under each judge."""
+    groups = _grouped(entries)
+    arms = list(dict.fromkeys(entry.arm for entry in entries))
+    judges = list(dict.fromkeys(entry.judge for entry in entries))
+    differences = []
+    for judge, figure in itertools.product(judges, figures):
+        for against, arm in itertools.combinations(arms, 2):
+            pairs = zip(groups[arm, judge], groups[against, judge], strict=True)
+            values = np.array([one.judged[figure] - other.judged[figure] for one, other in pairs])
+            differences.append(
+                PairedDifference(
+                    judge=judge, figure=figure, arm=arm, against=against,
+                    mean=float(values.mean()), ci95=interval95(values),
+                )
+            )  # fmt: skip
+    return differences
+
+
+def interval95(values: np.ndarray) -> tuple[float, float] | None:
+    """Student's t interval of the mean; None for a single value."""
+    if len(values) < 2:
+        return None
+    from scipy.stats import t
+
+    half = float(t.ppf(0.975, len(values) - 1)) * float(values.std(ddof=1)) / math.sqrt(len(values))
+    return float(values.mean()) - half, float(values.mean()) + half
+
+
+def _grouped(entries: Sequence[GapEntry]) -> dict[tuple[str, str], list[GapEntry]]:
+    groups: dict[tuple[str, str], list[GapEntry]] = {}
+    for entry in entries:
+        groups.setdefault((entry.arm, entry.judge), []).append(entry)
+    return groups

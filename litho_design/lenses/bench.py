@@ -1,0 +1,121 @@
+"""The optics of a lens: from a printed height map to a point spread function and to images."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from litho_design.lenses.settings import LensView
+from litho_design.optics import (
+    Optics,
+    RadialPropagator,
+    RSPropagator,
+    centred_grid,
+    element_field,
+    intensity_share,
+)
+from litho_design.optics.imaging import Blur, bin_pixels, richardson_lucy
+from litho_design.printers.layout import LayoutSettings
+
+
+class LensBench(nn.Module):
+    """A plane wave through a printed lens onto the focal window."""
+
+    aperture: Tensor
+
+    def __init__(self, layout: LayoutSettings, optics: Optics, view: LensView):
+        super().__init__()
+        self.layout, self.optics, self.view = layout, optics, view
+        self.grid = centred_grid((layout.size_px, layout.size_px), layout.pitch_um)
+        self.window = centred_grid((view.window_px, view.window_px), layout.pitch_um)
+        self.propagator = RSPropagator(self.grid, self.window, optics.distance_um, optics.wavelength_um)
+        radius = np.hypot(self.grid.y_um[:, None], self.grid.x_um[None, :])
+        inside = radius < layout.size_um / 2 if view.aperture == "circle" else np.ones_like(radius)
+        self.register_buffer("aperture", torch.from_numpy(inside).float(), persistent=False)
+
+    @property
+    def numerical_aperture(self) -> float:
+        """Sine of the angle from the focus to the edge of the aperture, on an axis."""
+        half = self.layout.size_um / 2
+        return half / math.hypot(half, self.optics.distance_um)
+
+    def forward(self, height_um: Tensor) -> Tensor:
+        """PSF of a height map (size, size), µm: share of the incident power per window pixel."""
+        field = element_field(height_um, self.grid, self.optics, self.aperture)
+        return intensity_share(self.propagator(field), self.window)
+
+    def ideal_height_um(self) -> Tensor:
+        """Height (size, size) of a perfect lens, wrapped to one wave, µm."""
+        y, x = torch.from_numpy(self.grid.y_um)[:, None], torch.from_numpy(self.grid.x_um)[None, :]
+        path = self.optics.distance_um - (x**2 + y**2 + self.optics.distance_um**2).sqrt()
+        # The height that delays the wave by the path difference; wrapping changes nothing.
+        height = path * self.optics.wave_height_um / self.optics.wavelength_um
+        wrapped = torch.remainder(height, self.optics.wave_height_um)
+        return wrapped.float().to(self.aperture.device)
+
+
+class RadialLensBench(nn.Module):
+    """The same PSF from the height along the central row, for ring layouts and circular apertures."""
+
+    lower: Tensor
+    share: Tensor
+
+    def __init__(self, layout: LayoutSettings, optics: Optics, view: LensView):
+        super().__init__()
+        self.optics, self.pitch_um = optics, layout.pitch_um
+        rings = layout.size_px // 2
+        window = centred_grid((view.window_px, view.window_px), layout.pitch_um)
+        radius = torch.from_numpy(np.hypot(window.y_um[:, None], window.x_um[None, :]))
+        nodes = torch.arange(int(float(radius.max()) / layout.pitch_um) + 2) * layout.pitch_um
+        self.propagator = RadialPropagator(
+            rings, layout.pitch_um, nodes, optics.distance_um, optics.wavelength_um
+        )
+        position = radius / layout.pitch_um
+        self.register_buffer("lower", position.floor().long(), persistent=False)
+        self.register_buffer("share", (position - position.floor()).float(), persistent=False)
+        self._incident = math.pi * (rings * layout.pitch_um) ** 2
+
+    def forward(self, ring_height_um: Tensor) -> Tensor:
+        """PSF (window, window) of ring heights (rings,), µm."""
+        phase = ring_height_um * (2 * math.pi / self.optics.wave_height_um)
+        wave = self.propagator(torch.polar(torch.full_like(phase, self._incident**-0.5), phase))
+        # The wave is smooth on the scale of a pixel: interpolate it, not the intensity.
+        here = wave[self.lower] * (1 - self.share) + wave[self.lower + 1] * self.share
+        return (here.real.square() + here.imag.square()) * self.pitch_um**2
+
+
+def centre_to_background(psf: Tensor, centre_px: int, element_px: int) -> Tensor:
+    """Mean intensity of the central box over the mean of the rest of an element-sized image plane.
+
+    All light that misses the box counts as background, wherever it went: (1 - box) spread over the
+    area of the element. A ratio within the PSF window alone would reward throwing light out of it.
+    """
+    first = (psf.shape[-1] - centre_px) // 2
+    box = psf[..., first : first + centre_px, first : first + centre_px].sum()
+    rest = (1 - box) / (element_px**2 - centre_px**2)
+    return box / centre_px**2 / rest
+
+
+def sensor_psf(psf: Tensor, pixel_px: int) -> Tensor:
+    """PSF on sensor pixels, cropped to an odd number of them around the axis."""
+    pixels = psf.shape[-1] // pixel_px
+    pixels -= 1 - pixels % 2
+    first = (psf.shape[-1] - pixels * pixel_px) // 2
+    last = first + pixels * pixel_px
+    return bin_pixels(psf[..., first:last, first:last], pixel_px)
+
+
+def record(objects: Tensor, psf: Tensor, read_noise: float, seed: int) -> Tensor:
+    """Sensor images (n, size, size): psf * object plus Gaussian read noise drawn from ``seed``."""
+    frame = (int(objects.shape[-2]), int(objects.shape[-1]))
+    generator = torch.Generator().manual_seed(seed)
+    noise = torch.randn(objects.shape, generator=generator).to(objects.device)
+    return Blur(psf, frame).forward(objects) + read_noise * noise
+
+
+def reconstruct(recorded: Tensor, psf: Tensor, iterations: int) -> Tensor:
+    """Richardson-Lucy estimate of the objects with the given PSF."""
+    return richardson_lucy(recorded, psf, iterations=iterations)

@@ -1,0 +1,177 @@
+"""Scores of a lens: its PSF against that of a perfect lens, and the images it gives."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from pydantic import Field
+from torch import Tensor
+
+from litho_data.foundation.results import Record
+from litho_design.images.similarity import similarity
+from litho_design.lenses.bench import LensBench, centre_to_background, reconstruct, record, sensor_psf
+from litho_design.lenses.objects import object_stack
+from litho_design.lenses.settings import ImagingSettings, LensSettings
+
+_TEST_SEEDS = range(1000, 1003)
+
+
+class LensScore(Record):
+    """Powers are shares of what falls on the aperture; lengths are µm."""
+
+    focusing_efficiency: float = Field(
+        description="power within the focusing radius, share of the aperture's"
+    )
+    focusing_radius_um: float = Field(description="focusing radius: 3 x ideal FWHM, µm")
+    strehl: float = Field(description="peak over the peak of a perfect lens")
+    mtf_volume_ratio: float = Field(description="volume of the MTF over that of a perfect lens")
+    mtf_half_cutoff: float = Field(description="MTF at half the cut-off NA / wavelength")
+    fwhm_um: float = Field(description="full width at half maximum, µm")
+    fwhm_ideal_um: float = Field(description="the same of a perfect lens, µm")
+    cbr: float = Field(description="centre-to-background ratio")
+    cbr_ceiling: float = Field(description="the same of a perfect lens: the ceiling")
+    eff_window: float = Field(description="power in the PSF window, share of the aperture's")
+
+
+class ImagingScore(Record):
+    """Means and standard deviations over test objects and noise seeds, never used in the design.
+
+    ``design`` deconvolves with the PSF that the design expected, ``calibrated`` with the PSF of the
+    print itself; ``direct`` is the sensor image without deconvolution, at the scale of least error.
+    """
+
+    mae_direct: float = Field(description="test objects: MAE of the sensor image, best scale")
+    mae_design: float = Field(description="test objects: MAE, deconvolved with the designed PSF")
+    mae_calibrated: float = Field(description="test objects: MAE, deconvolved with the print's own PSF")
+    mae_calibrated_sd: float = Field(description="its standard deviation over objects and noise seeds")
+    psnr_design_db: float = Field(description="PSNR with the designed PSF, dB")
+    psnr_calibrated_db: float = Field(description="PSNR with the print's own PSF, dB")
+    ssim_direct: float = Field(description="SSIM of the sensor image")
+    ssim_design: float = Field(description="SSIM with the designed PSF")
+    ssim_calibrated: float = Field(description="SSIM with the print's own PSF")
+    ssim_calibrated_sd: float = Field(description="its standard deviation over objects and noise seeds")
+
+
+@torch.no_grad()
+def lens_score(bench: LensBench, height_um: Tensor) -> LensScore:
+    """Score the plane PSF of a printed height map (size, size), µm."""
+    psf, ideal = (bench(height).double() for height in (height_um, bench.ideal_height_um()))
+    pitch = bench.layout.pitch_um
+    fwhm_ideal = half_maximum_width_um(ideal, pitch)
+    radius_um = 3 * fwhm_ideal
+    y, x = torch.from_numpy(bench.window.y_um), torch.from_numpy(bench.window.x_um)
+    near = (torch.hypot(y[:, None], x[None, :]) <= radius_um).to(psf.device)
+    centre_px = round(bench.view.centre_um / pitch)
+    cutoff = 2 * bench.numerical_aperture / bench.optics.wavelength_um
+    return LensScore(
+        focusing_efficiency=float(psf[near].sum()),
+        focusing_radius_um=radius_um,
+        strehl=float(psf.max() / ideal.max()),
+        mtf_volume_ratio=float(mtf(psf).sum() / mtf(ideal).sum()),
+        mtf_half_cutoff=mtf_at(psf, cutoff / 2, pitch),
+        fwhm_um=half_maximum_width_um(psf, pitch),
+        fwhm_ideal_um=fwhm_ideal,
+        cbr=float(centre_to_background(psf, centre_px, bench.layout.size_px)),
+        cbr_ceiling=float(centre_to_background(ideal, centre_px, bench.layout.size_px)),
+        eff_window=float(psf.sum()),
+    )
+
+
+def half_maximum_width_um(psf: Tensor, pitch_um: float) -> float:
+    """Diameter of the circle whose area lies above half the maximum, µm.
+
+    The PSF is interpolated fourfold (zero-padded spectrum) so that pixels do not limit it.
+    """
+    fine = 4
+    spectrum = torch.fft.fftshift(torch.fft.fft2(psf))
+    pad = (fine - 1) * psf.shape[-1] // 2
+    image = torch.fft.ifft2(torch.fft.ifftshift(torch.nn.functional.pad(spectrum, (pad,) * 4))).real
+    # An odd side cannot be padded to exactly four times its length.
+    sample_um = pitch_um * psf.shape[-1] / image.shape[-1]
+    area = float((image > image.max() / 2).sum()) * sample_um**2
+    return 2 * math.sqrt(area / math.pi)
+
+
+def mtf(psf: Tensor) -> Tensor:
+    """|FFT(psf)| / DC, (n, n), zero frequency first."""
+    transfer = torch.fft.fft2(psf).abs()
+    return transfer / transfer[0, 0]
+
+
+def mtf_at(psf: Tensor, frequency_per_um: float, pitch_um: float) -> float:
+    """MTF at one frequency, cycles/µm: mean of both axes, linear between samples."""
+    curve = mtf(psf)
+    position = frequency_per_um * psf.shape[-1] * pitch_um
+    index = int(position)
+    part = position - index
+    axes = (curve[0, : index + 2], curve[: index + 2, 0])
+    return float(sum(axis[index] * (1 - part) + axis[index + 1] * part for axis in axes) / 2)
+
+
+@torch.no_grad()
+def imaging_score(
+    psf: Tensor,
+    design_psf: Tensor,
+    settings: ImagingSettings,
+    pictures: Mapping[str, np.ndarray] | None = None,
+) -> ImagingScore:
+    """Image the test objects through ``psf`` and reconstruct with both PSFs.
+
+    Args:
+        psf, design_psf: (window, window), share of the incident power per window pixel.
+        pictures: pixels of the test objects that are pictures, see ``object_stack``.
+    """
+    real, expected = (sensor_psf(p, settings.pixel_px).float() for p in (psf, design_psf))
+    objects = object_stack(settings.test_objects, settings.object_px, pictures).to(psf.device)
+    rows: dict[str, list[float]] = {}
+
+    def add(name: str, estimates: Tensor) -> None:
+        for estimate, wanted in zip(estimates, objects, strict=True):
+            found = similarity(estimate, wanted)
+            rows.setdefault(f"mae_{name}", []).append(found.mae)
+            rows.setdefault(f"psnr_{name}", []).append(found.psnr_db)
+            rows.setdefault(f"ssim_{name}", []).append(found.ssim)
+
+    for seed in _TEST_SEEDS:
+        seen = record(objects, real, settings.read_noise, seed)
+        scale = (seen * objects).sum((-2, -1)) / seen.square().sum((-2, -1))
+        add("direct", seen * scale[:, None, None])
+        add("design", reconstruct(seen, expected, settings.iterations))
+        add("calibrated", reconstruct(seen, real, settings.iterations))
+    means = {name: sum(values) / len(values) for name, values in rows.items()}
+    spread = {name: float(torch.tensor(values).std()) for name, values in rows.items()}
+    return ImagingScore(
+        mae_direct=means["mae_direct"],
+        mae_design=means["mae_design"],
+        mae_calibrated=means["mae_calibrated"],
+        mae_calibrated_sd=spread["mae_calibrated"],
+        psnr_design_db=means["psnr_design"],
+        psnr_calibrated_db=means["psnr_calibrated"],
+        ssim_direct=means["ssim_direct"],
+        ssim_design=means["ssim_design"],
+        ssim_calibrated=means["ssim_calibrated"],
+        ssim_calibrated_sd=spread["ssim_calibrated"],
+    )
+
+
+class ImagingLensScore(LensScore, ImagingScore):
+    """PSF and imaging figures of a computational lens."""
+
+
+@torch.no_grad()
+def score_lens(
+    settings: LensSettings,
+    bench: LensBench,
+    height_um: Tensor,
+    design_height_um: Tensor,
+    pictures: Mapping[str, np.ndarray] | None = None,
+) -> LensScore | ImagingLensScore:
+    """Figures of a printed lens whose design expected ``design_height_um``."""
+    score = lens_score(bench, height_um)
+    if settings.task == "direct":
+        return score
+    imaging = imaging_score(bench(height_um), bench(design_height_um), settings.imaging, pictures)
+    return ImagingLensScore(**score.model_dump(), **imaging.model_dump())

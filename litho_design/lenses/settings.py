@@ -1,0 +1,125 @@
+"""All settings of a lens, by preset: what the paper leaves open is written down here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal, get_args
+
+from pydantic import model_validator
+
+from litho_data.foundation.results import Record
+from litho_data.foundation.settings import changed, setting
+from litho_design.images.targets import DrawnTarget, ImagedObject, object_name
+from litho_design.optics import Optics
+from litho_design.optimisation.settings import (
+    PAPER_SEARCH,
+    DesignSettings,
+    SearchSettings,
+    Variant,
+    check_variant,
+)
+from litho_design.printers.layout import LayoutSettings
+
+LensTaskName = Literal["direct", "computational"]
+
+
+class LensView(Record):
+    """Aperture, PSF window and search path of a lens.
+
+    ``window_px`` pixels of the layout's pitch around the focus are computed. ``path="radial"``
+    searches with a strip through the centre and the ring propagator instead of the whole plane; it
+    needs a circular aperture and a ring layout, and scores always use the plane.
+    """
+
+    aperture: Literal["square", "circle"] = setting("circle", "Aperture of the lens")
+    window_px: int = setting(254, "Lens: side of the PSF window", unit="px", option="--window-px", ge=16)
+    centre_um: float = setting(1.0, "Side of the centre in the centre-to-background ratio", unit="µm", gt=0)
+    path: Literal["plane", "radial"] = setting("plane", "Search on the plane, or along a radius of rings")
+
+
+class ImagingSettings(Record):
+    """Computational imaging: sensor, noise, reconstruction and the objects of design and test.
+
+    An object is the name of a drawing or the record of a picture (see ``bring_objects``).
+    ``read_noise`` is the standard deviation relative to a white object behind a lens that focuses
+    all light; the paper does not state its own.
+    """
+
+    pixel_px: int = setting(2, "Side of a sensor pixel, in pixels of the layout", unit="px", ge=1)
+    objects: tuple[ImagedObject, ...] = setting(("text", "chart", "spots"), "Drawings imaged in the search")
+    test_objects: tuple[ImagedObject, ...] = setting(("ring", "letters"), "Drawings that are only scored")
+    object_px: int = setting(
+        128,
+        "Computational lens: side of the objects, in sensor pixels",
+        unit="px",
+        option="--object-px",
+        ge=32,
+    )
+    read_noise: float = setting(0.01, "Read noise, relative to a white object", ge=0)
+    iterations: int = setting(50, "Iterations of the Richardson-Lucy deconvolution", ge=1)
+
+    @model_validator(mode="after")
+    def _held_out(self) -> ImagingSettings:
+        drawn = {item for item in (*self.objects, *self.test_objects) if isinstance(item, str)}
+        unknown = sorted(drawn - set(get_args(DrawnTarget)))
+        if unknown:
+            raise ValueError(f"object {unknown[0]!r} is none of {', '.join(get_args(DrawnTarget))}")
+        seen = sorted(object_name(item) for item in set(self.objects) & set(self.test_objects))
+        if seen:
+            raise ValueError(f"object {seen[0]!r} is in the design and in the test")
+        if not self.objects or len(self.test_objects) < 2:
+            raise ValueError("one object for the design and two for the test are the least")
+        return self
+
+
+class LensSettings(DesignSettings):
+    """All settings of one lens."""
+
+    task: LensTaskName = setting("direct", "Focus light, or image with a computer behind", option="--task")
+    layout: LayoutSettings = setting(LayoutSettings(size_px=1200, cell_um=0.1, symmetry="radial"), "Layout")
+    optics: Optics = setting(Optics(distance_um=400.0), "Optics")
+    search: SearchSettings = setting(
+        SearchSettings(start="fresnel", start_jitter_levels=0.3, iterations=200, learning_rate=0.3), "Search"
+    )
+    view: LensView = setting(LensView(path="radial"), "View")
+    imaging: ImagingSettings = setting(ImagingSettings(), "Computational imaging")
+
+
+def lens_settings(
+    task: LensTaskName = "direct", variant: Variant = "default", changes: Mapping[str, Any] | None = None
+) -> LensSettings:
+    """A preset of the lens with ``changes`` by path; 120 µm, focal length 400 µm, rings of 0.1 µm.
+
+    ``paper``: 13 levels, Gumbel-Softmax at temperature 0.5, 1000 AdamW iterations at 3, square
+    aperture; its rings are those of the published code, the text does not say. ``authors``: 12
+    levels, temperature 1, 2000 iterations at 1, their wavelength and index step. ``default``: a
+    circular aperture, the Fresnel phase as start, and the ring path in the search.
+
+    Args:
+        task: focus light directly, or image with a computer behind; ``task`` among the changes replaces it.
+        variant, changes: as for ``hologram_settings``.
+
+    Raises:
+        InputError: a change of a setting that does not exist, or to a value that it does not accept.
+    """
+    given = dict(changes or {})
+    return changed(_preset(given.pop("variant", variant)), {"task": task, **given})
+
+
+def _preset(variant: Variant) -> LensSettings:
+    check_variant(variant)
+    default = LensSettings()
+    if variant == "default":
+        return default
+    search = PAPER_SEARCH.model_copy(update={"optimiser": "adamw", "learning_rate": 3.0})
+    square = LensView(aperture="square", path="plane")
+    if variant == "paper":
+        return LensSettings(variant="paper", search=search, view=square)
+    temperature = {"temperature_start": 1.0, "temperature_end": 1.0}
+    return LensSettings(
+        variant="authors",
+        layout=default.layout.model_copy(update={"levels": 12}),
+        optics=Optics(wavelength_um=0.633, index_step=0.545, distance_um=400.0),
+        search=search.model_copy(update={"iterations": 2000, "learning_rate": 1.0, **temperature}),
+        view=square,
+    )

@@ -1,0 +1,65 @@
+"""What the height of a print is worth: how much light its staircase of levels can send into an order."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from litho_data.foundation.results import Record
+
+
+class Stroke(Record):
+    """What the print makes of the levels; None where no number or height of levels reaches a full wave."""
+
+    printed_height_um: list[float]
+    stroke_um: float
+    stroke_waves: float
+    print_gain: float
+    blaze_order_1: float
+    blaze_order_0: float
+    levels_for_one_wave: float | None
+    level_height_for_one_wave_um: float | None
+
+
+def blaze_efficiency(steps: int, gain: float, order: int = 1) -> float:
+    """Scalar efficiency of a blazed grating with ``steps`` equal steps whose stroke is ``gain`` waves.
+
+    eta_m = sinc^2(m/N) [ sin(pi (g - m)) / (N sin(pi (g - m) / N)) ]^2.
+    """
+    detuning = math.pi * (gain - order)
+    narrow = steps * math.sin(detuning / steps)
+    array = 1.0 if abs(narrow) < 1e-15 else math.sin(detuning) / narrow
+    fraction = order / steps
+    element = 1.0 if order == 0 else math.sin(math.pi * fraction) / (math.pi * fraction)
+    return (element * array) ** 2
+
+
+def measure_stroke(
+    printed_height_um: Sequence[float], wave_height_um: float, *, level_height_um: float
+) -> Stroke:
+    """What printed levels can do as one period of a blaze.
+
+    Args:
+        printed_height_um: printed height of a wide uniform area of each level, µm.
+        wave_height_um: height of one wave, µm.
+        level_height_um: nominal step, µm.
+
+    Returns:
+        The stroke, its first and zero order as a blaze, and the number of levels (or the step height)
+        with which the print would reach one wave.
+    """
+    count = len(printed_height_um)
+    stroke_um = printed_height_um[-1] - printed_height_um[0]
+    gain = stroke_um / ((count - 1) * level_height_um) if count > 1 else 0.0
+    # A period of N equal steps spans N/(N-1) of the highest step.
+    period_waves = stroke_um / wave_height_um * count / max(count - 1, 1)
+    return Stroke(
+        printed_height_um=list(printed_height_um),
+        stroke_um=stroke_um,
+        stroke_waves=stroke_um / wave_height_um,
+        print_gain=gain,
+        blaze_order_1=blaze_efficiency(count, period_waves, 1),
+        blaze_order_0=blaze_efficiency(count, period_waves, 0),
+        levels_for_one_wave=math.ceil(wave_height_um / (gain * level_height_um)) if gain > 0 else None,
+        level_height_for_one_wave_um=wave_height_um / (gain * count) if gain > 0 else None,
+    )

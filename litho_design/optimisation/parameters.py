@@ -1,0 +1,136 @@
+"""From free parameters to printable levels: cells, rings, Gumbel-Softmax or straight-through heights."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from litho_design.printers.layout import LayoutSettings
+
+# One level of spread: the neighbours of the starting level stay reachable from the first step.
+_START_SPREAD_LEVELS = 1.0
+
+
+class CellMap(nn.Module):
+    """Spread one value per free cell over the pixels of the layout, and average back."""
+
+    ring: Tensor
+
+    def __init__(self, layout: LayoutSettings):
+        super().__init__()
+        self.size_px, self.cell_px = layout.size_px, layout.cell_px
+        self.radial = layout.symmetry == "radial"
+        if self.radial:
+            centre = torch.arange(self.size_px, dtype=torch.float64) - (self.size_px - 1) / 2
+            radius_px = torch.hypot(centre[:, None], centre[None, :])
+            ring = (radius_px / self.cell_px).floor().long()
+            self.register_buffer("ring", ring, persistent=False)
+            self.cells: tuple[int, ...] = (int(ring.max()) + 1,)
+        else:
+            self.cells = (self.size_px // self.cell_px,) * 2
+
+    def forward(self, values: Tensor) -> Tensor:
+        """(..., *cells) to (..., size, size)."""
+        if self.radial:
+            return values[..., self.ring]
+        return values.repeat_interleave(self.cell_px, -1).repeat_interleave(self.cell_px, -2)
+
+    def average(self, pixels: Tensor) -> Tensor:
+        """Mean over each cell of real or complex ``pixels`` (size, size); empty rings give 0."""
+        if not self.radial:
+            blocks = pixels.unflatten(-1, (-1, self.cell_px)).unflatten(-3, (-1, self.cell_px))
+            return blocks.mean((-3, -1))
+        index = self.ring.flatten()
+        total = pixels.new_zeros(self.cells).index_add_(0, index, pixels.flatten())
+        count = torch.bincount(index, minlength=self.cells[0]).clamp(min=1)
+        return total / count
+
+
+class GumbelLevels(nn.Module):
+    """A categorical distribution over levels per cell, sampled with Gumbel-Softmax.
+
+    Jang, Gu and Poole 2017, arXiv:1611.01144; the soft sample is the expected level under the
+    sampled weights, the hard one is a level with the gradient of the soft one.
+    """
+
+    def __init__(self, layout: LayoutSettings):
+        super().__init__()
+        self.cells = CellMap(layout)
+        self.levels = layout.levels
+        self.logits = nn.Parameter(torch.zeros(layout.levels, *self.cells.cells))
+
+    def sample(self, temperature: float, hard: bool, seed: int) -> Tensor:
+        """Levels on the pixels, float (1, 1, size, size); the same ``seed`` gives the same sample."""
+        devices = [self.logits.device] if self.logits.is_cuda else []
+        with torch.random.fork_rng(devices=devices):
+            torch.manual_seed(seed)
+            weights = F.gumbel_softmax(self.logits, tau=temperature, hard=hard, dim=0)
+        ladder = torch.arange(self.levels, dtype=weights.dtype, device=weights.device)
+        return self.cells(torch.tensordot(ladder, weights, dims=1))[None, None]
+
+    def best_levels(self) -> Tensor:
+        """The most probable level of each cell, int64 (*cells)."""
+        return self.logits.detach().argmax(0)
+
+    @torch.no_grad()
+    def start_from(self, levels: Tensor, *, jitter_levels: float = 0.0, seed: int = 0) -> None:
+        """Centre the distribution on ``levels`` (real, *cells) with Gaussian ``jitter_levels``."""
+        levels = _jittered(levels.to(self.logits), jitter_levels, seed, self.levels)
+        ladder = torch.arange(self.levels, device=self.logits.device).view(-1, *[1] * levels.dim())
+        self.logits.copy_(-((ladder - levels) ** 2) / (2 * _START_SPREAD_LEVELS**2))
+
+    @torch.no_grad()
+    def start_random(self, seed: int) -> None:
+        """Standard normal logits."""
+        generator = torch.Generator().manual_seed(seed)
+        self.logits.copy_(torch.randn(self.logits.shape, generator=generator))
+
+    def project(self) -> None:
+        """Logits are free: nothing to bring back."""
+
+
+class DirectLevels(nn.Module):
+    """One real level per cell; rounding passes the gradient straight through when ``hard``."""
+
+    def __init__(self, layout: LayoutSettings):
+        super().__init__()
+        self.cells = CellMap(layout)
+        self.levels = layout.levels
+        self.height = nn.Parameter(torch.zeros(self.cells.cells))
+
+    def sample(self, temperature: float, hard: bool, seed: int) -> Tensor:
+        """Levels on the pixels, float (1, 1, size, size); nothing here is random."""
+        level: Tensor = self.height
+        if hard:
+            level = level + (level.round() - level).detach()
+        return self.cells(level)[None, None]
+
+    @torch.no_grad()
+    def project(self) -> None:
+        """Bring heights that an optimiser step carried out of the range back to its ends."""
+        self.height.clamp_(0, self.levels - 1)
+
+    def best_levels(self) -> Tensor:
+        """The nearest level of each cell, int64 (*cells)."""
+        return self.height.detach().round().long()
+
+    @torch.no_grad()
+    def start_from(self, levels: Tensor, *, jitter_levels: float = 0.0, seed: int = 0) -> None:
+        """Start at ``levels`` (real, *cells) with Gaussian ``jitter_levels``."""
+        self.height.copy_(_jittered(levels.to(self.height), jitter_levels, seed, self.levels))
+
+    @torch.no_grad()
+    def start_random(self, seed: int) -> None:
+        """Uniform over the whole range."""
+        generator = torch.Generator().manual_seed(seed)
+        self.height.copy_(torch.rand(self.height.shape, generator=generator) * (self.levels - 1))
+
+
+Parametrisation = GumbelLevels | DirectLevels
+
+
+def _jittered(levels: Tensor, jitter_levels: float, seed: int, level_count: int) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    jitter = torch.randn(levels.shape, generator=generator).to(levels) * jitter_levels
+    return (levels + jitter).clamp(0, level_count - 1)

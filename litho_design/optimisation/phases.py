@@ -1,0 +1,114 @@
+"""Wanted phases and the printed levels nearest to them: Gerchberg-Saxton for images, Fresnel for lenses."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from litho_design.optics import Optics, centred_grid
+from litho_design.optimisation.parameters import CellMap
+
+
+def gerchberg_saxton(
+    propagator: Any,
+    target: Tensor,
+    cells: CellMap,
+    *,
+    iterations: int,
+    weighted: bool,
+    seed: int,
+    level_phase: Tensor | None = None,
+) -> tuple[Tensor, list[float]]:
+    """A phase per cell whose propagated amplitude approaches sqrt(target).
+
+    Each step replaces the propagated amplitude inside the output window, keeps the wave outside it,
+    sends the correction back with the adjoint and projects on what the element can do: u' = Pi(u +
+    P^H (a exp(j arg P u) - P u)). Because the norm of P is at most one, this majorises the squared
+    amplitude error, which therefore never rises (Gerchberg and Saxton 1972). The weighted form
+    (Di Leonardo et al. 2007, doi:10.1364/OE.15.001913) raises the wanted amplitude where light is
+    missing; it trades that guarantee for uniformity.
+
+    Args:
+        propagator: RSPropagator or ASMPropagator on square grids of the element's pixel pitch.
+        target: wanted intensity (size, size) in [0, 1].
+        cells: the element's free cells.
+        level_phase: printed phase of each level, radian (levels,); if given, the second half of the
+            iterations projects on these phases instead of on the whole circle.
+
+    Returns:
+        Phase per cell, radian, and the amplitude error sqrt(sum (|P u| - a)^2) before each step.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    phase = (torch.rand(cells.cells, generator=generator) * 2 * math.pi).to(target)
+    amplitude = target.clamp(min=0).sqrt()
+    incident = math.sqrt(math.prod(propagator.source.shape) * math.prod(propagator.source.pitch_um))
+    area = math.prod(propagator.target.pitch_um)
+    amplitude = amplitude * (incident / math.sqrt(float(amplitude.square().sum()) * area))
+    wanted, lit = amplitude.clone(), amplitude > 0
+    errors = []
+    for step in range(iterations):
+        wave = cells(torch.polar(torch.ones_like(phase), phase))
+        seen = propagator(wave)
+        size = seen.abs()
+        errors.append(float((size - amplitude).square().sum().sqrt()))
+        if weighted:
+            shortfall = (
+                amplitude[lit] / size[lit].clamp(min=1e-12) * (size[lit].norm() / amplitude[lit].norm())
+            )
+            wanted[lit] *= shortfall.clamp(0.5, 2).sqrt()
+            wanted *= amplitude.norm() / wanted.norm()
+        missing = seen * (wanted / size.clamp(min=1e-12 * float(size.max())) - 1)
+        mean_wave = cells.average(wave + propagator.adjoint(missing))
+        phase = mean_wave.angle()
+        if level_phase is not None and step >= iterations // 2:
+            phase = level_phase[nearest_levels(phase, level_phase)]
+    return phase, errors
+
+
+def fresnel_lens_phase(cells: CellMap, pitch_um: float, optics: Optics) -> Tensor:
+    """The phase per cell of a perfect lens: phi = k (f - sqrt(f^2 + r^2)), radian.
+
+    ``optics.distance_um`` is the focal length f.
+    """
+    grid = centred_grid((cells.size_px, cells.size_px), pitch_um)
+    y, x = torch.from_numpy(grid.y_um)[:, None], torch.from_numpy(grid.x_um)[None, :]
+    radius = (x**2 + y**2 + optics.distance_um**2).sqrt()
+    phase = (2 * math.pi / optics.wavelength_um) * (optics.distance_um - radius)
+    # Cells average the wave, not the phase: a mean over a wrapped phase means nothing.
+    return cells.average(torch.polar(torch.ones_like(phase), phase)).angle().float()
+
+
+def focusing_levels(phase: Tensor, level_phase: Tensor) -> Tensor:
+    """Nearest levels to a lens's ``phase`` after the constant phase shift that wastes the least light.
+
+    A print whose stroke is below one wave leaves a gap on the circle; turning the wanted phase
+    moves the gap, and the sum of the cosines of what is left is the amplitude at the focus.
+    """
+    best, best_value = nearest_levels(phase, level_phase), -math.inf
+    for turn in torch.arange(0, 1, 1 / 24) * (2 * torch.pi):
+        levels = nearest_levels(phase + turn, level_phase)
+        value = float(torch.polar(torch.ones_like(phase), level_phase[levels] - phase).mean().abs())
+        if value > best_value:
+            best, best_value = levels, value
+    return best
+
+
+def printed_phase(level_heights_um: Sequence[float], optics: Optics) -> Tensor:
+    """Phase of each printed level, radian (levels,)."""
+    return torch.tensor(level_heights_um) * (2 * math.pi / optics.wave_height_um)
+
+
+def nearest_levels(phase: Tensor, level_phase: Tensor) -> Tensor:
+    """The level whose printed phase is closest on the circle, int64, for each ``phase`` (radian)."""
+    distance = phase.new_full(phase.shape, math.inf)
+    nearest = torch.zeros(phase.shape, dtype=torch.long, device=phase.device)
+    for level, printed in enumerate(level_phase.tolist()):
+        off = torch.remainder(phase - printed + math.pi, 2 * math.pi).sub_(math.pi).abs_()
+        closer = off < distance
+        distance = torch.where(closer, off, distance)
+        nearest = torch.where(closer, level, nearest)
+    return nearest

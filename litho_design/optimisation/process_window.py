@@ -1,0 +1,202 @@
+"""Process window: how a design fares when the print and the bench are not exactly as modelled."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.grid import PixelGrid
+from litho_data.foundation.results import Record
+from litho_data.foundation.settings import leaves, setting
+from litho_design.optics import Optics, sampling_limit_um
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+_NARROWEST_BLUR_PX = 0.2
+_UNSEEN_STREAM = 1
+YIELD_DRAWS = 16
+
+
+class ProcessWindow(Record):
+    """Spread of print and bench, and how a search weighs it.
+
+    ``gain_sd`` is relative to the printed height, ``blur_sd_um`` the scale of a half-normal extra
+    blur. A search with ``samples`` above 0 minimises mean + weight * sd of the loss over as many
+    draws (``mean-sd``), or the mean of the worst ``tail`` share of them (``cvar``); the draws are
+    the same in every iteration. The defaults are a guess to be replaced by figures of the own
+    printer: the fields of one measured data set spread by 13 % in gain, the microscope's scale included.
+    """
+
+    gain_sd: float = setting(
+        0.03, "Spread of the gain of a print, relative to its height", option="--gain-sd", ge=0
+    )
+    offset_sd_um: float = setting(0.02, "Spread of the offset of a print", unit="µm", ge=0)
+    gain_offset_correlation: float = setting(0.0, "Correlation of gain and offset", ge=-1, le=1)
+    blur_sd_um: float = setting(
+        0.05, "Spread of an additional blur of the print", unit="µm", option="--blur-sd-um", ge=0
+    )
+    defocus_sd_um: float = setting(3.0, "Spread of the distance", unit="µm", option="--defocus-sd-um", ge=0)
+    wavelength_sd_um: float = setting(
+        0.0, "Spread of the wavelength", unit="µm", option="--wavelength-sd-um", ge=0
+    )
+    samples: int = setting(
+        0,
+        "Draws of the process window in the loss; 0 designs for the print as modelled",
+        option="--robust-samples",
+        ge=0,
+    )
+    risk: Literal["mean-sd", "cvar"] = setting(
+        "cvar",
+        "Loss over the draws: mean of the worst share (cvar), or mean + weight * standard deviation",
+        option="--risk",
+    )
+    weight: float = setting(1.0, "Weight of the standard deviation for mean-sd", option="--risk-weight", ge=0)
+    tail: float = setting(0.25, "Worst share of the draws for cvar", option="--risk-tail", gt=0, le=1)
+    seed: int = setting(0, "Seed of the draws")
+
+
+def spreads(window: ProcessWindow) -> list[str]:
+    """Every spread of a window with its value and unit, for people."""
+    found = [leaf for leaf in leaves(window) if leaf.help.startswith("Spread of ")]
+    return [f"{leaf.help.removeprefix('Spread of ')} {leaf.value:g} {leaf.unit}".strip() for leaf in found]
+
+
+@dataclass(frozen=True)
+class Draw:
+    """One print on one bench."""
+
+    gain: float
+    offset_um: float
+    blur_um: float
+    optics: Optics
+
+    def apply(self, height_um: Tensor, pitch_um: float) -> Tensor:
+        """The height (size, size), or of rings (n,) from the centre outwards, µm, as this draw prints it.
+
+        A uniform offset is a uniform phase and changes no image; it is kept for scores of heights.
+        Rings are blurred along the radius only, which is exact where they are much wider than the blur
+        or far from the centre.
+        """
+        changed = height_um * self.gain + self.offset_um
+        sigma_px = self.blur_um / pitch_um
+        return changed if sigma_px < _NARROWEST_BLUR_PX else _blur(changed, sigma_px)
+
+
+def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = False) -> list[Draw]:
+    """``count`` draws from ``window.seed``; the first ``k`` of a longer list are those of a shorter one.
+
+    ``unseen`` draws come from a stream of their own: a yield must hold for prints that no search saw.
+    """
+    shared = window.gain_offset_correlation
+    seed = [window.seed, _UNSEEN_STREAM] if unseen else window.seed
+    normal = np.random.default_rng(seed).standard_normal((count, 5)).tolist()
+    return [
+        Draw(
+            gain=1 + window.gain_sd * gain,
+            offset_um=window.offset_sd_um * (shared * gain + math.sqrt(1 - shared**2) * offset),
+            blur_um=abs(window.blur_sd_um * blur),
+            optics=optics.model_copy(
+                update={
+                    "distance_um": optics.distance_um + window.defocus_sd_um * defocus,
+                    "wavelength_um": optics.wavelength_um + window.wavelength_sd_um * wavelength,
+                }
+            ),
+        )
+        for gain, offset, blur, defocus, wavelength in normal
+    ]
+
+
+def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target: PixelGrid) -> None:
+    """Refuse spreads that carry a draw of the search or of the yield out of what can be propagated.
+
+    Raises:
+        InputError: a draw below the sampling limit of the propagator between ``source`` and ``target``,
+            or without a positive wavelength.
+    """
+    drawn = draws(window, optics, window.samples) + draws(window, optics, YIELD_DRAWS, unseen=True)
+    nearest_um = min(draw.optics.distance_um for draw in drawn)
+    shortest_um = min(draw.optics.wavelength_um for draw in drawn)
+    if shortest_um <= 0:
+        raise InputError(
+            f"wavelength {optics.wavelength_um:g} µm with a spread of {window.wavelength_sd_um:g} µm",
+            got=f"{shortest_um:.4g} µm in a draw of the process window",
+            wanted="a positive wavelength",
+            hint="lower --wavelength-sd-um",
+        )
+    limit_um = max(sampling_limit_um(source, target, draw.optics.wavelength_um) for draw in drawn)
+    if nearest_um < limit_um:
+        raise InputError(
+            f"distance {optics.distance_um:g} µm with a defocus spread of {window.defocus_sd_um:g} µm",
+            got=f"{nearest_um:.4g} µm in a draw of the process window",
+            wanted=f"at least {limit_um:.4g} µm",
+            hint="lower --defocus-sd-um",
+        )
+
+
+def risk(losses: Tensor, window: ProcessWindow) -> Tensor:
+    """One figure of many losses: mean + weight * sd, or the mean of the worst share."""
+    if window.risk == "mean-sd":
+        return losses.mean() + window.weight * losses.std(correction=0)
+    worst = max(1, round(window.tail * losses.numel()))
+    return losses.topk(worst).values.mean()
+
+
+def measured_window(store: Any, window: ProcessWindow) -> ProcessWindow:
+    """``window`` with the spread of gain and offset, and their correlation, of measured prints.
+
+    Each scan is fitted as height = gain * nominal + offset; the spread between scans is that of the
+    process, of the microscope's own scale from scan to scan, and of what else the fit leaves in:
+    an upper bound of what one print differs from another. The locked scans are left out: whatever a
+    design is judged by later, its search has not seen them.
+
+    Args:
+        store: a ``litho_data`` store with at least three scans outside its lock box.
+
+    Raises:
+        InputError: fewer scans, or layouts without structure.
+    """
+    locked = store.locked_ids
+    fits = []
+    for scan in store.scans():
+        if scan.id in locked:
+            continue
+        nominal, height = scan.layout_um[scan.valid], scan.height_um[scan.valid]
+        if nominal.std() > 0:
+            fits.append(np.polyfit(nominal.astype(float), height.astype(float), 1))
+    if len(fits) < 3:
+        raise InputError(
+            "process window",
+            got=f"{len(fits)} scans with structure, {len(locked)} locked ones left out",
+            wanted="three at least",
+        )
+    gain, offset = np.array(fits).T
+    return window.model_copy(
+        update={
+            "gain_sd": float(gain.std(ddof=1) / gain.mean()),
+            "offset_sd_um": float(offset.std(ddof=1)),
+            "gain_offset_correlation": float(np.corrcoef(gain, offset)[0, 1]),
+        }
+    )
+
+
+def _blur(height: Tensor, sigma_px: float) -> Tensor:
+    """Gaussian blur of a map with mirrored borders; rings are mirrored at the centre, level at the edge."""
+    import torch
+    import torch.nn.functional as F
+
+    rings = height.dim() == 1
+    half = int(4 * sigma_px) + 1
+    half = min(half, height.numel() - 1) if rings else half
+    x = torch.arange(-half, half + 1, dtype=height.dtype, device=height.device)
+    kernel = torch.exp(-(x**2) / (2 * sigma_px**2))
+    kernel = kernel / kernel.sum()
+    if rings:
+        padded = torch.cat([height[:half].flip(0), height, height[-1:].expand(half)])
+        return F.conv1d(padded[None, None], kernel.view(1, 1, -1))[0, 0]
+    padded = F.pad(height[None, None], (half,) * 4, mode="reflect")
+    return F.conv2d(F.conv2d(padded, kernel.view(1, 1, 1, -1)), kernel.view(1, 1, -1, 1))[0, 0]

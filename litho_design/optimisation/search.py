@@ -1,0 +1,197 @@
+"""One loop for every design task: free parameters in, printable levels out, resumable at any step."""
+
+from __future__ import annotations
+
+import io
+import math
+import pickle
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from litho_data.foundation.commands import progress
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import atomic_file
+from litho_design.optimisation.parameters import DirectLevels, GumbelLevels, Parametrisation
+from litho_design.optimisation.settings import SearchSettings
+from litho_design.printers.layout import LayoutSettings
+
+Objective = Callable[[Tensor], tuple[Tensor, dict[str, float]]]
+_CHECKPOINT = "checkpoint.pt"
+# What torch raises for a damaged file depends on the place of the damage.
+_DAMAGED = (
+    RuntimeError,
+    pickle.UnpicklingError,
+    EOFError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+)
+
+
+@dataclass
+class SearchState:
+    """Everything a resumed search needs beside the settings."""
+
+    iteration: int = 0
+    best_loss: float = math.inf
+    best_levels: Tensor | None = None
+    history: list[dict[str, float]] = field(default_factory=list)
+
+
+def make_parametrisation(layout: LayoutSettings, search: SearchSettings) -> Parametrisation:
+    """The free parameters named by ``search.parametrisation``."""
+    return GumbelLevels(layout) if search.parametrisation == "gumbel" else DirectLevels(layout)
+
+
+def search_layout(
+    parameters: Parametrisation,
+    objective: Objective,
+    settings: SearchSettings,
+    *,
+    folder: Path | None = None,
+    fingerprint: str = "",
+    what: str = "designing",
+) -> SearchState:
+    """Minimise ``objective`` over layouts; the printable argmax layout is what counts.
+
+    Args:
+        parameters: a started parametrisation, changed in place.
+        objective: maps levels on pixels (1, 1, size, size) to a scalar loss and its named parts.
+        folder: where ``checkpoint.pt`` is written and looked for; None to run without.
+        fingerprint: identifies the task; a checkpoint of another task is refused.
+
+    Returns:
+        The state with the argmax levels kept (``best_levels``, per cell) and the history, one
+        record per evaluated iteration: loss of the sample and of the argmax layout.
+
+    Raises:
+        InputError: the checkpoint in ``folder`` belongs to another task, or the loss is not finite.
+    """
+    optimiser_class = torch.optim.Adam if settings.optimiser == "adam" else torch.optim.AdamW
+    optimiser = optimiser_class(parameters.parameters(), lr=settings.learning_rate)
+    state = SearchState()
+    if folder is not None and (folder / _CHECKPOINT).exists():
+        state = _resume(folder / _CHECKPOINT, parameters, optimiser, fingerprint)
+    remaining = range(state.iteration, settings.iterations)
+    for iteration in progress(remaining, what, total=len(remaining)):
+        step_loss = _step(parameters, objective, optimiser, settings, iteration)
+        state.iteration = iteration + 1
+        if iteration % settings.evaluate_every == 0 or state.iteration == settings.iterations:
+            _evaluate(parameters, objective, settings, state, step_loss)
+        if folder is not None and state.iteration % settings.checkpoint_every == 0:
+            _save(folder / _CHECKPOINT, parameters, optimiser, state, fingerprint)
+    return state
+
+
+def finished_iterations(folder: Path) -> int:
+    """How many iterations an interrupted run in ``folder`` has behind it; 0 where there is none."""
+    path = folder / _CHECKPOINT
+    return int(_load(path)["iteration"]) if path.exists() else 0
+
+
+def remove_checkpoint(folder: Path) -> None:
+    """A finished design needs none."""
+    (folder / _CHECKPOINT).unlink(missing_ok=True)
+
+
+def _step(
+    parameters: Parametrisation,
+    objective: Objective,
+    optimiser: torch.optim.Optimizer,
+    settings: SearchSettings,
+    iteration: int,
+) -> float:
+    # The noise follows from seed and iteration, so that a resumed run draws what the first one would have.
+    seed = settings.seed * 1_000_003 + iteration
+    optimiser.zero_grad(set_to_none=True)
+    level = parameters.sample(settings.temperature(iteration), settings.hard(iteration), seed)
+    loss, _ = objective(level)
+    if not torch.isfinite(loss):
+        raise InputError(
+            f"loss at iteration {iteration}",
+            got=float(loss),
+            wanted="a finite number",
+            hint="lower the learning rate",
+        )
+    loss.backward()
+    optimiser.step()
+    parameters.project()
+    return float(loss.detach())
+
+
+@torch.no_grad()
+def _evaluate(
+    parameters: Parametrisation,
+    objective: Objective,
+    settings: SearchSettings,
+    state: SearchState,
+    step_loss: float,
+) -> None:
+    levels = parameters.best_levels()
+    loss, parts = objective(parameters.cells(levels)[None, None].float())
+    value = float(loss)
+    state.history.append(
+        {"iteration": state.iteration, "sample_loss": step_loss, "argmax_loss": value, **parts}
+    )
+    if settings.keep == "last" or value < state.best_loss:
+        state.best_loss, state.best_levels = value, levels.clone()
+
+
+def _save(
+    path: Path,
+    parameters: Parametrisation,
+    optimiser: torch.optim.Optimizer,
+    state: SearchState,
+    fingerprint: str,
+) -> None:
+    content = {
+        "fingerprint": fingerprint,
+        "parameters": parameters.state_dict(),
+        "optimiser": optimiser.state_dict(),
+        "iteration": state.iteration,
+        "best_loss": state.best_loss,
+        "best_levels": state.best_levels,
+        "history": state.history,
+    }
+    with atomic_file(path) as temporary:
+        torch.save(content, temporary)
+
+
+def _resume(
+    path: Path, parameters: Parametrisation, optimiser: torch.optim.Optimizer, fingerprint: str
+) -> SearchState:
+    content = _load(path)
+    if content["fingerprint"] != fingerprint:
+        raise InputError(
+            f"checkpoint {path}",
+            got="a run with other settings",
+            wanted="the same settings, target and model",
+            hint="choose another --out, or delete the checkpoint to start again",
+        )
+    parameters.load_state_dict(content["parameters"])
+    optimiser.load_state_dict(content["optimiser"])
+    best_levels = content["best_levels"]
+    if best_levels is not None:
+        best_levels = best_levels.to(next(parameters.parameters()).device)
+    return SearchState(content["iteration"], content["best_loss"], best_levels, content["history"])
+
+
+def _load(path: Path) -> dict[str, Any]:
+    """A checkpoint on the CPU: neither a full GPU nor a file that may not be read is a damaged one."""
+    stored = path.read_bytes()
+    try:
+        content: dict[str, Any] = torch.load(io.BytesIO(stored), weights_only=True, map_location="cpu")
+    except _DAMAGED:
+        raise InputError(
+            f"checkpoint {path}",
+            got="a damaged file",
+            wanted="what an interrupted run left",
+            hint="delete it to start again",
+        ) from None
+    return content

@@ -1,0 +1,110 @@
+"""How a layout is searched."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal, get_args
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import Record
+from litho_data.foundation.settings import setting
+from litho_design.optics import Optics
+from litho_design.optimisation.process_window import ProcessWindow
+from litho_design.optimisation.starts import StartName
+from litho_design.printers.layout import LayoutSettings
+
+Variant = Literal["default", "paper", "authors"]
+
+
+class SearchSettings(Record):
+    """How the layout is searched; every choice the paper leaves open is a recorded setting."""
+
+    parametrisation: Literal["gumbel", "direct"] = setting(
+        "direct",
+        "Free parameters: one height per cell (direct), or a distribution over levels per cell (gumbel)",
+        option="--parametrisation",
+    )
+    start: StartName = setting(
+        "random", "Start of the search: random, gs or wgs (holograms), fresnel (lenses)", option="--start"
+    )
+    start_iterations: int = setting(40, "Iterations of the starts gs and wgs", ge=1)
+    start_jitter_levels: float = setting(
+        0.0, "Noise added to a start that is not random", unit="levels", ge=0
+    )
+    iterations: int = setting(300, "Iterations of the search", option="--iterations", ge=1)
+    optimiser: Literal["adam", "adamw"] = setting("adam", "Optimiser")
+    learning_rate: float = setting(
+        1.0, "Step of the optimiser, in levels (direct) or logits (gumbel)", option="--learning-rate", gt=0
+    )
+    temperature_start: float = setting(2.0, "Gumbel temperature at the start", gt=0)
+    temperature_end: float = setting(0.1, "Gumbel temperature at the end", gt=0)
+    hard_from: float = setting(
+        0.6, "Share of the iterations after which samples are whole levels", ge=0, le=1
+    )
+    evaluate_every: int = setting(10, "Iterations between two evaluations of the printable layout", ge=1)
+    keep: Literal["best", "last"] = setting("best", "Which evaluated layout is kept")
+    polish_rounds: int = setting(10, "Rounds of single-level changes after the search", ge=0)
+    checkpoint_every: int = setting(50, "Iterations between two checkpoints", ge=1)
+    precision: Literal["float32", "mixed", "bfloat16"] = setting(
+        "float32",
+        "Networks of the model in the search: float32; mixed, their gradient in bfloat16; or bfloat16; "
+        "scores are always in float32",
+        option="--precision",
+    )
+    seed: int = setting(0, "Seed of start and sampling", option="--seed")
+
+    def temperature(self, iteration: int) -> float:
+        """Gumbel temperature: a half cosine from start to end."""
+        share = iteration / max(self.iterations - 1, 1)
+        weight = (1 + math.cos(math.pi * share)) / 2
+        return self.temperature_end + (self.temperature_start - self.temperature_end) * weight
+
+    def hard(self, iteration: int) -> bool:
+        """Whether this iteration samples whole levels with a straight-through gradient."""
+        return iteration >= self.hard_from * self.iterations
+
+
+# The search of the paper, for holograms and lenses; each adds its own learning rate.
+PAPER_SEARCH = SearchSettings(
+    parametrisation="gumbel",
+    start="random",
+    iterations=1000,
+    temperature_start=0.5,
+    temperature_end=0.5,
+    hard_from=1.0,
+    keep="last",
+    polish_rounds=0,
+)
+
+
+class EnsemblePenalty(Record):
+    """With further models in the search, the loss is their mean loss + weight * disagreement in waves."""
+
+    weight: float = setting(
+        1.0, "Weight of the models' disagreement, per wave of height", option="--ensemble-weight", ge=0
+    )
+
+
+class DesignSettings(Record):
+    """What the settings of every design hold."""
+
+    variant: Variant = setting(
+        "default",
+        "Preset: ours, as printed in the paper, or as in the authors' code",
+        option="--variant",
+    )
+    layout: LayoutSettings = setting(LayoutSettings(), "Layout")
+    optics: Optics = setting(Optics(), "Optics")
+    search: SearchSettings = setting(SearchSettings(), "Search")
+    window: ProcessWindow = setting(ProcessWindow(), "Process window")
+    ensemble: EnsemblePenalty = setting(EnsemblePenalty(), "Several models")
+
+
+def check_variant(variant: str) -> None:
+    """Refuse a preset that does not exist.
+
+    Raises:
+        InputError: no such preset.
+    """
+    if variant not in get_args(Variant):
+        raise InputError("variant", got=repr(variant), wanted=", ".join(get_args(Variant)))

@@ -1,0 +1,148 @@
+"""A layout: what the printer is asked for, what that takes, and how unlike the training layouts it is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import Record
+from litho_data.foundation.settings import setting
+
+# Half of the training histogram's weight elsewhere: predictions are then mostly extrapolation.
+_FLAG_DISTANCE = 0.5
+_LARGE_JUMP_LEVELS = 8
+
+
+class LayoutSettings(Record):
+    """What the printer is asked for: pixels, free cells and levels.
+
+    ``cell_um`` is the side of one free cell, or the width of one ring with ``symmetry="radial"``.
+    """
+
+    size_px: int = setting(1024, "Side of the element", unit="px", option="--size-px", ge=4)
+    pitch_um: float = setting(
+        0.1, "Side of a pixel, which must be that of the model", unit="µm", option="--pitch-um", gt=0
+    )
+    cell_um: float = setting(
+        0.4, "Side of a free cell (hologram) or width of a ring (lens)", unit="µm", option="--cell-um", gt=0
+    )
+    levels: int = setting(13, "Number of printable levels", option="--levels", ge=2, le=256)
+    level_height_um: float = setting(0.1, "Height of one level", unit="µm", option="--level-height-um", gt=0)
+    symmetry: Literal["none", "radial"] = setting("none", "Whether the free cells are rings around the axis")
+
+    @property
+    def size_um(self) -> float:
+        """Side of the element, µm."""
+        return self.size_px * self.pitch_um
+
+    @property
+    def cell_px(self) -> int:
+        """Pixels per cell side.
+
+        Raises:
+            InputError: cells that are no whole number of pixels, or that do not fill the element.
+        """
+        cell_px = round(self.cell_um / self.pitch_um)
+        if cell_px < 1 or abs(cell_px * self.pitch_um - self.cell_um) > 1e-9 or self.size_px % cell_px:
+            raise InputError(
+                "cell_um",
+                got=f"{self.cell_um} µm",
+                wanted=f"whole pixels of {self.pitch_um} µm that divide {self.size_px} px",
+            )
+        return cell_px
+
+
+class Printability(Record):
+    """Fabrication figures of a layout; lengths in µm, shares of neighbouring pixel pairs."""
+
+    pitch_um: float
+    free_cell_um: float
+    highest_um: float
+    smallest_feature_um: float
+    single_pixel_feature_share: float
+    steepest_step_um: float
+    steepest_slope: float
+    large_jump_share: float
+    used_levels: int
+    smallest_ring_um: float | None = None
+
+
+class OutOfDistribution(Record):
+    """Total-variation distance between the level histogram and that of the model's training layouts."""
+
+    level_distance: float
+    flagged: bool
+    extreme_level_share: float
+    training_extreme_level_share: float
+
+
+def printability(levels: np.ndarray, layout: LayoutSettings) -> Printability:
+    """Check a layout against what a printer must resolve.
+
+    A feature is a run of pixels of one level along a row or a column that ends at other levels on
+    both sides; runs that touch the border are not counted, they may continue in a neighbour. In a ring
+    layout rows cut rings at every angle, so the narrowest ring is also given, along a radius.
+
+    Args:
+        levels: integer levels (ny, nx).
+    """
+    runs = np.concatenate([_inner_runs(levels), _inner_runs(levels.T)])
+    steps = np.concatenate([np.abs(np.diff(levels.astype(int), axis=axis)).ravel() for axis in (0, 1)])
+    steepest = float(steps.max(initial=0)) * layout.level_height_um
+    return Printability(
+        pitch_um=layout.pitch_um,
+        free_cell_um=layout.cell_um,
+        highest_um=float(levels.max()) * layout.level_height_um,
+        smallest_feature_um=float(runs.min(initial=max(levels.shape))) * layout.pitch_um,
+        single_pixel_feature_share=float((runs == 1).mean()) if runs.size else 0.0,
+        steepest_step_um=steepest,
+        steepest_slope=steepest / layout.pitch_um,
+        large_jump_share=float((steps >= _LARGE_JUMP_LEVELS).mean()) if steps.size else 0.0,
+        used_levels=len(np.unique(levels)),
+        smallest_ring_um=_smallest_ring_um(levels, layout),
+    )
+
+
+def out_of_distribution(
+    levels: np.ndarray, layout: LayoutSettings, card: Mapping[str, Any]
+) -> OutOfDistribution | None:
+    """Compare the level histogram with the one in a model's card; None where the card has none."""
+    trained = np.asarray(card.get("training_level_share") or [], dtype=float)
+    if trained.size == 0:
+        return None
+    count = max(layout.levels, trained.size)
+    share = np.bincount(levels.ravel(), minlength=count) / levels.size
+    trained = np.pad(trained / trained.sum(), (0, count - trained.size))
+    distance = float(np.abs(share - trained).sum()) / 2
+    top = layout.levels - 1
+    return OutOfDistribution(
+        level_distance=distance,
+        flagged=distance > _FLAG_DISTANCE,
+        extreme_level_share=float(share[0] + share[top]),
+        training_extreme_level_share=float(trained[0] + trained[top]),
+    )
+
+
+def _smallest_ring_um(levels: np.ndarray, layout: LayoutSettings) -> float | None:
+    """Narrowest run of one level along the radius; None without rings, or where only one level is left."""
+    if layout.symmetry != "radial":
+        return None
+    middle = levels.shape[0] // 2
+    edges = np.flatnonzero(np.diff(levels[middle, middle:].astype(int))) + 1
+    if edges.size == 0:
+        return None
+    # The central disc is twice as wide as its run, and the outermost ring may be cut.
+    widths = [2 * int(edges[0]), *np.diff(edges).tolist()]
+    return min(widths) * layout.pitch_um
+
+
+def _inner_runs(levels: np.ndarray) -> np.ndarray:
+    """Lengths, pixels, of the runs of equal level along the rows that touch no border."""
+    lengths = []
+    for row in levels:
+        edges = np.flatnonzero(np.diff(row)) + 1
+        lengths.append(np.diff(edges))
+    return np.concatenate(lengths) if lengths else np.empty(0, int)

@@ -1,0 +1,161 @@
+"""Sections and plots that several reports share."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from litho_data.foundation.report import Page, new_figure
+from litho_data.foundation.results import Record
+from litho_design.optimisation.process_window import ProcessWindow, spreads
+from litho_design.reports.advice import distribution_warning
+from litho_design.tasks.design import Design
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+# Brightest intensity shown, in units of the target's white; speckle beyond it is clipped.
+BRIGHTEST = 1.5
+
+
+def add_notes(page: Page, design: Design) -> None:
+    """What a reader of any design must know first: whose figures these are, and what was adapted."""
+    page.note(
+        "These figures are the design model's own opinion of its design. Judge the layout with another "
+        "model (litho-design score, litho-design compare) before printing it."
+    )
+    for note in design.notes:
+        page.note(note[0].upper() + note[1:] + ".")
+
+
+def progress_figure(history: list[dict[str, float]], design: Design):
+    """Loss against iteration."""
+    figure = new_figure(8, 3.4)
+    axis = figure.subplots()
+    steps = [entry["iteration"] for entry in history]
+    axis.plot(steps, [entry["sample_loss"] for entry in history], color="0.6", label="sampled layout")
+    axis.plot(steps, [entry["argmax_loss"] for entry in history], color="tab:blue", label="argmax layout")
+    axis.axhline(design.polished_loss, color="tab:green", linewidth=1, label="after polish")
+    axis.set_xlabel("iteration")
+    axis.set_ylabel("loss")
+    axis.legend()
+    return figure
+
+
+def add_yield(
+    page: Page, draws: list[dict[str, float]], window: ProcessWindow, figures: dict[str, tuple[float, str]]
+) -> None:
+    """Yield curves of a design.
+
+    Args:
+        draws: figures of single prints on single benches.
+        window: the spreads that were drawn from.
+        figures: name to value of the print as modelled, and label.
+    """
+    import pandas as pd
+
+    page.heading("Process window")
+    designed = "in the loss" if window.samples else "not in the loss: designed for the print as modelled"
+    page.paragraph(
+        f"Share of {len(draws)} random prints that is at least as good as the value on the axis. No search "
+        f"has seen these prints; the window was {designed}. Their standard deviations: "
+        f"{'; '.join(spreads(window))}."
+    )
+    figure = new_figure(8, 3)
+    axes = figure.subplots(1, len(figures), sharey=True)
+    for axis, (name, (modelled, label)) in zip(axes, figures.items(), strict=True):
+        values = np.sort([draw[name] for draw in draws])
+        axis.step(values, 1 - np.arange(len(values)) / len(values), where="pre")
+        axis.axvline(modelled, color="0.5", linestyle="--", linewidth=1)
+        axis.set_xlabel(label)
+    axes[0].set_ylabel("yield")
+    page.figure(figure, "Yield curves; the dashed line is the print as modelled.")
+    page.table(pd.DataFrame(draws), "Single draws", "window.csv", digits=3)
+
+
+def meanings(score: type[Record]) -> dict[str, str]:
+    """What each number of a score means."""
+    return {name: field.description or "" for name, field in score.model_fields.items()}
+
+
+def score_table(score: Mapping[str, float], labels: Mapping[str, str]) -> pd.DataFrame:
+    """One row per number of a score, with its meaning."""
+    import pandas as pd
+
+    return pd.DataFrame(
+        [(name, value, labels[name]) for name, value in score.items()], columns=["name", "value", "meaning"]
+    )
+
+
+def level_table(design: Design) -> pd.DataFrame:
+    """Level, nominal and printed height, and printed waves above level 0."""
+    import pandas as pd
+
+    printed, step_um = design.stroke.printed_height_um, design.layout.level_height_um
+    wave_um = design.optics.wave_height_um
+    return pd.DataFrame(
+        {
+            "level": range(len(printed)),
+            "nominal_um": [level * step_um for level in range(len(printed))],
+            "printed_um": printed,
+            "printed_waves": [(height - printed[0]) / wave_um for height in printed],
+        }
+    )
+
+
+def add_gauge(page: Page, design: Design) -> None:
+    """What the layout asks of the printer, and how far it is from the model's training layouts."""
+    import pandas as pd
+
+    page.heading("What the layout asks of the printer")
+    warning = distribution_warning(design)
+    if warning:
+        page.note(warning[0].upper() + warning[1:] + ".")
+    gauge = design.out_of_distribution
+    tiling, ensemble = design.tiling, design.ensemble
+    if tiling is not None:
+        page.paragraph(
+            f"Whole field against {tiling.tiles} tiles of {tiling.tile_px} px with their halo: the "
+            f"predicted height differs by {tiling.rms_nm:.2g} nm rms, {tiling.max_nm:.2g} nm at most."
+        )
+    if ensemble is not None:
+        names = ", ".join(member.name for member in ensemble.members)
+        page.paragraph(
+            f"Designed together with {names}: here the models are {ensemble.disagreement_nm:.1f} nm "
+            f"({ensemble.disagreement_waves:.3f} waves) apart, rms over the pixels."
+        )
+    figures = design.printability.model_dump() | (gauge.model_dump() if gauge else {})
+    given = {name: float(value) for name, value in figures.items() if value is not None}
+    frame = pd.DataFrame({"name": list(given), "value": list(given.values())})
+    page.table(frame, "Lengths in µm; shares of pixel pairs or runs", "printability.csv", digits=3)
+
+
+def image_grid(
+    images: list[list[np.ndarray]], titles: list[list[str]], row_labels: list[str], side_um: float
+) -> Figure:
+    """Intensity images in rows and columns on one scale.
+
+    Args:
+        images: rows of images (m, m) at the scale of the target.
+        titles: one title per image.
+        row_labels: left of each row.
+        side_um: extent of every image, µm.
+    """
+    rows, columns = len(images), max(len(row) for row in images)
+    figure = new_figure(2.3 * columns + 0.6, 2.45 * rows)
+    axes = figure.subplots(rows, columns, squeeze=False)
+    for axis in axes.flat:
+        axis.set_xticks([])
+        axis.set_yticks([])
+        axis.axis("off")
+    for row, (pictures, names) in enumerate(zip(images, titles, strict=True)):
+        for column, (picture, name) in enumerate(zip(pictures, names, strict=True)):
+            axis = axes[row, column]
+            axis.axis("on")
+            axis.imshow(picture, cmap="inferno", vmin=0, vmax=BRIGHTEST, extent=(0, side_um, side_um, 0))
+            axis.set_title(name, fontsize=8)
+        axes[row, 0].set_ylabel(row_labels[row], fontsize=10)
+    return figure

@@ -1,0 +1,246 @@
+"""One way to run every design task: start, search, polish, score, write; an interrupted run is continued."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import writable
+from litho_data.foundation.hashes import record_sha256
+from litho_data.foundation.outputs import require_own_folder
+from litho_data.foundation.results import Record
+from litho_data.foundation.run_facts import run_facts
+from litho_design.images.targets import TargetRecord
+from litho_design.optics.stroke import measure_stroke
+from litho_design.optimisation.budget import Budget, measure_budget, peak_memory_gib
+from litho_design.optimisation.parameters import Parametrisation
+from litho_design.optimisation.polish import polish_levels
+from litho_design.optimisation.robust import measure_disagreement
+from litho_design.optimisation.search import (
+    SearchState,
+    finished_iterations,
+    make_parametrisation,
+    remove_checkpoint,
+    search_layout,
+)
+from litho_design.optimisation.settings import DesignSettings
+from litho_design.printers.layout import out_of_distribution, printability
+from litho_design.printers.printer import Printer
+from litho_design.tasks.design import (
+    HEIGHT_FILE,
+    LEVELS_FILE,
+    Design,
+    RunRecord,
+    TaskName,
+    write_arrays,
+    write_level_image,
+)
+
+
+class Task(Protocol):
+    """A hologram or a lens, ready to be optimised through one printer."""
+
+    @property
+    def name(self) -> TaskName: ...
+    @property
+    def printer(self) -> Printer: ...
+    @property
+    def printers(self) -> Sequence[Printer]: ...
+    @property
+    def target_record(self) -> TargetRecord | None: ...
+    @property
+    def notes(self) -> Sequence[str]:
+        """What was adapted, for the record."""
+
+    def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
+        """Loss and its parts, of levels on the pixels (1, 1, size, size)."""
+
+    def start(self, parameters: Parametrisation, level_heights_um: list[float]) -> None:
+        """Set the start of the search."""
+
+    def score(self, height_um: Tensor) -> Record:
+        """Score of a printed height map (size, size), µm."""
+
+    def arrays(self, height_um: Tensor) -> dict[str, np.ndarray]:
+        """What is kept beside levels and heights, by file name."""
+
+    def reference_efficiency(self) -> float | None:
+        """What an ideal element would reach, where that is defined."""
+
+
+# Writes what people read into the folder of a design, from its record and the history of its search.
+Report = Callable[[Path, Design, list[dict[str, float]]], object]
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    levels: Tensor
+    state: SearchState
+    start_loss: float
+    polished_loss: float
+    budget: Budget
+    seconds: float
+
+
+def run_design(
+    task: Task,
+    settings: DesignSettings,
+    out: str | Path,
+    report: Report,
+    *,
+    announce: bool = True,
+) -> Design:
+    """Optimise, polish and score one layout, and write the folder ``out``.
+
+    The folder may hold an interrupted run of the same task (it goes on and ends as if it had never
+    stopped) or a finished one (it is returned as it is). The weights of every model are hashed before
+    and after; a model that changed leaves no design.
+
+    Args:
+        report: writes the report; the arrays are in the folder then, and the record is written after it.
+        announce: print the expected time and memory to stderr before starting.
+
+    Raises:
+        InputError: ``out`` holds another design or result, a printer only judges, or a model
+            changed meanwhile.
+    """
+    _check_printers(task.printers)
+    folder = Path(out)
+    require_own_folder(folder, Design.FILE_NAME)
+    hashes_before = [printer.weights_sha256() for printer in task.printers]
+    target = task.target_record.model_dump(mode="json") if task.target_record else None
+    fingerprint = record_sha256([task.name, settings.model_dump(mode="json"), hashes_before, target])
+    finished = _finished(folder, fingerprint)
+    if finished is not None:
+        return finished
+    with writable(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    heights = task.printer.level_heights_um()
+    with ExitStack() as precisions:
+        for printer in task.printers:
+            precisions.enter_context(printer.at_precision(settings.search.precision))
+        outcome = _optimise(task, settings, folder, fingerprint, heights, announce)
+    cells = make_parametrisation(settings.layout, settings.search).to(outcome.levels.device).cells
+    layout_level = cells(outcome.levels)
+    level = layout_level[None, None].float()
+    with torch.no_grad():
+        height = task.printer(level)[0, 0]
+    hashes_after = [printer.weights_sha256() for printer in task.printers]
+    for printer, before, after in zip(task.printers, hashes_before, hashes_after, strict=True):
+        if after != before:
+            raise InputError(
+                f"model {printer.name}",
+                got="weights or buffers that changed while a layout was designed through it",
+                wanted="a model that printing leaves as it is",
+            )
+    layout_array = layout_level.cpu().numpy().astype(np.uint8)
+    arrays = {LEVELS_FILE: layout_array, HEIGHT_FILE: height.cpu().numpy(), **task.arrays(height)}
+    files = write_arrays(folder, arrays) | write_level_image(folder, layout_array)
+    design = Design(
+        task=task.name,
+        variant=settings.variant,
+        fingerprint=fingerprint,
+        run=RunRecord(
+            **run_facts(),
+            device=str(height.device),
+            threads=torch.get_num_threads(),
+            seconds=outcome.seconds,
+            seconds_per_iteration=outcome.budget.seconds_per_iteration,
+            peak_memory_gib=peak_memory_gib(height.device),
+        ),
+        settings=settings.model_dump(mode="json"),
+        layout=settings.layout,
+        optics=settings.optics,
+        target=task.target_record,
+        printer=task.printer.record(),
+        printer_unchanged=hashes_after == hashes_before,
+        tiling=task.printer.tiling_check(level),
+        ensemble=measure_disagreement(task.printers, level, settings.optics.wave_height_um),
+        stroke=measure_stroke(
+            heights, settings.optics.wave_height_um, level_height_um=settings.layout.level_height_um
+        ),
+        printability=printability(layout_array, settings.layout),
+        out_of_distribution=out_of_distribution(layout_array, settings.layout, task.printer.card),
+        notes=list(task.notes),
+        iterations=outcome.state.iteration,
+        start_loss=outcome.start_loss,
+        sample_loss=outcome.state.history[-1]["sample_loss"],
+        argmax_loss=outcome.state.best_loss,
+        polished_loss=outcome.polished_loss,
+        reference_efficiency=task.reference_efficiency(),
+        predicted=task.score(height).model_dump(),
+        files=files,
+    )
+    report(folder, design, outcome.state.history)
+    design.write(folder)
+    remove_checkpoint(folder)
+    return design
+
+
+def _check_printers(printers: Sequence[Printer]) -> None:
+    for printer in printers:
+        if printer.only_judges:
+            raise InputError(
+                f"model {printer.name}",
+                got="a virtual fab",
+                wanted="a frozen model, or none",
+                hint="the fab only judges: --judge",
+            )
+
+
+def _finished(folder: Path, fingerprint: str) -> Design | None:
+    if not (folder / Design.FILE_NAME).exists():
+        return None
+    design = Design.read(folder)
+    if design.fingerprint != fingerprint:
+        raise InputError(
+            f"folder {folder}",
+            got="a design with other settings",
+            wanted="an empty folder",
+            hint="choose another --out",
+        )
+    return design
+
+
+def _optimise(
+    task: Task,
+    settings: DesignSettings,
+    folder: Path,
+    fingerprint: str,
+    heights: list[float],
+    announce: bool,
+) -> _Outcome:
+    started = time.monotonic()
+    search = settings.search
+    parameters = make_parametrisation(settings.layout, search).to(task.printer.device)
+    task.start(parameters, heights)
+    with torch.no_grad():
+        start_loss = float(task.objective(parameters.cells(parameters.best_levels())[None, None].float())[0])
+    budget = measure_budget(parameters, task.objective, search)
+    if announce:
+        for note in task.notes:
+            print(note, file=sys.stderr)
+        print(budget.sentence(search, finished_iterations(folder)), file=sys.stderr)
+    state = search_layout(parameters, task.objective, search, folder=folder, fingerprint=fingerprint)
+    levels, polished = state.best_levels, state.best_loss
+    assert levels is not None
+    if search.polish_rounds:
+        levels, losses = polish_levels(
+            levels,
+            parameters.cells,
+            task.objective,
+            level_count=settings.layout.levels,
+            rounds=search.polish_rounds,
+        )
+        polished = losses[-1]
+    return _Outcome(levels, state, start_loss, polished, budget, time.monotonic() - started)

@@ -1,0 +1,154 @@
+"""Design with every arm and print with every judge: the design-to-manufacturing gap, as one folder."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.outputs import require_own_folder
+from litho_data.foundation.run_facts import run_facts
+from litho_design.holograms.settings import HologramSettings
+from litho_design.images.targets import Target, load_target
+from litho_design.judging.gap import (
+    HEADLINE,
+    GapEntry,
+    GapResult,
+    design_folder,
+    paired_differences,
+    summarise,
+)
+from litho_design.judging.loaded import load_design
+from litho_design.lenses.objects import bring_objects
+from litho_design.lenses.settings import LensSettings
+from litho_design.printers.printer import Printer
+from litho_design.printers.source import Device, load_printers
+from litho_design.reports.gap import write_gap_report
+from litho_design.tasks.design import Design
+from litho_design.workflows.design import design_hologram, run_lens
+
+Settings = HologramSettings | LensSettings
+Models = Mapping[str, str | Path | Printer] | Iterable[str | Printer]
+
+
+def compare(
+    settings: Settings,
+    arms: Models,
+    out: str | Path,
+    *,
+    judges: Models = (),
+    target: str | Path | np.ndarray | Target = "text",
+    objects: Sequence[str | Path] = (),
+    held_out_objects: Sequence[str | Path] = (),
+    seeds: Iterable[int] = (0, 1, 2),
+    device: Device = "cpu",
+    extrapolate: bool = False,
+    announce: bool = True,
+) -> GapResult:
+    """Design once per arm and seed with equal budgets, and print each layout with every judge.
+
+    All arms share every setting but the printer; a finished or interrupted design in ``out`` is
+    used again or continued. The arms' own printers judge too, so that the whole matrix is there.
+
+    Args:
+        settings: of a hologram or a lens, which decides what is designed; the seed of the search is
+            replaced by those of ``seeds``.
+        arms: printers to design with: models by name, or NAME=MODEL, MODEL, ``none`` and loaded printers.
+        out: folder of the comparison.
+        judges: further printers that only judge.
+        target: wanted image, for holograms.
+        objects, held_out_objects: as for ``design_lens``.
+        seeds: one design per arm and seed.
+        device, extrapolate, announce: as for ``design_hologram``.
+
+    Returns:
+        The record written to ``out/gap.json``.
+
+    Raises:
+        InputError: no arm or no seed, a judge with the name of an arm, or an ``out`` that holds another
+            kind of result; and what designing raises.
+    """
+    every_seed = list(seeds)
+    fit: Any = {"device": device, "extrapolate": extrapolate}
+    designers = load_printers(arms, settings.layout, **fit)
+    others = load_printers(judges, settings.layout, **fit)
+    _check(designers, others, every_seed)
+    folder = Path(out)
+    require_own_folder(folder, GapResult.FILE_NAME)
+    designed: Callable[[Settings, Printer, Path], Design]
+    # What is wrong with a printer is said before a target is drawn or a picture read.
+    if isinstance(settings, HologramSettings):
+        if objects or held_out_objects:
+            raise InputError(
+                "objects", got="the hoe task, which has a target", wanted="a lens", hint="--target"
+            )
+        wanted = load_target(target, settings.layout.size_px)
+
+        def designed(settings, printer, place):
+            return design_hologram(wanted, printer, place, settings=settings, announce=announce)
+    else:
+        settings, pictures = bring_objects(settings, objects, held_out_objects)
+
+        def designed(settings, printer, place):
+            return run_lens(settings, printer, place, pictures, announce=announce)
+
+    everyone = {**designers, **others}
+    entries: list[GapEntry] = []
+    for (arm, printer), seed in itertools.product(designers.items(), every_seed):
+        search = settings.search.model_copy(update={"seed": seed})
+        place = design_folder(folder, arm, seed)
+        design = designed(settings.model_copy(update={"search": search}), printer, place)
+        entries += _judged(place, arm, seed, everyone)
+    result = GapResult(
+        task=design.task,
+        **run_facts(),
+        settings=settings,
+        target=design.target.name if design.target else "",
+        seeds=every_seed,
+        arms={name: printer.record() for name, printer in designers.items()},
+        judges={name: printer.record() for name, printer in everyone.items()},
+        entries=entries,
+        summary=summarise(entries),
+        paired=paired_differences(entries, HEADLINE[design.task]),
+    )
+    write_gap_report(folder, result, everyone)
+    result.write(folder)
+    return result
+
+
+def _judged(place: Path, arm: str, seed: int, printers: Mapping[str, Printer]) -> list[GapEntry]:
+    """One finished design as every printer prints it."""
+    own = printers[arm]
+    loaded = load_design(place, device=own.device)
+    expected = loaded.printed_um(own)
+    entries = []
+    for name, printer in printers.items():
+        printed = loaded.printed_um(printer)
+        entries.append(
+            GapEntry(
+                arm=arm,
+                seed=seed,
+                judge=name,
+                self_judged=name == arm,
+                designed=loaded.record.predicted,
+                judged=loaded.score(printed).model_dump(),
+                rms_height_gap_um=float((printed - expected).square().mean().sqrt()),
+            )
+        )
+    return entries
+
+
+def _check(arms: Mapping[str, Printer], judges: Mapping[str, Printer], seeds: Sequence[int]) -> None:
+    if not arms or not seeds:
+        raise InputError(
+            "comparison", got=f"{len(arms)} arms, {len(seeds)} seeds", wanted="at least one of each"
+        )
+    both = sorted(set(arms) & set(judges))
+    if both:
+        raise InputError(
+            "judges", got=f"{both[0]!r} twice", wanted="names that no arm has", hint="arms judge anyway"
+        )
