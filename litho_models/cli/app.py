@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 import typer
 
+import litho_models
 from litho_data.foundation.commands import new_app, run_app
 from litho_models.cli.loop import close_loop
 from litho_models.cli.noise import noise
@@ -19,7 +20,7 @@ StorePath = Annotated[Path, typer.Argument(help="dataset store made by `litho-da
 Out = Annotated[Path, typer.Option(help="folder of the result")]
 PolicyOption = Annotated[
     Literal["none", "offset", "offset-gain", "full", "full+rows"],
-    typer.Option(help="nuisances that a scan may be freed of in mae_datum_free"),
+    typer.Option(help="nuisances that a scan is freed of in mae_datum_free"),
 ]
 BackgroundOption = Annotated[
     Literal["training", "none"],
@@ -30,7 +31,9 @@ BackgroundOption = Annotated[
 ]
 NoiseOption = Annotated[
     Path | None,
-    typer.Option(help="noise.json of `litho-models noise` on this dataset, for the floor beside the errors"),
+    typer.Option(
+        help="noise.json of `litho-models noise` on this dataset, to show its floor beside the errors"
+    ),
 ]
 RecipeOption = Annotated[
     Literal["fast", "paper"],
@@ -65,11 +68,9 @@ def train(
         typer.Option("--use-lock-box", help="train on the locked scans too; nothing is left to judge by"),
     ] = False,
 ) -> None:
-    """Train a model on all scans but the locked ones; the same command continues a killed run."""
-    from litho_models.fitting.runs import train as train_model
-
+    """Train a model on all scans but the locked ones; resumable."""
     settings = {"seed": seed, **_given(steps=steps, precision=precision)}
-    run = train_model(
+    run = litho_models.train(
         store, model, out, recipe=recipe, variant=variant, settings=settings, use_lock_box=use_lock_box
     )
     typer.echo(f"{model} trained on {len(run.training_ids)} scans in {run.seconds:.0f} s: {out}")
@@ -95,10 +96,9 @@ def evaluate(
     ] = False,
 ) -> None:
     """Score one frozen model on a store; on the dataset it was trained on, without the locked scans."""
-    from litho_models.evaluation.evaluate import evaluate as evaluate_model
     from litho_models.evaluation.reports import lock_box_text
 
-    result = evaluate_model(
+    result = litho_models.evaluate(
         model,
         store,
         out,
@@ -142,14 +142,13 @@ def benchmark(
         typer.Option(min=0, help="of weights and crops alone, same split; --seed by default"),
     ] = None,
 ) -> None:
-    """Train every model per fold and score it on scans it never saw; resumable."""
+    """Train every model per fold and score it on scans it has not seen; resumable."""
     from litho_models.evaluation.benchmark import DEFAULT_MODELS
-    from litho_models.evaluation.benchmark import benchmark as run_benchmark
     from litho_models.evaluation.tables import headline_table
 
     settings = {"recipe": recipe, "variant": variant}
     settings |= _given(steps=steps, precision=precision, seed=training_seed)
-    result = run_benchmark(
+    result = litho_models.benchmark(
         store,
         out,
         split=split,
@@ -172,9 +171,7 @@ def compare(
     second: Annotated[Path, typer.Argument(help="another one, of the same protocol")],
 ) -> None:
     """Difference of two results, paired by scan; refuses different data, folds or nuisances."""
-    from litho_models.evaluation.compare import compare as compare_results
-
-    typer.echo(compare_results(first, second).round(3).to_string(index=False))
+    typer.echo(litho_models.compare(first, second).round(3).to_string(index=False))
 
 
 @app.command()
@@ -189,9 +186,7 @@ def freeze(
     ] = None,
 ) -> None:
     """Write the process model only: weights, card and a page for people."""
-    from litho_models.frozen.freezing import freeze as freeze_run
-
-    card = freeze_run(run, out, declare_process or [])
+    card = litho_models.freeze(run, out, declare_process or [])
     typer.echo(f"{card.name}: {card.parameters} parameters, frozen in {out}")
 
 

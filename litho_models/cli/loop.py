@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
+
+import litho_models
 
 
 def close_loop(
@@ -53,7 +54,7 @@ def close_loop(
     seed: Annotated[int, typer.Option("--seed", min=0, help="folds and bootstrap, not the lock box")] = 0,
 ) -> None:
     """Find what a model lacks on measured prints, add it, and report the error on held-out scans (nm)."""
-    from litho_models.loop import LoopConfig, close_loop_on_store, parse_priors
+    from litho_models.loop import LoopConfig, parse_priors
 
     config = LoopConfig(
         folds=folds,
@@ -64,21 +65,23 @@ def close_loop(
         prior_hypotheses=parse_priors(prior),
         inject=tuple(inject or ()),
     )
-    result = close_loop_on_store(
+    result = litho_models.close_loop(
         store,
         out,
         base=base,
         config=config,
         steps=steps,
         cache=cache,
-        report=lambda message: print(message, file=sys.stderr, flush=True),
+        report=lambda message: typer.echo(message, err=True),
     )
-    print(f"verdict: {result.verdict}")
-    print(
+    typer.echo(f"verdict: {result.verdict}")
+    typer.echo(
         f"datum-free error, held out: {result.before.mae_datum_free_nm:.2f} -> "
         f"{result.after.mae_datum_free_nm:.2f} nm"
     )
     for effect in result.effects:
         alike = f" (or {', '.join(effect.confusable_with)})" if effect.confusable_with else ""
-        print(f"  {effect.name}{alike}: {effect.verdict}, {effect.before_nm:.2f} -> {effect.after_nm:.2f} nm")
-    print(f"report: {out / 'report.html'}")
+        typer.echo(
+            f"  {effect.name}{alike}: {effect.verdict}, {effect.before_nm:.2f} -> {effect.after_nm:.2f} nm"
+        )
+    typer.echo(f"report: {out / 'report.html'}")

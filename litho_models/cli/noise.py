@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+import litho_models
 from litho_data.foundation.errors import InputError
 
 # What only single files need, and what only a store has.
@@ -44,11 +45,11 @@ def noise(
     seed: Annotated[int, typer.Option(min=0, help="seed of the pixels drawn")] = 0,
 ) -> None:
     """Roughness, dose matrix, bounds on the noise, σ(x) and its calibration; lengths in µm, noise in nm."""
-    from litho_models.noise import analyse_noise, analyse_noise_of_files
+    from litho_models.noise import analyse_noise_of_files
 
     _check_given(context)
     if store is not None:
-        result = analyse_noise(store, out, residuals=residuals or (), model=model, seed=seed)
+        result = litho_models.analyse_noise(store, out, residuals=residuals or (), model=model, seed=seed)
     else:
         result = analyse_noise_of_files(
             out,

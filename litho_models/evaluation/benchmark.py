@@ -1,6 +1,6 @@
 """All models on one dataset under one protocol: trained per fold, scored on scans never seen.
 
-A benchmark that was stopped continues where it was, and an unchanged fit is never repeated.
+An interrupted benchmark resumes, and an unchanged fit is never repeated.
 """
 
 from __future__ import annotations
@@ -52,13 +52,13 @@ def benchmark(
         store: dataset store.
         out: result folder; ``out/cache`` keeps every fit.
         split: ``grouped`` by scan, ``leave-one-print-out``, or ``paper``: one random 75/25 draw of
-            quadrants over all scans, leaky, for comparison with the paper only.
-        models: names of models; baselines cost next to nothing and belong in the table.
+            quadrants over all scans; it leaks and is for comparison with the paper only.
+        models: names of models; baselines cost next to nothing.
         settings: fields of ``TrainingConfig`` that replace the recipe's.
         folds: number of folds of ``grouped``, at most the number of development scans.
         policy: nuisances of ``mae_datum_free_nm``.
         background: whether each fit's background, learned on its training scans, is added to its predictions.
-        noise: ``noise.json`` of this dataset, or its folder: the floor beside the errors is the one in it.
+        noise: ``noise.json`` of this dataset, or its folder: its floor is shown beside the errors.
         open_lock_box: also train on all development scans and score the locked ones.
         seed: of the split, the nuisance blocks and the training.
 

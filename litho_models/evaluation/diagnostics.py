@@ -1,4 +1,4 @@
-"""What a benchmark records of each fit beside its held-out predictions; only the fitted model can tell it."""
+"""What a benchmark records of each fit besides its predictions, while the fitted model is at hand."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class TileConsistency(Record):
 class FitDiagnostics(Record):
     """One fitted model on its own scans and on those held out.
 
-    The three errors are alike, so that over-fitting shows: mean over scans of the datum-free error of
-    policy ``offset``, without a background. Fits without inner validation have none there.
+    The three errors are comparable, which shows over-fitting: the mean over scans of the datum-free error of
+    policy ``offset``, without a background. ``inner_validation_nm`` is None for fits without it.
     """
 
     background: Background
@@ -50,7 +50,7 @@ def diagnose(
 
     Args:
         model: the model; ``scans``: all that it was fitted to, of which ``validation_ids`` chose the weights.
-        held_out: scans that it never saw; ``held_out_um``: its heights (ny, nx) for them, µm.
+        held_out: scans that it has not seen; ``held_out_um``: its heights (ny, nx) for them, µm.
     """
     heights, cost = measured_predictions(lambda scan: predict_scan(model, scan), scans, device_of(model))
     seen = {scan.id: height for scan, height in zip(scans, heights, strict=True)}

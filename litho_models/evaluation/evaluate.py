@@ -53,10 +53,10 @@ def evaluate(
         model: folder of a frozen model, or ``zoo:NAME``.
         store: dataset store.
         out: folder for ``evaluation.json``, ``report.html`` and the CSV tables.
-        policy: nuisances that a scan may be freed of.
+        policy: nuisances that a scan is freed of.
         background: whether the background in the model's card is added to the predictions; a card without
             one, or with one of fields of another size, adds none, and the result says so.
-        noise: ``noise.json`` of this dataset, or its folder: the floor beside the errors is the one in it.
+        noise: ``noise.json`` of this dataset, or its folder: its floor is shown beside the errors.
         scan_ids: exactly these scans, locked ones among them too.
         extrapolate: accept layouts beyond the model's calibrated range.
         open_lock_box: score the locked scans also of the prints that the model was trained on.

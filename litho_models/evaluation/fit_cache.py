@@ -25,7 +25,7 @@ _FIT, _DIAGNOSTICS, _PREDICTION = "fit.json", "diagnostics.json", "prediction_{:
 class FitRecord(Record):
     """One fit: what it saw and what it cost; errors are nm, None where the model has no rounds.
 
-    ``diagnostics`` are None in results of before they were made.
+    ``diagnostics`` are None in older result files.
     """
 
     model: str
@@ -45,10 +45,10 @@ class FitRecord(Record):
 def fit_or_load(
     name: str, fold: Fold, config: TrainingConfig, cache: Path
 ) -> tuple[FitRecord, list[np.ndarray]]:
-    """One fit and its heights (ny, nx) of the held-out scans, µm; made only where the cache has none.
+    """One fit and its heights (ny, nx) of the held-out scans, µm; made only if the cache has none.
 
     Raises:
-        InputError: what the cache has cannot be read.
+        InputError: a kept fit that cannot be read.
     """
     untrained = build_model(name, config.variant, **common_geometry(fold.training))
     key = run_key(untrained, fold.training, config, [scan.id for scan in fold.held_out])

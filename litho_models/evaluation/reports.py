@@ -24,7 +24,7 @@ _SPLIT_TEXT = {
     "grouped": "whole scans are held out; scans of the lock box are in no fold",
     "leave-one-print-out": "all scans of one print are held out at a time; the lock box is in no fold",
     "paper": "a random quarter of the quadrants is held out: quadrants of one scan lie on both sides, so "
-    "this split is leaky and serves comparison with the paper only",
+    "this split leaks and serves comparison with the paper only",
 }
 
 
@@ -154,7 +154,7 @@ def lock_box_text(split: ScoredSplit) -> str:
 
 
 def paper_sentence(split: str) -> str:
-    """Why a figure here is or is not comparable with the paper's."""
+    """Why an error here is or is not comparable with the paper's."""
     shared = (
         f"The paper reports {plots.PAPER_MAE_NM} nm for PBL on 24 of 96 random quadrants, on 8-bit heights "
         "shifted to a minimum of zero, for the checkpoint chosen on those same quadrants. "
@@ -162,7 +162,7 @@ def paper_sentence(split: str) -> str:
     if split == "paper":
         return shared + (
             "This split is of the same kind, but heights are floating point and the checkpoint is not chosen "
-            "on the scored quadrants: close to comparable, with mae_abs, as a leaky figure."
+            "on the scored quadrants: its mae_abs is close to comparable, and leaks."
         )
     return shared + (
         "Here whole scans are held out and nothing is chosen on them; mae_abs carries the unknown datum of "
@@ -194,7 +194,7 @@ def _all_numbers(page: Page, scores: Sequence[ModelScores], by_scan: str, by_lev
     page.heading("Tables")
     page.table(tables.scan_table(scores), by_scan, "scans.csv")
     page.table(tables.level_table(scores), by_level, "levels.csv")
-    page.heading("Things worth knowing about these numbers")
+    page.heading("Notes on these numbers")
     for note in tables.caveats(scores):
         page.paragraph(note)
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def headline_table(scores: Sequence[ModelScores], floor: NoiseFloor) -> pd.DataFrame:
-    """One row per model: both error figures with intervals, spread and bias; below them the noise floor."""
+    """One row per model: both errors with intervals, spread and bias; below them the noise floor."""
     import pandas as pd
 
     rows = [
@@ -45,7 +45,7 @@ def headline_table(scores: Sequence[ModelScores], floor: NoiseFloor) -> pd.DataF
 
 
 def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol) -> pd.DataFrame:
-    """One row per model and background, one column per policy; of line offsets their effective number."""
+    """One row per model and background, one column per policy; for line offsets the effective number."""
     import pandas as pd
 
     rows = []
@@ -121,10 +121,10 @@ def interval_text(interval: Interval) -> str:
 
 
 def protocol_text(protocol: NuisanceProtocol) -> str:
-    """How the datum-free figure was obtained, in one paragraph."""
+    """How the datum-free error was obtained, in one paragraph."""
     lines = " and its line offsets" if protocol.policy == "full+rows" else ""
     return (
-        f"mae_abs has no fit at test time. mae_datum_free frees each scan of the nuisances of policy "
+        f"mae_abs has no fit at test time. mae_datum_free first frees each scan of the nuisances of policy "
         f"'{protocol.policy}' (k = {protocol.k:g} per scan{lines}), fitted on one half of a checkerboard of "
         f"{protocol.block_px} px blocks shrunk by {protocol.buffer_px} px and scored on the other half, "
         "both halves swapped; 'full+rows' uses stripes of columns instead. Means are per scan first, then "
@@ -136,7 +136,7 @@ _BACKGROUND_TEXT = {
     "none": "Background 'none': predictions are those of the print alone.",
     "training": "Background 'training': to each prediction is added what the training scans have in common "
     "beside their prints (five smooth terms, nothing fitted to the scored scan); the table of policies has "
-    "the errors without it too. Policies with smooth terms of their own cannot tell the difference.",
+    "the errors without it too. It makes no difference to policies with smooth terms of their own.",
 }
 
 
@@ -155,7 +155,7 @@ def metric_text() -> str:
 
 
 def band_text() -> str:
-    """What the figures of ``band_table`` are."""
+    """What the columns of ``band_table`` are."""
     return (
         "half_power is where predicted over measured falls to 1/√2 of that at the lowest frequencies, "
         "noise_band the width of the ideal low pass that lets as much white noise through; along x and y."
@@ -163,7 +163,7 @@ def band_text() -> str:
 
 
 def caveats(scores: Sequence[ModelScores]) -> list[str]:
-    """Things worth knowing about the numbers: what was dropped, what is degenerate, what is small."""
+    """Caveats: what was dropped, what is degenerate, what is few."""
     notes = []
     for s in scores:
         if s.constant_predictions:
@@ -179,6 +179,6 @@ def caveats(scores: Sequence[ModelScores]) -> list[str]:
         notes.append(
             f"Line offsets left by {s.model}: {s.row_offset_sd_nm:.1f} nm along the rows of the layout, "
             f"{s.scan_line_offset_sd_nm:.1f} nm along the scan's own lines. Offsets that follow the layout "
-            "although the scans are rotated belong to the print, not to the microscope."
+            "although the scans are rotated come from the print, not from the microscope."
         )
     return notes

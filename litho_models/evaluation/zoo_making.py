@@ -41,7 +41,7 @@ def make_zoo(
     open_lock_box: bool = False,
     benchmark: str | Path | None = None,
 ) -> dict[str, ModelCard]:
-    """Train, score and freeze ``models``; a killed call goes on where it stopped.
+    """Train, score and freeze ``models``; an interrupted call resumes.
 
     Args:
         store: dataset store.
@@ -49,8 +49,8 @@ def make_zoo(
         root: the zoo to write into, a folder per model.
         recipe, variant, steps, seed: as in ``litho-models train``, which makes the same weights.
         open_lock_box: score the locked scans too; once per release.
-        benchmark: result of ``litho-models benchmark`` with split ``grouped``, whose out-of-fold errors of
-            the same models go into the cards, said to be of other fits.
+        benchmark: result of ``litho-models benchmark`` with split ``grouped``; its out-of-fold errors of
+            the same models go into the cards, marked as those of other fits.
 
     Raises:
         InputError: a store or benchmark that cannot be used, or a zoo that is too large.
@@ -85,7 +85,7 @@ def make_zoo(
 
 
 def scored_metrics(model: str | Path, scans: Sequence[PrintedScan], split: str) -> list[Metric]:
-    """The errors of a frozen model on scans, as they stand in its card, whatever the number of threads."""
+    """The errors of a frozen model on scans, as in its card, the same for any number of threads."""
     frozen = load_frozen(model)
     learned = card_background(frozen, scans)
     protocol = NuisanceProtocol.of_policy("offset", background="training" if learned else "none")
@@ -99,7 +99,7 @@ def scored_metrics(model: str | Path, scans: Sequence[PrintedScan], split: str) 
 def differing_metrics(store: str | Path, root: str | Path = zoo.ZOO_FOLDER) -> dict[str, list[str]]:
     """Score every zoo model again; per model, what differs from its card in any bit.
 
-    Out-of-fold figures are of other fits and are not compared.
+    Out-of-fold errors are of other fits and are not compared.
 
     Raises:
         InputError: a model of another dataset.
@@ -127,7 +127,7 @@ def differing_metrics(store: str | Path, root: str | Path = zoo.ZOO_FOLDER) -> d
 
 
 def _metrics(scores: ModelScores, split: str, background: BackgroundUse) -> list[Metric]:
-    """The figures of a card, first as the protocol has them, then without its background."""
+    """The metrics of a card, first with the background of the protocol, then without it."""
 
     def metric(name: str, value: float, policy: Policy, used: BackgroundUse) -> Metric:
         return Metric(name=name, value=value, split=split, policy=policy, background=used)
@@ -159,11 +159,11 @@ def _out_of_fold(benchmark: str | Path, dataset: Store) -> dict[str, list[Metric
 
 def _limitations(metrics: Sequence[Metric]) -> list[str]:
     splits = {metric.split for metric in metrics}
-    notes = ["Trained on prints of one machine, resist and protocol: to be retrained for any other."]
+    notes = ["Trained on prints of one machine, resist and protocol: retrain for any other."]
     if HELD_OUT not in splits:
-        notes.append("The locked scans were not opened: no figure is of scans that this model never saw.")
+        notes.append("The locked scans were not opened: no error is of scans that this model has not seen.")
     if OUT_OF_FOLD in splits:
-        notes.append("Out-of-fold figures are of other fits with the same recipe, each on fewer scans.")
+        notes.append("Out-of-fold errors are of other fits with the same recipe, each on fewer scans.")
     return notes
 
 

@@ -18,12 +18,12 @@ CARD_FILE = "card.json"
 
 EffectValues = dict[str, dict[str, float]]
 
-# What is looked up in the free facts of a training and of a split.
+# Lists that are looked up in `training` and `split`, which hold free facts otherwise.
 _LISTS_OF_NAMES = ("scan_ids", "lock_box", "lock_box_files_sha256")
 
 
 class Metric(Record):
-    """One reported figure: what, how much, on which scans, with which nuisances and background."""
+    """One reported number: what, how much, on which scans, with which nuisances and background."""
 
     name: str
     value: float

@@ -52,7 +52,7 @@ def save_frozen(
         card_fields: further fields of ``ModelCard`` (dataset, training, split, metrics, …).
 
     Raises:
-        InputError: weights that are not finite or not float32, or card fields that do not belong.
+        InputError: weights that are not finite or not float32, or unknown card fields.
     """
     state = {key: value.detach().cpu().contiguous() for key, value in simulator.state_dict().items()}
     _check_numbers(state, f"weights of {simulator.name}")

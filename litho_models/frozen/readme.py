@@ -58,7 +58,7 @@ def model_readme(card: ModelCard) -> str:
         f"{card.level_height_um:g} µm; heights from {low:g} to {high:g} µm are calibrated, others are "
         "refused unless `extrapolate=True`.\n",
         "## What it is not\n",
-        "It knows one machine, one resist and one batch of prints, and nothing about the microscope: datum, "
+        "It describes one machine, one resist and one batch of prints, and not the microscope: datum, "
         "tilt, bow and line offsets of a scan are not part of it"
         + (
             "; the smooth background that its training scans share is in the card, for comparison with "
@@ -68,7 +68,7 @@ def model_readme(card: ModelCard) -> str:
         ),
         "## Training\n",
         _training(card),
-        "## Figures\n",
+        "## Errors\n",
         _metrics(card),
         "## Effects\n",
         f"Process effects inside the model: {_names(card.process_effects)}. Measurement effects, left out: "
@@ -92,7 +92,7 @@ def _training(card: ModelCard) -> str:
 def _metrics(card: ModelCard) -> str:
     if not card.metrics:
         return "Not evaluated.\n"
-    head = "| figure | value | split | nuisance policy | background |\n|---|---|---|---|---|\n"
+    head = "| metric | value | split | nuisance policy | background |\n|---|---|---|---|---|\n"
     lines = [
         f"| {m.name} | {m.value:.2f} {m.unit} | {m.split} | {m.policy} | {m.background} |"
         for m in card.metrics

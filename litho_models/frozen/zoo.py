@@ -42,7 +42,7 @@ def folder(name: str, root: str | Path = ZOO_FOLDER) -> Path:
 
 
 def model_folder(source: str | Path, root: str | Path = ZOO_FOLDER, other: str = "") -> Path:
-    """The folder that a command is given: one that is there, or ``zoo:NAME`` for a model of the zoo.
+    """The folder of a model as a command is given it: a path, or ``zoo:NAME`` for a model of the zoo.
 
     Args:
         source: what the user typed.

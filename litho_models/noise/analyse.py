@@ -1,4 +1,4 @@
-"""``litho-models noise``: what no model of the printer can predict, from whatever was measured."""
+"""``litho-models noise``: what no model of the printer can predict, estimated from whatever was measured."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def analyse_noise(
         seed: of the pixels drawn.
 
     Raises:
-        InputError: a store or residuals that cannot be read or do not belong together.
+        InputError: a store or residuals that cannot be read or do not match.
     """
     if model is not None and not residuals:
         raise InputError("model", got=f"{model} and no residuals", wanted="a benchmark to choose it from")

@@ -1,6 +1,6 @@
 """What ordinary prints say about the noise when no flat, step or repeated print was made.
 
-No figure here is the floor: each says what it contains, what it does not, and in which direction it errs.
+No estimate here is the floor: each says what it contains, what it lacks, and on which side it errs.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ PRINTER_CUTOFF_PER_UM = float(np.sqrt(np.log(100) / (2 * np.pi**2)) / 0.2)
 
 
 class NoiseBound(Record):
-    """One figure about the noise, nm.
+    """One estimate of the noise, nm.
 
     Args:
         name: what was measured.
-        of: which noise the figure bounds: ``pixel`` (white), ``line`` (offsets of scan lines) or ``all``.
-        direction: how it errs as a figure of that noise.
+        of: which noise is meant: ``pixel`` (white), ``line`` (offsets of scan lines) or ``all``.
+        direction: on which side of that noise it errs.
         sigma_nm: mean over scans, ``ci95_nm`` its interval over scans; ``mae_nm`` the mean absolute
             value, 0.798 σ unless measured.
         contains, lacks: in words.
@@ -49,12 +49,12 @@ class NoiseBound(Record):
 
 
 def noise_bounds(store: Store, scans: Sequence[PrintedScan], seed: int = 0) -> list[NoiseBound]:
-    """All figures that can be had from these scans; those that need repeats only where there are some."""
+    """All estimates that these scans allow; repeated prints count only if there are some."""
     bounds = _differences(store, scans)
     bounds.append(_high_band(scans))
-    for figure in (repeated_prints(scans), _neighbourhoods(scans, seed)):
-        if figure is not None:
-            bounds.append(figure)
+    for bound in (repeated_prints(scans), _neighbourhoods(scans, seed)):
+        if bound is not None:
+            bounds.append(bound)
     return bounds
 
 

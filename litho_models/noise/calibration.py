@@ -1,4 +1,4 @@
-"""Is a stated σ right? Judged scan by scan, with a variance that never saw the scan it is judged on."""
+"""Is a stated σ right? Judged scan by scan, with a variance fitted on other scans."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class ScanCalibration(Record):
     """One scan: likelihood and CRPS (nm, lower is better), coverage at 50, 80, 90, 95 %, rms of r/σ.
 
     ``factor_90`` is what σ has to be multiplied by for 90 % of this scan's pixels to be covered; ``ence`` and
-    ``ause`` are shares (see ``spread_scores``), None in results of before they were scored.
+    ``ause`` are shares (see ``spread_scores``), None in older result files.
     """
 
     scan: str
@@ -83,7 +83,7 @@ class Calibration(Record):
 class SpreadAnalysis(Record):
     """σ(x) of one model's residuals and its calibration; ``bins`` are out of fold, the model is of all.
 
-    ``nuisance``: what the residuals were freed of; in results of before it was stated, an offset only.
+    ``nuisance``: what the residuals were freed of; an offset only in older result files.
     """
 
     model: str

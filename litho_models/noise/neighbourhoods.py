@@ -147,5 +147,5 @@ def _pairs(
 
 def _intercept(distance2: np.ndarray, gamma: np.ndarray) -> float:
     slope, intercept = np.polyfit(distance2, gamma, 1)
-    # A fall with distance is chance: the nearest pairs then say what there is to say.
+    # A fall with distance is chance: the nearest pairs are then all there is.
     return float(intercept if slope > 0 else gamma.mean())

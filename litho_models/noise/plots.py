@@ -54,7 +54,7 @@ def surfaces(references: Sequence[Reference]) -> Figure:
 
 
 def bounds(found: Sequence[NoiseBound], floor: NoiseFloor) -> Figure:
-    """σ of every figure about the noise, coloured by the direction in which it errs."""
+    """σ of every estimate of the noise, coloured by what it is."""
     figure = new_figure(8.5, 0.42 * len(found) + 1.5)
     axes = figure.subplots()
     for number, bound in enumerate(found):
@@ -142,7 +142,7 @@ def spread(found: SpreadAnalysis) -> Figure:
     for axes, name in zip(grid, names, strict=True):
         rows = [row for row in found.bins if row.covariate == name]
         centre = [(row.low + row.high) / 2 for row in rows]
-        axes.plot(centre, [row.rms_nm for row in rows], "o", color="#1c2430", ms=4, label="there")
+        axes.plot(centre, [row.rms_nm for row in rows], "o", color="#1c2430", ms=4, label="measured")
         axes.plot(centre, [row.predicted_nm for row in rows], "-", color="#0b6aa2", label="predicted")
         axes.set_xlabel(name)
         axes.grid(alpha=0.3)

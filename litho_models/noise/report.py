@@ -38,10 +38,10 @@ def write_noise_report(result: NoiseAnalysis, references: Sequence[Reference], o
     if result.bounds:
         page.heading("Bounds from ordinary prints")
         page.paragraph(
-            "Each figure says how it errs. The lower bound holds if the printer is no sharper than stated; "
-            "an upper bound counts topography as well."
+            "Each estimate says on which side it errs. The lower bound holds if the printer is no sharper "
+            "than stated; an upper bound counts topography as well."
         )
-        page.figure(plots.bounds(result.bounds, floor), "σ of each figure.")
+        page.figure(plots.bounds(result.bounds, floor), "σ of each estimate.")
         page.table(_bounds(result), "What each contains, and what not.", "bounds.csv")
     if result.spread is not None:
         _spread(page, result.spread)
@@ -126,7 +126,7 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
         page.paragraph(
             f"{found.members} members disagree by {found.epistemic_rms_nm:.2f} nm (RMS over pixels, each "
             "member freed of its mean). The fitted σ already holds the error that this disagreement is "
-            "part of; the row with it added shows whether it tells more."
+            "part of; the row with it added shows whether it helps."
         )
     page.figure(plots.spread(found), "Spread against level, slope, distance to the next edge, and radius.")
     page.figure(plots.calibration(found), "Calibration on scans left out.")

@@ -30,13 +30,13 @@ def read_residuals(store: Store, sources: Sequence[str | Path], model: str | Non
     Args:
         store: the store that the sources were made from.
         sources: result folders of ``litho-models benchmark``, whose cache holds predictions of scans that
-            the fit never saw, or frozen models (folders, ``zoo:NAME``); not both kinds at once. The lock box
-            is left out.
+            the fit has not seen, or frozen models (folders, ``zoo:NAME``); not both kinds at once. The lock
+            box is left out.
         model: which model of a benchmark; its best one by default.
 
     Raises:
         InputError: a folder that is neither, one given twice, sources of another dataset or of different
-            policies, a ``model`` beside frozen ones, or no scan that all predict.
+            policies, a ``model`` together with frozen ones, or no scan that all predict.
     """
     folders = [zoo.model_folder(source, other="or that of a benchmark") for source in sources]
     if len({folder.resolve() for folder in folders}) < len(folders):
@@ -66,7 +66,7 @@ def read_residuals(store: Store, sources: Sequence[str | Path], model: str | Non
 
 
 def disagreement_um(predictions_um: Sequence[np.ndarray]) -> np.ndarray:
-    """Standard deviation of the members at each pixel, each freed of its own mean: a datum is no knowledge.
+    """Standard deviation of the members at each pixel, each freed of its own mean: a datum is arbitrary.
 
     ``(ny, nx)`` µm, with the n − 1 of a sample.
     """

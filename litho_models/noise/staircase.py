@@ -1,4 +1,4 @@
-"""Step prints: where the treads are, how high the steps, and how well one is told from the next."""
+"""Step prints: where the treads are, how high the steps, and how well neighbours can be told apart."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ class VarianceModel(Record):
 
 
 class SigmaBin(Record):
-    """Pixels within one range of one covariate: the spread that is there and the one that is predicted."""
+    """Pixels within one range of one covariate: the measured and the predicted spread."""
 
     covariate: str
     low: float

@@ -1,4 +1,4 @@
-"""Metrics of a scan beside its errors: each says its name, unit and meaning once, and every report shows it.
+"""Metrics of a scan besides its errors: each states its name, unit and meaning once; every report shows it.
 
 A metric sees one scan, what the model expects of it, and the residual freed of the scan's nuisances. Those
 that come with the package are fields of the results; one's own are listed there under ``metrics``.
@@ -22,7 +22,7 @@ MetricFunction = Callable[[PrintedScan, np.ndarray, np.ndarray], float | None]
 
 
 class Metric(NamedTuple):
-    """What one figure is called and how those of the scans become that of a model."""
+    """The name of a metric, and how its values for scans become the value for a model."""
 
     name: str
     unit: str
@@ -30,7 +30,7 @@ class Metric(NamedTuple):
 
     @property
     def key(self) -> str:
-        """Name in results and tables: with the unit, unless the figure has none (``1``)."""
+        """Name in results and tables: with the unit, unless it has none (``1``)."""
         return self.name if self.unit == "1" else f"{self.name}_{self.unit}"
 
 
@@ -75,7 +75,7 @@ def register_metric(
     Results list it by scan and by model as ``metrics: {"worst_pixel_nm": …}``.
 
     Args:
-        name: letters, digits and underscores; ``unit``: of the figure, ``1`` if it has none.
+        name: letters, digits and underscores; ``unit``: ``1`` if it has none.
         function: as above.
         explanation: a sentence for the report.
         over_scans: what a model gets: the mean of what is known, or the sum.
@@ -90,7 +90,7 @@ def register_metric(
         raise InputError(f"over_scans of {name}", got=over_scans, wanted=", ".join(get_args(Summary)))
     taken = {known.key for known in registered_metrics()} | ScanRow.model_fields.keys()
     if metric.key in taken | ModelScores.model_fields.keys():
-        raise InputError("metric", got=metric.key, wanted="a name that no other figure has")
+        raise InputError("metric", got=metric.key, wanted="a name that is not taken")
     _MEASUREMENTS.append(Measurement((metric,), lambda *scan: (function(*scan),), explanation))
     return metric
 

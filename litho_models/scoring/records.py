@@ -1,4 +1,4 @@
-"""What is scored and what comes out: the protocol, a prediction, and the figures of a scan and of a model."""
+"""What is scored and what comes out: the protocol, a prediction, and the scores of a scan and of a model."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class PolicyError(Record):
 
 
 class MetricValues(Record):
-    """Metrics beside the errors, of maps freed of their nuisances (``metric_registry``).
+    """Metrics besides the errors, of maps freed of their nuisances (``metric_registry``).
 
     SSIM as in ``structural_similarity``, edges as in ``EdgePlacement``, one's own by name and unit under
     ``metrics``. None where there was nothing to compare, or in older result files.
@@ -63,7 +63,7 @@ class MetricValues(Record):
 
 
 class ScanRow(MetricValues):
-    """The figures of one scan.
+    """The scores of one scan.
 
     Slope and intercept, the gain and offset of the print against the prediction, with standard errors and the
     correlation of the two (``print_gain``); None where they cannot be known.
@@ -98,7 +98,7 @@ class ModelScores(MetricValues):
 
     ``without_background`` repeats ``by_policy`` without the background of the protocol, for the policies
     that have no smooth terms themselves; it is empty where the protocol has no background.
-    ``phase_rms_waves`` is the RMS error as light sees it that passes the print.
+    ``phase_rms_waves`` is the RMS error seen by light that passes the print.
     """
 
     model: str

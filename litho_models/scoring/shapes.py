@@ -2,7 +2,7 @@
 
 For edges both maps are cut at the heights half way between nominal levels, which no model moves. Contours
 are those of marching squares, so a position is a linear interpolation between pixels; nothing is smoothed,
-and the roughness of the measured contour is part of the figure.
+and the roughness of the measured contour is part of the error.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def structural_similarity(measured_um: np.ndarray, expected_um: np.ndarray) -> f
     """Mean SSIM (Wang et al. 2004, doi:10.1109/TIP.2003.819861): 1 for equal maps.
 
     Gaussian window of standard deviation ``SSIM_SIGMA_PX``, ``SSIM_WINDOW_PX`` wide; data range
-    ``SSIM_RANGE_UM`` whatever the maps hold. Only windows that lie within the scored pixels count.
+    ``SSIM_RANGE_UM`` for all maps. Only windows within the scored pixels count.
 
     Args:
         measured_um: (ny, nx) µm, NaN where not scored; ``expected_um``: the same shape.

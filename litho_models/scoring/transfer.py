@@ -32,7 +32,7 @@ class TransferCurves(Record):
     ``error_psd``: one-sided density of the error's power along lines, nm² per cycle/µm, line means removed.
     ``half_power``: frequency at which the gain first falls below 1/√2 of that of the lowest band, 1/µm; None
     if it never does. ``noise_band``: width of the ideal low pass that lets as much white noise through, 1/µm.
-    None and empty in results of before these were scored.
+    None or empty in older result files.
     """
 
     frequency_per_um: list[float]

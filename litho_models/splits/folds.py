@@ -75,7 +75,7 @@ def plan_folds(
     seed: int = 0,
     open_lock_box: bool = False,
 ) -> list[Fold]:
-    """The folds of a split; scans of the lock box are in none of them, except in the leaky ``paper``.
+    """The folds of a split; scans of the lock box are in none of them, except for ``paper``, which leaks.
 
     Raises:
         InputError: too few scans, a lock box to open where there is none, or an unknown split.
@@ -148,7 +148,7 @@ def leave_one_print_out(ids: Sequence[str], print_ids: Sequence[str]) -> list[li
 def paper_draw(ids: Sequence[str], draw: int, held_out_fraction: float = 0.25) -> list[Crop]:
     """The crops held out in one random draw over quadrants, as in the paper (24 of 96).
 
-    Quadrants of one scan land on both sides: leaky, for comparison with the paper only.
+    Quadrants of one scan land on both sides, so this leaks; for comparison with the paper only.
     """
     require_unique(ids)
     crops = [Crop(scan_id, quadrant) for scan_id in ids for quadrant in QUADRANTS]

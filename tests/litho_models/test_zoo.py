@@ -176,7 +176,7 @@ def test_the_command_in_the_card_makes_the_same_weights(store, tmp_path):
     assert outcome.exit_code == 0, outcome.output
     again = ModelCard.read(tmp_path / "again" / "model")
     assert again.weights_sha256 == card.weights_sha256
-    assert "never saw" in " ".join(card.limitations)
+    assert "not seen" in " ".join(card.limitations)
 
 
 def test_a_benchmark_of_other_data_is_refused(store, tmp_path):
