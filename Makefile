@@ -6,10 +6,12 @@ OUT ?= runs
 WORKERS ?= 1
 PUBLISH ?=
 STAMP := .venv/.installed
+CPUS ?=
 # Two test processes on two cores: one thread each.
-PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
+PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n 2
 
-.PHONY: help setup demo trials gap test test-fast check format clean
+.PHONY: help setup demo trials gap test test-fast test-cpus check check-all format clean
 
 help:              ## list the targets
 	@grep -hE '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1	/' | expand -t 14
@@ -38,10 +40,16 @@ test: $(STAMP)     ## pass all tests; the report is runs/tests/report.xml
 test-fast: $(STAMP) ## pass the tests that take seconds
 	$(PYTEST) -m "not slow"
 
+test-cpus: $(STAMP) ## pass the tests of numerics as older processors too: make test-cpus, or make test-cpus CPUS="avx2"
+	$(ONE_THREAD) $(BIN)/python tests/processors.py $(CPUS)
+
 check: $(STAMP)    ## style and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+check-all: check   ## what is too long for CI, hours: all tests as they are and as older processors
+	$(ONE_THREAD) $(BIN)/python tests/processors.py --all $(CPUS)
 
 format: $(STAMP)   ## bring the code into the common style
 	$(BIN)/ruff check --fix .

@@ -1,6 +1,8 @@
 """The tests of numerics on this processor, and once more as if it were an older one.
 
-python tests/processors.py [native] [avx2] [avx512], all of them by default
+    python tests/processors.py [--all] [native] [avx2] [avx512]
+
+Without names as all of them; with --all every test, not only those of numerics that are quick.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from typing import NamedTuple
 import torch
 
 ROOT = Path(__file__).parents[1]
+_QUICK = ["-m", "numerics and not slow"]
 
 
 class Processor(NamedTuple):
@@ -57,8 +60,10 @@ def can_play(name: str) -> bool:
     return not capability or bool(torch.cpu.get_capabilities().get(capability))
 
 
-def main(names: list[str]) -> int:
+def main(arguments: list[str]) -> int:
     """Run the tests as each of the named processors; the exit status is 1 where one of them fails."""
+    names = [argument for argument in arguments if argument != "--all"]
+    chosen, what = ([], "all tests") if "--all" in arguments else (_QUICK, "numerics")
     unknown = set(names) - set(PROCESSORS)
     if unknown:
         print(
@@ -70,9 +75,9 @@ def main(names: list[str]) -> int:
         if not can_play(name):
             outcomes.append((name, "left out: this processor has other instructions"))
             continue
-        print(f"== numerics, {name}", flush=True)
+        print(f"== {what}, {name}", flush=True)
         started = time.perf_counter()
-        pytest = [sys.executable, "-m", "pytest", "-n", "2", "-m", "numerics"]
+        pytest = [sys.executable, "-m", "pytest", "-n", "2", *chosen]
         done = subprocess.run(pytest, cwd=ROOT, env={**os.environ, **PROCESSORS[name].environment})
         verdict = "failed" if done.returncode else "passed"
         outcomes.append((name, f"{verdict} in {time.perf_counter() - started:.0f} s"))

@@ -11,6 +11,8 @@ from litho_models.models import MODELS, build_model
 from litho_models.prediction.tiles import predict_field, tile_difference
 from litho_models.simulator import VARIANTS, Simulator
 
+pytestmark = pytest.mark.numerics
+
 CASES = [(name, variant) for name in MODELS for variant in VARIANTS]
 # Narrow blurs keep the fields of this suite small; the law does not depend on them.
 NARROW = {

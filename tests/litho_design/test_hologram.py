@@ -19,6 +19,8 @@ from litho_design.optimisation.parameters import CellMap
 from litho_design.optimisation.phases import fresnel_lens_phase, gerchberg_saxton
 from litho_design.printers.layout import LayoutSettings
 
+pytestmark = pytest.mark.numerics
+
 WAVELENGTH_UM = 0.6328
 
 

@@ -10,6 +10,8 @@ from scipy.signal import convolve2d
 from litho_design.images.targets import draw_target
 from litho_design.optics.imaging import Blur, bin_pixels, richardson_lucy
 
+pytestmark = pytest.mark.numerics
+
 
 def gaussian_psf(size, sigma, energy=1.0, shift=(0.0, 0.0)):
     x = torch.arange(size, dtype=torch.float64) - size // 2

@@ -10,6 +10,8 @@ import torch
 
 from litho_design.optics import ASMPropagator, RadialPropagator, RSPropagator, centred_grid
 
+pytestmark = pytest.mark.numerics
+
 WAVELENGTH_UM = 0.6328
 WAVENUMBER = 2 * math.pi / WAVELENGTH_UM
 

@@ -20,6 +20,8 @@ from litho_design.optics import (
     sampling_limit_um,
 )
 
+pytestmark = pytest.mark.numerics
+
 WAVELENGTH_UM = 0.6328
 
 

@@ -13,6 +13,8 @@ from litho_models.fast import convolution_stack
 from litho_models.frozen.files import load_frozen, save_frozen
 from litho_models.models import build_model
 
+pytestmark = pytest.mark.numerics
+
 SLOPE = 0.02
 
 

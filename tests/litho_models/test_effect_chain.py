@@ -10,6 +10,8 @@ from litho_models.effects.chain import EffectChain
 from litho_models.frozen.files import load_frozen, save_frozen
 from litho_models.models import build_model
 
+pytestmark = pytest.mark.numerics
+
 LAYOUT = (torch.rand(1, 1, 40, 40, generator=torch.Generator().manual_seed(0)) * 12).floor() / 10
 MEASUREMENT = [e for e in CATALOGUE.values() if e.role == "measurement"]
 

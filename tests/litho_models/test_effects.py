@@ -12,6 +12,8 @@ from litho_data.virtual_fab.knobs import KNOBS
 from litho_models.effects import CATALOGUE, FieldContext, get_effect, in_forward_order, screened_effects
 from litho_models.effects.effect import Effect, Parameter
 
+pytestmark = pytest.mark.numerics
+
 PITCH_UM = 0.1
 EFFECTS = list(CATALOGUE.values())
 PER_EFFECT = pytest.mark.parametrize("effect", EFFECTS, ids=[effect.name for effect in EFFECTS])

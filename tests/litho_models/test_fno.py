@@ -17,6 +17,8 @@ from litho_models.models.fno import PeriodicConvolution, SpectralConvolution
 from litho_models.prediction.tiles import blend_tiles, blending_window, predict_scan
 from litho_models.simulator import Tile
 
+pytestmark = pytest.mark.numerics
+
 SMALL = {"width": 6, "modes": (4, 4), "projection_channels": 16, "tile_px": 32, "overlap_px": 16}
 QUICK = {"steps": 12, "rounds": 3, "batch": 2, "precision": "32-true", "nuisance": "offset"}
 

@@ -19,6 +19,8 @@ from litho_models.frozen.files import README_FILE, WEIGHTS_FILE
 from litho_models.frozen.freezing import freeze
 from litho_models.models import build_model
 
+pytestmark = pytest.mark.numerics
+
 
 @pytest.fixture
 def folder(tmp_path):

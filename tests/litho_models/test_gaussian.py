@@ -12,6 +12,8 @@ from scipy.ndimage import gaussian_filter
 from litho_data.foundation.errors import InputError
 from litho_models.layers.gaussian import blur_interior, gaussian_blur, kernel_radius_px, pad_field
 
+pytestmark = pytest.mark.numerics
+
 PITCH = 0.1
 
 

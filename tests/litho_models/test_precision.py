@@ -12,6 +12,8 @@ from litho_models.layers import precision as precisions
 from litho_models.layers.precision import has_bfloat16_unit
 from litho_models.models import build_model
 
+pytestmark = pytest.mark.numerics
+
 LAYOUT_UM = 0.1 * torch.randint(0, 13, (1, 1, 96, 96), generator=torch.Generator().manual_seed(0))
 SHRINKAGE = {"vertical-shrinkage": {"fraction": 0.1}}
 WARNING = "in bfloat16: float32 is faster on this processor, which has no bfloat16 unit"

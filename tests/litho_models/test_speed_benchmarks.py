@@ -17,6 +17,8 @@ from litho_models.frozen.files import save_frozen
 from litho_models.models import build_model
 from litho_models.simulator import crop_border
 
+pytestmark = pytest.mark.numerics
+
 
 def make_pbl(**fields):
     torch.manual_seed(0)

@@ -11,6 +11,8 @@ import torch
 from litho_models.fast import threads as threads_of_work
 from litho_models.fast.threads import one_thread_each
 
+pytestmark = pytest.mark.numerics
+
 
 @pytest.fixture
 def threads(monkeypatch):

@@ -26,6 +26,8 @@ from litho_models.models.pbl import Pbl
 from litho_models.prediction.tiles import predict_scan
 from litho_models.scan_terms.training import estimate_scan_terms, training_terms
 
+pytestmark = pytest.mark.numerics
+
 QUICK = {"steps": 12, "rounds": 3, "batch": 2, "crop_px": 32, "precision": "32-true"}
 SMALL_NETS = {"pointwise_channels": (8, 4), "areawise_channels": (8, 4), "sigma_diffusion_init_um": 0.3}
 

@@ -15,6 +15,8 @@ from litho_models.fast import convolution_stack, winograd
 from litho_models.fast.winograd import FixedStack
 from litho_models.fast.winograd_passes import FRAME_PX, lift_back
 
+pytestmark = pytest.mark.numerics
+
 SLOPE = 0.02
 
 
