@@ -66,9 +66,8 @@ def main(arguments: list[str]) -> int:
     chosen, what = ([], "all tests") if "--all" in arguments else (_QUICK, "numerics")
     unknown = set(names) - set(PROCESSORS)
     if unknown:
-        print(
-            f"processors: got {', '.join(sorted(unknown))}, wanted {', '.join(PROCESSORS)}", file=sys.stderr
-        )
+        got, wanted = ", ".join(sorted(unknown)), ", ".join(PROCESSORS)
+        print(f"processors: got {got}, wanted {wanted}", file=sys.stderr)
         return 2
     outcomes = []
     for name in names or PROCESSORS:

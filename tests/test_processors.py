@@ -32,4 +32,4 @@ def test_a_played_processor_uses_its_own_instructions(name, vectors_of_16, tmp_p
 
 def test_an_unknown_processor_is_refused(capsys):
     assert processors.main(["avx3"]) == 2
-    assert "wanted avx2, avx512, native" in capsys.readouterr().err
+    assert "wanted native, avx2, avx512" in capsys.readouterr().err
