@@ -1,1 +1,69 @@
-"""Raw AFM files and layouts in, a dataset with provenance out."""
+"""Raw AFM files and layouts in, a dataset with provenance out.
+
+One scan: ``read_scan`` → ``level_scan`` → ``register_scan`` → ``resample_to_layout``. A whole dataset:
+``build_dataset`` from a card, then ``open_store``. ``fetch`` gets the files of a known dataset; ``simulate``
+makes those of a virtual one.
+"""
+
+from typing import TYPE_CHECKING
+
+from litho_data.foundation.faces import lazy_face
+
+if TYPE_CHECKING:
+    from litho_data.build.build import build_dataset as build_dataset
+    from litho_data.cards.fetch import fetch as fetch
+    from litho_data.foundation.errors import InputError as InputError
+    from litho_data.level.recipe import Recipe as Recipe
+    from litho_data.level.scan import level_scan as level_scan
+    from litho_data.provenance.verify import verify as verify
+    from litho_data.readers.layout import read_layout as read_layout
+    from litho_data.readers.read import read_scan as read_scan
+    from litho_data.register.resample import resample_to_layout as resample_to_layout
+    from litho_data.register.scan import register_scan as register_scan
+    from litho_data.scan import Scan as Scan
+    from litho_data.store.read import PrintedScan as PrintedScan
+    from litho_data.store.read import Store as Store
+    from litho_data.store.read import open_store as open_store
+    from litho_data.virtual_fab.simulate import simulate as simulate
+
+    __version__: str
+else:
+    __getattr__, __dir__ = lazy_face(
+        __name__,
+        {
+            "InputError": "litho_data.foundation.errors",
+            "PrintedScan": "litho_data.store.read",
+            "Recipe": "litho_data.level.recipe",
+            "Scan": "litho_data.scan",
+            "Store": "litho_data.store.read",
+            "build_dataset": "litho_data.build.build",
+            "fetch": "litho_data.cards.fetch",
+            "level_scan": "litho_data.level.scan",
+            "open_store": "litho_data.store.read",
+            "read_layout": "litho_data.readers.layout",
+            "read_scan": "litho_data.readers.read",
+            "register_scan": "litho_data.register.scan",
+            "resample_to_layout": "litho_data.register.resample",
+            "simulate": "litho_data.virtual_fab.simulate",
+            "verify": "litho_data.provenance.verify",
+        },
+    )
+
+__all__ = [
+    "InputError",
+    "PrintedScan",
+    "Recipe",
+    "Scan",
+    "Store",
+    "__version__",
+    "build_dataset",
+    "fetch",
+    "level_scan",
+    "open_store",
+    "read_layout",
+    "read_scan",
+    "register_scan",
+    "resample_to_layout",
+    "simulate",
+    "verify",
+]

@@ -43,14 +43,14 @@ def level(
 ) -> None:
     """Level one scan; writes the levelled heights, the removed surface and a record beside them."""
     from litho_data.level import Recipe
-    from litho_data.level.scan import level_scan
+    from litho_data.level.scan import write_levelled
     from litho_data.readers import read_scan
 
     steps = Recipe.from_toml(recipe)
     heights = read_scan(
         scan, format=format, unit=unit, size_um=size_um, channel=channel, full_scale_um=full_scale_um
     )
-    record = level_scan(heights, steps, out)
+    record = write_levelled(heights, steps, out)
     typer.echo(f"{out}: {len(steps.step)} steps")
     typer.echo(f"levelled sha256 {record.levelled_sha256}")
     typer.echo(f"removed surface {out.with_name(record.removed)}")

@@ -1,7 +1,8 @@
-"""Levelling one file: the levelled heights, the removed surface, and a record of how."""
+"""Levelling one scan: levelled heights and removed surface, in memory or as files with a record."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -37,7 +38,21 @@ class LevelRecord(RunFacts, Result):
     removed_sha256: str
 
 
-def level_scan(scan: Scan, recipe: Recipe, out: str | Path) -> LevelRecord:
+def level_scan(scan: Scan, recipe: Recipe | str | Path) -> tuple[Scan, np.ndarray]:
+    """Level a scan by a recipe, or by the recipe in a TOML file.
+
+    Returns:
+        The scan with levelled heights, and the removed surface, (ny, nx) µm; their sum is what came in.
+
+    Raises:
+        InputError: a bad recipe, or a step that cannot be applied.
+    """
+    steps = recipe if isinstance(recipe, Recipe) else Recipe.from_toml(recipe)
+    levelled, removed = steps.apply(scan)
+    return replace(scan, height_um=levelled), removed
+
+
+def write_levelled(scan: Scan, recipe: Recipe, out: str | Path) -> LevelRecord:
     """Level a scan and write ``out``, ``<out stem>.removed<suffix>`` and ``<out>.json``.
 
     Args:

@@ -21,6 +21,7 @@ from litho_data.register.quality import RegistrationQuality, Thresholds, judge, 
 from litho_data.register.refine import Refinement
 from litho_data.register.resample import Resampler, noise_variance_factor, resample_to_layout
 from litho_data.register.topography import predicted_topography, remove_bow
+from litho_data.scan import Scan
 
 MIN_SIZE_PX = 32
 # A picometre: below any instrument, above rounding.
@@ -49,40 +50,44 @@ class Registration:
 
 
 def register_scan(
-    scan_height_um: np.ndarray,
+    scan: Scan | np.ndarray,
     layout_level: np.ndarray,
     *,
-    scan_pitch_um: tuple[float, float],
     layout_pitch_um: float,
+    scan_pitch_um: tuple[float, float] | None = None,
     model: Model | Literal["ladder"] = "affine",
     orientation: Literal["search", "identity"] = "search",
     thresholds: Thresholds | None = None,
     seed: int = 0,
 ) -> Registration:
-    """Finds the warp from a scan to its layout and says how far it can be trusted.
+    """Find the warp from a scan to its layout, and say how far it can be trusted.
 
     Args:
-        scan_height_um: (ny, nx) heights, NaN where not measured.
+        scan: a ``Scan``, whose pitch is used, or heights (ny, nx) in µm, NaN where not measured.
         layout_level: (ny, nx) integer levels.
-        scan_pitch_um: (y, x) pitch of the scan.
         layout_pitch_um: pitch of the layout.
+        scan_pitch_um: (y, x) pitch of plain heights.
         model: a rung of the ladder, or ``ladder`` to let held-out blocks choose it.
         orientation: ``search`` tries eight orientations and both polarities, ``identity`` upright only.
         thresholds: limits of a pass.
         seed: of the robust estimator and the bootstrap.
 
     Raises:
-        InputError: arrays that are not 2-D or smaller than 32 pixels, or pitches that are not positive.
-            A fit that fails does not raise: ``quality.passed`` and ``quality.reason`` tell.
+        InputError: arrays that are not 2-D or smaller than 32 pixels, or pitches that are missing or not
+            positive. A fit that fails does not raise: ``quality.passed`` and ``quality.reason`` tell.
     """
-    height = np.asarray(scan_height_um, dtype=np.float64)
+    if isinstance(scan, Scan):
+        scan_pitch_um, scan = scan.require_pitch(), scan.height_um
+    if scan_pitch_um is None:
+        raise InputError("registration of plain heights", got="no scan_pitch_um", wanted="(y, x) in µm")
+    height = np.asarray(scan, dtype=np.float64)
     layout = np.asarray(layout_level)
     _check(height, layout, scan_pitch_um, layout_pitch_um)
     centred = centred_placement(height.shape, scan_pitch_um, layout.shape, layout_pitch_um)
     if not np.isfinite(height).any():
         return Registration(centred, unregistered_quality("no measured pixel in the scan"))
-    scan = remove_bow(_at_layout_pitch(height, scan_pitch_um, layout_pitch_um))
-    has_structure = layout.min() < layout.max() and np.nanstd(scan) > SMALLEST_STRUCTURE_UM
+    flat = remove_bow(_at_layout_pitch(height, scan_pitch_um, layout_pitch_um))
+    has_structure = layout.min() < layout.max() and np.nanstd(flat) > SMALLEST_STRUCTURE_UM
     limits = thresholds or Thresholds()
     smooth_layout = predicted_topography(layout, SEARCH_BLUR_PX)
     layout_repeats = rival_alignment(smooth_layout, smooth_layout) if has_structure else float("nan")
@@ -90,11 +95,11 @@ def register_scan(
     search = orientation == "search"
     coarse = None
     if has_structure:
-        coarse = find_coarse(scan, layout, smooth_layout, search=search, features=features, seed=seed)
+        coarse = find_coarse(flat, layout, smooth_layout, search=search, features=features, seed=seed)
     if coarse is None:
         return Registration(centred, unregistered_quality("no structure in the scan or the layout"))
 
-    oriented = coarse.polarity * orient(scan, coarse.orientation)
+    oriented = coarse.polarity * orient(flat, coarse.orientation)
     fine = refine_pyramid(
         oriented, layout, coarse.layout_to_oriented, "affine" if model == "ladder" else model
     )

@@ -16,7 +16,7 @@ from litho_data.foundation.commands import new_app, run_app
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import array_sha256, file_sha256
 from litho_data.level import Recipe
-from litho_data.level.scan import LevelRecord, level_scan, write_heights
+from litho_data.level.scan import LevelRecord, level_scan, write_heights, write_levelled
 from litho_data.readers import formats, read_scan
 from litho_data.scan import Scan
 
@@ -64,6 +64,16 @@ def test_level_writes_heights_removed_surface_and_record(app, scan_file: Path, s
     assert record.source_sha256 == file_sha256(scan_file)
     assert record.levelled_sha256 == array_sha256(expected.height, "µm", ("y", "x"))
     assert Recipe.from_dict(record.recipe).canonical() == Recipe.from_toml(recipe_file).canonical()
+
+
+def test_a_scan_is_levelled_in_memory_by_a_recipe_or_its_file(scan_file: Path) -> None:
+    scan = read_scan(scan_file, unit="m", size_um=SIZE_UM)
+    recipe = scan_file.with_name("recipe.toml")
+    levelled, removed_um = level_scan(scan, recipe)
+    expected = Recipe.from_toml(recipe).apply(scan)
+    np.testing.assert_array_equal(levelled.height_um, expected.height)
+    np.testing.assert_allclose(levelled.height_um + removed_um, scan.height_um, atol=1e-12)
+    assert (levelled.pitch_um, levelled.source) == (scan.pitch_um, scan.source)
 
 
 def test_the_command_offers_what_the_reader_reads(app, scan_file: Path) -> None:
@@ -155,5 +165,5 @@ def test_bad_input_is_one_line_and_exit_code_2(
 def test_a_step_that_fails_writes_nothing(tmp_path: Path) -> None:
     scan = Scan(height_um=HEIGHT_UM, pitch_um=None, source="scan")
     with pytest.raises(InputError, match="pixel pitch"):
-        level_scan(scan, Recipe.from_dict({"step": [{"op": "facet"}]}), tmp_path / "a.gsf")
+        write_levelled(scan, Recipe.from_dict({"step": [{"op": "facet"}]}), tmp_path / "a.gsf")
     assert not list(tmp_path.iterdir())
