@@ -1,1 +1,58 @@
-"""Diffractive optics designed through a frozen model of the printer."""
+"""Diffractive optics designed through a frozen model of the printer, scored, and exported for it."""
+
+from typing import TYPE_CHECKING
+
+from litho_data.foundation.faces import lazy_face
+
+if TYPE_CHECKING:
+    from litho_design.exports.files import export as export
+    from litho_design.exports.files import import_levels as import_levels
+    from litho_design.holograms.settings import hologram_settings as hologram_settings
+    from litho_design.images.targets import load_target as load_target
+    from litho_design.judging.loaded import load_design as load_design
+    from litho_design.judging.score import MeasuredSource as MeasuredSource
+    from litho_design.judging.score import PhotoSource as PhotoSource
+    from litho_design.lenses.settings import lens_settings as lens_settings
+    from litho_design.printers.source import load_printer as load_printer
+    from litho_design.workflows.compare import compare as compare
+    from litho_design.workflows.design import design_hologram as design_hologram
+    from litho_design.workflows.design import design_lens as design_lens
+    from litho_design.workflows.score import score as score
+
+    __version__: str
+else:
+    __getattr__, __dir__ = lazy_face(
+        __name__,
+        {
+            "MeasuredSource": "litho_design.judging.score",
+            "PhotoSource": "litho_design.judging.score",
+            "compare": "litho_design.workflows.compare",
+            "design_hologram": "litho_design.workflows.design",
+            "design_lens": "litho_design.workflows.design",
+            "export": "litho_design.exports.files",
+            "hologram_settings": "litho_design.holograms.settings",
+            "import_levels": "litho_design.exports.files",
+            "lens_settings": "litho_design.lenses.settings",
+            "load_design": "litho_design.judging.loaded",
+            "load_printer": "litho_design.printers.source",
+            "load_target": "litho_design.images.targets",
+            "score": "litho_design.workflows.score",
+        },
+    )
+
+__all__ = [
+    "MeasuredSource",
+    "PhotoSource",
+    "__version__",
+    "compare",
+    "design_hologram",
+    "design_lens",
+    "export",
+    "hologram_settings",
+    "import_levels",
+    "lens_settings",
+    "load_design",
+    "load_printer",
+    "load_target",
+    "score",
+]
