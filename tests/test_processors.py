@@ -6,8 +6,9 @@ import os
 import subprocess
 import sys
 
-import processors
 import pytest
+
+from tests import processors
 
 CODE = """
 import torch

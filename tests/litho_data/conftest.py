@@ -6,9 +6,9 @@ import shutil
 from pathlib import Path
 
 import pytest
-from campaigns import write_campaign
 
 from litho_data.build.build import build_dataset
+from tests.litho_data.campaigns import write_campaign
 
 
 @pytest.fixture(scope="session")

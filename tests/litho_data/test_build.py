@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import tifffile
-from campaigns import LEVEL_HEIGHT_UM, MARGIN_PX, NOISE_UM, height_of, layout_of, write_campaign, write_scan
 
 from litho_data.build.build import build_dataset
 from litho_data.build.jobs import attempt, field_jobs
@@ -28,6 +27,15 @@ from litho_data.provenance.verify import verify
 from litho_data.store import open_store
 from litho_data.store.access import values_of
 from litho_data.store.partial import Piece, partial_store
+from tests.litho_data.campaigns import (
+    LEVEL_HEIGHT_UM,
+    MARGIN_PX,
+    NOISE_UM,
+    height_of,
+    layout_of,
+    write_campaign,
+    write_scan,
+)
 
 
 def test_heights_come_back_on_the_layout(campaign: Path) -> None:

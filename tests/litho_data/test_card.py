@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from campaigns import card_text
 
 from litho_data.cards.card import check_card, load_card
 from litho_data.cards.fetch import known_cards
 from litho_data.foundation.errors import InputError
+from tests.litho_data.campaigns import card_text
 
 GOOD: dict[str, Any] = tomllib.loads(card_text())
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import afm_files
 import numpy as np
 import pytest
-from afm_files import HEIGHT_UM, SIZE_UM
 from typer.testing import CliRunner
 
 from litho_data.cli.scan import inspect, level
@@ -19,6 +17,8 @@ from litho_data.level import Recipe
 from litho_data.level.scan import LevelRecord, level_scan, write_heights, write_levelled
 from litho_data.readers import formats, read_scan
 from litho_data.scan import Scan
+from tests.litho_data import afm_files
+from tests.litho_data.afm_files import HEIGHT_UM, SIZE_UM
 
 RECIPE = '[[step]]\nop = "plane"\n[[step]]\nop = "fix-zero"\n'
 

@@ -6,10 +6,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-from campaigns import card_text
 from typer.testing import CliRunner
 
 from litho_data.cli.app import app
+from tests.litho_data.campaigns import card_text
 
 run = CliRunner()
 

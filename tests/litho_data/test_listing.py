@@ -6,10 +6,10 @@ import json
 from pathlib import Path
 
 import pytest
-from campaigns import card_text
 
 from litho_data.cards.listing import list_fields
 from litho_data.foundation.errors import InputError
+from tests.litho_data.campaigns import card_text
 
 
 def folder_with(tmp_path: Path, files: list[str], **card: str) -> Path:

@@ -8,7 +8,6 @@ from types import ModuleType
 
 import numpy as np
 import pytest
-from campaigns import MARGIN_PX, PITCH_UM, height_of, layout_of, write_campaign
 from typer.testing import CliRunner
 
 from litho_data.build.build import build_dataset
@@ -16,6 +15,7 @@ from litho_data.cli.app import app
 from litho_data.foundation.errors import InputError
 from litho_data.readers import Reader, add_reader, formats, read_scan, registry
 from litho_data.store import open_store
+from tests.litho_data.campaigns import MARGIN_PX, PITCH_UM, height_of, layout_of, write_campaign
 
 
 @pytest.fixture

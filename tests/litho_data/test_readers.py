@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import afm_files
 import numpy as np
 import pytest
 import tifffile
-from afm_files import HEIGHT_UM, SHAPE, SIZE_UM
 
 from litho_data.foundation.errors import InputError
 from litho_data.readers import list_channels, read_layout, read_scan
+from tests.litho_data import afm_files
+from tests.litho_data.afm_files import HEIGHT_UM, SHAPE, SIZE_UM
 
 PITCH_UM = (SIZE_UM[0] / SHAPE[0], SIZE_UM[1] / SHAPE[1])
 

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
-import afm_files
 import numpy as np
 import pytest
 import tifffile
@@ -16,6 +15,7 @@ from hypothesis import strategies as st
 
 from litho_data.foundation.errors import InputError
 from litho_data.readers import formats, list_channels, read_layout, read_scan
+from tests.litho_data import afm_files
 
 SIGNATURES = [
     b"Gwyddion Simple Field 1.0\n",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from prints import make_scans, printed_height_um, write_store
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Result
@@ -22,6 +21,7 @@ from litho_models.scan_terms.background import Background, learn_background
 from litho_models.scoring.records import Prediction
 from litho_models.scoring.scores import score_model
 from litho_models.splits.folds import plan_folds
+from tests.litho_models.prints import make_scans, printed_height_um, write_store
 
 BOW_NM = 40.0
 SMOOTH = ("full", "full+rows")

@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 import pytest
 import zarr
-from prints import make_scans, write_store
 
 from litho_data.build.build import build_dataset
 from litho_data.foundation.errors import InputError
@@ -26,6 +25,7 @@ from litho_models.fitting.runs import TrainingRun, train
 from litho_models.frozen.freezing import freeze
 from litho_models.scan_terms import NuisanceProtocol
 from litho_models.splits.folds import plan_folds
+from tests.litho_models.prints import make_scans, write_store
 
 MODELS = ("identity", "affine", "linear")
 SETTINGS = {"nuisance": "offset"}
@@ -314,7 +314,7 @@ def test_line_offsets_are_attributed_to_their_frame():
     angle = np.deg2rad(1.0)
     turned = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
     stripes = np.random.default_rng(0).normal(0, 0.01, 256)[:, None].astype(np.float32)
-    from prints import printed_height_um
+    from tests.litho_models.prints import printed_height_um
 
     scan = replace(scans[0], height_um=scans[0].height_um + stripes, scan_to_layout=turned)
     truth = printed_height_um(scan.layout_um).astype(np.float32)

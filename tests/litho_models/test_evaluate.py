@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from prints import make_scans, write_store
 
 from litho_data.foundation.errors import InputError
 from litho_data.store import open_store
@@ -17,6 +16,7 @@ from litho_models.evaluation.evaluate import evaluate
 from litho_models.evaluation.results import Evaluation
 from litho_models.fitting.runs import train
 from litho_models.noise.residuals import read_residuals
+from tests.litho_models.prints import make_scans, write_store
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from prints import make_scans
 
 from litho_data.foundation.errors import InputError
 from litho_models.fitting import TrainingConfig, fit_with_record
@@ -16,6 +15,7 @@ from litho_models.models import build_model
 from litho_models.models.fno import PeriodicConvolution, SpectralConvolution
 from litho_models.prediction.tiles import blend_tiles, blending_window, predict_scan
 from litho_models.simulator import Tile
+from tests.litho_models.prints import make_scans
 
 pytestmark = pytest.mark.numerics
 

@@ -6,7 +6,6 @@ import json
 import shutil
 
 import pytest
-from prints import make_scans, write_store
 from typer.testing import CliRunner
 
 from litho_data.foundation.errors import InputError
@@ -19,6 +18,7 @@ from litho_models.fitting.runs import TrainingRun, train
 from litho_models.frozen.card import ModelCard
 from litho_models.noise.residuals import read_residuals
 from litho_models.splits.folds import grouped_folds, plan_folds
+from tests.litho_models.prints import make_scans, write_store
 
 QUICK = {"steps": 2, "rounds": 2, "batch": 1, "crop_px": 32, "nuisance": "offset"}
 

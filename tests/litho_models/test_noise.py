@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from prints import make_scans, printed_height_um, write_store
 from scipy.integrate import quad
 from scipy.stats import norm
 
@@ -29,6 +28,7 @@ from litho_models.noise.spread_scores import (
 from litho_models.noise.staircase import READABLE_AT, find_edges, step_print
 from litho_models.noise.surface import print_noise, surface_noise
 from litho_models.noise.variance import COVARIATES, covariate_maps, fit_log_variance, sigma_nm
+from tests.litho_models.prints import make_scans, printed_height_um, write_store
 
 
 @pytest.fixture

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import pytest
 import torch
-from prints import make_scans
 
 from litho_models import load_frozen, save_frozen
 from litho_models.fitting import TrainingConfig, fit
 from litho_models.layers import precision as precisions
 from litho_models.layers.precision import has_bfloat16_unit
 from litho_models.models import build_model
+from tests.litho_models.prints import make_scans
 
 pytestmark = pytest.mark.numerics
 

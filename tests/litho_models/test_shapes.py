@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from prints import make_scan, make_scans
 
 from litho_data.foundation.errors import InputError
 from litho_models.evaluation.diagnostics import tile_consistency
@@ -25,6 +24,7 @@ from litho_models.scoring.shapes import (
     mid_step_heights_um,
     structural_similarity,
 )
+from tests.litho_models.prints import make_scan, make_scans
 
 PITCH_UM = 0.1
 HEIGHTS_UM = mid_step_heights_um(13, 0.1)

@@ -11,7 +11,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from prints import BLUR_UM, make_scan, make_scans, printed_height_um, write_store
 
 from litho_data.foundation.errors import InputError
 from litho_models.fitting import TrainingConfig, fit, fit_with_record
@@ -25,6 +24,7 @@ from litho_models.models import build_model
 from litho_models.models.pbl import Pbl
 from litho_models.prediction.tiles import predict_scan
 from litho_models.scan_terms.training import estimate_scan_terms, training_terms
+from tests.litho_models.prints import BLUR_UM, make_scan, make_scans, printed_height_um, write_store
 
 pytestmark = pytest.mark.numerics
 

@@ -8,7 +8,6 @@ import sys
 
 import pytest
 import torch
-from prints import make_scans, write_store
 from typer.testing import CliRunner
 
 from litho_data.foundation.errors import InputError
@@ -18,6 +17,7 @@ from litho_models.evaluation.zoo_making import HELD_OUT, OUT_OF_FOLD, TRAINED_ON
 from litho_models.frozen import zoo
 from litho_models.frozen.card import ModelCard
 from litho_models.models import build_model
+from tests.litho_models.prints import make_scans, write_store
 
 SMALL = {
     "physics": {},
