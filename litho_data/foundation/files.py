@@ -52,15 +52,29 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     temporary.chmod(0o777 & ~_umask())
     try:
         yield temporary
-        if target.exists():
-            retired = Path(tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".old", dir=target.parent))
-            target.replace(retired / target.name)
-            temporary.replace(target)
-            shutil.rmtree(retired)
-        else:
-            temporary.replace(target)
+        replace_folder(temporary, target)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def replace_folder(new: Path, target: Path) -> None:
+    """Rename a finished folder to ``target``; an older folder there goes back if that fails.
+
+    A process that is killed between the two renames leaves the older folder whole in ``.<name>.….old``.
+    """
+    if not target.exists():
+        new.replace(target)
+        return
+    retired = Path(tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".old", dir=target.parent))
+    old = target.replace(retired / target.name)
+    try:
+        new.replace(target)
+    except OSError:
+        old.replace(target)
+        raise
+    finally:
+        if target.exists():
+            shutil.rmtree(retired)
 
 
 @contextmanager

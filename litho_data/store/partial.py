@@ -19,7 +19,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import atomic_file, writable
+from litho_data.foundation.files import atomic_file, replace_folder, writable
 from litho_data.store.access import group_of, open_root, values_of
 from litho_data.store.schema import SAMPLE_VARIABLES, SCAN_VARIABLES, STORE_SCHEMA, VARIABLES
 from litho_data.store.write import write_scan_group
@@ -109,11 +109,7 @@ class PartialStore:
 
     def publish(self) -> None:
         """Put the finished store in its place; an older store there is replaced."""
-        retired = self.folder / "retired"
-        shutil.rmtree(retired, ignore_errors=True)
-        if self.out.exists():
-            self.out.rename(retired)
-        self.store.rename(self.out)
+        replace_folder(self.store, self.out)
         self.discard()
 
     def discard(self) -> None:

@@ -1,0 +1,100 @@
+"""A file or a folder is replaced whole or not at all: whatever stops the writing, the older one stays."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from litho_data.foundation.files import atomic_file, atomic_folder
+
+
+@pytest.fixture
+def older(tmp_path: Path) -> Path:
+    """A place with a finished result in it, a folder of two files."""
+    folder = tmp_path / "result"
+    (folder / "part").mkdir(parents=True)
+    (folder / "part" / "a.txt").write_text("weeks of work")
+    (folder / "b.txt").write_text("more of it")
+    return folder
+
+
+def contents(folder: Path) -> dict[str, str]:
+    return {str(file.relative_to(folder)): file.read_text() for file in folder.rglob("*") if file.is_file()}
+
+
+def stop_half_way(file: Path) -> None:
+    file.write_text("half of it")
+    raise ZeroDivisionError
+
+
+OLDER = {"part/a.txt": "weeks of work", "b.txt": "more of it"}
+
+
+def test_a_finished_folder_replaces_the_older_one_and_leaves_nothing_else(older: Path) -> None:
+    with atomic_folder(older) as folder:
+        (folder / "c.txt").write_text("new")
+        assert contents(older) == OLDER
+    assert contents(older) == {"c.txt": "new"}
+    assert list(older.parent.iterdir()) == [older]
+
+
+def test_an_error_on_the_way_leaves_the_older_folder_and_nothing_else(older: Path) -> None:
+    with pytest.raises(ZeroDivisionError), atomic_folder(older) as folder:
+        stop_half_way(folder / "c.txt")
+    assert contents(older) == OLDER
+    assert list(older.parent.iterdir()) == [older]
+
+
+def test_a_rename_that_fails_puts_the_older_folder_back(older: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    replace = Path.replace
+
+    def refuse_the_new(self: Path, target: Path) -> Path:
+        if self.name.endswith(".partial"):
+            raise OSError("no space left on device")
+        return replace(self, target)
+
+    monkeypatch.setattr(Path, "replace", refuse_the_new)
+    with pytest.raises(OSError, match="no space"), atomic_folder(older) as folder:
+        (folder / "c.txt").write_text("new")
+    assert contents(older) == OLDER
+    assert list(older.parent.iterdir()) == [older]
+
+
+KILL = "import os, signal; os.kill(os.getpid(), signal.SIGKILL)"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs SIGKILL")
+def test_a_process_killed_while_it_writes_leaves_the_older_folder(older: Path) -> None:
+    code = (
+        "from litho_data.foundation.files import atomic_folder\n"
+        f"with atomic_folder({str(older)!r}) as folder:\n"
+        f"    (folder / 'c.txt').write_text('half of it')\n    {KILL}"
+    )
+    assert subprocess.run([sys.executable, "-c", code]).returncode != 0
+    assert contents(older) == OLDER
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs SIGKILL")
+def test_a_process_killed_between_the_renames_leaves_both_folders_whole(older: Path) -> None:
+    code = (
+        "from pathlib import Path\nfrom litho_data.foundation.files import atomic_folder\n"
+        "replace = Path.replace\n"
+        "def stop(self, target):\n"
+        f"    if self.name.endswith('.partial'):\n        {KILL}\n"
+        "    return replace(self, target)\n"
+        "Path.replace = stop\n"
+        f"with atomic_folder({str(older)!r}) as folder:\n    (folder / 'c.txt').write_text('new')"
+    )
+    assert subprocess.run([sys.executable, "-c", code]).returncode != 0
+    beside = [path for path in older.parent.iterdir() if path.suffix == ".old"]
+    assert [contents(path / "result") for path in beside] == [OLDER]
+
+
+def test_an_error_on_the_way_leaves_the_older_file(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_text("older")
+    with pytest.raises(ZeroDivisionError), atomic_file(tmp_path / "a.txt") as file:
+        stop_half_way(file)
+    assert contents(tmp_path) == {"a.txt": "older"}
