@@ -18,7 +18,7 @@ from litho_data.store.access import has_child
 from litho_models.noise.neighbourhoods import neighbourhood_noise
 from litho_models.noise.spread_scores import GAUSSIAN_MAE
 from litho_models.noise.surface import without_background
-from litho_models.scoring.statistics import bootstrap_interval
+from litho_models.scoring.statistics import interval
 
 Direction = Literal["lower bound", "upper bound", "estimate", "control"]
 # Above this frequency a Gaussian spot of 0.2 µm passes less than 1 %: √(ln 100 / 2π²) / 0.2 µm.
@@ -98,7 +98,7 @@ def repeated_prints(scans: Sequence[PrintedScan]) -> NoiseBound | None:
         of="all",
         direction="estimate",
         sigma_nm=sigma,
-        ci95_nm=bootstrap_interval(sigmas) if len(sigmas) > 1 else None,
+        ci95_nm=interval(sigmas),
         mae_nm=float(np.mean(absolute)),
         scans=len(members),
         contains="print and microscope noise, registration error at edges; offset and bow of a pair removed",
@@ -177,7 +177,7 @@ def _bound(
         of=of,
         direction=direction,
         sigma_nm=sigma,
-        ci95_nm=bootstrap_interval(values) if len(values) > 1 else None,
+        ci95_nm=interval(values),
         mae_nm=GAUSSIAN_MAE * sigma,
         scans=len(values),
         contains=contains,

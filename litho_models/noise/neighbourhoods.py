@@ -14,7 +14,7 @@ import numpy as np
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
-from litho_models.scoring.statistics import bootstrap_interval
+from litho_models.scoring.statistics import interval
 
 _BLURS_UM = (0.1, 0.2, 0.4, 0.8, 1.6)
 _SLOPE_BLUR_UM = 0.3
@@ -84,7 +84,7 @@ def neighbourhood_noise(
     roots = [float(np.sqrt(max(0.0, value))) for value in per_scan]
     return NeighbourhoodNoise(
         sigma_nm=sigma,
-        ci95_nm=bootstrap_interval(roots) if len(roots) > 1 else None,
+        ci95_nm=interval(roots),
         # E|n₁ − n₂| is √2 E|n| for a Gaussian; the extrapolation scales it as it scales σ.
         mae_nm=float(absolute[:, 0].mean() / np.sqrt(2)) * shrink,
         nearest_sigma_nm=nearest,

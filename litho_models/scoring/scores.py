@@ -14,13 +14,12 @@ from litho_models.scan_terms import POLICIES, Blocks, NuisanceProtocol, Policy, 
 from litho_models.scoring.metric_registry import metrics_of, metrics_over_scans
 from litho_models.scoring.metrics import ScanScore, phase_waves, score_scan
 from litho_models.scoring.records import (
-    Interval,
     ModelScores,
     PolicyError,
     Prediction,
     ScanRow,
 )
-from litho_models.scoring.statistics import bootstrap_interval
+from litho_models.scoring.statistics import interval
 from litho_models.scoring.transfer import level_errors, transfer_curves
 
 # Policies without smooth terms of their own: only their errors know of a smooth background.
@@ -102,11 +101,6 @@ def _policy_error(policy: Policy, scores: Sequence[ScanScore]) -> PolicyError:
     values = [score.mae_datum_free_nm for score in scores]
     freedom = float(np.mean([score.degrees_of_freedom for score in scores]))
     return PolicyError(policy=policy, k=freedom, mae_nm=float(np.mean(values)), ci95_nm=interval(values))
-
-
-def interval(values: Sequence[float]) -> Interval:
-    """Bootstrap interval over scans, or None with fewer than two."""
-    return bootstrap_interval(values) if len(values) > 1 else None
 
 
 def _row(scan: PrintedScan, score: ScanScore, metrics: dict[str, Any]) -> ScanRow:

@@ -34,6 +34,11 @@ def bootstrap_interval(
     return float(low), float(high)
 
 
+def interval(values: Sequence[float]) -> tuple[float, float] | None:
+    """As ``bootstrap_interval``, for results: None with fewer than two scans."""
+    return bootstrap_interval(values) if len(values) > 1 else None
+
+
 def sign_flips(count: int, seed: int = 0, *, exact_scans: int = EXACT_SCANS) -> np.ndarray:
     """Signs (draws, count), the observed ones first: all of them up to ``exact_scans``, 10,000 beyond."""
     if count <= exact_scans:

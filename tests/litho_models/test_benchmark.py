@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
 import pandas as pd
 import pytest
 import zarr
+from PIL import Image
 
 from litho_data.build.build import build_dataset
 from litho_data.foundation.errors import InputError
@@ -73,15 +77,33 @@ def test_a_better_model_scores_better_and_the_truth_bounds_it(result):
 def test_the_result_is_complete_on_disk(result):
     record, out = result
     assert Benchmark.read(out) == record
-    assert (out / "report.html").stat().st_size > 50_000
-    table = pd.read_csv(out / "benchmark.csv")
-    assert list(table["model"]) == [*MODELS, "noise floor (unknown)"]
+    table = pd.read_csv(out / "benchmark.csv").set_index("model")
+    assert list(table.index) == [*MODELS, "noise floor (unknown)"]
+    scans = pd.read_csv(out / "scans.csv")
+    for scores in record.scores:
+        assert table.loc[scores.model, "mae_datum_free_nm"] == pytest.approx(scores.mae_datum_free_nm)
+        own = scans[scans["model"] == scores.model].set_index("scan")["mae_datum_free_nm"]
+        assert own.to_dict() == pytest.approx({row.scan: row.mae_datum_free_nm for row in scores.scans})
     assert {"pairs.csv", "scans.csv", "levels.csv", "policies.csv", "fits.csv", "metrics.csv"} <= {
         p.name for p in out.iterdir()
     }
     best = [pair for pair in record.paired if {pair.first, pair.second} == {"affine", "linear"}]
     assert best[0].mean_nm > 0
     assert best[0].first_better == 0
+
+
+def test_the_report_shows_the_result_in_words_tables_and_pictures(result):
+    record, out = result
+    page = (out / "report.html").read_text()
+    best = min(record.scores, key=lambda scores: scores.mae_datum_free_nm)
+    assert f"{best.model}, {best.mae_datum_free_nm:.2f} nm datum-free MAE" in page
+    assert all(f">{scan_id}<" in page for scan_id in [*record.split.scored_ids, *MODELS])
+    assert all(f">{scores.mae_abs_nm:.2f}<" in page for scores in record.scores)
+    pictures = re.findall(r"data:image/png;base64,([A-Za-z0-9+/=]+)", page)
+    # Errors, one scan as maps and as a profile, gains of prints, levels, frequencies.
+    assert len(pictures) == 6
+    for picture in pictures:
+        assert np.asarray(Image.open(io.BytesIO(base64.b64decode(picture))).convert("L")).std() > 5
 
 
 def test_over_fitting_shows_because_three_errors_are_alike(result):
