@@ -14,7 +14,7 @@ from litho_data.store import PrintedScan, Store, open_store
 from litho_models.fitting.config import Recipe
 from litho_models.fitting.runs import train
 from litho_models.frozen import zoo
-from litho_models.frozen.card import Metric, ModelCard
+from litho_models.frozen.card import CardMetric, ModelCard
 from litho_models.frozen.files import load_frozen
 from litho_models.frozen.freezing import MODEL_FOLDER, freeze
 from litho_models.frozen.on_store import card_background, predict_frozen
@@ -84,7 +84,7 @@ def make_zoo(
     return cards
 
 
-def scored_metrics(model: str | Path, scans: Sequence[PrintedScan], split: str) -> list[Metric]:
+def scored_metrics(model: str | Path, scans: Sequence[PrintedScan], split: str) -> list[CardMetric]:
     """The errors of a frozen model on scans, as in its card, the same for any number of threads."""
     frozen = load_frozen(model)
     learned = card_background(frozen, scans)
@@ -113,7 +113,7 @@ def differing_metrics(store: str | Path, root: str | Path = zoo.ZOO_FOLDER) -> d
         if card.dataset is None or card.dataset.sha256 != dataset.sha256:
             raise InputError(f"dataset of zoo model {name}", got=card.dataset, wanted=dataset.sha256)
         stated = [metric for metric in card.metrics if metric.split in (TRAINED_ON, HELD_OUT)]
-        again: list[Metric] = []
+        again: list[CardMetric] = []
         for split, inside in ((TRAINED_ON, False), (HELD_OUT, True)):
             if any(metric.split == split for metric in stated):
                 scans = [scan for scan in every if (scan.id in locked) == inside]
@@ -126,11 +126,11 @@ def differing_metrics(store: str | Path, root: str | Path = zoo.ZOO_FOLDER) -> d
     return found
 
 
-def _metrics(scores: ModelScores, split: str, background: BackgroundUse) -> list[Metric]:
+def _metrics(scores: ModelScores, split: str, background: BackgroundUse) -> list[CardMetric]:
     """The metrics of a card, first with the background of the protocol, then without it."""
 
-    def metric(name: str, value: float, policy: Policy, used: BackgroundUse) -> Metric:
-        return Metric(name=name, value=value, split=split, policy=policy, background=used)
+    def metric(name: str, value: float, policy: Policy, used: BackgroundUse) -> CardMetric:
+        return CardMetric(name=name, value=value, split=split, policy=policy, background=used)
 
     return [
         metric("mae_abs", scores.mae_abs_nm, "none", background),
@@ -143,7 +143,7 @@ def _metrics(scores: ModelScores, split: str, background: BackgroundUse) -> list
     ]
 
 
-def _out_of_fold(benchmark: str | Path, dataset: Store) -> dict[str, list[Metric]]:
+def _out_of_fold(benchmark: str | Path, dataset: Store) -> dict[str, list[CardMetric]]:
     from litho_models.evaluation.results import Benchmark
 
     result = Benchmark.read(benchmark)
@@ -157,7 +157,7 @@ def _out_of_fold(benchmark: str | Path, dataset: Store) -> dict[str, list[Metric
     return {scores.model: _metrics(scores, OUT_OF_FOLD, background) for scores in result.scores}
 
 
-def _limitations(metrics: Sequence[Metric]) -> list[str]:
+def _limitations(metrics: Sequence[CardMetric]) -> list[str]:
     splits = {metric.split for metric in metrics}
     notes = ["Trained on prints of one machine, resist and protocol: retrain for any other."]
     if HELD_OUT not in splits:

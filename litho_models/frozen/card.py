@@ -22,7 +22,7 @@ EffectValues = dict[str, dict[str, float]]
 _LISTS_OF_NAMES = ("scan_ids", "lock_box", "lock_box_files_sha256")
 
 
-class Metric(Record):
+class CardMetric(Record):
     """One reported number: what, how much, on which scans, with which nuisances and background."""
 
     name: str
@@ -63,7 +63,7 @@ class ModelCard(RunFacts, Result):
     split: dict[str, JsonValue] = Field(default_factory=dict)
     nuisance: dict[str, JsonValue] = Field(default_factory=dict)
     background: Background | None = None
-    metrics: list[Metric] = Field(default_factory=list)
+    metrics: list[CardMetric] = Field(default_factory=list)
     noise_floor: dict[str, JsonValue] | None = None
     process_effects: EffectValues = Field(default_factory=dict)
     measurement_effects: EffectValues = Field(default_factory=dict)
