@@ -1,7 +1,8 @@
 """Roughness and noise of scans: amplitudes, spectra, correlation, step heights, and what levelling hides."""
 
-from litho_data.roughness.amplitude import AmplitudeParameters, amplitude_parameters
-from litho_data.roughness.correlation import (
+from litho_data.roughness.amplitude import (
+    AmplitudeParameters,
+    amplitude_parameters,
     autocorrelation,
     correlation_length_um,
     effective_samples,

@@ -1,8 +1,11 @@
-"""Amplitude parameters of a surface (ISO 25178-2 names)."""
+"""Amplitudes of a surface (ISO 25178-2 names), its autocorrelation, and the uncertainty of Sq."""
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
+import scipy.fft
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
@@ -56,3 +59,68 @@ def amplitude_parameters(height_um: np.ndarray, valid: np.ndarray | None = None)
         sz_nm=float(np.ptp(height_nm)),
         pixels=int(height_nm.size),
     )
+
+
+Axis = Literal["x", "y"]
+
+
+def autocorrelation(height_um: np.ndarray) -> np.ndarray:
+    """Normalised autocorrelation for lags of 0 … half the field, shape (ny // 2, 2 (nx // 2) − 1).
+
+    Element ``[i, j]`` belongs to the lag of i rows and ``j − (nx // 2 − 1)`` columns; the sum at each
+    lag is divided by the number of pixel pairs.
+
+    Raises:
+        InputError: NaN in the surface, or a flat one.
+    """
+    if not np.isfinite(height_um).all():
+        raise InputError("surface", got="NaN", wanted="finite heights for an autocorrelation")
+    deviation = height_um.astype(np.float64) - height_um.mean(dtype=np.float64)
+    ny, nx = deviation.shape
+    padded = [scipy.fft.next_fast_len(size + size // 2, real=True) for size in (ny, nx)]
+    spectrum = scipy.fft.rfft2(deviation, padded)
+    products = scipy.fft.irfft2(np.abs(spectrum) ** 2, padded)
+    rows, columns = np.arange(ny // 2), np.arange(-(nx // 2 - 1), nx // 2)
+    pairs = np.outer(ny - rows, nx - np.abs(columns))
+    covariance = products[np.ix_(rows, columns)] / pairs
+    if covariance[0, nx // 2 - 1] <= 0:
+        raise InputError("surface", got="a flat one", wanted="heights that vary")
+    return covariance / covariance[0, nx // 2 - 1]
+
+
+def correlation_length_um(
+    height_um: np.ndarray, pitch_um: float, axis: Axis, *, level: float = np.exp(-1)
+) -> float:
+    """Lag at which the autocorrelation along an axis first falls to ``level``, µm, linear between pixels.
+
+    Infinity where it stays above ``level`` over half the field.
+    """
+    correlation = autocorrelation(height_um)
+    centre = correlation.shape[1] // 2
+    profile = correlation[0, centre:] if axis == "x" else correlation[:, centre]
+    below = np.flatnonzero(profile <= level)
+    if below.size == 0:
+        return float("inf")
+    lag = int(below[0])
+    before, after = profile[lag - 1], profile[lag]
+    return float(pitch_um * (lag - 1 + (before - level) / (before - after)))
+
+
+def effective_samples(height_um: np.ndarray) -> float:
+    """Independent heights in a field as far as its variance goes: pixels / Σ ρ² over all lags.
+
+    The estimate of a mean square has relative variance ``2 Σ ρ² / pixels`` for a Gaussian surface. Lags
+    beyond a quarter of the field are left out, because ρ² there is noise of the estimate.
+    """
+    correlation = autocorrelation(height_um)
+    rows, columns = max(1, correlation.shape[0] // 2), max(1, correlation.shape[1] // 4)
+    centre = correlation.shape[1] // 2
+    near = correlation[:rows, centre - columns : centre + columns + 1]
+    # The half plane of negative row lags mirrors the positive one.
+    total = 2 * np.sum(near**2) - np.sum(near[0] ** 2)
+    return float(min(height_um.size, max(1.0, height_um.size / total)))
+
+
+def sq_uncertainty_nm(height_um: np.ndarray) -> float:
+    """Standard uncertainty of Sq from the finite field: ``Sq / √(2 n_eff)``, nm (Gaussian heights)."""
+    return amplitude_parameters(height_um).sq_nm / float(np.sqrt(2 * effective_samples(height_um)))

@@ -8,8 +8,7 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
-from litho_data.roughness.amplitude import amplitude_parameters
-from litho_data.roughness.correlation import sq_uncertainty_nm
+from litho_data.roughness.amplitude import amplitude_parameters, sq_uncertainty_nm
 
 Axis = Literal["x", "y"]
 
