@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from litho_data.foundation.faces import lazy_face
 
 if TYPE_CHECKING:
+    from litho_models.effects import register_effect as register_effect
     from litho_models.evaluation.benchmark import benchmark as benchmark
     from litho_models.evaluation.compare import compare as compare
     from litho_models.evaluation.evaluate import evaluate as evaluate
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from litho_models.loop import close_loop_on_store as close_loop
     from litho_models.models import build_model as build_model
     from litho_models.noise import analyse_noise as analyse_noise
+    from litho_models.scan_terms import register_scan_term as register_scan_term
     from litho_models.scoring.metric_registry import register_metric as register_metric
     from litho_models.simulator import Simulator as Simulator
 
@@ -37,7 +39,9 @@ else:
             "evaluate": "litho_models.evaluation.evaluate",
             "freeze": "litho_models.frozen.freezing",
             "load_frozen": "litho_models.frozen.files",
+            "register_effect": "litho_models.effects",
             "register_metric": "litho_models.scoring.metric_registry",
+            "register_scan_term": "litho_models.scan_terms",
             "save_frozen": "litho_models.frozen.files",
             "train": "litho_models.fitting.runs",
             "zoo": "litho_models.frozen",
@@ -57,7 +61,9 @@ __all__ = [
     "evaluate",
     "freeze",
     "load_frozen",
+    "register_effect",
     "register_metric",
+    "register_scan_term",
     "save_frozen",
     "train",
     "zoo",

@@ -6,6 +6,7 @@ from litho_models.effects.registry import (
     UNTESTABLE,
     get_effect,
     in_forward_order,
+    register_effect,
     screened_effects,
 )
 
@@ -17,5 +18,6 @@ __all__ = [
     "Parameter",
     "get_effect",
     "in_forward_order",
+    "register_effect",
     "screened_effects",
 ]

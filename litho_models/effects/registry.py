@@ -72,14 +72,29 @@ UNTESTABLE = {
 }
 
 
-def _collect() -> dict[str, Effect]:
-    found = {effect.name: effect for family in _FAMILIES for effect in family.EFFECTS}
-    if set(found) != set(_FORWARD_ORDER):
-        raise ImportError(f"families and forward order differ in {set(found) ^ set(_FORWARD_ORDER)}")
-    return {name: found[name] for name in _FORWARD_ORDER}
+CATALOGUE: dict[str, Effect] = {}
 
 
-CATALOGUE: dict[str, Effect] = _collect()
+def register_effect(effect: Effect, *, after: str | None = None) -> Effect:
+    """Add an effect to the catalogue; returns it. From then on it is a candidate of the loop.
+
+    Args:
+        effect: the effect; one of single scans (``per_scan``) needs a scan term as well, see
+            ``litho_models.scan_terms.register_scan_term``.
+        after: the effect behind which it acts; by default it is the last one of its stage.
+
+    Raises:
+        InputError: a name that is taken, or no effect called ``after``.
+    """
+    if effect.name in CATALOGUE:
+        raise InputError("effect", got=f"{effect.name}, which exists", wanted="a new name")
+    alike = [name for name, other in CATALOGUE.items() if other.stage == effect.stage]
+    behind = get_effect(after).name if after else alike[-1]
+    entries = list(CATALOGUE.items())
+    entries.insert(list(CATALOGUE).index(behind) + 1, (effect.name, effect))
+    CATALOGUE.clear()
+    CATALOGUE.update(entries)
+    return effect
 
 
 def get_effect(name: str) -> Effect:
@@ -106,3 +121,14 @@ def in_forward_order(names: Sequence[str]) -> list[str]:
 def screened_effects() -> list[Effect]:
     """Effects with parameters common to all scans, tested by the score test."""
     return [effect for effect in CATALOGUE.values() if not effect.per_scan]
+
+
+def _fill() -> None:
+    """The built-in effects in the order in which they act; one without a place in it is last of its stage."""
+    found = {effect.name: effect for family in _FAMILIES for effect in family.EFFECTS}
+    CATALOGUE.update((name, found.pop(name)) for name in _FORWARD_ORDER)
+    for effect in found.values():
+        register_effect(effect)
+
+
+_fill()

@@ -15,8 +15,6 @@ from litho_models.loop.selection.search import separating_experiment
 from litho_models.loop.single_scans.nested_tests import MeasurementTest
 from litho_models.loop.structure import LINEAR_RESPONSE, is_structured
 
-# Their parameters lie in the span of what every scan may add: nested tests, error without other fits.
-_SPAN_EFFECTS = {"datum-offset", "z-gain", "tilt-bow"}
 # Of what the effect gained.
 _DOUBTFUL_SHARE = 0.1
 
@@ -45,7 +43,7 @@ def _added_measurement(findings: LoopFindings, test: MeasurementTest) -> AddedEf
             )
             for name, (value, interval, unit) in test.spread.items()
         },
-        metric="mae_abs" if effect.name in _SPAN_EFFECTS else "mae_datum_free",
+        metric="mae_abs" if effect.name == "datum-offset" else "mae_datum_free",
         before_nm=test.before.mean_mae_nm,
         after_nm=test.after.mean_mae_nm,
         gain_ci95_nm=test.confirmation.gain_ci95_nm,

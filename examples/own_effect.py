@@ -1,0 +1,93 @@
+"""Effects of your own in the closed loop: one of the printer, and one of single scans.
+
+    python examples/own_effect.py STORE.zarr --out loop
+
+Registers a process effect (the first layers sink into the adhesion promoter) and a term of single scans
+(a scanner whose bow has a cubic part), then closes the loop as `litho-models close-loop` does. Nothing else
+has to change: both are candidates, with a verdict and its reason in `close_loop.json` and `report.html`.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import torch
+from torch import Tensor
+
+from litho_data.foundation.commands import run_script
+from litho_models import LoopConfig, close_loop, register_effect, register_scan_term
+from litho_models.effects import Effect, FieldContext, Parameter
+from litho_models.effects.effect import Values
+from litho_models.scan_terms import FloatMap, ScanTerm, TermPixels
+
+SINKING_DEPTH_UM = 0.2
+
+
+def sinking_layers(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """H - d exp(-M / 0.2 µm): what is printed of the lowest levels M stands d lower."""
+    return height - values["depth_um"] * torch.exp(-context.layout_um / SINKING_DEPTH_UM)
+
+
+def cubic_bow(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """H + a x³, x from -1 to 1 over the scan."""
+    _, x = context.scan_position()
+    return height + values["bow_xxx_um"] * x**3
+
+
+def cubic_bow_map(pixels: TermPixels) -> FloatMap:
+    """The same as a map of zero mean, (1, n)."""
+    x = pixels.smooth[0]
+    return (x**3)[None]
+
+
+def register() -> None:
+    """Enter both effects, and the scan term that stands for the second."""
+    register_effect(
+        Effect(
+            name="sinking-layers",
+            title="first layers sinking into the adhesion promoter",
+            stage="development",
+            role="process",
+            acts_on="height",
+            parameters={"depth_um": Parameter("µm", 0.0, 0.3, 0.03)},
+            apply=sinking_layers,
+            trials=({"depth_um": 0.03},),
+            source="an example",
+            separating="print staircases with and without the promoter",
+        )
+    )
+    register_effect(
+        Effect(
+            name="cubic-bow",
+            title="cubic part of the bow of the single scan",
+            stage="measurement",
+            role="measurement",
+            acts_on="height",
+            parameters={"bow_xxx_um": Parameter("µm", -0.3, 0.3, 0.02)},
+            apply=cubic_bow,
+            source="an example",
+            separating="scan a flat substrate",
+            per_scan=True,
+        )
+    )
+    register_scan_term(ScanTerm("cubic-bow", "cubic-bow", "µm", ("x³",), maps=cubic_bow_map))
+
+
+def main() -> None:
+    """Register the effects, close the loop, print what became of them."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("store", help="dataset store")
+    parser.add_argument("--out", required=True, help="folder of the result")
+    parser.add_argument("--folds", type=int, default=5, help="outer folds, by scan (default 5)")
+    given = parser.parse_args()
+    register()
+    result = close_loop(given.store, given.out, config=LoopConfig.model_validate({"folds": given.folds}))
+    for candidate in result.candidates:
+        if candidate.name in ("sinking-layers", "cubic-bow"):
+            print(f"{candidate.name}: {candidate.verdict}, {candidate.reason}")
+
+
+if __name__ == "__main__":
+    run_script(main)
