@@ -118,10 +118,15 @@ def fit_folds(
     return FoldFits(chain_at(chain, common), common, per_fold, errors, _robust_covariance(linear), linear)
 
 
-def predict(chain: EffectChain, vector: np.ndarray, scan: PreparedScan) -> np.ndarray:
-    """Predicted height (y, x) float32, µm, by the chain with these parameters."""
+def predict(
+    chain: EffectChain, vector: np.ndarray, scan: PreparedScan, fold: int | None = None
+) -> np.ndarray:
+    """Predicted height (y, x) float32, µm, by the chain with these parameters.
+
+    Of a base trained per fold the model of ``fold`` predicts, by default that which has not seen the scan.
+    """
     here = chain_at(chain, vector)
-    return _with_height_effects(here, _base_height(here, scan), scan)
+    return _with_height_effects(here, _base_height(here, scan, fold), scan)
 
 
 class ChainProblem:
@@ -177,10 +182,10 @@ class ChainProblem:
         return orthonormal(terms.T).T if self._loss == "squares" else terms
 
 
-def _base_height(chain: EffectChain, scan: PreparedScan) -> Tensor:
+def _base_height(chain: EffectChain, scan: PreparedScan, fold: int | None = None) -> Tensor:
     """Height (1, 1, y, x) of the base model on the layout with the layout effects, µm."""
     with torch.no_grad():
-        return model_for(chain.base, scan.id)(chain.before_base(scan.layout, scan.context))
+        return model_for(chain.base, scan.id, fold)(chain.before_base(scan.layout, scan.context))
 
 
 def _with_height_effects(chain: EffectChain, base_height: Tensor, scan: PreparedScan) -> np.ndarray:

@@ -25,7 +25,12 @@ class FoldedBase(nn.Module):
         self.models = nn.ModuleList(models)
         self.common = common
         self.fold_of = dict(fold_of)
-        self.eval().requires_grad_(False)
+        # Weights stay as the trainer left them: frozen ones would be predicted with other roundings.
+        self.eval()
+
+    def of_fold(self, fold: int) -> nn.Module:
+        """The model trained without this fold; one that was trained elsewhere stands for all folds."""
+        return self.models[min(fold, len(self.models) - 1)]
 
     def of_scan(self, scan_id: str) -> nn.Module:
         """The model that has not seen this scan."""

@@ -22,7 +22,8 @@ _AT_BOUND = 1e-6
 
 def is_refitted(base: nn.Module) -> bool:
     """Whether the base has parameters, and few enough to be fitted together with the effects."""
-    return is_small(base) and any(p.requires_grad for p in base.parameters())
+    trainable = any(p.requires_grad for p in base.parameters())
+    return trainable and is_small(base) and not isinstance(base, FoldedBase)
 
 
 def get_vector(chain: EffectChain) -> np.ndarray:
@@ -44,9 +45,14 @@ def chain_at(chain: EffectChain, vector: np.ndarray) -> EffectChain:
     return moved
 
 
-def model_for(base: nn.Module, scan_id: str) -> nn.Module:
-    """The model that predicts a scan: the base, or of one per fold the one that has not seen the scan."""
-    return base.of_scan(scan_id) if isinstance(base, FoldedBase) else base
+def model_for(base: nn.Module, scan_id: str, fold: int | None = None) -> nn.Module:
+    """The model that predicts a scan: the base, or of one per fold that of ``fold``.
+
+    Without a fold it is the one that has not seen the scan.
+    """
+    if not isinstance(base, FoldedBase):
+        return base
+    return base.of_scan(scan_id) if fold is None else base.of_fold(fold)
 
 
 def effect_slots(chain: EffectChain) -> dict[tuple[str, str], int]:

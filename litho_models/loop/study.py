@@ -107,7 +107,7 @@ class State:
 
     def of_fold(self, fold: int, scan: PreparedScan) -> np.ndarray:
         """What the fit without this fold predicts of any scan, (y, x) µm."""
-        prediction = predict(self.fits.chain, self.fits.per_fold[fold], scan)
+        prediction = predict(self.fits.chain, self.fits.per_fold[fold], scan, fold)
         for correction in self.corrections:
             prediction = correction(fold, scan, prediction)
         return prediction
