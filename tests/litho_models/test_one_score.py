@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import pytest
-from prints import make_scans, write_store
 
 from litho_models.evaluation.benchmark import benchmark
 from litho_models.loop import LoopConfig, close_loop_on_store
+from tests.litho_models.prints import make_scans, write_store
 
 STEPS = 2
 

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from prints import write_store
 
 from litho_data.foundation.errors import InputError
 from litho_models.effects import CATALOGUE, get_effect, register_effect
 from litho_models.loop.result.record import CloseLoop
 from tests.litho_models.loop_scans import printed_scans
+from tests.litho_models.prints import write_store
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "own_effect.py"
 
