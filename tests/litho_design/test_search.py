@@ -1,0 +1,45 @@
+"""What a search reports is what can be printed: whole levels, the kept ones and the history alike."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from litho_design.optimisation.search import make_parametrisation, search_layout
+from litho_design.optimisation.settings import SearchSettings
+from litho_design.printers.layout import LayoutSettings
+
+LAYOUT = LayoutSettings(size_px=16, cell_um=0.4, levels=5)
+# Between two levels, so that a layout of fractions is worth more than any that can be printed.
+WANTED = torch.linspace(0.6, 3.4, 16)[:, None].expand(16, 16)
+
+
+def objective(level):
+    return (level[0, 0] - WANTED).square().mean(), {}
+
+
+@pytest.mark.parametrize("keep", ["best", "last"])
+@pytest.mark.parametrize("parametrisation", ["direct", "gumbel"])
+def test_history_and_kept_layout_are_of_whole_levels(parametrisation, keep):
+    """Runs of 1, 2 … iterations end where a longer one was after as many, whatever it says of itself."""
+    told, shown = [], []
+    for iterations in range(1, 9):
+        # Soft samples to the end: a score of them would fall far below that of the printable layout.
+        settings = SearchSettings(
+            parametrisation=parametrisation, keep=keep, iterations=iterations, evaluate_every=1,
+            learning_rate=0.3, temperature_start=1.0, temperature_end=1.0, hard_from=1.0,
+        )  # fmt: skip
+        parameters = make_parametrisation(LAYOUT, settings)
+        parameters.start_random(0)
+        state = search_layout(parameters, objective, settings)
+        levels = parameters.best_levels()
+        assert levels.dtype == torch.int64
+        told.append(float(objective(parameters.cells(levels)[None, None].float())[0]))
+        shown.append([entry["argmax_loss"] for entry in state.history])
+        assert shown[-1] == pytest.approx(told)
+        kept = float(objective(parameters.cells(state.best_levels)[None, None].float())[0])
+        assert state.best_loss == pytest.approx(kept)
+        assert kept == pytest.approx(min(told) if keep == "best" else told[-1])
+    samples = [entry["sample_loss"] for entry in state.history]
+    # The law is not vacuous: samples and layouts do differ here.
+    assert max(abs(one - other) for one, other in zip(samples, told, strict=True)) > 0.01

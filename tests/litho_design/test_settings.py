@@ -1,0 +1,209 @@
+"""Settings: each is stated in one field, and can be reached by option, by --set and from a file."""
+
+from __future__ import annotations
+
+import functools
+import json
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import Literal, get_args, get_origin
+
+import pytest
+from typer.main import get_command
+from typer.testing import CliRunner
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.settings import Leaf, changed, leaves
+from litho_design.cli.app import app
+from litho_design.holograms.settings import HologramSettings, hologram_settings
+from litho_design.lenses.settings import LensSettings, lens_settings
+from litho_design.optimisation.starts import _MADE_FOR, _STARTS, StartName
+
+ROOT = Path(__file__).parents[2]
+PRESETS = {"hoe": HologramSettings(), "lens": LensSettings()}
+EVERY = [(task, leaf) for task, preset in PRESETS.items() for leaf in leaves(preset)]
+# Choosing another preset or kind of lens changes more than the one value.
+CHOOSE = ("variant", "task")
+
+
+def named(pairs):
+    return pytest.mark.parametrize(
+        ("task", "leaf"), pairs, ids=[f"{task}-{leaf.path}" for task, leaf in pairs]
+    )
+
+
+def other(leaf: Leaf):
+    """Another value that the field accepts."""
+    if get_origin(leaf.kind) is Literal:
+        return next(choice for choice in get_args(leaf.kind) if choice != leaf.value)
+    if isinstance(leaf.value, tuple):
+        return leaf.value[::-1]
+    if leaf.kind is float:
+        return leaf.value / 2 if leaf.value else 0.25
+    assert leaf.kind is int, leaf
+    return leaf.value + 7
+
+
+@functools.cache
+def printed(task, *words):
+    """Settings by path, as `litho-design settings` prints them."""
+    result = CliRunner().invoke(app, ["settings", task, *map(str, words)], catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return flat(tomllib.loads(result.stdout))
+
+
+def flat(content, prefix=""):
+    found = {}
+    for name, value in content.items():
+        found |= flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {f"{prefix}{name}": value}
+    return found
+
+
+@named(EVERY)
+def test_every_setting_is_reached_by_its_path(task, leaf):
+    value = json.loads(json.dumps(other(leaf)))
+    word = value if isinstance(value, str) else json.dumps(value)
+    before, after = printed(task), printed(task, "--set", f"{leaf.path}={word}")
+    assert after[leaf.path] == value
+    if leaf.path not in CHOOSE:
+        assert {path for path in before if before[path] != after[path]} == {leaf.path}
+
+
+@named([(task, leaf) for task, leaf in EVERY if leaf.options])
+def test_every_option_sets_the_field_that_states_it(task, leaf):
+    value = other(leaf)
+    for option in leaf.options:
+        assert printed(task, option, value)[leaf.path] == value
+
+
+@named(EVERY)
+def test_every_setting_says_what_it_is_and_in_which_unit(task, leaf):
+    assert leaf.help
+    assert not leaf.help.endswith(".")
+    suffix = leaf.path.rpartition("_")[2]
+    assert {"um": "µm", "px": "px"}.get(suffix, leaf.unit) == leaf.unit
+
+
+@pytest.mark.parametrize("task", PRESETS)
+def test_no_two_settings_share_an_option(task):
+    options = [option for leaf in leaves(PRESETS[task]) for option in leaf.options]
+    assert len(options) == len(set(options))
+
+
+@pytest.mark.parametrize("command", ["hoe", "lens", "compare"])
+def test_help_shows_default_and_unit_of_every_option(command, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")
+    monkeypatch.setenv("TERMINAL_WIDTH", "200")
+    shown = CliRunner().invoke(app, [command, "--help"]).stdout
+    presets = PRESETS.values() if command == "compare" else [PRESETS[command]]
+    offered = options_of(command)
+    for leaf in (leaf for preset in presets for leaf in leaves(preset) if offered & set(leaf.options)):
+        assert leaf.options[0] in shown
+        value = f"{leaf.value:g}" if isinstance(leaf.value, float) else str(leaf.value)
+        assert value in shown
+    assert ", µm." in shown
+
+
+def options_of(command):
+    return {option for param in get_command(app).commands[command].params for option in param.opts}
+
+
+@pytest.mark.parametrize("page", ["docs/optics.md", "README.md"])
+def test_the_options_that_pages_name_are_there(page):
+    text = (ROOT / page).read_text("utf-8")
+    lines = [line for line in text.splitlines() if line.startswith("litho-design ")]
+    assert lines
+    for line in lines:
+        _, command, *words = line.split()
+        assert {word for word in words if word.startswith("--")} <= options_of(command), line
+
+
+def test_the_printed_settings_are_a_file_of_settings(tmp_path):
+    for task, words in (("hoe", ("--variant", "paper")), ("lens", ("--task", "computational"))):
+        file = tmp_path / f"{task}.toml"
+        file.write_text(CliRunner().invoke(app, ["settings", task, *words]).stdout)
+        assert printed(task, "--config", file) == printed(task, *words)
+    assert hologram_settings(changes=tomllib.loads((tmp_path / "hoe.toml").read_text())) == hologram_settings(
+        "paper"
+    )
+
+
+def test_options_win_over_the_file_and_the_file_over_the_preset(tmp_path):
+    file = tmp_path / "mine.json"
+    content = {"variant": "authors", "layout": {"levels": 9, "size_px": 64}, "loss.efficiency_weight": 0.3}
+    file.write_text(json.dumps(content))
+    found = printed("hoe", "--config", file, "--levels", 5, "--set", "optics.index_step=0.6")
+    authors = flat(json.loads(hologram_settings("authors").model_dump_json()))
+    given = {
+        "layout.levels": 5,
+        "layout.size_px": 64,
+        "loss.efficiency_weight": 0.3,
+        "optics.index_step": 0.6,
+    }
+    assert found == authors | given
+    assert printed("hoe", "--config", file, "--variant", "paper")["variant"] == "paper"
+
+
+def test_python_takes_the_same_changes():
+    changes = {"layout.size_px": 64, "loss": {"efficiency_weight": 0.3}}
+    settings = hologram_settings("paper", changes)
+    assert (settings.layout.size_px, settings.loss.efficiency_weight) == (64, 0.3)
+    assert settings.search == hologram_settings("paper").search
+    assert lens_settings("computational", changes={"task": "direct"}).task == "direct"
+    assert changed(settings, {}) == settings
+    with pytest.raises(InputError, match="variant"):
+        hologram_settings(changes={"variant": "ours"})
+
+
+@pytest.mark.parametrize(
+    ("words", "complaint"),
+    [
+        (("hoe", "--set", "loss.weight=0.2"), "got an unknown name, wanted one of loss.scale, loss.eff"),
+        (("hoe", "--set", "los.weight=0.2"), "wanted one of variant, layout, optics, search"),
+        (("hoe", "--set", "loss=0.2"), "wanted one of loss.scale"),
+        (("hoe", "--set", "layout.levels.top=2"), "layout.levels, which is a value"),
+        (("hoe", "--set", "layout.levels"), "PATH=VALUE"),
+        (("hoe", "--set", "layout.levels=many"), "setting layout.levels, got 'many', wanted a valid integer"),
+        (("hoe", "--set", "layout.levels=1"), "wanted greater than or equal to 2"),
+        (("hoe", "--set", "optics.distance_um=Infinity"), "wanted a finite number"),
+        (("hoe", "--set", "layout.levels=5", "--set", "layout.levels=6"), "layout.levels twice"),
+        (("hoe", "--levels", "5", "--set", "layout.levels=6"), "an option sets too"),
+        (("hoe", "--config", "unknown.toml"), "unknown.toml: layout.size, got an unknown name"),
+        (("hoe", "--config", "broken.toml"), "broken.toml"),
+        (("hoe", "--config", "list.json"), "wanted settings by name"),
+        (("hoe", "--config", "value.toml"), "layout, got 5"),
+        (("hoe", "--config", "nowhere.toml"), "nowhere.toml"),
+        (("hoe", "--config", "settings.yaml"), ".toml or .json"),
+        (("lens", "--set", "imaging.objects=[]"), "the least"),
+        (("compare", "--models", "none", "--window-px", "64"), "--window-px, got the hoe task"),
+        (("compare", "--models", "none", "--task", "lens-direct", "--loss-scale", "paper"), "--loss-scale"),
+        (("compare", "--models", "none", "--set", "search.seed=4"), "search.seed"),
+    ],
+)  # fmt: skip
+def test_bad_settings_are_one_line_and_exit_code_2(tmp_path, monkeypatch, refused, words, complaint):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "unknown.toml").write_text("[layout]\nsize = 5\n")
+    (tmp_path / "broken.toml").write_text("[layout\n")
+    (tmp_path / "list.json").write_text("[]")
+    (tmp_path / "value.toml").write_text("layout = 5\n")
+    (tmp_path / "settings.yaml").write_text("layout: 5\n")
+    model = () if words[0] == "compare" else ("--model", "none")
+    assert complaint in refused(*words, *model, "--out", "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_every_start_that_can_be_named_can_be_made():
+    assert {"random", *_STARTS} == set(get_args(StartName))
+    assert set(_MADE_FOR) <= set(_STARTS)
+
+
+def test_help_needs_no_torch():
+    code = (
+        "import sys; from litho_design.cli.app import app\n"
+        "try: app(['hoe', '--help'])\n"
+        "except SystemExit: pass\n"
+        "sys.exit('torch' in sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)
