@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from litho_models.effects.effect import Effect, FieldContext, Parameter, Values
+from litho_models.scan_terms.term import CREEP_DECAYS
 
 
 def datum_offset(height: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -37,10 +38,6 @@ def scan_line_stripes(height: Tensor, values: Values, context: FieldContext) -> 
     generator = torch.Generator().manual_seed(context.seed)
     draws = torch.randn(int(line.max()) + 1, generator=generator).to(height)
     return height + values["sd_um"] * draws[line]
-
-
-# Decay of the two parts of a creep, in scan times; what is slower still lies in the bow.
-CREEP_DECAYS = {"fast_creep_um": 0.05, "slow_creep_um": 0.2}
 
 
 def slow_drift(height: Tensor, values: Values, context: FieldContext) -> Tensor:

@@ -184,7 +184,7 @@ def _distortion(pixels: TermPixels) -> FloatMap:
     return np.stack([slope * by for slope in pixels.slopes for by in (y * y - 1 / 3, x * y, x * x - 1 / 3)])
 
 
-# Decay of the two parts of a creep, in scan times.
+# Decay of the two parts of a creep, in scan times; what is slower still lies in the bow.
 CREEP_DECAYS = {"fast_creep_um": 0.05, "slow_creep_um": 0.2}
 
 # In the order in which they are tested.
