@@ -148,7 +148,11 @@ class Pbl(Simulator):
 
 
 class AreawiseNet(nn.Module):
-    """Stack of 3 x 3 convolutions, 1 -> channels -> 1, leaky ReLU after each but the last."""
+    """Stack of 3 x 3 convolutions, 1 -> channels -> 1, leaky ReLU after each but the last.
+
+    ``activation`` may be any function of one value; the compiled stack knows the leaky ReLU only, and every
+    other one runs layer by layer.
+    """
 
     def __init__(self, channels: tuple[int, ...], leaky_slope: float):
         super().__init__()
@@ -156,7 +160,7 @@ class AreawiseNet(nn.Module):
         convolutions = [nn.Conv2d(inputs, outputs, 3) for inputs, outputs in pairwise(widths)]
         self.hidden = nn.ModuleList(convolutions[:-1])
         self.last = convolutions[-1]
-        self.leaky_slope = leaky_slope
+        self.activation: nn.Module = nn.LeakyReLU(leaky_slope)
         for convolution in convolutions:
             weight = convolution.weight
             weight.data = weight.data.contiguous(memory_format=torch.channels_last)
@@ -168,19 +172,21 @@ class AreawiseNet(nn.Module):
     def forward(self, height_um: Tensor, padding: int = 0) -> Tensor:
         """Interior of (b, 1, y, x) without padding; the same size with a zero padding of 1 per layer."""
         # Small tiles are for the cache of a CPU; a GPU wants large ones.
-        if padding == 0 and height_um.device.type == "cpu" and self.leaky_slope > 0:
-            return self._in_tiles(height_um)
+        if padding == 0 and height_um.device.type == "cpu":
+            activation = self.activation
+            if isinstance(activation, nn.LeakyReLU) and activation.negative_slope > 0:
+                return self._in_tiles(height_um, activation.negative_slope)
         features = height_um.contiguous(memory_format=torch.channels_last)
         for layer in cast(list[nn.Conv2d], list(self.hidden)):
             features = functional.conv2d(features, layer.weight, layer.bias, padding=padding)
-            features = functional.leaky_relu(features, self.leaky_slope)
+            features = self.activation(features)
         # The sum over channels is the height: full precision also where the stack runs in bfloat16.
         with torch.autocast(device_type=height_um.device.type, enabled=False):
             return functional.conv2d(
                 features.to(self.last.weight.dtype), self.last.weight, self.last.bias, padding=padding
             )
 
-    def _in_tiles(self, height_um: Tensor) -> Tensor:
+    def _in_tiles(self, height_um: Tensor, leaky_slope: float) -> Tensor:
         layers = cast(list[nn.Conv2d], [*self.hidden, self.last])
         dtype = self.last.weight.dtype
         hidden = torch.get_autocast_dtype("cpu") if torch.is_autocast_enabled("cpu") else dtype
@@ -189,7 +195,7 @@ class AreawiseNet(nn.Module):
                 height_um.to(dtype),
                 [layer.weight for layer in layers],
                 [cast(Tensor, layer.bias) for layer in layers],
-                leaky_slope=self.leaky_slope,
+                leaky_slope=leaky_slope,
                 hidden_dtype=hidden,
                 adjoint_dtype=adjoint_dtype() or hidden,
             )

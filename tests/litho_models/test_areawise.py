@@ -7,11 +7,13 @@ from typing import Any
 
 import pytest
 import torch
+from torch import nn
 from torch.nn import functional
 
 from litho_models.fast import convolution_stack
 from litho_models.frozen.files import load_frozen, save_frozen
 from litho_models.models import build_model
+from litho_models.models.pbl import AreawiseNet
 
 pytestmark = pytest.mark.numerics
 
@@ -65,6 +67,18 @@ def test_it_is_the_plain_stack_and_its_gradients(shape, learns):
     ):
         # A weight sums up to 80,000 pixels: relative to the largest, some hundred roundings of 1e-16.
         assert float((ours - plain).abs().max()) < 1e-13 * max(1.0, float(plain.abs().max()))
+
+
+def test_an_activation_that_the_tiles_do_not_know_runs_layer_by_layer():
+    net = AreawiseNet((16, 16), SLOPE)
+    field = torch.randn(1, 1, 40, 40, generator=torch.Generator().manual_seed(5))
+    tiled = net(field)
+    net.activation = nn.GELU()
+    expected = field
+    for layer in net.hidden:
+        expected = functional.gelu(layer(expected))
+    assert torch.allclose(net(field), net.last(expected), rtol=0, atol=1e-6)
+    assert not torch.allclose(net(field), tiled, atol=1e-3)
 
 
 @pytest.fixture
