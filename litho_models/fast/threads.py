@@ -8,7 +8,7 @@ be added up in an order, and so rounded in a way, that depends on how many threa
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from threading import Barrier, Lock
 from typing import TypeVar
@@ -22,17 +22,17 @@ _pools: dict[tuple[int, int], ThreadPoolExecutor] = {}
 _starting = Lock()
 
 
-def one_thread_each(compute: Callable[[int], _Made], count: int) -> Iterator[_Made]:
+def one_thread_each(compute: Callable[[int], _Made], count: int) -> list[_Made]:
     """``compute(0)`` to ``compute(count - 1)`` in order, on as many threads as PyTorch may use here.
 
-    Gradients are not recorded. The limits of the calling thread and of all others stay as they are.
+    Gradients are not recorded. The limits of the calling thread, which waits, and of all others stay as
+    they are.
     """
     threads = torch.get_num_threads()
     without_gradient = torch.no_grad()(compute)
     if threads == 1:
-        yield from map(without_gradient, range(count))
-    else:
-        yield from _pool(threads).map(without_gradient, range(count))
+        return list(map(without_gradient, range(count)))
+    return list(_pool(threads).map(without_gradient, range(count)))
 
 
 def _pool(threads: int) -> ThreadPoolExecutor:

@@ -37,9 +37,23 @@ def test_the_limits_of_all_other_threads_stay_as_they_are(threads):
             its_limit = another.submit(torch.get_num_threads).result()
             return number, torch.get_num_threads(), its_limit, limit_of_a_new_thread()
 
-        for number, seen in enumerate(one_thread_each(look, 8)):
-            assert seen == (number, 1, 2, 2)
-            assert torch.get_num_threads() == 3
+        assert one_thread_each(look, 8) == [(number, 1, 2, 2) for number in range(8)]
+    assert torch.get_num_threads() == 3
+
+
+def test_threads_that_call_at_the_same_time_get_what_each_gets_alone(threads):
+    threads(2)
+    fields = [torch.randn(60, 60, generator=torch.Generator().manual_seed(seed)) for seed in range(6)]
+
+    def powers(seed: int) -> list[torch.Tensor]:
+        return one_thread_each(lambda number: torch.linalg.matrix_power(fields[seed], number), 9)
+
+    alone = [powers(seed) for seed in range(6)]
+    with ThreadPoolExecutor(6) as callers:
+        together = list(callers.map(powers, range(6)))
+    assert all(
+        torch.equal(a, b) for made in zip(alone, together, strict=True) for a, b in zip(*made, strict=True)
+    )
 
 
 @pytest.mark.parametrize("count", [1, 3])
@@ -48,17 +62,17 @@ def test_gradients_are_not_recorded_and_an_error_is_raised(count, threads):
     one = torch.ones(1, requires_grad=True)
     assert not any(made.requires_grad for made in one_thread_each(lambda number: one * number, 4))
     with pytest.raises(ZeroDivisionError):
-        list(one_thread_each(lambda number: 1 // (number - 2), 4))
+        one_thread_each(lambda number: 1 // (number - 2), 4)
     assert torch.is_grad_enabled()
     assert torch.get_num_threads() == count
 
 
 def test_a_copy_of_the_process_works_too(threads):
     threads(2)
-    work = list(one_thread_each(lambda number: number, 2))
+    work = one_thread_each(lambda number: number, 2)
     copies = multiprocessing.get_context("fork")
     answers = copies.SimpleQueue()
-    child = copies.Process(target=lambda: answers.put(list(one_thread_each(lambda number: number, 2))))
+    child = copies.Process(target=lambda: answers.put(one_thread_each(lambda number: number, 2)))
     child.start()
     child.join(20)
     if child.is_alive():
