@@ -1,7 +1,7 @@
 """A reader of one's own: files that begin with TOYAFM are read, by Python, by cards and by the commands.
 
 In a project of one's own this file is all there is to write. In this package the reader is a module of
-`litho_data/readers/` with `READER = Reader(...)` at its end, and one entry in `formats.py`.
+`litho_data/readers/` with `READER = Reader(...)` at its end, and one entry in `registry.py`.
 """
 
 from __future__ import annotations

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import re
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -154,6 +155,38 @@ def _module_graph(package: str, root: Path = ROOT) -> dict[str, set[str]]:
         whole = {n if n in modules else n.rpartition(".")[0] for n in _imports(file)}
         graph[name] = (whole & modules.keys()) - {name}
     return graph
+
+
+def test_the_page_and_its_picture_show_the_rooms_in_their_order() -> None:
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    table = _between(page, "rooms")
+    assert re.findall(r"^\| `(\w+)` ", table, re.MULTILINE) == [
+        room for rooms in ROOMS.values() for room in rooms
+    ]
+    picture = (ROOT / "docs" / "figures" / "rooms.svg").read_text(encoding="utf-8")
+    drawn = [f"{number} {room}" for rooms in ROOMS.values() for number, room in enumerate(rooms, start=1)]
+    assert re.findall(r">(\d+ \w+)<", picture) == drawn
+    for file in re.findall(r"`(litho_\w+/[\w/]+(?:\.py)?)", page):
+        assert (ROOT / file).exists(), f"docs/architecture.md names {file}"
+
+
+def test_the_main_path_of_the_loop_takes_ten_files() -> None:
+    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    files = re.findall(r"^\d+\. `([\w/]+)\.py`", _between(page, "main path"), re.MULTILINE)
+    assert 5 < len(files) <= 10
+    graph = _module_graph("litho_models")
+    modules = [file.replace("/", ".") for file in files]
+    assert importlib.import_module("litho_models").close_loop.__module__ == modules[0]
+    for place, module in enumerate(modules[1:], start=1):
+        used = set().union(*(graph[before] for before in modules[:place]))
+        # A name may come through the face of its folder.
+        faces = [graph[name] for name in used if (ROOT / name.replace(".", "/")).is_dir()]
+        assert module in used.union(*faces), f"{module}: nothing before it uses it"
+
+
+def _between(page: str, name: str) -> str:
+    """What stands between the two comments of a page."""
+    return page.split(f"<!-- {name} -->")[1].split(f"<!-- end of {name} -->")[0]
 
 
 def test_virtual_fab_knows_no_model() -> None:
