@@ -1,4 +1,4 @@
-"""One height map as an instrument recorded it, with everything the file says about it."""
+"""One height map as an instrument recorded it, with everything that the file says about it."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ class Scan:
 
     Args:
         height_um: (ny, nx) float64, µm, row 0 on top; NaN where nothing was measured.
-        pitch_um: (along y, along x) sampling, µm; None where neither the file nor the caller says.
+        pitch_um: (along y, along x) sampling, µm; None if neither the file nor the caller states it.
         name: what the scan is called, by default the stem of its file.
         channel: name of the channel that was read.
         unit: unit of the heights in the file, before conversion to µm.
-        fast_axis: the axis along which the tip moved fast; None where unknown.
-        mask: (ny, nx) bool, the mask kept in the file; None where there is none.
-        header: what the file says beside the heights, word by word.
+        fast_axis: the axis along which the tip moved fast; None if unknown.
+        mask: (ny, nx) bool, the mask in the file; None if there is none.
+        header: everything else that the file says, as strings.
         source: path of the file.
         format: name of the reader that read it.
 
@@ -86,5 +86,5 @@ class Scan:
 
     @property
     def grid(self) -> PixelGrid:
-        """The sampling geometry; raises InputError where the pitch is unknown."""
+        """The sampling geometry; raises InputError if the pitch is unknown."""
         return PixelGrid(self.shape, self.require_pitch())

@@ -1,1 +1,1 @@
-"""From a card to a dataset: listing, jobs, operations, and the store that comes out."""
+"""From a card to a dataset: operations, jobs, and the store that they make."""

@@ -26,9 +26,8 @@ Record = Mapping[str, Any]
 class Campaign:
     """What a store is made of besides its scans.
 
-    ``recipe`` is the levelling recipe in canonical form, ``files`` has one row per raw file (``path``,
-    ``scan``, ``kind``, ``sha256``, ``size_bytes``, ``reader``, ``status``, ``reason``, ``header``), and
-    ``build`` is what must not enter a hash: when, where, with which software.
+    ``recipe`` is the levelling recipe in canonical form, ``files`` the table of :func:`files_table`, and
+    ``build`` what must not be part of a hash: time, folder, software.
     """
 
     card: Card
@@ -45,11 +44,11 @@ def assemble(
     load: Callable[[str], Mapping[str, np.ndarray]],
     campaign: Campaign,
 ) -> str:
-    """Write everything but the groups ``scans/<id>``, which are there; returns the dataset's hash.
+    """Write everything except the groups ``scans/<id>``, which exist; returns the dataset's hash.
 
     Args:
         root: the growing group.
-        records: of the finished scans, sorted by id; references (``use`` other than dataset) included.
+        records: of the finished scans, sorted by id, including references (``use`` other than dataset).
         load: the arrays of an id on the layout grid.
         campaign: the rest.
     """
@@ -75,7 +74,7 @@ def records_of_use(records: Sequence[Record], use: str = "dataset") -> list[Reco
 
 
 def dataset_facts(card: Card) -> dict[str, Any]:
-    """What a card says about every scan alike, as it enters the dataset's hash."""
+    """What a card says about all scans, as part of the dataset's hash."""
     layout = card.layout
     facts = {"pitch_um": layout.pitch_um, "level_height_um": layout.level_height_um, "levels": layout.levels}
     write = card.write.model_dump(exclude_none=True) if card.write else {}
@@ -104,7 +103,7 @@ def root_attributes(manifest: Record, dataset_hash: str, manifest_hash: str) -> 
 def manifest_attributes(
     campaign: Campaign, quality: pd.DataFrame, provenance: pd.DataFrame
 ) -> dict[str, Any]:
-    """The manifest beside its table of files: the card as it was understood, and hashes of the tables."""
+    """The manifest without its table of files: the card as it was understood, and hashes of the tables."""
     content = {
         "card": campaign.card.model_dump(mode="json", exclude_none=True),
         "recipe": dict(campaign.recipe),
@@ -117,7 +116,7 @@ def manifest_attributes(
 
 
 def quality_table(records: Sequence[Record]) -> pd.DataFrame:
-    """One row per scan of the dataset; a figure that could not be had is NaN."""
+    """One row per scan of the dataset; a figure that could not be computed is NaN."""
     import pandas as pd
 
     rows = []
@@ -150,7 +149,7 @@ def provenance_table(records: Sequence[Record]) -> pd.DataFrame:
 
 
 def table_sha256(table: pd.DataFrame) -> str:
-    """Hash of a table: column names and values, in order; the software column, which varies, is left out."""
+    """Hash of a table: column names and values, in order, without the software column, which varies."""
     columns = {}
     for name in sorted(str(column) for column in table.columns if column != "software"):
         values = table[name].to_numpy()
@@ -195,7 +194,7 @@ def files_table(
     Returns:
         Columns ``path``, ``scan``, ``status`` (ok, skipped, unpaired), ``reason``, ``use``, ``sha256`` of the
         bytes that were used (empty for a file that cannot be read), ``size_bytes``, and ``read``, JSON with
-        reader, unit, channel, pitch and the vendor's header word by word.
+        reader, unit, channel, pitch and the full header of the vendor.
     """
     import pandas as pd
 
@@ -228,7 +227,7 @@ def _used_sha256(record: Mapping[str, Any], name: str) -> str:
 
 
 def _facts(record: Mapping[str, Any] | None, name: str) -> dict[str, Any]:
-    """What the reader found out about a scan file; nothing for a layout."""
+    """Facts about a scan file from its reader; none for a layout."""
     for step in record["steps"] if record else ():
         if step["op"] == "read-scan" and step["inputs"][0]["name"] == name and record:
             return dict(record["read"])

@@ -26,7 +26,7 @@ from litho_data.foundation.workers import run_jobs
 from litho_data.store.partial import partial_store
 from litho_data.store.schema import DatasetId
 
-# Pixels whose sides differ from the other scans' by more than this come from missing rows or columns.
+# A larger difference from the pixel aspect of other scans comes from missing rows or columns.
 _ASPECT_TOLERANCE = 1e-3
 
 
@@ -44,15 +44,15 @@ def build_dataset(
 
     Each scan is read, levelled by the card's recipe, registered and resampled once onto its layout's grid.
     A scan that cannot be used is skipped, with a line on stderr and a reason in the manifest. The store
-    appears whole or not at all; a build that was killed goes on where it stopped. The report goes to
-    ``<name>-report`` beside the store.
+    appears whole or not at all; an interrupted build resumes. The report goes to ``<name>-report`` beside the
+    store.
 
     Args:
         card_path: the dataset card.
         out: folder of the store; an older store there is replaced.
         data_dir: folder of the raw files; by default the card's folder, ``$LITHO_DATA_DIR/<name>`` or the
             user cache, whichever has them.
-        workers: local processes; ``dask``: address of a Dask scheduler instead. The result is the same.
+        workers: local processes; ``dask``: address of a Dask scheduler instead. Both give the same result.
         strict: refuse to build if any scan has to be skipped.
         seed: of the robust registration.
 
@@ -87,7 +87,7 @@ def _source(listing: Listing, recipe: Mapping[str, Any], seed: int) -> Source:
 
 @dataclass(frozen=True)
 class Source:
-    """Everything a store is made from, with the raw files by id for the manifest.
+    """Everything that a store is made from, with the raw files by id for the manifest.
 
     ``files`` maps each id to its raw files by recorded name; ``unpaired`` and ``refused`` map ids to reasons.
     """
@@ -167,7 +167,7 @@ def make_store(
 
 
 def _relative(folder: Path, start: Path) -> str:
-    """Where the raw files are as seen from the store's folder, so that both can move together."""
+    """Path of the raw files from the store's folder, so that both can move together."""
     try:
         return Path(os.path.relpath(folder, start)).as_posix()
     except ValueError:  # another drive
@@ -175,9 +175,9 @@ def _relative(folder: Path, start: Path) -> str:
 
 
 def _odd_pixels(records: Mapping[str, Mapping[str, Any]], card: Card) -> dict[str, str]:
-    """Scans whose pixels have another aspect than most, where the card and not the file gives the size.
+    """Scans whose pixels have another aspect than most, if the card and not the file gives the size.
 
-    Rows missing at the end of a text file leave a readable matrix; the stated size then stretches its pixels.
+    A text file without its last rows is still a readable matrix; the stated size then stretches its pixels.
     """
     if card.scan.size_um is None:
         return {}

@@ -24,14 +24,14 @@ from litho_data.store.partial import Piece
 
 
 class Job(Protocol):
-    """What the runner of a build needs to know of a unit of work."""
+    """What a build needs of a unit of work."""
 
     @property
     def id(self) -> str:
         """Id of the scan."""
 
     def key(self) -> str:
-        """Hash of everything that decides the piece: files, parameters, code."""
+        """Hash of everything that determines the piece: files, parameters, code."""
 
     def run(self) -> Piece:
         """Make the piece; InputError if the files do not allow it."""
@@ -46,7 +46,7 @@ class Skipped:
 
 
 def attempt(job: Job) -> Piece | Skipped:
-    """Run a job; bad input becomes a reason, so that one bad file never stops a batch."""
+    """Run a job; bad input becomes a reason for skipping, so one bad file never stops a build."""
     try:
         return job.run()
     except InputError as error:

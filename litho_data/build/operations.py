@@ -1,6 +1,6 @@
 """The operations that turn raw files into a dataset, as pure functions of recorded parameters and inputs.
 
-``build`` runs them, ``replay`` runs them again from the record; there is no other way to make a stored array.
+A build runs them, ``replay`` runs them again from the record; nothing else makes a stored array.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from litho_data.foundation.errors import InputError
 if TYPE_CHECKING:
     from litho_data.register import Registration
 
-# Beyond it a failed registration asks whether rows are missing.
+# Beyond it, the message of a failed registration asks whether rows are missing.
 _OBLONG = 0.01
 
 
 def load_recipe(path: Path | None) -> dict[str, Any]:
-    """A levelling recipe in canonical form; without a file, the one that does nothing."""
+    """A levelling recipe in canonical form; without a file, the empty one."""
     from litho_data.level import Recipe
 
     return (Recipe() if path is None else Recipe.from_toml(path)).canonical()
@@ -65,7 +65,7 @@ def _read_scan(
 def _locate(
     params: Mapping[str, Any], _: Sequence[Path], arrays: Mapping[str, np.ndarray]
 ) -> tuple[Arrays, Facts]:
-    """Where the layout lies in the unlevelled scan, for levelling that has to know it."""
+    """Where the layout lies in the scan before levelling, for layout-aware levelling."""
     from litho_data.level import layout_in_scan_frame
 
     raw, layout = arrays["raw_height_um"], arrays["mask_level"]

@@ -1,6 +1,6 @@
-"""Figures of one scan that need no layout: noise, line errors, and what levelling took away.
+"""Figures of one scan that need no layout: noise, line errors, and what levelling removed.
 
-Topography is in all of them, so as estimates of instrument noise they are upper bounds.
+All contain topography, so as estimates of instrument noise they are upper bounds.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ def noise_figures(height_um: np.ndarray) -> dict[str, float]:
     """Noise and line errors of a scan, (ny, nx) µm with NaN where not measured, in nm.
 
     ``noise_x_nm``, ``noise_y_nm``: second difference z[i-1] - 2 z[i] + z[i+1] along the axis, median absolute
-    deviation as sigma, divided by sqrt(6); white noise gives its standard deviation, planes give nothing.
+    deviation as sigma, divided by sqrt(6): the standard deviation of white noise, 0 for a plane.
     ``row_step_nm``: standard deviation of the steps between the medians of neighbouring rows;
-    ``column_step_nm``: the same of columns, as a control.
+    ``column_step_nm``: the same for columns, as a control.
     """
     height_nm = np.asarray(height_um, dtype=np.float64) * 1e3
     return {

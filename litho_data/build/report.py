@@ -1,4 +1,4 @@
-"""The human report of a build: what went in, what came out, and a look at every scan."""
+"""The report of a build: what went in, what came out, and pictures of every scan."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 _MAX_SCANS_SHOWN = 48
 _THUMBNAIL_PX = 180
-# Blur of the layout in the residual: about the width of the printer's line; a look, not a model.
+# Blur of the layout in the residual: about the width of the printer's line. For pictures only, no model.
 _BLUR_PX = 3.0
 _STAGES = {
     "layout [level]": "viridis",
@@ -39,12 +39,12 @@ _TABLE = {
     "overlap": "overlap",
     "bend_um": "bend [µm]",
     "rotation_deg": "rotation [deg]",
-    "singular_min": "scale, least",
-    "singular_max": "scale, most",
+    "singular_min": "scale, smallest",
+    "singular_max": "scale, largest",
     "noise_x_nm": "noise along x [nm]",
     "noise_y_nm": "noise along y [nm]",
     "row_step_nm": "row steps [nm]",
-    "removed_sd_nm": "levelled away, sd [nm]",
+    "removed_sd_nm": "removed by levelling, sd [nm]",
 }
 
 
@@ -97,7 +97,7 @@ def _left_out(page: Page, result: BuildResult) -> None:
 def _warnings(page: Page, quality: pd.DataFrame) -> None:
     if "warning" in quality and (warned := quality["warning"].astype(bool)).any():
         page.heading("Passed with a warning")
-        page.table(quality.loc[warned, ["scan", "warning"]], "What to know about a scan", "warnings.csv")
+        page.table(quality.loc[warned, ["scan", "warning"]], "What to know about these scans", "warnings.csv")
 
 
 def _quality(page: Page, quality: pd.DataFrame) -> None:
@@ -112,7 +112,7 @@ def _pictures(page: Page, store: Store) -> None:
     page.heading("Every scan")
     ids = _shown_ids(store)
     if len(ids) < len(store):
-        page.note(f"The {len(ids)} scans that correlate least with their layout, of {len(store)}.")
+        page.note(f"The {len(ids)} scans with the lowest correlation with their layout, of {len(store)}.")
     stages = [_stages(store, scan_id) for scan_id in ids]
     columns, pictures = [], []
     for (title, colours), images in zip(_STAGES.items(), zip(*stages, strict=True), strict=True):

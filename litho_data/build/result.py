@@ -19,7 +19,7 @@ class LeftOut(Record):
 
 
 class BuildResult(Result):
-    """What a build made and what it left out. ``reused`` scans were finished by an earlier build."""
+    """What a build made and what it left out; ``reused`` scans were finished by an earlier build."""
 
     SCHEMA: ClassVar[str] = "litho-data/build/1"
     FILE_NAME: ClassVar[str] = "build.json"
@@ -38,5 +38,5 @@ class BuildResult(Result):
 
 
 def report_folder(out: str | Path) -> Path:
-    """Where the report of a store is: ``<name>-report`` beside it."""
+    """Folder of a store's report: ``<name>-report`` beside the store."""
     return Path(out).parent / f"{Path(out).stem}-report"

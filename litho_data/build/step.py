@@ -26,7 +26,7 @@ class Step:
 
     ``inputs`` are ``{"name", "sha256"}`` (a file's name is its path below the data folder), ``outputs``
     are ``{"name", "sha256", "dtype", "shape", "unit", "dims"}``. ``code_sha256`` identifies the source that
-    ran; it is recorded beside the identity, because moving a comment does not change a result.
+    ran. It is recorded but is no part of the id, because moving a comment does not change a result.
     """
 
     op: str
@@ -48,14 +48,14 @@ class Step:
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> Step:
-        """The step of a record; the recorded id is not taken over, so that it can be compared."""
+        """The step of a record; the recorded id is not used, so that it can be compared."""
         fields = {key: value for key, value in record.items() if key != "id"}
         return cls(**{**fields, "inputs": tuple(fields["inputs"]), "outputs": tuple(fields["outputs"])})
 
 
 @dataclass(frozen=True)
 class Done:
-    """A finished step with its arrays and with what it found out."""
+    """A finished step with its arrays and facts."""
 
     step: Step
     arrays: Arrays
@@ -67,8 +67,8 @@ class Operation:
     """A pure function of recorded parameters and inputs.
 
     Args:
-        name: as it stands in the records.
-        version: another one wherever the function may give other results.
+        name: as in the records.
+        version: changed whenever the function may give other results.
         function: ``function(params, files, arrays) -> (arrays, facts)``.
         code: files and folders of this package that the result depends on.
     """
@@ -94,7 +94,7 @@ class Operation:
             arrays: input arrays by their name in the store.
 
         Raises:
-            InputError: whatever is wrong with the input; a missing or unreadable file included.
+            InputError: anything wrong with the input, including a missing or unreadable file.
         """
         try:
             inputs = [{"name": name, "sha256": file_sha256(path)} for name, path in files.items()]
@@ -118,9 +118,9 @@ def _code_sha256(names: tuple[str, ...]) -> str:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """One thread for numerical libraries: sums do not depend on the cores, workers do not compete."""
+    """One thread for numerical libraries: sums do not depend on the cores, and workers do not compete."""
     import cv2
-    import scipy.linalg  # noqa: F401 - brings a BLAS of its own, which must be there to be limited
+    import scipy.linalg  # noqa: F401 - has its own BLAS, which must be loaded to be limited
     from threadpoolctl import threadpool_limits
 
     threads = cv2.getNumThreads()

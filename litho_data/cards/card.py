@@ -1,4 +1,4 @@
-"""The dataset card: one TOML file that says what the raw files are and what they mean."""
+"""The dataset card: a TOML file that says what the raw files are and what they mean."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def check_card(content: dict[str, Any], what: str) -> Card:
 
 
 def _positive(value: float) -> float:
-    # pydantic takes inf for a positive number.
+    # pydantic accepts inf as a positive number.
     if not 0 < value < float("inf"):
         raise ValueError("wanted a positive number")
     return value
@@ -68,7 +68,7 @@ def _file_pattern(value: str) -> str:
 
 
 def _inside(value: str) -> str:
-    """A relative path that stays in the data folder, whichever separator it is written with."""
+    """A relative path that stays in the data folder, with either kind of separator."""
     parts = PurePosixPath(value.replace("\\", "/")).parts
     if not parts or ".." in parts or parts[0] == "/" or re.match("[A-Za-z]:", value):
         raise ValueError("wanted a path that stays inside the data folder")
@@ -134,21 +134,21 @@ class Process(Record):
 
 
 class Ids(Record):
-    """What an id says: a regular expression over the whole id, and a CSV table with more about it."""
+    """What an id means: a regular expression for the whole id, and a CSV table with more about it."""
 
     print: Annotated[str, AfterValidator(_id_pattern)] | None = None
     table: InsidePath | None = None
 
 
 class Write(Record):
-    """How the printer wrote a field; what is absent is assumed and labelled as an assumption."""
+    """How the printer wrote a field; what is missing is assumed, and labelled as an assumption."""
 
     slow_axis: Literal["x", "y"] | None = None
     field_um: Length | None = None
 
 
 class Source(Record):
-    """Where the files can be had: a base URL, and a registry of SHA-256 sums beside the card."""
+    """Where to get the files: a base URL, and a registry of SHA-256 sums beside the card."""
 
     url: str = Field(pattern=r"^https?://")
     registry: InsidePath
@@ -178,7 +178,7 @@ def _readable(error: ValidationError, what: str) -> InputError:
     if first["type"] == "missing":
         return InputError(f"{what}: key {key}", got="nothing", wanted="a value")
     if first["type"] == "value_error":
-        # The cause is our own sentence; for a table it already names the key within it.
+        # The message of our own validators; for a table it already names the key.
         cause = first["ctx"]["error"]
         shown = "" if isinstance(first["input"], dict) else f" = {first['input']!r}"
         return InputError(f"{what}: {key}{shown}: {cause}")

@@ -19,18 +19,18 @@ CARDS = Path(__file__).parents[1] / "datasets"
 
 
 def fetch(dataset: str | Path, into: str | Path | None = None) -> Path:
-    """Make sure that all files of a dataset are there and unharmed; returns the folder with them.
+    """Make sure that all files of a dataset are there and undamaged; returns their folder.
 
-    Without ``into``, a folder that is already complete is taken: ``$LITHO_DATA_DIR/<name>`` first, then the
-    user cache, into which missing files are downloaded. Files that are there and right are never
-    downloaded again, so an interrupted fetch goes on where it stopped.
+    Without ``into``, a folder that is already complete is used: ``$LITHO_DATA_DIR/<name>`` first, then the
+    user cache, into which missing files are downloaded. Files with the right hash are not downloaded again,
+    so an interrupted fetch resumes.
 
     Args:
         dataset: name of a card of this project, for example ``neural-lithography``, or the path of a card.
         into: folder to fill; by default the user cache.
 
     Raises:
-        InputError: unknown name, a card without source, a file that cannot be had, or a wrong hash.
+        InputError: unknown name, a card without source, a file that cannot be downloaded, or a wrong hash.
     """
     card_path = find_card(dataset)
     name, registry = _registry(card_path)
@@ -46,7 +46,7 @@ def fetch(dataset: str | Path, into: str | Path | None = None) -> Path:
 
 
 def known_folders(name: str) -> list[Path]:
-    """Where the files of a dataset are looked for: ``$LITHO_DATA_DIR/<name>``, then the user cache."""
+    """The folders searched for the files of a dataset: ``$LITHO_DATA_DIR/<name>``, then the user cache."""
     root = os.environ.get("LITHO_DATA_DIR")
     return [*([Path(root) / name] if root else []), cache_folder(name)]
 
@@ -59,7 +59,7 @@ def cache_folder(name: str) -> Path:
 
 
 def find_card(dataset: str | Path) -> Path:
-    """Path of a card: a path to a ``.toml`` file is taken as it is, a name is one of the project's cards.
+    """Path of a card, from a path to a ``.toml`` file or the name of one of the project's cards.
 
     Raises:
         InputError: no card of that name.
@@ -74,7 +74,7 @@ def find_card(dataset: str | Path) -> Path:
 
 
 def known_cards() -> dict[str, Path]:
-    """The project's cards by name; files like ``<name>.split.toml`` beside them say something else."""
+    """The project's cards by name; files like ``<name>.split.toml`` are no cards."""
     return {path.stem: path for path in sorted(CARDS.glob("*.toml")) if "." not in path.stem}
 
 
@@ -101,7 +101,7 @@ def _registry(card_path: Path) -> tuple[str, pooch.Pooch]:
 
 
 def _missing(folder: Path, registry: pooch.Pooch) -> list[str]:
-    """Registered files that are not in the folder, or not as registered."""
+    """Registered files that are missing in the folder or have another hash."""
     hashes = registry.registry.items()
     return [
         file
@@ -117,15 +117,15 @@ def _download(registry: pooch.Pooch, file: str) -> None:
     downloader = pooch.HTTPDownloader(progressbar=False, timeout=60)
     logger = pooch.get_logger()
     level = logger.level
-    logger.setLevel("ERROR")  # the progress bar says what is going on
+    logger.setLevel("ERROR")  # the progress bar shows what happens
     try:
         registry.fetch(file, downloader=downloader)
     except (requests.RequestException, OSError) as error:
         url = registry.get_url(file)
         raise InputError(
-            f"cannot fetch {file}", got=str(error), wanted=url, hint="run fetch again to go on"
+            f"cannot fetch {file}", got=str(error), wanted=url, hint="run fetch again to resume"
         ) from error
-    except ValueError as error:  # pooch removes what does not match
+    except ValueError as error:  # pooch removes a file that does not match
         url, wanted = registry.get_url(file), registry.registry[file]
         hint = "the source has changed or the transfer was damaged; nothing was kept"
         raise InputError(f"{file} from {url}", got="another SHA-256", wanted=wanted, hint=hint) from error

@@ -1,4 +1,4 @@
-"""Which printed fields a card stands for: files found, paired by id, and described by the card's table."""
+"""The printed fields of a card: files found, paired by id, and described by the card's table."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class PrintedField:
 
 @dataclass(frozen=True)
 class LeftAside:
-    """Files that make no field: an id with only one of its files (``unpaired``), or one that is refused."""
+    """Files that are not used: an id with only one of its files (``unpaired``), or one that is refused."""
 
     id: str
     files: tuple[Path, ...]
@@ -46,7 +46,7 @@ class LeftAside:
 
 @dataclass(frozen=True)
 class Listing:
-    """A card, the folder of its files, the fields to build, and what was left aside with the reason why."""
+    """A card, the folder of its files, the fields to build, and what was left aside, with the reason."""
 
     card: Card
     card_path: Path
@@ -130,7 +130,7 @@ def _data_folder(card: Card, card_path: Path, data_dir: str | Path | None) -> Pa
 
 def _files_by_id(folder: Path, pattern: str) -> dict[str, Path]:
     before, *rest = pattern.split("{id}")
-    # Only the first place captures the id, the others must repeat it.
+    # The first position captures the id, the others must repeat it.
     text = re.escape(before) + "(?P<id>[^/]+)" + "(?P=id)".join(re.escape(part) for part in rest)
     match = re.compile(text)
     found = glob.glob("*".join(glob.escape(part) for part in (before, *rest)), root_dir=folder)
@@ -180,7 +180,7 @@ def _full_scale(scales: Mapping[str, float] | None, scan_id: str, scan: Path) ->
 
 
 def _assumptions(card: Card, table: Mapping[str, Mapping[str, str]]) -> tuple[str, ...]:
-    """What the card does not say and the effects that need it must take as assumed."""
+    """Facts that the card does not state, which are assumed for the effects that need them."""
     assumed = []
     if card.write is None or card.write.field_um is None:
         assumed.append("one scan is one write field, centred on it")

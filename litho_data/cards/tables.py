@@ -1,4 +1,4 @@
-"""The two files a card may point to: the table with more about each id, and the full scales of images."""
+"""The two files that a card may refer to: the table of the ids, and the full scales of images."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ COLUMNS = ("id", "order", *OPTIONAL_COLUMNS, "use")
 
 
 def read_table(path: Path) -> dict[str, dict[str, str]]:
-    """Rows of a card's CSV table by id; empty cells are left out, every cell that is left has been checked.
+    """Rows of a card's CSV table by id, without empty cells; all other cells have been checked.
 
     Raises:
         InputError: unreadable, an unknown column, an id that is no plain name, or a cell of the wrong kind.

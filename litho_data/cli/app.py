@@ -79,7 +79,7 @@ def build(
 
 @app.command()
 def verify(store: StorePath, data_dir: DataDir = None) -> None:
-    """Hash a store and its raw files again and name everything that is not as it was built."""
+    """Hash a store and its raw files again and name everything that has changed since the build."""
     from litho_data.provenance.verify import verify as verify_store
 
     result = verify_store(store, data_dir)
@@ -112,7 +112,7 @@ def replay(
     ] = None,
     data_dir: DataDir = None,
 ) -> None:
-    """Compute arrays again from the raw files and report the largest difference to what is stored."""
+    """Compute arrays again from the raw files and report the largest difference from the store."""
     from litho_data.provenance.replay import replay as replay_store
 
     table = replay_store(store, scan, arrays=array, data_dir=data_dir)

@@ -1,4 +1,4 @@
-"""Commands `masks` and `simulate`: parse arguments, call one function, say where the result is."""
+"""Commands `masks` and `simulate`: parse arguments, call one function, print where the result is."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def masks(
     passband: Annotated[str, typer.Option(help="square (as the measured layouts) or round")] = "square",
     pitch_um: Annotated[float, typer.Option(help="pixel pitch, µm")] = 0.1,
     level_height_um: Annotated[float, typer.Option(help="nominal height of one level, µm")] = 0.1,
-    seed: Annotated[int, typer.Option(min=0, help="decides every random draw")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="seed of every random draw")] = 0,
     list_patterns: Annotated[
         bool,
         typer.Option(
@@ -46,7 +46,7 @@ def masks(
         ),
     ] = False,
 ) -> None:
-    """Write layouts (8-bit TIFF of level numbers), their statistics, and a card that waits for scans."""
+    """Write layouts (8-bit TIFF of level numbers), their statistics, and a card to add scans to."""
     from litho_data.layouts import write_layout_set
 
     card = write_layout_set(
@@ -76,7 +76,7 @@ def simulate(
     size: Annotated[
         int | None, typer.Option(min=32, help="side of a layout, pixels; by default the preset's")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="decides every random draw")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="seed of every random draw")] = 0,
     knob: Annotated[
         list[str] | None,
         typer.Option(help="an effect, name=strength or name=strength@seed; repeat for more; --list-knobs"),
@@ -97,7 +97,7 @@ def simulate(
         typer.Option("--list-knobs", help="list the knobs and stop", callback=_list_knobs, is_eager=True),
     ] = False,
 ) -> None:
-    """The virtual fab: print layouts, scan the prints with an AFM, and write what a laboratory would."""
+    """The virtual fab: print layouts, scan the prints, and write the files a laboratory would deliver."""
     from litho_data.foundation.errors import InputError
     from litho_data.virtual_fab import jobs_of_card, simulate
     from litho_data.virtual_fab.settings import preset as named_preset

@@ -16,15 +16,13 @@ if TYPE_CHECKING:
 
 
 ScanPath = Annotated[Path, typer.Argument(help="a scan in any supported format")]
-Format = Annotated[
-    str, typer.Option(help=f"auto judges the content of the file; else {', '.join(formats())}")
-]
-Unit = Annotated[str | None, typer.Option(help="unit of the heights where the file states none, e.g. m, nm")]
+Format = Annotated[str, typer.Option(help=f"auto (by the content of the file), {', '.join(formats())}")]
+Unit = Annotated[str | None, typer.Option(help="unit of the heights if the file states none, e.g. m, nm")]
 Size = Annotated[
     tuple[float, float] | None,
-    typer.Option("--size-um", metavar="Y X", help="field size in µm (y, x) where the file states none"),
+    typer.Option("--size-um", metavar="Y X", help="field size in µm (y, x) if the file states none"),
 ]
-ChannelName = Annotated[str | None, typer.Option(help="which channel, where there are several of heights")]
+ChannelName = Annotated[str | None, typer.Option(help="name of the height channel, if there are several")]
 FullScale = Annotated[
     float | None,
     typer.Option("--full-scale-um", help="height in µm of the largest value of an integer image"),
@@ -64,12 +62,12 @@ def inspect(
     channel: ChannelName = None,
     full_scale_um: FullScale = None,
     picture: Annotated[Path | None, typer.Option(help="PNG to write")] = None,
-    header: Annotated[bool, typer.Option("--header", help="print what the file says, word by word")] = False,
+    header: Annotated[bool, typer.Option("--header", help="print the full header of the file")] = False,
 ) -> None:
     """List the channels of a file with sizes, units and pitch, and show the heights.
 
-    A picture needs one channel of heights: choose it with --channel where there are several, and
-    give --unit (or --full-scale-um) where the file states none.
+    A picture needs one height channel: choose it with --channel if there are several, and give --unit
+    (or --full-scale-um) if the file states none.
     """
     from rich.console import Console
 
@@ -87,7 +85,7 @@ def inspect(
             file, format=format, unit=unit, size_um=size_um, channel=channel, full_scale_um=full_scale_um
         )
     except InputError as error:
-        # Without a wish for a picture the list of channels is the answer.
+        # If no picture was asked for, the list of channels is enough.
         if picture is not None or unit or size_um or channel or full_scale_um:
             raise
         typer.echo(f"no picture: {error}")

@@ -1,4 +1,4 @@
-"""Pictures of a scan: a PNG with axes and scale, and a preview for the terminal."""
+"""Pictures of a scan: a PNG with axes and scale, and a preview in the terminal."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def terminal_preview(scan: Scan) -> Text:
 
 
 def _limits(height: np.ndarray) -> tuple[float, float]:
-    """Limits that a few outliers do not decide."""
+    """Limits that do not depend on a few outliers."""
     low, high = np.nanpercentile(height, _PERCENTILES)
     return float(low), float(high)
 

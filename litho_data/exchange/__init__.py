@@ -1,1 +1,1 @@
-"""Ways in and out of a dataset: known datasets, releases, the pair format."""
+"""Ways in and out of a store: releases, and the authors' pair format."""

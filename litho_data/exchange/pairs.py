@@ -1,4 +1,4 @@
-"""Folders in the authors' pair format, in and out; ``litho_data.readers.pairs`` says what it can hold.
+"""Importing and exporting the authors' pair format; see ``litho_data.readers.pairs`` for its limits.
 
 ``mask/<id><q>.tif`` holds levels, ``afm/<id><q>.tif`` heights, with the full scales in metres in
 ``src_max_dict.txt``; q is 1 top left, 2 top right, 3 bottom left, 4 bottom right.
@@ -49,13 +49,13 @@ def import_pairs(
 ) -> BuildResult:
     """Build a store from a folder in the pair format; four quadrants of one name become one field.
 
-    The heights are taken as they are, value / 255 · full scale. In the authors' own files they are cut off to
-    the grey value below, half a grey value (about 2 nm) too low on average.
+    Heights are value / 255 · full scale. In the authors' own files they are truncated to the grey value
+    below, so they are half a grey value (about 2 nm) too low on average.
 
     Args:
         folder: with ``mask/``, ``afm/`` and ``src_max_dict.txt``.
         out: the store.
-        pitch_um, level_height_um, levels: what the files do not say; by default those of the paper.
+        pitch_um, level_height_um, levels: not in the files; by default those of the paper.
         name: of the dataset, by default the folder's.
         workers: local processes.
         strict: refuse to build if any field has to be skipped.
@@ -146,7 +146,7 @@ class PairsJob:
 
 
 def _fields(root: Path, scales: Mapping[str, float]) -> tuple[dict[str, dict[int, str]], dict[str, str]]:
-    """Files by field and quadrant, and the files without partner with the reason."""
+    """Files by field and quadrant, and the files without a partner, with the reason."""
     masks, heights = ({path.name for path in (root / kind).glob("*.tif")} for kind in ("mask", "afm"))
     unpaired = {f"mask/{name}": "no heights of this name" for name in sorted(masks - heights)}
     unpaired |= {f"afm/{name}": "no layout of this name" for name in sorted(heights - masks)}
@@ -180,7 +180,7 @@ def _card(name: str, pitch_um: float, level_height_um: float, levels: int, ids: 
 
 
 def export_pairs(store_path: str | Path, out: str | Path) -> list[str]:
-    """Write a store in the pair format; returns a note for whatever a scan lost on the way.
+    """Write a store in the pair format; returns a note for everything that a scan lost.
 
     Heights are rounded to the nearest grey value; pixels that were not measured become 0.
 

@@ -1,4 +1,4 @@
-"""Releasing a store: one file, or a folder that describes itself as an RO-Crate."""
+"""Releasing a store: as one file, or as an RO-Crate, a folder that describes itself."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.outputs import require_replaceable_folder
 from litho_data.store.read import Store, open_store
 
-# Zip cannot hold a file without a time; a fixed one keeps the archive the same for the same store.
+# Zip needs a time for every file; with a fixed one, the same store gives the same archive.
 _ZIP_TIME = (1980, 1, 1, 0, 0, 0)
 _CRATE_FILE = "ro-crate-metadata.json"
 _CRATE_VERSION = "https://w3id.org/ro/crate/1.1"
@@ -41,7 +41,7 @@ def export_zip(store_path: str | Path, out: str | Path) -> Path:
 
 
 def export_ro_crate(store_path: str | Path, out: str | Path) -> Path:
-    """Write a release folder: the packed store, its quality table, and ``ro-crate-metadata.json`` about them.
+    """Write a release folder: the packed store, its quality table, and ``ro-crate-metadata.json``.
 
     The metadata name every raw file with its SHA-256, the software of the build, licence and citation.
 

@@ -1,1 +1,1 @@
-"""What every room stands on: errors, files, units, records, commands, reports."""
+"""What all packages use: errors, files, hashes, units, records, run facts, commands, reports."""

@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 
 def new_app(help_text: str):
-    """A typer application with our settings."""
+    """A typer application with the settings of this project."""
     import typer
 
     return typer.Typer(
@@ -52,7 +52,7 @@ def command_line(program: str | None = None) -> str:
 
 
 def progress(items: Iterable[T], what: str, total: int | None = None) -> Iterator[T]:
-    """Iterate with a progress bar on stderr; silent where stderr is not a terminal."""
+    """Iterate with a progress bar on stderr; without one if stderr is no terminal."""
     from rich.console import Console
     from rich.progress import track
 

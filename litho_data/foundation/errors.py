@@ -4,10 +4,10 @@ from __future__ import annotations
 
 
 class InputError(ValueError):
-    """Bad input: the message is one line that says what, got, wanted and the next step.
+    """Bad input: the message is one line that says what is wrong, what was found and wanted, and a hint.
 
-    The command lines print it without a traceback and exit with code 2; everything else that is
-    raised is a defect of this project.
+    The command lines print it without a traceback and exit with code 2; every other exception is a defect of
+    this project.
     """
 
     def __init__(self, what: str, *, got: object = None, wanted: object = None, hint: str = ""):

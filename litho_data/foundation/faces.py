@@ -25,7 +25,7 @@ def lazy_face(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], A
             ``"module:other"`` where it has another name there. A public name must not be that of a room of
             the package, because importing a room binds its name.
 
-    ``__version__`` is always there: the version of the distribution, ``"0"`` where it is not installed.
+    ``__version__`` is always included: the version of the distribution, or ``"0"`` if it is not installed.
     """
 
     def load(name: str) -> Any:

@@ -17,7 +17,7 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
     """Yield a temporary path beside ``path``; it replaces ``path`` only if the block succeeds.
 
     Raises:
-        InputError: ``path`` is a folder, or its place cannot be written.
+        InputError: ``path`` is a folder, or cannot be written.
     """
     target = Path(path)
     if target.is_dir():
@@ -39,11 +39,11 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
 def atomic_folder(path: str | Path) -> Iterator[Path]:
     """Yield an empty temporary folder beside ``path``; it replaces ``path`` only on success.
 
-    An older folder at ``path`` stays until the new one is complete. Where a user chose the path, ask
+    An older folder at ``path`` stays until the new one is complete. If a user chose the path, call
     ``litho_data.foundation.outputs.require_replaceable_folder`` first.
 
     Raises:
-        InputError: the place of ``path`` cannot be written.
+        InputError: ``path`` cannot be written.
     """
     target = Path(path)
     with writable(target):
@@ -60,7 +60,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
 def replace_folder(new: Path, target: Path) -> None:
     """Rename a finished folder to ``target``; an older folder there goes back if that fails.
 
-    A process that is killed between the two renames leaves the older folder whole in ``.<name>.….old``.
+    If the process is killed between the two renames, the older folder stays whole in ``.<name>.….old``.
     """
     if not target.exists():
         new.replace(target)
@@ -79,7 +79,7 @@ def replace_folder(new: Path, target: Path) -> None:
 
 @contextmanager
 def writable(target: Path) -> Iterator[None]:
-    """Make the first files of an output; a place that does not allow it becomes an InputError."""
+    """Make the first files of an output; an error of the file system becomes an InputError."""
     try:
         yield
     except OSError as error:

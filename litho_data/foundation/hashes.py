@@ -1,4 +1,4 @@
-"""SHA-256 of what decides a result: files, arrays, plain data, source code."""
+"""SHA-256 of what determines a result: files, arrays, plain data, source code."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def array_sha256(array: np.ndarray, unit: str, dims: Sequence[str]) -> str:
 
     Args:
         array: any numeric or boolean array; every NaN counts as the same NaN.
-        unit: unit of the values as stored, "1" where there is none.
+        unit: unit of the values as stored, "1" if there is none.
         dims: one name per axis.
 
     Returns:

@@ -1,4 +1,4 @@
-"""The door for folders that a command writes: what is not its own result is never replaced."""
+"""Checks of the folder that a command writes to: only an older result of its own is ever replaced."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
         holds: names, or patterns of names, of everything that such a result holds.
 
     Raises:
-        InputError: the folder that one works in, a file, or a folder with something else in it; the
-            message names it.
+        InputError: the current folder, a file, or a folder with something else in it, which the message
+            names.
     """
     folder = Path(path)
     if folder.resolve() == Path.cwd():
@@ -35,10 +35,10 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
 
 
 def require_own_folder(path: str | Path, record: str) -> None:
-    """Accept a folder for the result whose record is the file ``record``, beside anything but another result.
+    """Accept a folder for the result with the record file ``record``, if no other result is in it.
 
-    A file is the record of a result if its schema names the kind that the file is called after, as in
-    ``close_loop.json`` with schema ``litho-models/close-loop/1``.
+    A file is the record of a result if it is named after the kind in its schema, such as ``close_loop.json``
+    with schema ``litho-models/close-loop/1``.
 
     Raises:
         InputError: a file, or the folder of a result of another kind, whose report would be overwritten.

@@ -101,7 +101,7 @@ class Page:
         self._parts.append({"kind": "note", "text": text})
 
     def code(self, text: str) -> None:
-        """A command or another fixed-width text; nothing where it is empty."""
+        """A command or another fixed-width text; nothing if it is empty."""
         if not text:
             return
         self._parts.append({"kind": "code", "text": text})
@@ -190,7 +190,7 @@ def coloured_png(image: np.ndarray, colours: str, low: float, high: float) -> by
     Args:
         image: (ny, nx), one value per pixel of the picture.
         colours: name of the colour map.
-        low: value of its first colour, ``high``: of its last; what lies outside gets the nearest.
+        low: value of its first colour, ``high``: of its last; values outside get the nearest colour.
     """
     import matplotlib
     from PIL import Image

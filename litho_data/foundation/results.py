@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
 
-# A value that does not belong may be of any size and nested to any depth.
+# An unexpected value may be of any size and nested to any depth.
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = 120
 
@@ -34,7 +34,7 @@ class Result(Record):
     def write(self, folder: str | Path) -> Path:
         """Write ``folder/FILE_NAME`` atomically and return its path."""
         path = Path(folder) / self.FILE_NAME
-        # Validation once more from plain JSON: what is written is what a reader will accept.
+        # Validated once more from plain JSON, so that a reader will accept what is written.
         content = self.model_dump(mode="json", by_alias=True)
         text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False)
         type(self).model_validate_json(text)
@@ -47,7 +47,7 @@ class Result(Record):
         """Read one result; a folder stands for the file inside it.
 
         Raises:
-            InputError: no such file, not JSON, another schema, or fields that do not belong.
+            InputError: no such file, not JSON, another schema, or unexpected fields.
         """
         file = Path(path)
         file = file / cls.FILE_NAME if file.is_dir() else file

@@ -24,9 +24,9 @@ _COMMAND: ContextVar[str] = ContextVar("command", default="")
 
 
 class RunFacts(Record):
-    """Command line and code behind a result.
+    """Command line and code of a result.
 
-    ``command`` is empty where the result was made from Python. ``dirty`` says whether the source differed
+    ``command`` is empty for a result made from Python. ``dirty`` says whether the source differed
     from the commit; None without a checkout, and in older result files.
     """
 
@@ -37,7 +37,7 @@ class RunFacts(Record):
 
 
 class RunInfo(RunFacts):
-    """Command line, code and scans behind a result; ``dropped`` lists scans left out, with the reason."""
+    """Command line, code and scans of a result; ``dropped`` lists scans left out, with the reason."""
 
     seeds: list[int]
     n_scans: int
@@ -57,7 +57,7 @@ def run_facts() -> dict[str, Any]:
 
 @contextmanager
 def running_command(command: str) -> Iterator[None]:
-    """Results made inside record this command line; library code has no other way to know it."""
+    """Results made inside this context record the command line; library code cannot know it otherwise."""
     token = _COMMAND.set(command)
     try:
         yield
@@ -82,7 +82,7 @@ def software_record() -> dict[str, Any]:
 def checkout_state(folder: Path) -> dict[str, Any]:
     """``commit`` of a checkout, and whether it is ``dirty``: a file of the packages changed or not in git.
 
-    Both are None where there is no checkout, as for an installed wheel.
+    Both are None without a checkout, as for an installed wheel.
     """
     if not (folder / ".git").exists():
         return {"commit": None, "dirty": None}

@@ -1,4 +1,4 @@
-"""Units of length as they are written in files: known ones are converted, all others are refused."""
+"""Units of length in files: known ones are converted, all others are refused."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ _IN_UM = {
     "ångström": 1e-4,
     "pm": 1e-6,
 }
-# MICRO SIGN and GREEK SMALL LETTER MU look alike, Bruker files write a tilde for both, and the
-# ångström has a sign of its own beside the letter.
+# MICRO SIGN and GREEK SMALL LETTER MU look the same, Bruker files write a tilde for both, and the
+# ångström has its own sign besides the letter.
 _SPELLINGS = str.maketrans({"\u00b5": "u", "\u03bc": "u", "~": "u", "\u212b": "å", "\u00c5": "å"})
 
 
@@ -32,8 +32,8 @@ def um_per(unit: str) -> float:
     """How many µm one ``unit`` of length is.
 
     Args:
-        unit: for example ``"m"``, ``"nm"``, ``"µm"``, ``"um"``, ``"pm"``, ``"Å"``; upper and lower
-            case differ, because ``"Mm"`` is not ``"mm"``.
+        unit: for example ``"m"``, ``"nm"``, ``"µm"``, ``"um"``, ``"pm"``, ``"Å"``. Case matters: ``"Mm"`` is
+            not ``"mm"``.
 
     Raises:
         InputError: the unit is unknown or not a length. ``"A"`` is the ampere, never the ångström.

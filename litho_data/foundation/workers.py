@@ -1,4 +1,4 @@
-"""Running the jobs of a build: here, in local processes, or on a Dask cluster; always a few at a time."""
+"""Running the jobs of a build: in this process, in local processes, or on a Dask cluster, a few at a time."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def run_jobs(
 ) -> Iterator[R]:
     """Results of ``function`` over the jobs, in the order in which they are finished.
 
-    At most two jobs per worker are under way, so that memory does not grow with the number of jobs.
+    At most two jobs per worker are in progress, so memory does not grow with the number of jobs.
 
     Args:
         function: importable by name.
@@ -55,7 +55,7 @@ def _windowed(executor: Executor, function: Callable[[J], R], jobs: Sequence[J],
 def _local_executor(workers: int) -> Iterator[tuple[Executor, int]]:
     from multiprocessing import get_context
 
-    # Spawned, because a forked copy of a process with threads can hang.
+    # Spawned, because a forked copy of a process with threads may hang.
     with ProcessPoolExecutor(
         workers, mp_context=get_context("spawn"), initializer=_die_with_parent
     ) as executor:
@@ -66,7 +66,7 @@ def _local_executor(workers: int) -> Iterator[tuple[Executor, int]]:
 
 
 def _die_with_parent() -> None:
-    """Workers whose parent was killed would wait for ever for their next job."""
+    """Workers of a killed parent would otherwise wait forever for their next job."""
     from multiprocessing import parent_process
 
     def watch() -> None:

@@ -1,4 +1,4 @@
-"""A set of layouts on disk: one TIFF per layout, a table, and a dataset card that waits for scans."""
+"""A set of layouts on disk: one TIFF per layout, a table, and a dataset card to which scans can be added."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class CardText:
         scan_size_um: (y, x) extent of a scan, µm.
         print_pattern: regular expression with a group ``print``, or empty.
         table: whether a table lies beside the card.
-        slow_axis: axis across the hatch lines, or empty where it is not told.
-        write_field_um: side of the write field, µm, or None where it is not told.
+        slow_axis: axis across the hatch lines, or empty if it is not stated.
+        write_field_um: side of the write field, µm, or None if it is not stated.
     """
 
     name: str
@@ -79,7 +79,7 @@ class CardText:
         """Write the card into ``folder``.
 
         Raises:
-            InputError: a value that no card may hold.
+            InputError: a value that a card may not have.
         """
         path = folder / CARD_NAME
         text = self.toml()
@@ -94,7 +94,7 @@ def write_layout(folder: Path, scan_id: str, level: np.ndarray) -> Path:
 
     path = folder / "layouts" / f"{scan_id}.tif"
     path.parent.mkdir(parents=True, exist_ok=True)
-    # Without a description the file's bytes depend on the levels alone.
+    # Without a description, the bytes of the file depend only on the levels.
     tifffile.imwrite(path, level, compression="zlib", metadata=None, software=False)
     return path
 

@@ -27,7 +27,7 @@ from litho_data.layouts.random_layout import random_layout
 from litho_data.layouts.statistics import LayoutStatistics, layout_statistics
 from litho_data.layouts.statistics_report import statistics_page
 
-# Leaves an even strip of a micrometre between two edges that the printer blurs over a micrometre each.
+# Leaves an even strip of 1 µm between two edges, each of which the printer blurs over 1 µm.
 _TREAD_UM = 3.0
 
 
@@ -43,7 +43,7 @@ class NamedLayout:
 
 @dataclass(frozen=True)
 class SetSettings:
-    """What a set is made of: see `write_layout_set`."""
+    """The arguments of `write_layout_set`."""
 
     count: int
     shape: tuple[int, int]
@@ -175,7 +175,7 @@ def _features(settings: SetSettings, feature: int, ground: int) -> np.ndarray:
 
 
 def _dose_matrix(settings: SetSettings) -> Iterator[NamedLayout]:
-    # Twice the default cut-off: the finer the frame, the better it fixes the scale.
+    # Twice the default cut-off: a finer frame determines the scale better.
     frame = random_layout(
         settings.shape,
         levels=settings.levels,

@@ -1,4 +1,4 @@
-"""Calibration patterns: what a laboratory prints to learn one thing at a time.
+"""Calibration patterns: prints that measure one thing at a time.
 
 All functions return uint8 levels of shape (ny, nx); lengths are rounded to whole pixels.
 """
@@ -18,7 +18,7 @@ def flat(shape: tuple[int, int], *, level: int) -> np.ndarray:
 
 
 def step_ladder(shape: tuple[int, int], *, highest: int, lowest: int = 0) -> np.ndarray:
-    """Stairs along x from ``lowest`` to ``highest``, all steps of one width: height against level."""
+    """Stairs along x from ``lowest`` to ``highest``, steps of equal width: height against level."""
     if not 0 <= lowest < highest:
         raise InputError("levels of a step ladder", got=(lowest, highest), wanted="0 <= lowest < highest")
     steps = highest - lowest + 1
@@ -29,15 +29,15 @@ def step_ladder(shape: tuple[int, int], *, highest: int, lowest: int = 0) -> np.
 
 
 def framed_ladder(frame: np.ndarray, *, highest: int, tread_px: int, lowest: int = 0) -> np.ndarray:
-    """Stairs along x inside a pattern that tells where they are: height and roughness against level.
+    """Stairs along x inside a frame that shows their position: height and roughness against level.
 
-    A ladder alone looks the same wherever it is moved along its steps, so its scan cannot be registered;
-    the frame, a fifth of the side all around, can. The stairs go from ``lowest`` to ``highest`` evenly,
-    over every level where there is room for it.
+    A ladder alone looks the same wherever it is shifted along its steps, so its scan cannot be registered.
+    The frame, whose width is a fifth of the side, can. The stairs go from ``lowest`` to ``highest`` evenly,
+    over every level if there is room.
 
     Args:
         frame: layout without repeats, (ny, nx).
-        tread_px: least width of a step, at least 3 of which have to fit.
+        tread_px: smallest width of a step; at least 3 steps have to fit.
     """
     inset_y, inset_x = (size // 5 for size in frame.shape)
     width = frame.shape[1] - 2 * inset_x
@@ -55,7 +55,7 @@ def framed_ladder(frame: np.ndarray, *, highest: int, tread_px: int, lowest: int
 
 
 def checkerboard(shape: tuple[int, int], *, cell_px: int, high: int, low: int = 0) -> np.ndarray:
-    """Squares of ``cell_px``, the top left one high: lateral scales and shear, corners."""
+    """Squares of ``cell_px``, the top left one high: lateral scale, shear, corners."""
     _positive(cell_px, "cell_px of a checkerboard")
     y, x = np.indices(shape) // cell_px
     return np.where((y + x) % 2 == 0, high, low).astype(np.uint8)
@@ -68,7 +68,7 @@ def line_space_sweep(
 
     Args:
         narrowest_px: width of the first line.
-        along: axis of the lines: ``y`` (they follow one another along x) or ``x``.
+        along: axis of the lines: ``y`` (their order is along x) or ``x``.
     """
     _positive(narrowest_px, "narrowest_px of a line/space sweep")
     if along not in ("x", "y"):
@@ -86,7 +86,7 @@ def siemens_star(shape: tuple[int, int], *, spokes: int, high: int, low: int = 0
     """``spokes`` wedges around the centre, as wide as the gaps: resolution against direction."""
     _positive(spokes, "spokes of a Siemens star")
     y, x = np.indices(shape)
-    # Half a wedge of turn keeps the axes of the grid inside wedges and gaps, not on their edges.
+    # A rotation by half a wedge keeps the axes of the grid off the edges of the wedges.
     angle = np.arctan2(y - (shape[0] - 1) / 2, x - (shape[1] - 1) / 2) * spokes / np.pi + 0.5
     inside = np.hypot(y - (shape[0] - 1) / 2, x - (shape[1] - 1) / 2) <= 0.48 * min(shape)
     return np.where(inside & (np.floor(angle).astype(int) % 2 == 0), high, low).astype(np.uint8)
@@ -95,10 +95,10 @@ def siemens_star(shape: tuple[int, int], *, spokes: int, high: int, low: int = 0
 def isolated_features(
     shape: tuple[int, int], *, widths_px: Sequence[int], feature: int, ground: int
 ) -> np.ndarray:
-    """Squares of growing width far apart on even ground: spot, shrinkage and collapse of single features.
+    """Isolated squares of growing width: spot, shrinkage and collapse of single features.
 
-    ``feature`` above ``ground`` makes pillars, below it pits. Every cell of the square array holds one
-    width, in reading order; the free ground between two features is at least twice the larger width.
+    ``feature`` above ``ground`` makes pillars, below it pits. Each cell of the square array holds one width,
+    in reading order; the space between two features is at least twice the larger width.
     """
     side = int(np.ceil(len(widths_px) ** 0.5))
     cell = (shape[0] // side, shape[1] // side)

@@ -30,7 +30,7 @@ def random_layout(
         levels: number of levels L; the result holds integers 0…L−1.
         cutoff_per_um: highest spatial frequency that passes, cycles per µm.
         pitch_um: pixel pitch, µm.
-        seed: anything that `numpy.random.default_rng` takes.
+        seed: anything that `numpy.random.default_rng` accepts.
         passband: ``square`` limits each axis, ``round`` the length of the frequency vector.
 
     Returns:
@@ -48,7 +48,7 @@ def random_layout(
         passband=passband,
     )
     lowest, highest = field.min(), field.max()
-    # Rounding of the transform leaves about 1e-17 where nothing but the mean passes.
+    # If only the mean passes, rounding of the transform leaves about 1e-17.
     if highest - lowest < 1e-12:
         raise InputError(
             "cutoff_per_um of a random layout",
@@ -59,7 +59,7 @@ def random_layout(
 
 
 def low_pass(field: np.ndarray, *, cutoff_per_um: float, pitch_um: float, passband: str) -> np.ndarray:
-    """Keep the spatial frequencies up to ``cutoff_per_um`` (inclusive), periodic boundaries."""
+    """Keep spatial frequencies up to and including ``cutoff_per_um``, with periodic boundaries."""
     if passband not in PASSBANDS:
         raise InputError("passband", got=repr(passband), wanted=" or ".join(PASSBANDS))
     if not cutoff_per_um > 0 or not pitch_um > 0:
@@ -72,7 +72,7 @@ def low_pass(field: np.ndarray, *, cutoff_per_um: float, pitch_um: float, passba
         distance = np.maximum(np.abs(frequency_y), frequency_x)
     else:
         distance = np.hypot(frequency_y, frequency_x)
-    # A real field times an even filter stays real, so the half-plane transform loses nothing.
+    # An even filter keeps a real field real, so the half-plane transform is enough.
     return np.fft.irfft2(np.fft.rfft2(field) * (distance <= cutoff_per_um), s=field.shape)
 
 

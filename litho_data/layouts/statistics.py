@@ -1,4 +1,4 @@
-"""What a set of layouts is like, and how far a design lies outside it."""
+"""Statistics of a set of layouts, and how far a design lies outside it."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class LayoutStatistics(Result):
 
 
 class WindowFeatures(Record):
-    """Mean and covariance of the features of all windows of a set, and how far its own windows stray.
+    """Mean and covariance of the features of all windows of a set, and the spread of its own windows.
 
     The features are `FEATURES`; ``distance_quantile`` is the 99 % quantile of their Mahalanobis distance.
     """
@@ -84,7 +84,7 @@ class Departure(Record):
 def layout_statistics(
     layouts: Iterable[np.ndarray | Path], *, levels: int, pitch_um: float
 ) -> LayoutStatistics:
-    """Pool the statistics of layouts, one after the other.
+    """Collect the statistics of layouts, one at a time.
 
     Args:
         layouts: uint8 levels (ny, nx), or paths of layout files.
@@ -198,7 +198,7 @@ def _radial_power(level: np.ndarray, pitch_um: float) -> np.ndarray:
 
 
 def _autocorrelation(level: np.ndarray, pitch_um: float) -> np.ndarray:
-    """Autocorrelation along y and x, shape (2, lags); 0 for a constant layout but for lag 0."""
+    """Autocorrelation along y and x, shape (2, lags); for a constant layout 0 except at lag 0."""
     centred = level - level.mean()
     variance = (centred**2).mean()
     lags = min(round(_LONGEST_LAG_UM / pitch_um), min(level.shape) - 1) + 1
@@ -224,7 +224,7 @@ def _pool(features: np.ndarray) -> WindowFeatures:
 
 
 def _mahalanobis(features: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    # A feature that never varies in the set (a flat print) still needs a scale: a thousandth of a level.
+    # A feature that does not vary in the set (a flat print) still needs a scale: a thousandth of a level.
     ridge = covariance + 1e-6 * np.eye(len(mean))
     off = features - mean
     return np.sqrt(np.einsum("wi,ij,wj->w", off, np.linalg.inv(ridge), off))

@@ -11,7 +11,7 @@ from litho_data.foundation.report import Page, new_figure
 from litho_data.layouts.statistics import LayoutStatistics
 
 _SHOWN = 4
-# Lower limit of the logarithmic axes: below it a share is rounding.
+# Lower limit of the logarithmic axes: smaller shares are rounding.
 _LEAST_SHARE = 1e-6
 
 

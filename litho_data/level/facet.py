@@ -44,7 +44,7 @@ def level_facet(
         )
     total_x = total_y = 0.0
     for _ in range(_MAX_PASSES):
-        # Subtracting a plane only shifts all slopes, so the map itself is not touched in between.
+        # Subtracting a plane only shifts all slopes, so the map itself need not change in between.
         step_x, step_y = facet_pass(slope_x, slope_y)
         total_x += step_x
         total_y += step_y

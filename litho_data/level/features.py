@@ -1,4 +1,4 @@
-"""Features that levelling must not follow: marking them, and levelling and marking in turn."""
+"""Features that levelling must not follow: marking them, and alternating between levelling and marking."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from litho_data.level.selection import Levelled, Masking, as_height, select, sub
 
 Side = Literal["above", "below", "both"]
 _MAX_ROUNDS = 50
-# With less than this share of the pixels left, the background is a guess.
+# With a smaller share of the pixels left, the background is a guess.
 _LEAST_BACKGROUND = 0.02
 
 
 class MaskedLevelling(NamedTuple):
-    """What ``mask_and_relevel`` found: the levelled map and the features that it left out."""
+    """Result of ``mask_and_relevel``: the levelled map and the features left out."""
 
     levelled: Levelled
     mask: np.ndarray
@@ -36,13 +36,13 @@ def mark_features(
 ) -> np.ndarray:
     """Mark the pixels that lie off the main surface by more than ``threshold`` noise sigmas.
 
-    Main surface and noise are the median and 1.4826 · MAD of the selected pixels, so the features
-    must be the minority of them. Measured pixels that were not selected are marked as well: the
+    Main surface and noise are the median and 1.4826 · MAD of the selected pixels, so features must be a
+    minority. Measured pixels that were not selected are marked as well: the
     result is everything that later steps should exclude.
 
     Args:
         height: (ny, nx), any unit, already level.
-        grow_px: the marked area is widened by this many pixels, against edges that blur.
+        grow_px: the marked area is widened by this many pixels, to cover blurred edges.
 
     Returns:
         bool (ny, nx).
@@ -72,11 +72,11 @@ def mask_and_relevel(
     mask: np.ndarray | None = None,
     masking: Masking = "exclude",
 ) -> MaskedLevelling:
-    """Level, mark the features, level again without them, until the marks stay the same.
+    """Level, mark the features, level again without them, until the marks no longer change.
 
     The first background is robust (Tukey), the following ones are least squares over the unmarked
     pixels. The background is subtracted with its constant, so that the main surface lies at zero.
-    The mask that comes back marks what ``mark_features`` marks.
+    The returned mask is that of ``mark_features``.
 
     Raises:
         InputError: parameters outside their range, or features that leave no background.
@@ -87,7 +87,7 @@ def mask_and_relevel(
     chosen = select(z, mask, masking)
     usable = np.isfinite(z) if chosen is None else chosen
     surface = robust_surface(z, chosen, terms)
-    # The noise is judged once: judged again over what is left, it would shrink round by round.
+    # The noise is estimated once: estimated again over the remaining pixels, it would shrink every round.
     limit = threshold * noise_sigma((z - surface)[usable])
     seen: set[bytes] = set()
     for _ in range(_MAX_ROUNDS):

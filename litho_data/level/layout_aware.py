@@ -14,7 +14,7 @@ from litho_data.level.selection import Levelled, Masking, as_height, select, sub
 if TYPE_CHECKING:
     from litho_data.register.bend import Bend
 
-# Below it background and structure cannot be told apart in double precision with noise on top.
+# Below it, background and structure cannot be separated in double precision with noise.
 _SINGULAR = 1e-9
 _ROWS_AT_ONCE = 64
 
@@ -30,23 +30,23 @@ def level_layout_aware(
     mask: np.ndarray | None = None,
     masking: Masking = "exclude",
 ) -> Levelled:
-    """Subtract the background that is left once the layout has explained what it can.
+    """Subtract the background that remains once the layout has explained what it can.
 
     Least squares of z = sum_pq c_pq x^p y^q + g(blurred level), where g is a free piecewise linear
-    response with one knot per level. A plain fit would assign to the background whatever slope the
-    structure itself has. Only the polynomial without its constant is subtracted, with mean zero
-    over the fitted pixels: the datum belongs to the response.
+    response with one knot per level. A plain fit would count the structure's own slope
+    as background. Only the polynomial without its constant is subtracted, with mean zero
+    over the fitted pixels: the datum is part of the response.
 
     Args:
         height: (ny, nx), any unit.
         layout_level: (ny, nx) in the scan's frame, level per pixel, NaN outside the layout; see
             ``layout_in_scan_frame``.
-        blur_px: sigma of the Gaussian that stands for the lateral spread of printing.
+        blur_px: sigma of a Gaussian for the lateral spread of printing.
         x_degree, y_degree, total_degree: as in ``level_polynomial``; by default a plane.
 
     Raises:
         InputError: a layout of another shape or without overlap, or a layout that looks like the
-            background itself (a ramp, say), so that the two cannot be told apart.
+            background itself, such as a ramp, so that the two cannot be separated.
     """
     z = as_height(height)
     if layout_level.shape != z.shape:

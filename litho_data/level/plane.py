@@ -18,9 +18,8 @@ def level_plane(
 ) -> Levelled:
     """Subtract the tilt of the least-squares plane; the height at the pivot (nx/2, ny/2) stays.
 
-    Gwyddion's definition: the fitted constant is discarded and -(bx nx + by ny) / 2 taken in its
-    place, so that the mean of the result is the mean of the input plus (bx + by) / 2, slopes in
-    height per pixel.
+    Gwyddion's definition: the fitted constant is replaced by -(bx nx + by ny) / 2, slopes in height per
+    pixel, so that the mean changes by (bx + by) / 2.
 
     Raises:
         InputError: the selected pixels do not determine a plane. (Gwyddion then removes nothing.)
@@ -74,7 +73,7 @@ def slopes_per_px(coefficients: np.ndarray, shape: tuple[int, ...]) -> tuple[flo
 
 
 def subtract_tilt(z: np.ndarray, slopes: tuple[float, float], at_pivot: float = 0.0) -> Levelled:
-    """The map less the plane of these slopes (x, y) per pixel and this height at column nx/2, row ny/2."""
+    """The map minus the plane with these slopes (x, y) per pixel and this height at column nx/2, row ny/2."""
     ny, nx = z.shape
     along_y = slopes[1] * (np.arange(ny) - ny / 2) + at_pivot
     along_x = slopes[0] * (np.arange(nx) - nx / 2)
@@ -141,7 +140,7 @@ def _rotate_rows(z: np.ndarray, slope: float, pitch_um: float) -> np.ndarray:
 
 
 def fix_zero(height: np.ndarray, *, mask: np.ndarray | None = None, masking: Masking = "exclude") -> Levelled:
-    """Move the lowest selected pixel to zero; an order statistic of one pixel, not a physical datum."""
+    """Move the lowest selected pixel to zero. This is the height of one pixel, not a physical datum."""
     return _shift(height, np.min, mask, masking)
 
 

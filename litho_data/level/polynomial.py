@@ -13,7 +13,7 @@ from litho_data.level.selection import Levelled, Masking, as_height, select, sub
 MAX_DEGREE = 11
 Terms = tuple[tuple[int, int], ...]
 
-# Below it the smallest direction of the normal matrix is rounding noise.
+# Below it, the smallest direction of the normal matrix is rounding noise.
 _SINGULAR = 1e-12
 _WELL_CONDITIONED = 1e3
 
@@ -87,7 +87,7 @@ def fit_terms(z: np.ndarray, weights: np.ndarray | None, terms: Terms) -> np.nda
         known[~(weights > 0)] = 0.0
     coefficients[powers_y, powers_x] = _solve(factors, (basis_y.T @ (known @ basis_x))[powers_y, powers_x])
     if factors[0][-1] > _WELL_CONDITIONED * factors[0][0]:
-        # A second round removes the rounding that a badly conditioned mask put into the first.
+        # A second round removes the rounding error of the first under a badly conditioned mask.
         known -= weights * (basis_y @ (coefficients @ basis_x.T))
         coefficients[powers_y, powers_x] += _solve(
             factors, (basis_y.T @ (known @ basis_x))[powers_y, powers_x]

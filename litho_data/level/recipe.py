@@ -1,4 +1,4 @@
-"""Levelling recipes: a list of steps, written in TOML or Python, kept with the data."""
+"""Levelling recipes: a list of steps, written in TOML or Python and stored with the data."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Recipe(BaseModel):
             raise InputError(f"recipe {source}".rstrip(), got=first_error(error)) from error
 
     def canonical(self) -> dict[str, Any]:
-        """Everything that decides the result, defaults written out; ``from_dict`` reads it back."""
+        """Everything that determines the result, with all defaults; ``from_dict`` reads it."""
         return {"schema": self.SCHEMA, "step": [step.model_dump(mode="json") for step in self.step]}
 
     def apply(
@@ -66,7 +66,7 @@ class Recipe(BaseModel):
         mask: np.ndarray | None = None,
         layout_level: np.ndarray | None = None,
     ) -> Levelled:
-        """Level a scan; ``height + removed`` is what came in, both NaN where nothing was measured.
+        """Level a scan; ``height + removed`` is the input, both NaN where nothing was measured.
 
         Args:
             scan: a ``Scan``, whose pitch and mask are used, or heights (ny, nx) in µm.

@@ -167,7 +167,7 @@ class AlignRows(Step):
     trim: float = Field(default=0.05, ge=0, le=MEDIAN_TRIM)
 
     def call(self, state: State) -> Any:
-        """Only one of the methods needs the pitch."""
+        """Pass the pitch to the one method that needs it."""
         pitch_um = state.need("pitch_um") if self.method == "facet-tilt" else None
         return align_rows(
             state.height_um,

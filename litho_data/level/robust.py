@@ -16,7 +16,7 @@ Loss = Literal["huber", "tukey"]
 _WIDTH = {"huber": 1.345, "tukey": 4.685}
 _MAD_TO_SIGMA = 1.4826
 _MAX_ROUNDS = 200
-# Change of the surface, in units of the noise, that no longer matters.
+# A change of the surface, in units of the noise, that is too small to matter.
 _SETTLED = 1e-7
 
 
@@ -30,10 +30,10 @@ def level_robust(
     mask: np.ndarray | None = None,
     masking: Masking = "exclude",
 ) -> Levelled:
-    """Subtract the robust polynomial, its constant included: the main surface comes to lie at zero.
+    """Subtract the robust polynomial with its constant: the main surface then lies at zero.
 
     Iteratively reweighted least squares with the scale 1.4826 · MAD. Tukey's biweight gives no
-    weight at all to far features and starts from the Huber solution, which has a single minimum.
+    weight to distant features and starts from the Huber solution, which has a single minimum.
 
     Args:
         height: (ny, nx), any unit.
@@ -61,7 +61,7 @@ def robust_surface(
 
 
 def noise_sigma(residual: np.ndarray) -> float:
-    """1.4826 times the median absolute value: the sigma of Gaussian noise, blind to rare outliers."""
+    """1.4826 times the median absolute value: the sigma of Gaussian noise, unaffected by rare outliers."""
     return _MAD_TO_SIGMA * float(np.median(np.abs(residual)))
 
 

@@ -1,4 +1,4 @@
-"""One number per row: the order statistics and sums that row alignment is made of.
+"""One number per row: the order statistics and sums that row alignment uses.
 
 Each function takes (rows, n) values and the selection of the same shape, or None for all of it.
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-# From this trim on nothing but the median is left.
+# From this trim on, only the median is left.
 MEDIAN_TRIM = 0.5
 _FEW_FOR_MODUS = 9
 

@@ -44,14 +44,14 @@ def align_rows(
     mask: np.ndarray | None = None,
     masking: Masking = "exclude",
 ) -> Levelled:
-    """Take from each scan line what it does not share with the others.
+    """Remove from each scan line what it does not share with the others.
 
     Args:
         height_um: (ny, nx), µm. Only ``"matching"`` depends on the unit: its weights compare a
             squared height with a height, in metres as Gwyddion does.
         method: ``median``, ``trimmed-mean`` and ``modus`` make that statistic of all rows equal;
-            the two ``-of-differences`` and ``matching`` sum up steps between neighbouring rows and
-            so keep large features; ``polynomial`` fits each row by itself; ``facet-tilt`` removes
+            the two ``-of-differences`` and ``matching`` add up steps between neighbouring rows, which
+            keeps large features; ``polynomial`` fits each row by itself; ``facet-tilt`` removes
             the prevailing slope of each row.
         direction: ``"horizontal"`` lines are rows, ``"vertical"`` lines are columns.
         degree: of the polynomial, 0 to 5.
@@ -149,7 +149,7 @@ def _difference_shifts(z: np.ndarray, chosen: np.ndarray | None, trim: float) ->
     if both is not None:
         step[row_counts(steps, both) < fewest_for_row(z.shape[1])] = 0.0
     shifts = np.concatenate([[0.0], np.cumsum(step)])
-    # Steps alone cannot tell drift from slope: the straight part stays in the data.
+    # Steps alone cannot separate drift from slope: the linear part stays in the data.
     row = _centred(len(shifts))
     return shifts - shifts.mean() - row * (row @ shifts) / (row @ row)
 
@@ -172,7 +172,7 @@ def _matching_shifts(z: np.ndarray, chosen: np.ndarray | None) -> np.ndarray:
 
 
 def _row_polynomials(z: np.ndarray, chosen: np.ndarray | None, degree: int) -> np.ndarray:
-    """The fit of each row less the mean of all measured pixels, mask or not, as Gwyddion adds it back."""
+    """The fit of each row minus the mean of all measured pixels, masked or not, which Gwyddion adds back."""
     overall = float(np.nanmean(z))
     basis = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, z.shape[1]), degree)
     if chosen is None:

@@ -81,7 +81,7 @@ def remove_scars(height: np.ndarray, *, scars: np.ndarray) -> Levelled:
 
 
 def _prominence(z: np.ndarray, max_width_px: int) -> np.ndarray:
-    """By how much each pixel belongs to a ridge at most ``max_width_px`` rows wide."""
+    """By how much each pixel stands out as part of a ridge at most ``max_width_px`` rows wide."""
     ny = z.shape[0]
     prominence = np.zeros_like(z)
     for width in range(1, min(max_width_px, ny - 2) + 1):
@@ -124,7 +124,7 @@ def _harmonic(z: np.ndarray, unknown: np.ndarray) -> np.ndarray:
     anchored = np.bincount(labels[unknown], weights=anchors, minlength=count + 1)[1:]
     if (anchored == 0).any():
         raise InputError(
-            "a marked area has no measured neighbour", wanted="marks that leave something around them"
+            "a marked area has no measured neighbour", wanted="marks that leave measured pixels around them"
         )
     rows, columns = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
     links = sparse.csc_matrix((-np.ones(len(rows)), (rows, columns)), shape=(n, n))

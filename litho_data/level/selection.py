@@ -1,4 +1,4 @@
-"""What all levelling operations share: which pixels are used, and what is returned."""
+"""What all levelling operations share: the choice of pixels, and the result."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _ROWS_IN_CACHE = 32
 
 
 class Levelled(NamedTuple):
-    """A levelled map and what was taken away; ``height + removed`` is the map that came in.
+    """A levelled map and the surface removed; ``height + removed`` is the input.
 
     Both are float64 (ny, nx) in the unit of the input. NaNs of the input stay NaN in ``height``;
     ``removed`` is a number everywhere, and may be a read-only view where it is constant along an axis.
@@ -62,12 +62,12 @@ def select(z: np.ndarray, mask: np.ndarray | None, masking: Masking) -> np.ndarr
 
 
 def subtract(z: np.ndarray, removed: np.ndarray) -> Levelled:
-    """The map less the surface."""
+    """The map minus the surface."""
     return Levelled(z - removed, removed)
 
 
 def subtract_product(z: np.ndarray, along_y: np.ndarray, along_x: np.ndarray) -> Levelled:
-    """The map less the surface ``along_y @ along_x``, factors (ny, k) and (k, nx).
+    """The map minus the surface ``along_y @ along_x``, factors (ny, k) and (k, nx).
 
     A few rows at a time: the surface is then still in the cache when it is subtracted.
     """

@@ -1,1 +1,1 @@
-"""Who made which array from what: records, history, verification, replay."""
+"""Where every array comes from: history, verification, replay."""

@@ -1,4 +1,4 @@
-"""``history``: where the arrays of a scan come from; and what a store records for it."""
+"""``history``: where the arrays of a scan come from, and the records in a store that say so."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _HASH_DIGITS = 12
 def history(store_path: str | Path, scan_id: str | None = None) -> str:
     """The chain of one scan as text, from the raw files to the arrays, with all parameters and hashes.
 
-    Without a scan: one line per scan, from its raw files over the operations to its registered height.
+    Without a scan: one line per scan, from its raw files through the operations to its registered height.
 
     Raises:
         InputError: no such store or scan.
@@ -60,7 +60,7 @@ def _overview(recorded: dict[str, list[tuple[str, Step]]]) -> Iterator[str]:
 
 
 def read_steps(store: Store) -> dict[str, list[tuple[str, Step]]]:
-    """Recorded steps of every scan in order, each with the id it was recorded under.
+    """Recorded steps of every scan in order, each with its recorded id.
 
     Raises:
         InputError: a store without provenance, or a record that is no JSON.
@@ -77,14 +77,14 @@ def read_steps(store: Store) -> dict[str, list[tuple[str, Step]]]:
 
 
 def steps_of(recorded: dict[str, list[tuple[str, Step]]], scan_id: str) -> list[tuple[str, Step]]:
-    """The recorded steps of one scan; InputError where there is no such scan."""
+    """The recorded steps of one scan; InputError if there is no such scan."""
     if scan_id not in recorded:
         raise InputError("scan", got=repr(scan_id), wanted=f"one of {', '.join(list(recorded)[:30])}")
     return recorded[scan_id]
 
 
 def raw_folder(store: Store, data_dir: str | Path | None = None) -> Path | None:
-    """Where the raw files of a store are; None where they are not to be found.
+    """Folder of the raw files of a store; None if they cannot be found.
 
     Raises:
         InputError: ``data_dir`` is given and is no folder.
@@ -100,7 +100,7 @@ def raw_folder(store: Store, data_dir: str | Path | None = None) -> Path | None:
 
 
 def require_folder(data_dir: str | Path) -> Path:
-    """The folder that the user named; InputError where there is none."""
+    """The folder that the user named; InputError if there is none."""
     if not Path(data_dir).is_dir():
         raise InputError("folder of raw files", got=str(data_dir), wanted="an existing folder")
     return Path(data_dir)
@@ -109,7 +109,7 @@ def require_folder(data_dir: str | Path) -> Path:
 def stored_array(store: Store, scan_id: str, name: str) -> np.ndarray | None:
     """A scan's array by name, from the arrays over all scans or from its own group.
 
-    None for the one thing that is not kept, the layout of a reference scan.
+    None for the layout of a reference scan, which is not kept.
 
     Raises:
         InputError: no such array, or a stored chunk that does not decode.

@@ -33,12 +33,12 @@ def replay(
     Args:
         store_path: the store.
         scan_ids: which scans, by default all.
-        arrays: which arrays, by default all; the steps that they need are run in any case.
+        arrays: which arrays, by default all; the steps they need run in any case.
         data_dir: folder of the raw files, as in ``verify``.
 
     Returns:
-        One row per array: ``scan``, ``array``, ``max_abs_difference`` (inf where one has a number and the
-        other has none), ``unit``, ``same_hash``.
+        One row per array: ``scan``, ``array``, ``max_abs_difference`` (inf if only one of the two has a
+        number at some pixel), ``unit``, ``same_hash``.
 
     Raises:
         InputError: no such store, scan or array, or raw files that are missing or have changed.
@@ -76,7 +76,7 @@ def replay(
 
 
 def _recomputed(steps: Sequence[Step], folder: Path) -> Iterator[tuple[str, np.ndarray]]:
-    """Arrays in the order in which they are made, each step on the outputs of the steps before it."""
+    """Arrays in the order in which they are made, each step from the outputs of the steps before it."""
     made: dict[str, np.ndarray] = {}
     for step in steps:
         if step.op not in OPERATIONS:

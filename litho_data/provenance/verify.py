@@ -1,4 +1,4 @@
-"""``verify``: is a store still what was built, and are the raw files still those it was built from?"""
+"""``verify``: is a store unchanged since its build, and are its raw files unchanged?"""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from litho_data.store.write import pixel_centres_um
 
 @dataclass(frozen=True)
 class Finding:
-    """Something that is not as it was built: where, and what is wrong there."""
+    """Something that has changed since the build: where, and what is wrong there."""
 
     where: str
     problem: str
@@ -37,7 +37,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Verification:
-    """What ``verify`` found. ``notes`` are worth knowing and no damage."""
+    """What ``verify`` found. ``notes`` are worth knowing, but no damage."""
 
     findings: tuple[Finding, ...]
     notes: tuple[str, ...]
@@ -51,11 +51,11 @@ def verify(store_path: str | Path, data_dir: str | Path | None = None) -> Verifi
 
     Args:
         store_path: a ``.zarr`` folder or ``.zarr.zip`` file.
-        data_dir: folder of the raw files; by default where they were at the build, seen from the store, then
-            ``$LITHO_DATA_DIR/<name>`` and the user cache. Where there are none, a note says so.
+        data_dir: folder of the raw files; by default the one recorded by the build, relative to the store,
+            then ``$LITHO_DATA_DIR/<name>`` and the user cache. If they are in none of these, a note says so.
 
     Raises:
-        InputError: no store at the path, or ``data_dir`` that is not there.
+        InputError: no store at the path, or ``data_dir`` does not exist.
     """
     path = Path(store_path)
     if open_root(path).attrs.get("schema") != STORE_SCHEMA:
@@ -121,7 +121,7 @@ def _read_documents(path: Path) -> Iterator[tuple[str, bytes]]:
 
 
 def _guarded(check: Iterator[Finding]) -> Iterator[Finding]:
-    """A check whose data cannot be read has found something, too."""
+    """A check whose data cannot be read is a finding, too."""
     try:
         yield from check
     except InputError as error:
@@ -129,7 +129,7 @@ def _guarded(check: Iterator[Finding]) -> Iterator[Finding]:
 
 
 def _attributes(store: Store) -> Iterator[Finding]:
-    """Attributes of the root against those that follow from the manifest and the arrays."""
+    """Attributes of the root, compared with those that follow from the manifest and the arrays."""
     attributes = dict(store.root.attrs)
     wanted = root_attributes(store.manifest, _dataset_sha256(store), str(attributes.get("manifest_sha256")))
     for name in sorted({*wanted, *attributes}):
@@ -140,7 +140,7 @@ def _attributes(store: Store) -> Iterator[Finding]:
 
 
 def _tables(store: Store) -> Iterator[Finding]:
-    """The tables against the hashes in the manifest, the manifest against its hash in the root."""
+    """The tables compared with their hashes in the manifest, the manifest with its hash in the root."""
     manifest = {key: value for key, value in store.manifest.items() if key not in ("build", "files")}
     files = read_table(group_of(store.root, "manifest"), "path")
     if record_sha256([manifest, table_sha256(files)]) != store.root.attrs.get("manifest_sha256"):
@@ -151,7 +151,7 @@ def _tables(store: Store) -> Iterator[Finding]:
 
 
 def _dataset_sha256(store: Store) -> str:
-    """The dataset's hash now; the stored one where an array is damaged, since that has its own finding."""
+    """The dataset's hash now; the stored one if an array is damaged, which has its own finding."""
     try:
         return store.computed_sha256()
     except InputError:
@@ -159,7 +159,7 @@ def _dataset_sha256(store: Store) -> str:
 
 
 def _steps(store: Store, history: Mapping[str, list[tuple[str, Step]]]) -> Iterator[Finding]:
-    """Each step's id against its content, and its inputs against what came before it."""
+    """Each step's id compared with its content, and its inputs with the outputs before it."""
     raw = {row["path"]: row["sha256"] for row in store.manifest["files"]}
     for scan_id, steps in history.items():
         made: dict[str, str] = {}

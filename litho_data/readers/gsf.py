@@ -16,7 +16,7 @@ _UM_PER_M = 1e6
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """The one field of a GSF file; unit and size only where the header states them.
+    """The one field of a GSF file; unit and size only if the header states them.
 
     Raises:
         InputError: another format, a header without XRes and YRes, or data of another length.
@@ -27,7 +27,7 @@ def read_channels(path: Path) -> list[Channel]:
     header_end = raw.find(b"\0")
     header = _parse_header(path, raw[len(_MAGIC) : header_end if header_end >= 0 else None])
     shape = (_count(path, header, "YRes"), _count(path, header, "XRes"))
-    # At least one NUL, even where the header already ends on a multiple of four.
+    # At least one NUL, even if the header already ends on a multiple of four.
     start = (header_end // _ITEM + 1) * _ITEM
     wanted = shape[0] * shape[1] * _ITEM
     if header_end < 0 or len(raw) - start != wanted:

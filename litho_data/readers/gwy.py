@@ -1,4 +1,4 @@
-"""Gwyddion's own files: every data field is a channel, and a mask stays a mask."""
+"""Gwyddion's own files: every data field is a channel, a mask stays a mask."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _FIELD_KEY = re.compile(r"/(\d+)/data")
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """One channel per data field; heights under a mask are kept, and the mask beside them.
+    """One channel per data field; heights under a mask are kept, together with the mask.
 
     A pixel counts as masked where the mask is above zero. The metadata that Gwyddion keeps for a
     channel is its header.
@@ -64,7 +64,7 @@ def _pixels(path: Path, key: str, field: Any, shape: tuple[int, int]) -> np.ndar
 
 
 def _unit(field: Any, key: str) -> str | None:
-    """None where Gwyddion states no unit, which it also uses for pure numbers."""
+    """None if Gwyddion states no unit, as it does for pure numbers."""
     unit = field.get(key)
     return None if unit is None else str(unit.get("unitstr", "")) or None
 
@@ -84,8 +84,8 @@ def _header(meta: Any) -> dict[str, str]:
 def check_structure(path: Path) -> None:
     """Accept a file whose bytes form a tree of components with sizes that fit into each other.
 
-    gwyfile trusts the sizes in the file: a missing string end or a damaged count sends it into an
-    endless loop, so they are checked before it sees the file.
+    gwyfile trusts the sizes in the file. A missing end of a string or a damaged count sends it into an
+    endless loop, so sizes are checked first.
 
     Raises:
         InputError: another format, or sizes that do not fit; the message gives the position.

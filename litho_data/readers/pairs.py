@@ -1,7 +1,7 @@
 """Fields in the authors' pair format: 8-bit layouts and heights, cut into four quadrants.
 
-A grey value stands for value / 255 · full scale. The format has no validity, no negative heights and 256 grey
-values, so that going through it costs accuracy.
+A grey value means value / 255 · full scale. The format has no validity, no negative heights and 256 grey
+values, so it loses accuracy.
 """
 
 from __future__ import annotations

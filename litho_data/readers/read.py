@@ -1,4 +1,4 @@
-"""Reading one scan: format, channel, unit and size are settled here, once, for every format."""
+"""Reading one scan: format, channel, unit and size are decided here, in one place for all formats."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from litho_data.readers.reader import Channel, Reader
 from litho_data.readers.registry import PICTURE, detect_format, reader_of, require_file
 from litho_data.scan import Axis, Scan
 
-# Sizes that files state are rounded to a few digits when they are written.
+# Files state sizes rounded to a few digits.
 _SIZE_TOLERANCE = 1e-4
 
 
@@ -31,13 +31,13 @@ def read_scan(
     Args:
         path: the instrument's file.
         format: one of ``formats()``, or ``"auto"``, which judges the content.
-        unit: of the heights, needed where the file states none.
+        unit: of the heights, needed if the file states none.
         size_um: (y, x) extent from edge to edge, µm, for files that state none; without it the
             pitch stays unknown (None).
-        channel: which channel; needed where a file has several height channels.
-        fast_axis: ``"x"`` or ``"y"`` where it is known and the file does not state it.
+        channel: which channel; needed if a file has several height channels.
+        fast_axis: ``"x"`` or ``"y"``, if it is known and the file does not state it.
         full_scale_um: height of the largest integer value, for images that hold integers:
-            height = value / largest value · full_scale_um. Takes the place of ``unit``.
+            height = value / largest value · full_scale_um. Replaces ``unit``.
 
     Raises:
         InputError: unreadable, no or several height channels, a missing or contradicting unit or

@@ -15,7 +15,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import is_length
 from litho_data.scan import Axis
 
-# 2 GiB as float64: beyond it a damaged header is far likelier than a scan.
+# 2 GiB as float64: beyond it, a damaged header is far more likely than a scan.
 _MAX_PIXELS = 2**28
 _LOGGERS = ("tifffile", "igor2", "SurfaceTopography")
 _LONGEST_MESSAGE = 160
@@ -30,12 +30,12 @@ class Channel:
     Args:
         name: unique within the file.
         shape: (ny, nx) in pixels.
-        unit: of the values, as the file states it; None where it does not.
-        size_um: (y, x) extent from edge to edge; None where the file does not state it.
+        unit: of the values, as the file states it; None if it does not.
+        size_um: (y, x) extent from edge to edge; None if the file does not state it.
         load: returns the values, (ny, nx) in ``unit``, row 0 on top, and the file's mask or None.
         full_scale: the largest value of an integer image; None for real numbers.
-        fast_axis: None where the file does not state it.
-        header: what the file states, word by word.
+        fast_axis: None if the file does not state it.
+        header: everything that the file states, as strings.
     """
 
     name: str
@@ -58,7 +58,7 @@ class Channel:
 
     @property
     def is_height(self) -> bool:
-        """A length, or a value whose unit only the caller can know."""
+        """Whether the unit is a length, or only the caller can know it."""
         return self.unit is None or is_length(self.unit)
 
     def describe(self) -> str:
@@ -86,7 +86,7 @@ class Reader:
 
 
 def with_unique_names(channels: list[Channel]) -> list[Channel]:
-    """Number the channels that share a name, such as trace and retrace, so that each can be chosen."""
+    """Number channels with the same name, such as trace and retrace, so that each can be chosen."""
     seen: dict[str, int] = {}
     unique = []
     for channel in channels:
@@ -97,10 +97,10 @@ def with_unique_names(channels: list[Channel]) -> list[Channel]:
 
 @contextmanager
 def foreign_parser(path: Path, kind: str) -> Iterator[None]:
-    """Run a parser that is not ours; any exception becomes one InputError about the file.
+    """Run another project's parser; any exception becomes one InputError about the file.
 
-    Parsers of binary formats raise struct, index, key, value, memory, decode, assertion and own
-    errors on damaged files, and log to stderr besides; a caller can act on none of it.
+    On damaged files such parsers raise struct, index, key, value, memory, decode, assertion and their own
+    errors, and log to stderr; a caller can do nothing with these.
     """
     loggers = [logging.getLogger(name) for name in _LOGGERS]
     levels = [logger.level for logger in loggers]

@@ -1,4 +1,4 @@
-"""The formats that are read, and which of them a file has, judged by its content and never by its suffix."""
+"""The formats that are read, and which of them a file has, by its content and never by its suffix."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ def formats() -> tuple[str, ...]:
 
 
 def add_reader(reader: Reader) -> Reader:
-    """Read files of another format from now on; a new reader is asked before those that are there.
+    """Read files of another format from now on; a new reader is asked before the existing ones.
 
-    A build in several processes needs the call in a module that each of them imports, such as the top level
-    of the script that starts the build.
+    For a build in several processes, put the call in a module that each of them imports, such as the top
+    level of the script that starts the build.
 
     Raises:
-        InputError: a format of that name is there already.
+        InputError: there is a format of that name.
     """
     if reader.name in ("auto", PICTURE, *formats()):
-        raise InputError("reader to add", got=f"{reader.name!r}, which is there", wanted="another name")
+        raise InputError("reader to add", got=f"{reader.name!r}, which exists", wanted="another name")
     _READERS.insert(0, reader)
     return reader
 
@@ -57,7 +57,7 @@ def detect_format(path: Path) -> str:
 
 
 def require_file(path: str | Path) -> Path:
-    """The path, if it is a file with something in it.
+    """The path, if it is a file that is not empty.
 
     Raises:
         InputError: no such file, a folder, not readable, or empty.

@@ -25,8 +25,8 @@ _CELL_WIDTH = len("-1.2345e-007\t")
 def read_channels(path: Path) -> list[Channel]:
     """The one channel of a text matrix; unit and size only if comment lines of Gwyddion state them.
 
-    Comment lines start with ``#``. A decimal comma is accepted where the cells are not separated
-    by commas. ``nan`` marks a pixel that was not measured.
+    Comment lines start with ``#``. A decimal comma is accepted if the cells are not separated by
+    commas. ``nan`` marks a pixel that was not measured.
 
     Raises:
         InputError: binary or empty file, something that is no number, rows of different lengths,
@@ -89,7 +89,7 @@ def _parse(path: Path, body: bytes, first_line: int) -> np.ndarray:
         raise InputError(f"{path} line {line}", got=f"byte 0x{strange[0]:02x}", wanted="a text of numbers")
     if not body.strip():
         raise InputError(f"{path} holds no numbers", wanted="one line per row of the height map")
-    # Looking for a comma first takes a hundredth of the time of the expression.
+    # Looking for a comma first takes a hundredth of the time of the regular expression.
     if (b"," in body or b";" in body) and (empty := _EMPTY_CELL.search(body)):
         line = first_line + body.count(b"\n", 0, empty.start())
         raise InputError(
@@ -113,7 +113,7 @@ def _separate_by_blanks(body: bytes) -> bytes:
 
 
 def _refuse_cut_number(path: Path, cells: bytes, first_line: int) -> None:
-    """A copy that stopped inside the last number (5.4e-007 -> 5.4) would otherwise read as 5.4 m."""
+    """A copy cut off inside the last number (5.4e-007 -> 5.4) would otherwise read as 5.4 m."""
     if cells.endswith((b"\n", b"\r")):
         return
     last_row = cells[cells.rfind(b"\n") + 1 :].decode("ascii").split()
@@ -131,7 +131,7 @@ def _refuse_cut_number(path: Path, cells: bytes, first_line: int) -> None:
 
 
 def _complain(path: Path, cells: bytes, first_line: int) -> NoReturn:
-    """Find the first line that is to blame; only reached when the fast parser refused the text."""
+    """Find the first bad line; only called after the fast parser refused the text."""
     width, width_line = 0, 0
     for line, row in enumerate(cells.decode("ascii").splitlines(), start=first_line):
         tokens = row.split()

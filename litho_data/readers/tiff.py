@@ -24,8 +24,8 @@ _JPK_FILE_FORMAT_VERSION = 0x8000
 def read_channels(path: Path) -> list[Channel]:
     """One channel per page; RGB pages count as one channel if their samples are identical.
 
-    The resolution tags are believed only where ImageJ names their unit: elsewhere they usually
-    describe the paper, not the sample.
+    The resolution tags are used only if ImageJ names their unit; otherwise they usually describe
+    paper, not the sample.
 
     Raises:
         InputError: damaged file, or pages that are not two-dimensional images.
@@ -37,7 +37,7 @@ def read_channels(path: Path) -> list[Channel]:
 
 @contextmanager
 def open_tiff(path: Path) -> Iterator[TiffFile]:
-    """A TIFF file, open; whatever a damaged one provokes becomes an InputError and nothing else."""
+    """A TIFF file, open; any error of a damaged one becomes an InputError."""
     import tifffile
 
     with foreign_parser(path, "TIFF"), tifffile.TiffFile(path) as file:
@@ -86,7 +86,7 @@ def single_sample(path: Path, pixels: np.ndarray) -> np.ndarray:
     """(ny, nx) from (ny, nx) or from (ny, nx, 3 or 4) whose colours are identical.
 
     Raises:
-        InputError: the colours differ, so that no single number belongs to a pixel.
+        InputError: the colours differ, so a pixel has no single value.
     """
     if pixels.ndim == 3 and pixels.shape[2] in (1, 3, 4):
         colours = pixels[..., :3]
@@ -109,7 +109,7 @@ def _is_jpk(path: Path) -> bool:
     try:
         with open_tiff(path) as file:
             return _JPK_FILE_FORMAT_VERSION in file.pages.first.tags
-    except InputError:  # reported by the reader that will be tried on it
+    except InputError:  # the reader that tries it next reports it
         return False
 
 

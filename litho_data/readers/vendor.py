@@ -15,11 +15,11 @@ from litho_data.foundation.units import is_length, um_per
 from litho_data.readers.reader import Channel, Loaded, Reader, foreign_parser, with_unique_names
 from litho_data.scan import Axis
 
-# Left out: formats with readers of our own, plain text, and two that have no signature and would
-# take any bytes of a fitting length for a map.
+# Left out: formats with readers of our own, plain text, and two without a signature, which would accept
+# any bytes of the right length as a map.
 _NOT_OURS = {"npy", "npz", "gwy", "asc", "xyz", "hgt", "nms"}
 _HEAD_BYTES = 512
-# Deflate, the strongest compression in use, packs at most 1032 bytes into one.
+# Deflate, the strongest compression in use, packs at most 1032 bytes into one byte.
 _MOST_PIXELS_PER_BYTE = 1032
 _ANGLE_TOLERANCE_DEG = 1.0
 _NANOSCOPE_END = b"\\*File list end"
@@ -101,7 +101,7 @@ def _size_um(sizes: Any, unit: str | None) -> tuple[float, float] | None:
 
 def _load(path: Path, kind: str, index: int, without_size: bool) -> Loaded:
     """Heights with row 0 on top: SurfaceTopography indexes [x, y] with y downwards."""
-    # A size is demanded even where the file has none; heights do not depend on it.
+    # A size is required even if the file has none; heights do not depend on it.
     arguments = {"physical_sizes": (1.0, 1.0)} if without_size else {}
     with foreign_parser(path, kind), _open(path, kind) as reader:
         heights = reader.topography(channel_index=index, **arguments).heights()
@@ -129,9 +129,9 @@ def _vendor_header(path: Path, kind: str) -> dict[str, str]:
 
 
 def _fast_axis(header: dict[str, str]) -> Axis | None:
-    """``"x"`` where an Asylum note gives a scan angle of 0° or 180°.
+    """``"x"`` if an Asylum note gives a scan angle of 0° or 180°.
 
-    At other angles the lines of the file may follow the scanner or the scan; the caller has to say.
+    At other angles the lines of the file may follow the scanner or the scan; the caller has to know.
     """
     try:
         angle = float(header["ScanAngle"]) % 180

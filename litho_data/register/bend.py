@@ -1,4 +1,4 @@
-"""A bent scan: the smooth quadratic distance between where a scanner was and where it says it was."""
+"""A bent scan: the smooth, quadratic difference between where a scanner was and where it says it was."""
 
 from __future__ import annotations
 
@@ -58,20 +58,20 @@ class Bend:
         return Bend(self.amount * factor, self.middle * factor, self.half * factor)
 
     def shift(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far (along x, along y) a point of the scan is from where it was meant to be."""
+        """Distance (along x, along y) of points of the scan from their nominal position."""
         u, v = self._unit(x, y)
         terms = (u * u - 1 / 3, u * v, v * v - 1 / 3)
         along_x, along_y = (sum(a * term for a, term in zip(row, terms, strict=True)) for row in self.amount)
         return along_x, along_y
 
     def straighten(self, points: np.ndarray) -> np.ndarray:
-        """Where points (n, 2) of the scan really are."""
+        """True positions of points (n, 2) of the scan."""
         return points + np.stack(self.shift(*points.T), axis=1)
 
     def undo(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The points of the scan that really are at (x, y): Newton's method, all points at once.
+        """The points of the scan whose true position is (x, y), by Newton's method, all points at once.
 
-        A place that no point reaches comes back far outside of the frame.
+        A position that no point has comes back far outside the frame.
         """
         at_x, at_y = (np.array(one, dtype=np.float64) for one in np.broadcast_arrays(x, y))
         for _ in range(_ITERATIONS):
@@ -83,7 +83,7 @@ class Bend:
                 step_x = ((1 + yy) * miss_x - xy * miss_y) / determinant
                 step_y = ((1 + xx) * miss_y - yx * miss_x) / determinant
             open_ = ~((np.abs(step_x) < _SETTLED * self.half[0]) & (np.abs(step_y) < _SETTLED * self.half[1]))
-            # Half a frame per step: further than any bend that is accepted, too short to run away.
+            # Half a frame per step: more than any accepted bend, and too short to diverge.
             at_x += np.clip(np.nan_to_num(step_x), -self.half[0], self.half[0])
             at_y += np.clip(np.nan_to_num(step_y), -self.half[1], self.half[1])
             if not open_.any():
@@ -99,7 +99,7 @@ class Bend:
 
     @property
     def slope(self) -> float:
-        """The largest local stretch or turn that the bend brings, as a share; from 1 on it may fold."""
+        """The largest local stretch or rotation of the bend, as a fraction; from 1 on it may fold."""
         # The gradient is linear in u and v, its norm convex: it is largest in a corner.
         gradient = np.array(self._gradient(*self._grid(2)))
         return float(np.linalg.norm(np.moveaxis(gradient, (0, 1), (-2, -1)), ord=2, axis=(-2, -1)).max())

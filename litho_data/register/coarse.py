@@ -1,4 +1,4 @@
-"""From nothing to within a few pixels: orientation, polarity and a robust affine, with fallbacks."""
+"""The coarse fit, to within a few pixels: orientation, polarity and a robust affine, with fallbacks."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from litho_data.register.geometry import (
 from litho_data.register.orientation import TIE, Hypothesis, search_orientation
 
 CLEAR_MARGIN = 0.1
-# Correlation above which a hypothesis is believed without features to support it.
+# Correlation above which a hypothesis is accepted without support from features.
 CONVINCING = 0.7
 MIN_INLIERS = 30
 MIN_COVERAGE = 0.5
@@ -58,8 +58,8 @@ def find_coarse(
         scan: (ny, nx) heights at the layout's pitch without bow, NaN where not measured.
         layout_level: (ny, nx) integer levels.
         smooth_layout: (ny, nx) the topography predicted from it with a blur of ``SEARCH_BLUR_PX``.
-        search: whether all eight orientations and both polarities are open, or only the identity.
-        features: whether keypoints may be matched; on a layout that repeats itself they match everywhere.
+        search: try all eight orientations and both polarities, or only the identity.
+        features: whether to match keypoints; on a layout that repeats itself they match everywhere.
         seed: of the robust estimators.
     """
     allowed = (tuple(ORIENTATIONS), (1, -1)) if search else (("identity",), (1,))
@@ -75,7 +75,7 @@ def find_coarse(
 
 
 def _upright_if_tied(hypotheses: list[Hypothesis]) -> Hypothesis:
-    """The best hypothesis, or the upright one where a symmetric layout makes it just as good."""
+    """The best hypothesis, or the upright one if a symmetric layout makes it equally good."""
     best = hypotheses[0]
     for hypothesis in hypotheses:
         upright = (hypothesis.orientation, hypothesis.polarity) == ("identity", 1)
@@ -87,8 +87,8 @@ def _upright_if_tied(hypotheses: list[Hypothesis]) -> Hypothesis:
 def _attempts(best: Hypothesis, hypotheses: list[Hypothesis]) -> list[tuple[str, str, int]]:
     """(method, orientation, polarity) to try in turn.
 
-    ORB and SIFT see through rotations, so that only the four combinations of mirror image and polarity
-    differ; they are all tried where correlation leaves the orientation open.
+    ORB and SIFT do not depend on rotation, so only the four combinations of mirror image and polarity
+    differ; all are tried if the correlation leaves the orientation open.
     """
     own = (best.orientation, best.polarity)
     rivals = [h.ncc for h in hypotheses if (h.orientation, h.polarity) != own]
@@ -112,7 +112,7 @@ def _fit_features(
     layout_shape = (layout_level.shape[0], layout_level.shape[1])
     from_family = np.linalg.inv(orientation_matrix(orientation, shape))
     to_layout = np.linalg.inv(linear_part(from_family @ points.layout_to_scan, centre(layout_shape)))
-    # The keypoints may have found a quarter turn that the correlation had missed.
+    # The keypoints may have found a rotation by 90° that the correlation missed.
     found = nearest_orientation(to_layout)
     turn = orientation_matrix(found, shape) @ from_family
     warp = turn @ points.layout_to_scan

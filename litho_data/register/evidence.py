@@ -18,10 +18,10 @@ BOOTSTRAP_SAMPLES = 200
 
 @dataclass(frozen=True)
 class BlockShifts:
-    """What single blocks of the field say about the warp; all (n, 2) as (x, y), layout pixels.
+    """What single blocks of the field say about the warp; arrays (n, 2) of (x, y) in layout pixels.
 
-    ``shift_px`` is how far a block's content lies from where the warp puts it, ``held_out_px`` the same
-    against a warp that was fitted without the block.
+    ``shift_px`` is the distance of a block's content from where the warp puts it, ``held_out_px`` the same
+    for a warp fitted without the block.
     """
 
     middle_px: np.ndarray
@@ -36,7 +36,7 @@ class BlockShifts:
     def curve_px(self, axis: int) -> float:
         """Peak to valley of the mean shift along an axis (0 = x, 1 = y) as a function of that coordinate.
 
-        A straight scanner and a sufficient model leave only noise; a curve means that the scanner's axis is
+        A straight scanner and a sufficient model leave only noise. A curve means that the scanner's axis is
         not linear, which no rung of the ladder can follow.
         """
         places = np.unique(self.middle_px[:, axis])
@@ -50,7 +50,7 @@ class BlockShifts:
 def match_blocks_of_field(
     refinement: Refinement, registered: np.ndarray, measured: np.ndarray, topography: np.ndarray
 ) -> BlockShifts:
-    """The shift of every block, and against a warp refitted to the pixels outside it.
+    """The shift of every block, under the warp and under a warp refitted to the pixels outside the block.
 
     Args:
         registered: (ny, nx) smoothed scan on the layout's pixels without background, gaps filled.
@@ -94,7 +94,7 @@ def match_blocks_of_field(
 
 
 def bootstrap_corner_sd_px(refinement: Refinement, shape: tuple[int, int], seed: int) -> float:
-    """Largest standard deviation of a corner when the field's blocks are drawn with replacement, px."""
+    """Largest standard deviation of a corner over bootstrap draws of the field's blocks, px."""
     blocks = refinement.blocks()
     blocks = blocks.reshape(-1, *blocks.shape[2:])
     if len(blocks) < 4:
@@ -140,7 +140,7 @@ def _interior(height: np.ndarray) -> np.ndarray:
 
 
 def _peak(score: np.ndarray) -> np.ndarray:
-    """Sub-pixel position (x, y) of the maximum; a maximum on the rim stays where it is."""
+    """Sub-pixel position (x, y) of the maximum; a maximum on the border stays where it is."""
     row, column = (int(k) for k in np.unravel_index(np.argmax(score), score.shape))
     position = np.array([column, row], dtype=np.float64)
     for axis, line, k in ((0, score[row], column), (1, score[:, column], row)):

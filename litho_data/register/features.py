@@ -1,4 +1,4 @@
-"""Coarse registration without a position prior: matched points and a robust affine."""
+"""Coarse registration without an assumption about position: matched points and a robust affine."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ _ROWS_AT_ONCE = 32
 
 @dataclass(frozen=True)
 class Correspondence:
-    """Matched points and the affine that most of them share.
+    """Matched points and the affine that most of them agree on.
 
     ``layout_points`` and ``scan_points`` are (n, 2) index coordinates (x, y) of the matches, ``inlier``
     tells which agree with ``layout_to_scan`` within ``INLIER_PX``; ``hull_px2`` is the area of the layout
-    inside the convex hull of the inliers; ``keypoints`` is the count in the poorer of the two images.
+    inside the convex hull of the inliers; ``keypoints`` is the smaller count of the two images.
     """
 
     method: str
@@ -94,18 +94,18 @@ def match_features(
 
 
 def match_bits(first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Cross-checked matches of binary descriptors, as OpenCV's matcher finds them, in a third of its time.
+    """Cross-checked matches of binary descriptors: those of OpenCV's matcher, in a third of its time.
 
     Args:
         first: (n, b) uint8 with n < 65536 and b a multiple of 8; second: (m, b) alike.
 
     Returns:
-        Indices into both of the pairs of which each is the other's nearest by Hamming distance; of
-        several equally near ones the first counts.
+        Indices into both arrays, one pair per match: each is the other's nearest by Hamming distance, and
+        the first of several equally near ones counts.
     """
     words, other_words = first.view(np.uint64), np.ascontiguousarray(second.view(np.uint64).T)
     nearest = np.empty(len(first), dtype=np.intp)
-    # Distance in the high half, row in the low one: the least key is the first of the nearest rows.
+    # Distance in the high half, row in the low half: the smallest key is the first of the nearest rows.
     least_key = np.full(len(second), np.iinfo(np.uint32).max, dtype=np.uint32)
     # A few rows at a time stay in the processor's cache.
     for start in range(0, len(first), _ROWS_AT_ONCE):
@@ -149,7 +149,7 @@ def match_blocks(
             row, column = np.unravel_index(np.argmax(score), score.shape)
             layout_points.append((left, top))
             scan_points.append((x0 + column, y0 + row))
-    # A block speaks for its middle: at its corner a change of scale would look like a shift.
+    # A block stands for its middle: at its corner a change of scale would look like a shift.
     middle = (BLOCK_PX - 1) / 2
     layout_middles, scan_middles = (
         np.array(corners, float).reshape(-1, 2) + middle for corners in (layout_points, scan_points)
@@ -158,7 +158,7 @@ def match_blocks(
 
 
 def _contrast_image(image: np.ndarray) -> np.ndarray:
-    """8-bit copy with local contrast equalised; only keypoints are found on it, never heights."""
+    """8-bit copy with local contrast equalised; used to find keypoints, never for heights."""
     import cv2
 
     low, high = np.percentile(image, (0.5, 99.5))

@@ -53,7 +53,7 @@ def figures_of_warp(
 
 
 def figures_of_evidence(fine: FineFit, pitch_um: float, seed: int) -> dict[str, Any]:
-    """How well the warp is known: held-out blocks, bootstrap, rivals."""
+    """How well the warp is known: held-out blocks, bootstrap, other candidates."""
     warp, shape = fine.refinement.layout_to_scan, _shape(fine.topography)
     background = np.einsum("k,kyx->yx", fine.refinement.background, quadratic_basis(shape))
     aligned = fine.refinement.warped - background

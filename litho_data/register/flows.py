@@ -1,4 +1,4 @@
-"""How a warp can change: the generators of every rung of the ladder, and the flows that bend."""
+"""How a warp can change: the generators of every rung of the ladder, and the quadratic flows."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 Model = Literal["translation", "euclidean", "similarity", "affine", "homography"]
-# Every rung owns the first so many generators below: the ladder is nested by construction.
+# Number of generators of each rung, counted from the first: the ladder is nested by construction.
 LADDER: dict[Model, int] = {"translation": 2, "euclidean": 3, "similarity": 4, "affine": 6, "homography": 8}
 GENERATORS = np.zeros((8, 3, 3))
 GENERATORS[0, 0, 2] = GENERATORS[1, 1, 2] = 1.0
@@ -17,19 +17,19 @@ GENERATORS[3, 0, 0] = GENERATORS[3, 1, 1] = 1.0
 GENERATORS[4, 0, 0], GENERATORS[4, 1, 1] = 1.0, -1.0
 GENERATORS[5, 0, 1] = GENERATORS[5, 1, 0] = 1.0
 GENERATORS[6, 2, 0] = GENERATORS[7, 2, 1] = 1.0
-# An affine and a bend: of the six quadratic flows, the generators of the perspective are two.
+# An affine and a bend: two of the six quadratic flows are the generators of the perspective.
 BENT_COUNT = 12
 
 
 def normalisation(shape: tuple[int, int]) -> np.ndarray:
-    """Index coordinates to coordinates of order one about the middle, the same scale along both axes."""
+    """Matrix from index coordinates to ones of order one about the middle, same scale for both axes."""
     scale = 2.0 / (max(shape) - 1)
     ny, nx = shape
     return np.array([[scale, 0, -scale * (nx - 1) / 2], [0, scale, -scale * (ny - 1) / 2], [0, 0, 1]])
 
 
 def _flow(generator: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Velocity along x and y that a generator gives to normalised points; x and y broadcast."""
+    """Velocity (along x, along y) of normalised points under a generator; x and y broadcast."""
     coordinates = (x, y, np.ones(1, dtype=x.dtype))
     zero = np.zeros(1, dtype=x.dtype)
     moved_x, moved_y, weight = (
@@ -39,7 +39,7 @@ def _flow(generator: np.ndarray, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarr
 
 
 def flows(count: int, x: np.ndarray, y: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Velocities of the first ``count`` generators; of ``BENT_COUNT``, all affine and quadratic ones."""
+    """Velocities of the first ``count`` generators; for ``BENT_COUNT`` all affine and quadratic ones."""
     for generator in GENERATORS[:count]:
         yield _flow(generator, x, y)
     if count == BENT_COUNT:

@@ -1,4 +1,4 @@
-"""Frames, units and orientations: how pixel indices, micrometres and turned images relate.
+"""Frames, units and orientations: how pixel indices, micrometres and rotated images relate.
 
 Points are rows ``(x, y)``; matrices are 3×3 and act on ``(x, y, 1)``. An *index* frame counts
 pixel centres 0, 1, 2 …; the micrometre frame of the same image has those centres at
@@ -11,7 +11,7 @@ import numpy as np
 
 from litho_data.register.bend import Bend
 
-# name: (transpose, then flip rows, then flip columns); the operation that turns the scan onto the layout.
+# name: (transpose, then flip rows, then flip columns); the operation that brings the scan onto the layout.
 ORIENTATIONS: dict[str, tuple[bool, bool, bool]] = {
     "identity": (False, False, False),
     "rotate-90": (True, True, False),
@@ -31,7 +31,7 @@ def index_to_um(pitch_um: tuple[float, float]) -> np.ndarray:
 
 
 def orient(image: np.ndarray, orientation: str) -> np.ndarray:
-    """The image turned by one of the eight operations of ``ORIENTATIONS`` (a view)."""
+    """The image after one of the eight operations of ``ORIENTATIONS`` (a view)."""
     transpose, flip_y, flip_x = ORIENTATIONS[orientation]
     turned = image.T if transpose else image
     turned = turned[::-1] if flip_y else turned
@@ -39,7 +39,7 @@ def orient(image: np.ndarray, orientation: str) -> np.ndarray:
 
 
 def orientation_matrix(orientation: str, shape: tuple[int, int]) -> np.ndarray:
-    """Takes an index of an image of this (y, x) shape to its index in ``orient(image, orientation)``."""
+    """The matrix from indices of an image of this (y, x) shape to those in ``orient(image, orientation)``."""
     transpose, flip_y, flip_x = ORIENTATIONS[orientation]
     ny, nx = shape[::-1] if transpose else shape
     matrix = np.eye(3)
@@ -73,7 +73,7 @@ def warped_grid(
 ) -> tuple[np.ndarray, np.ndarray]:
     """(rows, columns) that a 3×3 index matrix assigns to every pixel of an image.
 
-    With a bend of the image that the matrix leads to: the places that really are where the matrix points.
+    With a bend of the target image: the points whose true position is where the matrix points.
     """
     y = np.arange(shape[0], dtype=np.float64)[:, None]
     x = np.arange(shape[1], dtype=np.float64)[None, :]

@@ -1,4 +1,4 @@
-"""Which warp the data can carry: the lowest rung that no higher one beats on held-out blocks."""
+"""Which warp the data support: the lowest rung that no higher one beats on held-out blocks."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ def climb(fine: FineFit) -> FineFit:
     Args:
         fine: a converged affine fit; every rung starts from its projection.
 
-    A higher rung pays if its gain on held-out blocks, averaged over the blocks, exceeds three of its
-    standard errors.
+    A higher rung is better if its gain on held-out blocks, averaged over the blocks, exceeds three standard
+    errors.
     """
     shape = (fine.topography.shape[0], fine.topography.shape[1])
     start = fine.refinement.layout_to_scan
@@ -37,7 +37,7 @@ def climb(fine: FineFit) -> FineFit:
 def held_out_energy(refinement: Refinement) -> np.ndarray:
     """Residual energy of every block under the fit to the blocks of the other folds, (n,).
 
-    The folds interleave, so that each is spread over the whole field.
+    The folds interleave, so each is spread over the whole field.
     """
     blocks = refinement.blocks()
     rows, columns = np.indices(blocks.shape[:2])

@@ -1,4 +1,4 @@
-"""Which way up, which sign, roughly where: masked normalised cross-correlation over all shifts."""
+"""Orientation, sign and rough position, by masked normalised cross-correlation over all shifts."""
 
 from __future__ import annotations
 
@@ -57,10 +57,10 @@ def search_orientation(
     for orientation, moving, (correlation, overlap) in zip(orientations, turned, correlations, strict=True):
         if np.isnan(correlation).all():
             continue
-        # Only breaks ties: on a repeating layout the shift with the larger overlap is the better guess.
+        # Only breaks ties: on a repeating layout, the shift with the larger overlap is the better guess.
         handicap = TIE * (1 - overlap / overlap.max())
-        # A block of `factor` pixels has its centre (factor - 1) / 2 behind its first pixel; turning a scan
-        # whose size is no multiple of the factor moves the cut-off rest to the other side.
+        # The centre of a block of `factor` pixels is (factor - 1) / 2 after its first pixel; rotating a scan
+        # whose size is no multiple of the factor moves the remainder to the other side.
         cut_y, cut_x = _cut_off(orientation, (scan.shape[0], scan.shape[1]), factor)
         for polarity in polarities:
             row, column = np.unravel_index(np.nanargmax(polarity * correlation - handicap), correlation.shape)
@@ -80,7 +80,7 @@ def rival_alignment(registered: np.ndarray, topography: np.ndarray) -> float:
     """Correlation of the best rival shift, as a share of that of the registration itself.
 
     A rival is a local maximum of the correlation over shifts, a sixteenth of the field or more away. With
-    the topography in place of the scan it tells how well the layout repeats itself.
+    the topography in place of the scan, it says how well the layout repeats itself.
     """
     from scipy.ndimage import maximum_filter
 
@@ -99,7 +99,7 @@ def rival_alignment(registered: np.ndarray, topography: np.ndarray) -> float:
 
 
 def rival_orientation(registered: np.ndarray, topography: np.ndarray) -> float:
-    """Largest correlation of the registered scan when turned, mirrored or inverted, over all shifts."""
+    """Largest correlation of the registered scan after rotation, mirroring or inversion, over all shifts."""
     factor = max(1, round(max(topography.shape) / SEARCH_SIZE_PX))
     small, scan = reduce_image(topography, factor), reduce_image(registered, factor)
     rivals = []
@@ -113,7 +113,7 @@ def rival_orientation(registered: np.ndarray, topography: np.ndarray) -> float:
 
 
 def reduce_image(image: np.ndarray, factor: int) -> np.ndarray:
-    """Means over blocks of ``factor`` × ``factor`` pixels (the rest cut off); NaN where half is missing."""
+    """Means over blocks of ``factor`` × ``factor`` pixels; no remainder, NaN where half is missing."""
     ny, nx = image.shape[0] // factor, image.shape[1] // factor
     blocks = image[: ny * factor, : nx * factor].reshape(ny, factor, nx, factor)
     measured = np.isfinite(blocks)
@@ -152,7 +152,7 @@ def masked_correlations(
     for moving in movings:
         ny, nx = (next_fast_len(a + b - 1, real=True) for a, b in zip(fixed.shape, moving.shape, strict=True))
         shape, measured = (ny, nx), np.isfinite(moving)
-        # Turning a scan that is measured everywhere does not change what it covers.
+        # A rotated scan without gaps covers the same pixels.
         complete = measured.all()
         overlap, total1, variance1 = (
             under_complete(moving.shape, shape) if complete else under(measured, shape)

@@ -26,7 +26,7 @@ SMALLEST_LEVEL_PX = 48
 
 @dataclass(frozen=True)
 class FineFit:
-    """The refinement with the two images it compared: smoothed scan and blur-matched topography."""
+    """The refinement with the two images that were compared: smoothed scan and blur-matched topography."""
 
     refinement: Refinement
     scan: np.ndarray
@@ -35,7 +35,7 @@ class FineFit:
 
 
 def refine_pyramid(scan: np.ndarray, layout_level: np.ndarray, start: np.ndarray, model: Model) -> FineFit:
-    """Refines a coarse warp at a quarter, half and full resolution.
+    """Refine a coarse warp at a quarter, half and full resolution.
 
     Args:
         scan: (ny, nx) oriented heights without bow at the layout's pitch, NaN where not measured.
@@ -58,11 +58,11 @@ def refine_pyramid(scan: np.ndarray, layout_level: np.ndarray, start: np.ndarray
 
 
 def refine_bent(scan: np.ndarray, layout_level: np.ndarray, straight: FineFit) -> FineFit:
-    """Refines the best straight warp once more, as an affine and a bend of the scan.
+    """Refine the best straight warp again, as an affine and a bend of the scan.
 
     Args:
         scan, layout_level: as in ``refine_pyramid``.
-        straight: what it returned; it may miss by as much as the structures at a quarter resolution are wide.
+        straight: what that returned; its error may reach the width of structures at a quarter resolution.
     """
     shape = (layout_level.shape[0], layout_level.shape[1])
     matrix = project_to_model(straight.refinement.layout_to_scan, "affine", shape)
@@ -80,8 +80,8 @@ def _without_own_bow(
 ) -> np.ndarray:
     """The scan minus the quadratic surface that the topography does not explain.
 
-    A surface quadratic in the scan's frame, the print's own share of it included, is not quadratic in the
-    layout's once the scan is straightened, and would pull at the bend.
+    A surface that is quadratic in the scan's frame, including the print's share of it, is not quadratic in
+    the layout's frame once the scan is straightened. It would distort the bend.
     """
     from scipy.ndimage import map_coordinates
 
@@ -102,7 +102,7 @@ def _from_coarse_to_fine(
     for factor in LEVELS:
         if min(*layout_level.shape, *scan.shape) < factor * SMALLEST_LEVEL_PX:
             continue
-        # The extra blur widens the basin of convergence to the few pixels a coarse fit may be off.
+        # The extra blur widens the basin of convergence to the few pixels by which a coarse fit may be off.
         small_scan = _smooth(scan, factor)[::factor, ::factor]
         small_topography = predicted_topography(layout_level, 1.5 * factor)[::factor, ::factor]
         scale = np.diag([1.0 / factor, 1.0 / factor, 1.0])
@@ -171,5 +171,5 @@ def _about(linear: np.ndarray, point: np.ndarray, image: np.ndarray) -> np.ndarr
 
 
 def _smooth(scan: np.ndarray, sigma_px: float) -> np.ndarray:
-    """Smoothed where measured: what a gap would take from its surroundings is no evidence of its own."""
+    """Smoothed where measured: what fills a gap comes from its surroundings and is no evidence."""
     return np.where(np.isfinite(scan), smooth_measured(scan, sigma_px), np.nan)

@@ -10,17 +10,17 @@ from litho_data.register.bend import Bend
 
 @dataclass(frozen=True)
 class RegistrationQuality:
-    """Figures of one registration; NaN where a figure could not be had.
+    """Figures of one registration; NaN for a figure that could not be computed.
 
     Lengths in px are layout pixels; the nm figures are the same lengths times the pitch.
     """
 
     passed: bool
     reason: str  # why it failed; empty when passed
-    warning: str  # what to know although it passed
+    warning: str  # what to know about a scan that passed
     model: str
     method: str  # orb | sift | blocks | correlation: what found the coarse fit
-    dihedral: str  # the operation that turns the scan onto the layout
+    dihedral: str  # the operation that brings the scan onto the layout
     polarity: int  # -1: the scan shows the layout's negative
     converged: bool
     keypoints: int
@@ -63,21 +63,21 @@ class Thresholds:
     tre_median_warning_px: float = 1.0
     max_tre_median_px: float = 1.5
     max_corner_sd_px: float = 1.5
-    # Beyond this blur of the print (sigma) the two limits above grow with it.
+    # Beyond this blur of the print (sigma), the two limits above grow with it.
     blur_of_limits_px: float = 8.0
     singular_range: tuple[float, float] = (0.90, 1.10)
     singular_warning_range: tuple[float, float] = (0.95, 1.05)
     max_layout_repeats: float = 0.9
     max_second_alignment: float = 0.9
     min_orientation_margin: float = 0.1
-    # From a slope of 1 on, two points of the scan may show the same place.
+    # From a slope of 1 on, two points of the scan may show the same position.
     max_bend_slope: float = 1.0
 
 
 def judge(
     figures: dict[str, Any], thresholds: Thresholds, blur_px: float, bend_um: Bend | None = None
 ) -> tuple[bool, str, str]:
-    """(passed, reason, warning) for the figures of one registration; every failure is named.
+    """(passed, reason, warning) for the figures of one registration; the reason names every failure.
 
     Args:
         figures: of the fit, the warp and the evidence.

@@ -30,12 +30,12 @@ HOPELESS_SLOPE = 2.0
 
 @dataclass(frozen=True)
 class Refinement:
-    """A converged warp with what is needed to ask how well it is known.
+    """A converged warp, with what is needed to determine how well it is known.
 
-    ``layout_to_scan`` is the 3×3 index matrix; of a scan with a ``bend`` it leads to the straightened one.
+    ``layout_to_scan`` is the 3×3 index matrix; for a scan with a ``bend`` it leads to the straightened scan.
     ``warped`` (ny, nx) float32 is the scan on the layout's pixels, gaps filled. ``gram`` (cells_y, cells_x,
     k, k) holds, per cell of ``CELL_PX`` pixels, the inner products of the regressors (gain, background, warp)
-    and, last, the scan: every sub-sample of the field can be refitted from it without touching a pixel.
+    and, last, the scan: any part of the field can be refitted from it without the pixels.
     """
 
     model: Model
@@ -48,7 +48,7 @@ class Refinement:
     def blocks(self) -> np.ndarray:
         """``gram`` summed over blocks of two by two cells, (blocks_y, blocks_x, k, k).
 
-        The topography repeats its errors over a feature or two; a block is the smallest independent piece.
+        Errors of the topography extend over a feature or two; a block is the smallest independent piece.
         """
         starts = [np.linspace(0, n, max(1, n // 2) + 1).astype(int)[:-1] for n in self.gram.shape[:2]]
         return np.add.reduceat(np.add.reduceat(self.gram, starts[0], axis=0), starts[1], axis=1)
@@ -80,15 +80,15 @@ def refine(
     max_iterations: int = 30,
     tolerance_px: float = TOLERANCE_PX,
 ) -> Refinement:
-    """The warp of this model that maximises the correlation, from a start within the structures' width.
+    """The warp of this model that maximises the correlation; the start may be off by the structures' width.
 
     Args:
         scan: (ny, nx) smoothed heights, NaN where not measured.
         topography: (ny, nx) predicted topography.
-        start: 3×3 index matrix, layout to scan; it must already belong to ``model``.
+        start: 3×3 index matrix, layout to scan, of the kind ``model``.
         bend: of the scan, to start from; with one the warp is an affine and a bend, whatever the model.
-        max_iterations: Gauss-Newton steps at most; 0 only evaluates the start.
-        tolerance_px: a step that would move no corner by more ends the iteration.
+        max_iterations: largest number of Gauss-Newton steps; 0 only evaluates the start.
+        tolerance_px: the iteration ends at a step that moves every corner by less.
     """
     from scipy.linalg import expm
     from scipy.ndimage import map_coordinates, spline_filter
@@ -133,7 +133,7 @@ def refine(
             try:
                 moved, further_bent = _moved_on(matrix, bend, coefficients, shape)
             except np.linalg.LinAlgError:
-                break  # the scan shows too little of the layout to say where the step leads
+                break  # the scan shows too little of the layout to determine the step
             if not further_bent.slope < HOPELESS_SLOPE:
                 break
             matrix, bend = moved, further_bent
@@ -144,7 +144,7 @@ def solve_gram(gram: np.ndarray) -> np.ndarray:
     """Least-squares coefficients of the regressors for the scan, for (…, k, k) inner products."""
     normal, right = gram[..., :-1, :-1], gram[..., :-1, -1]
     scale = np.sqrt(np.maximum(np.einsum("...ii->...i", normal), 1e-300))
-    # A ridge of the regressors' float32 precision keeps directions that the layout cannot fix at rest.
+    # A ridge at float32 precision of the regressors: what the layout does not determine stays at zero.
     scaled = normal / (scale[..., :, None] * scale[..., None, :]) + 1e-7 * np.eye(normal.shape[-1])
     return np.linalg.solve(scaled, (right / scale)[..., None])[..., 0] / scale
 
@@ -156,9 +156,9 @@ def residual_energy(gram: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
 
 
 def corner_motion_px(coefficients: np.ndarray, shape: tuple[int, int], points: np.ndarray) -> np.ndarray:
-    """Displacement (…, n, 2) in layout pixels that fitted coefficients (…, k) ask for at points (n, 2).
+    """Displacement (…, n, 2) in layout pixels at points (n, 2), from fitted coefficients (…, k).
 
-    Not finite where nothing of the topography was fitted (gain 0).
+    Not finite where the fitted gain of the topography is 0.
     """
     normalise = normalisation(shape)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -174,7 +174,7 @@ def _moved_on(
     """The warp after a step, again as an affine and a bend: higher orders vanish with the step.
 
     Raises:
-        numpy.linalg.LinAlgError: the places in and around the scan do not determine them.
+        numpy.linalg.LinAlgError: the positions in and around the scan do not determine them.
     """
     y, x = (np.linspace(0, n - 1, 17) for n in shape)
     layout = np.stack([one.ravel() for one in np.meshgrid(x, y)], axis=1)
@@ -201,7 +201,7 @@ def _regressors(topography: np.ndarray, count: int) -> np.ndarray:
 
 
 class _Sums:
-    """Inner products over the whole field; those among the regressors are kept while the overlap stays."""
+    """Inner products over the whole field; those of the regressors are reused for an equal overlap."""
 
     def __init__(self, regressors: np.ndarray):
         self._regressors = regressors

@@ -1,4 +1,4 @@
-"""The one resampling between a scan and the dataset: float heights, gaps respected."""
+"""The single resampling between a scan and the dataset: float heights, gaps kept."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def resample_to_layout(
         layout_shape: (ny, nx) of the result.
         scan_pitch_um: (y, x) pitch of the scan.
         layout_pitch_um: pitch of the layout.
-        bend_um: of a bent scan, in µm of its frame; it changes where the one interpolation looks.
+        bend_um: of a bent scan, in µm of its frame; it changes where the heights are interpolated.
 
     Returns:
         ``height_um`` float32 (NaN where not valid) and ``valid`` bool, both of ``layout_shape``. A pixel is
@@ -49,7 +49,7 @@ def resample_to_layout(
 
 
 class Resampler:
-    """`resample_to_layout` of one scan to several places; the spline is fitted once."""
+    """`resample_to_layout` for several transforms of one scan; the spline is fitted once."""
 
     def __init__(self, height_um: np.ndarray, *, scan_pitch_um: tuple[float, float], layout_pitch_um: float):
         from scipy.ndimage import spline_filter
@@ -88,7 +88,7 @@ class Resampler:
 
 @lru_cache
 def noise_variance_factor(scan_pitch_um: tuple[float, float], layout_pitch_um: float) -> float:
-    """What the resampling leaves of the variance of white pixel noise, averaged over sub-pixel positions.
+    """Share of the variance of white pixel noise left by resampling, averaged over sub-pixel positions.
 
     The squared weights that one output pixel gives to the scan's pixels along an axis, summed, averaged
     over phases; the product of both axes.

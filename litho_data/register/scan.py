@@ -26,9 +26,9 @@ from litho_data.scan import Scan
 MIN_SIZE_PX = 32
 # A picometre: below any instrument, above rounding.
 SMALLEST_STRUCTURE_UM = 1e-6
-# A bend has an affine part: a model that is stiffer by choice does not bend.
+# A bend contains an affine: a model that is stiffer by choice does not bend.
 BENDABLE = ("affine", "homography", "ladder")
-# A bend that is one accounts for nearly all of the displacement; half is far from both outcomes.
+# A real bend accounts for nearly all of the displacement; one half separates the two cases clearly.
 BENT_SHARE = 0.5
 
 
@@ -37,11 +37,11 @@ class Registration:
     """Where a scan lies on its layout.
 
     ``scan_to_layout`` is 3×3 and maps (x_um, y_um, 1) of the scan's frame to the layout's; both frames
-    have pixel centres at ``(i + 0.5) * pitch``. If ``quality.passed`` is false it is the best guess, or the
-    centred placement where there was none.
+    have pixel centres at ``(i + 0.5) * pitch``. If ``quality.passed`` is false, it is the best guess, or the
+    centred placement if there was none.
 
-    ``bend_um`` is there if the scanner has bent the scan: a place (x_um, y_um) of the scan really is at
-    ``bend_um.straighten``, and ``scan_to_layout`` acts on that. It is the affine closest to the whole map.
+    ``bend_um`` is set if the scanner has bent the scan: the true position of a point (x_um, y_um) is then
+    ``bend_um.straighten``, and ``scan_to_layout``, the affine closest to the whole map, acts on that.
     """
 
     scan_to_layout: np.ndarray
@@ -120,7 +120,7 @@ def _explains(bent: RegistrationQuality, straight: RegistrationQuality) -> bool:
 
 @dataclass(frozen=True)
 class _Case:
-    """One scan and its layout, with what any warp between them is judged by."""
+    """One scan and its layout, with what is needed to judge a warp between them."""
 
     height_um: np.ndarray
     layout: np.ndarray
@@ -165,14 +165,14 @@ class _Case:
         if found.bend is None:
             to_scan = np.linalg.inv(to_oriented)
             return frame @ to_scan @ found.layout_to_scan @ np.linalg.inv(frame), None
-        # A turned polynomial of second degree is one: points of the scan and where they go determine it.
+        # A rotated polynomial of second degree is again one: points and their images determine it.
         u, v = (one.ravel() for one in np.meshgrid(*[np.linspace(0, 1, 9)] * 2))
         points_um = np.stack([u, v], axis=1) * size_um
         oriented = apply_transform(to_oriented @ np.linalg.inv(frame), points_um)
         to_layout = frame @ np.linalg.inv(found.layout_to_scan)
         images_um = apply_transform(to_layout, found.bend.straighten(oriented))
         scan_to_layout, bend_um = fit_bent_affine(points_um, images_um, size_um / 2, size_um / 2)
-        # As the matrix: no digit below any physical meaning.
+        # Rounded like the matrix: no digits below physical meaning.
         bend_um = replace(bend_um, amount=np.round(bend_um.amount, 6) + 0.0)
         return np.linalg.inv(scan_to_layout), bend_um
 
@@ -183,7 +183,7 @@ def centred_placement(
     layout_shape: tuple[int, ...],
     layout_pitch_um: float,
 ) -> np.ndarray:
-    """The shift, as ``scan_to_layout``, that puts the middle of the scan on the middle of the layout."""
+    """The ``scan_to_layout`` that puts the middle of the scan on the middle of the layout."""
     matrix = np.eye(3)
     matrix[0, 2] = (layout_shape[1] * layout_pitch_um - scan_shape[1] * scan_pitch_um[1]) / 2
     matrix[1, 2] = (layout_shape[0] * layout_pitch_um - scan_shape[0] * scan_pitch_um[0]) / 2
@@ -204,7 +204,7 @@ def _check(
 def _at_layout_pitch(
     height: np.ndarray, scan_pitch_um: tuple[float, float], layout_pitch_um: float
 ) -> np.ndarray:
-    """A copy to compare with; the heights that are kept are resampled once, from the original."""
+    """A copy for comparison; the heights that are kept are resampled once, from the original."""
     if np.allclose(scan_pitch_um, layout_pitch_um, rtol=1e-6):
         return height
     shape = _shape_at(layout_pitch_um, height.shape, scan_pitch_um)
@@ -223,7 +223,7 @@ def _shape_at(
 
 
 def _rounded(matrix: np.ndarray) -> np.ndarray:
-    """Digits far below any physical meaning cut off, so that they cannot change between machines."""
+    """The matrix without digits far below physical meaning, which could differ between machines."""
     matrix = matrix / matrix[2, 2]
     rounded = np.round(matrix, 8)
     rounded[:2, 2] = np.round(matrix[:2, 2], 6)

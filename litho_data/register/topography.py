@@ -1,4 +1,4 @@
-"""Images that can be compared: the topography a layout predicts, and a scan freed of gaps and bow."""
+"""Images that can be compared: the topography that a layout predicts, and a scan without gaps and bow."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def predicted_topography(layout_level: np.ndarray, blur_px: float) -> np.ndarray
         blur_px: Gaussian sigma of the process, layout pixels.
 
     Returns:
-        (ny, nx) float32 in levels; gain and offset to heights stay open.
+        (ny, nx) float32 in levels; gain and offset to heights remain free.
     """
     from scipy.ndimage import gaussian_filter
 
@@ -40,15 +40,15 @@ def smooth_measured(height: np.ndarray, sigma_px: float) -> np.ndarray:
         return gaussian_filter(height.astype(np.float64), sigma_px)
     weight = gaussian_filter(measured.astype(np.float64), sigma_px)
     total = gaussian_filter(np.where(measured, height, 0.0).astype(np.float64), sigma_px)
-    # 1e-9 keeps pixels that see only a few far measured ones apart from those that see rounding.
+    # 1e-9 separates pixels that see a few distant measured ones from those that see only rounding.
     return np.divide(total, weight, out=np.full(height.shape, np.nan), where=weight > 1e-9)
 
 
 def fill_gaps(height: np.ndarray) -> np.ndarray:
-    """The same heights with every NaN replaced: continued straight for three pixels, then held.
+    """The heights with every NaN replaced: extrapolated for three pixels, then constant.
 
     A gap's first pixels are the point reflection of the measured side about the nearest measured pixel, so
-    that slopes run on and an interpolating spline does not ring at the rim.
+    that slopes continue and an interpolating spline does not ring at the border.
     """
     from scipy.ndimage import distance_transform_edt
 
@@ -66,10 +66,10 @@ def fill_gaps(height: np.ndarray) -> np.ndarray:
 
 
 def remove_bow(height: np.ndarray) -> np.ndarray:
-    """The heights minus their least-squares quadratic surface; only ever used on a copy for comparison."""
+    """The heights minus their least-squares quadratic surface; only used on copies for comparison."""
     basis = quadratic_basis((height.shape[0], height.shape[1]))
     measured = np.isfinite(height)
-    # A third of the rows and columns fixes six coefficients as well as all of them do.
+    # A third of the rows and columns determines six coefficients as well as all of them.
     sparse = np.zeros_like(measured)
     sparse[::3, ::3] = measured[::3, ::3]
     chosen = sparse if sparse.sum() >= 60 else measured

@@ -17,8 +17,8 @@ class AmplitudeParameters(Record):
     Args:
         sa_nm: mean absolute deviation.
         sq_nm: root mean square.
-        ssk: skewness, 0 where the surface is flat.
-        sku: kurtosis, 3 for a Gaussian; 0 where the surface is flat.
+        ssk: skewness, 0 for a flat surface.
+        sku: kurtosis, 3 for a Gaussian, 0 for a flat surface.
         sz_nm: highest minus lowest pixel.
         pixels: pixels counted.
     """
@@ -93,7 +93,7 @@ def correlation_length_um(
 ) -> float:
     """Lag at which the autocorrelation along an axis first falls to ``level``, µm, linear between pixels.
 
-    Infinity where it stays above ``level`` over half the field.
+    Infinity if it stays above ``level`` over half the field.
     """
     correlation = autocorrelation(height_um)
     centre = correlation.shape[1] // 2
@@ -107,7 +107,7 @@ def correlation_length_um(
 
 
 def effective_samples(height_um: np.ndarray) -> float:
-    """Independent heights in a field as far as its variance goes: pixels / Σ ρ² over all lags.
+    """Number of independent heights in a field, for its variance: pixels / Σ ρ² over all lags.
 
     The estimate of a mean square has relative variance ``2 Σ ρ² / pixels`` for a Gaussian surface. Lags
     beyond a quarter of the field are left out, because ρ² there is noise of the estimate.

@@ -1,4 +1,4 @@
-"""What levelling takes out of Sq: it removes some of the roughness together with the background.
+"""How levelling lowers Sq: it removes some of the roughness together with the background.
 
 Least squares on a basis Q (orthonormal over the N pixels) leaves a surface with correlation matrix C
 the expected variance ``σ² (1 − tr(Qᵀ C Q) / N)``. This is exact for any polynomial background and
@@ -34,7 +34,7 @@ def retained_variance(
     *,
     degree: int | tuple[int, int],
 ) -> float:
-    """Expected Sq² after polynomial levelling over the true variance of the surface, 0…1.
+    """Expected Sq² after polynomial levelling, divided by the true variance of the surface, 0…1.
 
     Sq of a levelled surface is too low by the square root; divide by it to correct.
 

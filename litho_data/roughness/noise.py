@@ -1,4 +1,4 @@
-"""Line noise apart from pixel noise, and the print's roughness apart from the microscope's."""
+"""Separating line noise from pixel noise, and the print's roughness from the microscope's."""
 
 from __future__ import annotations
 
@@ -74,10 +74,10 @@ def split_noise(height_um: np.ndarray, *, fast_axis: Axis = "x") -> NoiseSplit:
 
 
 def print_roughness(flat_um: np.ndarray, substrate_um: np.ndarray) -> PrintRoughness:
-    """Roughness of a print from a flat print and a bare substrate, by quadrature.
+    """Roughness of a print from a flat print and a bare substrate, in quadrature.
 
-    ``print² = flat² − substrate²``: microscope and substrate are taken to add independently. Both
-    surfaces have to be levelled alike.
+    ``print² = flat² − substrate²``: microscope and substrate are assumed to add independently. Level both
+    surfaces in the same way.
 
     Raises:
         InputError: a substrate rougher than the print.
@@ -102,7 +102,7 @@ def print_roughness(flat_um: np.ndarray, substrate_um: np.ndarray) -> PrintRough
 
 
 def _line_sd(lines: np.ndarray, pixel_nm: float) -> float:
-    """Sd of the offsets of lines, freed of what pixel noise does to a median."""
+    """Sd of the offsets of lines, without what pixel noise adds to a median."""
     step_variance = _robust_sd(np.diff(np.median(lines, axis=1))) ** 2
     return float(np.sqrt(max(0.0, step_variance / 2 - np.pi / 2 * pixel_nm**2 / lines.shape[1])))
 

@@ -48,7 +48,7 @@ def psd_along(height_um: np.ndarray, pitch_um: float, axis: Axis, *, window: boo
         lines = lines - _straight_line(lines)
     power = np.abs(np.fft.rfft(lines * weight, axis=1)) ** 2
     density = power.mean(axis=0) * pitch_um / np.sum(weight**2)
-    # Frequencies other than 0 and Nyquist stand for their negative twins as well.
+    # Frequencies other than 0 and Nyquist stand for their negative counterparts as well.
     density[1 : None if size % 2 else -1] *= 2
     return Spectrum(np.fft.rfftfreq(size, pitch_um)[1:], density[1:])
 

@@ -1,4 +1,4 @@
-"""Step heights by the windows of ISO 5436-1: stay off the edges, share one slope, repeat line by line."""
+"""Step heights in the windows of ISO 5436-1: off the edges, with one common slope, line by line."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class StepHeight(Record):
         height_nm: mean over the lines.
         line_sd_nm: sd over the lines.
         uncertainty_nm: standard uncertainty of the mean, from the sd and the number of independent
-            lines; calibration of the z scale is not in it.
+            lines; it does not contain the calibration of the z scale.
         lines: lines that were fitted.
     """
 

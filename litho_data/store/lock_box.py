@@ -14,7 +14,7 @@ from litho_data.foundation.errors import InputError
 
 
 class HasPrint(Protocol):
-    """What the draw needs of a scan: its id and the print that it belongs to."""
+    """What the draw needs of a scan: its id, and the print it is from."""
 
     @property
     def id(self) -> str: ...

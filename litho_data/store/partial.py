@@ -1,8 +1,8 @@
-"""A store under construction: finished scans are kept, so that a build that was killed can go on.
+"""A store under construction: finished scans are kept, so that an interrupted build resumes.
 
-It lies beside the store as ``.<name>.partial`` and becomes the store in one rename. A scan counts as finished
-when its record is there, which is written last; it is taken over only if its files, parameters and code
-are the same and its arrays still have the recorded hashes.
+It lies beside the store as ``.<name>.partial`` and becomes the store in one rename. A scan is finished when
+its record exists, which is written last. It is reused only if its files, parameters and code are the same and
+its arrays still have the recorded hashes.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Piece:
 
 @contextmanager
 def partial_store(out: Path) -> Iterator[PartialStore]:
-    """The construction site of the store ``out``; only one process at a time may use it.
+    """The unfinished store of ``out``; only one process at a time may use it.
 
     Raises:
         InputError: ``out`` exists and is not a dataset store, cannot be written, or is being built already.
@@ -62,7 +62,7 @@ class PartialStore:
         self._pieces = self.folder / "pieces"
 
     def open(self) -> zarr.Group:
-        """The growing root group; everything but finished scans is thrown away first."""
+        """The growing root group; everything except finished scans is removed first."""
         import zarr
 
         self._pieces.mkdir(exist_ok=True)
@@ -93,7 +93,7 @@ class PartialStore:
         return records
 
     def add(self, root: zarr.Group, piece: Piece) -> None:
-        """Keep one finished scan; its record comes last."""
+        """Keep one finished scan; its record is written last."""
         scan_id = piece.record["id"]
         write_scan_group(root, scan_id, piece.arrays, {"use": piece.record["use"]})
         samples = {v.name: piece.arrays[v.name] for v in SAMPLE_VARIABLES if v.name in piece.arrays}
@@ -138,12 +138,12 @@ def _require_replaceable(out: Path) -> None:
         schema = None
     if schema != STORE_SCHEMA or not out.is_dir():
         raise InputError(
-            "output", got=f"{out}, which is there and no store of ours", wanted="a new path or a store"
+            "output", got=f"{out}, which is no dataset store", wanted="a new path, or a store to replace"
         )
 
 
 def _lock(stream: IO[str], out: Path) -> None:
-    """An advisory lock that ends with the process, however it ends; where there is none, go without."""
+    """An advisory lock that ends with the process; a system without such locks does without."""
     try:
         import fcntl
     except ImportError:

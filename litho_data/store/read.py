@@ -1,4 +1,4 @@
-"""Reading a dataset store: checked once at the door, then one scan at a time."""
+"""Reading a dataset store: checked once when it is opened, then read one scan at a time."""
 
 from __future__ import annotations
 
@@ -52,10 +52,10 @@ class PrintedScan:
         pitch_um: pixel pitch of all three arrays, µm; ``level_height_um``: nominal height of a level, µm.
         levels: number of levels the layout may use.
         scan_to_layout: 3 x 3 float64, maps (x_um, y_um, 1) of the scan's own frame to the layout frame.
-        write: the card's ``[write]`` table, None where the card has none.
+        write: the card's ``[write]`` table; None if it has none.
         field_x_um, field_y_um: position of the scan in its write field, µm; ``dose``: relative dose;
-            None where the card does not say.
-        bend_um: of a scan that the scanner has bent; ``scan_to_layout`` then acts on its straightened places.
+            None if the card does not state it.
+        bend_um: of a bent scan; ``scan_to_layout`` then acts on the straightened positions.
     """
 
     id: str
@@ -95,7 +95,7 @@ def open_store(path: str | Path) -> Store:
 
 
 class Store:
-    """A dataset of printed scans; arrays are read when asked for, never all at once."""
+    """A dataset of printed scans; arrays are read when they are needed, never all at once."""
 
     def __init__(self, root: zarr.Group, path: Path):
         self.path = path
@@ -123,7 +123,7 @@ class Store:
         return f"Store({self.name!r}, {len(self)} scans, pitch_um={self.pitch_um}, path={str(self.path)!r})"
 
     def scan(self, scan_id: str) -> PrintedScan:
-        """One scan, padding cut off.
+        """One scan, without padding.
 
         Raises:
             InputError: no such id, or a stored chunk that does not decode.
@@ -181,7 +181,7 @@ class Store:
         return lock_box(self.ids, self._print_ids, lock_box_size(len(self)))
 
     def files_sha256(self, ids: Sequence[str]) -> dict[str, str]:
-        """Hash of the raw file behind each of some scans, however they were levelled and registered.
+        """Hash of the raw file of each of these scans, however they were levelled and registered.
 
         A scan whose file the store does not list is left out. Layouts do not count: one may be printed twice.
         """
@@ -208,7 +208,7 @@ class Store:
 
     @cached_property
     def quality(self) -> pd.DataFrame:
-        """One row per scan: registration, levelling and noise figures; only ids where none were stored."""
+        """One row per scan: registration, levelling and noise figures; only the ids if none are stored."""
         import pandas as pd
 
         if not has_child(self.root, "quality"):
@@ -250,7 +250,7 @@ class Store:
         return {**identity, "arrays": hashes}
 
     def _bend_um(self, row: int) -> Bend | None:
-        """The bend of a scan in its own frame; None where none is stored."""
+        """The bend of a scan in its own frame; None if none is stored."""
         scan_id = self.ids[row]
         if not has_child(self.root, f"scans/{scan_id}/bend_um"):
             return None

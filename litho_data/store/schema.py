@@ -37,7 +37,7 @@ class Variable:
         return tuple(dim for dim in self.dims if dim != "scan")
 
     def sample_sha256(self, sample: np.ndarray) -> str:
-        """Hash of one scan's slice in its true shape, so that padding and chunking leave no trace."""
+        """Hash of one scan's slice in its true shape, so padding and chunking have no influence."""
         return array_sha256(np.asarray(sample, dtype=self.dtype), self.unit, self.sample_dims)
 
 
@@ -75,7 +75,7 @@ def dataset_sha256(facts: Mapping[str, Any], scans: Sequence[Mapping[str, Any]])
     """Hash of what a model can see of a dataset, independent of chunking, padding and metadata texts.
 
     Args:
-        facts: ``pitch_um``, ``level_height_um``, ``levels`` and, where known, the ``write`` table.
+        facts: ``pitch_um``, ``level_height_um``, ``levels`` and, if known, the ``write`` table.
         scans: per scan in stored order: ``id``, ``print``, ``order``, the optional columns that are not NaN,
             and ``arrays``, a dict of variable name to :meth:`Variable.sample_sha256`.
     """

@@ -52,7 +52,7 @@ def scan_surface(
 
 
 def _dilate_by_tip(height: np.ndarray, pitch_um: float, radius_um: float) -> np.ndarray:
-    """Path of a paraboloid tip: ``max_u h(x − u) − u²/2R``, between pixels as well."""
+    """Path of a paraboloid tip: ``max_u h(x − u) − u²/2R``, also between pixels."""
     # A paraboloid is a sum of two parabolas, so the maximum can be taken axis by axis.
     columns_done = _dilate_columns(height, pitch_um, radius_um)
     return _dilate_columns(columns_done.T, pitch_um, radius_um).T
@@ -77,7 +77,7 @@ def _dilate_columns(height: np.ndarray, pitch_um: float, radius_um: float) -> np
 
 
 def _follow_surface(height: np.ndarray, pitch_um: float, lag_um: float) -> np.ndarray:
-    """First-order feedback along the lines that loses the surface more easily on the way down."""
+    """First-order feedback along the lines, which loses the surface more easily on falling edges."""
     falling, rising = (1 - np.exp(-pitch_um / length) for length in (lag_um, lag_um / 3))
     followed = np.empty_like(height)
     at = height[:, 0].copy()
@@ -92,7 +92,7 @@ def _follow_surface(height: np.ndarray, pitch_um: float, lag_um: float) -> np.nd
 def _additive_nm(
     frame: ScanFrame, noise: Noise, knobs: KnobBoard, scan_index: int, rng: np.random.Generator
 ) -> np.ndarray:
-    """Everything that is added to the height whatever the surface, nm."""
+    """Everything that is added to the height, independent of the surface, nm."""
     y, x = frame.unit_axes
     lines = noise.line_nm * rng.standard_normal((frame.shape[0], 1))
     pixels = noise.pixel_nm * rng.standard_normal(frame.shape)

@@ -1,4 +1,4 @@
-"""The patch of substrate that is simulated around one layout, and spectral blurs on it."""
+"""The area simulated around one layout, and spectral blurs on it."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def cut_layout(array: np.ndarray) -> np.ndarray:
 
 
 def set_layout(array: np.ndarray, inner: np.ndarray) -> np.ndarray:
-    """A copy of a canvas array with another middle."""
+    """A copy of a canvas array with another middle part."""
     changed = array.copy()
     changed[GUARD_PX:-GUARD_PX, GUARD_PX:-GUARD_PX] = inner
     return changed

@@ -32,8 +32,8 @@ def accumulate_dose(
 ) -> np.ndarray:
     """Two-photon dose of a written canvas; 1 is the middle of a wide block of the highest level.
 
-    Each row of the canvas is one hatch line. In slice k the laser is on where the level is at
-    least k, and absorption goes with the squared intensity of the spot, so the slices add up to
+    Each row of the canvas is one hatch line. In slice k the laser is on wherever the level is at
+    least k, and absorption is proportional to the squared intensity of the spot, so the slices add up to
     ``level * (squared spot)``.
 
     Args:
@@ -107,7 +107,7 @@ def _spot_transfer(canvas: Canvas, printer: Printer, knobs: KnobBoard) -> np.nda
 def _slice_by_slice(
     nominal: np.ndarray, line_energy: np.ndarray | float, spot: np.ndarray, printer: Printer
 ) -> np.ndarray:
-    """Dose that counts if every slice has to pass the threshold on its own."""
+    """Effective dose if every slice has to pass the threshold on its own."""
     slices = printer.levels - 1
     passed = np.zeros_like(nominal)
     for index in range(slices):

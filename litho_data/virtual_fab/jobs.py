@@ -1,4 +1,4 @@
-"""Which fields a run prints: random layouts in print blocks, and the reference scans of a noise analysis."""
+"""The fields of a run: random layouts in print blocks, and the reference scans of a noise analysis."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class Plan:
         size_px: (ny, nx) of a layout.
         fields_per_print: fields of one print block.
         cutoffs_per_um: cut-offs of the layouts, taken in turn by the prints, cycles/µm.
-        write_field_um: side of a write field that all fields of a print share; None gives each
-            field a write field of its own, centred on it.
+        write_field_um: side of a write field shared by all fields of a print; None gives each
+            field its own write field, centred on it.
         references: add a bare substrate, a flat print and a five-step print (print 0).
     """
 
@@ -62,7 +62,7 @@ class Plan:
 
 
 def random_jobs(plan: Plan, printer: Printer, seed: int) -> Iterator[Job]:
-    """The fields of a plan in print order; each depends on the seed and on its own number only."""
+    """The fields of a plan in print order; each depends only on the seed and its own number."""
     for index in range(plan.count):
         block, field = divmod(index, plan.fields_per_print)
         yield Job(

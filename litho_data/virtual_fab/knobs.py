@@ -1,4 +1,4 @@
-"""Every effect beyond plain printing: name, unit, frame, and what it is called in the effects catalogue."""
+"""Every effect beyond plain printing: name, unit, range, and its name in the catalogue of effects."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ OFF_CATALOGUE = "off-catalogue"
 
 @dataclass(frozen=True)
 class Knob:
-    """One effect that the fab can add; strength 0 leaves every bit as it was.
+    """One effect that the fab can add; strength 0 does not change a bit.
 
     Args:
-        name: what the command line and the truth file call it.
+        name: on the command line and in the truth file.
         effect: identifier in the effects catalogue, or `off-catalogue`.
-        stage: where in the chain it acts.
-        role: whether it belongs to the print, the microscope, or chance.
+        stage: the step at which it acts.
+        role: whether it is part of the print, the microscope, or chance.
         unit: unit of the strength.
-        limit: largest strength that still means something.
+        limit: largest meaningful strength.
         meaning: what a strength of one unit does, and what the seed draws.
         nuisance_span: True if offset, gain, plane and bow of each scan absorb nearly all of it.
         refit_absorbs: True if other parameters of the plain printing model imitate most of it.
@@ -52,7 +52,7 @@ class Knob:
 
 @dataclass(frozen=True)
 class KnobSetting:
-    """A knob turned to a strength; without a seed of its own it follows the run's seed."""
+    """A knob turned to a strength; without its own seed it uses that of the run."""
 
     name: str
     strength: float
@@ -98,7 +98,7 @@ def checked(setting: KnobSetting) -> KnobSetting:
 
 
 class KnobBoard:
-    """The knobs of one run: strengths, and a random stream per knob that no other knob can disturb."""
+    """The knobs of one run: strengths, and a separate random stream per knob."""
 
     def __init__(self, settings: Iterable[KnobSetting], run_seed: int):
         self.settings = tuple(checked(setting) for setting in settings)
@@ -111,11 +111,11 @@ class KnobBoard:
         return self._strength.get(KNOBS[name].name, 0.0)
 
     def any(self, *names: str) -> bool:
-        """Whether one of the knobs is off its null."""
+        """Whether one of the knobs is not at zero."""
         return any(self[name] for name in names)
 
     def machine_rng(self, name: str) -> np.random.Generator:
-        """Draws of a knob that belong to the machine: the same for every scan."""
+        """Draws of a knob for the machine: the same for every scan."""
         return self._rng(name, 0)
 
     def scan_rng(self, name: str, scan_index: int) -> np.random.Generator:

@@ -13,7 +13,7 @@ _BAND_WIDTH_PER_UM = 0.5
 _BAND_SHARE = 0.55
 _SLOW_WIDTH_PER_UM = 0.6
 _ALONG_UM = 1.2
-# Nothing that was written with a 0.2 µm spot changes faster than this along the line.
+# What a 0.2 µm spot writes does not change faster than this along the line.
 _SMOOTH_UM = 0.06
 
 

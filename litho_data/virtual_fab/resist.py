@@ -16,8 +16,8 @@ _NARROW_UM = 1.5
 def develop(dose: np.ndarray, canvas: Canvas, printer: Printer, knobs: KnobBoard) -> np.ndarray:
     """Height of the developed, dried print above the zero of the scans, µm.
 
-    A column of resist converts along a logistic curve of its dose. On drying it shrinks the less,
-    the denser the polymer network around it.
+    A column of resist converts along a logistic curve of its dose. On drying, it shrinks less in a denser
+    polymer network.
 
     Args:
         dose: two-photon dose on the canvas, 1 = full.
@@ -45,7 +45,7 @@ def develop(dose: np.ndarray, canvas: Canvas, printer: Printer, knobs: KnobBoard
 
 
 def _convert(dose: np.ndarray, printer: Printer, extra_steepness: float) -> np.ndarray:
-    """Logistic conversion, shifted and scaled so that no dose gives 0 and full dose 1."""
+    """Logistic conversion, shifted and scaled to be 0 without dose and 1 at full dose."""
     steepness = printer.threshold_steepness * (1 + extra_steepness)
 
     def logistic(at: np.ndarray | float) -> np.ndarray:
@@ -55,7 +55,7 @@ def _convert(dose: np.ndarray, printer: Printer, extra_steepness: float) -> np.n
 
 
 def _field_shape(canvas: Canvas, knobs: KnobBoard) -> np.ndarray:
-    """Tilt and bow over the write field, 1 at its highest corner."""
+    """Tilt and bow over the write field, 1 at the highest corner."""
     rng = knobs.machine_rng("field-curvature")
     y_um, x_um = canvas.field_offset_um()
     half_um = canvas.write_field_um / 2

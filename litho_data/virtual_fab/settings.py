@@ -1,4 +1,4 @@
-"""What the plain fab is: printer, microscope and default noise, all with units; and the named runs."""
+"""The plain fab: printer, microscope and default noise, with units; and the named runs."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class Printer:
             whose sd is smaller by √2: 0.2 µm.
         threshold_dose: dose at which conversion rises fastest, share of the full column's dose.
         threshold_steepness: slope parameter of the logistic conversion curve, per full dose.
-        network_reach_um: sd of the neighbourhood whose conversion decides how much a column shrinks, µm.
-        loose_retention: share of its height that an isolated, loose network keeps; a dense one keeps all.
+        network_reach_um: sd of the neighbourhood whose conversion determines how much a column shrinks, µm.
+        loose_retention: share of its height that an isolated, loose network keeps; a dense one keeps it all.
         base_um: height of the base layer's surface above the zero of the scans, µm.
     """
 
@@ -60,7 +60,7 @@ class Microscope:
 
     @classmethod
     def aligned(cls) -> Microscope:
-        """Scan pixels fall on layout pixels: no warp, whole-pixel margin."""
+        """Scan pixels coincide with layout pixels: no warp, a margin of whole pixels."""
         return cls(rotation_deg=0.0, scale=0.0, shear=0.0, shift_um=0.0)
 
 
@@ -93,7 +93,7 @@ class Noise:
 
 @dataclass(frozen=True)
 class Preset:
-    """Count, size and knobs of a run; what a caller states overrules them.
+    """Count, size and knobs of a run; arguments of the caller override them.
 
     Args:
         count: number of scans.

@@ -1,4 +1,4 @@
-"""A whole run of the virtual fab: raw files as a laboratory would hand them over, and the truth apart."""
+"""A whole run of the virtual fab: raw files as a laboratory would deliver them, and the truth apart."""
 
 from __future__ import annotations
 
@@ -46,14 +46,14 @@ def simulate(
 ) -> Path:
     """Print and scan a set of fields; returns the path of the card, ``out/raw/card.toml``.
 
-    ``out/raw`` is what a laboratory hands over: card, table, layouts, scans. ``out/truth`` holds what
-    only a simulation knows: `truth.json` and the clean prints. Scans are made one after the other, so
-    memory does not grow with their number, and none depends on how many there are.
+    ``out/raw`` is what a laboratory would deliver: card, table, layouts, scans. ``out/truth`` holds what
+    only a simulation knows: `truth.json` and the clean prints. Scans are made one at a time, so memory
+    does not grow with their number, and no scan depends on that number.
 
     Args:
         count: number of scans with random layouts.
         size_px: size of a layout, pixels (one number, or ny and nx).
-        seed: decides every random draw of the run.
+        seed: of every random draw of the run.
         knobs: effects beyond plain printing, as settings or ``name=strength[@seed]``.
         noise: ``default``, ``off``, or own standard deviations.
         microscope: ``default`` (margin, small affine errors), ``aligned`` (margin only), or own values.
@@ -61,7 +61,7 @@ def simulate(
         cutoffs_per_um: cut-offs of the random layouts, taken in turn by the prints, cycles/µm.
         write_field_um: side of a write field that a print's fields share, µm; None: each has its own.
         references: add scans of a bare substrate, a flat print and a five-step print.
-        jobs: own layouts instead of random ones; ``count`` and what follows about layouts is then unused.
+        jobs: your own layouts instead of random ones; the arguments about random layouts are then unused.
         metadata: ``files-only`` leaves print groups, order, positions and write axis out of the card.
 
     Raises:

@@ -1,4 +1,4 @@
-"""How large an effect is in the data, and which strength makes it a given size."""
+"""The size of an effect in the data, and the strength for a given size."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _MAX_STEPS = 40
 
 @dataclass(frozen=True)
 class KnobStrength:
-    """A strength and the rms it has. ``rms_nm`` stays below the wish where the knob's range ends first."""
+    """A strength and its rms. ``rms_nm`` is smaller than requested if the knob's range ends first."""
 
     setting: KnobSetting
     rms_nm: float
@@ -47,7 +47,7 @@ def strength_for_rms(
         name: knob.
         rms_nm: wanted rms, nm.
         jobs: fields to measure it on; by default four of 256 × 256 px, two of each cut-off.
-        policy: what each scan is freed from before the rms is taken.
+        policy: what is removed from each scan before the rms is taken.
         seed: seed of the knob.
 
     Raises:
@@ -65,7 +65,7 @@ def strength_for_rms(
         KnobSetting.parse(f"{name}=0")
     highest = KNOBS[name].limit
     at_limit = measured(highest)
-    # Float32-sized remainders of what the policy removes are no trace.
+    # Remainders of float32 size are no trace of the effect.
     if at_limit < 1e-3:
         raise InputError(
             f"knob {name}", got=f"no trace under policy {policy}", wanted="another knob or policy"
@@ -73,7 +73,7 @@ def strength_for_rms(
     if at_limit <= rms_nm:
         return KnobStrength(KnobSetting(name, highest, seed), at_limit)
     low, high = 0.0, highest
-    # Most effects grow about linearly, some with the square: the first guess assumes the former.
+    # Most effects grow about linearly, some quadratically: the first guess assumes linear growth.
     strength = highest * rms_nm / at_limit
     for _ in range(_MAX_STEPS):
         found = measured(strength)
@@ -88,9 +88,9 @@ def strength_for_rms(
 def knob_rms_nm(
     setting: KnobSetting, jobs: Sequence[Job], *, policy: Policy = "full", printer: Printer | None = None
 ) -> float:
-    """Rms over the scans of (noise-free scan with the knob) − (without), free of nuisances, nm.
+    """Rms over the scans of (noise-free scan with the knob) − (without), without nuisances, nm.
 
-    Scans are aligned with the layout, so a warp counts by the heights that it moves. Policy ``full``
+    Scans are aligned with the layout, so a warp counts by the heights it changes. Policy ``full``
     removes the least-squares fit of {1, P, x, y, x², xy, y²} from each scan, P the scan without the
     knob; ``offset`` the mean; ``none`` nothing.
     """

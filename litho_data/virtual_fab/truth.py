@@ -1,4 +1,4 @@
-"""What a simulated run hides from `build`: knobs, warps, clean prints and the noise floor."""
+"""What a simulated run hides from the build: knobs, warps, clean prints and the noise floor."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from litho_data.virtual_fab.knobs import KNOBS, KnobSetting
 
 
 class KnobTruth(Record):
-    """One knob that was off its null."""
+    """One knob that was not at zero."""
 
     name: str
     effect: str
@@ -23,7 +23,7 @@ class KnobTruth(Record):
 
     @classmethod
     def of(cls, setting: KnobSetting, run_seed: int) -> KnobTruth:
-        """The knob of a setting, with the seed that counted."""
+        """The knob of a setting, with the seed that was used."""
         knob = KNOBS[setting.name]
         return cls(
             name=knob.name,
@@ -37,7 +37,7 @@ class KnobTruth(Record):
 
 
 class ScanTruth(Record):
-    """One scan: its place, its datum, and the error that perfect models of print and microscope make."""
+    """One scan: position, datum, and the error that perfect models of print and microscope would make."""
 
     id: str
     use: str
@@ -68,7 +68,7 @@ class Truth(Result):
 
 
 def noise_floor(noise_um: np.ndarray) -> dict[str, float]:
-    """Size of one scan's noise, free of its offset and, for ``floor_full``, of tilt and bow as well, nm."""
+    """Size of one scan's noise, without its offset and, for ``floor_full``, without tilt and bow, nm."""
     centred_nm = 1e3 * (noise_um - noise_um.mean())
     bent_nm = centred_nm - quadratic_surface(centred_nm)
     return {
@@ -82,7 +82,7 @@ def noise_floor(noise_um: np.ndarray) -> dict[str, float]:
 
 def quadratic_surface(field: np.ndarray) -> np.ndarray:
     """Least-squares surface of {1, x, y, x², xy, y²}, same shape as ``field``."""
-    # Legendre products are nearly orthogonal on the grid, which keeps the normal equations harmless.
+    # Legendre products are nearly orthogonal on the grid, which keeps the normal equations well conditioned.
     y, x = (np.polynomial.legendre.legvander(np.linspace(-1, 1, size), 2) for size in field.shape)
     pairs = [(0, 0), (0, 1), (1, 0), (0, 2), (1, 1), (2, 0)]
     gram = np.array([[(y[:, a] @ y[:, c]) * (x[:, b] @ x[:, d]) for c, d in pairs] for a, b in pairs])

@@ -306,6 +306,6 @@ def test_another_build_or_a_foreign_folder_is_left_alone(campaign: Path, tmp_pat
         build_dataset(campaign / "card.toml", tmp_path / "busy.zarr")
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "chapter.txt").write_text("years of work")
-    with pytest.raises(InputError, match="no store of ours"):
+    with pytest.raises(InputError, match="no dataset store"):
         build_dataset(campaign / "card.toml", tmp_path / "thesis")
     assert (tmp_path / "thesis" / "chapter.txt").read_text() == "years of work"
