@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from litho_data.foundation.errors import InputError
-from litho_data.readers import Channel, Reader, add_reader, read_scan
+from litho_data.readers import Channel, Reader, read_scan, register_reader
 
 MAGIC = b"TOYAFM"
 
@@ -47,7 +47,7 @@ TOY = Reader("toy", lambda path, head: head.startswith(MAGIC), read_channels)
 
 
 def main() -> None:
-    add_reader(TOY)
+    register_reader(TOY)
     file = Path("runs") / "toy.afm"
     file.parent.mkdir(exist_ok=True)
     write_toy(file, 100 * np.random.default_rng(0).random((64, 64)), (6.4, 6.4))

@@ -5,15 +5,15 @@ from __future__ import annotations
 from litho_data.readers.layout import read_layout
 from litho_data.readers.read import list_channels, read_scan
 from litho_data.readers.reader import Channel, Reader, foreign_parser
-from litho_data.readers.registry import add_reader, formats
+from litho_data.readers.registry import formats, register_reader
 
 __all__ = [
     "Channel",
     "Reader",
-    "add_reader",
     "foreign_parser",
     "formats",
     "list_channels",
     "read_layout",
     "read_scan",
+    "register_reader",
 ]

@@ -20,7 +20,7 @@ def formats() -> tuple[str, ...]:
     return tuple(reader.name for reader in _READERS)
 
 
-def add_reader(reader: Reader) -> Reader:
+def register_reader(reader: Reader) -> Reader:
     """Read files of another format from now on; a new reader is asked before the existing ones.
 
     For a build in several processes, put the call in a module that each of them imports, such as the top
@@ -30,7 +30,7 @@ def add_reader(reader: Reader) -> Reader:
         InputError: there is a format of that name.
     """
     if reader.name in ("auto", PICTURE, *formats()):
-        raise InputError("reader to add", got=f"{reader.name!r}, which exists", wanted="another name")
+        raise InputError("reader to register", got=f"{reader.name!r}, which exists", wanted="another name")
     _READERS.insert(0, reader)
     return reader
 

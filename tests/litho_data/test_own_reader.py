@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from litho_data.build.build import build_dataset
 from litho_data.cli.app import app
 from litho_data.foundation.errors import InputError
-from litho_data.readers import Reader, add_reader, formats, read_scan, registry
+from litho_data.readers import Reader, formats, read_scan, register_reader, registry
 from litho_data.store import open_store
 from tests.litho_data.campaigns import MARGIN_PX, PITCH_UM, height_of, layout_of, write_campaign
 
@@ -28,7 +28,7 @@ def example(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     monkeypatch.setattr(registry, "_READERS", [*registry._READERS])
-    add_reader(module.TOY)
+    register_reader(module.TOY)
     return module
 
 
@@ -56,7 +56,7 @@ def test_a_card_may_name_it_and_a_dataset_is_built_with_it(example: ModuleType, 
 def test_it_is_asked_before_the_readers_that_are_there(example: ModuleType, tmp_path: Path) -> None:
     np.savetxt(tmp_path / "scan.txt", np.ones((3, 3)))
     greedy = Reader("greedy", lambda path, head: path.suffix == ".txt", example.read_channels)
-    add_reader(greedy)
+    register_reader(greedy)
     assert formats()[0] == "greedy"
     with pytest.raises(InputError, match="as TOYAFM"):
         read_scan(tmp_path / "scan.txt")
@@ -65,4 +65,4 @@ def test_it_is_asked_before_the_readers_that_are_there(example: ModuleType, tmp_
 @pytest.mark.parametrize("name", ["toy", "gsf", "auto", "image"])
 def test_a_name_that_is_taken_is_refused(example: ModuleType, name: str) -> None:
     with pytest.raises(InputError, match="another name"):
-        add_reader(Reader(name, lambda path, head: True, example.read_channels))
+        register_reader(Reader(name, lambda path, head: True, example.read_channels))
