@@ -40,12 +40,12 @@ def score(
     camera_dark_level: Annotated[float | None, typer.Option(help="Its dark level, counts.")] = None,
     camera_object: Annotated[
         str | None,
-        typer.Option(help="What the lens looked at: one of the design's objects by name, or a picture."),
+        typer.Option(help="Object in front of the lens: one of the design's objects by name, or a picture."),
     ] = None,
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
-    """Score a design as printed by models, as measured by AFM, or as photographed."""
+    """Score a design as models print it, as an AFM measured it, or as a camera saw it."""
     from litho_design.judging.score import MeasuredSource, PhotoSource
     from litho_design.reports.advice import headline
     from litho_design.workflows.score import score as score_design

@@ -1,4 +1,4 @@
-"""Commands `hoe`, `lens`, `compare`, `settings`: parse options, call one function, say what came of it."""
+"""Commands `hoe`, `lens`, `compare`, `settings`: parse options, call one function, print the result."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def hoe(
         target, model, out, settings=settings, ensemble=ensemble or (), device=device,
         extrapolate=extrapolate,
     )  # fmt: skip
-    _tell(design, out)
+    _print_design(design, out)
 
 
 @takes_settings(LensSettings())
@@ -99,7 +99,7 @@ def lens(
         model, out, settings=settings, objects=objects or (), held_out_objects=held_out_objects or (),
         ensemble=ensemble or (), device=device, extrapolate=extrapolate,
     )  # fmt: skip
-    _tell(design, out)
+    _print_design(design, out)
 
 
 @takes_settings(HologramSettings(), LensSettings(), leave_out=("task", "search.seed", "ensemble.weight"))
@@ -166,7 +166,7 @@ def _lens(changes: Mapping[str, Any]) -> LensSettings:
 def _settings(
     given: Given, make: Callable[[Mapping[str, Any]], S], task: str, spread_of: Path | None = None
 ) -> S:
-    """A preset under the settings file, the measured spreads, and what the command line says."""
+    """The preset, then the settings file, the measured spreads and the command line, each over the last."""
     made = make(given.over(make({}), task))
     if spread_of is None:
         return made
@@ -177,7 +177,7 @@ def _settings(
     return changed(measured, given.options)
 
 
-def _tell(design: Design, out: Path) -> None:
+def _print_design(design: Design, out: Path) -> None:
     from litho_design.reports.advice import distribution_warning, headline, stroke_advice
 
     warning = distribution_warning(design)

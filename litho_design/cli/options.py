@@ -21,7 +21,7 @@ Device = Annotated[str, typer.Option(help="cpu, cuda, cuda:0 …")]
 Extrapolate = Annotated[
     bool,
     typer.Option(
-        "--extrapolate", help="Accept heights beyond the model's calibration; stamped into the result."
+        "--extrapolate", help="Accept heights beyond the model's calibration; recorded in the result."
     ),
 ]
 _Config = Annotated[
@@ -42,7 +42,7 @@ _Set = Annotated[
 
 @dataclass(frozen=True)
 class Given:
-    """What a command line says of the settings.
+    """The settings given on a command line.
 
     Attributes:
         options: values by path, of options and of ``--set``.

@@ -39,8 +39,8 @@ def export(
         design: its folder, or what ``load_design`` gives.
         format: png16, bmp, tiff, stl or gds.
         out: folder of the export; exports of the same layout in other formats stay in it.
-        pedestal_um: base under level 0 (part of the STL; told to the operator otherwise).
-        slicing_um, hatching_um: recorded for the job.
+        pedestal_um: base under level 0; part of the solid in STL, a note to the operator in other formats.
+        slicing_um, hatching_um: settings of the print job, recorded in the sidecar.
 
     Returns:
         Path of the exported file.

@@ -66,7 +66,7 @@ def read_image_levels(path: Path, grey_per_level: int) -> np.ndarray:
 
 
 def read_published_bmp(path: Path) -> np.ndarray:
-    """Levels uint8 of the one published hologram mask, whose grey is level + 10 for a reason not stated."""
+    """Levels uint8 of the one published hologram mask, whose grey value is level + 10."""
     import cv2
 
     grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)

@@ -1,4 +1,4 @@
-"""The record that goes with every exported file: without it a file has no heights and no size."""
+"""The sidecar of an exported file: the heights, sizes and hashes that the file itself cannot hold."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def make_sidecar(
     grey_per_level: int | None = None,
     gds_layers: Literal["cumulative", "exclusive"] | None = None,
 ) -> Sidecar:
-    """Everything that the file itself cannot say."""
+    """The sidecar of ``file``."""
     layout, optics, stroke = design.layout, design.optics, design.stroke
     return Sidecar(
         file=file.name,

@@ -17,13 +17,13 @@ if TYPE_CHECKING:
 class HologramLoss(Record):
     """RMSE(target, image) + efficiency_weight * (1 - efficiency).
 
-    ``scale`` says how the image is brought to the scale of the target: ``paper`` divides by its
-    mean over the wanted light, ``least-squares`` takes the factor of least error. The efficiency is
+    ``scale`` matches the image to the target: ``paper`` divides by the mean over the wanted light,
+    ``least-squares`` uses the factor of least error. The efficiency is
     the share of the incident power on pixels whose target is above zero.
     """
 
     scale: Literal["paper", "least-squares"] = setting(
-        "paper", "How the image is brought to the scale of the target", option="--loss-scale"
+        "paper", "How the image is scaled to match the target", option="--loss-scale"
     )
     efficiency_weight: float = setting(
         0.1, "Weight of the light that misses the target", option="--efficiency-weight", ge=0
@@ -37,9 +37,8 @@ def hologram_loss(share: Tensor, target: Tensor, settings: HologramLoss) -> tupl
         share: share of the incident power on each pixel (size, size).
         target: wanted intensity in [0, 1], (size, size).
     """
-    from litho_design.images.similarity import (
-        matched_scale,  # the command line reads the weights without torch
-    )
+    # Not at the top: the command line reads the weights without torch.
+    from litho_design.images.similarity import matched_scale
 
     lit = (share * target).sum()
     factor = target.sum() / lit if settings.scale == "paper" else matched_scale(share, target)

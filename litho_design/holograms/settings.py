@@ -1,4 +1,4 @@
-"""All settings of a hologram, by preset: what the paper leaves open is written down here."""
+"""All settings of a hologram, by preset: choices that the paper leaves open are stated here."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from litho_design.printers.layout import LayoutSettings
 
 
 class CameraView(Record):
-    """The camera that looks at the image: its pixel in object space, µm, and the objective's aperture.
+    """The camera that records the image: its pixel in the image plane and the aperture of its objective.
 
     The default is a 3.45 µm pixel behind a 10x / 0.3 objective; the paper does not state its own.
     """

@@ -38,7 +38,7 @@ class HologramTask:
 
     Raises:
         InputError: a target of another size or without dark and bright pixels, a start for lenses, or
-            spreads that leave what can be propagated.
+            spreads beyond the range of the propagator.
     """
 
     name: TaskName = "hoe"
@@ -101,7 +101,7 @@ class HologramTask:
         return hologram_loss(bench(height_um), self.target, self.settings.loss)
 
     def start(self, parameters: Parametrisation, level_heights_um: list[float]) -> None:
-        """Set the start of the search, for the phases that the levels really print."""
+        """Set the start of the search, from the phases of the levels as printed."""
         search, optics = self.settings.search, self.settings.optics
         scene = Scene(
             cells=self.cells,
@@ -116,7 +116,7 @@ class HologramTask:
         start_search(parameters, search.start, scene, jitter_levels=search.start_jitter_levels)
 
     def score(self, height_um: Tensor) -> HologramScore:
-        """All figures of the image behind a print (size, size), µm."""
+        """Score of the image behind a print (size, size), µm."""
         return self.bench.score(height_um, self.target, self.settings.camera)
 
     @torch.no_grad()

@@ -1,1 +1,1 @@
-"""Wanted images, photographs of them, and how alike two images are."""
+"""Target images, photographs, and measures of similarity."""

@@ -1,4 +1,4 @@
-"""A photograph of an image or through a lens: cleaned, and registered on the image that is expected."""
+"""Photographs: cleaned, and registered on the image that a design expects."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _LARGEST_STRETCH = 1.2
 
 
 class CameraRecord(Record):
-    """Which photograph, and what was done to it; ``imaged`` is the object in front of a lens."""
+    """Source of a photograph and how it was processed; ``imaged`` is the object in front of a lens."""
 
     name: str
     sha256: str
@@ -39,7 +39,7 @@ def photographed_image(
     *,
     dark_level: float | None = None,
 ) -> tuple[np.ndarray, CameraRecord]:
-    """A photograph of what a print shows, on the pixels of the image that its design expects.
+    """A photograph, resampled onto the pixels of the image that the design expects.
 
     Dark level subtracted (the 1st percentile where none is given), single hot or dead pixels
     replaced by their neighbours' median, then shifted, rotated and scaled onto the expected image:
@@ -55,14 +55,14 @@ def photographed_image(
         Image (m, m) in counts, and its record.
 
     Raises:
-        InputError: no image, no positive pitch, or a photograph that does not resemble the expected image.
+        InputError: not an image, a pitch that is not positive, or a photograph unlike the expected image.
     """
     import cv2
 
     if not pitch_um > 0:
         raise InputError("camera pitch", got=f"{pitch_um} µm", wanted="a positive number")
     if not Path(photo_file).is_file():
-        raise InputError("photograph", got=f"{photo_file}, which is no file", wanted="an image file")
+        raise InputError("photograph", got=f"{photo_file}, which does not exist", wanted="an image file")
     raw = cv2.imread(str(photo_file), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     if raw is None:
         raise InputError("photograph", got=str(photo_file), wanted="an image file")
@@ -126,7 +126,7 @@ def _register(photo: Any, wanted: Any, scale: float) -> tuple[np.ndarray, float]
         )
     except cv2.error:
         correlation = 0.0
-    # A fit that shrinks or shears the image has found noise, not the image.
+    # A fit that strongly shrinks or shears the image has matched noise.
     stretch = np.linalg.svd(warp[:, :2], compute_uv=False)
     if stretch.max() > _LARGEST_STRETCH or stretch.min() < 1 / _LARGEST_STRETCH:
         correlation = 0.0

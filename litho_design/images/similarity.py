@@ -1,4 +1,4 @@
-"""How alike two images are, with the definitions written down."""
+"""Measures of similarity between two images, with their definitions."""
 
 from __future__ import annotations
 

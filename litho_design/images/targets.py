@@ -17,14 +17,14 @@ _OVERSAMPLE = 4
 
 
 class TargetRecord(Record):
-    """Where a target came from, and what was done to fit it."""
+    """Source of a picture, and how it was fitted to the square."""
 
     name: str
     sha256: str
     adaptation: str = ""
 
 
-# What a lens images: a drawing by its name, or a picture whose pixels travel beside the settings.
+# What a lens images: a drawing by its name, or a picture, whose pixels are kept beside the settings.
 ImagedObject = str | TargetRecord
 
 
@@ -46,10 +46,10 @@ def load_target(source: str | Path | np.ndarray | Target, size_px: int) -> Targe
 
     Args:
         source: text, ring, chart, spots or letters; an image file, whose grey values are fitted to the
-            square; or an array (size_px, size_px) in [0, 1], which is taken as it is.
+            square; or an array (size_px, size_px) in [0, 1], used unchanged.
 
     Raises:
-        InputError: neither a drawing nor a readable image, or an image without any light.
+        InputError: not a drawing, not a readable image, or an image without light.
     """
     if isinstance(source, Target):
         return source
@@ -146,13 +146,13 @@ def read_image(path: Path, size_px: int, what: str) -> tuple[np.ndarray, list[st
     Args:
         path: any format and bit depth that OpenCV reads; grey values are taken as brightness.
         size_px: side of the square.
-        what: what the errors call it.
+        what: its name in error messages.
 
     Returns:
-        float32 (size, size) in [0, 1], and what was done to fit it, one phrase each.
+        float32 (size, size) in [0, 1], and the conversions, one phrase each.
 
     Raises:
-        InputError: not a readable image, values that are no numbers, or no light.
+        InputError: not a readable image, values that are not numbers, or no light.
     """
     import cv2
 
@@ -161,7 +161,7 @@ def read_image(path: Path, size_px: int, what: str) -> tuple[np.ndarray, list[st
         raise InputError(what, got=str(path), wanted="an image that OpenCV can read (PNG, TIFF, JPEG, BMP)")
     grey: np.ndarray = picture.astype(np.float32)
     if not np.isfinite(grey).all():
-        raise InputError(what, got=f"{path} with values that are no numbers", wanted="finite brightness")
+        raise InputError(what, got=f"{path} with values that are not numbers", wanted="finite brightness")
     if grey.max() <= 0:
         raise InputError(what, got=f"{path} without any light", wanted="an image with bright pixels")
     notes = []

@@ -1,1 +1,1 @@
-"""How good a print is: predicted, measured, photographed, over a process window."""
+"""Scores of a finished design: as predicted by models, as measured, as photographed."""

@@ -1,4 +1,4 @@
-"""A finished design, read back from its folder: it can be printed by any judge, lit, and scored."""
+"""A finished design, read back from its folder: any judge can print and score it."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class LoadedDesign:
         return self.bench.score(height_um, self.target, self.hologram.camera)
 
     def display(self, image: np.ndarray) -> np.ndarray:
-        """As pictures show it: a hologram at the scale of its target, a PSF as the root over its peak."""
+        """The image as reports show it: scaled to its target, or the root of a PSF over its peak."""
         if self.target is None:
             return np.sqrt(image / image.max())
         target = self.target.cpu().numpy()
@@ -104,7 +104,7 @@ class LoadedDesign:
 
 
 def load_design(folder: str | Path, *, device: str | torch.device = "cpu") -> LoadedDesign:
-    """The finished design in ``folder``, ready to be printed, lit and scored on ``device``.
+    """The finished design in ``folder``, ready to be printed and scored on ``device``.
 
     Raises:
         InputError: an incomplete or altered folder, or a device that this machine does not have.

@@ -1,4 +1,4 @@
-"""A printed part as its own judge: the measured height map, registered onto the layout."""
+"""A measured height map of the printed part, registered onto its layout."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Record
 from litho_design.judging.loaded import LoadedDesign
 
-# Below this share of measured pixels the figures would be those of the filling, not of the print.
+# With fewer measured pixels the score would describe the filled-in part more than the print.
 _SMALLEST_COVERAGE = 0.8
 
 
 class MeasuredRecord(Record):
-    """Which scan was used, how well it fitted, and how much of the element it covers."""
+    """The scan, its agreement with the expected print, and the share of the element that it covers."""
 
     name: str
     sha256: str
@@ -36,13 +36,13 @@ def measured_print(
 ) -> tuple[Tensor, MeasuredRecord]:
     """The measured height of a printed design on its layout's pixels.
 
-    The AFM's zero is unknown, and a constant height is a constant phase: it is set so that the
-    median agrees with the designed print. Pixels without a measurement take the designed print.
+    The zero of an AFM map is arbitrary, and a constant height is only a constant phase: the zero is set so
+    that the medians of measured and designed print agree. Unmeasured pixels take the designed print.
 
     Args:
         loaded: the design.
         scan_file: any format that ``litho-data inspect`` reads.
-        unit, size_um: for files that do not carry them.
+        unit, size_um: for files that do not state them.
 
     Returns:
         Height (size, size), µm, and its record.
@@ -63,7 +63,7 @@ def measured_print(
     quality = registration.quality
     if not quality.passed:
         raise InputError(
-            f"scan {scan_file} on the layout of the design", got=quality.reason, wanted="a good match"
+            f"scan {scan_file} on the layout of the design", got=quality.reason, wanted="a match"
         )
     height, valid = resample_to_layout(
         scan.height_um,

@@ -25,7 +25,7 @@ from litho_design.printers.printer import Printer, PrinterRecord
 
 @dataclass(frozen=True)
 class MeasuredSource:
-    """A height map of the printed part; unit and size only for files that do not carry them."""
+    """A height map of the printed part; unit and size for files that do not state them."""
 
     path: Path
     unit: str | None = None
@@ -34,7 +34,7 @@ class MeasuredSource:
 
 @dataclass(frozen=True)
 class PhotoSource:
-    """A photograph of the image, its pixel in the image plane, its dark level if it is known.
+    """A photograph, its pixel in the image plane, and its dark level if known.
 
     ``imaged`` is the object in front of a lens: a name of the design's objects, or a picture's path.
     """
@@ -78,12 +78,12 @@ class ScoreResult(RunFacts, Result):
 
 @dataclass(frozen=True)
 class Judgement:
-    """What judges say of one design.
+    """The verdicts of several judges on one design.
 
     Attributes:
         scores: one per judge.
         pictures: image or PSF (m, m) behind each print, share of the incident power per pixel, by title.
-        photos: what was photographed through a lens and what became of it, (n, n), by title.
+        photos: object, photograph and reconstructions (n, n) of a lens, by title.
     """
 
     scores: list[JudgedScore]
@@ -106,7 +106,7 @@ def judge_design(
             with ``scan`` it is deconvolved with the PSF of the measured print too.
 
     Raises:
-        InputError: a measurement that does not belong to the design.
+        InputError: a measurement that does not match the design.
     """
     scores, pictures = [], {"in design": loaded.image(loaded.expected_um)}
     printed_um: Tensor | None = None

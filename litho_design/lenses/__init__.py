@@ -1,1 +1,1 @@
-"""Flat lenses: direct focus and imaging with a computer behind."""
+"""Multi-level diffractive lenses: direct focusing, and imaging with deconvolution."""

@@ -91,7 +91,7 @@ def centre_to_background(psf: Tensor, centre_px: int, element_px: int) -> Tensor
     """Mean intensity of the central box over the mean of the rest of an element-sized image plane.
 
     All light that misses the box counts as background, wherever it went: (1 - box) spread over the
-    area of the element. A ratio within the PSF window alone would reward throwing light out of it.
+    area of the element. A ratio within the PSF window alone would reward light that is sent out of it.
     """
     first = (psf.shape[-1] - centre_px) // 2
     box = psf[..., first : first + centre_px, first : first + centre_px].sum()

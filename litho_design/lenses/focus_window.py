@@ -1,7 +1,7 @@
-"""The lithographer's process window of a lens: its focus over defocus and print gain.
+"""The process window of a lens: how sharp its focus stays over defocus and print gain.
 
-A lens is printed with one dose and used at one distance; both drift. Gain stands for dose: it scales
-the printed height. As in a Bossung plot, one curve per gain shows what defocus does.
+The dose of the printer and the distance of the sensor both drift. The gain of the printed height represents
+the dose. As in a Bossung plot, there is one curve over defocus for each gain.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ _KEPT_PEAK = 0.8
 
 
 class FocusWindow(Record):
-    """Strehl ratio and FWHM over gain (rows) and defocus (columns), and what stays above the limit.
+    """Strehl ratio and FWHM over gain (rows) and defocus (columns), and the ranges that stay in focus.
 
-    ``depth_of_focus_um`` and ``gain_latitude`` are the widths of the ranges, through the print as
-    modelled, in which the peak keeps 80 % of its best value of the sweep; an edge of the sweep cuts them.
+    ``depth_of_focus_um`` and ``gain_latitude`` are the widths of the ranges around the modelled print in
+    which the peak is at least 80 % of the best in the sweep; the edges of the sweep limit them.
     """
 
     defocus_um: list[float]

@@ -1,4 +1,4 @@
-"""Objects that a lens images: drawn by code, or pictures that the user brings."""
+"""Objects that a lens images: drawings, or pictures of your own."""
 
 from __future__ import annotations
 
@@ -35,29 +35,29 @@ def object_stack(
     return torch.stack([torch.from_numpy(_frame(item, size_px, pictures or {})) for item in objects])
 
 
-def bring_objects(
+def with_objects(
     settings: LensSettings, objects: Sequence[str | Path], held_out: Sequence[str | Path]
 ) -> tuple[LensSettings, dict[str, np.ndarray]]:
-    """``settings`` of a computational lens with the user's pictures as objects.
+    """``settings`` of a computational lens with your own pictures as objects.
 
-    A path is a picture or a folder, which stands for all files directly in it except hidden ones.
+    A path is a picture, or a folder whose files, except hidden ones, are all pictures.
     Without ``held_out`` the last quarter of the pictures in the order of their names, two at least,
-    are held out of the design and only scored. Without ``objects`` the design keeps the drawings.
+    are held out of the design and only scored. Without ``objects`` the design uses the drawings.
 
     Returns:
         The settings, with name, SHA-256 and conversion of each picture, and the pixels by SHA-256 for
-        ``design_lens``; ``settings`` and nothing where no path is given.
+        ``run_lens``; unchanged settings and no pixels where no path is given.
 
     Raises:
-        InputError: a task that images no object, a file that is no picture, one without light, one
-            that is there twice, or too few of them.
+        InputError: a task that images no objects, a file that is not a picture, a picture without light or
+            given twice, or too few pictures.
     """
     if not objects and not held_out:
         return settings, {}
     if settings.task != "computational":
         raise InputError(
             "objects",
-            got=f"the {settings.task} task, which images none",
+            got=f"the {settings.task} task, which images no objects",
             wanted="the computational task",
             hint="or leave out --objects and --held-out-objects",
         )
@@ -85,7 +85,7 @@ def picture_records(objects: Sequence[ImagedObject]) -> list[TargetRecord]:
 
 
 def pictures_note(objects: Sequence[ImagedObject], held_out: Sequence[ImagedObject]) -> list[str]:
-    """One sentence on what is imaged where it is not drawings alone; none otherwise."""
+    """One sentence that names the objects where some are pictures; nothing otherwise."""
     if not picture_records((*objects, *held_out)):
         return []
     kept, tested = (", ".join(map(object_name, part)) for part in (objects, held_out))
@@ -99,7 +99,7 @@ def read_object(path: Path, size_px: int) -> tuple[np.ndarray, TargetRecord]:
         float32 (size, size) in [0, 1], and its record.
 
     Raises:
-        InputError: no picture, or one without light.
+        InputError: not a picture, or one without light.
     """
     border = size_px // _BORDER_SHARE
     inner, notes = read_image(path, size_px - 2 * border, "object")
@@ -128,7 +128,7 @@ def _read_all(
         pixels, record = read_object(path, size_px)
         if any(np.array_equal(pixels, other) for other in pictures.values()):
             raise InputError(
-                "objects", got=f"{path}, whose picture is there already", wanted="each picture once"
+                "objects", got=f"{path}, a picture that is already there", wanted="each picture once"
             )
         pictures[record.sha256] = pixels
         records.append(record)
@@ -140,5 +140,5 @@ def _files(place: Path) -> list[Path]:
         return [place]
     found = sorted(file for file in place.iterdir() if file.is_file() and not file.name.startswith("."))
     if not found:
-        raise InputError("objects", got=f"{place} without a file in it", wanted="a folder of pictures")
+        raise InputError("objects", got=f"{place}, an empty folder", wanted="a folder of pictures")
     return found

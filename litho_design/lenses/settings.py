@@ -1,4 +1,4 @@
-"""All settings of a lens, by preset: what the paper leaves open is written down here."""
+"""All settings of a lens, by preset: choices that the paper leaves open are stated here."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class LensView(Record):
 class ImagingSettings(Record):
     """Computational imaging: sensor, noise, reconstruction and the objects of design and test.
 
-    An object is the name of a drawing or the record of a picture (see ``bring_objects``).
+    An object is the name of a drawing or the record of a picture (see ``with_objects``).
     ``read_noise`` is the standard deviation relative to a white object behind a lens that focuses
     all light; the paper does not state its own.
     """
@@ -63,19 +63,21 @@ class ImagingSettings(Record):
         drawn = {item for item in (*self.objects, *self.test_objects) if isinstance(item, str)}
         unknown = sorted(drawn - set(get_args(DrawnTarget)))
         if unknown:
-            raise ValueError(f"object {unknown[0]!r} is none of {', '.join(get_args(DrawnTarget))}")
+            raise ValueError(f"object {unknown[0]!r} is not one of {', '.join(get_args(DrawnTarget))}")
         seen = sorted(object_name(item) for item in set(self.objects) & set(self.test_objects))
         if seen:
-            raise ValueError(f"object {seen[0]!r} is in the design and in the test")
+            raise ValueError(f"object {seen[0]!r} is used both in the design and in the test")
         if not self.objects or len(self.test_objects) < 2:
-            raise ValueError("one object for the design and two for the test are the least")
+            raise ValueError("at least one object for the design and two for the test are needed")
         return self
 
 
 class LensSettings(DesignSettings):
     """All settings of one lens."""
 
-    task: LensTaskName = setting("direct", "Focus light, or image with a computer behind", option="--task")
+    task: LensTaskName = setting(
+        "direct", "Focus light (direct), or image and deconvolve (computational)", option="--task"
+    )
     layout: LayoutSettings = setting(LayoutSettings(size_px=1200, cell_um=0.1, symmetry="radial"), "Layout")
     optics: Optics = setting(Optics(distance_um=400.0), "Optics")
     search: SearchSettings = setting(
@@ -96,7 +98,7 @@ def lens_settings(
     circular aperture, the Fresnel phase as start, and the ring path in the search.
 
     Args:
-        task: focus light directly, or image with a computer behind; ``task`` among the changes replaces it.
+        task: focus light, or image and deconvolve; ``task`` among the changes replaces it.
         variant, changes: as for ``hologram_settings``.
 
     Raises:

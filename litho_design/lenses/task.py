@@ -33,7 +33,9 @@ from litho_design.tasks.design import IMAGE_FILE, PICTURES_FILE, TaskName
 
 # The same noise in every iteration: the search compares layouts, not noise; the score draws its own.
 _DESIGN_NOISE_SEED = 0
-_PLANE_NOTE = "searched on the whole plane, not along a radius: the printer's effects depend on the position"
+_PLANE_NOTE = (
+    "the search ran on the whole plane, not along a radius: the printer's effects depend on the position"
+)
 
 
 class LensTask:
@@ -43,11 +45,11 @@ class LensTask:
         settings: geometry, optics, task and search (see ``lens_settings``).
         printer: frozen model, or nominal heights.
         ensemble: further models: the loss is the mean over all, plus a penalty on their disagreement.
-        pictures: pixels of the objects that are pictures (see ``bring_objects``).
+        pictures: pixels of the objects that are pictures (see ``with_objects``).
 
     Raises:
         InputError: a radial search of a layout without rings or with a square aperture, a start for
-            holograms, an object without its pixels, or spreads that leave what can be propagated.
+            holograms, an object without pixels, or spreads beyond the range of the propagator.
     """
 
     target_record: TargetRecord | None = None
@@ -118,10 +120,10 @@ class LensTask:
         return error, parts
 
     def start(self, parameters: Parametrisation, level_heights_um: list[float]) -> None:
-        """Set the start of the search, for the phases that the levels really print."""
+        """Set the start of the search, from the phases of the levels as printed."""
         settings, search = self.settings, self.settings.search
         scene = Scene(
-            # On the processor: its sums over rings have one order.
+            # On the CPU, where sums over rings are reproducible.
             cells=CellMap(settings.layout),
             pitch_um=settings.layout.pitch_um,
             optics=settings.optics,
@@ -178,15 +180,15 @@ class LensTask:
 
 
 def _narrow_window(bench: LensBench) -> list[str]:
-    """What a PSF window narrower than the focusing circle does to the focusing efficiency."""
+    """A note where the PSF window is narrower than the focusing circle."""
     # Airy disc: full width at half maximum 0.514 wavelength / NA; the circle's radius is three of them.
     radius_um = 3 * 0.514 * bench.optics.wavelength_um / bench.numerical_aperture
     window_um, enough_px = bench.window.size_um[0], math.ceil(2 * radius_um / bench.layout.pitch_um)
     if window_um >= 2 * radius_um:
         return []
     return [
-        f"the PSF window of {window_um:.1f} µm cuts the focusing circle (radius {radius_um:.1f} µm): light "
-        f"beyond it is missing from the focusing efficiency; --window-px {enough_px} holds the circle"
+        f"the PSF window of {window_um:.1f} µm is narrower than the focusing circle (radius "
+        f"{radius_um:.1f} µm), so the focusing efficiency leaves light out; use --window-px {enough_px}"
     ]
 
 

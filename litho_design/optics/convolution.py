@@ -1,4 +1,4 @@
-"""A linear convolution by FFT that computes only what is kept, forwards and backwards."""
+"""A linear convolution by FFT that computes only the samples that are kept, forwards and backwards."""
 
 from __future__ import annotations
 

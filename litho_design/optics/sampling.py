@@ -1,4 +1,4 @@
-"""Where grids sit and which propagator may be used on them."""
+"""Centred grids, and the distances at which a sampled propagation kernel is valid."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the height of a print is worth: how much light its staircase of levels can send into an order."""
+"""Stroke of a print: how much light its staircase of levels can send into a diffraction order."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from litho_data.foundation.results import Record
 
 
 class Stroke(Record):
-    """What the print makes of the levels; None where no number or height of levels reaches a full wave."""
+    """Printed heights of the levels as one period of a blaze; None where nothing reaches a full wave."""
 
     printed_height_um: list[float]
     stroke_um: float
@@ -37,7 +37,7 @@ def blaze_efficiency(steps: int, gain: float, order: int = 1) -> float:
 def measure_stroke(
     printed_height_um: Sequence[float], wave_height_um: float, *, level_height_um: float
 ) -> Stroke:
-    """What printed levels can do as one period of a blaze.
+    """Efficiency of printed levels as one period of a blaze.
 
     Args:
         printed_height_um: printed height of a wide uniform area of each level, µm.

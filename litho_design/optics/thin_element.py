@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class Optics(Record):
-    """What the light sees: wavelength, index step and the distance to the output plane, µm."""
+    """Wavelength, refractive index step and distance to the output plane."""
 
     wavelength_um: float = setting(0.6328, "Wavelength", unit="µm", option="--wavelength-um", gt=0)
     index_step: float = setting(

@@ -1,1 +1,1 @@
-"""From a task to a layout: start, search, polish, robustness."""
+"""Free parameters, starts, search, polish, and losses over a process window or several models."""

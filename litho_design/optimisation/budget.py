@@ -1,4 +1,4 @@
-"""Time and memory of a design, told before it starts."""
+"""Time and memory of a design, estimated before it starts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _KIB_PER_GIB = 1 << 20
 
 
 class Budget(Record):
-    """What one iteration costs, measured on a trial iteration that changes nothing."""
+    """Cost of one iteration, measured on a trial iteration that changes nothing."""
 
     seconds_per_iteration: float
     seconds_per_evaluation: float
@@ -32,7 +32,7 @@ class Budget(Record):
         ) * self.seconds_per_iteration + evaluations * self.seconds_per_evaluation
 
     def sentence(self, search: SearchSettings, done: int = 0) -> str:
-        """The estimate in one line; ``done`` iterations of an interrupted run need not be repeated."""
+        """The estimate in one line, for the iterations left after ``done``."""
         minutes = self.total_seconds(search, done) / 60
         what = f"{search.iterations - done} more iterations" if done else f"{search.iterations} iterations"
         return (

@@ -1,4 +1,4 @@
-"""From free parameters to printable levels: cells, rings, Gumbel-Softmax or straight-through heights."""
+"""Free parameters and the layout that they stand for: cells or rings, Gumbel-Softmax or rounded heights."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from litho_design.printers.layout import LayoutSettings
 
-# One level of spread: the neighbours of the starting level stay reachable from the first step.
+# One level: the neighbours of the starting level can be reached from the first step.
 _START_SPREAD_LEVELS = 1.0
 
 
@@ -87,7 +87,7 @@ class GumbelLevels(nn.Module):
         self.logits.copy_(torch.randn(self.logits.shape, generator=generator))
 
     def project(self) -> None:
-        """Logits are free: nothing to bring back."""
+        """Logits have no range: nothing to clamp."""
 
 
 class DirectLevels(nn.Module):
@@ -108,7 +108,7 @@ class DirectLevels(nn.Module):
 
     @torch.no_grad()
     def project(self) -> None:
-        """Bring heights that an optimiser step carried out of the range back to its ends."""
+        """Clamp heights that an optimiser step moved out of the range."""
         self.height.clamp_(0, self.levels - 1)
 
     def best_levels(self) -> Tensor:

@@ -83,10 +83,10 @@ def fresnel_lens_phase(cells: CellMap, pitch_um: float, optics: Optics) -> Tenso
 
 
 def focusing_levels(phase: Tensor, level_phase: Tensor) -> Tensor:
-    """Nearest levels to a lens's ``phase`` after the constant phase shift that wastes the least light.
+    """Levels nearest to a lens's ``phase``, after the constant phase shift that loses the least light.
 
-    A print whose stroke is below one wave leaves a gap on the circle; turning the wanted phase
-    moves the gap, and the sum of the cosines of what is left is the amplitude at the focus.
+    A stroke below one wave leaves a gap in the phase circle, and a constant phase moves that gap. The mean of
+    exp(j error) over the cells is the amplitude at the focus.
     """
     best, best_value = nearest_levels(phase, level_phase), -math.inf
     for turn in torch.arange(0, 1, 1 / 24) * (2 * torch.pi):

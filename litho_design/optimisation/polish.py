@@ -1,4 +1,4 @@
-"""The last touch on the printable layout: single-level changes that are kept only if they help."""
+"""Polish of the printable layout: single-level changes, kept only if they lower the loss."""
 
 from __future__ import annotations
 

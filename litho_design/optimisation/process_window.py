@@ -1,4 +1,4 @@
-"""Process window: how a design fares when the print and the bench are not exactly as modelled."""
+"""Process window: prints and optics that differ from the model, drawn at random."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ YIELD_DRAWS = 16
 
 
 class ProcessWindow(Record):
-    """Spread of print and bench, and how a search weighs it.
+    """Spread of prints and optics, and how a search weighs it.
 
     ``gain_sd`` is relative to the printed height, ``blur_sd_um`` the scale of a half-normal extra
     blur. A search with ``samples`` above 0 minimises mean + weight * sd of the loss over as many
     draws (``mean-sd``), or the mean of the worst ``tail`` share of them (``cvar``); the draws are
-    the same in every iteration. The defaults are a guess to be replaced by figures of the own
-    printer: the fields of one measured data set spread by 13 % in gain, the microscope's scale included.
+    the same in every iteration. The defaults are a guess: replace them by the spreads of your
+    printer. The fields of one measured data set vary by 13 % in gain, including the scale of the microscope.
     """
 
     gain_sd: float = setting(
@@ -61,14 +61,14 @@ class ProcessWindow(Record):
 
 
 def spreads(window: ProcessWindow) -> list[str]:
-    """Every spread of a window with its value and unit, for people."""
+    """Every spread of a window with its value and unit, for reports."""
     found = [leaf for leaf in leaves(window) if leaf.help.startswith("Spread of ")]
     return [f"{leaf.help.removeprefix('Spread of ')} {leaf.value:g} {leaf.unit}".strip() for leaf in found]
 
 
 @dataclass(frozen=True)
 class Draw:
-    """One print on one bench."""
+    """One print, in one set of optics."""
 
     gain: float
     offset_um: float
@@ -76,9 +76,9 @@ class Draw:
     optics: Optics
 
     def apply(self, height_um: Tensor, pitch_um: float) -> Tensor:
-        """The height (size, size), or of rings (n,) from the centre outwards, µm, as this draw prints it.
+        """Printed height of this draw, µm, of a map (size, size) or of rings (n,) from the centre.
 
-        A uniform offset is a uniform phase and changes no image; it is kept for scores of heights.
+        A uniform offset changes no image, only the scores of heights.
         Rings are blurred along the radius only, which is exact where they are much wider than the blur
         or far from the centre.
         """
@@ -90,7 +90,7 @@ class Draw:
 def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = False) -> list[Draw]:
     """``count`` draws from ``window.seed``; the first ``k`` of a longer list are those of a shorter one.
 
-    ``unseen`` draws come from a stream of their own: a yield must hold for prints that no search saw.
+    ``unseen`` draws come from a separate stream: a yield must hold for prints that no search has used.
     """
     shared = window.gain_offset_correlation
     seed = [window.seed, _UNSEEN_STREAM] if unseen else window.seed
@@ -112,7 +112,7 @@ def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = F
 
 
 def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target: PixelGrid) -> None:
-    """Refuse spreads that carry a draw of the search or of the yield out of what can be propagated.
+    """Refuse spreads with draws, in the search or in the yield, that cannot be propagated.
 
     Raises:
         InputError: a draw below the sampling limit of the propagator between ``source`` and ``target``,
@@ -139,7 +139,7 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
 
 
 def risk(losses: Tensor, window: ProcessWindow) -> Tensor:
-    """One figure of many losses: mean + weight * sd, or the mean of the worst share."""
+    """One number for many losses: mean + weight * sd, or the mean of the worst share."""
     if window.risk == "mean-sd":
         return losses.mean() + window.weight * losses.std(correction=0)
     worst = max(1, round(window.tail * losses.numel()))
@@ -149,10 +149,9 @@ def risk(losses: Tensor, window: ProcessWindow) -> Tensor:
 def measured_window(store: Any, window: ProcessWindow) -> ProcessWindow:
     """``window`` with the spread of gain and offset, and their correlation, of measured prints.
 
-    Each scan is fitted as height = gain * nominal + offset; the spread between scans is that of the
-    process, of the microscope's own scale from scan to scan, and of what else the fit leaves in:
-    an upper bound of what one print differs from another. The locked scans are left out: whatever a
-    design is judged by later, its search has not seen them.
+    Each scan is fitted as height = gain * nominal + offset. The spread between scans includes the process,
+    the scale of the microscope from scan to scan and what the fit leaves over, so it is an upper bound of
+    the spread between prints. Locked scans are left out, so that a search never depends on them.
 
     Args:
         store: a ``litho_data`` store with at least three scans outside its lock box.

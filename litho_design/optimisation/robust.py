@@ -1,4 +1,4 @@
-"""One loss for several prints of a layout: over the draws of a process window, and by several models."""
+"""The loss of several prints of one layout: by several models, over the draws of a process window."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def windowed_loss(
 
     Args:
         prints: printed heights of the same layout by one or several models.
-        scenes: a draw (None for the print as modelled) and the optics in which it is looked at.
+        scenes: pairs of a draw (None for the print as modelled) and its optics.
         loss: height and optics to a loss and its parts.
 
     Returns:
@@ -51,7 +51,7 @@ def windowed_loss(
 
 
 class EnsembleRecord(Record):
-    """The further models of a design, and how far all of them are apart on its layout."""
+    """The further models of a design, and the disagreement of all of them on its layout."""
 
     members: list[PrinterRecord]
     disagreement_nm: float
@@ -61,11 +61,11 @@ class EnsembleRecord(Record):
 def disagreement_um(heights_um: Tensor, area: Tensor | None = None) -> Tensor:
     """RMS over the area of the standard deviation between models, µm; differentiable.
 
-    A constant height is a constant phase, so every print is first freed of its mean.
+    A constant height is only a constant phase, so the mean of every print is subtracted first.
 
     Args:
         heights_um: prints of one layout by k models, (k, ...).
-        area: what each height stands for, (...), in any unit: rings grow outwards; None for pixels.
+        area: area that each height covers, (...), in any unit, as for rings; None for pixels.
     """
     flat = heights_um.flatten(1)
     share = torch.ones_like(flat[0]) if area is None else area.flatten()
@@ -87,7 +87,7 @@ def penalised(
 def measure_disagreement(
     printers: Sequence[Printer], level: Tensor, wave_height_um: float
 ) -> EnsembleRecord | None:
-    """How far the models are apart on a layout (1, 1, size, size); None for a single model."""
+    """Disagreement of the models on a layout (1, 1, size, size); None for a single model."""
     if len(printers) == 1:
         return None
     apart_um = float(disagreement_um(torch.stack([printer(level)[0, 0] for printer in printers])))

@@ -1,4 +1,4 @@
-"""One loop for every design task: free parameters in, printable levels out, resumable at any step."""
+"""The search loop of every task: free parameters in, printable levels out; it can resume at any step."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def search_layout(
     fingerprint: str = "",
     what: str = "designing",
 ) -> SearchState:
-    """Minimise ``objective`` over layouts; the printable argmax layout is what counts.
+    """Minimise ``objective`` over layouts; only the printable (argmax) layout is scored and kept.
 
     Args:
         parameters: a started parametrisation, changed in place.
@@ -71,7 +71,7 @@ def search_layout(
         record per evaluated iteration: loss of the sample and of the argmax layout.
 
     Raises:
-        InputError: the checkpoint in ``folder`` belongs to another task, or the loss is not finite.
+        InputError: the checkpoint in ``folder`` is of another task, or the loss is not finite.
     """
     optimiser_class = torch.optim.Adam if settings.optimiser == "adam" else torch.optim.AdamW
     optimiser = optimiser_class(parameters.parameters(), lr=settings.learning_rate)
@@ -90,13 +90,13 @@ def search_layout(
 
 
 def finished_iterations(folder: Path) -> int:
-    """How many iterations an interrupted run in ``folder`` has behind it; 0 where there is none."""
+    """Finished iterations of an interrupted run in ``folder``; 0 without one."""
     path = folder / _CHECKPOINT
     return int(_load(path)["iteration"]) if path.exists() else 0
 
 
 def remove_checkpoint(folder: Path) -> None:
-    """A finished design needs none."""
+    """Delete the checkpoint of a finished design."""
     (folder / _CHECKPOINT).unlink(missing_ok=True)
 
 
@@ -107,7 +107,7 @@ def _step(
     settings: SearchSettings,
     iteration: int,
 ) -> float:
-    # The noise follows from seed and iteration, so that a resumed run draws what the first one would have.
+    # The noise follows from seed and iteration, so that a resumed run draws the same numbers.
     seed = settings.seed * 1_000_003 + iteration
     optimiser.zero_grad(set_to_none=True)
     level = parameters.sample(settings.temperature(iteration), settings.hard(iteration), seed)
@@ -183,7 +183,7 @@ def _resume(
 
 
 def _load(path: Path) -> dict[str, Any]:
-    """A checkpoint on the CPU: neither a full GPU nor a file that may not be read is a damaged one."""
+    """A checkpoint, loaded to the CPU, so that a full GPU is not taken for a damaged file."""
     stored = path.read_bytes()
     try:
         content: dict[str, Any] = torch.load(io.BytesIO(stored), weights_only=True, map_location="cpu")
@@ -191,7 +191,7 @@ def _load(path: Path) -> dict[str, Any]:
         raise InputError(
             f"checkpoint {path}",
             got="a damaged file",
-            wanted="what an interrupted run left",
+            wanted="the checkpoint of an interrupted run",
             hint="delete it to start again",
         ) from None
     return content

@@ -1,4 +1,4 @@
-"""Where a search starts: one function per start, from what is known before it to a level for each free cell.
+"""Starts of a search: each is a function that gives one level for every free cell.
 
 To add a start, give it a name in ``StartName`` and a function in ``_STARTS``; where it needs an image or a
 focus, say so in ``_MADE_FOR``.
@@ -27,7 +27,7 @@ _MADE_FOR = {"gs": "hologram", "wgs": "hologram", "fresnel": "lens"}
 
 @dataclass(frozen=True)
 class Scene:
-    """What a start may look at.
+    """What a start can use.
 
     Attributes:
         cells: the free cells, on the device where the start is computed.

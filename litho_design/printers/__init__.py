@@ -1,1 +1,1 @@
-"""What stands for the printer: a frozen model, an ensemble, the virtual fab."""
+"""Layouts and the printers that print them: a frozen model, nominal heights, or the virtual fab."""

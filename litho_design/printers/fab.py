@@ -1,7 +1,7 @@
-"""The virtual fab as a judge: it prints a finished layout, and nothing can be designed through it.
+"""The virtual fab as a judge: it prints a finished layout; designing needs gradients, which it has not.
 
-It shares no code with the models that designs are made through, and holds the effects that were hidden
-in their training prints: what it prints is what the machine would have printed.
+It shares no code with the models and includes the effects that were hidden in their training prints, so it
+prints what the machine would have printed.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ from litho_data.virtual_fab.knobs import KnobBoard
 from litho_data.virtual_fab.printer import print_clean, surface_noise
 from litho_design.printers.layout import LayoutSettings
 
-# A stream of its own: no scan of the run that the truth file describes has this roughness.
+# A separate stream: no scan of the run in the truth file has this roughness.
 _ROUGHNESS_STREAM = 2
 
 
 @dataclass(frozen=True)
 class ElementJob(Job):
-    """A layout that stands alone on the substrate: nothing is written around it."""
+    """A layout that stands alone on the substrate."""
 
     def canvas(self, pitch_um: float) -> Canvas:
         """The layout in a frame of level 0, in the middle of a write field of its own size."""
@@ -52,7 +52,7 @@ class FabSimulator(nn.Module):
         settings = [KnobSetting(knob.name, knob.strength, knob.seed) for knob in truth.knobs]
         self.knobs = KnobBoard(settings, truth.seed)
         self.scans, self.seed = len(truth.scans), truth.seed
-        # What decides the print, where a model has its weights: results tell fabs apart by its hash.
+        # Everything that decides the print; its hash identifies the fab as weights identify a model.
         text = truth.model_dump_json(include={"printer", "noise", "knobs", "seed"})
         self.register_buffer("settings", torch.frombuffer(bytearray(text.encode()), dtype=torch.uint8))
 
@@ -71,7 +71,7 @@ class FabSimulator(nn.Module):
 
 
 def is_fab(source: str | Path) -> bool:
-    """Whether ``source`` is what ``litho-data simulate`` hides: a truth file, or the folder that holds it."""
+    """Whether ``source`` is a truth file of ``litho-data simulate``, or the folder with one."""
     path = Path(source)
     return path.name == Truth.FILE_NAME or (path / Truth.FILE_NAME).is_file()
 

@@ -1,4 +1,4 @@
-"""A layout: what the printer is asked for, what that takes, and how unlike the training layouts it is."""
+"""Layouts: geometry and levels, rules of fabrication, and distance from the training layouts of a model."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_data.foundation.settings import setting
 
-# Half of the training histogram's weight elsewhere: predictions are then mostly extrapolation.
+# Half of the pixels at levels that the training layouts hardly have: mostly extrapolation.
 _FLAG_DISTANCE = 0.5
 _LARGE_JUMP_LEVELS = 8
 
 
 class LayoutSettings(Record):
-    """What the printer is asked for: pixels, free cells and levels.
+    """Geometry of a layout: pixels, free cells and levels.
 
     ``cell_um`` is the side of one free cell, or the width of one ring with ``symmetry="radial"``.
     """
@@ -43,7 +43,7 @@ class LayoutSettings(Record):
         """Pixels per cell side.
 
         Raises:
-            InputError: cells that are no whole number of pixels, or that do not fill the element.
+            InputError: cells that are not a whole number of pixels, or that do not fill the element.
         """
         cell_px = round(self.cell_um / self.pitch_um)
         if cell_px < 1 or abs(cell_px * self.pitch_um - self.cell_um) > 1e-9 or self.size_px % cell_px:
@@ -80,7 +80,7 @@ class OutOfDistribution(Record):
 
 
 def printability(levels: np.ndarray, layout: LayoutSettings) -> Printability:
-    """Check a layout against what a printer must resolve.
+    """What a printer must resolve to print a layout.
 
     A feature is a run of pixels of one level along a row or a column that ends at other levels on
     both sides; runs that touch the border are not counted, they may continue in a neighbour. In a ring

@@ -1,4 +1,4 @@
-"""The printer as the designer meets it: layout levels in, printed height of the element out."""
+"""A printer applied to one element: layout levels in, printed height out."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ Precision = Literal["float32", "mixed", "bfloat16"]
 
 
 class TilingCheck(Record):
-    """How much a print depends on the tile in which it is computed, over some tiles of the layout.
+    """Difference between a print computed as a whole and in tiles.
 
-    With a receptive radius this is rounding; without one (a Fourier operator) it is the model's error.
+    For models with a finite reach this is rounding; for others (a Fourier operator) an error of the model.
     """
 
     tile_px: int
@@ -34,7 +34,7 @@ class TilingCheck(Record):
 
 
 class PrinterRecord(Record):
-    """Which printer a design or a score was made with; the dataset is the one its model was trained on."""
+    """The printer of a design or a score; the dataset is that of the model's training."""
 
     name: str
     sha256: str
@@ -74,11 +74,11 @@ class Printer(nn.Module):
         self.source = source
         self.extrapolate = extrapolate
         self.name = name or ("none" if simulator is None else str(simulator.name))
-        # The reach is a whole number of pixels times the pitch, give or take a rounding.
+        # The reach is a whole number of pixels times the pitch, up to rounding.
         self.guard_px = 0 if simulator is None else math.ceil(_guard_um(simulator) / layout.pitch_um - 1e-6)
         self.halo_px = 0 if simulator is None else _halo_px(simulator, self.guard_px)
         self.strip_halo_px = 0 if simulator is None else _strip_halo_px(simulator, self.guard_px)
-        # What lies in the guard ring is cut off again: a model that can leave it out need not compute it.
+        # The guard ring is cut off again: a model that can skip it does not compute it.
         self._interior: Callable[..., Tensor] | None = None
         if getattr(simulator, "has_interior", False):
             self._interior = cast(Any, simulator).interior
@@ -97,12 +97,12 @@ class Printer(nn.Module):
 
     @property
     def depends_on_position(self) -> bool:
-        """Whether added effects may depend on the place in the write field: a patch says nothing then."""
+        """Whether added effects may depend on the place in the write field, as no patch can show."""
         return bool(self.card.get("process_effects"))
 
     @property
     def device(self) -> torch.device:
-        """Where the model lives, also where there is no model."""
+        """Device of the model, or of the waves where there is no model."""
         return self.device_marker.device
 
     def forward(self, level: Tensor) -> Tensor:

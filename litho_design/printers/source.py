@@ -1,4 +1,4 @@
-"""Where a printer comes from: a folder of a frozen model, the zoo, a virtual fab, or none."""
+"""Loading printers: from a folder of a frozen model, the zoo, a virtual fab, or none."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def load_printer(
     """The printer for ``source``: a folder of a frozen model, ``zoo:NAME``, or ``none`` for nominal heights.
 
     The folder ``truth`` of a virtual fab is a printer that can only judge. ``name`` is what results
-    call it; the model's own name by default. A printer that is loaded is returned as it is.
+    call it; the model's own name by default. A loaded printer is returned unchanged.
 
     Raises:
         InputError: no frozen model there, another pitch, levels the model was not calibrated for, or a

@@ -1,1 +1,1 @@
-"""Designs and scores for people."""
+"""HTML reports of designs, scores and comparisons."""

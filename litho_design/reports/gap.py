@@ -31,15 +31,16 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
     page = Page(
         "The design-to-manufacturing gap",
         f"{what}: {len(result.arms)} arms, {len(result.seeds)} seed(s), {result.settings.search.iterations} "
-        "iterations each; every layout is scored as it would be printed.",
+        "iterations each; layouts are scored as they would be printed.",
     )
     if len(result.seeds) < 3:
         page.note(
-            f"Only {len(result.seeds)} seed(s): intervals are missing or wide, and no ranking is supported."
+            f"Only {len(result.seeds)} seed(s): intervals are missing or wide, so the arms cannot be ranked."
         )
     page.paragraph(
-        "Rows are the model a layout was designed with, columns the judge that prints it. A design's own "
-        "model is on the diagonal: that figure is an expectation, not a measurement."
+        "An arm is a model that layouts are designed with (rows); a judge is a model that prints them "
+        "(columns). On the diagonal a model judges its own design: that is its expectation, not an "
+        "independent result."
     )
     headline = HEADLINE[result.task]
     for figure in headline:
@@ -70,7 +71,7 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
     )
     page.heading("Arm against arm")
     page.paragraph(
-        "Differences under the same judge, paired by seed; an interval that holds 0 decides nothing."
+        "Differences under the same judge, paired by seed. Where the interval includes 0, the order is open."
     )
     page.table(_paired_frame(result), "Paired differences", "paired.csv", digits=3)
     page.table(_long_frame(result), "All means", "summary.csv", digits=4)

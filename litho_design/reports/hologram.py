@@ -1,4 +1,4 @@
-"""The report of one holographic design."""
+"""The report of one hologram."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def write_hologram_report(
     page = Page(
         "Holographic element",
         f"Designed through the printer model “{design.printer.name}”; "
-        "every figure is of the printable layout.",
+        "all scores are of the printable layout.",
     )
     page.tiles(
         [
@@ -41,7 +41,7 @@ def write_hologram_report(
             (f"{score.si_psnr_db:.1f} dB", "scale-invariant PSNR"),
             (f"{score.ssim:.3f}", "SSIM"),
             (f"{score.speckle_contrast:.2f}", "speckle contrast"),
-            (f"{design.stroke.stroke_waves:.2f} waves", "stroke that the print reaches"),
+            (f"{design.stroke.stroke_waves:.2f} waves", "printed stroke"),
         ]
     )
     add_notes(page, design)
@@ -52,8 +52,8 @@ def write_hologram_report(
     page.table(score_table(score.model_dump(), labels), "Scores of the argmax layout", "scores.csv", digits=4)
     if design.reference_efficiency:
         page.paragraph(
-            f"A Gerchberg-Saxton element with the same cells and any phase puts "
-            f"{100 * design.reference_efficiency:.1f} % on the signal: the print reaches "
+            f"A Gerchberg-Saxton element with the same cells and continuous phase puts "
+            f"{100 * design.reference_efficiency:.1f} % on the signal; the print reaches "
             f"{score.eff_signal / design.reference_efficiency:.2f} of that."
         )
     page.heading("Search")
@@ -67,7 +67,7 @@ def write_hologram_report(
     )
     shown = {name: (getattr(score, name), labels[name]) for name in ("si_psnr_db", "eff_signal")}
     add_yield(page, window, ProcessWindow.model_validate(design.settings["window"]), shown)
-    page.heading("What the print makes of the levels")
+    page.heading("Printed height of the levels")
     page.table(level_table(design), "Printed height of a uniform field of each level", "levels.csv", digits=3)
     page.paragraph(stroke_advice(design))
     add_gauge(page, design)

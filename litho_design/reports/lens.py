@@ -40,7 +40,7 @@ def write_lens_report(
     page = Page(
         "Multi-level diffractive lens",
         f"Designed through the printer model “{design.printer.name}”; "
-        "every figure is of the printable layout.",
+        "all scores are of the printable layout.",
     )
     page.tiles(
         [
@@ -63,7 +63,7 @@ def write_lens_report(
         reached = figures["focusing_efficiency"] / design.reference_efficiency
         page.paragraph(
             f"A perfect lens of this aperture puts {100 * design.reference_efficiency:.1f} % within the same "
-            f"radius: the print reaches {reached:.2f} of that."
+            f"radius; the print reaches {reached:.2f} of that."
         )
     page.heading("Search")
     page.figure(
@@ -72,7 +72,7 @@ def write_lens_report(
     shown = {name: (figures[name], labels[name]) for name in ("strehl", "cbr")}
     add_yield(page, window, ProcessWindow.model_validate(design.settings["window"]), shown)
     _add_focus_window(page, focus_window(bench, torch.from_numpy(height).to(bench.aperture.device)))
-    page.heading("What the print makes of the levels")
+    page.heading("Printed height of the levels")
     page.table(level_table(design), "Printed height of a uniform field of each level", "levels.csv", digits=3)
     page.paragraph(stroke_advice(design))
     add_gauge(page, design)
@@ -138,9 +138,9 @@ def _add_focus_window(page: Page, window: FocusWindow) -> None:
     import pandas as pd
 
     page.paragraph(
-        f"Through focus and print gain (gain stands for dose): the peak keeps 80 % of its best value over "
-        f"{window.depth_of_focus_um:.1f} µm of defocus at the modelled gain, and over a gain range of "
-        f"{window.gain_latitude:.2f} in focus; the ends of the sweep cut both."
+        "Focus and print gain (which represents the dose) are swept. The peak stays above 80 % of its best "
+        f"value over {window.depth_of_focus_um:.1f} µm of defocus at the modelled gain and over a gain range "
+        f"of {window.gain_latitude:.2f} in focus; both ranges end with the sweep."
     )
     strehl, width = np.array(window.strehl), np.array(window.fwhm_um)
     figure = new_figure(13, 3.6)

@@ -22,10 +22,10 @@ BRIGHTEST = 1.5
 
 
 def add_notes(page: Page, design: Design) -> None:
-    """What a reader of any design must know first: whose figures these are, and what was adapted."""
+    """Whose prediction the report shows, and the remarks of the record."""
     page.note(
-        "These figures are the design model's own opinion of its design. Judge the layout with another "
-        "model (litho-design score, litho-design compare) before printing it."
+        "These scores are predictions of the model that the layout was designed with. Before printing, score "
+        "the layout with another model (litho-design score, litho-design compare)."
     )
     for note in design.notes:
         page.note(note[0].upper() + note[1:] + ".")
@@ -58,11 +58,11 @@ def add_yield(
     import pandas as pd
 
     page.heading("Process window")
-    designed = "in the loss" if window.samples else "not in the loss: designed for the print as modelled"
+    designed = "in the loss" if window.samples else "not in the loss"
     page.paragraph(
-        f"Share of {len(draws)} random prints that is at least as good as the value on the axis. No search "
-        f"has seen these prints; the window was {designed}. Their standard deviations: "
-        f"{'; '.join(spreads(window))}."
+        f"The curves give the share of {len(draws)} random prints that are at least as good as the value on "
+        f"the axis. The search did not use these prints; the process window was {designed}. Standard "
+        f"deviations: {'; '.join(spreads(window))}."
     )
     figure = new_figure(8, 3)
     axes = figure.subplots(1, len(figures), sharey=True)
@@ -107,10 +107,10 @@ def level_table(design: Design) -> pd.DataFrame:
 
 
 def add_gauge(page: Page, design: Design) -> None:
-    """What the layout asks of the printer, and how far it is from the model's training layouts."""
+    """What a printer must resolve, and the distance from the model's training layouts."""
     import pandas as pd
 
-    page.heading("What the layout asks of the printer")
+    page.heading("What the printer must resolve")
     warning = distribution_warning(design)
     if warning:
         page.note(warning[0].upper() + warning[1:] + ".")
@@ -118,14 +118,14 @@ def add_gauge(page: Page, design: Design) -> None:
     tiling, ensemble = design.tiling, design.ensemble
     if tiling is not None:
         page.paragraph(
-            f"Whole field against {tiling.tiles} tiles of {tiling.tile_px} px with their halo: the "
-            f"predicted height differs by {tiling.rms_nm:.2g} nm rms, {tiling.max_nm:.2g} nm at most."
+            f"Predicted as a whole and in {tiling.tiles} tiles of {tiling.tile_px} px with their halo, the "
+            f"print differs by {tiling.rms_nm:.2g} nm rms, {tiling.max_nm:.2g} nm at most."
         )
     if ensemble is not None:
         names = ", ".join(member.name for member in ensemble.members)
         page.paragraph(
-            f"Designed together with {names}: here the models are {ensemble.disagreement_nm:.1f} nm "
-            f"({ensemble.disagreement_waves:.3f} waves) apart, rms over the pixels."
+            f"Designed with {names} as well: on this layout the models disagree by "
+            f"{ensemble.disagreement_nm:.1f} nm ({ensemble.disagreement_waves:.3f} waves) rms."
         )
     figures = design.printability.model_dump() | (gauge.model_dump() if gauge else {})
     given = {name: float(value) for name, value in figures.items() if value is not None}

@@ -26,7 +26,7 @@ def write_score_report(
 
     Args:
         pictures: image or PSF (m, m) behind each print, ``side_um`` wide.
-        photos: what was photographed through a lens and what became of it, (n, n), ``frame_um`` wide.
+        photos: object, photograph and reconstructions of a lens (n, n), ``frame_um`` wide.
     """
     import pandas as pd
 
@@ -36,7 +36,7 @@ def write_score_report(
     )
     if not any(score.independent for score in result.scores):
         page.note(
-            "No judge is independent of the design: these figures repeat the design model's own opinion."
+            "No judge is independent of the design: these scores only repeat the prediction of its own model."
         )
     columns = {f"{result.designed_with.name} (design)": result.designed}
     columns |= {
@@ -61,8 +61,8 @@ def write_score_report(
     if photos:
         page.figure(
             image_grid([list(photos.values())], [list(photos)], [""], frame_um),
-            "Photograph through the printed lens, each image at the scale of least error; its figures are "
-            "those of this one object.",
+            "Photograph through the printed lens, each image at the scale of least error. The scores are of "
+            "this one object.",
         )
     heights = pd.DataFrame(
         [

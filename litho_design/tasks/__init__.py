@@ -1,1 +1,1 @@
-"""What is designed for: settings, targets, and the run that every task shares."""
+"""The contract of a task, the run that holograms and lenses share, and the record of a finished design."""

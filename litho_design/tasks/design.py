@@ -30,7 +30,7 @@ TaskName = Literal["hoe", "lens-direct", "lens-computational"]
 
 
 class RunRecord(RunFacts):
-    """What was run, with what, and how long it took; older result files may have no commit."""
+    """Command, software, device and duration; older result files may have no commit."""
 
     device: str
     threads: int
@@ -97,7 +97,7 @@ def read_array(folder: str | Path, name: str) -> np.ndarray:
     """One array of a design folder, checked against the hash in its record.
 
     Raises:
-        InputError: no such file, or a file that is not the one the record names.
+        InputError: no such file, or one that changed after the design.
     """
     path = Path(folder) / name
     wanted = Design.read(folder).files.get(name)

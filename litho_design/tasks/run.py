@@ -1,4 +1,4 @@
-"""One way to run every design task: start, search, polish, score, write; an interrupted run is continued."""
+"""The run that every task shares: start, search, polish, score, write; interrupted runs resume."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Task(Protocol):
     def target_record(self) -> TargetRecord | None: ...
     @property
     def notes(self) -> Sequence[str]:
-        """What was adapted, for the record."""
+        """Remarks for the record, such as how the target was fitted."""
 
     def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
         """Loss and its parts, of levels on the pixels (1, 1, size, size)."""
@@ -72,13 +72,13 @@ class Task(Protocol):
         """Score of a printed height map (size, size), µm."""
 
     def arrays(self, height_um: Tensor) -> dict[str, np.ndarray]:
-        """What is kept beside levels and heights, by file name."""
+        """Arrays saved beside levels and heights, by file name."""
 
     def reference_efficiency(self) -> float | None:
-        """What an ideal element would reach, where that is defined."""
+        """Efficiency of an ideal element, where that is defined."""
 
 
-# Writes what people read into the folder of a design, from its record and the history of its search.
+# Writes the report into the folder of a design, from the record and the history of the search.
 Report = Callable[[Path, Design, list[dict[str, float]]], object]
 
 
@@ -102,17 +102,17 @@ def run_design(
 ) -> Design:
     """Optimise, polish and score one layout, and write the folder ``out``.
 
-    The folder may hold an interrupted run of the same task (it goes on and ends as if it had never
-    stopped) or a finished one (it is returned as it is). The weights of every model are hashed before
-    and after; a model that changed leaves no design.
+    If the folder holds an interrupted run of the same task, the run resumes, with the same result as an
+    uninterrupted one; a finished design of the same task is returned. The weights of every model are hashed
+    before and after the run; if they changed, no design is written.
 
     Args:
-        report: writes the report; the arrays are in the folder then, and the record is written after it.
+        report: called with the folder when the arrays are in it; the record is written afterwards.
         announce: print the expected time and memory to stderr before starting.
 
     Raises:
-        InputError: ``out`` holds another design or result, a printer only judges, or a model
-            changed meanwhile.
+        InputError: ``out`` holds another design or result, a printer can only judge, or the weights
+            of a model changed during the run.
     """
     _check_printers(task.printers)
     folder = Path(out)
@@ -140,8 +140,8 @@ def run_design(
         if after != before:
             raise InputError(
                 f"model {printer.name}",
-                got="weights or buffers that changed while a layout was designed through it",
-                wanted="a model that printing leaves as it is",
+                got="weights or buffers that changed during the run",
+                wanted="a model that printing does not change",
             )
     layout_array = layout_level.cpu().numpy().astype(np.uint8)
     arrays = {LEVELS_FILE: layout_array, HEIGHT_FILE: height.cpu().numpy(), **task.arrays(height)}
@@ -194,7 +194,7 @@ def _check_printers(printers: Sequence[Printer]) -> None:
                 f"model {printer.name}",
                 got="a virtual fab",
                 wanted="a frozen model, or none",
-                hint="the fab only judges: --judge",
+                hint="a fab can only judge: --judge",
             )
 
 

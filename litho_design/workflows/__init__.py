@@ -1,1 +1,1 @@
-"""What a user calls: design, compare and score; each writes one folder with a record and a report."""
+"""Design, score and compare: each function writes one folder with a record and a report."""

@@ -23,7 +23,7 @@ from litho_design.judging.gap import (
     summarise,
 )
 from litho_design.judging.loaded import load_design
-from litho_design.lenses.objects import bring_objects
+from litho_design.lenses.objects import with_objects
 from litho_design.lenses.settings import LensSettings
 from litho_design.printers.printer import Printer
 from litho_design.printers.source import Device, load_printers
@@ -52,7 +52,7 @@ def compare(
     """Design once per arm and seed with equal budgets, and print each layout with every judge.
 
     All arms share every setting but the printer; a finished or interrupted design in ``out`` is
-    used again or continued. The arms' own printers judge too, so that the whole matrix is there.
+    reused or resumed. The arms' own printers also judge, which completes the matrix.
 
     Args:
         settings: of a hologram or a lens, which decides what is designed; the seed of the search is
@@ -69,8 +69,8 @@ def compare(
         The record written to ``out/gap.json``.
 
     Raises:
-        InputError: no arm or no seed, a judge with the name of an arm, or an ``out`` that holds another
-            kind of result; and what designing raises.
+        InputError: no arm or no seed, a judge with the name of an arm, an ``out`` that holds another kind
+            of result, or anything that ``design_hologram`` and ``design_lens`` refuse.
     """
     every_seed = list(seeds)
     fit: Any = {"device": device, "extrapolate": extrapolate}
@@ -80,7 +80,7 @@ def compare(
     folder = Path(out)
     require_own_folder(folder, GapResult.FILE_NAME)
     designed: Callable[[Settings, Printer, Path], Design]
-    # What is wrong with a printer is said before a target is drawn or a picture read.
+    # Printers are checked before a target is drawn or a picture is read.
     if isinstance(settings, HologramSettings):
         if objects or held_out_objects:
             raise InputError(
@@ -91,7 +91,7 @@ def compare(
         def designed(settings, printer, place):
             return design_hologram(wanted, printer, place, settings=settings, announce=announce)
     else:
-        settings, pictures = bring_objects(settings, objects, held_out_objects)
+        settings, pictures = with_objects(settings, objects, held_out_objects)
 
         def designed(settings, printer, place):
             return run_lens(settings, printer, place, pictures, announce=announce)

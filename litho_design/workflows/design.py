@@ -12,7 +12,7 @@ from torch import Tensor
 from litho_design.holograms.settings import HologramSettings, hologram_settings
 from litho_design.holograms.task import HologramTask
 from litho_design.images.targets import Target, load_target
-from litho_design.lenses.objects import bring_objects
+from litho_design.lenses.objects import with_objects
 from litho_design.lenses.settings import LensSettings, lens_settings
 from litho_design.lenses.task import LensTask
 from litho_design.optimisation.process_window import YIELD_DRAWS
@@ -40,12 +40,12 @@ def design_hologram(
     Args:
         target: a drawing by name, an image file, or an array (size_px, size_px) in [0, 1].
         model: folder of a frozen model, ``zoo:NAME``, ``none`` for nominal heights, or a loaded printer.
-        out: folder of the design; an interrupted run in it is continued.
+        out: folder of the design; an interrupted run in it resumes.
         settings: geometry, optics, search and loss; ``hologram_settings()`` by default.
         ensemble: further models, MODEL or NAME=MODEL: the loss is the mean over all models, plus a
             penalty on their disagreement.
-        device: where models that are named are loaded to.
-        extrapolate: accept heights beyond a model's calibration; the result says so.
+        device: where models are loaded.
+        extrapolate: accept heights beyond a model's calibration; recorded in the result.
         announce: print the expected time and memory to stderr before starting.
 
     Returns:
@@ -84,10 +84,10 @@ def design_lens(
 
     Args:
         model: as for ``design_hologram``.
-        out: folder of the design; an interrupted run in it is continued.
+        out: folder of the design; an interrupted run in it resumes.
         settings: geometry, optics, task and search; ``lens_settings()`` by default.
         objects: pictures, or folders of them, that a computational lens images instead of the drawings.
-        held_out_objects: pictures or folders that are only scored (see ``bring_objects``).
+        held_out_objects: pictures or folders that are only scored (see ``with_objects``).
         ensemble, device, extrapolate, announce: as for ``design_hologram``.
 
     Returns:
@@ -95,12 +95,12 @@ def design_lens(
 
     Raises:
         InputError: as for ``design_hologram``; a radial search of a layout without rings or with a
-            square aperture; or objects that are no pictures.
+            square aperture; or objects that are not pictures.
     """
     settings = settings or lens_settings()
     printer = load_printer(model, settings.layout, device=device, extrapolate=extrapolate)
     others = load_printers(ensemble, settings.layout, device=device, extrapolate=extrapolate)
-    settings, pictures = bring_objects(settings, objects, held_out_objects)
+    settings, pictures = with_objects(settings, objects, held_out_objects)
     return run_lens(settings, printer, out, pictures, ensemble=list(others.values()), announce=announce)
 
 
@@ -113,7 +113,7 @@ def run_lens(
     ensemble: Sequence[Printer] = (),
     announce: bool = True,
 ) -> Design:
-    """``design_lens`` with its printers loaded and the pixels of its pictures read (``bring_objects``)."""
+    """``design_lens`` with its printers loaded and the pixels of its pictures read (``with_objects``)."""
     task = LensTask(settings, printer, ensemble, pictures)
 
     def report(folder: Path, design: Design, history: list[dict[str, float]]) -> None:

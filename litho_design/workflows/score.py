@@ -1,4 +1,4 @@
-"""Score a finished design by others than its own model, and write the folder of the score."""
+"""Score a finished design with independent judges, and write the folder of the score."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ def score(
         camera: a photograph of the printed hologram's image, or of an object through the printed lens;
             with ``scan`` it is deconvolved with the PSF of the measured print too.
         device: where prints and waves are computed; ignored for a design that is loaded.
-        extrapolate: accept heights beyond a judge's calibration; the result says so.
+        extrapolate: accept heights beyond a judge's calibration; recorded in the result.
 
     Raises:
         InputError: nothing to judge with, an incomplete or altered design folder, a measurement that
-            does not belong to it, or an ``out`` that holds another kind of result.
+            does not match it, or an ``out`` that holds another kind of result.
     """
     require_own_folder(out, ScoreResult.FILE_NAME)
     loaded = design if isinstance(design, LoadedDesign) else load_design(design, device=device)

@@ -70,7 +70,7 @@ def test_designs_are_scored_by_it_and_never_made_through_it(tmp_path, small_sett
     truth = truth_folder(tmp_path / "fab", noise="default")
     layout, target = small_settings.layout, load_target("ring", 128)
     fab = load_printer(str(truth), layout, name="fab")
-    with pytest.raises(InputError, match="only judges"):
+    with pytest.raises(InputError, match="can only judge"):
         design_hologram(target, fab, tmp_path / "through", settings=small_settings, announce=False)
     search = small_settings.search.model_copy(update={"iterations": 2, "polish_rounds": 0})
     settings = small_settings.model_copy(update={"search": search})

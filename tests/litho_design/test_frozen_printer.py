@@ -139,12 +139,12 @@ def test_commands_design_score_and_compare(tmp_path, affine_folder):
     assert record.printer.sha256 == load_printer(str(affine_folder), record.layout).weights_sha256()
     # The card of this model names no training levels: nothing can be said about its extrapolation.
     assert "extrapolation" not in stroke_advice(record)
-    assert "the card of the model affine does not say" in distribution_warning(record)
+    assert "the card of the model affine does not describe" in distribution_warning(record)
     seen = OutOfDistribution(
         level_distance=0.6, flagged=True, extreme_level_share=0.4, training_extreme_level_share=0.001
     )
     rarely = record.model_copy(update={"out_of_distribution": seen})
-    assert "0.1 % of the layouts" in stroke_advice(rarely)
+    assert "0.1 % of the training layouts" in stroke_advice(rarely)
     assert "60 % of the pixels" in distribution_warning(rarely)
     usual = record.model_copy(update={"out_of_distribution": seen.model_copy(update={"flagged": False})})
     assert distribution_warning(usual) == ""
@@ -260,7 +260,7 @@ def test_an_odd_picture_is_adapted_and_the_adaptation_is_told(tmp_path, capsys, 
         (("compare", "--models", "none,none", "--out", "out"), "twice"),
         (("compare", "--models", "none", *SMALL[:2], "--seeds", "0", "--out", "out"), "at least one"),
         (("hoe", "--model", "none", "--target", "black.png", "--out", "out"), "without any light"),
-        (("hoe", "--model", "none", "--target", "nan.tif", "--out", "out"), "no numbers"),
+        (("hoe", "--model", "none", "--target", "nan.tif", "--out", "out"), "not numbers"),
         (("hoe", "--model", "coarse", "--out", "out"), "got 0.1 µm, wanted 0.2 µm, as the model was"),
         (("hoe", "--model", "affine", "--levels", "16", "--out", "out"), "what the model was calibrated for"),
         (("hoe", "--model", "affine", "--level-height-um", "0.13", "--out", "out"), "as the model was"),

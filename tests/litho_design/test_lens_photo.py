@@ -173,7 +173,7 @@ def test_a_name_that_two_objects_have_is_refused(lens):
         (("--camera", "flat.png", "--camera-pitch-um", "0.15"), "no --camera-object"),
         (("--camera", "flat.png", "--camera-pitch-um", "0.15", "--camera-object", "face"), "'face'"),
         (("--camera", "flat.png", "--camera-pitch-um", "0.15", "--camera-object", "text"), "correlation"),
-        (("--camera", "none.png", "--camera-pitch-um", "0.15", "--camera-object", "text"), "no file"),
+        (("--camera", "none.png", "--camera-pitch-um", "0.15", "--camera-object", "text"), "does not exist"),
         (("--camera", "flat.png", "--camera-object", "text"), "--camera-pitch-um"),
         (("--judge", "none", "--camera-object", "text"), "no --camera"),
     ],

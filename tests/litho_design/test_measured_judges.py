@@ -95,7 +95,7 @@ def test_a_photograph_of_something_else_is_refused(tmp_path, printed_design):
         score_design(
             printed_design, tmp_path / "s", judges=[], camera=PhotoSource(tmp_path / "flat.png", 0.2)
         )
-    with pytest.raises(InputError, match="which is no file"):
+    with pytest.raises(InputError, match="which does not exist"):
         score_design(
             printed_design, tmp_path / "s", judges=[], camera=PhotoSource(tmp_path / "none.png", 0.2)
         )

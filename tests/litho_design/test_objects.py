@@ -14,7 +14,7 @@ from litho_data.foundation.hashes import file_sha256
 from litho_design.cli.app import main
 from litho_design.images.targets import draw_target, object_name
 from litho_design.judging.gap import GapResult
-from litho_design.lenses.objects import bring_objects, object_stack, picture_records
+from litho_design.lenses.objects import object_stack, picture_records, with_objects
 from litho_design.lenses.settings import lens_settings
 from litho_design.lenses.task import LensTask
 from litho_design.optics import Optics
@@ -58,7 +58,7 @@ def folder(tmp_path):
 
 
 def test_drawings_and_pictures_stand_inside_a_dark_border(folder, settings):
-    brought, pictures = bring_objects(settings, [folder / "a.png"], [folder / "b.png", folder / "c.png"])
+    brought, pictures = with_objects(settings, [folder / "a.png"], [folder / "b.png", folder / "c.png"])
     (record,) = picture_records(("ring", *brought.imaging.objects))
     ring, picture = object_stack(("ring", record), 32, pictures)
     inside = slice(4, 28)
@@ -77,7 +77,7 @@ def test_a_picture_is_converted_as_its_record_says(tmp_path, settings):
     grey = np.full((24, 24), 7, np.uint16)
     grey[0, 0] = 70
     cv2.imwrite(str(tmp_path / "deep.png"), grey)
-    brought, pictures = bring_objects(settings, [], [tmp_path / "wide.png", tmp_path / "deep.png"])
+    brought, pictures = with_objects(settings, [], [tmp_path / "wide.png", tmp_path / "deep.png"])
     wide, deep = brought.imaging.test_objects
     assert brought.imaging.objects == settings.imaging.objects
     assert (wide.name, wide.sha256) == ("wide.png", file_sha256(tmp_path / "wide.png"))
@@ -102,7 +102,7 @@ def test_the_last_quarter_by_name_is_held_out(tmp_path, settings, count, held_ou
     for index in reversed(range(count)):
         picture = np.random.default_rng(index).integers(0, 255, (24, 24)).astype(np.uint8)
         cv2.imwrite(str(tmp_path / f"{index:02d}.png"), picture)
-    imaging = bring_objects(settings, [tmp_path], [])[0].imaging
+    imaging = with_objects(settings, [tmp_path], [])[0].imaging
     names = [f"{index:02d}.png" for index in range(count)]
     assert [object_name(item) for item in imaging.objects] == names[:-held_out]
     assert [object_name(item) for item in imaging.test_objects] == names[-held_out:]
@@ -152,7 +152,7 @@ def test_another_set_of_objects_is_another_design(tmp_path, folder, settings, ma
 
 
 def test_pixels_must_belong_to_the_settings(folder, settings, make_printer):
-    brought, pictures = bring_objects(settings, [folder], [])
+    brought, pictures = with_objects(settings, [folder], [])
     with pytest.raises(InputError, match=r"object a\.png, got no pixels"):
         LensTask(brought, make_printer(settings.layout))
     wider = brought.model_copy(update={"imaging": brought.imaging.model_copy(update={"object_px": 48})})
@@ -187,14 +187,14 @@ def test_commands_take_objects(tmp_path, folder, monkeypatch, capsys):
     [
         (("--objects", "note.txt"), "note.txt"),
         (("--objects", "nowhere"), "nowhere"),
-        (("--objects", "empty"), "without a file"),
+        (("--objects", "empty"), "an empty folder"),
         (("--objects", "mixed"), "note.txt"),
         (("--objects", "pictures/a.png"), "got 0 for the design"),
         (("--objects", "pictures/a.png", "--objects", "pictures/b.png"), "0 for the design and 2 held out"),
         (("--objects", "pictures", "--held-out-objects", "extra.png"), "1 held out"),
-        (("--objects", "pictures", "--held-out-objects", "pictures/a.png"), "there already"),
+        (("--objects", "pictures", "--held-out-objects", "pictures/a.png"), "already there"),
         (("--objects", "black.png"), "without any light"),
-        (("--objects", "pictures", "--task", "direct"), "images none"),
+        (("--objects", "pictures", "--task", "direct"), "images no objects"),
         (("--objects", "pictures", "compare"), "the hoe task"),
     ],
 )  # fmt: skip
