@@ -5,7 +5,7 @@
 Each store has 12 scans of random layouts, printed by a Physics model away from its starting values. The
 noise is stationary and Gaussian, 16 nm with the spectrum of the virtual fab's flat print (lines along x
 included), with a datum and a tilt per scan. Right is to find nothing beyond what single scans add: every
-effect or probe taken is a false positive. A killed run goes on where it stopped.
+effect or probe taken is a false positive. An interrupted run resumes.
 """
 
 from __future__ import annotations

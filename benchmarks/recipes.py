@@ -3,7 +3,7 @@
     python -m benchmarks.recipes STORE --publish
 
 ``--fast`` is the result of `litho-models benchmark STORE --split paper` with the fast recipe in float32. A
-killed run goes on where it stopped. All epochs of the paper, ``--epochs 4000``, are a task for a GPU.
+interrupted run resumes. All epochs of the paper, ``--epochs 4000``, are a task for a GPU.
 """
 
 from __future__ import annotations

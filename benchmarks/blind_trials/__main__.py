@@ -4,7 +4,7 @@
     python -m benchmarks.blind_trials --out runs/development --seed 0 --only 0,1,2
 
 Draws what the fab hides over all of its knobs, gives the loop scans and layouts only, and judges its answers.
-A killed run goes on where it stopped. Writes scoreboard.json, scoreboard.csv and report.html; --publish also
+An interrupted run resumes. Writes scoreboard.json, scoreboard.csv and report.html; --publish also
 puts them into the documentation.
 """
 

@@ -17,7 +17,7 @@ from litho_models.loop.prepared import prepare_scans
 from litho_models.loop.result.record import CloseLoop
 from litho_models.loop.study import DATUM_FREE, names_to_terms, score
 
-# What no model can foretell: an offset drawn anew for every line is estimated from the other half of the
+# What no model can predict: an offset drawn anew for every line is estimated from the other half of the
 # pixels, as the loop does it; rounding cannot be undone, and scars lie where chance put them. The few
 # values that other knobs draw per scan could be estimated almost exactly, so the true model knows them.
 _UNFORESEEABLE = {"scan-line-stripes", "quantisation", "scars-and-spikes"}

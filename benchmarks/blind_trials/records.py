@@ -70,7 +70,7 @@ class Planted(Record):
 
 
 class Named(Record):
-    """One effect that the loop added outside the nuisance span, with those it cannot be told from."""
+    """One effect that the loop added outside the nuisance span, and those that look the same."""
 
     names: list[str]
     verdict: Literal["explained", "confusable", "traced-to-covariate"]

@@ -1,4 +1,4 @@
-"""How well the scans pin the fitted numbers down: which of them move together, and how far each may go."""
+"""How well the scans determine the fitted numbers: which of them move together, and how far each may go."""
 
 from __future__ import annotations
 

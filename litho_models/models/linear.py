@@ -1,4 +1,4 @@
-"""Linear in features: blurs, their powers and slopes. Stiff, closed form, a strong reference."""
+"""Linear in features: blurs, their powers and slopes. Few parameters, closed form, a strong reference."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Figures of merit: of one scan, over scans, between models."""
+"""Errors and metrics: of one scan, over scans, between models."""

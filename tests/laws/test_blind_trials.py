@@ -124,7 +124,7 @@ def test_a_knob_that_cannot_reach_the_size_stands_at_its_limit_and_says_what_it_
 
 
 def loop_result(*sets: tuple[str, ...], verdict: str = "traced") -> CloseLoop:
-    """What the loop would write had it added these effects, each with those it cannot be told from."""
+    """What the loop would write had it added these effects, each with those that look the same."""
     return CloseLoop.model_construct(
         effects=[added(*names) for names in sets],
         candidates=[

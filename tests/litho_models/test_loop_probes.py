@@ -14,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 
 from litho_models.loop.fold_fits import FoldFits
 from litho_models.loop.prepared import PreparedScan, prepare_scans
-from litho_models.loop.probes import Probed, figures, probe_residual
+from litho_models.loop.probes import Probed, probe_residual, with_intervals
 from litho_models.loop.probes.defects import find_defects
 from litho_models.loop.probes.kernel import off_centre_peak, resampled
 from litho_models.loop.probes.places import drawn, drawn_profile
@@ -97,7 +97,7 @@ def test_a_response_displaced_from_the_layout_comes_back_in_place_and_size() -> 
     found = probed(*scene(lambda f: 0.03 * np.roll(f.stored.layout_um, (8, -6), (0, 1))))
     assert found.added[0].probe.name == "missing-kernel"
     entry = found.added[0]
-    values = {name: value for name, (value, _, _) in figures(entry.probe, entry.estimate).items()}
+    values = {name: value for name, (value, _, _) in with_intervals(entry.probe, entry.estimate).items()}
     # EFFECTS asks for 1 px = 0.1 µm in place; the peak is read on a grid of 0.05 µm.
     assert values["peak_y"] == pytest.approx(0.8, abs=0.1)
     assert values["peak_x"] == pytest.approx(-0.6, abs=0.1)
@@ -116,7 +116,7 @@ def test_a_wrong_level_comes_back_at_its_level() -> None:
     scans, predictions = scene(one_level)
     found = probed(scans, predictions)
     entry = next(e for e in found.added if e.probe.name == "level-table")
-    values = figures(entry.probe, entry.estimate)
+    values = with_intervals(entry.probe, entry.estimate)
     heights = np.array([value for value, _, _ in values.values()])
     levels = [int(name.removeprefix("level_")) for name in values]
     own = heights[levels.index(6)] - (heights[levels.index(5)] + heights[levels.index(7)]) / 2
@@ -142,7 +142,7 @@ def test_what_grows_with_the_slope_along_one_axis_comes_back_as_a_table_of_that_
     found = probed(*scene(lambda f: -0.04 * along_x[f.id]))
     entry = found.added[0]
     assert entry.probe.name == "axis-slope-table"
-    values = figures(entry.probe, entry.estimate)
+    values = with_intervals(entry.probe, entry.estimate)
     rise_nm = {}
     for axis in ("y", "x"):
         table = {name: value for name, (value, _, _) in values.items() if name.startswith(f"along_{axis}_")}
@@ -164,7 +164,7 @@ def test_what_grows_with_the_slope_comes_back_as_a_table_over_the_slope() -> Non
     found = probed(*scene(lambda f: 0.02 * steepness[f.id]))
     entry = found.added[0]
     assert entry.probe.name == "slope-table"
-    values = figures(entry.probe, entry.estimate)
+    values = with_intervals(entry.probe, entry.estimate)
     slopes = np.array([float(name.removeprefix("slope_")) for name in values])
     heights = np.array([value for value, _, _ in values.values()])
     # Each scan's offset is free, so the table is known but for a constant; its rise is 20 nm.

@@ -31,7 +31,7 @@ class LinearProbe:
         columns_of: (scan, prediction (y, x) µm) -> maps (m, y, x).
         penalty: (m, m), what a ridge fit keeps small.
         shuffle: (generator, m) -> order of the columns of one scan under the probe's control.
-        summary: coefficients -> figures for people, name to (value, unit).
+        summary: coefficients -> numbers for people, name to (value, unit).
         grams, rights: (scans, m, m) and (scans, m), freed of per-scan terms, µm².
         pixels: (scans,).
     """

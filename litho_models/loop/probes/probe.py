@@ -26,8 +26,8 @@ class Estimate:
         return float(self.gains_nm2.mean())
 
 
-def figures(probe: Probe, estimate: Estimate) -> dict[str, tuple[float, str, tuple[float, float]]]:
-    """The probe's figures, name to (value, unit, 95 % interval from the jackknife over folds)."""
+def with_intervals(probe: Probe, estimate: Estimate) -> dict[str, tuple[float, str, tuple[float, float]]]:
+    """The probe's numbers, name to (value, unit, 95 % interval from the jackknife over folds)."""
     from scipy.stats import t
 
     folds = [probe.summary(one) for one in estimate.per_fold]
@@ -58,7 +58,7 @@ class Probe(Protocol):
         """Correlation of what two disjoint halves of the scans ask for."""
 
     def summary(self, parameters: np.ndarray) -> dict[str, tuple[float, str]]:
-        """Figures for people: name to (value, unit)."""
+        """Numbers for people: name to (value, unit)."""
 
     def correction(self, parameters: np.ndarray, scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
         """Height to add (y, x), µm, to a prediction (y, x), µm."""

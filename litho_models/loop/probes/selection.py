@@ -157,7 +157,7 @@ def _best(
         )
         reasons = [confirmation.reason] if confirmation.reason else []
         if gain <= limit:
-            reasons.append("no more gain than its control")
+            reasons.append("gains no more than its control")
         if agreement < SMALLEST_AGREEMENT:
             reasons.append(f"two halves of the scans agree by {agreement:.2f} only")
         tests[probe.name] = ProbeTest(probe.name, gain, limit, agreement, "; ".join(reasons))

@@ -1,4 +1,4 @@
-"""The figures of the loop's report."""
+"""The plots of the loop's report."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from litho_data.foundation.report import new_figure
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.findings import LoopFindings
 from litho_models.loop.identifiability import Profile
-from litho_models.loop.probes import AddedProbe, figures
+from litho_models.loop.probes import AddedProbe, with_intervals
 from litho_models.loop.probes.kernel import MissingKernel
 from litho_models.loop.probes.places import drawn, drawn_profile
 from litho_models.loop.result.record import CloseLoop
@@ -119,7 +119,7 @@ def probe_figure(entry: AddedProbe) -> Figure:
 
 
 def _table_figure(entry: AddedProbe) -> Figure:
-    found = figures(entry.probe, entry.estimate)
+    found = with_intervals(entry.probe, entry.estimate)
     values = pd.DataFrame(
         [(*name.rpartition("_")[::2], value, *interval) for name, (value, _, interval) in found.items()],
         columns=["covariate", "place", "height", "low", "high"],

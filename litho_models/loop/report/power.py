@@ -1,4 +1,4 @@
-"""Report sections on what the scans could tell: how well they pin the fit down, what they would show."""
+"""Report sections on what the scans can decide: how well they determine the fit, what they would reveal."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ def identifiability_section(page: Page, findings: LoopFindings) -> None:
     found = findings.identifiability
     if found is None:
         return
-    page.heading("How well these scans pin the fit down")
+    page.heading("How well these scans determine the fit")
     weakest = ", ".join(f"{part:+.2f} {name}" for name, part in found.weakest.items())
     idle = ", ".join(found.without_slope)
     bounds = f" At a bound, or without influence: {idle}." if idle else ""

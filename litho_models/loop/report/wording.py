@@ -28,7 +28,7 @@ def plain_words(findings: LoopFindings, result: CloseLoop) -> str:
             f"The microscope accounts for: {', '.join(microscope)}. This says nothing about the printer."
         )
     if written:
-        parts.append(f"Every print adds anew, so that no model can foretell it: {', '.join(written)}.")
+        parts.append(f"Different in every print, so no model can predict it: {', '.join(written)}.")
     for e in causes:
         alike = f" (or {', '.join(e.confusable_with)}: these data cannot tell)" if e.confusable_with else ""
         parts.append(

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from litho_models.effects import Effect
 from litho_models.loop.findings import LoopFindings
 from litho_models.loop.parameters import effect_slots
-from litho_models.loop.probes import AddedProbe, figures
+from litho_models.loop.probes import AddedProbe, with_intervals
 from litho_models.loop.result.record import AddedEffect, EffectVerdict, ParameterEstimate
 from litho_models.loop.selection.contest import Added
 from litho_models.loop.selection.search import separating_experiment
@@ -122,7 +122,7 @@ def _added_probe(entry: AddedProbe) -> AddedEffect:
         prior_hypothesis=False,
         parameters={
             name: ParameterEstimate(value=value, unit=unit, ci95=interval)
-            for name, (value, unit, interval) in figures(entry.probe, entry.estimate).items()
+            for name, (value, unit, interval) in with_intervals(entry.probe, entry.estimate).items()
         },
         metric="mae_datum_free",
         before_nm=entry.before.mean_mae_nm,

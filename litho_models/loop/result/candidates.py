@@ -73,7 +73,7 @@ def _measurement_candidate(findings: LoopFindings, test: MeasurementTest, added:
     too_few = len(findings.development) < FEWEST_SCANS
     reason = test.evidence if added else f"{test.evidence}; {test.confirmation.reason}"
     verdict: CandidateVerdict = "not-testable" if too_few else "below-noise"
-    if added or test.confirmation.reason.startswith("cannot be told"):
+    if added or test.confirmation.reason.startswith("cannot be distinguished"):
         verdict = "confusable" if test.confusable_with else "explained"
     return Candidate(
         name=test.effect.name,
@@ -105,7 +105,7 @@ def _process_candidate(
         verdict, reason = "absorbed", search.absorbed[name]
     elif name in sets:
         verdict = "confusable"
-        reason = f"cannot be told from {sets[name].effect.name}, which was added"
+        reason = f"cannot be distinguished from {sets[name].effect.name}, which was added"
     elif screened is None:
         verdict, reason = "not-testable", "not screened"
     elif len(findings.development) < FEWEST_SCANS:
@@ -130,7 +130,7 @@ def _why_not(findings: LoopFindings, name: str, screened: Screened) -> str:
     if name in search.failures and screened.p <= FAMILY_P:
         return f"stands out, but is not confirmed: {search.failures[name]}"
     if screened.p <= FAMILY_P:
-        return "stands out, but others gained more and none further was confirmed"
+        return "stands out, but others gained more and none of the rest was confirmed"
     if first.p <= FAMILY_P and search.added:
         return f"stood out at first, gone once {search.added[0].effect.name} was added; {detectable}"
     return f"no evidence (z = {screened.z:.1f}); {detectable}"

@@ -73,7 +73,7 @@ def confirm(
     elif p > BINOMIAL_P:
         failures.append(f"better in only {better} of {count} held-out scans (p = {p:.3f})")
     if low <= 0:
-        failures.append("the interval of the held-out gain includes none")
+        failures.append("the interval of the held-out gain includes zero")
     if share < SMALLEST_SHARE and rmse_gain < SMALLEST_RMSE_NM:
         failures.append(f"gain of {100 * share:.2f} % and {rmse_gain:.2f} nm is too small to matter")
     if amplitudes:

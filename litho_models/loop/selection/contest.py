@@ -1,6 +1,6 @@
 """Candidates that promise much are fitted side by side: which the scans agree on, and what equals it.
 
-A score test at the null foretells the gain of a small effect. Of a large one it is a guess, and a
+A score test at the null predicts the gain of a small effect. For a large one it is a guess, and a
 candidate that merely comes near may promise more than the true one delivers. So all that promise
 a good part of the best gain are fitted in full before one is chosen.
 """
@@ -172,7 +172,7 @@ def _fitted(state: State, entering: Sequence[Screened], study: Study) -> list[En
 def _confusable_unfitted(
     winner: Screened, relatives: Sequence[Screened], directions: Directions
 ) -> list[str]:
-    """What cannot be told from the winner without having been fitted itself."""
+    """What cannot be distinguished from the winner without having been fitted itself."""
     alike = [s.effect.name for s in relatives if abs(cosine(directions, winner, s)) >= SAME_COSINE]
     # The same tilt and bow in all scans: printed so, or measured so.
     return [*alike, "tilt-bow"] if winner.projection == "no-bow" else alike

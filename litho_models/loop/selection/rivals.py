@@ -50,7 +50,7 @@ def generic_rival(before: State, after: State, study: Study) -> str | None:
 
 
 def remainder_of(named: tuple[State, State], before: State, after: State, study: Study) -> str:
-    """Why a further effect may be no more than the error in the form of one named before; empty if not.
+    """Why a further effect may only correct the formula of one named before; empty if not.
 
     Another shape: the change by the first effect scaled, squared, growing with the height, blurred,
     displaced. If these do half of what the further effect does and leave it no more than half of its
@@ -73,8 +73,8 @@ def remainder_of(named: tuple[State, State], before: State, after: State, study:
     both = np.arange(len(gram) - 1)
     alone, reshaped, together = (_gain_of(gram, columns) for columns in (both[-1:], both[:-1], both))
     if reshaped >= _REMAINDER * alone and together - reshaped <= _REMAINDER * alone:
-        return "does what {} does in another shape: may be the error of its form"
-    return "more is missing in the form of {} than this would gain" if reshaped >= alone else ""
+        return "repeats {} in another shape: may only correct its formula"
+    return "correcting the formula of {} would gain more" if reshaped >= alone else ""
 
 
 def _reshaped(change: np.ndarray, prediction: np.ndarray, pitch_um: float) -> list[np.ndarray]:

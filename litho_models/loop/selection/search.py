@@ -24,7 +24,7 @@ class Search:
     ``steps``: effect to the model without and with it, when it was added.
     ``first``, ``last``: first and latest screening of every candidate.
     ``failures``: effect to why it was not confirmed.
-    ``dropped``: added and not needed later; ``absorbed``: only the stiff model lacks it.
+    ``dropped``: added and not needed later; ``absorbed``: only the small model lacks it.
     """
 
     state: State
@@ -98,14 +98,14 @@ def search_effects(start: State, study: Study, terms: Terms, *, exclude: Mapping
 
 
 def rejection_reason(winner: tuple[Added, State], before: State, found: Search, study: Study) -> str:
-    """Why a winner gets no name: a generic term, or the error in an earlier one's form, does as much."""
+    """Why a winner gets no name: a generic term, or a correction of an earlier formula, does as much."""
     added, state = winner
     for earlier in found.added:
         name = earlier.effect.name
         if name not in before.fits.chain.names:
             continue
         if added.gain_nm2 < FORM_ERROR**2 * earlier.gain_nm2:
-            return f"small beside {name}, whose form no catalogue knows to {100 * FORM_ERROR:.0f} %"
+            return f"small beside {name}, whose formula may be wrong by {100 * FORM_ERROR:.0f} %"
         if reason := remainder_of(found.steps[name], before, state, study):
             return reason.format(name)
     rival = generic_rival(before, state, study)

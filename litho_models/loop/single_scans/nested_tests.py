@@ -143,7 +143,9 @@ def _test_lines(
         if beaten_p <= BINOMIAL_P:
             reasons.append(f"the lines follow {_frame(other)} more closely (p = {beaten_p:.4f}): {other}")
         elif alike and at:
-            reasons.append(f"cannot be told from {other}: no scan is turned enough against its layout")
+            reasons.append(
+                f"cannot be distinguished from {other}: no scan is turned enough against its layout"
+            )
         reason = "; ".join(part for part in reasons if part)
         variance = np.maximum(gains[name], 0) / NM_PER_UM**2
         interval = bootstrap_interval(variance.tolist(), seed=study.seed)

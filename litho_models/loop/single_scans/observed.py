@@ -1,4 +1,4 @@
-"""Effects that are seen directly, in the raw files or as marks in a scan: no model foretells them.
+"""Effects that are seen directly, in the raw files or as marks in a scan: no model predicts them.
 
 They lower no held-out error, so they are not added to a model; they have a verdict and its evidence.
 """
@@ -57,7 +57,7 @@ def quantisation(rounding_um: Sequence[float]) -> Observed:
     noise_nm = float(np.sqrt(np.mean(steps_nm**2) / 12))
     rounded = int((steps_nm > 0).sum())
     if not rounded:
-        return Observed("quantisation", False, "the heights of the raw files are on no common step")
+        return Observed("quantisation", False, "the heights of the raw files share no common step")
     text = (
         f"the raw heights of {rounded} of {len(steps_nm)} scans are multiples of "
         f"{np.median(steps_nm[steps_nm > 0]):.3g} nm, which adds {noise_nm:.2g} nm rms"
