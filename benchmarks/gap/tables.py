@@ -35,13 +35,13 @@ _TITLES = {
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
-    """Every table with what it rests on, as the result file has it."""
+    """Every table of the result file, with the conditions that it was made under."""
     effort = record["plan"]["effort"]
     knobs = ", ".join(f"`{name}` {value:g}" for name, value in record["plan"]["print_knobs"].items())
     parts = [
-        f"The fab holds {knobs} (10 nm rms each); the models saw {effort['scans']} scans of its prints, "
-        f"{effort['scan_px']} px; the networks were trained for {effort['training_steps']:,} steps and "
-        f"searched through in {effort['search_precision']}; what is printed and judged is float32.\n\n"
+        f"Effects of the fab, 10 nm rms each: {knobs}. The models were trained on {effort['scans']} scans "
+        f"of its prints, {effort['scan_px']} px wide, the networks for {effort['training_steps']:,} steps. "
+        f"Searches ran in {effort['search_precision']}, prints and scores in float32.\n\n"
         + _model_table(record["models"])
     ]
     for name, task in record["tasks"].items():
@@ -51,8 +51,8 @@ def as_markdown(record: Mapping[str, Any]) -> str:
     minutes = sum(sum(task["minutes"].values()) for task in record["tasks"].values())
     designs = sum(len(task["seeds"]) * len(task["minutes"]) for task in record["tasks"].values())
     parts.append(
-        f"{designs} designs, {minutes / 60:.1f} hours of search by the clock, one thread each, other work "
-        "beside it; intervals: Student's, 95 %, over seeds."
+        f"{designs} designs took {minutes / 60:.1f} hours of search, one thread each, while the machine did "
+        "other work. Intervals are Student's, 95 %, over seeds."
     )
     return "\n\n".join(parts)
 
@@ -93,9 +93,9 @@ def _proof_part(proof: Mapping[str, Any]) -> str:
         for name in SHOWN["hoe"]
     )
     return (
-        f"### The paper's {proof['iterations']:,} iterations\n\n"
-        f"One hologram through {proof['designed_with']}, start {proof['start']}, "
-        f"in design → by fab: {figures}."
+        f"### {proof['iterations']:,} iterations\n\n"
+        f"One hologram with as many iterations as in the paper, otherwise with our search, through "
+        f"{proof['designed_with']}, start {proof['start']}, in design → by fab: {figures}."
     )
 
 
@@ -135,15 +135,15 @@ def _verdict(
                 # Better counts upwards, also where less of a figure is better.
                 turn = sign if item["arm"] == best else -sign
                 low, high = sorted(turn * end for end in item["ci95"])
-                open_ = "" if low * high > 0 else ", undecided"
+                open_ = "" if low * high > 0 else ", which includes 0"
                 interval = f"[{low:+.{digits}f}, {high:+.{digits}f}]"
-                against.append(f"{other} by {turn * item['mean']:+.{digits}f} {interval}{open_}")
-    return f"Printed by {judge}, {best} is best in {_LABELS[figure]}; it beats " + "; ".join(against) + "."
+                against.append(f"over {other} {turn * item['mean']:+.{digits}f} {interval}{open_}")
+    return f"Printed by {judge}, {best} is best in {_LABELS[figure]}. Its lead: " + "; ".join(against) + "."
 
 
 def _model_table(models: Mapping[str, Mapping[str, float]]) -> str:
     lines = [
-        "| model | error on unseen prints of the fab, zero free | tilt, bow and gain free |",
+        "| model | error on unseen prints of the fab, offset removed | tilt, bow and gain removed too |",
         "|---|---|---|",
     ]
     lines += [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 
@@ -10,10 +11,12 @@ import torch
 from typer.testing import CliRunner
 
 from benchmarks.gap.cost import estimate
+from benchmarks.gap.document import NAME, PAGE, RESULT_FILE, RESULTS
 from benchmarks.gap.jobs import Job, run_jobs
 from benchmarks.gap.plan import ARMS, PRINT_KNOBS, Effort, open_plan
 from benchmarks.gap.tables import as_markdown
 from benchmarks.gap.tasks import Task, chosen, tasks
+from benchmarks.record import published
 from litho_data.foundation.errors import InputError
 from litho_data.virtual_fab import KnobSetting, knob_rms_nm
 from litho_data.virtual_fab.settings import Printer
@@ -156,4 +159,9 @@ def test_the_tables_name_the_winner_and_what_is_undecided():
     assert "SI-PSNR, dB 15.500 → 14.500" in text
     assert "| none | 16.000 → 12.000 ± 0.100 |" in text
     assert "pbl is best" in text
-    assert "none by +2.000 [-0.500, +4.500], undecided" in text
+    assert "over none +2.000 [-0.500, +4.500], which includes 0" in text
+
+
+def test_the_page_quotes_the_committed_comparison():
+    record = json.loads((RESULTS / RESULT_FILE).read_text("utf-8"))
+    assert published(PAGE, NAME) == as_markdown(record)

@@ -1,0 +1,25 @@
+"""The Python on the page of this package runs as it stands there."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import litho_design
+from litho_design.tasks.design import Design
+
+PAGE = Path(__file__).parents[2] / "docs" / "optics.md"
+
+
+def test_the_python_of_the_page_runs_in_one_go(tmp_path, monkeypatch):
+    blocks = re.findall(r"^```python\n(.*?)^```", PAGE.read_text("utf-8"), re.MULTILINE | re.DOTALL)
+    assert len(blocks) > 1
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    for block in blocks:
+        exec(block, names)
+    assert (names["levels"] == names["design"].level.numpy()).all()
+    assert names["image"].shape == (128, 128)
+    assert isinstance(Design.read("designs/ring"), Design)
+    used = set(re.findall(r"litho_design\.(\w+)", "".join(blocks)))
+    assert used <= set(litho_design.__all__)
