@@ -16,6 +16,7 @@ from litho_models.cli.app import app
 from litho_models.evaluation.zoo_making import HELD_OUT, OUT_OF_FOLD, TRAINED_ON, differing_metrics, make_zoo
 from litho_models.frozen import zoo
 from litho_models.frozen.card import ModelCard
+from litho_models.frozen.readme import model_readme
 from litho_models.models import build_model
 from tests.litho_models.prints import make_scans, write_store
 
@@ -64,7 +65,7 @@ def test_every_shipped_model_works_and_says_where_it_comes_from(name):
     assert card.dataset is not None
     assert card.command.startswith("litho-models train")
     assert card.metrics
-    assert (zoo.folder(name) / "README.md").is_file()
+    assert (zoo.folder(name) / "README.md").read_text(encoding="utf-8") == model_readme(card)
 
 
 def test_the_shipped_zoo_stays_small():
