@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from litho_design.workflows.compare import compare as compare
     from litho_design.workflows.design import design_hologram as design_hologram
     from litho_design.workflows.design import design_lens as design_lens
+    from litho_design.workflows.first import first as first
     from litho_design.workflows.score import score as score
 
     __version__: str
@@ -30,6 +31,7 @@ else:
             "design_hologram": "litho_design.workflows.design",
             "design_lens": "litho_design.workflows.design",
             "export": "litho_design.exports.files",
+            "first": "litho_design.workflows.first",
             "hologram_settings": "litho_design.holograms.settings",
             "import_levels": "litho_design.exports.files",
             "lens_settings": "litho_design.lenses.settings",
@@ -48,6 +50,7 @@ __all__ = [
     "design_hologram",
     "design_lens",
     "export",
+    "first",
     "hologram_settings",
     "import_levels",
     "lens_settings",

@@ -77,8 +77,8 @@ def proof_jobs(out: Path, effort: Effort) -> list[Job]:
     folder, score_folder = proof_folders(out)
     design = design_command(
         "hoe", "--model", model(out, "pbl"), "--target", "text", "--size-px", effort.hoe_px,
-        "--distance-um", effort.hoe_distance_um, "--iterations", 1000, "--precision", effort.search_precision,
-        "--out", folder,
+        "--distance-um", effort.hoe_distance_um, "--iterations", 1000, "--start", "random",
+        "--precision", effort.search_precision, "--out", folder,
     )  # fmt: skip
     judge = ("--judge", f"fab={out / 'fab' / 'truth'}")
     score = design_command("score", folder, *judge, "--out", score_folder)

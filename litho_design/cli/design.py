@@ -1,4 +1,4 @@
-"""Commands `hoe`, `lens`, `compare`, `settings`: parse options, call one function, print the result."""
+"""Commands that design, and `settings`: parse options, call one function, print the result."""
 
 from __future__ import annotations
 
@@ -55,6 +55,23 @@ HeldOutObjects = Annotated[
         help="Computational lens: picture or folder of pictures that is only scored; may be repeated."
     ),
 ]
+
+
+def first(
+    out: Annotated[Path, typer.Option(help="Folder of the result.")] = Path("first"),
+    target: Target = "text",
+    device: Device = "cpu",
+) -> None:
+    """Design one small hologram with and without a printer's model, and show both printed: a minute."""
+    from litho_design.reports.first import DESIGNER, WITHOUT, psnr_db
+    from litho_design.workflows.first import first as make_first
+
+    scores = psnr_db(make_first(out, target=target, device=device))
+    print(
+        f"printed by {DESIGNER}: {scores[WITHOUT, DESIGNER]:.1f} dB designed without it, "
+        f"{scores[DESIGNER, DESIGNER]:.1f} dB designed with it"
+    )
+    print(out / "report.html")
 
 
 @takes_settings(HologramSettings())

@@ -9,7 +9,13 @@ from litho_data.foundation.results import Record
 from litho_data.foundation.settings import changed, setting
 from litho_design.holograms.loss import HologramLoss
 from litho_design.optics import Optics
-from litho_design.optimisation.settings import PAPER_SEARCH, DesignSettings, Variant, check_variant
+from litho_design.optimisation.settings import (
+    PAPER_SEARCH,
+    DesignSettings,
+    SearchSettings,
+    Variant,
+    check_variant,
+)
 from litho_design.printers.layout import LayoutSettings
 
 
@@ -26,6 +32,7 @@ class CameraView(Record):
 class HologramSettings(DesignSettings):
     """All settings of one hologram."""
 
+    search: SearchSettings = setting(SearchSettings(start="gs"), "Search")
     loss: HologramLoss = setting(HologramLoss(), "Loss")
     camera: CameraView = setting(CameraView(), "Camera of the score")
 
@@ -39,7 +46,8 @@ def hologram_settings(
     iterations at 0.1, expected levels). ``authors``: as in the published code (12 levels,
     temperature 1, wavelength 0.633 and index step 0.545; its efficiency term is constant and
     therefore left out; its truncated, half-pixel-shifted kernel is not reproduced). ``default``:
-    one height per cell with straight-through rounding, and a polish of the printable layout.
+    one height per cell with straight-through rounding from a Gerchberg-Saxton start, and a polish of
+    the printable layout.
 
     Args:
         variant: the preset; ``variant`` among the changes replaces it.

@@ -14,7 +14,7 @@ from litho_design.holograms.bench import HologramBench, HologramScore
 from litho_design.holograms.loss import hologram_loss
 from litho_design.holograms.settings import HologramSettings
 from litho_design.images.similarity import SSIM_WINDOW_PX, si_psnr_db
-from litho_design.images.targets import Target
+from litho_design.images.targets import Target, stroke_width_px
 from litho_design.optimisation.parameters import CellMap, Parametrisation
 from litho_design.optimisation.phases import gerchberg_saxton, printed_phase
 from litho_design.optimisation.process_window import Draw, check_draws, draws
@@ -56,6 +56,7 @@ class HologramTask:
         self.settings, self.printer, self.target_record = settings, printer, record
         self.printers = [printer, *ensemble]
         self.notes = [f"target {record.adaptation}"] if record.adaptation else []
+        self.notes += _too_fine(target.pixels, settings)
         self.cells = CellMap(settings.layout).to(device)
         self.bench = HologramBench(settings.layout, settings.optics).to(device)
         check_draws(settings.window, settings.optics, self.bench.grid, self.bench.grid)
@@ -137,6 +138,22 @@ class HologramTask:
         )
         share = self.bench(self.cells(phase) * (self.settings.optics.wave_height_um / (2 * math.pi)))
         return float(share[self.target > 0.5].sum())
+
+
+def _too_fine(target: np.ndarray, settings: HologramSettings) -> list[str]:
+    """A note where diffraction blurs the strokes of the target, whatever the layout is."""
+    layout, optics = settings.layout, settings.optics
+    stroke_um = stroke_width_px(target) * layout.pitch_um
+    finest_um = optics.wavelength_um * optics.distance_um / layout.size_um
+    if stroke_um >= finest_um:
+        return []
+    near_um = stroke_um / finest_um * optics.distance_um
+    return [
+        f"strokes of the target are about {stroke_um:.2g} µm wide, narrower than λz/D = {finest_um:.2g} µm, "
+        f"the finest detail that an element of {layout.size_um:.4g} µm draws at {optics.distance_um:g} µm: "
+        f"the image will be blurred; take --distance-um {near_um:.2g} or less, a larger --size-px, or "
+        "bolder strokes"
+    ]
 
 
 def _check_target(target: np.ndarray, layout: LayoutSettings) -> None:

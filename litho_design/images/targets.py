@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -70,6 +71,17 @@ def load_target(source: str | Path | np.ndarray | Target, size_px: int) -> Targe
 
 def _record(name: str, pixels: np.ndarray) -> TargetRecord:
     return TargetRecord(name=name, sha256=array_sha256(pixels, "1", ("y", "x")))
+
+
+def stroke_width_px(pixels: np.ndarray) -> float:
+    """Width of the strokes of a target (size, size) in [0, 1]: the median along their middle lines."""
+    import cv2
+
+    # At twice the size even widths, too, have a middle pixel; its distance to the dark is the width.
+    bright = (pixels > 0.5).astype(np.uint8).repeat(2, 0).repeat(2, 1)
+    distance = cv2.distanceTransform(bright, cv2.DIST_L2, 5)
+    middle = (distance > 0) & (distance >= cv2.dilate(distance, np.ones((3, 3))))
+    return float(np.median(distance[middle])) if middle.any() else math.inf
 
 
 def draw_target(name: str, size_px: int) -> np.ndarray:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -120,7 +120,7 @@ def run_design(
     hashes_before = [printer.weights_sha256() for printer in task.printers]
     target = task.target_record.model_dump(mode="json") if task.target_record else None
     fingerprint = record_sha256([task.name, settings.model_dump(mode="json"), hashes_before, target])
-    finished = _finished(folder, fingerprint)
+    finished = _finished(folder, fingerprint, settings)
     if finished is not None:
         return finished
     with writable(folder):
@@ -198,18 +198,29 @@ def _check_printers(printers: Sequence[Printer]) -> None:
             )
 
 
-def _finished(folder: Path, fingerprint: str) -> Design | None:
+def _finished(folder: Path, fingerprint: str, settings: DesignSettings) -> Design | None:
     if not (folder / Design.FILE_NAME).exists():
         return None
     design = Design.read(folder)
     if design.fingerprint != fingerprint:
         raise InputError(
             f"folder {folder}",
-            got="a design with other settings",
-            wanted="an empty folder",
+            got=f"a finished design with {_difference(design.settings, settings.model_dump(mode='json'))}",
+            wanted="the same settings, target and model",
             hint="choose another --out",
         )
     return design
+
+
+def _difference(then: Any, now: Any, path: str = "") -> str:
+    """The first setting in which two dumps differ, in words."""
+    for name in now:
+        if then.get(name) == now[name]:
+            continue
+        if isinstance(then.get(name), dict):
+            return _difference(then[name], now[name], f"{path}{name}.")
+        return f"{path}{name} = {then.get(name)!r} where now {now[name]!r} is asked"
+    return "another target or model"
 
 
 def _optimise(

@@ -32,6 +32,8 @@ from litho_design.tasks.design import Design
 from litho_design.workflows.design import design_hologram, run_lens
 
 Settings = HologramSettings | LensSettings
+# Writes what people read into the folder of a comparison.
+GapReport = Callable[[Path, GapResult, Mapping[str, Printer]], object]
 Models = Mapping[str, str | Path | Printer] | Iterable[str | Printer]
 
 
@@ -48,6 +50,7 @@ def compare(
     device: Device = "cpu",
     extrapolate: bool = False,
     announce: bool = True,
+    report: GapReport = write_gap_report,
 ) -> GapResult:
     """Design once per arm and seed with equal budgets, and print each layout with every judge.
 
@@ -64,6 +67,7 @@ def compare(
         objects, held_out_objects: as for ``design_lens``.
         seeds: one design per arm and seed.
         device, extrapolate, announce: as for ``design_hologram``.
+        report: writes the report; the designs are in the folder then.
 
     Returns:
         The record written to ``out/gap.json``.
@@ -115,7 +119,7 @@ def compare(
         summary=summarise(entries),
         paired=paired_differences(entries, HEADLINE[design.task]),
     )
-    write_gap_report(folder, result, everyone)
+    report(folder, result, everyone)
     result.write(folder)
     return result
 

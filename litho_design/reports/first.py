@@ -1,0 +1,116 @@
+"""The page of a first result: the wanted image, and both designs as they would be printed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from litho_data.foundation.report import Page, new_figure
+from litho_design.judging.gap import GapResult, design_folder
+from litho_design.judging.loaded import LoadedDesign
+from litho_design.printers.printer import Printer
+from litho_design.reports.parts import BRIGHTEST
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# The design for a perfect printer, the model that the other was made through, and a further judge.
+WITHOUT, DESIGNER, JUDGE = "none", "pbl", "physics"
+_NAMES = {WITHOUT: "designed without the model", DESIGNER: "designed with the model"}
+
+
+def write_first_report(folder: Path, result: GapResult, printers: Mapping[str, Printer]) -> Path:
+    """Write ``report.html`` and its table."""
+    import pandas as pd
+
+    designs = {
+        arm: LoadedDesign(design_folder(folder, arm, result.seeds[0]), device=printers[arm].device)
+        for arm in _NAMES
+    }
+    scores = psnr_db(result)
+    page = Page(
+        "The same hologram, designed without and with a model of the printer",
+        "A printer blurs and shrinks what it prints. A layout made for a perfect printer suffers from "
+        "that; a layout made through the model of the printer has already taken it into account.",
+    )
+    page.tiles(
+        [
+            (f"{scores[arm, DESIGNER]:.1f} dB", f"{name}, as it would be printed")
+            for arm, name in _NAMES.items()
+        ]
+    )
+    for note in designs[WITHOUT].record.notes:
+        page.note(note[0].upper() + note[1:] + ".")
+    page.figure(
+        draw_images(designs, printers[DESIGNER], scores),
+        "Left: the wanted image. Middle and right: what the printed holograms would show, at matched scale.",
+    )
+    page.paragraph(
+        "dB is the scale-invariant peak signal-to-noise ratio of the image: higher is better. The prints "
+        f"are those that the model {DESIGNER} predicts. One of the layouts was designed through this very "
+        f"model, so its figure is an expectation and no measurement. In the prints of {JUDGE}, a model "
+        f"through which neither was designed, the images have {scores[WITHOUT, JUDGE]:.1f} dB without and "
+        f"{scores[DESIGNER, JUDGE]:.1f} dB with the model."
+    )
+    page.heading("Layouts and prints")
+    page.figure(
+        _draw_prints(designs, printers[DESIGNER]),
+        f"Layouts at their nominal heights, and what the model {DESIGNER} prints of them; all on one scale.",
+    )
+    page.heading("In numbers")
+    rows = [
+        {"hologram": name} | {f"printed by {judge}, dB": scores[arm, judge] for judge in printers}
+        for arm, name in _NAMES.items()
+    ]
+    page.table(
+        pd.DataFrame(rows), "none: a perfect printer, which prints every level at its height", "scores.csv"
+    )
+    places = {arm: design_folder(Path(), arm, result.seeds[0]) / "report.html" for arm in _NAMES}
+    page.links([(places[arm].as_posix(), f"Report of the hologram {name}") for arm, name in _NAMES.items()])
+    page.code(result.command)
+    return page.write(folder)
+
+
+def psnr_db(result: GapResult) -> dict[tuple[str, str], float]:
+    """Scale-invariant PSNR by arm and judge, dB."""
+    return {(entry.arm, entry.judge): entry.judged["si_psnr_db"] for entry in result.entries}
+
+
+def draw_images(
+    designs: Mapping[str, LoadedDesign], printer: Printer, scores: Mapping[tuple[str, str], float]
+) -> Figure:
+    """The wanted image, and the images of the designs as ``printer`` prints them."""
+    first = next(iter(designs.values()))
+    assert first.target is not None
+    pictures = {"wanted": first.target.cpu().numpy()}
+    for arm, design in designs.items():
+        title = f"{_NAMES[arm]}: {scores[arm, DESIGNER]:.1f} dB"
+        pictures[title] = design.display(design.image(design.printed_um(printer)))
+    figure = new_figure(10.5, 3.8)
+    for axis, (title, picture) in zip(figure.subplots(1, len(pictures)), pictures.items(), strict=True):
+        axis.imshow(picture, cmap="inferno", vmin=0, vmax=BRIGHTEST)
+        axis.set_title(title, fontsize=11)
+        axis.set_axis_off()
+    return figure
+
+
+def _draw_prints(designs: Mapping[str, LoadedDesign], printer: Printer) -> Figure:
+    layout = next(iter(designs.values())).record.layout
+    highest_um = (layout.levels - 1) * layout.level_height_um
+    figure = new_figure(8.6, 7.4)
+    axes = figure.subplots(len(designs), 2)
+    for (arm, design), row in zip(designs.items(), axes, strict=True):
+        maps = {
+            "layout": design.level * layout.level_height_um,
+            f"its print, predicted by {printer.name}": design.printed_um(printer),
+        }
+        for axis, (title, height_um) in zip(row, maps.items(), strict=True):
+            extent = (0, layout.size_um, layout.size_um, 0)
+            shown = axis.imshow(height_um.cpu().numpy(), vmin=0, vmax=highest_um, extent=extent)
+            axis.set_title(title, fontsize=9)
+        row[0].set_ylabel(f"{_NAMES[arm]}\ny, µm")
+    for axis in axes[-1]:
+        axis.set_xlabel("x, µm")
+    figure.colorbar(shown, ax=axes.ravel().tolist(), label="height, µm", shrink=0.8)
+    return figure

@@ -1,0 +1,71 @@
+"""The first result: both designs judged alike, and a word where diffraction blurs the target."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from litho_data.foundation.errors import InputError
+from litho_design import design_hologram, first, hologram_settings, load_target
+from litho_design.images.targets import stroke_width_px
+from litho_design.workflows.first import _SMALL
+
+TINY = {"layout.size_px": 64, "optics.distance_um": 12, "search.iterations": 2, "search.polish_rounds": 0}
+
+
+def test_both_designs_are_printed_by_the_same_model_and_shown_on_one_page(tmp_path):
+    result = first(tmp_path, target="ring", settings=hologram_settings(changes=TINY), announce=False)
+    assert {(entry.arm, entry.judge) for entry in result.entries} == {
+        (arm, judge) for arm in ("none", "pbl") for judge in ("none", "pbl", "physics")
+    }
+    page = (tmp_path / "report.html").read_text("utf-8")
+    for entry in result.entries:
+        if entry.judge == "pbl":
+            assert f"{entry.judged['si_psnr_db']:.1f} dB" in page
+    assert page.count("<img") == 2
+    for arm in ("none", "pbl"):
+        place = f"designs/{arm}/seed0/report.html"
+        assert f'href="{place}"' in page
+        assert (tmp_path / place).exists()
+
+
+@pytest.mark.parametrize("width", [1, 2, 3, 6, 9])
+def test_the_width_of_strokes_is_found(width):
+    target = np.zeros((64, 64), np.float32)
+    target[20 : 20 + width, 4:60] = target[40 : 40 + width, 4:60] = 1
+    assert stroke_width_px(target) == width
+
+
+def test_the_first_hologram_can_be_resolved_and_a_far_one_is_announced(tmp_path, capsys):
+    """Strokes against wavelength x distance / side: the first result must not be a picture of failure."""
+    settings = hologram_settings(changes=_SMALL)
+    finest_um = settings.optics.wavelength_um * settings.optics.distance_um / settings.layout.size_um
+    assert stroke_width_px(load_target("text", settings.layout.size_px).pixels) * 0.1 > 1.2 * finest_um
+    square = np.pad(np.ones((12, 12), np.float32), 26)
+    near = hologram_settings(changes=TINY)
+    assert not design_hologram(square, "none", tmp_path / "near", settings=near).notes
+    capsys.readouterr()
+    far = hologram_settings(changes=TINY | {"optics.distance_um": 40})
+    design = design_hologram(square, "none", tmp_path / "far", settings=far)
+    # 0.6328 µm x 40 µm / 6.4 µm = 3.955 µm, against a square of 1.2 µm.
+    said = capsys.readouterr().err.splitlines()[0]
+    assert "about 1.2 µm wide, narrower than λz/D = 4 µm" in said
+    assert "--distance-um 12 or less" in said
+    assert said == design.notes[0]
+    assert "narrower than λz/D" in (tmp_path / "far" / "report.html").read_text("utf-8")
+
+
+def test_holograms_start_from_gerchberg_saxton_except_as_published():
+    starts = [hologram_settings(variant).search.start for variant in ("default", "paper", "authors")]
+    assert starts == ["gs", "random", "random"]
+
+
+def test_a_folder_of_another_design_says_what_differs(tmp_path):
+    made = hologram_settings(changes=TINY | {"search.start": "random"})
+    design_hologram("ring", "none", tmp_path, settings=made, announce=False)
+    again = design_hologram("ring", "none", tmp_path, settings=made, announce=False)
+    assert again.settings == made.model_dump(mode="json")
+    with pytest.raises(InputError, match=r"search\.start = 'random' where now 'gs' is asked"):
+        design_hologram("ring", "none", tmp_path, settings=hologram_settings(changes=TINY), announce=False)
+    with pytest.raises(InputError, match="another target or model"):
+        design_hologram("chart", "none", tmp_path, settings=made, announce=False)
