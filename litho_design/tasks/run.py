@@ -205,7 +205,7 @@ def _finished(folder: Path, fingerprint: str, settings: DesignSettings) -> Desig
     if design.fingerprint != fingerprint:
         raise InputError(
             f"folder {folder}",
-            got=f"a finished design with {_difference(design.settings, settings.model_dump(mode='json'))}",
+            got=f"a design with {_difference(design.settings, settings.model_dump(mode='json'))}",
             wanted="the same settings, target and model",
             hint="choose another --out",
         )
@@ -215,11 +215,12 @@ def _finished(folder: Path, fingerprint: str, settings: DesignSettings) -> Desig
 def _difference(then: Any, now: Any, path: str = "") -> str:
     """The first setting in which two dumps differ, in words."""
     for name in now:
-        if then.get(name) == now[name]:
-            continue
-        if isinstance(then.get(name), dict):
-            return _difference(then[name], now[name], f"{path}{name}.")
-        return f"{path}{name} = {then.get(name)!r} where now {now[name]!r} is asked"
+        before, after = then.get(name), now[name]
+        if isinstance(before, dict) and before != after:
+            return _difference(before, after, f"{path}{name}.")
+        if before != after:
+            values = "" if isinstance(after, list) else f" = {before!r} where now {after!r} is asked"
+            return f"other settings, {path}{name}{values}"
     return "another target or model"
 
 
