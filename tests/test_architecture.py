@@ -18,8 +18,8 @@ ALLOWED = {
     "litho_models": {"litho_data", "litho_models"},
     "litho_design": {"litho_data", "litho_models", "litho_design"},
 }
-# What design may use of the models: what loads and calls a frozen one.
-FROZEN_ONLY = {"load_frozen", "frozen", "simulator"}
+# What design may use of the models: what finds and loads a frozen one.
+FROZEN_ONLY = {"load_frozen", "zoo"}
 # Rooms from the ground up: a room imports from those before it only. `simulator` is a module.
 ROOMS = {
     "litho_data": (

@@ -32,13 +32,11 @@ class ProcessWindow(Record):
     printer. The fields of one measured data set vary by 13 % in gain, including the scale of the microscope.
     """
 
-    gain_sd: float = setting(
-        0.03, "Spread of the gain of a print, relative to its height", option="--gain-sd", ge=0
-    )
+    gain_sd: float = setting(0.03, "Spread of the gain of a print, relative", option="--gain-sd", ge=0)
     offset_sd_um: float = setting(0.02, "Spread of the offset of a print", unit="µm", ge=0)
     gain_offset_correlation: float = setting(0.0, "Correlation of gain and offset", ge=-1, le=1)
     blur_sd_um: float = setting(
-        0.05, "Spread of an additional blur of the print", unit="µm", option="--blur-sd-um", ge=0
+        0.05, "Spread of the additional blur of a print", unit="µm", option="--blur-sd-um", ge=0
     )
     defocus_sd_um: float = setting(3.0, "Spread of the distance", unit="µm", option="--defocus-sd-um", ge=0)
     wavelength_sd_um: float = setting(
@@ -62,8 +60,10 @@ class ProcessWindow(Record):
 
 def spreads(window: ProcessWindow) -> list[str]:
     """Every spread of a window with its value and unit, for reports."""
-    found = [leaf for leaf in leaves(window) if leaf.help.startswith("Spread of ")]
-    return [f"{leaf.help.removeprefix('Spread of ')} {leaf.value:g} {leaf.unit}".strip() for leaf in found]
+    found = [leaf for leaf in leaves(window) if leaf.help.startswith("Spread of the ")]
+    return [
+        f"{leaf.help.removeprefix('Spread of the ')} {leaf.value:g} {leaf.unit}".strip() for leaf in found
+    ]
 
 
 @dataclass(frozen=True)
@@ -94,6 +94,7 @@ def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = F
     """
     shared = window.gain_offset_correlation
     seed = [window.seed, _UNSEEN_STREAM] if unseen else window.seed
+    # Five numbers a draw: a further spread needs a stream of its own, or all older draws change.
     normal = np.random.default_rng(seed).standard_normal((count, 5)).tolist()
     return [
         Draw(

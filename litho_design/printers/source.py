@@ -79,8 +79,7 @@ def load_printers(
 
 
 def _load_simulator(source: str, device: Device, extrapolate: bool) -> Any:
-    from litho_models import load_frozen
-    from litho_models.frozen import zoo
+    from litho_models import load_frozen, zoo
 
     return load_frozen(zoo.model_folder(source, other="or none"), device=device, extrapolate=extrapolate)
 

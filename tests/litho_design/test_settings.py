@@ -160,7 +160,7 @@ def test_python_takes_the_same_changes():
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (("hoe", "--set", "loss.weight=0.2"), "got an unknown name, wanted one of loss.scale, loss.eff"),
+        (("hoe", "--set", "loss.weight=0.2"), "got an unknown name, wanted one of loss.scale"),
         (("hoe", "--set", "los.weight=0.2"), "wanted one of variant, layout, optics, search"),
         (("hoe", "--set", "loss=0.2"), "wanted one of loss.scale"),
         (("hoe", "--set", "layout.levels.top=2"), "layout.levels, which is a value"),
