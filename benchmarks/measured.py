@@ -9,6 +9,7 @@ What the pages quote is written here from the result files, and a test holds the
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import shutil
 from pathlib import Path
@@ -19,8 +20,10 @@ from benchmarks.measured_loop import locked_table, loop_table
 from benchmarks.measured_models import (
     benchmark_table,
     design_table,
+    equal_freedom_table,
     extrapolation_table,
     further_table,
+    headline_table,
     noise_table,
     paired_table,
     paper_table,
@@ -48,8 +51,8 @@ RESULTS = {
 }
 NAMES = ("benchmark", "paper split", "loop", "loop with PBL", "locked scans", "design")
 PAGES = {
-    ROOT / "README.md": NAMES,
-    FOLDER / "README.md": (*NAMES, "whole prints", "paired differences", "further figures"),
+    ROOT / "README.md": ("headline",),
+    FOLDER / "README.md": (*NAMES, "equal freedom", "whole prints", "paired differences", "further figures"),
     ROOT / "docs" / "noise.md": ("noise",),
 }
 
@@ -60,7 +63,11 @@ def texts(folder: Path) -> dict[str, str]:
     def found(file: str) -> dict[str, Any]:
         return json.loads((folder / file).read_text(encoding="utf-8"))
 
+    with open(folder / "close_loop_errors.csv", encoding="utf-8", newline="") as file:
+        errors = list(csv.DictReader(file))
     return {
+        "headline": headline_table(found("benchmark.json"), found("noise.json")),
+        "equal freedom": equal_freedom_table(errors),
         "benchmark": benchmark_table(found("benchmark.json"), found("noise.json")),
         "paper split": paper_table(
             [found(f"benchmark_paper_{seed}.json") for seed in PAPER_SEEDS], found("benchmark.json")
