@@ -66,8 +66,9 @@ def headline_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
         f"Mean absolute error over all valid pixels of {len(split['scored_ids'])} scans in {split['folds']} "
         "folds: each scan is predicted by models that were not trained on it, with the smooth background "
         "that their training scans share. k counts the terms fitted to each scan, on pixels other than those "
-        "scored. Intervals: 95 %, bootstrap over scans, which are not independent: they come from 6 prints. No model "
-        "can predict the noise; the first bound is too low, the second is of another band and levelling.",
+        "scored. Intervals: 95 %, bootstrap over scans, which are not independent: they come from 6 prints. "
+        "No model can predict the noise; the first bound is too low, the second is of another band and "
+        "levelling.",
     )
 
 
