@@ -53,11 +53,12 @@ def build_dataset(
         data_dir: folder of the raw files; by default the card's folder, ``$LITHO_DATA_DIR/<name>`` or the
             user cache, whichever has them.
         workers: local processes; ``dask``: address of a Dask scheduler instead. Both give the same result.
-        strict: refuse to build if any scan has to be skipped.
+        strict: refuse to build if any scan has to be skipped, or a scan or layout has no partner.
         seed: of the robust registration.
 
     Raises:
-        InputError: a bad card, no usable scan, a skipped scan under ``strict``, or ``out`` that is no store.
+        InputError: a bad card, no usable scan, a skipped or unpaired one under ``strict``, or ``out`` that
+            is no store.
     """
     listing = list_fields(card_path, data_dir)
     recipe = load_recipe(_recipe_path(listing))
@@ -131,7 +132,7 @@ def make_store(
                 _report_skipped(scan_id, reason)
                 del records[scan_id]
                 shutil.rmtree(partial.store / "scans" / scan_id)
-            _require_enough(records, skipped, strict, out)
+            _require_enough(records, {**skipped, **source.unpaired}, strict, out)
         except InputError:
             partial.discard()
             raise
@@ -198,12 +199,12 @@ def _report_skipped(scan_id: str, reason: str) -> None:
 
 
 def _require_enough(
-    records: Mapping[str, Mapping[str, Any]], skipped: Mapping[str, str], strict: bool, out: Path
+    records: Mapping[str, Mapping[str, Any]], left_out: Mapping[str, str], strict: bool, out: Path
 ) -> None:
-    shown = "; ".join(f"{scan_id}: {reason}" for scan_id, reason in sorted(skipped.items())[:2])
-    if strict and skipped:
+    shown = "; ".join(f"{scan_id}: {reason}" for scan_id, reason in sorted(left_out.items())[:2])
+    if strict and left_out:
         raise InputError(
-            f"{out} not built: {len(skipped)} scans cannot be used", got=shown, wanted="all, with --strict"
+            f"{out} not built: {len(left_out)} ids cannot be used", got=shown, wanted="all, with --strict"
         )
     if not records_of_use(list(records.values())):
         raise InputError(f"{out} not built: no scan can be used", got=shown, wanted="at least one good scan")

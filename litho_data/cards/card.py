@@ -30,7 +30,9 @@ def load_card(path: str | Path) -> Card:
         content = tomllib.loads(file.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(
-            f"cannot read {file} as a dataset card", got=str(error), wanted="a TOML file"
+            f"cannot read {file} as a dataset card",
+            got=(error.strerror if isinstance(error, OSError) else None) or str(error),
+            wanted="a TOML file",
         ) from error
     return check_card(content, f"card {file}")
 
@@ -182,6 +184,10 @@ def _readable(error: ValidationError, what: str) -> InputError:
         cause = first["ctx"]["error"]
         shown = "" if isinstance(first["input"], dict) else f" = {first['input']!r}"
         return InputError(f"{what}: {key}{shown}: {cause}")
+    if first["type"] == "tuple_type":
+        given = first["input"]
+        numbers = f"[{given}, {given}]" if isinstance(given, int | float) else "[54.0, 54.0]"
+        return InputError(f"{what}: {key} = {given!r}", got="one value", wanted=f"y and x, such as {numbers}")
     return InputError(f"{what}: {first_error(error)}")
 
 

@@ -29,7 +29,7 @@ DataDir = Annotated[
     ),
 ]
 Workers = Annotated[int, typer.Option(min=1, help="local processes; the result does not depend on it")]
-Strict = Annotated[bool, typer.Option("--strict", help="do not build if any scan has to be skipped")]
+Strict = Annotated[bool, typer.Option("--strict", help="do not build if a scan is skipped or has no partner")]
 
 
 class Format(StrEnum):
@@ -72,7 +72,12 @@ def build(
     from litho_data.build.result import report_folder
 
     result = build_dataset(card, out, data_dir=data_dir, workers=workers, dask=dask, strict=strict, seed=seed)
-    typer.echo(f"{out}: {result.n_scans} scans, {len(result.skipped)} skipped, {result.seconds:.1f} s")
+    unpaired = f"{len(result.unpaired)} without layout or scan, " if result.unpaired else ""
+    typer.echo(
+        f"{out}: {result.n_scans} scans, {len(result.skipped)} skipped, {unpaired}{result.seconds:.1f} s"
+    )
+    if result.unpaired:
+        typer.echo(f"{result.unpaired[0].id}: {result.unpaired[0].reason}", err=True)
     typer.echo(f"dataset sha256 {result.dataset.sha256}")
     typer.echo(f"report {report_folder(out) / 'report.html'}")
 

@@ -18,8 +18,23 @@ def new_app(help_text: str):
     """A typer application with the settings of this project."""
     import typer
 
+    def options(
+        version: bool = typer.Option(False, "--version", help="Print the version and exit.", is_eager=True),
+    ) -> None:
+        if version:
+            from litho_data import __version__
+
+            typer.echo(__version__)
+            raise typer.Exit()
+
     return typer.Typer(
-        help=help_text, no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False
+        help=help_text,
+        callback=options,
+        # Without this, --version alone would be asked for a command.
+        invoke_without_command=True,
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
     )
 
 

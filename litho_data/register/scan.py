@@ -97,7 +97,10 @@ def register_scan(
     if has_structure:
         coarse = find_coarse(flat, layout, smooth_layout, search=search, features=features, seed=seed)
     if coarse is None:
-        return Registration(centred, unregistered_quality("no structure in the scan or the layout"))
+        why = "no structure in the scan or the layout"
+        if np.nanstd(flat) <= SMALLEST_STRUCTURE_UM:
+            why = f"no structure in the scan: heights vary by {np.nanstd(flat):.1e} µm; check their unit"
+        return Registration(centred, unregistered_quality(why))
 
     oriented = coarse.polarity * orient(flat, coarse.orientation)
     fine = refine_pyramid(

@@ -145,6 +145,7 @@ def benchmark(
     """Train every model per fold and score it on scans it has not seen; resumable."""
     from litho_models.evaluation.benchmark import DEFAULT_MODELS
     from litho_models.evaluation.tables import headline_table
+    from litho_models.scoring.statistics import FEWEST_FOR_INTERVAL
 
     settings = {"recipe": recipe, "variant": variant}
     settings |= _given(steps=steps, precision=precision, seed=training_seed)
@@ -162,6 +163,9 @@ def benchmark(
         seed=seed,
     )
     typer.echo(headline_table(result.scores, result.noise_floor).round(2).to_string(index=False, na_rep="–"))
+    scored = len(result.split.scored_ids)
+    if scored < FEWEST_FOR_INTERVAL:
+        typer.echo(f"no intervals: {scored} scans are too few, {FEWEST_FOR_INTERVAL} are needed")
     typer.echo(f"report {out / 'report.html'}")
 
 

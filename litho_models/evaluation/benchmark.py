@@ -5,12 +5,14 @@ An interrupted benchmark resumes, and an unchanged fit is never repeated.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 from litho_data.foundation.commands import progress
+from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import run_info
 from litho_data.store import PrintedScan, open_store
 from litho_data.store.lock_box import ids_sha256
@@ -64,14 +66,17 @@ def benchmark(
 
     Raises:
         InputError: no model, an unknown one or one twice, a store that cannot be read or is too small for
-            the split or for a lock box to open, a noise analysis of other data, or a damaged cache.
+            the split or for a lock box to open, a noise analysis of other data, a damaged cache, or an
+            ``out`` with a benchmark that this one would not contain.
     """
     require_models(models)
     dataset = open_store(store)
+    _require_same_benchmark(Path(out), dataset.name, models, split, seed)
     scans = dataset.scans()
     floor = noise_floor(dataset.name, noise)
     locked = dataset.locked_ids
     plan = plan_folds(scans, locked, split, folds=folds, seed=seed, open_lock_box=open_lock_box)
+    _say_fewer_folds(folds, sum(not fold.locked for fold in plan), split)
     configs = {name: _config(name, settings, seed) for name in models}
     fits: list[FitRecord] = []
     predicted: dict[tuple[str, bool], dict[str, Prediction]] = {}
@@ -129,3 +134,36 @@ def _config(name: str, settings: dict[str, Any] | None, seed: int) -> TrainingCo
 
 def _settings(name: str, config: TrainingConfig, scans: Sequence[PrintedScan]) -> dict[str, Any]:
     return config.used_by(build_model(name, config.variant, **common_geometry(scans)))
+
+
+def _say_fewer_folds(asked: int, made: int, split: SplitKind) -> None:
+    if split == "grouped" and made < asked:
+        print(f"{made} folds instead of {asked}: one for each scan that is not locked", file=sys.stderr)
+
+
+def _require_same_benchmark(
+    out: Path, dataset: str, models: Sequence[str], split: SplitKind, seed: int
+) -> None:
+    """A result may be made again or extended; one of something else is not replaced."""
+    if not (out / Benchmark.FILE_NAME).exists():
+        return
+    old = Benchmark.read(out)
+    lost = [score.model for score in old.scores if score.model not in models]
+    other = [
+        f"{name} {then}"
+        for name, then, now in (
+            ("dataset", old.dataset.name, dataset),
+            ("split", old.split.kind, split),
+            ("seed", old.split.seed, seed),
+        )
+        if then != now
+    ]
+    if lost:
+        other.append(f"model {', '.join(lost)}")
+    if other:
+        raise InputError(
+            "output",
+            got=f"{out}, which holds a benchmark of {'; '.join(other)}",
+            wanted="a folder of its own",
+            hint="choose another --out",
+        )

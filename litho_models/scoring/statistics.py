@@ -9,6 +9,8 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 
+# With fewer, no arrangement of signs is as rare as one in 20: 2 / 2**5 > 0.05, 2 / 2**6 < 0.05.
+FEWEST_FOR_INTERVAL = 6
 BOOTSTRAP_DRAWS = 2000
 SIGN_FLIP_DRAWS = 9999
 # Up to so many scans every combination of signs is used. A table of 2^14 rows is the larger for all
@@ -35,8 +37,8 @@ def bootstrap_interval(
 
 
 def interval(values: Sequence[float]) -> tuple[float, float] | None:
-    """As ``bootstrap_interval``, for results: None with fewer than two scans."""
-    return bootstrap_interval(values) if len(values) > 1 else None
+    """As ``bootstrap_interval``, for results: None with fewer than ``FEWEST_FOR_INTERVAL`` scans."""
+    return bootstrap_interval(values) if len(values) >= FEWEST_FOR_INTERVAL else None
 
 
 def sign_flips(count: int, seed: int = 0, *, exact_scans: int = EXACT_SCANS) -> np.ndarray:

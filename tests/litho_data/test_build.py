@@ -131,7 +131,7 @@ def test_bad_scans_are_skipped_with_their_reason(tmp_path: Path, capsys: pytest.
     assert status["scans/P11.txt"] == ("ok", False)
     assert BuildResult.read(report_folder(tmp_path / "prints.zarr")) == result
 
-    with pytest.raises(InputError, match="6 scans cannot be used"):
+    with pytest.raises(InputError, match="7 ids cannot be used"):
         build_dataset(card, tmp_path / "strict.zarr", strict=True)
     assert not [path for path in tmp_path.iterdir() if "strict" in path.name]
 

@@ -1,0 +1,34 @@
+"""Scans and layouts without their partner are counted where the build is reported."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from typer.testing import CliRunner
+
+import litho_data
+from litho_data.cli.app import app
+from litho_data.foundation.errors import InputError
+
+
+def test_a_scan_without_layout_is_counted_and_refused_under_strict(tmp_path):
+    card = litho_data.simulate(tmp_path / "fab", count=3, size_px=128)
+    sorted((card.parent / "layouts").iterdir())[0].unlink()
+    words = ["build", str(card), "--out", str(tmp_path / "few.zarr")]
+    said = CliRunner().invoke(app, words, catch_exceptions=False)
+    assert "2 scans, 0 skipped, 1 without layout or scan, " in said.stdout
+    assert "no file " in said.stderr
+    with pytest.raises(InputError, match="1 ids cannot be used"):
+        litho_data.build_dataset(card, tmp_path / "strict.zarr", strict=True)
+
+
+def test_a_card_that_is_not_there_or_has_one_size_says_so_in_words(tmp_path):
+    with pytest.raises(InputError) as missing:
+        litho_data.build_dataset(tmp_path / "no.toml", tmp_path / "s.zarr")
+    assert "No such file or directory, wanted a TOML file" in str(missing.value)
+    assert "Errno" not in str(missing.value)
+    card = litho_data.simulate(tmp_path / "fab", count=1, size_px=128)
+    card.write_text(re.sub(r"^size_um = .*$", "size_um = 54", card.read_text(), flags=re.MULTILINE))
+    with pytest.raises(InputError, match=r"size_um = 54, got one value, wanted y and x, such as \[54, 54\]"):
+        litho_data.build_dataset(card, tmp_path / "s.zarr")

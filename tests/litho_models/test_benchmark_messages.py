@@ -1,0 +1,37 @@
+"""What a benchmark says of few scans, of too many folds, and of a folder that holds another one."""
+
+from __future__ import annotations
+
+import pytest
+from typer.testing import CliRunner
+
+import litho_data
+import litho_models
+from litho_data.foundation.errors import InputError
+from litho_models.cli.app import app
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("few")
+    card = litho_data.simulate(folder / "fab", count=4, size_px=128)
+    litho_data.build_dataset(card, folder / "few.zarr")
+    return folder / "few.zarr"
+
+
+def test_few_scans_have_no_interval_and_folds_are_not_dropped_silently(store, tmp_path):
+    words = ["benchmark", store, "--models", "affine", "--folds", 50, "--out", tmp_path]
+    result = CliRunner().invoke(app, list(map(str, words)), catch_exceptions=False)
+    assert "no intervals: " in result.stdout
+    assert "are too few, 6 are needed" in result.stdout
+    assert " folds instead of 50: one for each scan" in result.stderr
+    assert "…" not in result.stdout
+
+
+def test_a_benchmark_is_extended_but_not_replaced_by_another(store, tmp_path):
+    litho_models.benchmark(store, tmp_path, models=["identity"], folds=2)
+    litho_models.benchmark(store, tmp_path, models=["identity", "affine"], folds=2)
+    with pytest.raises(InputError, match="holds a benchmark of model identity"):
+        litho_models.benchmark(store, tmp_path, models=["affine"], folds=2)
+    with pytest.raises(InputError, match="holds a benchmark of seed 0"):
+        litho_models.benchmark(store, tmp_path, models=["identity", "affine"], folds=2, seed=1)
