@@ -136,6 +136,8 @@ def test_a_damaged_checkpoint_is_told_with_its_folder(name, damage, trained, sto
 def test_a_damaged_fit_is_told_with_its_folder(name, damage, scored, store, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(scored[1], out)
+    # What is asked for anew has fewer models than the result, which is not replaced then.
+    (out / "benchmark.json").unlink()
     folder = next(path for path in (out / "cache").glob("affine-*"))
     damage(folder / name)
     with pytest.raises(InputError, match=f"delete {folder} and run again") as told:
