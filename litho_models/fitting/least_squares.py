@@ -133,9 +133,8 @@ class NormalEquations:
         """The equations at linearised scans with the present ``terms`` (scans, k)."""
         count = len(linear[0].jacobian)
         if terms is None:
-            parts = [eliminated(part, rules.term_weight) for part in linear]
-            matrix, right = np.sum([p[0] for p in parts], axis=0), np.sum([p[1] for p in parts], axis=0)
-            return cls(matrix, right, count, (len(linear), 0), sum(p[2] for p in parts))
+            matrix, right, squares = eliminated_sum(linear, rules.term_weight)
+            return cls(matrix, right, count, (len(linear), 0), squares)
         each, pinned = terms.shape[1], rules.pinned
         size = count + terms.size
         matrix, right = np.zeros((size + pinned, size + pinned)), np.zeros(size + pinned)
@@ -187,6 +186,23 @@ def eliminated(part: Linearised, term_weight: float) -> tuple[np.ndarray, np.nda
     """Normal matrix, right side and weighted sum of squares of one scan, its own terms eliminated."""
     full = gram(np.vstack([part.jacobian, part.residual]).T, part.basis.T, term_weight)
     return full[:-1, :-1], full[:-1, -1], float(full[-1, -1])
+
+
+def eliminated_sum(linear: Sequence[Linearised], term_weight: float) -> tuple[np.ndarray, np.ndarray, float]:
+    """``eliminated``, summed over scans."""
+    parts = [eliminated(part, term_weight) for part in linear]
+    normal, right = np.sum([p[0] for p in parts], axis=0), np.sum([p[1] for p in parts], axis=0)
+    return normal, right, sum(p[2] for p in parts)
+
+
+def weighted_squares(
+    residuals: Sequence[np.ndarray], linear: Sequence[Linearised], term_weight: float
+) -> float:
+    """Sum of squares of residuals (n,) of these scans, their own terms weighted down."""
+    return sum(
+        float(gram(r[:, None], part.basis.T, term_weight)[0, 0])
+        for r, part in zip(residuals, linear, strict=True)
+    )
 
 
 def solve_damped(
@@ -242,11 +258,7 @@ def _total_loss(
     residuals: Sequence[np.ndarray], linear: Sequence[Linearised], terms: np.ndarray | None, rules: Rules
 ) -> float:
     if terms is None:
-        weight = rules.term_weight
-        return sum(
-            float(gram(r[:, None], part.basis.T, weight)[0, 0])
-            for r, part in zip(residuals, linear, strict=True)
-        )
+        return weighted_squares(residuals, linear, rules.term_weight)
     losses = [
         _magnitude(r - own @ part.basis).mean() for r, own, part in zip(residuals, terms, linear, strict=True)
     ]

@@ -22,10 +22,11 @@ from litho_models.fitting.least_squares import (
     Room,
     Rules,
     eliminated,
+    eliminated_sum,
     fit_least_squares,
-    gram,
     orthonormal,
     solve_damped,
+    weighted_squares,
 )
 from litho_models.fitting.small_models import RULES as ZOO_RULES
 from litho_models.fitting.small_models import fit_small_model
@@ -94,14 +95,18 @@ def fit_folds(
         scans: development scans; ``fold_of``: (len(scans),) fold that holds each out.
     """
     windows = [scan.window for scan in scans]
-    training = [np.flatnonzero(fold_of != fold) for fold in range(int(fold_of.max()) + 1)]
+    training = [np.flatnonzero(fold_of != fold).tolist() for fold in range(int(fold_of.max()) + 1)]
     if loss == "absolute":
         common = _fit_absolute(chain, scans)
         linear = ChainProblem(chain, windows).linearise(common)
-        per_fold = np.stack([_fit_absolute(chain, [scans[int(i)] for i in own]) for own in training])
+        per_fold = np.stack([_fit_absolute(chain, [scans[i] for i in own]) for own in training])
         errors = np.array(
             [
-                _squares(chain, vector, linear, windows, own)
+                weighted_squares(
+                    ChainProblem(chain, [windows[i] for i in own]).residuals(vector),
+                    [linear[i] for i in own],
+                    TERM_WEIGHT,
+                )
                 for vector, own in zip(per_fold, training, strict=True)
             ]
         )
@@ -111,7 +116,10 @@ def fit_folds(
             start = fit_least_squares(ChainProblem(chain, windows[::_START_EVERY]), start, RULES[loss]).vector
         fitted = fit_least_squares(ChainProblem(chain, windows), start, RULES[loss])
         common, linear = fitted.vector, fitted.linear
-        own_fits = [_fit_without(chain, common, linear, windows, own) for own in training]
+        own_fits = [
+            _fit_without(chain, common, [linear[i] for i in own], [windows[i] for i in own])
+            for own in training
+        ]
         per_fold, errors = np.stack([v for v, _ in own_fits]), np.array([error for _, error in own_fits])
     free = within_bounds(chain, common)
     linear = [replace(part, jacobian=part.jacobian * free[:, None]) for part in linear]
@@ -171,7 +179,11 @@ class ChainProblem:
 
     def residuals(self, vector: np.ndarray) -> list[np.ndarray]:
         """Measured minus predicted of all scans, µm."""
-        return [scan.height - scan.at_sample(predict(self._chain, vector, scan)) for scan in self._scans]
+        here = chain_at(self._chain, vector)
+        return [
+            scan.height - scan.at_sample(_with_height_effects(here, _base_height(here, scan), scan))
+            for scan in self._scans
+        ]
 
     def room(self, vector: np.ndarray) -> Room:
         """Effects stay within their range, the base does not go too far at once."""
@@ -205,51 +217,30 @@ def _fit_absolute(chain: EffectChain, scans: Sequence[PreparedScan]) -> np.ndarr
 
 
 def _fit_without(
-    chain: EffectChain,
-    common: np.ndarray,
-    linear: Sequence[Linearised],
-    scans: Sequence[PreparedScan],
-    training: np.ndarray,
+    chain: EffectChain, common: np.ndarray, linear: Sequence[Linearised], scans: Sequence[PreparedScan]
 ) -> tuple[np.ndarray, float]:
     """Fit on some of the scans, and their weighted sum of squares; cheap steps with the common derivatives,
     full ones where those fail."""
-    parts = [eliminated(linear[i], TERM_WEIGHT) for i in training]
+    problem = ChainProblem(chain, scans)
+    normal, right, start = eliminated_sum(linear, TERM_WEIGHT)
     if not len(common):
-        return common, sum(p[2] for p in parts)
-    normal, right = np.sum([p[0] for p in parts], axis=0), np.sum([p[1] for p in parts], axis=0)
-    start = best = sum(p[2] for p in parts)
-    vector = common
+        return common, start
+    vector, best = common, start
     for _ in range(_FOLD_STEPS):
-        moved = vector + solve_damped(normal, right, _FOLD_DAMPING, room(chain, vector))
-        right, total = np.zeros(len(vector)), 0.0
-        for i in training:
-            residual = scans[i].height - scans[i].at_sample(predict(chain, moved, scans[i]))
-            _, own, squares = eliminated(replace(linear[i], residual=residual), TERM_WEIGHT)
-            right += own
-            total += squares
-        gained, vector = best - total, moved
-        if abs(gained) <= _FOLD_GAIN * total:
+        vector = vector + solve_damped(normal, right, _FOLD_DAMPING, room(chain, vector))
+        _, right, total = eliminated_sum(with_residuals(linear, problem.residuals(vector)), TERM_WEIGHT)
+        if abs(best - total) <= _FOLD_GAIN * total:
             return vector, total
         if total > start:
             break
         best = total
-    fitted = fit_least_squares(ChainProblem(chain, [scans[i] for i in training]), common, RULES["squares"])
-    return fitted.vector, sum(eliminated(part, TERM_WEIGHT)[2] for part in fitted.linear)
+    fitted = fit_least_squares(problem, common, RULES["squares"])
+    return fitted.vector, eliminated_sum(fitted.linear, TERM_WEIGHT)[2]
 
 
-def _squares(
-    chain: EffectChain,
-    vector: np.ndarray,
-    linear: Sequence[Linearised],
-    scans: Sequence[PreparedScan],
-    which: np.ndarray,
-) -> float:
-    """Weighted sum of squares over some scans at these parameters, µm²."""
-    total = 0.0
-    for i in which:
-        residual = scans[i].height - scans[i].at_sample(predict(chain, vector, scans[i]))
-        total += float(gram(residual[:, None], linear[i].basis.T, TERM_WEIGHT)[0, 0])
-    return total
+def with_residuals(linear: Sequence[Linearised], residuals: Sequence[np.ndarray]) -> list[Linearised]:
+    """The same scans with other residuals, their derivatives kept."""
+    return [replace(part, residual=own) for part, own in zip(linear, residuals, strict=True)]
 
 
 def _robust_covariance(linear: Sequence[Linearised]) -> np.ndarray:

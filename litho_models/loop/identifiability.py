@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import get_effect
 from litho_models.effects.chain import EffectChain
-from litho_models.fitting.least_squares import eliminated, solve_damped
-from litho_models.loop.fold_fits import TERM_WEIGHT, FoldFits, predict
+from litho_models.fitting.least_squares import eliminated_sum, solve_damped
+from litho_models.loop.fold_fits import TERM_WEIGHT, ChainProblem, FoldFits, with_residuals
 from litho_models.loop.parameters import effect_slots, is_refitted, room
 from litho_models.loop.prepared import PreparedScan
 
@@ -57,7 +57,7 @@ class Profile:
 
 def identifiability(fits: FoldFits) -> Identifiability | None:
     """Conditioning at the fit to all development scans; None where nothing is fitted."""
-    normal = np.sum([eliminated(part, TERM_WEIGHT)[0] for part in fits.linear], axis=0)
+    normal, _, _ = eliminated_sum(fits.linear, TERM_WEIGHT)
     names = _names(fits.chain)
     free = np.diag(normal) > 0
     if not free.any():
@@ -101,20 +101,14 @@ def _squares_with(fits: FoldFits, scans: Sequence[PreparedScan], slot: int, valu
     vector = fits.common.copy()
     vector[slot] = value
     others = np.arange(len(vector)) != slot
-    best = np.inf
+    problem, best = ChainProblem(fits.chain, scans), np.inf
     for _ in range(_STEPS):
-        parts = [
-            eliminated(
-                replace(own, residual=scan.height - scan.at_sample(predict(fits.chain, vector, scan))),
-                TERM_WEIGHT,
-            )
-            for scan, own in zip(scans, fits.linear, strict=True)
-        ]
-        total = sum(part[2] for part in parts)
+        normal, right, total = eliminated_sum(
+            with_residuals(fits.linear, problem.residuals(vector)), TERM_WEIGHT
+        )
         if total > (1 - _GAIN) * best or not others.any():
             return min(total, best)
         best = total
-        normal, right = np.sum([p[0] for p in parts], axis=0), np.sum([p[1] for p in parts], axis=0)
         lowest, highest = room(fits.chain, vector)
         box = (lowest[others], highest[others])
         vector[others] += solve_damped(normal[others][:, others], right[others], 1e-6, box)

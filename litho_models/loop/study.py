@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,6 +12,7 @@ from litho_models.effects.chain import EffectChain
 from litho_models.fitting.least_squares import Loss
 from litho_models.loop.fold_fits import FoldFits, fit_folds, predict
 from litho_models.loop.prepared import PreparedScan
+from litho_models.loop.selection.confirming import Confirmation, confirm
 from litho_models.scan_terms import BackgroundUse, Blocks, Terms, cross_fit, terms_of_effect
 from litho_models.scan_terms.background import learn_background
 from litho_models.scoring.records import Prediction
@@ -87,6 +88,20 @@ class Study:
     def score(self, predictions: Sequence[np.ndarray], terms: Terms) -> Score:
         """Held-out errors of predictions (y, x) µm, freed of terms that were fitted on other pixels."""
         return score(self.scans, predictions, terms, self.blocks)
+
+    def confirm(
+        self, before: Score, after: Score, amplitudes: Mapping[str, np.ndarray] | None = None
+    ) -> Confirmation:
+        """Whether a change is confirmed on scans that it was not fitted on."""
+        return confirm(
+            before.mse_nm2,
+            after.mse_nm2,
+            before.mae_nm,
+            after.mae_nm,
+            floor_nm2=self.floor_nm2,
+            amplitudes=amplitudes,
+            seed=self.seed,
+        )
 
 
 # (fold, scan, prediction) to the prediction with a generic term, as estimated without that fold.

@@ -82,14 +82,16 @@ def cross_fit(
         residual[usable] = difference[usable]
         return CrossFit(residual, 0.0, 0.0)
     basis = term_maps(TermPixels(prediction, scan_line), terms).reshape(-1, *height.shape)
-    lines = [(term, _lines(term, height.shape, scan_line)) for term in line_terms(terms)]
+    lines = [_lines(term, height.shape, scan_line) for term in line_terms(terms)]
+    axes = [axis_along(line) for line in lines]
+    cells = line_cells(height.shape, axes, blocks.line_gap_px)
     freedom, variances = [], []
     for half in checkerboard(height.shape, blocks):
         rest = difference - _fitted(basis, difference, half.calibrate & usable)
-        for cell in line_cells(height.shape, (axis_along(line) for _, line in lines), blocks.line_gap_px):
+        for cell in cells:
             freed, weights = rest, 0.0
-            for _, line in lines:
-                other = cell.other_side[axis_along(line)] & usable
+            for line, axis in zip(lines, axes, strict=True):
+                other = cell.other_side[axis] & usable
                 offsets, weight, variance = shrunk_line_offsets(freed, other, line, blocks.block_px)
                 freed = freed - offsets[line]
                 weights += float(weight.sum())

@@ -59,8 +59,9 @@ def shrunk_line_offsets(
         offsets (lines,) µm, their shrinkage weights (lines,) in 0 ... 1, and v in µm².
     """
     line_count = int(line.max()) + 1
-    along = np.arange(residual_um.shape[axis_along(line)]) // block_px
-    block = np.broadcast_to(along[None, :] if axis_along(line) else along[:, None], residual_um.shape)
+    axis = axis_along(line)
+    along = np.arange(residual_um.shape[axis]) // block_px
+    block = np.broadcast_to(np.expand_dims(along, 1 - axis), residual_um.shape)
     block_count = int(block.max()) + 1
     cell = (line * block_count + block)[used]
     count = np.bincount(cell, minlength=line_count * block_count).reshape(line_count, block_count)

@@ -14,7 +14,7 @@ from litho_models.loop.probes.places import position_map, profile
 from litho_models.loop.probes.probe import Estimate, Probe
 from litho_models.loop.probes.tables import axis_slope_table, level_table, slope_table
 from litho_models.loop.probes.trend import OrderTrend, order_trends
-from litho_models.loop.selection.confirming import SMALLEST_SHARE, Confirmation, confirm
+from litho_models.loop.selection.confirming import SMALLEST_SHARE, Confirmation
 from litho_models.loop.study import Correction, Score, State, Study
 from litho_models.scan_terms import Terms
 from litho_models.scan_terms.term import smooth_shapes
@@ -147,14 +147,7 @@ def _best(
             for scan, p, fold in zip(scans, state.predictions, fold_of, strict=True)
         ]
         after = study.score(corrected, terms)
-        confirmation = confirm(
-            before.mse_nm2,
-            after.mse_nm2,
-            before.mae_nm,
-            after.mae_nm,
-            floor_nm2=study.floor_nm2,
-            seed=study.seed,
-        )
+        confirmation = study.confirm(before, after)
         reasons = [confirmation.reason] if confirmation.reason else []
         if gain <= limit:
             reasons.append("gains no more than its control")

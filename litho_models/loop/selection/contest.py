@@ -24,7 +24,7 @@ from litho_models.loop.screening.score_test import (
     cosine,
     screen,
 )
-from litho_models.loop.selection.confirming import BINOMIAL_P, SMALLEST_SHARE, Confirmation, confirm
+from litho_models.loop.selection.confirming import BINOMIAL_P, SMALLEST_SHARE, Confirmation
 from litho_models.loop.study import Score, State, Study, fit_state, held_out_residuals
 from litho_models.scan_terms import Terms
 
@@ -188,15 +188,7 @@ def judged(
     """The entrant as it would be added to ``state``, with its confirmation on the scans left out."""
     effect, own = entrant.screened.effect, terms_for(terms, [entrant.screened])
     before, after = (s.score(study, own) for s in (state, entrant.state))
-    confirmation = confirm(
-        before.mse_nm2,
-        after.mse_nm2,
-        before.mae_nm,
-        after.mae_nm,
-        floor_nm2=study.floor_nm2,
-        amplitudes=fold_amplitudes(entrant.state.fits, effect),
-        seed=study.seed,
-    )
+    confirmation = study.confirm(before, after, fold_amplitudes(entrant.state.fits, effect))
     return Added(effect, sorted(confusable), before, after, confirmation, entrant.screened.p)
 
 
@@ -210,7 +202,7 @@ def _told_apart(state: State, winner: Entrant, rival: Entrant, study: Study, ter
     """The rival is worse in nearly every held-out scan, by a good part of the gain."""
     own = terms_for(terms, [winner.screened, rival.screened])
     before, best, other = (s.score(study, own) for s in (state, winner.state, rival.state))
-    verdict = confirm(other.mse_nm2, best.mse_nm2, other.mae_nm, best.mae_nm, seed=study.seed)
+    verdict = study.confirm(other, best)
     gain, lost = before.mse_nm2.mean() - best.mse_nm2.mean(), other.mse_nm2.mean() - best.mse_nm2.mean()
     return verdict.p <= BINOMIAL_P and lost >= TOLD_APART_SHARE * gain
 
