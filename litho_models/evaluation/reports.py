@@ -210,10 +210,16 @@ def _model(model: ModelRecord) -> pd.DataFrame:
 def _pairs(result: Benchmark) -> pd.DataFrame:
     import pandas as pd
 
-    rows = [
-        {**pair.model_dump(exclude={"ci95_nm"}), "ci95_nm": tables.interval_text(pair.ci95_nm)}
-        for pair in result.paired
-    ]
+    rows = []
+    for pair in result.paired:
+        row = pair.model_dump(exclude={"ci95_nm", "over_prints"})
+        row["ci95_nm"] = tables.interval_text(pair.ci95_nm)
+        if pair.over_prints is not None:
+            row["prints"] = pair.over_prints.count
+            row["ci95_over_prints_nm"] = tables.interval_text(pair.over_prints.ci95_nm)
+            row["p_over_prints"] = pair.over_prints.p
+            row["smallest_p_over_prints"] = pair.over_prints.smallest_p
+        rows.append(row)
     return pd.DataFrame(rows)
 
 

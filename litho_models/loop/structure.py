@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.linear import without_scan_terms
 from litho_models.loop.prepared import PreparedScan
-from litho_models.scoring.statistics import sign_flip_statistics
+from litho_models.scoring.statistics import sign_flip_statistics, smallest_flip_p
 
 BINS = 8
 # Cells of the scan along y and along x.
@@ -62,6 +62,11 @@ def covariate_tests(scans: Sequence[PreparedScan], predictions: Sequence[np.ndar
 def is_structured(tests: Sequence[CovariateTest]) -> list[CovariateTest]:
     """The covariates with evidence: Bonferroni p <= 0.05 and at least 1 % of the squared error."""
     return [t for t in tests if t.p * len(tests) <= STRUCTURED_P and t.share >= STRUCTURED_SHARE]
+
+
+def fewest_scans_for_structure(tests: int) -> int:
+    """With fewer scans no residual is structured: the sign flips of none of so many tests are rare enough."""
+    return next(count for count in range(2, 64) if smallest_flip_p(count) * tests <= STRUCTURED_P)
 
 
 def _covariates(scan: PreparedScan, prediction: np.ndarray) -> dict[str, np.ndarray]:

@@ -1,8 +1,9 @@
-"""Statistics over scans. Pixels of a scan are correlated: every draw and every sign is of a whole scan."""
+"""Statistics over scans, or over prints. Pixels of a scan are correlated: what is drawn, and what changes its
+sign, is a whole scan; where scans of one print share its day and batch, a whole print."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,19 +22,36 @@ _ROUNDING = 1 - 1e-12
 
 
 def bootstrap_interval(
-    values: Sequence[float], *, level: float = 0.95, draws: int = BOOTSTRAP_DRAWS, seed: int = 0
+    values: Sequence[float],
+    *,
+    groups: Sequence[Hashable] | None = None,
+    level: float = 0.95,
+    draws: int = BOOTSTRAP_DRAWS,
+    seed: int = 0,
 ) -> tuple[float, float]:
-    """Percentile interval of the mean over scans, resampling whole scans.
+    """Percentile interval of the mean over scans, resampling whole scans, or whole groups of them.
 
-    With one scan there is nothing to resample: both ends are NaN.
+    With one of them there is nothing to resample: both ends are NaN.
+
+    Args:
+        values: one per scan; ``groups``: the print of each scan, if prints are what is resampled.
     """
-    sample = np.asarray(values, np.float64)
-    if sample.size < 2:
+    sums, counts = _by_group(values, groups)
+    if sums.size < 2:
         return float("nan"), float("nan")
-    picks = np.random.default_rng(seed).integers(0, sample.size, size=(draws, sample.size))
-    means = sample[picks].mean(axis=1)
+    picks = np.random.default_rng(seed).integers(0, sums.size, size=(draws, sums.size))
+    means = sums[picks].sum(axis=1) / counts[picks].sum(axis=1)
     low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])
     return float(low), float(high)
+
+
+def _by_group(values: Sequence[float], groups: Sequence[Hashable] | None) -> tuple[np.ndarray, np.ndarray]:
+    """Sum and count of the values of each group; each value by itself without groups."""
+    sample = np.asarray(values, np.float64)
+    if groups is None:
+        return sample, np.ones(sample.size)
+    members = [list(dict.fromkeys(groups)).index(group) for group in groups]
+    return np.bincount(members, sample), np.bincount(members).astype(np.float64)
 
 
 def interval(values: Sequence[float]) -> tuple[float, float] | None:
@@ -75,22 +93,41 @@ def family_wise_p(z: float, null_max: np.ndarray) -> float:
     return float(np.mean(null_max >= abs(z) * (1 - 1e-9)))
 
 
+def smallest_flip_p(count: int) -> float:
+    """Smallest two-sided sign-flip p that so many scans or prints can have: all signs, or their mirror image.
+
+    Six prints cannot go below 2 / 2^6 = 0.031, however large the difference.
+    """
+    return min(1.0, 2 / 2**count) if count <= EXACT_PAIRED_SCANS else 1 / (SIGN_FLIP_DRAWS + 1)
+
+
 @dataclass(frozen=True)
 class PairedDifference:
-    """Mean over scans of (first minus second), its bootstrap interval and two-sided sign-flip p."""
+    """Mean over scans of (first minus second), its bootstrap interval and two-sided sign-flip p.
+
+    ``units``: scans, or groups of them, that were resampled and flipped; the first is better in
+    ``first_better`` of them.
+    """
 
     mean: float
     interval: tuple[float, float]
     p: float
     first_better: int
-    scans: int
+    units: int
 
 
-def paired_difference(first: Sequence[float], second: Sequence[float], *, seed: int = 0) -> PairedDifference:
+def paired_difference(
+    first: Sequence[float],
+    second: Sequence[float],
+    *,
+    groups: Sequence[Hashable] | None = None,
+    seed: int = 0,
+) -> PairedDifference:
     """Compare two lists of errors scan by scan; smaller values are better.
 
     The null flips the sign of each scan's difference: all combinations up to 14 scans, 9,999 random
-    ones beyond (the observed one counted in).
+    ones beyond (the observed one counted in). With ``groups``, the print of each scan, the differences
+    of a print are resampled and flipped together.
 
     Raises:
         InputError: lists of different length, or empty.
@@ -100,11 +137,12 @@ def paired_difference(first: Sequence[float], second: Sequence[float], *, seed: 
             "paired scores", got=f"{len(first)} and {len(second)} scans", wanted="the same scans in both"
         )
     difference = np.asarray(first, np.float64) - np.asarray(second, np.float64)
-    flipped = np.abs(sign_flips(difference.size, seed, exact_scans=EXACT_PAIRED_SCANS) @ difference)
+    sums, _ = _by_group(difference.tolist(), groups)
+    flipped = np.abs(sign_flips(sums.size, seed, exact_scans=EXACT_PAIRED_SCANS) @ sums)
     return PairedDifference(
         mean=float(difference.mean()),
-        interval=bootstrap_interval(difference.tolist(), seed=seed),
-        p=float(np.mean(flipped >= abs(difference.sum()) * _ROUNDING)),
-        first_better=int((difference < 0).sum()),
-        scans=difference.size,
+        interval=bootstrap_interval(difference.tolist(), groups=groups, seed=seed),
+        p=float(np.mean(flipped >= abs(sums.sum()) * _ROUNDING)),
+        first_better=int((sums < 0).sum()),
+        units=sums.size,
     )

@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 from litho_models.fitting.least_squares import gram, orthonormal, solve_damped
-from litho_models.loop.selection.confirming import binomial_p, confirm, confirm_variance
+from litho_models.loop.selection.confirming import (
+    BINOMIAL_P,
+    FEWEST_SCANS,
+    binomial_p,
+    confirm,
+    confirm_variance,
+)
 from litho_models.scoring.statistics import (
     family_wise_p,
     one_sided_flip_p,
@@ -22,9 +28,16 @@ def test_scans_needed_for_a_confirmation(needed: int, count: int) -> None:
     assert binomial_p(needed, count) <= 0.005 < binomial_p(needed - 1, count)
 
 
-def test_seven_scans_can_confirm_nothing() -> None:
-    before, after = np.full(7, 100.0), np.full(7, 50.0)
-    assert not confirm(before, after, before, after).passed
+def test_fewer_scans_than_its_gates_allow_can_confirm_nothing_and_as_many_can() -> None:
+    assert FEWEST_SCANS == 8
+    for count in (FEWEST_SCANS - 1, FEWEST_SCANS):
+        before, after = np.full(count, 100.0), np.full(count, 50.0)
+        maps, left = ([np.full(9, size)] * count for size in (0.01, 0.0))
+        enough = count == FEWEST_SCANS
+        assert confirm(before, after, before, after).passed is enough
+        # By sign flips, too: the smallest p is that of all scans agreeing.
+        assert confirm_variance(maps, left, (before, before), (after, after)).passed is enough
+        assert (one_sided_flip_p(np.ones(count)) <= BINOMIAL_P) is enough
 
 
 def test_a_steady_gain_is_confirmed_and_its_rules_fail_one_by_one() -> None:

@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 from litho_data.foundation.errors import InputError
 from litho_models.scoring.metrics import score_scan
 from litho_models.scoring.print_gain import print_gain
-from litho_models.scoring.statistics import bootstrap_interval, paired_difference
+from litho_models.scoring.statistics import bootstrap_interval, paired_difference, smallest_flip_p
 
 VALID = np.ones((256, 256), bool)
 
@@ -86,6 +86,37 @@ def test_sign_flip_p_of_a_uniform_improvement_is_two_in_two_to_the_n():
     assert compared.p == pytest.approx(2 / 2**6)
     assert compared.mean == -1.0
     assert compared.first_better == 6
+
+
+def test_prints_are_resampled_and_flipped_whole():
+    prints, scans_of_each = 6, 4
+    groups = [print_ for print_ in "abcdef" for _ in range(scans_of_each)]
+    better = paired_difference([20.0] * len(groups), [21.0] * len(groups), groups=groups)
+    assert (better.units, better.first_better) == (prints, prints)
+    # Twenty-four scans that agree, and yet no smaller p than six prints can have.
+    assert better.p == smallest_flip_p(prints) == 1 / 32
+    # Groups of one scan are the scans themselves.
+    values = np.random.default_rng(5).normal(size=8).tolist()
+    alone, grouped = (
+        paired_difference(values, [0.0] * 8, groups=groups) for groups in (None, list("abcdefgh"))
+    )
+    assert alone == grouped
+    # What differs from print to print only is as uncertain as the mean of the prints: sd / sqrt(6) each way,
+    # against sd / sqrt(24) if its scans counted as independent. Percentiles of 6 values: within a third.
+    shifts = np.random.default_rng(6).normal(size=prints)
+    values = np.repeat(shifts, scans_of_each).tolist()
+    low, high = bootstrap_interval(values, groups=groups)
+    assert high - low == pytest.approx(2 * 1.96 * shifts.std() / np.sqrt(prints), rel=1 / 3)
+    by_scan = bootstrap_interval(values)
+    assert high - low == pytest.approx(2 * (by_scan[1] - by_scan[0]), rel=1 / 4)
+
+
+def test_prints_of_unequal_size_count_by_their_scans():
+    # Three scans at 0, one at 4: the mean over scans is 1, over prints it would be 2; no draw leaves 0 ... 4.
+    low, high = bootstrap_interval([0.0, 0.0, 0.0, 4.0], groups=list("aaab"))
+    assert (low, high) == (0.0, 4.0)
+    found = paired_difference([0.0, 0.0, 0.0, 4.0], [0.0] * 4, groups=list("aaab"))
+    assert found.mean == 1.0
 
 
 def test_no_difference_gives_p_of_one():

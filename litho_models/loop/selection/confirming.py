@@ -11,8 +11,9 @@ import numpy as np
 from litho_models.scoring.statistics import bootstrap_interval, one_sided_flip_p
 
 BINOMIAL_P = 0.005
-# Seven gains out of seven have p = 0.0078: below eight scans nothing can be confirmed.
-FEWEST_SCANS = 8
+# Every test of a confirmation, binomial or by sign flips, has p = 2**-n at best: seven gains out of seven
+# have 0.0078, so that below eight scans nothing can be confirmed.
+FEWEST_SCANS = math.ceil(-math.log2(BINOMIAL_P))
 SMALLEST_SHARE = 0.01
 SMALLEST_RMSE_NM = 0.5
 LARGEST_SPREAD = 0.5
