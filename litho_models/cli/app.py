@@ -55,7 +55,11 @@ Seed = Annotated[int, typer.Option(min=0, help="seed of weights, crops and split
 def train(
     store: StorePath,
     model: Annotated[
-        str, typer.Option(help="identity, affine, affine-mtf, blur-table, linear, physics, pbl or fno")
+        str,
+        typer.Option(
+            help="identity, affine, affine-mtf, blur-table, linear, features, random-features, physics, "
+            "pbl or fno"
+        ),
     ],
     out: Out,
     recipe: RecipeOption = "fast",

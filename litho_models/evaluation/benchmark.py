@@ -30,8 +30,8 @@ from litho_models.scoring.records import ModelScores, Prediction
 from litho_models.scoring.scores import score_model
 from litho_models.splits.folds import GROUPED_FOLDS, ScoredSplit, SplitKind, plan_folds
 
-BASELINES = ("identity", "affine", "affine-mtf", "blur-table", "linear")
-DEFAULT_MODELS = (*BASELINES, "physics", "pbl", "fno")
+BASELINES = ("identity", "affine", "affine-mtf", "blur-table", "linear", "features")
+DEFAULT_MODELS = (*BASELINES, "random-features", "physics", "pbl", "fno")
 
 
 def benchmark(

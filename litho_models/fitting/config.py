@@ -14,13 +14,13 @@ Recipe = Literal["fast", "paper"]
 RECIPES: tuple[str, ...] = get_args(Recipe)
 PAPER_EPOCHS, PAPER_CROPS, PAPER_BATCH = 4000, 72, 4
 FAST_STEPS = {"pbl": 2000, "fno": 1000}
-# What a fit by Gauss-Newton depends on.
-GAUSS_NEWTON_FIELDS = {"recipe", "variant", "seed", "nuisance", "free_gain"}
+# What a fit by least squares depends on.
+LEAST_SQUARES_FIELDS = {"recipe", "variant", "seed", "nuisance", "free_gain"}
 PAPER_LEARNING_RATE = {"pbl": 5e-4, "fno": 1e-4, "physics": 1e-2}
 
 
 class TrainingConfig(BaseModel):
-    """Settings of one fit. A model that is fitted by Gauss-Newton uses the seed and nuisances only.
+    """Settings of one fit. A model that is fitted by least squares uses the seed and nuisances only.
 
     ``nuisance`` are the per-scan terms fitted jointly with the model (never part of it), their
     offset and gain pinned to a mean of zero over the training scans.
@@ -86,14 +86,16 @@ class TrainingConfig(BaseModel):
         return cls(**{"recipe": recipe, **paper, **settings})
 
     def takes_steps(self, model: Simulator) -> bool:
-        """Whether the model is trained by stochastic gradient rather than fitted by Gauss-Newton.
+        """Whether the model is trained by stochastic gradient rather than by least squares.
 
-        A model with many parameters always is; a small one where the paper trains it so.
+        One with many parameters is, unless it is linear in them; a small one where the paper trains it so.
         """
-        return not is_small(model) or (self.recipe == "paper" and model.name in PAPER_LEARNING_RATE)
+        closed_form = is_small(model) or model.is_linear
+        return not closed_form or (self.recipe == "paper" and model.name in PAPER_LEARNING_RATE)
 
     def used_by(self, model: Simulator) -> dict[str, Any]:
         """The settings that decide a fit of ``model``, for its record."""
         if self.takes_steps(model):
             return self.model_dump(mode="json")
-        return {**self.model_dump(mode="json", include=GAUSS_NEWTON_FIELDS), "optimiser": "gauss-newton"}
+        optimiser = "gauss-newton" if is_small(model) else "ridge"
+        return {**self.model_dump(mode="json", include=LEAST_SQUARES_FIELDS), "optimiser": optimiser}

@@ -18,9 +18,11 @@ from litho_data.foundation.hashes import array_sha256
 from litho_data.store import PrintedScan
 from litho_models.fitting.checkpoint import CheckpointFolder, RoundRecord
 from litho_models.fitting.config import TrainingConfig
+from litho_models.fitting.ridge import fit_ridge
 from litho_models.fitting.small_models import fit_small_model
 from litho_models.fitting.stochastic import train_network
 from litho_models.models import build_model
+from litho_models.models.features import Features
 from litho_models.prediction.tiles import predict_scan
 from litho_models.simulator import Simulator
 from litho_models.splits.folds import inner_validation
@@ -85,6 +87,8 @@ def fit_with_record(
         history = train_network(
             model, training, validation, config, lambda: _first_predictions(training, config), folder
         )
+    elif isinstance(model, Features):
+        fit_ridge(model, scans, config.nuisance, config.free_gain)
     else:
         fit_small_model(model, scans, config.nuisance, config.free_gain)
     return Fitted(

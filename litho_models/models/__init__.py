@@ -9,6 +9,7 @@ from litho_data.foundation.errors import InputError
 from litho_models.models.affine import Affine
 from litho_models.models.affine_mtf import AffineMtf
 from litho_models.models.blur_table import BlurTable
+from litho_models.models.features import Features, RandomFeatures
 from litho_models.models.fno import Fno
 from litho_models.models.identity import Identity
 from litho_models.models.linear import Linear
@@ -19,7 +20,11 @@ from litho_models.simulator import Simulator, Variant
 __all__ = ["MODELS", "build_model", "model_class", "require_models"]
 
 MODELS: dict[str, type[Simulator]] = {
-    model.name: model for model in (Identity, Affine, AffineMtf, BlurTable, Linear, Physics, Pbl, Fno)
+    model.name: model
+    for model in (
+        *(Identity, Affine, AffineMtf, BlurTable, Linear),
+        *(Features, RandomFeatures, Physics, Pbl, Fno),
+    )
 }
 
 

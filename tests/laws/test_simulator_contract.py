@@ -18,6 +18,13 @@ CASES = [(name, variant) for name in MODELS for variant in VARIANTS]
 NARROW = {
     "affine-mtf": {"sigmas_um": (0.1, 0.2, 0.3)},
     "linear": {"sigmas_um": (0.1, 0.2, 0.3)},
+    "features": {"sigmas_um": (0.0, 0.1, 0.3), "shifts_um": (0.2, 0.5)},
+    "random-features": {
+        "sigmas_um": (0.0, 0.3),
+        "slope_sigmas_um": (0.15,),
+        "shifts_um": (0.2,),
+        "units": 70,
+    },
     "pbl": {"sigma_diffusion_init_um": 0.3},
     "physics": {"sigma_diffusion_init_um": 0.3},
     "fno": {"width": 6, "modes": (4, 4), "projection_channels": 8},
@@ -43,16 +50,8 @@ def layout(ny: int = 80, nx: int = 96, seed: int = 1) -> torch.Tensor:
 
 
 def test_there_are_models_to_test():
-    assert set(MODELS) >= {
-        "identity",
-        "affine",
-        "affine-mtf",
-        "blur-table",
-        "linear",
-        "physics",
-        "pbl",
-        "fno",
-    }
+    baselines = {"identity", "affine", "affine-mtf", "blur-table", "linear", "features", "random-features"}
+    assert set(MODELS) >= baselines | {"physics", "pbl", "fno"}
 
 
 @pytest.mark.parametrize(("name", "variant"), CASES)
@@ -85,7 +84,7 @@ def test_samples_of_a_batch_do_not_touch_each_other(name, variant):
 
 @pytest.mark.parametrize(("name", "variant"), CASES)
 def test_gradient_equals_finite_difference(name, variant):
-    if name == "linear" and variant != "default":
+    if name in ("linear", "features", "random-features") and variant != "default":
         pytest.skip("the variants of a baseline are the same model")
     model = make(name, variant).double()
     field = (layout(60, 64).double() + 0.05).clamp(0.02, 1.18).requires_grad_()

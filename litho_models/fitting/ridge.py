@@ -1,0 +1,119 @@
+"""Models that are linear in many features: ridge regression in closed form, one scan in memory at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+
+from litho_data.foundation.commands import progress
+from litho_data.store import PrintedScan
+from litho_models.fitting.least_squares import ABSOLUTE_WIDTH_UM, Linearised, eliminated, orthonormal
+from litho_models.layers.gaussian import pad_field
+from litho_models.models.features import Features, RandomFeatures
+from litho_models.scan_terms import FloatMap, Policy, TermPixels, Terms, least_squares, line_terms, term_maps
+from litho_models.scan_terms.training import training_terms
+
+# Relative to the mean square of each feature, what scans may add taken out: only what the scans cannot tell
+# apart feels it. On the measured prints nothing changes from 1e-6 to 1e-4.
+RIDGE = 1e-5
+# Pixels of a scan that are fitted, on a square grid: with twice as many the measured prints are predicted
+# alike. The rows of one scan are all that is kept (16,384 × 8 B × 654 features: 86 MB), and the maps of one
+# tile (0.3 GB).
+FITTED_PX = 16_384
+TILE_PX = 512
+# The first pass minimises squares; the second reweights them to absolute values, so that blobs weigh little.
+PASSES = 2
+# Of what the scans may add by themselves: fixes what only these terms carry, the common datum.
+_TERM_WEIGHT = 1e-3
+
+
+def fit_ridge(
+    model: Features, scans: Sequence[PrintedScan], policy: Policy, free_gain: bool = False
+) -> list[float]:
+    """Fit the weights of ``model`` in place to the mean absolute error.
+
+    Args:
+        model: the model; ``scans``: what it is fitted to.
+        policy: what each scan may add by itself; offsets of lines are left out, as they average out.
+
+    Returns:
+        mean absolute residual before the last pass, µm, the terms of the scans taken out.
+    """
+    terms = training_terms(policy, free_gain)
+    terms -= {term.name for term in line_terms(terms)}
+    if isinstance(model, RandomFeatures):
+        _standardise(model, scans)
+    weights: FloatMap | None = None
+    losses = []
+    for _ in range(PASSES):
+        size = model.parameter_count
+        matrix, right, errors = np.zeros((size, size)), np.zeros(size), []
+        for scan in progress(scans, f"fitting {model.name}"):
+            design, height, basis = _rows(model, scan, terms)
+            certainty = np.ones_like(height)
+            if weights is not None:
+                rest = height - weights @ design
+                rest -= least_squares(basis, rest) @ basis if len(basis) else 0.0
+                errors.append(np.abs(rest).mean())
+                certainty = 1 / np.sqrt(rest**2 + ABSOLUTE_WIDTH_UM**2)
+            root = np.sqrt(certainty / certainty.sum())
+            own = Linearised(height * root, design * root, orthonormal((basis * root).T).T)
+            normal, moment, _ = eliminated(own, _TERM_WEIGHT)
+            matrix, right = matrix + normal, right + moment
+        weights = _ridge(matrix, right)
+        losses += [float(np.mean(errors))] if errors else []
+    with torch.no_grad():
+        model.weights.copy_(torch.as_tensor(weights))
+    return losses
+
+
+def _ridge(matrix: FloatMap, right: FloatMap) -> FloatMap:
+    size = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
+    return np.linalg.solve(matrix / np.outer(size, size) + RIDGE * np.eye(len(size)), right / size) / size
+
+
+def _rows(model: Features, scan: PrintedScan, terms: Terms) -> tuple[FloatMap, FloatMap, FloatMap]:
+    """Features (k, n), measured height (n,) µm and the scan's own terms (m, n) at the fitted pixels."""
+    at = _fitted_pixels(scan)
+    height = scan.height_um.reshape(-1)[at].astype(np.float64)
+    return _features(model, scan, at), height, term_maps(TermPixels(scan.layout_um, at=at), terms)
+
+
+def _features(model: Features, scan: PrintedScan, at: np.ndarray) -> FloatMap:
+    """Features (k, n) at flat indices of a scan, tile by tile."""
+    reach = model.reach_px
+    layout = pad_field(torch.from_numpy(scan.layout_um)[None, None], reach, reach)
+    place = np.stack(np.divmod(at, scan.shape[1]))
+    tile = place // TILE_PX
+    found = np.empty((model.parameter_count, len(at)))
+    for number in np.unique(tile, axis=1).T:
+        inside = np.flatnonzero((number == tile.T).all(axis=1))
+        top, left = number * TILE_PX
+        side = TILE_PX + 2 * reach
+        part = layout[..., top : top + side, left : left + side]
+        y, x = place[:, inside] - TILE_PX * number[:, None]
+        own = torch.from_numpy(y * (part.shape[-1] - 2 * reach) + x)
+        with torch.no_grad():
+            found[:, inside] = model.at_pixels(part, own).numpy()
+    return found
+
+
+def _fitted_pixels(scan: PrintedScan) -> np.ndarray:
+    usable = scan.valid & np.isfinite(scan.height_um)
+    step = max(1, round((usable.size / FITTED_PX) ** 0.5))
+    grid = np.zeros_like(usable)
+    grid[::step, ::step] = True
+    return np.flatnonzero(usable & grid)
+
+
+def _standardise(model: RandomFeatures, scans: Sequence[PrintedScan]) -> None:
+    """Measure what the random features see: mean over all scans, spread within them."""
+    count = len(model.centre)
+    seen = [_features(model, scan, _fitted_pixels(scan))[:count] for scan in scans]
+    centre = np.mean([one.mean(axis=1) for one in seen], axis=0)
+    spread = np.sqrt(np.mean([one.var(axis=1) for one in seen], axis=0))
+    model.standardise(
+        torch.as_tensor(centre), torch.as_tensor(np.where(spread > 1e-6 * spread.max(), spread, 1.0))
+    )

@@ -1,0 +1,204 @@
+"""Linear in many features of the layout: how far blurs, slopes and their products go without a network."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations_with_replacement
+from typing import ClassVar
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+
+from litho_models.layers.gaussian import kernel_radius_px
+from litho_models.models.affine_mtf import blurred_interior
+from litho_models.simulator import Simulator, SimulatorConfig, crop_border
+
+# Relative height per µm below which the length of a slope is rounded off, so that it has a derivative.
+_LEAST_SLOPE = 1e-4
+_UNITS_AT_ONCE = 64
+
+
+class FeaturesConfig(SimulatorConfig):
+    sigmas_um: tuple[float, ...] = Field(
+        (0.0, 0.1, 0.2, 0.3, 0.45, 0.65, 1.0, 1.6, 2.5, 4.0),
+        min_length=1,
+        description="blurs, µm; 0 is the layout itself",
+    )
+    slope_sigmas_um: tuple[float, ...] = Field((0.15, 0.3, 0.6), min_length=1, description="µm")
+    shifts_um: tuple[float, ...] = Field((0.2, 0.5, 1.0), min_length=1, description="displacements, µm")
+    shift_sigma_um: float = Field(0.1, gt=0, description="blur of what is displaced, µm")
+
+
+class Features(Simulator):
+    """H = w · φ(M), all heights relative to the highest level.
+
+    φ: blurs with their cubes and the products of each two; slopes along y and x at several blurs, their
+    sizes, products and second derivatives; copies displaced to one side, and the sizes of the steps up to
+    them. Sizes |∂x| and |∂y| are features of their own because a microscope's lines make the two axes unlike.
+    The weights are found in closed form, see ``litho_models.fitting.ridge``.
+    """
+
+    name = "features"
+    is_linear = True
+    Config: ClassVar[type[SimulatorConfig]] = FeaturesConfig
+    config: FeaturesConfig
+
+    def __init__(self, config: FeaturesConfig):
+        super().__init__(config)
+        weights = torch.zeros(feature_count(config))
+        weights[0] = config.full_height_um
+        self.weights = nn.Parameter(weights)
+
+    @property
+    def reach_px(self) -> int:
+        config = self.config
+        blurred = max(self._radius(sigma) for sigma in (*config.sigmas_um, *config.slope_sigmas_um))
+        displaced = self._steps_px()[-1] + self._radius(config.shift_sigma_um)
+        return max(blurred + 1, displaced)
+
+    def interior(self, layout_um: Tensor) -> Tensor:
+        simple, products = self.features(layout_um)
+        return _weighted(self.weights, (*simple, *products))
+
+    def features(self, layout_um: Tensor) -> tuple[list[Tensor], list[Tensor]]:
+        """φ(M) of the interior, (b, 1, y, x) each: blurs, slopes, displaced copies; their products, and 1."""
+        config = self.config
+        layout = layout_um / config.full_height_um
+        blurs = [self._blurred(layout, sigma) for sigma in config.sigmas_um]
+        slopes = [self._slopes(self._blurred(layout, s, margin_px=1)) for s in config.slope_sigmas_um]
+        products = [first * second for first, second in combinations_with_replacement(blurs, 2)]
+        products += [blur**3 for blur in blurs]
+        for height, y, x, size_y, size_x, *_ in slopes:
+            products += [y * y, x * x, y * x, *(height * slope for slope in (y, x, size_y, size_x))]
+            products.append((y * y + x * x + _LEAST_SLOPE**2).sqrt())
+        simple = [*blurs, *(one for group in slopes for one in group), *self._displaced(layout)]
+        return simple, [*products, torch.ones_like(blurs[0])]
+
+    def at_pixels(self, layout_um: Tensor, at: Tensor) -> Tensor:
+        """φ(M) (features, n) at the flat indices ``at`` of the interior of one layout (1, 1, y, x)."""
+        simple, products = self.features(layout_um)
+        return torch.stack([feature.reshape(-1)[at] for feature in (*simple, *products)])
+
+    def _slopes(self, height: Tensor) -> list[Tensor]:
+        """Height, slopes, their sizes and second derivatives, per µm; from a height with a margin of 1 px."""
+        pitch, inner = self.pitch_um, crop_border(height, 1)
+        up, down, left, right = _neighbours(height, 1)
+        y, x = (down - up) / (2 * pitch), (right - left) / (2 * pitch)
+        corners = height[..., 2:, 2:] + height[..., :-2, :-2] - height[..., 2:, :-2] - height[..., :-2, 2:]
+        curved = [up + down - 2 * inner, left + right - 2 * inner, corners / 4]
+        return [inner, y, x, y.abs(), x.abs(), *(second / pitch**2 for second in curved)]
+
+    def _displaced(self, layout: Tensor) -> list[Tensor]:
+        """Copies displaced to each side, and the sizes of the steps up to them and across."""
+        steps, found = self._steps_px(), []
+        sharp = self._blurred(layout, self.config.shift_sigma_um, margin_px=steps[-1])
+        here = crop_border(sharp, steps[-1])
+        for step in steps:
+            up, down, left, right = _neighbours(crop_border(sharp, steps[-1] - step), step)
+            found += [up, down, left, right]
+            for before, after in ((up, down), (left, right)):
+                found += [(before - here).abs(), (after - here).abs(), (after - before).abs()]
+        return found
+
+    def _blurred(self, layout: Tensor, sigma_um: float, margin_px: int = 0) -> Tensor:
+        reach = self.reach_px - margin_px
+        if not sigma_um:
+            return crop_border(layout, reach)
+        return blurred_interior(layout, sigma_um, self.pitch_um, reach)
+
+    def _steps_px(self) -> list[int]:
+        return sorted(max(1, round(shift_um / self.pitch_um)) for shift_um in self.config.shifts_um)
+
+    def _radius(self, sigma_um: float) -> int:
+        return kernel_radius_px(sigma_um / self.pitch_um)
+
+
+class RandomFeaturesConfig(FeaturesConfig):
+    units: int = Field(500, ge=1, description="random features")
+    inputs: int = Field(8, ge=1, description="simple features that each of them sees")
+    seed: int = Field(0, ge=0, description="of what they see")
+
+
+class RandomFeatures(Features):
+    """``Features`` and tanh(V z + c) of the standardised simple ones, V and c drawn at random and kept.
+
+    A network with one hidden layer that is not trained (random features, Rahimi and Recht 2008): what lies
+    beyond products of two features can be learned, still in closed form.
+    """
+
+    name = "random-features"
+    Config: ClassVar[type[SimulatorConfig]] = RandomFeaturesConfig
+    config: RandomFeaturesConfig
+    directions: Tensor
+    thresholds: Tensor
+    centre: Tensor
+    scale: Tensor
+
+    def __init__(self, config: RandomFeaturesConfig):
+        super().__init__(config)
+        count = simple_count(config)
+        random = torch.Generator().manual_seed(config.seed)
+        seen = torch.rand(config.units, count, generator=random).argsort(dim=1) < config.inputs
+        size = min(config.inputs, count) ** 0.5
+        self.register_buffer("directions", torch.randn(config.units, count, generator=random) * seen / size)
+        self.register_buffer("thresholds", torch.randn(config.units, generator=random))
+        self.register_buffer("centre", torch.zeros(count))
+        self.register_buffer("scale", torch.ones(count))
+        self.weights = nn.Parameter(torch.cat([self.weights.detach(), torch.zeros(config.units)]))
+
+    def interior(self, layout_um: Tensor) -> Tensor:
+        simple, products = self.features(layout_um)
+        known = len(simple) + len(products)
+        height = _weighted(self.weights[:known], (*simple, *products))
+        standard = self._standard(torch.cat(simple, dim=1))
+        for block in torch.arange(self.config.units).split(_UNITS_AT_ONCE):
+            own = self.weights[known:][block], self.directions[block], self.thresholds[block]
+            # Computed again for a gradient: all units of a field at once would take gigabytes.
+            height = height + checkpoint(_random_part, standard, *own, use_reentrant=False)
+        return height
+
+    def at_pixels(self, layout_um: Tensor, at: Tensor) -> Tensor:
+        """As of ``Features``, then the random ones."""
+        known = super().at_pixels(layout_um, at)
+        standard = self._standard(known[None, : len(self.centre), :, None])[0, ..., 0]
+        return torch.cat([known, torch.tanh(self.directions @ standard + self.thresholds[:, None])])
+
+    def standardise(self, centre: Tensor, scale: Tensor) -> None:
+        """State mean and standard deviation (simple features,) of what the random ones see."""
+        self.centre.copy_(centre)
+        self.scale.copy_(scale)
+
+    def _standard(self, simple: Tensor) -> Tensor:
+        return (simple - self.centre[:, None, None]) / self.scale[:, None, None]
+
+
+def _random_part(standard: Tensor, weights: Tensor, directions: Tensor, thresholds: Tensor) -> Tensor:
+    """Weighted sum (b, 1, y, x) of some units over (b, features, y, x)."""
+    seen = torch.einsum("bfyx,uf->buyx", standard, directions) + thresholds[:, None, None]
+    return torch.einsum("buyx,u->byx", torch.tanh(seen), weights)[:, None]
+
+
+def _weighted(weights: Tensor, features: Sequence[Tensor]) -> Tensor:
+    height = torch.zeros_like(features[0])
+    for weight, feature in zip(weights, features, strict=True):
+        height = height + weight * feature
+    return height
+
+
+def _neighbours(field: Tensor, step: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Pixels ``step`` above, below, left and right of those farther than ``step`` from the edge."""
+    inner, far, near = slice(step, -step), slice(2 * step, None), slice(None, -2 * step)
+    return field[..., near, inner], field[..., far, inner], field[..., inner, near], field[..., inner, far]
+
+
+def simple_count(config: FeaturesConfig) -> int:
+    """Number of features that are no products."""
+    return len(config.sigmas_um) + 8 * len(config.slope_sigmas_um) + 10 * len(config.shifts_um)
+
+
+def feature_count(config: FeaturesConfig) -> int:
+    """Number of features that a config has, without random ones."""
+    blurs = len(config.sigmas_um)
+    return simple_count(config) + blurs * (blurs + 1) // 2 + blurs + 8 * len(config.slope_sigmas_um) + 1
