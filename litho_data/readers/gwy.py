@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import struct
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import is_length, um_per
-from litho_data.readers.reader import Channel, Reader, foreign_parser, with_unique_names
+from litho_data.readers.confined import confined
+from litho_data.readers.reader import Channel, Loaded, Reader, foreign_parser, with_unique_names
 
 _MAGIC = b"GWYP"
 _SCALAR_BYTES = {"b": 1, "c": 1, "i": 4, "q": 8, "d": 8}
@@ -43,17 +45,27 @@ def _channel(path: Path, container: Any, key: str) -> Channel:
     number = key.split("/")[1]
     field = container[key]
     shape = (int(field["yres"]), int(field["xres"]))
-    values = _pixels(path, key, field, shape)
-    mask_field = container.get(f"/{number}/mask")
-    mask = None if mask_field is None else _pixels(path, f"/{number}/mask", mask_field, shape) > 0
     return Channel(
         name=str(container.get(f"{key}/title", f"channel {number}")),
         shape=shape,
         unit=_unit(field, "si_unit_z"),
         size_um=_size_um(field),
-        load=lambda: (values, mask),
+        load=partial(_load, path, key, shape),
         header=_header(container.get(f"/{number}/meta")),
     )
+
+
+def _load(path: Path, key: str, shape: tuple[int, int]) -> Loaded:
+    import gwyfile
+
+    with foreign_parser(path, "GWY"):
+        container = gwyfile.load(str(path))
+        mask_key = key.replace("/data", "/mask")
+        mask = container.get(mask_key)
+        return (
+            _pixels(path, key, container[key], shape),
+            None if mask is None else _pixels(path, mask_key, mask, shape) > 0,
+        )
 
 
 def _pixels(path: Path, key: str, field: Any, shape: tuple[int, int]) -> np.ndarray:
@@ -146,4 +158,4 @@ def _string_end(data: bytes, start: int, limit: int) -> int:
     return end + 1
 
 
-READER = Reader("gwy", lambda path, head: head.startswith(_MAGIC), read_channels)
+READER = Reader("gwy", lambda path, head: head.startswith(_MAGIC), confined(read_channels, ("gwyfile",)))

@@ -1,13 +1,25 @@
-"""NumPy arrays in ``.npy`` files; pickled objects are refused."""
+"""NumPy arrays in ``.npy`` and ``.npz`` files; pickled objects are refused."""
 
 from __future__ import annotations
 
+import zipfile
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError
-from litho_data.readers.reader import Channel, Reader, foreign_parser
+from litho_data.readers.reader import Channel, Loaded, Reader, foreign_parser
+
+_ZIP_MAGIC = b"PK\x03\x04"
+_NAME_AT = 30
+# The most that deflate packs.
+_MOST_BYTES_PER_BYTE = 1032
+_READ_HEADER = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
 
 
 def read_channels(path: Path) -> list[Channel]:
@@ -19,17 +31,46 @@ def read_channels(path: Path) -> list[Channel]:
     array = load_array(path)
     if array.ndim != 2:
         raise InputError(f"{path}: shape", got=array.shape, wanted="two dimensions (ny, nx)")
-    return [
-        Channel(
-            name="array",
-            shape=(array.shape[0], array.shape[1]),
-            unit=None,
-            size_um=None,
-            load=lambda: (np.array(array), None),
-            full_scale=float(np.iinfo(array.dtype).max) if array.dtype.kind in "ui" else None,
-            header={"dtype": str(array.dtype)},
-        )
-    ]
+    return [_channel("array", array.shape, array.dtype, lambda: (np.array(array), None))]
+
+
+def read_archive(path: Path) -> list[Channel]:
+    """One channel per two-dimensional array of numbers in an ``.npz`` file; others are passed over.
+
+    Raises:
+        InputError: damaged file, or no such array.
+    """
+    channels = []
+    with foreign_parser(path, "NPZ"), zipfile.ZipFile(path) as archive:
+        for member in archive.infolist():
+            with archive.open(member) as stream:
+                shape, _, dtype = _READ_HEADER[np.lib.format.read_magic(stream)](stream)
+                whole = stream.tell() + np.prod(shape, dtype=float) * dtype.itemsize == member.file_size
+            if not whole or member.file_size > _MOST_BYTES_PER_BYTE * member.compress_size:
+                raise InputError(f"{path}: {member.filename}", got=f"{member.file_size} bytes", wanted=shape)
+            if len(shape) == 2 and min(shape) > 1 and dtype.kind in "uif":
+                name = member.filename.removesuffix(".npy")
+                channels.append(_channel(name, shape, dtype, partial(_load_member, path, name)))
+    if not channels:
+        raise InputError(f"{path} (NPZ) holds no two-dimensional array of numbers")
+    return channels
+
+
+def _load_member(path: Path, name: str) -> Loaded:
+    with foreign_parser(path, "NPZ"), np.load(path, allow_pickle=False) as archive:
+        return archive[name], None
+
+
+def _channel(name: str, shape: tuple[int, ...], dtype: np.dtype, load: Callable[[], Loaded]) -> Channel:
+    return Channel(
+        name=name,
+        shape=(shape[0], shape[1]),
+        unit=None,
+        size_um=None,
+        load=load,
+        full_scale=float(np.iinfo(dtype).max) if dtype.kind in "ui" else None,
+        header={"dtype": str(dtype)},
+    )
 
 
 def load_array(path: Path) -> np.ndarray:
@@ -49,4 +90,11 @@ def load_array(path: Path) -> np.ndarray:
     return array
 
 
+def _is_archive(head: bytes) -> bool:
+    """Whether the first file in a ZIP is an array; its name stands behind a header of 30 bytes."""
+    length = int.from_bytes(head[26:28], "little")
+    return head.startswith(_ZIP_MAGIC) and head[_NAME_AT : _NAME_AT + length].endswith(b".npy")
+
+
+ARCHIVE_READER = Reader("npz", lambda path, head: _is_archive(head), read_archive, self_describing=False)
 READER = Reader("npy", lambda path, head: head.startswith(b"\x93NUMPY"), read_channels, self_describing=False)

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import um_per
-from litho_data.readers.reader import Channel, Reader
+from litho_data.readers.gzipped import unpacked
+from litho_data.readers.reader import Channel, Loaded, Reader
 from litho_data.readers.registry import PICTURE, detect_format, reader_of, require_file
 from litho_data.scan import Axis, Scan
 
+# Deflate, the strongest compression in use, packs at most 1032 bytes into one byte.
+_MOST_PIXELS_PER_BYTE = 1032
 # Files state sizes rounded to a few digits.
 _SIZE_TOLERANCE = 1e-4
 
@@ -43,11 +48,11 @@ def read_scan(
         InputError: unreadable, no or several height channels, a missing or contradicting unit or
             size, nothing finite in the map.
     """
-    file = require_file(path)
-    reader = _settle_format(file, format)
-    chosen = _choose(file, reader.read_channels(file), channel)
-    values, mask = chosen.load()
-    stated_unit, factor = _settle_unit(file, chosen, unit, full_scale_um)
+    with unpacked(require_file(path)) as file:
+        reader = _settle_format(file, format)
+        chosen = _choose(file, _read_channels(reader, file), channel)
+        values, mask = chosen.load()
+    stated_unit, factor = _settle_unit(file, chosen, values, unit, full_scale_um)
     return Scan(
         height_um=_to_um(np.asarray(values, dtype=np.float64), factor),
         pitch_um=_settle_pitch(file, chosen, size_um),
@@ -57,7 +62,7 @@ def read_scan(
         fast_axis=_settle_fast_axis(file, chosen, fast_axis),
         mask=mask,
         header=chosen.header,
-        source=str(file),
+        source=str(path),
         format=reader.name,
     )
 
@@ -68,8 +73,31 @@ def list_channels(path: str | Path, *, format: str = "auto") -> list[Channel]:
     Raises:
         InputError: unreadable or of unknown format.
     """
-    file = require_file(path)
-    return _settle_format(file, format).read_channels(file)
+    given = require_file(path)
+    with unpacked(given) as file:
+        channels = _read_channels(_settle_format(file, format), file)
+    if file == given:
+        return channels
+    # The unpacked file is gone by the time when a channel is loaded.
+    return [replace(one, load=partial(_load_packed, given, format, one.name)) for one in channels]
+
+
+def _load_packed(path: Path, format: str, name: str) -> Loaded:
+    with unpacked(path) as file:
+        channels = _read_channels(_settle_format(file, format), file)
+        return next(channel for channel in channels if channel.name == name).load()
+
+
+def _read_channels(reader: Reader, file: Path) -> list[Channel]:
+    channels = reader.read_channels(file)
+    size = file.stat().st_size
+    for channel in channels:
+        if channel.shape[0] * channel.shape[1] > _MOST_PIXELS_PER_BYTE * size:
+            got = f"{size} bytes for {channel.shape[0]} x {channel.shape[1]} pixels"
+            raise InputError(
+                f"{file} ({reader.name})", got=got, wanted="more", hint="the file may be damaged"
+            )
+    return channels
 
 
 def _settle_format(file: Path, format: str) -> Reader:
@@ -97,7 +125,7 @@ def _choose(file: Path, channels: list[Channel], name: str | None) -> Channel:
 
 
 def _settle_unit(
-    file: Path, channel: Channel, unit: str | None, full_scale_um: float | None
+    file: Path, channel: Channel, values: np.ndarray, unit: str | None, full_scale_um: float | None
 ) -> tuple[str, float]:
     """The unit of the file and the factor from its values to µm."""
     if full_scale_um is not None:
@@ -107,7 +135,12 @@ def _settle_unit(
             raise InputError(f"{file}: full scale in µm", got=full_scale_um, wanted="a positive number")
         return f"{full_scale_um:g} µm / {channel.full_scale:g}", full_scale_um / channel.full_scale
     if unit is None and channel.unit is None:
-        raise InputError(f"{file} does not state the unit of its heights", wanted="unit, for example 'm'")
+        first = ", ".join(f"{value:g}" for value in np.asarray(values)[0, :3])
+        raise InputError(
+            f"{file} does not state the unit of its heights",
+            wanted="unit, for example 'm'",
+            hint=f"the first row begins {first}: unit 'm' reads these as metres, 'nm' as nanometres",
+        )
     if unit is not None and channel.unit is not None and um_per(unit) != um_per(channel.unit):
         raise InputError(f"{file}: unit", got=repr(unit), wanted=f"{channel.unit!r} as in the file, or none")
     stated = channel.unit if channel.unit is not None else str(unit)

@@ -5,11 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 
 from litho_data.foundation.errors import InputError
-from litho_data.readers import gsf, gwy, npy, text_matrix, tiff, vendor
+from litho_data.readers import gsf, gwy, hdf5, npy, text_matrix, tiff, vendor
 from litho_data.readers.reader import Reader
 
 # In the order in which they are asked.
-_READERS = [gsf.READER, gwy.READER, npy.READER, tiff.READER, text_matrix.READER, vendor.READER]
+_READERS = [
+    gsf.READER,
+    gwy.READER,
+    npy.READER,
+    npy.ARCHIVE_READER,
+    tiff.READER,
+    hdf5.READER,
+    text_matrix.READER,
+    vendor.READER,
+]
 PICTURE = "image"
 _PICTURE_MAGIC = (b"\x89PNG\r\n\x1a\n", b"BM")
 _HEAD_BYTES = 1 << 16

@@ -16,70 +16,126 @@ from litho_data.readers.reader import Channel, Reader
 _TEXT_BYTES = bytes(range(0x20, 0x7F)) + b"\t\n\r\x0c"
 _EMPTY_CELL = re.compile(rb"[,;][ \t]*[,;]")
 _EXPONENT = re.compile(r"[eE][+-]?\d+$")
-_LENGTH = re.compile(r"^\s*([-+\d.eE]+)\s*(\S+)\s*$")
-_COMMENT = b"#"
-_NUMBER = re.compile(rb"[-+]?(\d+[.,]?\d*|[.,]\d+)([eE][-+]?\d+)?|[-+]?nan", re.IGNORECASE)
+_FORTRAN_EXPONENT = re.compile(rb"(?<=[\d.])[dD](?=[-+]?\d)")
+_LENGTH = re.compile(r"^\s*([-+\d.,eE]+)\s*(\S+)\s*$")
+_ENTRY = re.compile(r"([\w ()>-]+?)\s*[:=]\s*(.*)")
+_COMMENT = (b"#", b"%", b";")
+_NUMBER = re.compile(rb"[-+]?(\d+[.,]?\d*|[.,]\d+)([eEdD][-+]?\d+)?|[-+]?nan|[-+]?inf", re.IGNORECASE)
+_AROUND_COMMA = re.compile(rb"[ \t]*,[ \t]*(?=[^\s,])|[ \t]*,[ \t]*(?=\r?\n|$)")
+_OTHER_SEPARATOR = re.compile(rb"[^\s,][ \t]*[;\t ]+[ \t]*[^\s;,]")
+_UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 _CELL_WIDTH = len("-1.2345e-007\t")
+_MOST_HEADER_LINES = 1000
+_SHOWN_ROWS, _SHOWN_CHARACTERS = 2, 40
+# A row of two or three numbers in a long table is a point, not a line of a map.
+_POINT_COLUMNS, _POINT_ROWS_PER_COLUMN = 3, 3
+# Gwyddion exports these words in the language of its user.
+_WIDTHS = ("Width", "Breite", "Largeur", "Larghezza", "Ancho", "Šířka")
+_HEIGHTS = ("Height", "Höhe", "Hauteur", "Altezza", "Alto", "Výška")
+_CHANNELS = ("Channel", "Kanal", "Canal", "Canale", "Kanál")
+_TO_METRES = "height conversion factor (-> m)"
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """The one channel of a text matrix; unit and size only if comment lines of Gwyddion state them.
+    """The one channel of a text matrix; unit and size only if the lines above the numbers state them.
 
-    Comment lines start with ``#``. A decimal comma is accepted if the cells are not separated by
-    commas. ``nan`` marks a pixel that was not measured.
+    Lines of words, and lines that start with ``#``, ``%`` or ``;``, are the header. A decimal comma is
+    accepted if the cells are not separated by commas, and so is Fortran's ``1.0D-07``. ``nan`` marks a
+    pixel that was not measured.
 
     Raises:
-        InputError: binary or empty file, something that is no number, rows of different lengths,
-            or a last number that was cut off; the message names the line.
+        InputError: binary or empty file, something that is no number, rows of different lengths, mixed
+            separators, numbers too large, or a last number that was cut off; the message names the line
+            and shows the first rows.
     """
-    raw = path.read_bytes().removeprefix(b"\xef\xbb\xbf")
-    comments, body, first_line = _split_comments(raw)
-    header = _header(comments)
-    values = _parse(path, body, first_line)
+    raw = _in_utf_8(path, path.read_bytes())
+    head, body, first_line = _split_header(raw)
+    header = _header(head)
+    try:
+        values = _parse(path, body, first_line)
+    except InputError as error:
+        rows = [line.strip() for line in body.splitlines() if line.strip()][:_SHOWN_ROWS]
+        shown = " | ".join(repr(row.decode("latin-1")[:_SHOWN_CHARACTERS]) for row in rows)
+        raise InputError(str(error), hint=f"the first rows are {shown}" if rows else "") from error
+    factor = float(header[_TO_METRES]) if _NUMBER.fullmatch(header.get(_TO_METRES, "").encode()) else None
     return [
         Channel(
-            name=header.get("Channel", "height"),
+            name=_first(header, _CHANNELS) or "height",
             shape=(values.shape[0], values.shape[1]),
-            unit=header.get("Value units"),
-            size_um=_size_um(header),
-            load=lambda: (values, None),
+            unit=header.get("Value units") if factor is None else "m",
+            size_um=_size_um(header, values.shape),
+            load=lambda: (values if factor is None else values * factor, None),
             header=header,
         )
     ]
 
 
-def _split_comments(raw: bytes) -> tuple[list[bytes], bytes, int]:
-    """Comment lines on top, the rest, and the number of the first line of the rest."""
-    comments = []
+def _in_utf_8(path: Path, raw: bytes) -> bytes:
+    if not raw.startswith(_UTF_16):
+        return raw.removeprefix(b"\xef\xbb\xbf")
+    try:
+        return raw.decode("utf-16").encode()
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"cannot read {path} as UTF-16", got=error.reason, hint="the file may be truncated"
+        ) from error
+
+
+def _split_header(raw: bytes) -> tuple[list[bytes], bytes, int]:
+    """Lines above the numbers, the rest, and the number of the first line of the rest.
+
+    A line of words counts as header only if less than half of its cells are numbers: otherwise it is a
+    damaged row, which must not be passed over.
+    """
+    header: list[bytes] = []
     start = 0
-    while raw.startswith(_COMMENT, start):
+    while start < len(raw) and len(header) < _MOST_HEADER_LINES:
         end = raw.find(b"\n", start)
         end = len(raw) if end < 0 else end + 1
-        comments.append(raw[start:end])
+        line = raw[start:end]
+        if line.strip() and not line.startswith(_COMMENT):
+            cells = _cells(line)
+            if 2 * sum(_NUMBER.fullmatch(cell) is not None for cell in cells) >= len(cells):
+                break
+        header.append(line)
         start = end
-    return comments, raw[start:], len(comments) + 1
+    return header, raw[start:], len(header) + 1
 
 
-def _header(comments: list[bytes]) -> dict[str, str]:
+def _cells(line: bytes) -> list[bytes]:
+    return re.split(rb"[\s;]+|,\s*", line.strip(b" \t\r\n,;"))
+
+
+def _header(lines: list[bytes]) -> dict[str, str]:
     header = {}
-    for index, line in enumerate(comments):
-        text = line.decode("utf-8", errors="replace").strip("# \t\r\n")
-        key, colon, value = text.partition(":")
-        header[key.strip() if colon else f"comment {index + 1}"] = value.strip() if colon else text
+    for index, line in enumerate(lines):
+        text = line.decode("utf-8", errors="replace").strip("#%; \t\r\n")
+        entry = _ENTRY.fullmatch(text)
+        if text:
+            header[entry[1].strip() if entry else f"comment {index + 1}"] = entry[2] if entry else text
     return header
 
 
-def _size_um(header: dict[str, str]) -> tuple[float, float] | None:
-    sizes = []
-    for key in ("Height", "Width"):
-        match = _LENGTH.match(header.get(key, ""))
-        if match is None or not is_length(match[2]):
-            return None
-        try:
-            sizes.append(float(match[1]) * um_per(match[2]))
-        except ValueError:
-            return None
-    return sizes[0], sizes[1]
+def _first(header: dict[str, str], names: tuple[str, ...]) -> str:
+    return next((header[name] for name in names if name in header), "")
+
+
+def _size_um(header: dict[str, str], shape: tuple[int, ...]) -> tuple[float, float] | None:
+    """From the two sides, or from the size of a pixel."""
+    if pitch := _length_um(header.get("pixel size", "")):
+        return shape[0] * pitch, shape[1] * pitch
+    sides = [_length_um(_first(header, names)) for names in (_HEIGHTS, _WIDTHS)]
+    return (sides[0], sides[1]) if sides[0] and sides[1] else None
+
+
+def _length_um(text: str) -> float | None:
+    match = _LENGTH.match(text)
+    if match is None or not is_length(match[2]):
+        return None
+    try:
+        return float(match[1].replace(",", ".")) * um_per(match[2])
+    except ValueError:
+        return None
 
 
 def _parse(path: Path, body: bytes, first_line: int) -> np.ndarray:
@@ -95,21 +151,40 @@ def _parse(path: Path, body: bytes, first_line: int) -> np.ndarray:
         raise InputError(
             f"{path} line {line}", got="an empty cell", wanted="a number, or nan where not measured"
         )
-    cells = _separate_by_blanks(body)
+    cells = _separate_by_blanks(path, body, first_line)
+    if b"d" in cells or b"D" in cells:
+        cells = _FORTRAN_EXPONENT.sub(b"e", cells)
     _refuse_cut_number(path, cells, first_line)
     try:
         values = np.loadtxt(io.BytesIO(cells), dtype=np.float64, comments=None, ndmin=2)
     except ValueError:
         _complain(path, cells, first_line)
+    if np.isinf(values).any():
+        _refuse_overflow(path, cells, first_line)
     return values
 
 
-def _separate_by_blanks(body: bytes) -> bytes:
-    """Turn separators into blanks and a decimal comma into a point."""
-    first = body.lstrip().split(b"\n", 1)[0].strip()
-    apart_by_other = any(mark in first for mark in (b";", b"\t", b" "))
-    decimal_comma = b"," in first and b"." not in first and apart_by_other and not re.search(rb",\s", first)
-    return body.translate(bytes.maketrans(b",;\x0c", b".  " if decimal_comma else b"   "))
+def _separate_by_blanks(path: Path, body: bytes, first_line: int) -> bytes:
+    """Turn separators into blanks and a decimal comma into a point.
+
+    Commas separate cells only if nothing else does; otherwise they are decimal commas, and then there is no
+    decimal point in the file.
+
+    Raises:
+        InputError: cells apart by commas and by something else, as in ``1,234.5;2,345.6``.
+    """
+    if b"," not in body:
+        return body.translate(bytes.maketrans(b";\x0c", b"  "))
+    plain = _AROUND_COMMA.sub(b",", body)
+    if not _OTHER_SEPARATOR.search(plain):
+        return body.translate(bytes.maketrans(b",\x0c", b"  "))
+    if b"." in plain or plain != body:
+        for line, row in enumerate(plain.splitlines(), start=first_line):
+            if b"," in row and _OTHER_SEPARATOR.search(row.strip()):
+                got = repr(row.strip().decode("ascii")[:_SHOWN_CHARACTERS])
+                wanted = "cells apart by one separator, and no marks of thousands"
+                raise InputError(f"{path} line {line}", got=got, wanted=wanted)
+    return body.translate(bytes.maketrans(b",;\x0c", b".  "))
 
 
 def _refuse_cut_number(path: Path, cells: bytes, first_line: int) -> None:
@@ -148,6 +223,14 @@ def _complain(path: Path, cells: bytes, first_line: int) -> NoReturn:
         if tokens and not width:
             width, width_line = len(tokens), line
     raise InputError(f"{path} is no matrix of numbers", wanted="one line per row, cells apart by tabs")
+
+
+def _refuse_overflow(path: Path, cells: bytes, first_line: int) -> None:
+    """An infinity that is not written as one is a number too large to hold, such as 1e400."""
+    for line, row in enumerate(cells.decode("ascii").splitlines(), start=first_line):
+        for token in row.split():
+            if "inf" not in token.lower() and np.isinf(float(token)):
+                raise InputError(f"{path} line {line}", got=repr(token[:24]), wanted="a number below 1e308")
 
 
 def _is_number(token: str) -> bool:
@@ -194,14 +277,29 @@ def _five_digits(magnitude: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.where(carried, 10000, mantissa), np.where(positive, exponent + carried, 0)
 
 
-def _starts_with_numbers(head: bytes) -> bool:
-    for line in head.removeprefix(b"\xef\xbb\xbf").splitlines():
-        if line.strip() and not line.startswith(b"#"):
-            cells = re.split(rb"[\s;]+|,\s*", line.strip(b" \t,;"))
-            return len(cells) > 1 and _NUMBER.fullmatch(cells[0]) is not None
-    return False
+def _recognises(path: Path, head: bytes) -> bool:
+    """Whether the file is text with rows of numbers.
+
+    Raises:
+        InputError: the rows are points of a profile or of a cloud.
+    """
+    if head.startswith(_UTF_16):
+        head = head[: len(head) // 2 * 2].decode("utf-16", errors="ignore").encode()
+    lines, body, _ = _split_header(head.removeprefix(b"\xef\xbb\xbf"))
+    if len(lines) == _MOST_HEADER_LINES or b"\0" in b"".join(lines):
+        return False
+    rows = [_cells(line) for line in body.splitlines() if line.strip()]
+    if not rows or len(rows[0]) < 2 or _NUMBER.fullmatch(rows[0][0]) is None:
+        return False
+    columns = len(rows[0])
+    if columns <= _POINT_COLUMNS and len(rows) >= _POINT_ROWS_PER_COLUMN * columns:
+        raise InputError(
+            f"{path} holds {'a profile' if columns == 2 else 'a point cloud'}",
+            got=f"{columns} numbers in a row, the first {b' '.join(rows[0]).decode('latin-1')}",
+            wanted="a height map",
+            hint="format 'text-matrix' reads it as a map",
+        )
+    return True
 
 
-READER = Reader(
-    "text-matrix", lambda path, head: _starts_with_numbers(head), read_channels, self_describing=False
-)
+READER = Reader("text-matrix", _recognises, read_channels, self_describing=False)

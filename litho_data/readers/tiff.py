@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +13,7 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import is_length, um_per
+from litho_data.readers.confined import confined
 from litho_data.readers.reader import Channel, Loaded, Reader, foreign_parser
 
 if TYPE_CHECKING:
@@ -18,21 +21,23 @@ if TYPE_CHECKING:
 
 _MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _XRESOLUTION, _YRESOLUTION = 282, 283
+_OME_SIZES = ("PhysicalSizeY", "PhysicalSizeX")
 _JPK_FILE_FORMAT_VERSION = 0x8000
 
 
 def read_channels(path: Path) -> list[Channel]:
     """One channel per page; RGB pages count as one channel if their samples are identical.
 
-    The resolution tags are used only if ImageJ names their unit; otherwise they usually describe
-    paper, not the sample.
+    The size of a pixel is taken from OME metadata, or from the resolution tags if ImageJ names their
+    unit; otherwise these usually describe paper, not the sample.
 
     Raises:
         InputError: damaged file, or pages that are not two-dimensional images.
     """
     with open_tiff(path) as file:
         imagej = file.imagej_metadata or {}
-        return [_channel(path, index, page, imagej) for index, page in enumerate(file.pages)]
+        ome_um = _ome_pitch_um(file.ome_metadata or "")
+        return [_channel(path, index, page, imagej, ome_um) for index, page in enumerate(file.pages)]
 
 
 @contextmanager
@@ -44,7 +49,9 @@ def open_tiff(path: Path) -> Iterator[TiffFile]:
         yield file
 
 
-def _channel(path: Path, index: int, page: Any, imagej: dict[str, Any]) -> Channel:
+def _channel(
+    path: Path, index: int, page: Any, imagej: dict[str, Any], ome_um: tuple[float, float] | None
+) -> Channel:
     samples = page.samplesperpixel
     if page.ndim not in (2, 3) or (page.ndim == 3 and page.shape[-1] != samples):
         raise InputError(f"{path} page {index}: shape", got=page.shape, wanted="a two-dimensional image")
@@ -58,12 +65,25 @@ def _channel(path: Path, index: int, page: Any, imagej: dict[str, Any]) -> Chann
         name=f"page {index}",
         shape=shape,
         unit=None,
-        size_um=_size_um(page, imagej, shape),
-        load=lambda: _load(path, index),
+        size_um=(shape[0] * ome_um[0], shape[1] * ome_um[1]) if ome_um else _size_um(page, imagej, shape),
+        load=partial(_load, path, index),
         full_scale=float(np.iinfo(dtype).max) if dtype.kind in "ui" else None,
         header={str(key): str(value) for key, value in imagej.items()}
         | ({"ImageDescription": str(page.description)} if page.description else {}),
     )
+
+
+def _ome_pitch_um(text: str) -> tuple[float, float] | None:
+    """(y, x) of the only image in OME metadata; its lengths are in µm unless it names another unit."""
+    images = re.findall(r"<(?:\w+:)?Pixels\s[^>]*", text)
+    if len(images) != 1:
+        return None
+    says = dict(re.findall(r'(PhysicalSize[XY](?:Unit)?)\s*=\s*"([^"]*)"', images[0]))
+    try:
+        pitch = [float(says[key]) * um_per(says.get(f"{key}Unit", "µm")) for key in _OME_SIZES]
+    except (KeyError, ValueError):  # not stated, no number, or in pixels
+        return None
+    return (pitch[0], pitch[1]) if all(0 < one < np.inf for one in pitch) else None
 
 
 def _size_um(page: Any, imagej: dict[str, Any], shape: tuple[int, int]) -> tuple[float, float] | None:
@@ -113,4 +133,6 @@ def _is_jpk(path: Path) -> bool:
         return False
 
 
-READER = Reader("tiff", _recognises, read_channels, self_describing=False)
+READER = Reader(
+    "tiff", _recognises, confined(read_channels, ("tifffile", "imagecodecs")), self_describing=False
+)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, closing
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +14,26 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import is_length, um_per
+from litho_data.readers.confined import confined
 from litho_data.readers.reader import Channel, Loaded, Reader, foreign_parser, with_unique_names
 from litho_data.scan import Axis
 
 # Left out: formats with readers of our own, plain text, and two without a signature, which would accept
 # any bytes of the right length as a map.
 _NOT_OURS = {"npy", "npz", "gwy", "asc", "xyz", "hgt", "nms"}
+IMPORTS = ("SurfaceTopography.IO", "igor2.binarywave")
 _HEAD_BYTES = 512
-# Deflate, the strongest compression in use, packs at most 1032 bytes into one byte.
-_MOST_PIXELS_PER_BYTE = 1032
+_ZIP = (b"PK\x03\x04",)
+# How files start whose readers in SurfaceTopography find that out by trying; igor2 knows four versions.
+_STARTS = {
+    "di": (b"\\*File list", b"?*File list"),
+    "ibw": tuple(bytes(pair) for n in (1, 2, 3, 5) for pair in ((n, 0), (0, n))),
+    "opdx": (b"VCA DATA",),
+    "oir": (b"OLYMPUSRAWFORMAT",),
+    "mnt": (b"\xd0\xcf\x11\xe0",),
+    **dict.fromkeys(("mitutoyo", "nmm", "plux", "poir", "qep", "x3p"), _ZIP),
+}
+_IGOR_5_SIZES = "15I"
 _ANGLE_TOLERANCE_DEG = 1.0
 _NANOSCOPE_END = b"\\*File list end"
 _LONGEST_HEADER = 1 << 20
@@ -35,12 +48,8 @@ def read_channels(path: Path) -> list[Channel]:
     kind = _recognise(path)
     header = _vendor_header(path, kind)
     with foreign_parser(path, kind), _open(path, kind) as reader:
-        channels = [_channel(path, kind, info, header) for info in reader.channels if info.dim == 2]
-    size = path.stat().st_size
-    for channel in channels:
-        if channel.shape[0] * channel.shape[1] > _MOST_PIXELS_PER_BYTE * size:
-            got = f"{size} bytes for {channel.shape[0]} x {channel.shape[1]} pixels"
-            raise InputError(f"{path} ({kind})", got=got, wanted="more", hint="the file may be damaged")
+        maps = [info for info in reader.channels if info.dim == 2 and min(info.nb_grid_pts) > 1]
+        channels = [_channel(path, kind, info, header) for info in maps]
     if not channels:
         raise InputError(f"{path} ({kind}) holds no two-dimensional channel")
     names = _layer_names(path, kind)
@@ -50,24 +59,54 @@ def read_channels(path: Path) -> list[Channel]:
 
 
 def _recognise(path: Path) -> str:
-    """SurfaceTopography's name of the format: the first whose reader opens the file."""
+    """SurfaceTopography's name of the format: the first whose reader opens the file.
+
+    Raises:
+        InputError: unknown, or the one format whose signature the file carries cannot be read.
+    """
     from SurfaceTopography.IO import readers
     from SurfaceTopography.IO.Reader import MagicMatch
 
     with path.open("rb") as stream:
         head = stream.read(_HEAD_BYTES)
+    answers = {
+        reader.format(): reader.can_read(head) for reader in readers if reader.format() not in _NOT_OURS
+    }
+    signed = [
+        kind
+        for kind, answer in answers.items()
+        if (head.startswith(_STARTS[kind]) if kind in _STARTS else answer == MagicMatch.YES)
+    ]
+    unsigned = [
+        kind for kind, answer in answers.items() if answer == MagicMatch.MAYBE and kind not in _STARTS
+    ]
     refusals = []
-    for kind, can_read in ((reader.format(), reader.can_read) for reader in readers):
-        if kind in _NOT_OURS or can_read(head) == MagicMatch.NO:
-            continue
+    for kind in signed or unsigned:
         try:
+            if kind == "ibw":
+                _require_whole_igor_file(path, head)
             with foreign_parser(path, kind), _open(path, kind):
                 return kind
         except InputError as error:
             refusals.append(error)
-    if len(refusals) == 1:
+    if len(refusals) == 1 or len(signed) == 1:
         raise refusals[0]
     raise InputError(f"{path}: format", got=f"unknown content {head[:8]!r}", wanted="a known AFM format")
+
+
+def _require_whole_igor_file(path: Path, head: bytes) -> None:
+    """igor2 trusts the sizes in the header of version 5 and walks through gigabytes of labels."""
+    order = {b"\5\0": "<", b"\0\5": ">"}.get(head[:2])
+    if order is None:
+        return
+    stated = sum(struct.unpack_from(f"{order}{_IGOR_5_SIZES}", head.ljust(64, b"\0"), 4)) + 64
+    if stated > path.stat().st_size:
+        raise InputError(
+            f"cannot read {path} as ibw",
+            got=f"{path.stat().st_size} bytes",
+            wanted=f"the {stated} of its header",
+            hint="the file may be damaged",
+        )
 
 
 def _open(path: Path, kind: str) -> AbstractContextManager[Any]:
@@ -79,14 +118,17 @@ def _open(path: Path, kind: str) -> AbstractContextManager[Any]:
 def _channel(path: Path, kind: str, info: Any, header: dict[str, str]) -> Channel:
     nx, ny = info.nb_grid_pts
     sizes = info.physical_sizes
-    unit = info.unit if info.is_height_channel else info.data_unit or "not a length"
-    lateral_unit = info.lateral_unit
+    lateral_unit, unit = info.lateral_unit, info.unit
+    if isinstance(unit, tuple):  # how a Nanoscope channel says that its values are no lengths
+        lateral_unit, unit = unit[0], unit[1] or "not a length"
+    elif not info.is_height_channel:
+        unit = info.data_unit or "not a length"
     return Channel(
         name=str(info.name),
         shape=(int(ny), int(nx)),
         unit=unit,
         size_um=_size_um(sizes, lateral_unit),
-        load=lambda: _load(path, kind, info.index, sizes is None),
+        load=partial(_load, path, kind, info.index, sizes is None),
         fast_axis=_fast_axis(header),
         header=header or dict(_flatten(info.info.get("raw_metadata", info.info))),
     )
@@ -184,4 +226,4 @@ def _nanoscope_header(path: Path) -> dict[str, str]:
 
 
 # Asked last: which of its many formats a file is in, SurfaceTopography finds out by trying.
-READER = Reader("vendor", lambda path, head: True, read_channels)
+READER = Reader("vendor", lambda path, head: True, confined(read_channels, IMPORTS))

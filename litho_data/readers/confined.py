@@ -1,0 +1,170 @@
+"""Other projects' parsers run in a process of their own, within limits of time and memory.
+
+A damaged header can keep such a parser busy for minutes, make it ask for gigabytes, or crash it. One child
+process per process that reads is started with the first file and kept; only a parser that breaks a limit
+costs a new one.
+"""
+
+from __future__ import annotations
+
+import atexit
+import importlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from functools import partial
+from multiprocessing.connection import Connection, Pipe
+from pathlib import Path
+from typing import Any
+
+from litho_data.foundation.errors import InputError
+from litho_data.readers.reader import Channel
+
+_MIB = 1 << 20
+# Intact files take a hundredth of this time and a tenth of this memory.
+_COMPUTING_S, _COMPUTING_S_PER_MIB = 4.0, 1.0
+_MEMORY_MIB, _MEMORY_PER_BYTE = 128, 64
+# A busy machine may stretch the computing; only a parser that waits for something reaches this.
+_WAITING_PER_COMPUTING = 20
+_OUT_OF_MEMORY = 3
+_START = "from litho_data.readers.confined import serve; serve({descriptor})"
+
+
+def confined(
+    read_channels: Callable[[Path], list[Channel]], imports: tuple[str, ...]
+) -> Callable[[Path], list[Channel]]:
+    """The same function, run in the child process; so is the loading of its channels.
+
+    Where there is no POSIX the function runs in this process.
+
+    Args:
+        read_channels: importable by name; the ``load`` of its channels can be pickled.
+        imports: modules that the child imports before the limits hold.
+    """
+    if os.name != "posix":
+        return read_channels
+
+    def read(path: Path) -> list[Channel]:
+        channels = _CHILD.call(partial(read_channels, path), path, imports)
+        return [replace(one, load=partial(_CHILD.call, one.load, path, imports)) for one in channels]
+
+    return read
+
+
+class _Child:
+    """One child process, started when it is first needed and again after it was ended."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._owner = 0
+
+    def call(self, function: Callable[[], Any], path: Path, imports: tuple[str, ...]) -> Any:
+        """The function's result.
+
+        Raises:
+            InputError: the function's own, or it took too long, needed too much memory, or crashed.
+        """
+        size = path.stat().st_size
+        computing_s = _COMPUTING_S + _COMPUTING_S_PER_MIB * size / _MIB
+        memory = _MEMORY_MIB * _MIB + _MEMORY_PER_BYTE * size
+        with self._lock:
+            self._start()
+            try:
+                self._pipe.send((os.getcwd(), imports, function, computing_s, memory))
+                if not self._pipe.poll(_WAITING_PER_COMPUTING * computing_s):
+                    raise TimeoutError
+                result, refusal = self._pipe.recv()
+            except (EOFError, OSError) as error:
+                raise InputError(
+                    f"cannot read {path}", got=self._end(error, computing_s), hint="the file may be damaged"
+                ) from error
+            except BaseException:
+                self.stop()  # an answer that nobody waits for must not reach the next file
+                raise
+        if refusal:
+            raise InputError(refusal)
+        return result
+
+    def _start(self) -> None:
+        # A forked copy of this process must not talk to its parent's child.
+        if self._process is not None and self._owner == os.getpid() and self._process.poll() is None:
+            return
+        self._pipe, far_end = Pipe()
+        paths = os.pathsep.join(path for path in sys.path if path)
+        with far_end:
+            self._process = subprocess.Popen(
+                [sys.executable, "-c", _START.format(descriptor=far_end.fileno())],
+                pass_fds=[far_end.fileno()],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                env=os.environ | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+            )
+        self._owner = os.getpid()
+
+    def _end(self, error: Exception, computing_s: float) -> str:
+        """Why there is no answer."""
+        assert self._process is not None
+        if isinstance(error, TimeoutError):
+            self.stop()
+        code = self._process.wait()
+        if code == -signal.SIGPROF or isinstance(error, TimeoutError):
+            return f"no result after {computing_s:.0f} s of computing"
+        if code == _OUT_OF_MEMORY:
+            return "a parser that asked for more memory than such a file can need"
+        return f"a parser that crashed (exit code {code})"
+
+    def stop(self) -> None:
+        """End the process, if this process started one."""
+        if self._process is not None and self._owner == os.getpid():
+            self._process.kill()
+            self._process.wait()
+            self._pipe.close()
+            self._process = None
+
+
+def serve(descriptor: int) -> None:
+    """What the child does: one function after the other, until its parent is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    pipe = Connection(descriptor)
+    with suppress(EOFError):
+        while True:
+            folder, imports, function, computing_s, memory = pipe.recv()
+            os.chdir(folder)
+            for module in imports:
+                importlib.import_module(module)
+            try:
+                with _limits(computing_s, memory):
+                    answer = function(), ""
+            except InputError as error:
+                answer = None, str(error)
+            except MemoryError:
+                os._exit(_OUT_OF_MEMORY)
+            pipe.send(answer)
+
+
+@contextmanager
+def _limits(computing_s: float, memory: int) -> Iterator[None]:
+    """The end of the process after this time of computing; MemoryError beyond this many more bytes."""
+    import resource
+
+    unlimited = resource.getrlimit(resource.RLIMIT_AS)
+    with suppress(OSError):  # only Linux tells what is in use
+        pages = int(Path("/proc/self/statm").read_text().split()[0])
+        resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + memory, unlimited[1]))
+    signal.setitimer(signal.ITIMER_PROF, computing_s)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_PROF, 0)
+        resource.setrlimit(resource.RLIMIT_AS, unlimited)
+
+
+_CHILD = _Child()
+atexit.register(_CHILD.stop)

@@ -1,0 +1,270 @@
+"""What instruments and their users really hand over: packed files, odd text, real vendor files."""
+
+from __future__ import annotations
+
+import gzip
+import os
+import time
+from functools import partial
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+
+from litho_data.foundation.errors import InputError
+from litho_data.readers import Channel, list_channels, read_scan
+from litho_data.readers.confined import confined
+from tests.litho_data import afm_files
+from tests.litho_data.afm_files import HEIGHT_UM, SHAPE, SIZE_UM
+
+ROWS = "1e-007\t2e-007\t3e-007\n4e-007\t5e-007\t6e-007\n"
+EXPECTED_UM = np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
+
+
+def read_text(folder: Path, content: str | bytes, **arguments: object):
+    path = folder / "scan.txt"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    return read_scan(path, **({"unit": "m"} | arguments))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        ROWS.encode("utf-16"),
+        b"\xfe\xff" + ROWS.encode("utf-16-be"),
+        "% measured on Monday\n; by us\n" + ROWS,
+        "Height map of sample 7\n\nscan rate 1.5 Hz\n" + ROWS,
+        ROWS.replace("e", "D"),
+        ROWS.replace("1e", "1.0d").replace("e", "D"),
+        ROWS.replace("1e", "1,0e").replace("\t", ";"),
+        ROWS.replace("1e", "1,0D"),
+        ROWS.replace("\t", " , "),
+    ],
+)
+def test_spellings_of_other_programs(tmp_path: Path, content: str | bytes) -> None:
+    # Decimal to binary and the factor 1e6 round once each.
+    np.testing.assert_allclose(read_text(tmp_path, content).height_um, EXPECTED_UM, rtol=4e-16)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("1,234.5;2,345.6\n1,234.5;2,345.6\n", r"line 1, got '1,234.5;2,345.6', wanted .*one separator"),
+        ("1,234.5\t2,345.6\n1,234.5\t2,345.6\n", "line 1, got .*one separator"),
+        ("1.5;2,5\n1.5;2.5\n", "line 1, got .*one separator"),
+        ("1.5;2.5\n1,5;2.5\n", "line 2, got .*one separator"),
+        ("1 2\n1e400 3\n", "line 2, got '1e400', wanted a number below"),
+        ("1 2\nx y 3 4\n", "line 2.*first rows are '1 2' | 'x y 3 4'"),
+        ("0 1\n" * 6, "holds a profile.*format 'text-matrix' reads it"),
+        ("0 1 2\n" * 9, "holds a point cloud.*format 'text-matrix' reads it"),
+    ],
+)
+def test_text_that_is_no_map_is_refused_with_its_rows(tmp_path: Path, content: str, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        read_text(tmp_path, content)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_hints_are_true(tmp_path: Path) -> None:
+    assert read_text(tmp_path, "0 1 2\n" * 9, format="text-matrix").shape == (9, 3)
+    with pytest.raises(InputError, match=r"first row begins 1e-07, 2e-07.*unit 'm'"):
+        read_text(tmp_path, ROWS, unit=None)
+
+
+def test_headers_in_other_languages_state_size_and_unit(tmp_path: Path) -> None:
+    lines = "# Kanal: Topographie\n# Breite: 3,00 µm\n# Höhe: 1000 nm\n# Value units: nm\n"
+    scan = read_text(tmp_path, lines + ROWS.replace("e-007", ""), unit=None)
+    assert (scan.channel, scan.pitch_um) == ("Topographie", (0.5, 1.0))
+    lines = "h=2 w=3\npixel size=2e-006 m\ndata unit=rad\nheight conversion factor (-> m)=1e-007\n"
+    scan = read_text(tmp_path, lines + "1 2 3\n4 5 6\n", unit=None)
+    np.testing.assert_allclose(scan.height_um, EXPECTED_UM, rtol=4e-16)
+    assert scan.pitch_um == pytest.approx((2, 2))
+
+
+@pytest.mark.parametrize("suffix", ["txt", "ibw"])
+def test_gzip_is_read_as_its_content(tmp_path: Path, suffix: str) -> None:
+    plain = tmp_path / f"scan.{suffix}"
+    if suffix == "txt":
+        np.savetxt(plain, HEIGHT_UM * 1e-6)
+    else:
+        afm_files.write_ibw(plain, {"Height": HEIGHT_UM * 1e-6}, "")
+    packed = tmp_path / f"{plain.name}.gz"
+    packed.write_bytes(gzip.compress(plain.read_bytes()))
+    scan = read_scan(packed, unit="m")
+    np.testing.assert_array_equal(scan.height_um, read_scan(plain, unit="m").height_um)
+    assert (scan.name, scan.source) == ("scan", str(packed))
+    np.testing.assert_allclose(list_channels(packed)[0].load()[0], HEIGHT_UM * 1e-6, rtol=1e-6)
+    packed.write_bytes(packed.read_bytes()[:-20])
+    with pytest.raises(InputError, match=r"cannot unpack .*\.gz"):
+        read_scan(packed, unit="m")
+
+
+def test_npz_offers_its_maps(tmp_path: Path) -> None:
+    path = tmp_path / "scan.npz"
+    np.savez_compressed(path, height=HEIGHT_UM, pitch=0.2, names=np.array(["a", "b"]))
+    np.testing.assert_array_equal(read_scan(path, unit="um").height_um, HEIGHT_UM)
+    assert [channel.name for channel in list_channels(path)] == ["height"]
+    np.savez(path, forward=HEIGHT_UM, backward=HEIGHT_UM)
+    with pytest.raises(InputError, match=r"several height channels.*'forward'"):
+        read_scan(path, unit="um")
+
+
+@pytest.mark.parametrize("unit", ["µm", "nm"])
+def test_ome_tiff_states_its_pitch(tmp_path: Path, unit: str) -> None:
+    path = tmp_path / "scan.ome.tif"
+    factor = 1 if unit == "µm" else 1000
+    metadata = {"axes": "YX", "PhysicalSizeX": 0.2 * factor, "PhysicalSizeY": 0.5 * factor}
+    if unit != "µm":  # the unit of the standard needs no words
+        metadata |= {"PhysicalSizeXUnit": unit, "PhysicalSizeYUnit": unit}
+    tifffile.imwrite(path, HEIGHT_UM.astype(np.float32), ome=True, metadata=metadata)
+    assert read_scan(path, unit="um").pitch_um == pytest.approx((0.5, 0.2), rel=1e-12)
+
+
+def test_a_channel_of_a_nanoscope_file_that_is_no_height(tmp_path: Path) -> None:
+    """Its scale has no calibration in metres; it must not take the heights with it."""
+    path = tmp_path / "scan.spm"
+    afm_files.write_spm(path, np.ones(SHAPE, int), hard_v=1.0, sensitivity_nm_per_v=1.0)
+    raw = path.read_bytes()
+    path.write_bytes(raw.replace(b"V [Sens. Zsens]", b"V [Sens. Phase]"))
+    assert [(one.is_height, one.size_um) for one in list_channels(path)] == [(False, SIZE_UM)]
+
+
+def write_jpk_series(path: Path) -> None:
+    """JPK's HDF5: pixels x fastest and y upwards, one column of counts per frame, a thumbnail beside."""
+    ny, nx = SHAPE
+    with h5py.File(path, "w") as file:
+        file.attrs["file-format-info"] = np.bytes_("JPK SCAN")
+        whole = file.create_group("Measurement_000")
+        for key, value in {"ilength": nx, "jlength": ny, "ulength": 1.6e-6, "vlength": 2.5e-6}.items():
+            whole.attrs[f"position-pattern.grid.{key}"] = value
+        j, i = np.divmod(np.arange(nx * ny), nx)
+        whole["Position_Indices"] = np.stack([i, j], axis=1).astype("u4")
+        channel = whole.create_group("Channel_000")
+        channel.attrs["channel.fancy-name"] = np.bytes_("Height")
+        channel.attrs["net-encoder.scaling.unit.unit"] = np.bytes_("m")
+        channel.attrs["net-encoder.scaling.multiplier"] = -1e-9
+        channel.attrs["net-encoder.scaling.offset"] = 5e-7
+        counts = np.round((0.5 - HEIGHT_UM[::-1]) * 1000).astype(int).ravel()
+        channel["Height"] = np.stack([counts, 2 * counts], axis=1)
+        channel["thumbnail"] = np.zeros((16, 1))
+
+
+def test_a_series_of_jpk_images(tmp_path: Path) -> None:
+    path = tmp_path / "scan.h5-jpk"
+    write_jpk_series(path)
+    assert [one.name for one in list_channels(path)] == ["Height, frame 1", "Height, frame 2"]
+    scan = read_scan(path, channel="Height, frame 1")
+    np.testing.assert_allclose(scan.height_um, HEIGHT_UM, atol=1e-12)
+    assert scan.pitch_um == pytest.approx((0.5, 0.2))
+
+
+def _height(path: Path, load) -> list[Channel]:
+    return [Channel(name="height", shape=(2, 2), unit="m", size_um=None, load=load)]
+
+
+def _endless(path: Path) -> list[Channel]:
+    while True:
+        pass
+
+
+def _greedy(path: Path) -> list[Channel]:
+    raise InputError(f"got {len(bytearray(1 << 31))} bytes")
+
+
+def _crash(path: Path) -> list[Channel]:
+    os.abort()
+
+
+def _whole(path: Path) -> list[Channel]:
+    return _height(path, partial(np.full, (1, 2, 2), 7.0))
+
+
+def test_a_parser_that_goes_wild_costs_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("litho_data.readers.confined._COMPUTING_S", 0.3)
+    path = tmp_path / "scan"
+    path.write_bytes(b"1")
+    start = time.process_time()
+    for parser, message in ((_endless, "after 0 s of computing"), (_crash, "crashed"), (_greedy, "memory")):
+        with pytest.raises(InputError, match=message):
+            confined(parser, ())(path)
+        # The next file finds a parser at work again.
+        assert confined(_whole, ())(path)[0].load()[0, 0, 0] == 7
+    assert time.process_time() - start < 2
+
+
+# What each real file says of itself: heights among its channels, (ny, nx), unit, size (y, x) in µm.
+INTACT = {
+    "10x10-one_channel_without_name.ibw": (1, (10, 10), None, None),
+    "al3d-1.al3d": (1, (296, 200), "m", (296 * 0.438027, 200 * 0.438027)),
+    "di-1.di": (2, (512, 512), "nm", (0.5, 0.5)),
+    "di-4.di": (2, (512, 512), "nm", (10.0, 10.0)),
+    "gwyddion-export-english.txt": (1, (4, 3), "m", (5.6789, 12.34)),
+    "gwyddion-export-german.txt": (1, (4, 3), "m", (5.6789, 12.34)),
+    "matrix-4.txt.gz": (1, (305, 75), "m", (305 * 0.369862, 75 * 0.369862)),
+    "matrix-5.txt": (1, (10, 10), None, None),
+    "matrix-6.txt": (1, (3, 4), "m", (10.0, 10.0)),
+    "mi-1.mi": (1, (256, 256), "µm", (20.0, 20.0)),
+    "mnt-1.mnt": (1, (600, 960), "µm", (600 * 1.8545542570951588, 960 * 1.853393117831074)),
+    "multiple_data_sets.h5": (2, (256, 256), None, None),
+    "nid-1.nid": (4, (256, 256), "m", (20.0, 20.0)),
+    "opd-1.opd": (1, (480, 640), "mm", (480 * 0.19673303, 640 * 0.19673303)),
+    "plu-1.plu": (1, (576, 768), "µm", (576 * 1.66, 768 * 1.66)),
+    "sample_0.h5-jpk": (28, (128, 128), "m", (0.15, 0.15)),
+    "sample_0.jpk": (6, (256, 256), "m", (0.326916514, 0.326916514)),
+    "sample_0.stp": (1, (512, 512), "nm", (0.5, 0.5)),
+    "sample_0.top": (1, (512, 512), "nm", (0.5, 0.5)),
+    "sample_0_2.topostats": (2, (64, 64), "nm", (64 * 1.97601171875e-3, 64 * 1.97601171875e-3)),
+    "sur-3.sur": (1, (512, 512), "m", (512 * 295.546, 512 * 295.546)),
+    "tmd-1.tmd": (1, (300, 300), "mm", (18956.6002, 18956.6002)),
+    "x3p-2.x3p": (1, (650, 650), "m", (650 * 0.314582113527746, 650 * 0.127656509837346)),
+}
+REFUSED = {
+    "damaged_header.ibw": "as ibw, got 804 bytes.*may be damaged",
+    "di_corrupted.di": "as di.*not large enough.*may be damaged",
+    "nonuniform.asc": "holds a profile",
+    "xy-1.txt": "holds a profile",
+    "xyz-1.txt": "holds a point cloud",
+    "xyz-2.txt": "holds a point cloud",
+}
+
+
+@pytest.mark.oracle
+def test_real_files_of_vendors(oracles: Path) -> None:
+    folder = oracles / "vendor"
+    assert {path.name for path in folder.iterdir()} == {*INTACT, *REFUSED, "README.md", "reference.npz"}
+    for name, (count, shape, unit, size_um) in INTACT.items():
+        heights = [channel for channel in list_channels(folder / name) if channel.is_height]
+        first = heights[0]
+        assert (name, len(heights), first.shape, first.unit) == (name, count, shape, unit)
+        # The files state their sizes with six digits or more.
+        assert first.size_um == (pytest.approx(size_um, rel=2e-6) if size_um else None)
+        values, _ = first.load()
+        assert values.shape == shape
+        # The Digital Surf file marks nine tenths of its pixels as not measured.
+        assert np.isfinite(values).mean() > 0.1
+    for name, message in REFUSED.items():
+        with pytest.raises(InputError, match=message):
+            list_channels(folder / name)
+
+
+@pytest.mark.oracle
+def test_real_files_agree_with_another_reader(oracles: Path) -> None:
+    """AFMReader 0.0.7, every 8th pixel; its WSxM maps are turned back.
+
+    WSxM writes its rows with x downwards and y upwards: in the example of a matrix and of points of the
+    same image at https://spmimages.ftmc.uam.es/file-specifications the first number is the one at the
+    largest x and the smallest y. That is the lower right pixel, which AFMReader shows in the upper left.
+    """
+    reference = np.load(oracles / "vendor" / "reference.npz")
+    for name, channel, key, turned in (
+        ("sample_0.jpk", "Height", "jpk", False),
+        ("sample_0.jpk", "Height (measured)", "jpkm", False),
+        ("sample_0.stp", None, "stp", True),
+    ):
+        scan = read_scan(oracles / "vendor" / name, channel=channel)
+        height_um = scan.height_um[::-1, ::-1] if turned else scan.height_um
+        expected_um = reference[f"{key}_nm_every_8px"] * 1e-3
+        np.testing.assert_allclose(height_um[::8, ::8], expected_um, rtol=1e-12, atol=1e-15)
+        assert scan.require_pitch()[1] == pytest.approx(float(reference[f"{key}_nm_per_px"]) * 1e-3)
