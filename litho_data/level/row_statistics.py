@@ -10,6 +10,13 @@ import numpy as np
 # From this trim on, only the median is left.
 MEDIAN_TRIM = 0.5
 _FEW_FOR_MODUS = 9
+_METRE_PER_UM = 1e-6
+# Of heights in metres: more than files state, fewer than rounding between units disturbs.
+_DECIMAL_DIGITS = 12
+# Powers of ten up to here are exact in a double.
+_LARGEST_EXACT_POWER = 22
+_FACET_SHARPNESS, _FACET_PASSES, _FACET_SMALLEST_STEP = 1 / 200, 30, 1e-6
+_FEWEST_SLOPES = 4
 
 
 def row_counts(values: np.ndarray, chosen: np.ndarray | None) -> np.ndarray:
@@ -47,27 +54,43 @@ def row_trimmed_mean(values: np.ndarray, chosen: np.ndarray | None, trim: float)
 def row_modus(values: np.ndarray, chosen: np.ndarray | None) -> np.ndarray:
     """Mean of the middle third of the shortest window that holds round(sqrt n) sorted values.
 
-    Below 9 values the upper median; a row without selected values gives 0.
+    Below 9 values the upper median; a row without selected values gives 0. Windows of heights with few
+    digits are often equally short. Gwyddion takes the one that comes out shortest in metres, so values (µm)
+    are compared in metres, rounded to 12 digits: no unit of a file changes the choice.
     """
     counts = row_counts(values, chosen)
     ordered = np.sort(values if chosen is None else np.where(chosen, values, np.inf), axis=1)
-    return np.array([_modus(row[:count]) for row, count in zip(ordered, counts, strict=True)])
+    metres = _decimal_metres(ordered)
+    rows = zip(ordered, metres, counts, strict=True)
+    return np.array([_modus(row[:count], row_m[:count]) for row, row_m, count in rows])
 
 
-def row_facet_tilt(
-    values: np.ndarray, chosen: np.ndarray | None, pitch_um: float, sharpness: float
-) -> np.ndarray:
-    """Slope per pixel of the prevailing 1-D facet of each row, from neighbours that are both selected."""
+def row_facet_tilt(values: np.ndarray, chosen: np.ndarray | None, pitch_um: float) -> np.ndarray:
+    """Slope per pixel of the prevailing 1-D facet of each row, from neighbours that are both selected.
+
+    Each row is levelled up to 30 times, until its slope changes by less than 1e-6.
+    """
     slopes = np.diff(values, axis=1) / pitch_um
     usable = np.isfinite(slopes) if chosen is None else chosen[:, 1:] & chosen[:, :-1]
-    slopes = np.where(usable, slopes, 0.0)
-    spread = (slopes**2).sum(axis=1) / np.maximum(usable.sum(axis=1), 1) * sharpness
-    safe = np.where(spread > 0, spread, 1.0)
-    weights = np.where(usable, np.exp(-(slopes**2) / safe[:, None]), 0.0)
-    total = weights.sum(axis=1)
-    return (
-        np.where(total > 0, (weights * slopes).sum(axis=1) / np.where(total > 0, total, 1.0), 0.0) * pitch_um
-    )
+    return np.array([_facet_slope(row[use]) for row, use in zip(slopes, usable, strict=True)]) * pitch_um
+
+
+def _facet_slope(slopes: np.ndarray) -> float:
+    total = 0.0
+    if len(slopes) < _FEWEST_SLOPES:
+        return total
+    for _ in range(_FACET_PASSES):
+        squares = slopes * slopes
+        spread = float(squares.mean()) * _FACET_SHARPNESS
+        if spread == 0.0:
+            break
+        weights = np.exp(squares / -spread)
+        step = float(weights @ slopes) / float(weights.sum())
+        slopes = slopes - step
+        total += step
+        if abs(step) < _FACET_SMALLEST_STEP:
+            break
+    return total
 
 
 def _dense_trimmed_mean(values: np.ndarray, trim: float) -> np.ndarray:
@@ -80,10 +103,20 @@ def _dense_trimmed_mean(values: np.ndarray, trim: float) -> np.ndarray:
     return np.partition(values, (cut, n - cut - 1), axis=1)[:, cut : n - cut].mean(axis=1)
 
 
-def _modus(ordered: np.ndarray) -> float:
+def _modus(ordered: np.ndarray, metres: np.ndarray) -> float:
     n = len(ordered)
     if n < _FEW_FOR_MODUS:
         return float(ordered[n // 2]) if n else 0.0
     window = int(np.floor(np.sqrt(n) + 0.5))
-    start = int(np.argmin(ordered[window - 1 :] - ordered[: n - window + 1]))
+    start = int(np.argmin(metres[window - 1 :] - metres[: n - window + 1]))
     return float(ordered[start + window // 3 : start + window - window // 3].mean())
+
+
+def _decimal_metres(height_um: np.ndarray) -> np.ndarray:
+    """The doubles that a file in metres with up to 12 digits would have been read as."""
+    metres = height_um * _METRE_PER_UM
+    with np.errstate(divide="ignore", invalid="ignore"):
+        exponent = np.nan_to_num(np.floor(np.log10(np.abs(metres))), posinf=0.0, neginf=0.0)
+        power = np.clip(_DECIMAL_DIGITS - 1 - exponent, 0, _LARGEST_EXACT_POWER)
+        scale = (10.0 ** np.arange(_LARGEST_EXACT_POWER + 1))[power.astype(int)]
+        return np.rint(metres * scale) / scale

@@ -29,7 +29,6 @@ RowMethod = Literal[
 ]
 Direction = Literal["horizontal", "vertical"]
 MAX_ROW_DEGREE = 5
-_FACET_SHARPNESS = 1 / 200
 _METRE_PER_UM = 1e-6
 
 
@@ -47,12 +46,13 @@ def align_rows(
     """Remove from each scan line what it does not share with the others.
 
     Args:
-        height_um: (ny, nx), µm. Only ``"matching"`` depends on the unit: its weights compare a
-            squared height with a height, in metres as Gwyddion does.
+        height_um: (ny, nx), µm. ``"matching"`` and ``"modus"`` need it in this unit: weights of the
+            first compare a squared height with a height, in metres as Gwyddion does, and the second
+            chooses between equally short windows as Gwyddion does in metres.
         method: ``median``, ``trimmed-mean`` and ``modus`` make that statistic of all rows equal;
             the two ``-of-differences`` and ``matching`` add up steps between neighbouring rows, which
             keeps large features; ``polynomial`` fits each row by itself; ``facet-tilt`` removes
-            the prevailing slope of each row.
+            the prevailing slope of each row, found in up to 30 passes.
         direction: ``"horizontal"`` lines are rows, ``"vertical"`` lines are columns.
         degree: of the polynomial, 0 to 5.
         trim: fraction cut at each end by the trimmed means, 0 to 0.5; 0.5 is the median.
@@ -67,9 +67,9 @@ def align_rows(
     if direction == "vertical":
         columns = None if chosen is None else np.ascontiguousarray(chosen.T)
         pitch = None if pitch_um is None else (pitch_um[1], pitch_um[0])
-        removed = _removed(np.ascontiguousarray(z.T), columns, method, degree, trim, pitch).T
+        removed = _removed(np.ascontiguousarray(z.T), columns, masking, method, degree, trim, pitch).T
     else:
-        removed = _removed(z, chosen, method, degree, trim, pitch_um)
+        removed = _removed(z, chosen, masking, method, degree, trim, pitch_um)
     return subtract(z, removed)
 
 
@@ -93,6 +93,7 @@ def _check(
 def _removed(
     z: np.ndarray,
     chosen: np.ndarray | None,
+    masking: Masking,
     method: RowMethod,
     degree: int,
     trim: float,
@@ -102,7 +103,7 @@ def _removed(
         return _row_polynomials(z, chosen, degree)
     if method == "facet-tilt":
         assert pitch_um is not None
-        slopes = row_facet_tilt(z, chosen, pitch_um[1], _FACET_SHARPNESS)
+        slopes = row_facet_tilt(z, chosen, pitch_um[1])
         return np.multiply.outer(slopes, _centred(z.shape[1]))
     match method:
         case "median":
@@ -118,7 +119,7 @@ def _removed(
         case "trimmed-mean-of-differences":
             shifts = _difference_shifts(z, chosen, trim)
         case _:
-            shifts = _matching_shifts(z, chosen)
+            shifts = _matching_shifts(z, chosen, last_column_counts=masking == "include")
     return np.broadcast_to(shifts[:, None], z.shape)
 
 
@@ -154,7 +155,12 @@ def _difference_shifts(z: np.ndarray, chosen: np.ndarray | None, trim: float) ->
     return shifts - shifts.mean() - row * (row @ shifts) / (row @ row)
 
 
-def _matching_shifts(z: np.ndarray, chosen: np.ndarray | None) -> np.ndarray:
+def _matching_shifts(z: np.ndarray, chosen: np.ndarray | None, last_column_counts: bool) -> np.ndarray:
+    """Weighted mean steps between rows.
+
+    Args:
+        last_column_counts: whatever the mask says there, as in Gwyddion's include mode.
+    """
     steps_m = np.nan_to_num(np.diff(z, axis=0) * _METRE_PER_UM, nan=0.0)
     usable = np.ones(steps_m.shape, dtype=bool) if chosen is None else chosen[1:] & chosen[:-1]
     bends_m = np.diff(steps_m, axis=1)
@@ -164,6 +170,8 @@ def _matching_shifts(z: np.ndarray, chosen: np.ndarray | None) -> np.ndarray:
     pixel_weights = np.zeros_like(steps_m)
     pixel_weights[:, :-1] += weights
     pixel_weights[:, 1:] += weights
+    if last_column_counts:
+        usable[:, -1] = np.isfinite(z[1:, -1] - z[:-1, -1])
     pixel_weights[~usable] = 0.0
     total = 2 * weights.sum(axis=1)
     step_m = (pixel_weights * steps_m).sum(axis=1) / np.where(total > 0, total, 1.0)

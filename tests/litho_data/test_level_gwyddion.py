@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from litho_data.level import (
     zero_max,
     zero_mean,
 )
+from litho_data.readers import read_scan
 
 pytestmark = pytest.mark.oracle
 
@@ -33,6 +35,15 @@ ROW_METHODS = {
     "poly2": "polynomial",
     "match": "matching",
     "modus": "modus",
+    "facettilt": "facet-tilt",
+}
+# Further results of Gwyddion 2.62, every 27th pixel in both axes: method, masking of synA, parameters.
+SAMPLED = {
+    **{name: {} for name in ("facettilt", "modus", "match")},
+    "tmean20": {"trim": 0.2},
+    "tmeandiff20": {"trim": 0.2},
+    "poly1_vert": {"degree": 1, "direction": "vertical"},
+    "median_vert": {"direction": "vertical"},
 }
 
 
@@ -85,6 +96,47 @@ def test_vector(oracles: Path, entry: dict[str, Any]) -> None:
     mirrored = _level(entry | {"masking": "exclude"}, height_um, ~mask, pitch_um)
     np.testing.assert_array_equal(levelled.height, mirrored.height)
     assert np.abs(levelled.removed).max() > 0.01 * np.ptp(height_um)
+
+
+@pytest.mark.parametrize("masking", ["ignore", "exclude", "include"])
+@pytest.mark.parametrize("name", SAMPLED)
+def test_sampled_rows_of_a_phantom(oracles: Path, name: str, masking: str) -> None:
+    field = {"input": "synA__input.npz", "file": "synA__input.npz"}
+    with np.load(oracles / "gwyddion" / field["input"]) as stored:
+        height_um, mask = stored["z"] * 1e6, stored["mask"] > 0
+        ny, nx = height_um.shape
+        pitch_um = (float(stored["yreal"]) * 1e6 / ny, float(stored["xreal"]) * 1e6 / nx)
+    if (name, masking) == ("tmeandiff20", "include"):
+        pytest.skip("Gwyddion's difference methods find no pixel of an inclusion mask: see test_vector")
+    _compare_samples(oracles, f"synA__rows_{name}_{masking}", name, height_um, pitch_um, mask, masking)
+
+
+@pytest.mark.measured
+@pytest.mark.parametrize("factor", ["e6", "e0"])
+@pytest.mark.parametrize("name", SAMPLED)
+def test_sampled_rows_of_a_measured_scan(
+    oracles: Path, measured_prints: Path, tmp_path: Path, name: str, factor: str
+) -> None:
+    """From the file in metres, and from the same digits written in micrometres."""
+    path = measured_prints / "afm_ug" / "FOV11.txt"
+    if factor == "e6":
+        scan = read_scan(path, unit="m", size_um=(54, 54))
+    else:
+        text = re.sub(r"e([-+]\d+)", lambda found: f"e{int(found[1]) + 6:+d}", path.read_text())
+        (tmp_path / "scan.txt").write_text(text)
+        scan = read_scan(tmp_path / "scan.txt", unit="um", size_um=(54, 54))
+    key = f"FOV11__rows_{name}_ignore"
+    _compare_samples(oracles, key, name, scan.height_um, scan.require_pitch(), None, "exclude")
+
+
+def _compare_samples(
+    oracles: Path, key: str, name: str, height_um: np.ndarray, pitch_um: tuple, mask: Any, masking: Any
+) -> None:
+    expected_um = np.load(oracles / "gwyddion" / "rows_samples.npz")[key] * 1e6
+    method, params = ROW_METHODS[name.split("_")[0].replace("20", "05")], SAMPLED[name]
+    got = align_rows(height_um, method=method, pitch_um=pitch_um, mask=mask, masking=masking, **params).height
+    tolerance = (1e-10 if method == "polynomial" else 1e-12) * np.ptp(height_um)
+    np.testing.assert_allclose(got[::27, ::27], expected_um, rtol=0, atol=tolerance)
 
 
 def test_all_vectors_are_there(oracles: Path) -> None:
