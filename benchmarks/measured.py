@@ -16,11 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.measured_figures import draw_prediction, draw_steps
-from benchmarks.measured_loop import locked_table, loop_table
+from benchmarks.measured_loop import equal_freedom_table, locked_table, loop_table
 from benchmarks.measured_models import (
     benchmark_table,
     design_table,
-    equal_freedom_table,
     extrapolation_table,
     further_table,
     headline_table,
@@ -67,7 +66,9 @@ def texts(folder: Path) -> dict[str, str]:
         errors = list(csv.DictReader(file))
     return {
         "headline": headline_table(found("benchmark.json"), found("noise.json")),
-        "equal freedom": equal_freedom_table(errors),
+        "equal freedom": equal_freedom_table(
+            [found("close_loop.json"), found("close_loop_pbl.json")], errors
+        ),
         "benchmark": benchmark_table(found("benchmark.json"), found("noise.json")),
         "paper split": paper_table(
             [found(f"benchmark_paper_{seed}.json") for seed in PAPER_SEEDS], found("benchmark.json")

@@ -16,6 +16,85 @@ OLDER_PIXELS = (
 )
 
 
+def equal_freedom_table(loops: Sequence[dict[str, Any]], errors: Sequence[dict[str, str]]) -> str:
+    """Errors before and after with the same terms per scan.
+
+    Args:
+        loops: results of the loop, the one on Physics first; ``errors``: the rows of its errors.csv, which
+            stand for results of schema 1.
+    """
+    if any(loop.get("equal_terms") is None for loop in loops):
+        return _equal_freedom_of_schema_1(errors)
+    rows = []
+    for loop in loops:
+        for row in loop["equal_terms"]:
+            before, after = row["before"], row["after"]
+            rows.append(
+                (
+                    loop["base_model"],
+                    _terms_per_scan(row["terms"], before["k"], after["k"]),
+                    with_interval(before["mae_nm"], before["mae_ci95_nm"]),
+                    with_interval(after["mae_nm"], after["mae_ci95_nm"]),
+                    f"{row['gain_nm']:.2f} nm",
+                    *(_over(row[unit]) for unit in ("over_scans", "over_prints")),
+                )
+            )
+    first = loops[0]["equal_terms"][0]
+    prints = first["over_prints"]
+    best = (
+        f" Scans of a print are not independent: what {prints['count']} prints can show at best is "
+        f"p = {prints['smallest_p']:.3f}."
+        if prints
+        else ""
+    )
+    return markdown_table(
+        ("loop on", "terms per scan", "before", "after", "gain", "over scans", "over prints"),
+        rows,
+        f"Mean absolute error on {first['over_scans']['count']} held-out scans, on the benchmark's pixels, "
+        f"{_background(loops)}; terms are fitted on pixels that are not scored. Intervals of 95 % resample "
+        "whole scans, or whole prints; p is of sign flips of these." + best,
+    )
+
+
+def _terms_per_scan(terms: str, before: float, after: float) -> str:
+    number = f"k = {before:.0f}" if round(before) == round(after) else f"k = {before:.0f} and {after:.0f}"
+    return f"{number} (accepted by the loop)" if terms == "accepted" else number
+
+
+def _over(units: dict[str, Any] | None) -> str:
+    if units is None:
+        return "–"
+    interval = "" if units["ci95_nm"] is None else "{:.2f} … {:.2f} nm, ".format(*units["ci95_nm"])
+    return f"{interval}better in {units['positive']} of {units['count']}, p = {units['p']:.2g}"
+
+
+def _background(loops: Sequence[dict[str, Any]]) -> str:
+    used = {loop["nuisance"].get("background", "none") for loop in loops}
+    return {
+        ("training",): "with the shared background of the benchmark",
+        ("none",): "without the shared background of the benchmark",
+    }.get(tuple(sorted(used)), "in part with the shared background")
+
+
+def _equal_freedom_of_schema_1(errors: Sequence[dict[str, str]]) -> str:
+    found = {row["model"]: row for row in errors}
+    rows = []
+    for name in ("datum", "+ z-gain", "+ tilt-bow"):
+        before, after = found[f"base: {name}"], found[f"corrected: {name}"]
+        assert before["terms per scan"] == after["terms per scan"]
+        cells = [
+            with_interval(float(row["MAE (nm)"]), [float(row["low"]), float(row["high"])])
+            for row in (before, after)
+        ]
+        rows.append((f"k = {float(before['terms per scan']):.0f}", *cells))
+    return markdown_table(
+        ("terms per scan", "before", "after"),
+        rows,
+        "Mean absolute error on held-out scans, a border of 8 px left out, without the shared background of "
+        "the benchmark; 95 % intervals over scans.",
+    )
+
+
 def loop_table(loop: dict[str, Any], on_physics: dict[str, Any] | None = None) -> str:
     """The closed loop step by step, then what is left.
 
@@ -34,22 +113,31 @@ def loop_table(loop: dict[str, Any], on_physics: dict[str, Any] | None = None) -
                 f"{effect['role']}, {effect['verdict']}{known}",
                 f"{effect['before_nm']:.2f} nm ({figure})",
                 f"{effect['after_nm']:.2f} nm",
+                _both_terms(effect.get("terms_per_scan")),
                 f"{better} of {count}",
             )
         )
+    equal = loop.get("equal_terms") is not None
     return markdown_table(
-        ("step", "what it is", "held-out error before", "after", "scans better"),
+        ("step", "what it is", "held-out error before", "after", "terms per scan", "scans better"),
         rows,
         "A row need not begin where the last one ended: both sides of a process effect leave each scan's "
         "shift, turn and stretch free, and both sides of one that acts as a gain go without the gain of "
         "single scans.",
         *_absorbed(loop, on_physics),
-        f"Base model {loop['base_model']}: datum-free {before['mae_datum_free_nm']:.2f} nm before, "
-        f"{after['mae_datum_free_nm']:.2f} nm after, {loop['split']['folds']} folds by scan. "
+        f"Base model {loop['base_model']}, {loop['split']['folds']} folds by scan: "
+        f"{before['mae_datum_free_nm']:.2f} nm before with the zero of each scan free, "
+        f"{after['mae_datum_free_nm']:.2f} nm after with "
+        + ("the same. " if equal else "all accepted terms free: not the same freedom. ")
+        + f"{_background([loop]).capitalize()}. "
         f"What is left: {loop['residual']['state']}"
         + (f"; it {loop['residual']['signature']}." if loop["residual"]["signature"] else "."),
         *_older_pixels([loop]),
     )
+
+
+def _both_terms(numbers: Sequence[float] | None) -> str:
+    return " → ".join(f"{k:.0f}" for k in numbers) if numbers else "not recorded"
 
 
 def _older_pixels(loops: Sequence[dict[str, Any]]) -> list[str]:
@@ -84,7 +172,10 @@ def _absorbed(loop: dict[str, Any], on_physics: dict[str, Any] | None) -> list[s
 
 
 def locked_table(loops: Sequence[dict[str, Any]], cards: Sequence[ModelCard]) -> str:
-    """The errors on the locked scans: the models of the zoo, and both loops before and after."""
+    """The errors on the locked scans: the models of the zoo, and both loops before and after.
+
+    Loops of schema 1 have one term per scan before, and all accepted ones after.
+    """
     rows = []
     for card in cards:
         # The first of a name and policy is the one with the background.
@@ -93,12 +184,8 @@ def locked_table(loops: Sequence[dict[str, Any]], cards: Sequence[ModelCard]) ->
         figures = [("mae_datum_free", "offset"), ("mae_datum_free", "full+rows"), ("mae_abs", "none")]
         rows.append((card.name, *(f"{errors[key]:.2f} nm" for key in figures)))
     for loop in loops:
-        before, after = (
-            (with_interval(state["mae_datum_free_nm"], state["mae_datum_free_ci95_nm"]), state["mae_abs_nm"])
-            for state in (loop["locked_before"], loop["locked_after"])
-        )
-        rows.append((f"loop on {loop['base_model']}, before", before[0], "–", f"{before[1]:.2f} nm"))
-        rows.append((f"loop on {loop['base_model']}, after", "–", after[0], f"{after[1]:.2f} nm"))
+        for when in ("before", "after"):
+            rows.append((f"loop on {loop['base_model']}, {when}", *_locked_errors(loop, when)))
     locked = loops[0]["split"]["lock_box"]
     others = loops[0]["run"]["n_scans"] - len(locked)
     return markdown_table(
@@ -106,7 +193,22 @@ def locked_table(loops: Sequence[dict[str, Any]], cards: Sequence[ModelCard]) ->
         rows,
         f"The {len(locked)} locked scans ({', '.join(locked)}), scored once, when model, recipe and loop "
         f"had been settled; all was fitted to the other {others}. Models: those of the package, with the "
-        "background of their training scans. The loops on Physics and on PBL free what they accepted of "
-        "single scans, on pixels that are not scored, the first the registration too.",
+        "background of their training scans. Loops: with one term per scan in the first column, and in the "
+        "second with all that they accepted, fitted on pixels that are not scored, the loop on Physics the "
+        f"registration too; {_background(loops)}. Intervals resample scans.",
         *_older_pixels(loops),
     )
+
+
+def _locked_errors(loop: dict[str, Any], when: str) -> tuple[str, str, str]:
+    """With the zero of each scan free, with the accepted terms, and with nothing fitted."""
+    errors = loop[f"locked_{when}"]
+    absolute = f"{errors['mae_abs_nm']:.2f} nm"
+    if loop.get("locked_equal_terms") is None:
+        free = with_interval(errors["mae_datum_free_nm"], errors["mae_datum_free_ci95_nm"])
+        return (free, "–", absolute) if when == "before" else ("–", free, absolute)
+    rows = {row["terms"]: row[when] for row in loop["locked_equal_terms"]}
+    first, all_terms = (
+        with_interval(rows[t]["mae_nm"], rows[t]["mae_ci95_nm"]) for t in ("offset", "accepted")
+    )
+    return first, f"{all_terms}, k = {rows['accepted']['k']:.0f}", absolute

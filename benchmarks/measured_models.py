@@ -72,26 +72,6 @@ def headline_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
     )
 
 
-def equal_freedom_table(errors: Sequence[dict[str, str]]) -> str:
-    """Errors before and after the loop with the same terms per scan, from the rows of its errors.csv."""
-    found = {row["model"]: row for row in errors}
-    rows = []
-    for name in ("datum", "+ z-gain", "+ tilt-bow"):
-        before, after = found[f"base: {name}"], found[f"corrected: {name}"]
-        assert before["terms per scan"] == after["terms per scan"]
-        cells = [
-            with_interval(float(row["MAE (nm)"]), [float(row["low"]), float(row["high"])])
-            for row in (before, after)
-        ]
-        rows.append((f"k = {float(before['terms per scan']):.0f}", *cells))
-    return markdown_table(
-        ("terms per scan", "before", "after"),
-        rows,
-        "Mean absolute error on held-out scans, a border of 8 px left out, without the shared background of "
-        "the benchmark; 95 % intervals over scans.",
-    )
-
-
 def paired_table(benchmark: dict[str, Any]) -> str:
     """How much better each model is than each other, scan by scan."""
     rows = [

@@ -234,9 +234,12 @@ def write_index(out: Path, name: str, steps: list[Step], seconds: list[float]) -
         [
             (
                 f"{loop['before']['mae_datum_free_nm']:.2f} nm",
-                "error of the base model, held-out scans, datum-free",
+                "error of the base model on held-out scans, one term per scan free",
             ),
-            (f"{loop['after']['mae_datum_free_nm']:.2f} nm", "error after the effects that the loop added"),
+            (
+                f"{loop['after']['mae_datum_free_nm']:.2f} nm",
+                "with all that the loop added, the same term free",
+            ),
             (", ".join(e["name"] for e in loop["effects"]) or "none", "effects found"),
         ]
     )

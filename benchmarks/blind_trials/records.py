@@ -96,7 +96,11 @@ class ErrorPair(Record):
 
 
 class TrialErrors(Record):
-    """Before, after, and what the true models of print and microscope leave on the same pixels."""
+    """Before, after, and what the true models of print and microscope leave on the same pixels.
+
+    All three with the terms per scan that the loop accepted; on boards before 20267 ``before`` has the zero
+    of each scan free only.
+    """
 
     before: ErrorPair
     after: ErrorPair

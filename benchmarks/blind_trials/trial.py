@@ -16,7 +16,7 @@ from benchmarks.blind_trials.records import Cost, Draw, ErrorPair, Outcome, Plan
 from litho_data.build.build import build_dataset
 from litho_data.store import open_store
 from litho_data.virtual_fab import Truth, simulate
-from litho_models.loop.result.record import CloseLoop, Errors
+from litho_models.loop.result.record import CloseLoop, TermsError
 from litho_models.loop.run import close_loop_on_store
 
 
@@ -106,6 +106,8 @@ def failed(draw: Draw, planted: list[Planted], reason: str) -> Trial:
 
 def _judged(draw: Draw, planted: list[Planted], result: CloseLoop, floor: ErrorPair, cost: Cost) -> Trial:
     named = named_outside_span(result)
+    # The floor has the terms that the loop accepted, and so have the errors beside it.
+    accepted = next(row for row in result.equal_terms or [] if row.terms == "accepted")
     return Trial(
         schema=Trial.SCHEMA,
         draw=draw,
@@ -116,14 +118,14 @@ def _judged(draw: Draw, planted: list[Planted], result: CloseLoop, floor: ErrorP
         scan_terms=scan_terms(result),
         verdict=result.verdict,
         dropped=result.run.dropped,
-        errors=TrialErrors(before=_pair(result.before), after=_pair(result.after), floor=floor),
+        errors=TrialErrors(before=_pair(accepted.before), after=_pair(accepted.after), floor=floor),
         cost=cost,
         failure="",
     )
 
 
-def _pair(errors: Errors) -> ErrorPair:
-    return ErrorPair(mae_nm=errors.mae_datum_free_nm, rmse_nm=errors.rmse_datum_free_nm)
+def _pair(errors: TermsError) -> ErrorPair:
+    return ErrorPair(mae_nm=errors.mae_nm, rmse_nm=errors.rmse_nm)
 
 
 def _cpu_s() -> float:

@@ -24,9 +24,10 @@ class Record(BaseModel):
 
 
 class Result(Record):
-    """The root of a result file. Subclasses set ``SCHEMA`` and ``FILE_NAME``."""
+    """The root of a result file. Subclasses set ``SCHEMA``, ``FILE_NAME``, and ``OLDER`` schemas to read."""
 
     SCHEMA: ClassVar[str]
+    OLDER: ClassVar[tuple[str, ...]] = ()
     FILE_NAME: ClassVar[str]
 
     schema_: str = Field(alias="schema")
@@ -56,7 +57,7 @@ class Result(Record):
         except (OSError, ValueError, RecursionError) as error:
             raise InputError(f"cannot read {file} as JSON", got=str(error), wanted=cls.SCHEMA) from error
         schema = content.get("schema") if isinstance(content, dict) else None
-        if schema != cls.SCHEMA:
+        if schema not in (cls.SCHEMA, *cls.OLDER):
             raise InputError(f"schema of {file}", got=repr(schema), wanted=repr(cls.SCHEMA))
         try:
             return cls.model_validate(content)

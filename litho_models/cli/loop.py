@@ -55,6 +55,7 @@ def close_loop(
 ) -> None:
     """Find what a model lacks on measured prints, add it, and report the error on held-out scans (nm)."""
     from litho_models.loop import LoopConfig, parse_priors
+    from litho_models.loop.report.wording import error_lines, verdict_text
 
     config = LoopConfig(
         folds=folds,
@@ -74,11 +75,8 @@ def close_loop(
         cache=cache,
         report=lambda message: typer.echo(message, err=True),
     )
-    typer.echo(f"verdict: {result.verdict}")
-    typer.echo(
-        f"datum-free error, held out: {result.before.mae_datum_free_nm:.2f} -> "
-        f"{result.after.mae_datum_free_nm:.2f} nm"
-    )
+    for line in (verdict_text(result), *error_lines(result)):
+        typer.echo(line)
     for effect in result.effects:
         alike = f" (or {', '.join(effect.confusable_with)})" if effect.confusable_with else ""
         typer.echo(

@@ -156,7 +156,7 @@ def _save_process_model(findings: LoopFindings, result: CloseLoop, store: Store,
             {"name": f"mae_{kind}", "value": value, "split": "grouped", "policy": policy}
             for kind, value, policy in (
                 ("abs", result.after.mae_abs_nm, "none"),
-                ("datum_free", result.after.mae_datum_free_nm, "offset and accepted measurement effects"),
+                ("datum_free", result.after.mae_datum_free_nm, "offset"),
             )
         ],
     )

@@ -11,28 +11,36 @@ from litho_models.scoring.statistics import FEWEST_FOR_INTERVAL, paired_differen
 
 
 class OverUnits(Record):
-    """A mean difference when whole scans, or whole prints, are resampled and change their sign together.
+    """The mean over scans of a difference, where whole scans or whole prints are resampled and change sign.
 
-    ``count``: of these; ``first_better``: in how many the first is smaller. ``ci95_nm``: bootstrap interval,
-    None with fewer than ``FEWEST_FOR_INTERVAL``. ``p``: two-sided sign flips, which with so many cannot go
-    below ``smallest_p``.
+    ``count``: of these; ``positive``: in how many the difference is above zero. ``ci95_nm``: bootstrap
+    interval, None with fewer than ``FEWEST_FOR_INTERVAL``. ``p``: two-sided sign flips, which with so many
+    cannot go below ``smallest_p``.
     """
 
     count: int
-    first_better: int
+    positive: int
     ci95_nm: tuple[float, float] | None
     p: float
     smallest_p: float
 
 
-def over_units(
-    first_nm: Sequence[float], second_nm: Sequence[float], groups: Sequence[str] | None = None, seed: int = 0
-) -> OverUnits:
-    """The difference of the errors of the same scans; ``groups``: the print of each, to resample prints."""
-    found = paired_difference(list(first_nm), list(second_nm), groups=groups, seed=seed)
+def over_scans(differences_nm: Sequence[float], seed: int = 0) -> OverUnits:
+    """A difference per scan, resampled over scans."""
+    return _over_units(differences_nm, None, seed)
+
+
+def over_prints(differences_nm: Sequence[float], prints: Sequence[str], seed: int = 0) -> OverUnits | None:
+    """A difference per scan, resampled over the ``prints`` of the scans; None for a single print."""
+    return _over_units(differences_nm, prints, seed) if len(set(prints)) > 1 else None
+
+
+def _over_units(differences_nm: Sequence[float], groups: Sequence[str] | None, seed: int) -> OverUnits:
+    differences = list(differences_nm)
+    found = paired_difference(differences, [0.0] * len(differences), groups=groups, seed=seed)
     return OverUnits(
         count=found.units,
-        first_better=found.first_better,
+        positive=found.second_better,
         ci95_nm=found.interval if found.units >= FEWEST_FOR_INTERVAL else None,
         p=found.p,
         smallest_p=smallest_flip_p(found.units),
@@ -42,7 +50,7 @@ def over_units(
 class Paired(Record):
     """Mean over scans of first minus second ``mae_datum_free_nm``; negative means the first is better.
 
-    ``over_prints``: the same with whole prints resampled; None in older result files.
+    ``over_prints``: the same with whole prints resampled; None for a single print, or in older result files.
     """
 
     first: str
@@ -67,6 +75,7 @@ def paired_scores(first: ModelScores, second: ModelScores, seed: int = 0) -> Pai
         raise InputError("paired scores", got=f"{counts} scans", wanted="the same scans in both")
     pairs = list(errors[0].values()), [errors[1][scan] for scan in errors[0]]
     found = paired_difference(*pairs, seed=seed)
+    differences = [a - b for a, b in zip(*pairs, strict=True)]
     return Paired(
         first=first.model,
         second=second.model,
@@ -75,5 +84,5 @@ def paired_scores(first: ModelScores, second: ModelScores, seed: int = 0) -> Pai
         p=found.p,
         first_better=found.first_better,
         scans=found.units,
-        over_prints=over_units(*pairs, [row.print for row in first.scans], seed),
+        over_prints=over_prints(differences, [row.print for row in first.scans], seed),
     )

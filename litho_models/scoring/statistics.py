@@ -105,14 +105,15 @@ def smallest_flip_p(count: int) -> float:
 class PairedDifference:
     """Mean over scans of (first minus second), its bootstrap interval and two-sided sign-flip p.
 
-    ``units``: scans, or groups of them, that were resampled and flipped; the first is better in
-    ``first_better`` of them.
+    ``units``: scans, or groups of them, that were resampled and flipped; of these the first is better in
+    ``first_better``, the second in ``second_better``.
     """
 
     mean: float
     interval: tuple[float, float]
     p: float
     first_better: int
+    second_better: int
     units: int
 
 
@@ -144,5 +145,6 @@ def paired_difference(
         interval=bootstrap_interval(difference.tolist(), groups=groups, seed=seed),
         p=float(np.mean(flipped >= abs(sums.sum()) * _ROUNDING)),
         first_better=int((sums < 0).sum()),
+        second_better=int((sums > 0).sum()),
         units=sums.size,
     )

@@ -22,6 +22,7 @@ from litho_models.loop.findings import LoopFindings
 from litho_models.loop.fold_fits import fit_folds, predict
 from litho_models.loop.parameters import get_vector
 from litho_models.loop.prepared import LARGE_PX, prepare_scans
+from litho_models.loop.report.wording import verdict_text
 from litho_models.loop.result.exporting import exported_effects
 from litho_models.loop.result.record import CloseLoop
 from litho_models.loop.result.summary import summarise
@@ -66,6 +67,32 @@ def test_nothing_is_found_where_nothing_is_missing(null) -> None:
     assert 4.5 < result.after.mae_datum_free_nm < 6.5
 
 
+def test_where_nothing_is_added_the_errors_with_the_same_terms_are_the_same(null) -> None:
+    _, result = null
+    assert [row.terms for row in result.equal_terms] == ["offset", "offset-gain", "full", "accepted"]
+    assert [row.before.k for row in result.equal_terms[:3]] == [1, 2, 7]
+    for row in result.equal_terms:
+        assert row.before == row.after
+        assert row.gain_nm == 0
+        # Twelve scans of four prints; none better, none worse.
+        assert (row.over_scans.count, row.over_prints.count) == (12, 4)
+        assert row.over_scans.positive == row.over_prints.positive == 0
+        assert row.over_prints.p == 1
+    # What single scans add is no gain of a model, and so not in the headline.
+    assert result.after == result.before
+    assert result.effects
+
+
+def test_the_headline_has_one_term_per_scan_before_and_after(planted) -> None:
+    _, result = planted
+    first = result.equal_terms[0]
+    assert first.before.k == first.after.k == 1
+    for row, errors in ((first.before, result.before), (first.after, result.after)):
+        assert (row.mae_nm, row.rmse_nm) == (errors.mae_datum_free_nm, errors.rmse_datum_free_nm)
+    assert [row.before.k for row in result.locked_equal_terms[:3]] == [1, 2, 7]
+    assert result.locked_equal_terms[0].after.mae_nm == result.locked_after.mae_datum_free_nm
+
+
 def test_the_datum_of_the_scans_is_recognised(null) -> None:
     _, result = null
     datum = next(e for e in result.effects if e.name == "datum-offset")
@@ -97,7 +124,7 @@ def test_the_result_is_read_back_as_written_and_keeps_to_its_keys(planted, null,
     path = result.write(tmp_path)
     assert CloseLoop.read(tmp_path) == result
     content = json.loads(path.read_text())
-    assert content["schema"] == "litho-models/close-loop/1"
+    assert content["schema"] == "litho-models/close-loop/2"
     assert sum(content["shares"].values()) == pytest.approx(1)
     assert next(e for e in content["effects"] if e["name"] == "datum-offset")["prior_hypothesis"]
     content["surprise"] = 1
@@ -228,7 +255,8 @@ def test_lines_of_the_print_are_told_from_lines_of_the_scan(written: bool) -> No
 def test_too_few_scans_confirm_nothing_and_say_so() -> None:
     _, result = closed_on(printed_scans({"vignetting": {"strength": 0.3}}, count=2))
     assert not result.effects
-    assert result.verdict in {"nothing-missing", "unexplained"}
+    assert result.verdict == "too-few-scans"
+    assert "too-few-scans: 2 to work on; 8 are needed to confirm anything, 9" in verdict_text(result)
     found = {c.name: c for c in result.candidates}
     assert found["vignetting"].verdict == "not-testable"
     assert "2 scans" in found["vignetting"].reason

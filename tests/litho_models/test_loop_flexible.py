@@ -23,7 +23,8 @@ def test_an_effect_is_added_to_or_absorbed_by_a_trained_model(carries_it: bool) 
     verdict = {c.name: c.verdict for c in result.candidates}["vignetting"]
     if carries_it:
         assert verdict == "absorbed"
-        assert result.verdict == "nothing-missing"
+        # Of eight scans no test of the rest could show a structure.
+        assert result.verdict == "too-few-scans"
     else:
         assert verdict == "explained"
         assert corrected_chain(findings).values()["vignetting"]["strength"] == pytest.approx(0.2, abs=0.02)

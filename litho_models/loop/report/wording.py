@@ -1,11 +1,52 @@
-"""The words of the report: one paragraph for a process engineer, and what to be warned of."""
+"""The words of report and terminal: verdict, errors, one paragraph for a process engineer, warnings."""
 
 from __future__ import annotations
 
 from litho_models.effects import get_effect
 from litho_models.loop.findings import LoopFindings
-from litho_models.loop.result.record import AddedEffect, CloseLoop
+from litho_models.loop.result.record import AddedEffect, CloseLoop, EqualTerms
 from litho_models.loop.selection.confirming import FEWEST_SCANS
+from litho_models.scoring.pairs import OverUnits
+
+
+def verdict_text(result: CloseLoop) -> str:
+    """The verdict, and with too few scans how many would do."""
+    if result.verdict != "too-few-scans" or result.headline is None:
+        return f"verdict: {result.verdict}"
+    return (
+        f"verdict: too-few-scans: {result.headline.over_scans.count} to work on; {FEWEST_SCANS} are needed "
+        f"to confirm anything, {result.fewest_scans} to find that nothing is missing"
+    )
+
+
+def error_lines(result: CloseLoop) -> list[str]:
+    """The errors before and after with the same terms per scan, a line each."""
+    rows = result.equal_terms or []
+    return ["held-out error (MAE) before -> after, with the same terms per scan:"] + [
+        f"  {terms_text(row)}: {row.before.mae_nm:.2f} -> {row.after.mae_nm:.2f} nm; "
+        f"gain {row.gain_nm:.2f} nm, {', '.join(_resampled(row))}"
+        for row in rows
+    ]
+
+
+def terms_text(row: EqualTerms) -> str:
+    """What is free in each scan, with the number of terms before and after."""
+    before, after = row.before.k, row.after.k
+    number = f"k = {before:.0f}" + (f" and {after:.0f}" if round(before) != round(after) else "")
+    return f"accepted terms, {number}" if row.terms == "accepted" else number
+
+
+def over_text(over: OverUnits, unit: str) -> str:
+    """Interval and p of a gain over scans or prints, and what so many can show at best."""
+    interval = "no interval" if over.ci95_nm is None else "{:.2f} … {:.2f}".format(*over.ci95_nm)
+    best = f", the smallest that {over.count} {unit} can have" if over.p <= over.smallest_p else ""
+    return f"{interval} over {over.count} {unit} (p = {over.p:.2g}{best})"
+
+
+def _resampled(row: EqualTerms) -> list[str]:
+    return [over_text(row.over_scans, "scans")] + (
+        [over_text(row.over_prints, "prints")] if row.over_prints else []
+    )
 
 
 def plain_words(findings: LoopFindings, result: CloseLoop) -> str:
@@ -19,7 +60,8 @@ def plain_words(findings: LoopFindings, result: CloseLoop) -> str:
         f"On {total} scans, each predicted by a fit that has not seen it, the model is wrong by "
         f"{result.before.mae_abs_nm:.0f} nm as it stands and by {result.before.mae_datum_free_nm:.1f} nm "
         "once the "
-        "zero of each scan is freed."
+        f"zero of each scan is freed. With everything added, and still only the zero free, it is wrong by "
+        f"{result.after.mae_datum_free_nm:.1f} nm."
     ]
     microscope = [get_effect(e.name).title for e in scan_terms if e.role == "measurement"]
     written = [get_effect(e.name).title for e in scan_terms if e.role != "measurement"]
@@ -44,7 +86,7 @@ def plain_words(findings: LoopFindings, result: CloseLoop) -> str:
         for seen in findings.observed.values()
         if seen.seen
     ]
-    if not causes:
+    if not causes and result.verdict != "too-few-scans":
         parts.append("No named effect of the printer is confirmed as missing from the model.")
     for e in traced:
         parts.append(
@@ -54,18 +96,15 @@ def plain_words(findings: LoopFindings, result: CloseLoop) -> str:
         )
     if result.residual.state == "unexplained":
         parts.append(f"What is left is still structured: {result.residual.signature}.")
-    else:
+    elif result.verdict != "too-few-scans":
         parts.append("What is left shows no structure that is shared between scans.")
     return " ".join(parts)
 
 
 def warnings_for(findings: LoopFindings, result: CloseLoop) -> list[str]:
     warnings = []
-    if len(findings.development) < FEWEST_SCANS:
-        warnings.append(
-            f"Only {len(findings.development)} scans to work on, and nothing can be confirmed below "
-            f"{FEWEST_SCANS}: errors are given, verdicts are withheld."
-        )
+    if result.verdict == "too-few-scans":
+        warnings.append(f"{_sentence_case(verdict_text(result).partition(': ')[2])}. Errors are given.")
     if result.run.dropped:
         warnings.append(f"Scans left out: {'; '.join(result.run.dropped)}")
     if findings.development[0].stored.write is None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 from litho_models.effects import Effect
 from litho_models.loop.findings import LoopFindings
@@ -14,6 +15,8 @@ from litho_models.loop.selection.contest import Added
 from litho_models.loop.selection.search import separating_experiment
 from litho_models.loop.single_scans.nested_tests import MeasurementTest
 from litho_models.loop.structure import LINEAR_RESPONSE, is_structured
+from litho_models.loop.study import Score
+from litho_models.scoring.pairs import over_prints
 
 # Of what the effect gained.
 _DOUBTFUL_SHARE = 0.1
@@ -26,7 +29,7 @@ def added_effects(findings: LoopFindings) -> list[AddedEffect]:
     early = [_added_measurement(findings, first[name]) for name in first if name in last]
     late = [_added_measurement(findings, last[name]) for name in last if name not in first]
     process = [_added_process(findings, entry) for entry in findings.search.added]
-    return early + process + [_added_probe(entry) for entry in findings.probed.added] + late
+    return early + process + [_added_probe(findings, entry) for entry in findings.probed.added] + late
 
 
 def _added_measurement(findings: LoopFindings, test: MeasurementTest) -> AddedEffect:
@@ -52,6 +55,7 @@ def _added_measurement(findings: LoopFindings, test: MeasurementTest) -> AddedEf
         scans_improved=test.confirmation.improved,
         confusable_with=list(test.confusable_with),
         separating_experiment=effect.separating,
+        **_beside(findings, test.before, test.after),
     )
 
 
@@ -109,10 +113,11 @@ def _added_process(findings: LoopFindings, entry: Added) -> AddedEffect:
         scans_improved=entry.confirmation.improved,
         confusable_with=entry.confusable_with,
         separating_experiment=separating_experiment([effect.name, *entry.confusable_with]),
+        **_beside(findings, entry.before, entry.after),
     )
 
 
-def _added_probe(entry: AddedProbe) -> AddedEffect:
+def _added_probe(findings: LoopFindings, entry: AddedProbe) -> AddedEffect:
     """A generic term: where the residual lives, added to the height; never a cause."""
     return AddedEffect(
         name=entry.probe.name,
@@ -133,7 +138,17 @@ def _added_probe(entry: AddedProbe) -> AddedEffect:
         scans_improved=entry.confirmation.improved,
         confusable_with=[],
         separating_experiment="print and scan the same layouts turned by 90 degrees",
+        **_beside(findings, entry.before, entry.after),
     )
+
+
+def _beside(findings: LoopFindings, before: Score, after: Score) -> dict[str, Any]:
+    """Terms per scan on both sides, and the gain over prints."""
+    gains = (before.mae_nm - after.mae_nm).tolist()
+    return {
+        "terms_per_scan": (before.degrees_of_freedom, after.degrees_of_freedom),
+        "over_prints": over_prints(gains, findings.prints, findings.config.seed),
+    }
 
 
 def _parameter_estimates(findings: LoopFindings, effect: Effect) -> dict[str, ParameterEstimate]:

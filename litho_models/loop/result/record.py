@@ -1,4 +1,4 @@
-"""``close_loop.json``, schema ``litho-models/close-loop/1``."""
+"""``close_loop.json``, schema ``litho-models/close-loop/2``."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from litho_data.foundation.run_facts import RunInfo
 from litho_data.store.schema import DatasetId
 from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.noise_floor import NoiseFloor
+from litho_models.scoring.pairs import OverUnits
 from litho_models.splits.folds import Split
 
 EffectVerdict = Literal["explained", "confusable", "traced-to-covariate"]
-Verdict = Literal["traced", "nothing-missing", "unexplained"]
+Verdict = Literal["traced", "nothing-missing", "unexplained", "too-few-scans"]
 CandidateVerdict = Literal[
     "explained",
     "confusable",
@@ -27,10 +28,40 @@ CandidateVerdict = Literal[
 
 
 class Errors(Record):
+    """Nothing fitted (``mae_abs_nm``), and the zero of each scan free: k = 1, before and after alike.
+
+    In results of schema 1 the zero alone before, and all accepted terms after.
+    """
+
     mae_abs_nm: float
     mae_datum_free_nm: float
     mae_datum_free_ci95_nm: tuple[float, float]
     rmse_datum_free_nm: float
+
+
+class TermsError(Record):
+    """Held-out error with ``k`` terms per scan, their effective number in the mean over scans, nm."""
+
+    k: float
+    mae_nm: float
+    mae_ci95_nm: tuple[float, float] | None
+    rmse_nm: float
+
+
+class EqualTerms(Record):
+    """Errors before and after with the same terms per scan: a policy of the benchmark, or the accepted terms.
+
+    Offsets of lines count with their weight, so that ``k`` of the same terms may differ a little. The gain is
+    before minus after of the mean absolute error, with its interval and sign flips over scans and over prints
+    (None for a single print).
+    """
+
+    terms: Literal["offset", "offset-gain", "full", "accepted"]
+    before: TermsError
+    after: TermsError
+    gain_nm: float
+    over_scans: OverUnits
+    over_prints: OverUnits | None
 
 
 class ParameterEstimate(Record):
@@ -40,6 +71,11 @@ class ParameterEstimate(Record):
 
 
 class AddedEffect(Record):
+    """``terms_per_scan``: effective number before and after; ``over_prints``: as in ``EqualTerms``.
+
+    Both are None in results of schema 1.
+    """
+
     name: str
     stage: Literal["exposure", "resist", "development", "measurement"]
     role: Literal["process", "measurement", "nuisance", "undetermined"]
@@ -55,6 +91,8 @@ class AddedEffect(Record):
     scans_improved: tuple[int, int]
     confusable_with: list[str]
     separating_experiment: str
+    terms_per_scan: tuple[float, float] | None = None
+    over_prints: OverUnits | None = None
 
 
 class Candidate(Record):
@@ -80,7 +118,15 @@ class Residual(Record):
 
 
 class CloseLoop(Result):
-    SCHEMA: ClassVar[str] = "litho-models/close-loop/1"
+    """What the loop found.
+
+    ``fewest_scans``: with fewer to work on the verdict is ``too-few-scans`` unless something is found.
+    ``equal_terms``, ``fewest_scans`` and, where the lock box was opened, ``locked_equal_terms`` are None in
+    results of schema 1.
+    """
+
+    SCHEMA: ClassVar[str] = "litho-models/close-loop/2"
+    OLDER: ClassVar[tuple[str, ...]] = ("litho-models/close-loop/1",)
     FILE_NAME: ClassVar[str] = "close_loop.json"
 
     run: RunInfo
@@ -94,15 +140,20 @@ class CloseLoop(Result):
     after: Errors
     locked_before: Errors | None = None
     locked_after: Errors | None = None
+    equal_terms: list[EqualTerms] | None = None
+    locked_equal_terms: list[EqualTerms] | None = None
     effects: list[AddedEffect]
     candidates: list[Candidate]
     shares: Shares
     residual: Residual
     verdict: Verdict
+    fewest_scans: int | None = None
+
+    @property
+    def headline(self) -> EqualTerms | None:
+        """The zero of each scan free, before and after; None in results of schema 1."""
+        return self.equal_terms[0] if self.equal_terms else None
 
     @model_serializer(mode="wrap")
     def _without_unopened_lock_box(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        content = handler(self)
-        return {
-            k: v for k, v in content.items() if v is not None or k not in ("locked_before", "locked_after")
-        }
+        return {k: v for k, v in handler(self).items() if v is not None or not k.startswith("locked_")}

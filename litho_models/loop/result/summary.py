@@ -2,28 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 
 from litho_data.foundation.run_facts import run_info
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store.schema import DatasetId
 from litho_models.effects import CATALOGUE
+from litho_models.loop import equal_terms
+from litho_models.loop.equal_terms import BeforeAfter, TermSet
 from litho_models.loop.findings import LoopFindings
 from litho_models.loop.result.added_effects import added_effects
 from litho_models.loop.result.candidates import all_candidates
 from litho_models.loop.result.record import (
     CloseLoop,
+    EqualTerms,
     Errors,
     Residual,
     Shares,
+    TermsError,
     Verdict,
 )
-from litho_models.loop.study import DATUM_FREE, Score
-from litho_models.scan_terms import NuisanceProtocol
+from litho_models.loop.selection.confirming import FEWEST_SCANS
+from litho_models.loop.structure import fewest_scans_for_structure
+from litho_models.loop.study import Score
+from litho_models.scan_terms import NuisanceProtocol, Terms
 from litho_models.scoring.noise_floor import NoiseFloor
+from litho_models.scoring.pairs import over_prints, over_scans
+from litho_models.scoring.statistics import interval
 from litho_models.splits.folds import Split
 
-_NO_TERMS: frozenset[str] = frozenset()
+_NO_TERMS: Terms = frozenset()
 
 
 def summarise(findings: LoopFindings, *, dataset: DatasetId, base_name: str, dropped: list[str]) -> CloseLoop:
@@ -33,11 +43,19 @@ def summarise(findings: LoopFindings, *, dataset: DatasetId, base_name: str, dro
         findings: what the loop found.
         dropped: scans left out, with reason.
     """
-    locked = findings.locked_scores
+    found, locked = equal_terms.scores(findings), findings.locked_scores
+    elsewhere = [scan.stored.print_id for scan in findings.locked]
     effects = added_effects(findings)
     tested = [e for e in effects if e.name not in _span_names()]
     structured = findings.structured
-    verdict: Verdict = "traced" if tested else "unexplained" if structured else "nothing-missing"
+    fewest = max(FEWEST_SCANS, fewest_scans_for_structure(len(findings.structure)))
+    verdict: Verdict = "nothing-missing"
+    if tested:
+        verdict = "traced"
+    elif structured:
+        verdict = "unexplained"
+    elif len(findings.development) < fewest:
+        verdict = "too-few-scans"
     floor_rms, floor_mae = findings.floor_nm
     return CloseLoop(
         schema=CloseLoop.SCHEMA,
@@ -53,18 +71,12 @@ def summarise(findings: LoopFindings, *, dataset: DatasetId, base_name: str, dro
             kind="lower-bound",
             source="second differences along x of the held-out residual: blind to correlated roughness",
         ),
-        before=_errors(
-            findings.errors(findings.base, _NO_TERMS),
-            findings.errors(findings.base, DATUM_FREE),
-            findings.config.seed,
-        ),
-        after=_errors(
-            findings.errors(findings.final, _NO_TERMS),
-            findings.errors(findings.final, findings.terms),
-            findings.config.seed,
-        ),
-        locked_before=_errors(*locked[0], findings.config.seed) if locked else None,
-        locked_after=_errors(*locked[1], findings.config.seed) if locked else None,
+        before=_errors(found, 0, findings.config.seed),
+        after=_errors(found, 1, findings.config.seed),
+        locked_before=_errors(locked, 0, findings.config.seed) if locked else None,
+        locked_after=_errors(locked, 1, findings.config.seed) if locked else None,
+        equal_terms=_equal_terms(found, findings.prints, findings.config.seed),
+        locked_equal_terms=_equal_terms(locked, elsewhere, findings.config.seed) if locked else None,
         effects=effects,
         candidates=all_candidates(findings, {e.name for e in effects}),
         shares=_shares(findings),
@@ -77,6 +89,7 @@ def summarise(findings: LoopFindings, *, dataset: DatasetId, base_name: str, dro
             ),
         ),
         verdict=verdict,
+        fewest_scans=fewest,
     )
 
 
@@ -84,12 +97,41 @@ def _span_names() -> set[str]:
     return {name for name, effect in CATALOGUE.items() if effect.per_scan}
 
 
-def _errors(without_fit: Score, datum_free: Score, seed: int) -> Errors:
+def _errors(found: Mapping[TermSet, BeforeAfter], which: int, seed: int) -> Errors:
+    without_fit, datum_free = found["none"][which], found["offset"][which]
     return Errors(
         mae_abs_nm=without_fit.mean_mae_nm,
         mae_datum_free_nm=datum_free.mean_mae_nm,
         mae_datum_free_ci95_nm=datum_free.interval_nm(seed),
         rmse_datum_free_nm=datum_free.rmse_nm,
+    )
+
+
+def _equal_terms(found: Mapping[TermSet, BeforeAfter], prints: Sequence[str], seed: int) -> list[EqualTerms]:
+    rows = []
+    for name, (before, after) in found.items():
+        if name == "none":
+            continue
+        gains = (before.mae_nm - after.mae_nm).tolist()
+        rows.append(
+            EqualTerms(
+                terms=name,
+                before=_terms_error(before),
+                after=_terms_error(after),
+                gain_nm=before.mean_mae_nm - after.mean_mae_nm,
+                over_scans=over_scans(gains, seed),
+                over_prints=over_prints(gains, prints, seed),
+            )
+        )
+    return rows
+
+
+def _terms_error(score: Score) -> TermsError:
+    return TermsError(
+        k=score.degrees_of_freedom,
+        mae_nm=score.mean_mae_nm,
+        mae_ci95_nm=interval(score.mae_nm.tolist()),
+        rmse_nm=score.rmse_nm,
     )
 
 
