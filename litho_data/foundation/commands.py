@@ -33,7 +33,6 @@ def new_app(help_text: str):
         # Without this, --version alone would be asked for a command.
         invoke_without_command=True,
         no_args_is_help=True,
-        add_completion=False,
         pretty_exceptions_enable=False,
     )
 

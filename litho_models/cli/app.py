@@ -174,6 +174,45 @@ def benchmark(
 
 
 @app.command()
+def predict(
+    model: Annotated[str, typer.Argument(help="folder of a frozen model, or zoo:NAME")],
+    layout: Annotated[Path, typer.Argument(help="TIFF, PNG, BMP or NPY of levels")],
+    out: Annotated[Path, typer.Option(help="file to write: .gsf (opens in Gwyddion) or .npy (µm)")],
+    extrapolate: Annotated[
+        bool, typer.Option("--extrapolate", help="accept levels beyond the calibrated range")
+    ] = False,
+) -> None:
+    """Predict the printed height of a layout that is sampled at the pitch of the model.
+
+    Example: litho-models predict zoo:pbl layout.png --out height.gsf
+    """
+    from litho_models.frozen.predicting import predict_file
+
+    frozen = litho_models.load_frozen(litho_models.zoo.model_folder(model), extrapolate=extrapolate)
+    height = predict_file(frozen, layout, out)
+    lowest, highest = height.min(), height.max()
+    typer.echo(f"{height.shape[0]} x {height.shape[1]} px, {lowest:.3f} to {highest:.3f} µm high: {out}")
+
+
+@app.command("zoo")
+def show_zoo(
+    name: Annotated[str | None, typer.Argument(help="show the page of this model; list all without")] = None,
+) -> None:
+    """List the models that come with the package, or show the page of one.
+
+    Example: litho-models zoo pbl
+    """
+    zoo = litho_models.zoo
+    if name is not None:
+        page = (zoo.folder(name.removeprefix(zoo.PREFIX)) / "README.md").read_text(encoding="utf-8")
+        # Without the front matter, which is for machines.
+        typer.echo(page.split("---\n", 2)[-1].strip())
+        return
+    for known in zoo.list():
+        typer.echo(f"{zoo.PREFIX}{known:10} {zoo.load(known)}")
+
+
+@app.command()
 def compare(
     first: Annotated[Path, typer.Argument(help="benchmark.json or evaluation.json")],
     second: Annotated[Path, typer.Argument(help="another one, of the same protocol")],

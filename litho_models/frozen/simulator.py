@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from litho_data.foundation.errors import InputError
 from litho_models.frozen.card import ModelCard
+from litho_models.frozen.predicting import Field, predict_layout
 from litho_models.layers.precision import Precision, network_precision, warn_where_slower
 from litho_models.prediction.tiles import predict_field, predict_interior
 from litho_models.simulator import Simulator, Tile
@@ -90,6 +91,28 @@ class FrozenSimulator(nn.Module):
         if isinstance(self.simulator, Simulator):
             return self._in_precision(predict_field, self.simulator, layout_um)
         return self._in_precision(self.simulator, layout_um)
+
+    def predict(self, layout_um: Field, pitch_um: float | None = None) -> Field:
+        """Printed height of a layout of any kind and number of dimensions: the same kind and shape, µm.
+
+        Args:
+            layout_um: nominal height (..., y, x), µm, of any float type: an array of NumPy or xarray (whose
+                coordinates y_um and x_um, if any, are checked), or a tensor, through which gradients flow.
+            pitch_um: sampling of the layout, if the caller wants it checked.
+
+        Raises:
+            InputError: as ``forward``; whole numbers, which would be levels; fewer than two dimensions.
+        """
+        self.check_geometry(pitch_um)
+        return predict_layout(self, layout_um)
+
+    def __repr__(self) -> str:
+        card = self.card
+        return (
+            f"<FrozenSimulator {self.name}: {card['parameters']:,} parameters, pitch {self.pitch_um:g} µm, "
+            f"{card['levels']} levels of {card['level_height_um']:g} µm, "
+            f"heights from {self._lowest_um:g} to {self._highest_um:g} µm>"
+        )
 
     @property
     def has_interior(self) -> bool:
