@@ -78,11 +78,11 @@ def _rows(model: Features, scan: PrintedScan, terms: Terms) -> tuple[FloatMap, F
     """Features (k, n), measured height (n,) µm and the scan's own terms (m, n) at the fitted pixels."""
     at = _fitted_pixels(scan)
     height = scan.height_um.reshape(-1)[at].astype(np.float64)
-    return _features(model, scan, at), height, term_maps(TermPixels(scan.layout_um, at=at), terms)
+    return feature_rows(model, scan, at), height, term_maps(TermPixels(scan.layout_um, at=at), terms)
 
 
-def _features(model: Features, scan: PrintedScan, at: np.ndarray) -> FloatMap:
-    """Features (k, n) at flat indices of a scan, tile by tile."""
+def feature_rows(model: Features, scan: PrintedScan, at: np.ndarray) -> FloatMap:
+    """Features (k, n) at flat indices ``at`` of a scan, made tile by tile."""
     reach = model.reach_px
     layout = pad_field(torch.from_numpy(scan.layout_um)[None, None], reach, reach)
     place = np.stack(np.divmod(at, scan.shape[1]))
@@ -111,7 +111,7 @@ def _fitted_pixels(scan: PrintedScan) -> np.ndarray:
 def _standardise(model: RandomFeatures, scans: Sequence[PrintedScan]) -> None:
     """Measure what the random features see: mean over all scans, spread within them."""
     count = len(model.centre)
-    seen = [_features(model, scan, _fitted_pixels(scan))[:count] for scan in scans]
+    seen = [feature_rows(model, scan, _fitted_pixels(scan))[:count] for scan in scans]
     centre = np.mean([one.mean(axis=1) for one in seen], axis=0)
     spread = np.sqrt(np.mean([one.var(axis=1) for one in seen], axis=0))
     model.standardise(

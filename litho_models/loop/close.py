@@ -12,8 +12,9 @@ from litho_data.foundation.errors import InputError
 from litho_data.store.lock_box import locked_ids
 from litho_data.store.read import PrintedScan
 from litho_models.effects import get_effect
-from litho_models.loop.choice import choose, passed
+from litho_models.loop.choice import Choice, choose, passed
 from litho_models.loop.equal_terms import scores_elsewhere
+from litho_models.loop.explainable import Learner, Rest
 from litho_models.loop.findings import LoopConfig, LoopFindings
 from litho_models.loop.folded_base import Trainer
 from litho_models.loop.identifiability import identifiability, profiles
@@ -21,7 +22,7 @@ from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.loop.screening.power import parse_injection, plant
 from litho_models.loop.single_scans.observed import observe
 from litho_models.loop.structure import covariate_tests
-from litho_models.loop.study import DATUM_FREE, Study, names_to_terms, noise_lower_bound_nm
+from litho_models.loop.study import DATUM_FREE, State, Study, names_to_terms, noise_lower_bound_nm
 from litho_models.splits.folds import grouped_folds
 
 
@@ -84,6 +85,7 @@ def close_loop(
         structure=covariate_tests(development, final.predictions)
         if choice.probed.added
         else choice.left_by_named,
+        explainable=_explainable(choice),
         locked_scores=scores_elsewhere(choice, locked) if config.open_lock_box and locked else None,
         observed=observe(choice.study, final.predictions, choice.terms, choice.probed.defects, rounding_um),
         identifiability=identifiability(search.state.fits),
@@ -91,6 +93,21 @@ def close_loop(
         planted=planted,
         config=config,
     )
+
+
+def _explainable(choice: Choice) -> dict[str, Rest]:
+    """What layout and place still explain: beside the base, after each effect, and at last."""
+    choice.study.report("measuring what could still be learned")
+    learner, search = Learner(choice.study, choice.base.predictions), choice.search
+    stages = {"base": choice.base} | {f"with {name}": after for name, (_, after) in search.steps.items()}
+    stages |= {"named effects": search.state, "generic terms": choice.final}
+    rests: dict[str, Rest] = {}
+    seen: list[State] = []
+    for name, state in stages.items():
+        if not any(state is other for other in seen):
+            seen.append(state)
+            rests[name] = learner.rest(state.predictions)
+    return rests
 
 
 def _folds(scans: Sequence[PreparedScan], config: LoopConfig) -> np.ndarray:

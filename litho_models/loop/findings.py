@@ -13,6 +13,7 @@ from litho_models.effects.chain import EffectChain
 from litho_models.fitting.least_squares import Loss
 from litho_models.loop.choice import Choice
 from litho_models.loop.equal_terms import BeforeAfter, TermSet
+from litho_models.loop.explainable import Rest
 from litho_models.loop.folded_base import FoldedBase
 from litho_models.loop.identifiability import Identifiability, Profile
 from litho_models.loop.prepared import PreparedScan
@@ -48,6 +49,7 @@ class LoopFindings(Choice):
         lock_box: ids of the locked scans, those that cannot be used among them.
         floor_nm: lower bound of the noise, nm (root mean square, mean absolute).
         structure: covariate tests on what is left at last.
+        explainable: what layout and place still explain, by stage of the loop.
         locked_scores: by name of the terms, errors of the locked scans before and after, if opened.
         observed: what is seen without a model, by name.
         identifiability, profiles: how well the scans pin down what was fitted to name the causes.
@@ -58,6 +60,7 @@ class LoopFindings(Choice):
     lock_box: list[str]
     floor_nm: tuple[float, float]
     structure: list[CovariateTest]
+    explainable: dict[str, Rest]
     locked_scores: dict[TermSet, BeforeAfter] | None
     observed: dict[str, Observed]
     identifiability: Identifiability | None
@@ -77,6 +80,11 @@ class LoopFindings(Choice):
     @property
     def structured(self) -> list[CovariateTest]:
         return is_structured(self.structure)
+
+    @property
+    def rest(self) -> Rest:
+        """What layout and place still explain at last."""
+        return list(self.explainable.values())[-1]
 
     def errors(self, state: State, terms: Terms) -> Score:
         """Held-out errors of a state over the development scans."""

@@ -47,7 +47,7 @@ class LinearProbe:
 
     def held_out(self, fold_of: np.ndarray) -> Estimate:
         """Coefficients without each fold, and the gain of each scan by those that have not seen it."""
-        return _held_out(self.grams, self.rights, self.pixels, self.penalty, fold_of)
+        return held_out_ridge(self.grams, self.rights, self.pixels, self.penalty, fold_of)
 
     def control(self, fold_of: np.ndarray, random: np.random.Generator) -> float:
         """Mean held-out gain, nm², after the columns of every scan were shuffled on their own."""
@@ -55,7 +55,7 @@ class LinearProbe:
         for scan in range(len(grams)):
             order = self.shuffle(random, len(self.penalty))
             grams[scan], rights[scan] = self.grams[scan][np.ix_(order, order)], self.rights[scan][order]
-        return _held_out(grams, rights, self.pixels, self.penalty, fold_of).mean_gain_nm2
+        return held_out_ridge(grams, rights, self.pixels, self.penalty, fold_of).mean_gain_nm2
 
     def agreement(self) -> float:
         """Correlation of the corrections that two disjoint halves of the scans ask for."""
@@ -108,37 +108,43 @@ def second_differences(count: int) -> np.ndarray:
     return operator.T @ operator
 
 
-def _held_out(
+def held_out_ridge(
     grams: np.ndarray, rights: np.ndarray, pixels: np.ndarray, penalty: np.ndarray, fold_of: np.ndarray
 ) -> Estimate:
-    folds = int(fold_of.max()) + 1
-    per_fold = []
-    gains = np.zeros(len(grams))
-    for fold in range(folds):
-        training = fold_of != fold
-        own = _best_ridge(grams[training], rights[training], penalty, fold_of[training])
-        per_fold.append(own)
-        for scan in np.flatnonzero(~training):
-            gains[scan] = _gain(grams[scan], rights[scan], own) / pixels[scan]
-    common = _best_ridge(grams, rights, penalty, fold_of)
-    return Estimate(common=common, per_fold=np.stack(per_fold), gains_nm2=gains * NM_PER_UM**2)
+    """Ridge fits without each fold and their gains on the scans of that fold.
+
+    Args:
+        grams, rights, pixels: (scans, m, m) and (scans, m), µm², and (scans,).
+        penalty: (m, m), what is kept small; how much is chosen inside the training folds.
+        fold_of: (scans,).
+    """
+    folds = np.arange(int(fold_of.max()) + 1)
+    fold_grams, fold_rights = (
+        np.stack([part[fold_of == fold].sum(axis=0) for fold in folds]) for part in (grams, rights)
+    )
+    per_fold = [_best_ridge(fold_grams[folds != f], fold_rights[folds != f], penalty) for f in folds]
+    gains = np.array(
+        [_gain(gram, right, per_fold[f]) for gram, right, f in zip(grams, rights, fold_of, strict=True)]
+    )
+    return Estimate(
+        common=_best_ridge(fold_grams, fold_rights, penalty),
+        per_fold=np.stack(per_fold),
+        gains_nm2=gains / pixels * NM_PER_UM**2,
+    )
 
 
-def _best_ridge(
-    grams: np.ndarray, rights: np.ndarray, penalty: np.ndarray, fold_of: np.ndarray
-) -> np.ndarray:
-    """The ridge whose fits without a fold do best on that fold, then fitted on all these scans."""
-    totals = []
-    for ridge in RIDGES:
-        total = 0.0
-        for fold in np.unique(fold_of):
-            kept = fold_of != fold
-            if not kept.any():
-                continue
-            own = _ridge(grams[kept].sum(axis=0), rights[kept].sum(axis=0), penalty, ridge)
-            total += _gain(grams[~kept].sum(axis=0), rights[~kept].sum(axis=0), own)
-        totals.append(total)
-    return _ridge(grams.sum(axis=0), rights.sum(axis=0), penalty, RIDGES[int(np.argmax(totals))])
+def _best_ridge(grams: np.ndarray, rights: np.ndarray, penalty: np.ndarray) -> np.ndarray:
+    """The ridge whose fits without a fold do best on that fold, then fitted on all of them."""
+    gram, right = grams.sum(axis=0), rights.sum(axis=0)
+    others = [(gram - own_gram, right - own_right) for own_gram, own_right in zip(grams, rights, strict=True)]
+    totals = [
+        sum(
+            _gain(own_gram, own_right, _ridge(*kept, penalty, ridge))
+            for own_gram, own_right, kept in zip(grams, rights, others, strict=True)
+        )
+        for ridge in (RIDGES if len(grams) > 1 else RIDGES[:1])
+    ]
+    return _ridge(gram, right, penalty, RIDGES[int(np.argmax(totals))])
 
 
 def _ridge(gram: np.ndarray, right: np.ndarray, penalty: np.ndarray, ridge: float) -> np.ndarray:

@@ -101,6 +101,12 @@ def _map_columns(scan: PreparedScan, prediction: np.ndarray, times_height: bool)
     return maps * prediction if times_height else maps
 
 
+def map_columns_at(scan: PreparedScan, at: np.ndarray) -> np.ndarray:
+    """The splines of ``position_map`` at flat indices of a scan, (25, n)."""
+    (ny, nx), (y, x) = scan.stored.shape, np.divmod(at, scan.stored.shape[1])
+    return (_splines(ny)[:, None, y] * _splines(nx)[None, :, x]).reshape(-1, len(at))
+
+
 def _profile_columns(
     scan: PreparedScan, prediction: np.ndarray, along: Literal["row", "column"], times_height: bool
 ) -> np.ndarray:

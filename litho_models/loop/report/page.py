@@ -273,6 +273,24 @@ def _rest_section(page: Page, findings: LoopFindings, result: CloseLoop) -> None
     page.table(
         pd.DataFrame(
             [
+                {
+                    "stage": one.stage,
+                    "squared error (nm²)": one.squared_error_nm2,
+                    "explained (nm²)": one.explained_nm2,
+                    "95 % over scans": interval_text(one.explained_ci95_nm2),
+                }
+                for one in result.explainable or []
+            ]
+        ),
+        "What a ridge regression over features of layout, place, order and dose still explains, each scan by "
+        "one that has not seen it; offset, gain, tilt and bow of each scan are free "
+        f"(k = {findings.rest.k}). It says that something could be learned, not what.",
+        "explainable.csv",
+        digits=1,
+    )
+    page.table(
+        pd.DataFrame(
+            [
                 {"covariate": t.name, "p": t.p, "share of squared error (%)": 100 * t.share}
                 for t in findings.structure
             ]

@@ -112,6 +112,20 @@ class Shares(Record):
     noise_floor: float
 
 
+class Explainable(Record):
+    """What a ridge over features of layout and place explains out of fold, at one stage of the loop.
+
+    Of the squared error per pixel with ``k`` terms per scan free; the interval over scans is None with fewer
+    than six.
+    """
+
+    stage: str
+    squared_error_nm2: float
+    k: int
+    explained_nm2: float
+    explained_ci95_nm2: tuple[float, float] | None
+
+
 class Residual(Record):
     state: Literal["at-floor", "unexplained", "undecided"]
     signature: str
@@ -121,8 +135,8 @@ class CloseLoop(Result):
     """What the loop found.
 
     ``fewest_scans``: with fewer to work on the verdict is ``too-few-scans`` unless something is found.
-    ``equal_terms``, ``fewest_scans`` and, where the lock box was opened, ``locked_equal_terms`` are None in
-    results of schema 1.
+    ``equal_terms``, ``explainable``, ``fewest_scans`` and, where the lock box was opened,
+    ``locked_equal_terms`` are None in results of schema 1.
     """
 
     SCHEMA: ClassVar[str] = "litho-models/close-loop/2"
@@ -145,6 +159,7 @@ class CloseLoop(Result):
     effects: list[AddedEffect]
     candidates: list[Candidate]
     shares: Shares
+    explainable: list[Explainable] | None = None
     residual: Residual
     verdict: Verdict
     fewest_scans: int | None = None

@@ -19,6 +19,7 @@ from litho_models.loop.result.record import (
     CloseLoop,
     EqualTerms,
     Errors,
+    Explainable,
     Residual,
     Shares,
     TermsError,
@@ -47,12 +48,12 @@ def summarise(findings: LoopFindings, *, dataset: DatasetId, base_name: str, dro
     elsewhere = [scan.stored.print_id for scan in findings.locked]
     effects = added_effects(findings)
     tested = [e for e in effects if e.name not in _span_names()]
-    structured = findings.structured
+    unexplained = _signature(findings)
     fewest = max(FEWEST_SCANS, fewest_scans_for_structure(len(findings.structure)))
     verdict: Verdict = "nothing-missing"
     if tested:
         verdict = "traced"
-    elif structured:
+    elif unexplained:
         verdict = "unexplained"
     elif len(findings.development) < fewest:
         verdict = "too-few-scans"
@@ -80,17 +81,32 @@ def summarise(findings: LoopFindings, *, dataset: DatasetId, base_name: str, dro
         effects=effects,
         candidates=all_candidates(findings, {e.name for e in effects}),
         shares=_shares(findings),
-        residual=Residual(
-            # Only a measured floor can show that it is reached; the loop has a lower bound: never at-floor.
-            state="unexplained" if structured else "undecided",
-            signature="; ".join(
-                f"follows {t.name} (p = {t.p:.4f}, {100 * t.share:.1f} % of the squared error)"
-                for t in sorted(structured, key=lambda t: -t.share)
-            ),
-        ),
+        explainable=[
+            Explainable(
+                stage=stage,
+                squared_error_nm2=float(rest.squares_nm2.mean()),
+                k=rest.k,
+                explained_nm2=rest.mean_nm2,
+                explained_ci95_nm2=rest.ci95_nm2,
+            )
+            for stage, rest in findings.explainable.items()
+        ],
+        # Only a measured floor can show that it is reached; the loop has a lower bound: never at-floor.
+        residual=Residual(state="unexplained" if unexplained else "undecided", signature=unexplained),
         verdict=verdict,
         fewest_scans=fewest,
     )
+
+
+def _signature(findings: LoopFindings) -> str:
+    """What is left to be explained, in words; empty where nothing shows."""
+    parts = [
+        f"follows {t.name} (p = {t.p:.4f}, {100 * t.share:.1f} % of the squared error)"
+        for t in sorted(findings.structured, key=lambda t: -t.share)
+    ]
+    if findings.rest.matters:
+        parts.append(f"layout and place explain {100 * findings.rest.share:.1f} % of the squared error")
+    return "; ".join(parts)
 
 
 def _span_names() -> set[str]:

@@ -1,0 +1,104 @@
+"""What could still be learned: what is there is measured, and nothing is where nothing is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from litho_data.foundation.units import NM_PER_UM
+from litho_models.loop import explainable
+from litho_models.loop.explainable import Learner
+from litho_models.loop.prepared import PreparedScan, prepare_scans
+from litho_models.loop.study import Study
+from tests.litho_models.loop_scans import printed_scans, true_model
+
+FOLD_OF = np.arange(10) % 5
+Change = Callable[[PreparedScan, np.ndarray], np.ndarray]
+
+
+@pytest.fixture(scope="module")
+def scene() -> tuple[list[PreparedScan], list[np.ndarray]]:
+    scans = prepare_scans(printed_scans(count=10, size_px=96, seed=5))
+    with torch.no_grad():
+        return scans, [true_model({})(f.layout, f.context)[0, 0].numpy() for f in scans]
+
+
+def changed(scans: list[PreparedScan], predictions: list[np.ndarray], change: Change) -> list[np.ndarray]:
+    """Predictions that lack a change."""
+    return [p - change(f, p).astype(np.float32) for f, p in zip(scans, predictions, strict=True)]
+
+
+def bead(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
+    """Some nanometres on slopes along x, the higher the print the more."""
+    return 0.02 * prediction * np.abs(np.gradient(prediction, scan.stored.pitch_um, axis=1))
+
+
+def later(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
+    """The slopes along y lose height in the second half of the run."""
+    return 0.03 * (scan.context.order > 0) * np.abs(np.gradient(prediction, scan.stored.pitch_um, axis=0))
+
+
+def placed(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
+    ny, nx = prediction.shape
+    y, x = np.meshgrid(np.linspace(-1, 1, ny), np.linspace(-1, 1, nx), indexing="ij")
+    return 0.01 * prediction * np.sin(3 * x + 1) * np.cos(3.5 * y)
+
+
+def test_where_nothing_is_missing_nothing_can_be_learned(scene) -> None:
+    scans, predictions = scene
+    rest = Learner(Study(scans, FOLD_OF), predictions).rest(predictions)
+    assert not rest.matters
+    assert rest.share < 0.01
+    assert rest.k == 7
+
+
+@pytest.mark.parametrize("change", [bead, later, placed])
+def test_what_follows_layout_order_or_place_is_measured_in_its_size(scene, change) -> None:
+    scans, predictions = scene
+    learner = Learner(Study(scans, FOLD_OF), predictions)
+    lacking = changed(scans, predictions, change)
+    rest, true = learner.rest(lacking), learner.rest(predictions)
+    there = float((rest.squares_nm2 - true.squares_nm2).mean())
+    assert rest.matters
+    assert rest.ci95_nm2[0] <= rest.mean_nm2 <= rest.ci95_nm2[1]
+    # A fifth is left for the spread of 200 coefficients over 80,000 correlated pixels and for the ridge.
+    assert 0.8 * there < rest.mean_nm2 < 1.05 * there
+
+
+def test_a_scan_is_judged_by_a_ridge_that_has_not_seen_it(scene) -> None:
+    scans, predictions = scene
+    learner = Learner(Study(scans, FOLD_OF), predictions)
+    # One scan alone has a pattern of its own: the others cannot know it.
+    alone = list(predictions)
+    alone[0] = alone[0] - bead(scans[0], alone[0])
+    gains, before = learner.rest(alone).gains_nm2, learner.rest(alone).squares_nm2
+    assert gains[0] < 0.05 * (before[0] - learner.rest(predictions).squares_nm2[0])
+
+
+def test_rows_are_thinned_where_they_would_not_fit(scene, monkeypatch) -> None:
+    scans, predictions = scene
+    study = Study(scans, FOLD_OF)
+    lacking = changed(scans, predictions, bead)
+    full = Learner(study, predictions).rest(lacking)
+    pixels = sum(len(scan.sample) for scan in scans)
+    monkeypatch.setattr(explainable, "_KEPT_BYTES", 4 * 256 * pixels // 2)
+    thinned = Learner(study, predictions)
+    assert sum(rows.nbytes for rows in thinned._rows_of) <= 4 * 256 * pixels // 2
+    # Half of the pixels; neighbours share most of their roughness, so little is lost.
+    assert thinned.rest(lacking).mean_nm2 == pytest.approx(full.mean_nm2, rel=0.15)
+
+
+def test_the_squared_error_is_that_of_the_residual_without_what_a_scan_adds(scene) -> None:
+    scans, predictions = scene
+    tilted = [
+        replace(scan, height=scan.height + 0.05 * scan.position[1] + 0.02 * number)
+        for number, scan in enumerate(scans)
+    ]
+    plain, moved = (Learner(Study(f, FOLD_OF), predictions).rest(predictions) for f in (scans, tilted))
+    assert moved.squares_nm2 == pytest.approx(plain.squares_nm2, rel=1e-6)
+    # Roughness of 6 nm is all that is there.
+    assert np.sqrt(plain.squares_nm2.mean()) == pytest.approx(0.006 * NM_PER_UM, rel=0.1)
