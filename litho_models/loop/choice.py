@@ -20,7 +20,7 @@ from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.probes import Probed, probe_residual
 from litho_models.loop.selection.search import Search, search_effects
 from litho_models.loop.single_scans.nested_tests import MeasurementTest, measurement_tests
-from litho_models.loop.structure import CovariateTest, covariate_tests, is_structured
+from litho_models.loop.structure import CovariateTest, covariate_tests
 from litho_models.loop.study import (
     DATUM_FREE,
     State,
@@ -120,12 +120,7 @@ def choose(study: Study, base: nn.Module, trainer: Trainer | None = None) -> Cho
     # Effects that displace a print leave a shift in every scan, which its registration then takes up.
     between = first_tests if search.state is start else measurement_tests(study, search.state.predictions)
     left = covariate_tests(study.scans, search.state.predictions)
-    probed = probe_residual(
-        search.state,
-        study,
-        DATUM_FREE | names_to_terms(passed(between)),
-        search=bool(is_structured(left)),
-    )
+    probed = probe_residual(search.state, study, DATUM_FREE | names_to_terms(passed(between)))
     return Choice(
         study=study,
         base=start,

@@ -21,6 +21,7 @@ from litho_models.loop.probes.places import drawn, drawn_profile
 from litho_models.loop.probes.selection import _anchor, _corrected
 from litho_models.loop.probes.tables import SPOT_UM
 from litho_models.loop.probes.trend import order_trends
+from litho_models.loop.report.plots import probe_figure
 from litho_models.loop.study import State, Study
 from tests.litho_models.loop_scans import printed_scans, true_model
 
@@ -51,7 +52,7 @@ def probed(scans: list[PreparedScan], predictions: list[np.ndarray]) -> Probed:
     fits = FoldFits(true_model({}), nothing, np.empty((5, 0)), np.zeros(5), np.empty((0, 0)), [])
     return probe_residual(
         State(fits, predictions), Study(scans, FOLD_OF, floor_nm2=(1e3 * NOISE_UM) ** 2),
-        frozenset({"offset", "bow"}), search=True,
+        frozenset({"offset", "bow"}),
     )  # fmt: skip
 
 
@@ -103,6 +104,40 @@ def test_a_response_displaced_from_the_layout_comes_back_in_place_and_size() -> 
     assert values["peak_x"] == pytest.approx(-0.6, abs=0.1)
     assert values["peak_amplitude"] == pytest.approx(0.03, rel=0.2)
     assert entry.after.rmse_nm < 0.5 * (entry.before.rmse_nm + 1e3 * NOISE_UM)
+
+
+def test_a_copy_far_from_the_layout_comes_back_in_place_and_size() -> None:
+    """3 % of the layout again 5 µm away: the kernel reaches 1.6 µm on fields of 12.8 µm."""
+    found = probed(*scene(lambda f: 0.03 * np.roll(f.stored.layout_um, (40, -30), (0, 1))))
+    entry = found.added[0]
+    assert entry.probe.name == "displaced-copy"
+    values = {name: value for name, (value, _, _) in with_intervals(entry.probe, entry.estimate).items()}
+    # Places are 0.2 µm apart.
+    assert values["shift_y"] == pytest.approx(4.0, abs=0.1)
+    assert values["shift_x"] == pytest.approx(-3.0, abs=0.1)
+    # What np.roll brings in from the other side is no copy: it is not fitted, and does not move the amount.
+    assert values["amount"] == pytest.approx(0.03, rel=0.2)
+    assert probe_figure(entry).axes
+
+
+def test_a_product_of_slope_and_height_comes_back_as_powers_of_the_shape() -> None:
+    scans, predictions = scene()
+    along_x = {
+        f.id: p * np.abs(np.gradient(p.astype(float), f.stored.pitch_um, axis=1))
+        for f, p in zip(scans, predictions, strict=True)
+    }
+    found = probed(*scene(lambda f: 0.03 * along_x[f.id]))
+    assert found.added[0].probe.name == "shape-powers"
+    assert found.added[0].after.rmse_nm < 1.05 * 1e3 * NOISE_UM
+    assert probe_figure(found.added[0]).axes
+
+
+def test_a_jump_over_the_rows_is_seen() -> None:
+    def jump(scan: PreparedScan) -> np.ndarray:
+        return 0.008 * (np.arange(SIZE_PX) > 50)[:, None] * np.ones(SIZE_PX)
+
+    found = probed(*scene(jump))
+    assert found.added[0].probe.name == "row-profile"
 
 
 @pytest.mark.slow

@@ -139,7 +139,7 @@ class MissingKernel:
         transfer = cross / (power + regularisation * np.median(power))
         kernel = irfft2(transfer, s=self.size)
         distance = _distance_um(self.size, self.pitch_um)
-        reach = _reach_um(self.size, self.pitch_um)
+        reach = reach_um(self.size, self.pitch_um)
         ring = (distance > 0.8 * reach) & (distance <= reach)
         return np.where(distance <= reach, kernel - kernel[ring].mean(), 0.0)
 
@@ -188,7 +188,7 @@ def resampled(kernel: np.ndarray, pitch_um: float, wanted_um: float) -> np.ndarr
     """
     ny, nx = kernel.shape
     factor = pitch_um / wanted_um
-    radius = round(_reach_um((ny, nx), pitch_um) / wanted_um)
+    radius = round(reach_um((ny, nx), pitch_um) / wanted_um)
     offsets = np.arange(-radius, radius + 1) / factor
     rows = np.exp(2j * np.pi * np.outer(offsets, np.fft.fftfreq(ny)))
     columns = np.exp(2j * np.pi * np.outer(offsets, np.fft.fftfreq(nx)))
@@ -260,5 +260,6 @@ def _distance_um(size: tuple[int, int], pitch_um: float) -> np.ndarray:
     return np.hypot(y[:, None], x[None, :])
 
 
-def _reach_um(size: tuple[int, int], pitch_um: float) -> float:
+def reach_um(size: tuple[int, int], pitch_um: float) -> float:
+    """How far a kernel reaches on fields of ``size`` pixels."""
     return min(SUPPORT_UM, min(size) * pitch_um / 8)

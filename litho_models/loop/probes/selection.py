@@ -9,10 +9,11 @@ import numpy as np
 
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.probes.defects import Defects, find_defects
+from litho_models.loop.probes.displaced import displaced_copy
 from litho_models.loop.probes.kernel import missing_kernel
 from litho_models.loop.probes.places import position_map, profile
 from litho_models.loop.probes.probe import Estimate, Probe
-from litho_models.loop.probes.tables import axis_slope_table, level_table, slope_table
+from litho_models.loop.probes.tables import axis_slope_table, level_table, shape_powers, slope_table
 from litho_models.loop.probes.trend import OrderTrend, order_trends
 from litho_models.loop.selection.confirming import SMALLEST_SHARE, Confirmation
 from litho_models.loop.study import Correction, Score, State, Study
@@ -68,24 +69,17 @@ class Probed:
         return prediction
 
 
-def probe_residual(
-    state: State,
-    study: Study,
-    terms: Terms,
-    *,
-    search: bool,
-) -> Probed:
+def probe_residual(state: State, study: Study, terms: Terms) -> Probed:
     """Look for what has no name in the residual that the named effects leave.
 
     Args:
         state: the model after the named effects; ``terms``: scan terms of the scoring.
-        search: whether the residual is structured; otherwise only defects and trends are looked at.
     """
     defects = find_defects(study.scans, state.predictions)
     trends = order_trends(study.scans, state.predictions, study.seed)
     added: list[AddedProbe] = []
     tests: dict[str, ProbeTest] = {}
-    while search:
+    while True:
         taken = {entry.probe.name for entry in added}
         candidates = [
             p for p in generic_terms(study.scans, state.predictions, defects) if p.name not in taken
@@ -111,8 +105,9 @@ def generic_terms(
             profile(scans, predictions, kept, along=along, times_height=times) for along in ("row", "column")
         ]
     kernel = missing_kernel(scans, predictions, defects.masks)
-    slopes = [make(scans, predictions, kept) for make in (slope_table, axis_slope_table)]
-    return [*([table] if table else []), *slopes, *places, kernel]
+    shapes = [make(scans, predictions, kept) for make in (slope_table, axis_slope_table, shape_powers)]
+    far = displaced_copy(scans, predictions, defects.masks)
+    return [*([table] if table else []), *shapes, *places, kernel, *([far] if far else [])]
 
 
 def _best(

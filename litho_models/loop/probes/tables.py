@@ -16,6 +16,11 @@ from litho_models.loop.probes.linear import ColumnsOf, LinearProbe, linear_probe
 SPOT_UM = 0.2
 SLOPE_KNOTS = 8
 _FEWEST_SCANS, _SMALLEST_SHARE = 5, 0.01
+# h: height, y and x: slopes along y and x.
+_POWERS = (
+    *("h²", "h³", "y²", "x²", "yx", "y³", "x³"),
+    *("h y", "h x", "h |y|", "h |x|", "h² |y|", "h² |x|"),
+)
 Steepness = Callable[[PreparedScan, np.ndarray], np.ndarray]
 
 
@@ -69,6 +74,24 @@ def axis_slope_table(
     return _table("axis-slope-table", entries, columns_of, scans, predictions, kept, blocks=len(knots))
 
 
+def shape_powers(
+    scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray], kept: Sequence[np.ndarray]
+) -> LinearProbe:
+    """Powers and products of height and slopes of the predicted print; no table over one follows them."""
+    return linear_probe(
+        "shape-powers",
+        _power_columns,
+        np.eye(len(_POWERS)),
+        lambda random, count: random.permutation(count),
+        lambda heights: {
+            name: (float(height) * NM_PER_UM, "nm") for name, height in zip(_POWERS, heights, strict=True)
+        },
+        scans,
+        predictions,
+        kept,
+    )
+
+
 def _table(
     name: str,
     entries: Sequence[str],
@@ -91,6 +114,20 @@ def _table(
         scans,
         predictions,
         kept,
+    )
+
+
+def _power_columns(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
+    """``_POWERS`` of height (in heights of the highest level) and slopes (µm/µm), (m, y, x)."""
+    height = prediction.astype(np.float64) / scan.context.full_height_um
+    y, x = np.gradient(prediction.astype(np.float64), scan.stored.pitch_um)
+    size_y, size_x = np.abs(y), np.abs(x)
+    return np.stack(
+        [
+            *(height**2, height**3, y * y, x * x, y * x, y**3, x**3),
+            *(height * slope for slope in (y, x, size_y, size_x)),
+            *(height**2 * slope for slope in (size_y, size_x)),
+        ]
     )
 
 

@@ -13,6 +13,7 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.findings import LoopFindings
 from litho_models.loop.identifiability import Profile
 from litho_models.loop.probes import AddedProbe, with_intervals
+from litho_models.loop.probes.displaced import DisplacedCopy
 from litho_models.loop.probes.kernel import MissingKernel
 from litho_models.loop.probes.places import drawn, drawn_profile
 from litho_models.loop.result.record import CloseLoop
@@ -103,12 +104,16 @@ def curve_figure(curves: list[CovariateTest]) -> Figure:
 
 
 def probe_figure(entry: AddedProbe) -> Figure:
-    """What one generic term looks like: a table over levels, a map, or a kernel."""
+    """What one generic term looks like: a kernel, a copy, a table, a profile or a map."""
     probe, common = entry.probe, entry.estimate.common
     if isinstance(probe, MissingKernel):
         kernel = probe.kernel_map(common) / probe.pitch_um**2
         shown = _half_um(probe.size, probe.pitch_um)
         return _image(kernel, shown, "height per layout height and µm²", min(5.5, shown[0]))
+    if isinstance(probe, DisplacedCopy):
+        return _copy_figure(probe, common)
+    if probe.name == "shape-powers":
+        return _bars_figure(entry)
     if probe.name in _TABLES:
         return _table_figure(entry)
     unit = "relative height" if "-gain-" in probe.name else "nm"
@@ -116,6 +121,38 @@ def probe_figure(entry: AddedProbe) -> Figure:
     if probe.name.endswith("profile"):
         return _profile_figure(drawn_profile(common) * scale, probe.name.partition("-")[0], unit)
     return _image(drawn(common) * scale, (1.0, 1.0), unit, 1.0)
+
+
+def _copy_figure(probe: DisplacedCopy, common: np.ndarray) -> Figure:
+    """Gain of one copy at every displacement, and where it was taken."""
+    figure = new_figure(5, 4)
+    axes = figure.subplots()
+    y, x = probe.places_um.T
+    points = axes.scatter(x, y, c=probe.gain_nm2(), s=6, cmap="viridis")
+    axes.plot(common[1], common[0], "o", mfc="none", mec="#c05621", ms=14)
+    figure.colorbar(points, ax=axes, label="gain of one copy (nm²)")
+    axes.set_aspect("equal")
+    axes.invert_yaxis()
+    axes.set_xlabel("displaced along x (µm)")
+    axes.set_ylabel("displaced along y (µm)")
+    return figure
+
+
+def _bars_figure(entry: AddedProbe) -> Figure:
+    found = with_intervals(entry.probe, entry.estimate)
+    values = np.array([value for value, _, _ in found.values()])
+    ends = np.array([interval for _, _, interval in found.values()])
+    figure = new_figure(6, 0.3 * len(found) + 1)
+    axes = figure.subplots()
+    axes.axvline(0, color="k", lw=0.6)
+    axes.errorbar(
+        values, np.arange(len(found)), xerr=np.abs(ends.T - values), fmt="o", color=_AFTER, ms=4, capsize=2
+    )
+    axes.set_yticks(np.arange(len(found)), list(found))
+    axes.invert_yaxis()
+    axes.set_xlabel("missing height (nm per unit)")
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure
 
 
 def _table_figure(entry: AddedProbe) -> Figure:
