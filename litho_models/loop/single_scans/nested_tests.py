@@ -15,9 +15,12 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import Effect, get_effect
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.selection.confirming import BINOMIAL_P, Confirmation, confirm_variance
+from litho_models.loop.single_scans.line_period import LinePeriod, line_period
 from litho_models.loop.study import Score, Study
 from litho_models.scan_terms import (
     SCAN_TERMS,
+    LineIndex,
+    ScanTerm,
     TermPixels,
     Terms,
     chosen_terms,
@@ -150,6 +153,8 @@ def _test_lines(
         variance = np.maximum(gains[name], 0) / NM_PER_UM**2
         interval = bootstrap_interval(variance.tolist(), seed=study.seed)
         low, high = (float(np.sqrt(end)) for end in interval)
+        term = line_terms(terms_of_effect(name))[0]
+        period = line_period(study.scans, predictions, [_lines(term, scan) for scan in study.scans])
         tests.append(
             MeasurementTest(
                 effect=get_effect(name),
@@ -162,11 +167,26 @@ def _test_lines(
                     "line offsets, estimated on the other side of each scan, remove on the scored side "
                     f"{gains[name].mean():.1f} nm² along {_frame(name)}, {gains[other].mean():.1f} nm² along "
                     f"{_frame(other)}; offsets of the columns, treated alike, {columns.mean():.1f} nm²"
+                    f"{_period_text(period)}"
                 ),
                 confusable_with=(other,) if alike else (),
             )
         )
     return tests
+
+
+def _lines(term: ScanTerm, scan: PreparedScan) -> LineIndex:
+    assert term.lines is not None
+    return term.lines(scan.usable.shape, scan.line)
+
+
+def _period_text(period: LinePeriod | None) -> str:
+    if period is None:
+        return ""
+    return (
+        f"; they repeat every {period.period_um:.3g} µm, with {100 * period.share:.0f} % of the squared "
+        f"line means (p = {period.p:.1g})"
+    )
 
 
 def _frame(effect: str) -> str:
