@@ -73,7 +73,7 @@ class Named(Record):
     """One effect that the loop added outside the nuisance span, and those that look the same."""
 
     names: list[str]
-    verdict: Literal["explained", "confusable", "traced-to-covariate"]
+    verdict: Literal["explained", "confusable", "partial", "traced-to-covariate"]
 
 
 class Outcome(Record):

@@ -20,6 +20,7 @@ from litho_models.loop.folded_base import Trainer
 from litho_models.loop.identifiability import identifiability, profiles
 from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.loop.screening.power import parse_injection, plant
+from litho_models.loop.selection.weight import weigh_effects
 from litho_models.loop.single_scans.observed import observe
 from litho_models.loop.structure import covariate_tests
 from litho_models.loop.study import DATUM_FREE, State, Study, names_to_terms, noise_lower_bound_nm
@@ -76,6 +77,8 @@ def close_loop(
     for text in config.inject:
         report(f"planting {text}")
         planted += plant(text, choice.guide, choice.study, terms)
+    report("measuring what could still be learned")
+    learner = Learner(choice.study, choice.base.predictions)
     choice = replace(choice, study=replace(choice.study, background=config.background))
     return LoopFindings(
         **vars(choice),
@@ -85,7 +88,8 @@ def close_loop(
         structure=covariate_tests(development, final.predictions)
         if choice.probed.added
         else choice.left_by_named,
-        explainable=_explainable(choice),
+        explainable=_explainable(choice, learner),
+        weights=weigh_effects(choice.search, choice.study, learner),
         locked_scores=scores_elsewhere(choice, locked) if config.open_lock_box and locked else None,
         observed=observe(choice.study, final.predictions, choice.terms, choice.probed.defects, rounding_um),
         identifiability=identifiability(search.state.fits),
@@ -95,10 +99,9 @@ def close_loop(
     )
 
 
-def _explainable(choice: Choice) -> dict[str, Rest]:
+def _explainable(choice: Choice, learner: Learner) -> dict[str, Rest]:
     """What layout and place still explain: beside the base, after each effect, and at last."""
-    choice.study.report("measuring what could still be learned")
-    learner, search = Learner(choice.study, choice.base.predictions), choice.search
+    search = choice.search
     stages = {"base": choice.base} | {f"with {name}": after for name, (_, after) in search.steps.items()}
     stages |= {"named effects": search.state, "generic terms": choice.final}
     rests: dict[str, Rest] = {}

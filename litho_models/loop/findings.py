@@ -18,6 +18,7 @@ from litho_models.loop.folded_base import FoldedBase
 from litho_models.loop.identifiability import Identifiability, Profile
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.screening.power import Planted
+from litho_models.loop.selection.weight import Weight
 from litho_models.loop.single_scans.observed import Observed
 from litho_models.loop.structure import CovariateTest, is_structured
 from litho_models.loop.study import Score, State
@@ -50,6 +51,7 @@ class LoopFindings(Choice):
         floor_nm: lower bound of the noise, nm (root mean square, mean absolute).
         structure: covariate tests on what is left at last.
         explainable: what layout and place still explain, by stage of the loop.
+        weights: what each named effect gains beside its generic rivals.
         locked_scores: by name of the terms, errors of the locked scans before and after, if opened.
         observed: what is seen without a model, by name.
         identifiability, profiles: how well the scans pin down what was fitted to name the causes.
@@ -61,6 +63,7 @@ class LoopFindings(Choice):
     floor_nm: tuple[float, float]
     structure: list[CovariateTest]
     explainable: dict[str, Rest]
+    weights: dict[str, Weight]
     locked_scores: dict[TermSet, BeforeAfter] | None
     observed: dict[str, Observed]
     identifiability: Identifiability | None

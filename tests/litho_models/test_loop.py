@@ -22,7 +22,7 @@ from litho_models.loop.findings import LoopFindings
 from litho_models.loop.fold_fits import fit_folds, predict
 from litho_models.loop.parameters import get_vector
 from litho_models.loop.prepared import LARGE_PX, prepare_scans
-from litho_models.loop.report.wording import verdict_text
+from litho_models.loop.report.wording import plain_words, verdict_text
 from litho_models.loop.result.exporting import exported_effects
 from litho_models.loop.result.record import CloseLoop
 from litho_models.loop.result.summary import summarise
@@ -65,6 +65,42 @@ def test_nothing_is_found_where_nothing_is_missing(null) -> None:
     assert (result.residual.state, result.noise_floor.kind) == ("undecided", "lower-bound")
     # Roughness of 6 nm is all that is left: E|n| = 0.8 sd, the tilt of single scans adds a little.
     assert 4.5 < result.after.mae_datum_free_nm < 6.5
+
+
+def test_blobs_that_hold_a_part_of_the_error_are_not_nothing(null) -> None:
+    findings, result = null
+    for share, verdict in ((0.009, "nothing-missing"), (0.039, "unexplained")):
+        defects = replace(findings.probed.defects, share_of_squares=share)
+        blotted = replace(findings, probed=replace(findings.probed, defects=defects))
+        found = summarise(blotted, dataset=result.dataset, base_name="physics", dropped=[])
+        assert found.verdict == verdict
+        assert ("localised defects hold 3.9 %" in found.residual.signature) == (verdict == "unexplained")
+
+
+def test_what_could_be_learned_is_given_for_every_stage(null, planted) -> None:
+    assert [one.stage for one in null[1].explainable] == ["base"]
+    before, after = planted[1].explainable
+    assert (before.stage, after.stage) == ("base", "with vignetting")
+    # Free of each scan's own gain, what is left of the vignetting can be learned before, and not after.
+    assert before.explained_nm2 > 0.01 * before.squared_error_nm2
+    assert after.explained_nm2 < 0.01 * after.squared_error_nm2
+    assert before.k == after.k == 7
+
+
+def test_an_effect_that_is_only_a_part_is_not_exported_and_traces_nothing(planted) -> None:
+    findings, result = planted
+    (name,) = findings.weights
+    assert findings.weights[name].lacking == ""
+    light = replace(findings.weights[name], learner_gain_nm2=3 * findings.weights[name].gain_nm2)
+    found = summarise(
+        replace(findings, weights={name: light}), dataset=result.dataset, base_name="physics", dropped=[]
+    )
+    entry = next(e for e in found.effects if e.name == name)
+    assert (entry.verdict, entry.role, entry.share) == ("partial", "undetermined", pytest.approx(1 / 3))
+    assert verdicts(found)[name] == "partial"
+    assert found.verdict == "unexplained"
+    assert list(exported_effects(findings.final.fits.chain, found)["undetermined"]) == [name]
+    assert "a part of what is missing, 33 %" in plain_words(findings, found)
 
 
 def test_where_nothing_is_added_the_errors_with_the_same_terms_are_the_same(null) -> None:

@@ -163,6 +163,7 @@ def _effect_section(page: Page, result: CloseLoop) -> None:
                     "effect": e.name + (" (known before)" if e.prior_hypothesis else ""),
                     "role": e.role,
                     "verdict": e.verdict,
+                    "share of the best rival (%)": np.nan if e.share is None else 100 * e.share,
                     "or": ", ".join(e.confusable_with),
                     "terms per scan": " / ".join(f"{k:.0f}" for k in e.terms_per_scan or ()),
                     "before (nm)": e.before_nm,
@@ -204,6 +205,7 @@ def _candidate_section(page: Page, result: CloseLoop) -> None:
     order = [
         "explained",
         "confusable",
+        "partial",
         "traced-to-covariate",
         "contradicted",
         "below-noise",

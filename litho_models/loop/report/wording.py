@@ -79,6 +79,11 @@ def plain_words(findings: LoopFindings, result: CloseLoop) -> str:
             f"{e.scans_improved[0]} of "
             f"{e.scans_improved[1]} scans."
         )
+        if e.verdict == "partial":
+            parts.append(
+                f"It is a part of what is missing, {100 * (e.share or 0.0):.0f} % of what layout and place "
+                "explain in its place, and not the explanation; design does not use it."
+            )
         if e.separating_experiment and (e.confusable_with or e.role == "undetermined"):
             parts.append(f"To be sure: {e.separating_experiment}.")
     parts += [

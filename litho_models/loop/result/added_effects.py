@@ -18,6 +18,8 @@ from litho_models.loop.structure import LINEAR_RESPONSE, is_structured
 from litho_models.loop.study import Score
 from litho_models.scoring.pairs import over_prints
 
+# Verdicts on an effect that something without a name would do better: no design uses it.
+NEAR_A_CAUSE: tuple[EffectVerdict, ...] = ("partial", "traced-to-covariate")
 # Of what the effect gained.
 _DOUBTFUL_SHARE = 0.1
 
@@ -89,9 +91,11 @@ def _left_for_a_filter_nm2(findings: LoopFindings) -> float:
 
 
 def verdict_on(findings: LoopFindings, entry: Added) -> EffectVerdict:
-    """Of an added effect: a cause, one of a set, or near the cause."""
+    """Of an added effect: a cause, one of a set, near the cause, or a part of what is missing."""
     if entry.effect.name in doubtful_effects(findings.search.added, _left_for_a_filter_nm2(findings)):
         return "traced-to-covariate"
+    if findings.weights[entry.effect.name].lacking:
+        return "partial"
     return "confusable" if entry.confusable_with else "explained"
 
 
@@ -100,7 +104,7 @@ def _added_process(findings: LoopFindings, entry: Added) -> AddedEffect:
     return AddedEffect(
         name=effect.name,
         stage=effect.stage,
-        role="undetermined" if verdict == "traced-to-covariate" else effect.role,
+        role="undetermined" if verdict in NEAR_A_CAUSE else effect.role,
         verdict=verdict,
         prior_hypothesis=effect.name in findings.config.prior_hypotheses,
         parameters=_parameter_estimates(findings, effect),
@@ -113,6 +117,7 @@ def _added_process(findings: LoopFindings, entry: Added) -> AddedEffect:
         scans_improved=entry.confirmation.improved,
         confusable_with=entry.confusable_with,
         separating_experiment=separating_experiment([effect.name, *entry.confusable_with]),
+        share=findings.weights[effect.name].share,
         **_beside(findings, entry.before, entry.after),
     )
 

@@ -101,6 +101,8 @@ def _process_candidate(
         verdict = verdict_on(findings, entry)
         if verdict == "traced-to-covariate":
             reason += "; but what it leaves still follows the layout, so it is near the cause, not the cause"
+        elif verdict == "partial":
+            reason += f"; but only a part of what is missing: {findings.weights[name].lacking}"
     elif name in search.absorbed:
         verdict, reason = "absorbed", search.absorbed[name]
     elif name in sets:

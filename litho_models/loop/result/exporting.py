@@ -11,6 +11,7 @@ from litho_data.foundation.files import atomic_file
 from litho_models.effects import get_effect
 from litho_models.effects.chain import EffectChain
 from litho_models.loop.findings import LoopFindings
+from litho_models.loop.result.added_effects import NEAR_A_CAUSE
 from litho_models.loop.result.record import CloseLoop
 from litho_models.loop.single_scans.nested_tests import scan_parameters
 from litho_models.scan_terms import parameter_names
@@ -22,10 +23,10 @@ def exported_effects(chain: EffectChain, result: CloseLoop) -> dict[str, EffectV
     """The chain's effects as ``process``, ``measurement`` and ``undetermined`` (kept out of design).
 
     A process effect that these data cannot tell from one of the microscope is undetermined, and so is
-    one that only comes near the cause.
+    one that only comes near the cause, or is a part of what is missing.
     """
     alike = {e.name: e.confusable_with for e in result.effects}
-    doubtful = {e.name for e in result.effects if e.verdict == "traced-to-covariate"}
+    doubtful = {e.name for e in result.effects if e.verdict in NEAR_A_CAUSE}
     groups: dict[str, EffectValues] = {"process": {}, "measurement": {}, "undetermined": {}}
     for name, values in chain.values().items():
         roles = {get_effect(other).role for other in (name, *alike.get(name, []))}

@@ -14,11 +14,12 @@ from litho_models.scoring.noise_floor import NoiseFloor
 from litho_models.scoring.pairs import OverUnits
 from litho_models.splits.folds import Split
 
-EffectVerdict = Literal["explained", "confusable", "traced-to-covariate"]
+EffectVerdict = Literal["explained", "confusable", "partial", "traced-to-covariate"]
 Verdict = Literal["traced", "nothing-missing", "unexplained", "too-few-scans"]
 CandidateVerdict = Literal[
     "explained",
     "confusable",
+    "partial",
     "contradicted",
     "absorbed",
     "not-testable",
@@ -73,7 +74,8 @@ class ParameterEstimate(Record):
 class AddedEffect(Record):
     """``terms_per_scan``: effective number before and after; ``over_prints``: as in ``EqualTerms``.
 
-    Both are None in results of schema 1.
+    ``share``: of what the best generic rival explains in its place, for named effects of the printer. All
+    three are None in results of schema 1.
     """
 
     name: str
@@ -93,6 +95,7 @@ class AddedEffect(Record):
     separating_experiment: str
     terms_per_scan: tuple[float, float] | None = None
     over_prints: OverUnits | None = None
+    share: float | None = None
 
 
 class Candidate(Record):

@@ -25,7 +25,7 @@ from litho_models.loop.result.record import (
     TermsError,
     Verdict,
 )
-from litho_models.loop.selection.confirming import FEWEST_SCANS
+from litho_models.loop.selection.confirming import FEWEST_SCANS, SMALLEST_SHARE
 from litho_models.loop.structure import fewest_scans_for_structure
 from litho_models.loop.study import Score
 from litho_models.scan_terms import NuisanceProtocol, Terms
@@ -51,9 +51,9 @@ def summarise(findings: LoopFindings, *, dataset: DatasetId, base_name: str, dro
     unexplained = _signature(findings)
     fewest = max(FEWEST_SCANS, fewest_scans_for_structure(len(findings.structure)))
     verdict: Verdict = "nothing-missing"
-    if tested:
+    if any(e.verdict != "partial" for e in tested):
         verdict = "traced"
-    elif unexplained:
+    elif tested or unexplained:
         verdict = "unexplained"
     elif len(findings.development) < fewest:
         verdict = "too-few-scans"
@@ -106,6 +106,8 @@ def _signature(findings: LoopFindings) -> str:
     ]
     if findings.rest.matters:
         parts.append(f"layout and place explain {100 * findings.rest.share:.1f} % of the squared error")
+    if (blobs := findings.probed.defects.share_of_squares) > SMALLEST_SHARE:
+        parts.append(f"localised defects hold {100 * blobs:.1f} % of the squared error")
     return "; ".join(parts)
 
 

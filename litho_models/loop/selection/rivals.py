@@ -14,10 +14,11 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from litho_data.foundation.units import NM_PER_UM
-from litho_models.loop.linear import without_scan_terms
+from litho_models.loop.linear import ALL_FREE, without_scan_terms
 from litho_models.loop.probes.defects import find_defects
 from litho_models.loop.probes.selection import generic_terms
 from litho_models.loop.study import State, Study
+from litho_models.scan_terms import Terms
 
 # A generic term has to gain this much more: its own estimate is noisy, too.
 _BETTER = 1.05
@@ -35,7 +36,7 @@ def generic_rival(before: State, after: State, study: Study) -> str | None:
         before, after: the model without and with the effect.
     """
     changes = [new - old for old, new in zip(before.predictions, after.predictions, strict=True)]
-    own = _freed(before, changes, study)
+    own = freed_changes(before, changes, study)
     defects = find_defects(study.scans, before.predictions)
     for probe in generic_terms(study.scans, before.predictions, defects):
         estimate = probe.held_out(study.fold_of)
@@ -43,8 +44,8 @@ def generic_rival(before: State, after: State, study: Study) -> str | None:
             probe.correction(estimate.per_fold[fold], scan, prediction)
             for scan, prediction, fold in zip(study.scans, before.predictions, study.fold_of, strict=True)
         ]
-        generic = _freed(before, corrections, study)
-        if _gain(generic) > _BETTER * _gain(own) and _is_contained(own, generic):
+        generic = freed_changes(before, corrections, study)
+        if gains_nm2(generic).mean() > _BETTER * gains_nm2(own).mean() and _is_contained(own, generic):
             return probe.name
     return None
 
@@ -97,18 +98,20 @@ def _is_contained(own: Sequence[np.ndarray], generic: Sequence[np.ndarray]) -> b
     return together - beside <= _CONTAINED * alone
 
 
-def _gain(freed: Sequence[np.ndarray]) -> float:
-    """Mean gain in squared error of the changes as they are, nm²."""
+def gains_nm2(freed: Sequence[np.ndarray]) -> np.ndarray:
+    """Gain in squared error of the changes as they are, (scans,) nm²."""
     gains = [
         (2 * change @ residual - change @ change) / len(change) for change, residual in (c.T for c in freed)
     ]
-    return float(np.mean(gains)) * NM_PER_UM**2
+    return np.array(gains) * NM_PER_UM**2
 
 
-def _freed(state: State, changes: Sequence[np.ndarray], study: Study) -> list[np.ndarray]:
+def freed_changes(
+    state: State, changes: Sequence[np.ndarray], study: Study, terms: Terms = ALL_FREE
+) -> list[np.ndarray]:
     """Change and residual (n, 2) at the sampled pixels, free of what single scans may add, µm."""
     freed = []
     for scan, prediction, change in zip(study.scans, state.predictions, changes, strict=True):
         columns = np.column_stack([scan.at_sample(change), scan.height - scan.at_sample(prediction)])
-        freed.append(without_scan_terms(columns, scan, prediction))
+        freed.append(without_scan_terms(columns, scan, prediction, terms))
     return freed

@@ -1,0 +1,113 @@
+"""Whether a named effect carries its weight: against generic terms, and against all that could be learned.
+
+Judged on the final set: the effect is taken out, the rest fitted again, and what it gains is compared with
+what others would gain in its place. So a cause is not blamed for what another named one does, and a small one
+is not called the explanation of a large remainder.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from litho_models.loop.explainable import Learner
+from litho_models.loop.probes.defects import find_defects
+from litho_models.loop.probes.selection import generic_terms
+from litho_models.loop.screening.directions import PROJECTIONS
+from litho_models.loop.selection.rivals import freed_changes, gains_nm2
+from litho_models.loop.selection.search import Search
+from litho_models.loop.study import State, Study, fit_state
+from litho_models.scan_terms import Terms
+from litho_models.scoring.statistics import bootstrap_interval
+
+# Of the best generic term's gain, where that is ahead by more than chance.
+RECOVERED_SHARE = 0.8
+# Of what the learner regains once the effect is taken out.
+ACCOUNTED_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class Weight:
+    """What an effect of the final set gains, and what else would, nm² on scans left out.
+
+    Attributes:
+        gain_nm2: squared error without it minus with it.
+        probe, probe_gain_nm2: the best generic term in its place; ``probe_ahead``: the interval over scans of
+            the difference to it lies above zero.
+        learner_gain_nm2: what all features of layout and place explain in its place; 0 where this is chance.
+    """
+
+    gain_nm2: float
+    probe: str
+    probe_gain_nm2: float
+    probe_ahead: bool
+    learner_gain_nm2: float
+
+    @property
+    def share(self) -> float:
+        """Of what the better of its rivals explains, at most 1."""
+        rivals = [self.learner_gain_nm2, self.probe_gain_nm2 if self.probe_ahead else 0.0]
+        return min(1.0, max(0.0, self.gain_nm2) / max(*rivals, 1e-9))
+
+    @property
+    def lacking(self) -> str:
+        """Why the effect is only a part of what is missing; empty where it carries its weight."""
+        reasons = []
+        if self.probe_ahead and self.gain_nm2 < RECOVERED_SHARE * self.probe_gain_nm2:
+            reasons.append(f"{self.probe} gains {self.probe_gain_nm2:.1f} nm² in its place")
+        if self.gain_nm2 < ACCOUNTED_SHARE * self.learner_gain_nm2:
+            reasons.append(
+                f"without it layout and place explain {self.learner_gain_nm2:.1f} nm² of what is left"
+            )
+        return f"it gains {self.gain_nm2:.1f} nm², {', '.join(reasons)}" if reasons else ""
+
+
+def weigh_effects(found: Search, study: Study, learner: Learner) -> dict[str, Weight]:
+    """The weight of every effect of a search, by name."""
+    weights = {}
+    for entry in found.added:
+        name = entry.effect.name
+        study.report(f"weighing {name}")
+        terms = PROJECTIONS[found.first[name].projection]
+        weights[name] = weigh(_without(name, found, study), found.state, study, learner, terms)
+    return weights
+
+
+def weigh(without: State, final: State, study: Study, learner: Learner, terms: Terms) -> Weight:
+    """The weight of what makes the difference between two states; ``terms``: what single scans may add."""
+    rest = learner.rest(without.predictions, terms)
+    defects = find_defects(study.scans, without.predictions)
+    estimates = [
+        (probe, probe.held_out(study.fold_of))
+        for probe in generic_terms(study.scans, without.predictions, defects)
+    ]
+    probe, estimate = max(estimates, key=lambda one: one[1].mean_gain_nm2)
+    in_its_place = [
+        probe.correction(estimate.per_fold[fold], scan, prediction)
+        for scan, prediction, fold in zip(study.scans, without.predictions, study.fold_of, strict=True)
+    ]
+    added = [new - old for old, new in zip(without.predictions, final.predictions, strict=True)]
+    own, other = (_gains(without, changes, study, terms) for changes in (added, in_its_place))
+    return Weight(
+        gain_nm2=float(own.mean()),
+        probe=probe.name,
+        probe_gain_nm2=float(other.mean()),
+        probe_ahead=bool(bootstrap_interval((other - own).tolist(), seed=study.seed)[0] > 0),
+        learner_gain_nm2=rest.mean_nm2 if rest.matters else 0.0,
+    )
+
+
+def _gains(state: State, changes: Sequence[np.ndarray], study: Study, terms: Terms) -> np.ndarray:
+    return gains_nm2(freed_changes(state, changes, study, terms))
+
+
+def _without(name: str, found: Search, study: Study) -> State:
+    """The final model without one effect, the rest fitted again; known already if it was added last."""
+    chain = found.state.fits.chain
+    kept = {other: values for other, values in chain.values().items() if other != name}
+    before = found.steps[name][0] if name in found.steps else None
+    if before is not None and set(before.fits.chain.names) == set(kept):
+        return before
+    return fit_state(chain.with_effects(kept), study)
