@@ -13,9 +13,11 @@ from litho_models.loop import close_loop
 from litho_models.loop.explainable import Learner
 from litho_models.loop.linear import ALL_FREE
 from litho_models.loop.prepared import PreparedScan, prepare_scans
+from litho_models.loop.screening.directions import PROJECTIONS
 from litho_models.loop.selection.weight import Weight, weigh
 from litho_models.loop.study import Study, fit_state
 from litho_models.models import build_model
+from litho_models.scan_terms import Terms
 from tests.litho_models.loop_scans import printed_scans, true_model
 
 FOLD_OF = np.arange(10) % 5
@@ -23,7 +25,7 @@ SMALL = {"slope-thinning": get_effect("slope-thinning").off_values() | {"along_x
 Change = Callable[[PreparedScan], np.ndarray]
 
 
-def weight_of_the_small_one(also: Change | None = None) -> Weight:
+def weight_of_the_small_one(also: Change | None = None, terms: Terms = ALL_FREE) -> Weight:
     """Scans with a loss of height on slopes along x, and something else: what the name weighs."""
     scans = prepare_scans(printed_scans(SMALL, count=10, size_px=96, seed=4))
     if also is not None:
@@ -32,7 +34,7 @@ def weight_of_the_small_one(also: Change | None = None) -> Weight:
         )
     study = Study(scans, FOLD_OF)
     without, final = (fit_state(true_model(effects), study) for effects in ({}, SMALL))
-    return weigh(without, final, study, Learner(study, without.predictions), ALL_FREE)
+    return weigh(without, final, study, Learner(study, without.predictions), terms)
 
 
 def far_copy(scan: PreparedScan) -> np.ndarray:
@@ -46,11 +48,13 @@ def bead(scan: PreparedScan) -> np.ndarray:
     return 0.04 * height * np.abs(np.gradient(scan.stored.layout_um, scan.stored.pitch_um, axis=0)).clip(0, 2)
 
 
-def test_a_cause_that_is_all_there_is_carries_its_weight() -> None:
-    weight = weight_of_the_small_one()
+@pytest.mark.parametrize("projection", PROJECTIONS)
+def test_a_cause_that_is_all_there_is_carries_its_weight(projection: str) -> None:
+    weight = weight_of_the_small_one(terms=PROJECTIONS[projection])
     assert weight.lacking == ""
     # The learner finds the same, less what 200 coefficients cost it.
     assert 0.5 * weight.gain_nm2 < weight.learner_gain_nm2 < 1.05 * weight.gain_nm2
+    assert 0.5 * weight.gain_nm2 < weight.probe_gain_nm2 < 1.05 * weight.gain_nm2
     assert weight.share > 0.95
 
 

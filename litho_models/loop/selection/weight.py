@@ -7,10 +7,7 @@ is not called the explanation of a large remainder.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
-
-import numpy as np
 
 from litho_models.loop.explainable import Learner
 from litho_models.loop.probes.defects import find_defects
@@ -89,7 +86,9 @@ def weigh(without: State, final: State, study: Study, learner: Learner, terms: T
         for scan, prediction, fold in zip(study.scans, without.predictions, study.fold_of, strict=True)
     ]
     added = [new - old for old, new in zip(without.predictions, final.predictions, strict=True)]
-    own, other = (_gains(without, changes, study, terms) for changes in (added, in_its_place))
+    own = gains_nm2(freed_changes(without, added, study, terms))
+    # Probes are estimated free of every scan's gain and bow: what they carry of these means nothing.
+    other = gains_nm2(freed_changes(without, in_its_place, study))
     return Weight(
         gain_nm2=float(own.mean()),
         probe=probe.name,
@@ -97,10 +96,6 @@ def weigh(without: State, final: State, study: Study, learner: Learner, terms: T
         probe_ahead=bool(bootstrap_interval((other - own).tolist(), seed=study.seed)[0] > 0),
         learner_gain_nm2=rest.mean_nm2 if rest.matters else 0.0,
     )
-
-
-def _gains(state: State, changes: Sequence[np.ndarray], study: Study, terms: Terms) -> np.ndarray:
-    return gains_nm2(freed_changes(state, changes, study, terms))
 
 
 def _without(name: str, found: Search, study: Study) -> State:
