@@ -6,12 +6,13 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 
-from benchmarks.blind_trials.draws import draw_trials
-from benchmarks.blind_trials.records import Draw, Draws, Trial
+from benchmarks.blind_trials.draws import draw_board, draw_earlier
+from benchmarks.blind_trials.planting import plant, trial_jobs
+from benchmarks.blind_trials.records import COUNTS_FROM_RMS_NM, Draw, Draws, Trial
 from benchmarks.blind_trials.trial import failed, run_trial, trial_folder
 from litho_data.foundation.errors import InputError
 from litho_data.virtual_fab.jobs import Plan
@@ -21,20 +22,23 @@ _ROOT = Path(__file__).parents[2]
 _ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
-def open_campaign(out: Path, *, count: int, seed: int, n_scans: int, size_px: int) -> Draws:
-    """The draws of a campaign, written to ``out/draws.json`` before anything is run.
+def make_draws(*, count: int | None, seed: int, n_scans: int, size_px: int) -> Draws:
+    """The draws of a board; with a ``count`` those of the plan of boards up to seed 20266.
 
     Raises:
-        InputError: ``out`` holds the campaign of other settings, or settings that cannot be drawn.
+        InputError: settings that cannot be drawn, or fields that cannot be printed.
     """
     Plan(n_scans, (size_px, size_px))  # refuses fields that cannot be printed, before any trial fails by it
-    draws = Draws(
-        schema=Draws.SCHEMA,
-        seed=seed,
-        n_scans=n_scans,
-        size_px=size_px,
-        trials=draw_trials(count, seed),
-    )
+    trials = draw_board(seed) if count is None else draw_earlier(count, seed)
+    return Draws(schema=Draws.SCHEMA, seed=seed, n_scans=n_scans, size_px=size_px, trials=trials)
+
+
+def open_campaign(out: Path, draws: Draws) -> None:
+    """Write the draws to ``out/draws.json``, before anything is run.
+
+    Raises:
+        InputError: ``out`` holds the campaign of other settings.
+    """
     if not (out / Draws.FILE_NAME).exists():
         draws.write(out)
     elif Draws.read(out) != draws:
@@ -44,7 +48,6 @@ def open_campaign(out: Path, *, count: int, seed: int, n_scans: int, size_px: in
             wanted="the same settings",
             hint="choose another folder",
         )
-    return draws
 
 
 def finished(out: Path, draws: Draws) -> list[Trial]:
@@ -77,6 +80,19 @@ def run_campaign(
         for place, future in enumerate(as_completed(running), 1):
             trial, seconds = future.result()
             print(f"[{place}/{len(todo)}] {_line(trial)} ({seconds:.0f} s)", flush=True)
+
+
+def plan_lines(draws: Draws, numbers: Sequence[int]) -> Iterator[str]:
+    """What would be planted, a line per trial, and how much of it counts in each class; no loop is run."""
+    chosen = [draw for draw in draws.trials if draw.number in set(numbers)]
+    counted: dict[str, list[bool]] = {}
+    for draw in chosen:
+        planted = plant(draw, trial_jobs(draw, draws.n_scans, draws.size_px))
+        counts = [one.rms_nm > COUNTS_FROM_RMS_NM for one in planted]
+        counted.setdefault(draw.kind, []).extend(counts or [False])
+        what = [f"{one.name} {one.strength:.4g} {one.unit}: {one.rms_nm:.1f} nm" for one in planted]
+        yield f"trial {draw.number}: {draw.kind}: {', '.join(what)}"
+    yield "counted: " + ", ".join(f"{kind} {sum(c)} of {len(c)}" for kind, c in sorted(counted.items()))
 
 
 def run_one(out: Path, number: int, keep_data: bool) -> None:

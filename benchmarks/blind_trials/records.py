@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field, model_validator
 
 from litho_data.foundation.results import Record, Result
 
-Kind = Literal["single", "two", "none", "off-catalogue"]
+# The last four since seed 20267.
+Kind = Literal["single", "two", "none", "off-catalogue", "in-form", "alias", "other-form", "empty"]
+OTHER_FORM: tuple[Kind, ...] = ("off-catalogue", "other-form")
+EMPTY: tuple[Kind, ...] = ("none", "empty")
+# Causes of a smaller rms are listed and not counted.
+COUNTS_FROM_RMS_NM = 8.0
 Judgement = Literal[
     "right",
     "set-contains-it",
+    "absorbed",
+    "partial",
     "wrong",
     "missed",
     "clean",
@@ -22,19 +31,24 @@ Judgement = Literal[
 
 
 class KnobDraw(Record):
-    """A knob and the size that its effect is to have; free of nuisances, see `Planted.rms_nm`."""
+    """A knob or a form, and the size that it is to have, see `Planted.rms_nm`."""
 
     name: str
     wanted_rms_nm: float
 
 
 class Draw(Record):
-    """One trial as drawn. ``seed`` decides its layouts, its noise and what its knobs draw."""
+    """One trial as drawn.
+
+    ``seed`` decides its layouts, its noise and what its knobs draw; ``printer`` has what differs from the
+    fab's default printer.
+    """
 
     number: int
     kind: Kind
     seed: int
     knobs: list[KnobDraw]
+    printer: dict[str, float] = Field(default_factory=dict)
 
 
 class Draws(Result):
@@ -50,12 +64,13 @@ class Draws(Result):
 
 
 class Planted(Record):
-    """A knob as it was set.
+    """A knob or a form as it was set.
 
     Attributes:
-        name: of the knob; ``effect``: identifier in the effects catalogue, or `off-catalogue`.
-        strength: in ``unit``; ``at_limit``: the knob's range ended before the wanted size was reached.
-        rms_nm: noise-free scans with minus without the knob, freed of {1, P, x, y, x², xy, y²} per scan.
+        name: of the knob or form; ``effect``: identifier in the effects catalogue, or `off-catalogue`.
+        strength: in ``unit``; ``at_limit``: its range ended before the wanted size was reached.
+        rms_nm: what base, scan terms and registration, refitted to the noise-free scans, leave. Boards up to
+            seed 20266: scans with minus without the knob, freed of {1, P, x, y, x², xy, y²} per scan.
         nuisance_span: True if such terms of single scans absorb nearly all of the effect.
     """
 
@@ -70,7 +85,7 @@ class Planted(Record):
 
 
 class Named(Record):
-    """One effect that the loop added outside the nuisance span, and those that look the same."""
+    """One effect that the loop reports outside the nuisance span, and those that look the same."""
 
     names: list[str]
     verdict: Literal["explained", "confusable", "partial", "traced-to-covariate"]
@@ -116,11 +131,15 @@ class TrialErrors(Record):
 
 
 class Cost(Record):
-    """Wall seconds of build and loop, and processor seconds of the whole trial with its judging."""
+    """Wall seconds of build and loop; processor seconds of the whole trial, and of build and loop alone.
+
+    The last is None in boards up to seed 20266.
+    """
 
     build_s: float
     loop_s: float
     cpu_s: float
+    dataset_cpu_s: float | None = None
 
 
 class Trial(Result):
@@ -154,37 +173,46 @@ class Tally(Record):
 
 
 class Summary(Record):
-    """The figures that the campaign is about.
+    """The figures that the campaign is about; "counted" is what is above ``counts_from_rms_nm``.
 
     Attributes:
-        single_found: right or contained, of the trials with one effect above the size that counts.
-        single_not_testable: of the others among them, those whose effect the loop says it cannot test.
-        effects_found: the same per effect, pairs included.
-        without_stranger: of ``effects_found``, those in trials where nothing false was named beside it.
-        clean: trials without an effect in which none was reported outside the nuisance span.
-        honest: off-catalogue trials in which no cause was named.
-        at_floor: trials whose error after is at most the tolerated multiple of the floor.
-        failed: trials that ended with an error; they count as not found.
+        tolerance_in_form: error after, as a multiple of that of the true models; also for empty trials.
+        in_form: right or in the set, of the counted causes in form.
+        false_beside: of these, those in trials where a false name stands beside.
+        in_form_with_false_name: trials with a cause in form, counted or not, in which a false name was given.
+        named, noticed, unnoticed: of the counted causes of another form.
+        clean: trials without a cause in which nothing was reported.
+        at_floor_in_form: trials in form or empty whose error after is within the tolerance.
+        at_floor_other: the same of trials with a cause of another form.
+        failed: trials that ended with an error; their causes count as not found and as unnoticed.
+        mean_cpu_s, longest_cpu_s: processor seconds of a data set.
     """
 
     counts_from_rms_nm: float
-    floor_tolerance: float
-    single_found: Tally
-    single_not_testable: int
-    effects_found: Tally
-    without_stranger: Tally
+    tolerance_in_form: float
+    tolerance_other: float
+    in_form: Tally
+    false_beside: Tally
+    in_form_with_false_name: Tally
+    named: Tally
+    noticed: Tally
+    unnoticed: Tally
     clean: Tally
-    honest: Tally
-    at_floor: Tally
+    at_floor_in_form: Tally
+    at_floor_other: Tally
     failed: int
     mean_cpu_s: float | None
-    longest_loop_s: float | None
+    longest_cpu_s: float | None
 
 
 class Scoreboard(Result):
-    """All trials of a campaign; ``pending`` are drawn but not run."""
+    """All trials of a campaign; ``pending`` are drawn but not run.
 
-    SCHEMA: ClassVar[str] = "litho-models/blind-trials/1"
+    The figures of schema 1 (boards up to seed 20266) were others: there ``summary`` is None when read.
+    """
+
+    SCHEMA: ClassVar[str] = "litho-models/blind-trials/2"
+    OLDER: ClassVar[tuple[str, ...]] = ("litho-models/blind-trials/1",)
     FILE_NAME: ClassVar[str] = "scoreboard.json"
 
     command: str
@@ -194,5 +222,12 @@ class Scoreboard(Result):
     n_scans: int
     size_px: int
     pending: list[int]
-    summary: Summary
+    summary: Summary | None
     trials: list[Trial]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_earlier_figures(cls, content: Any) -> Any:
+        if isinstance(content, dict) and content.get("schema") in cls.OLDER:
+            return content | {"summary": None}
+        return content

@@ -9,15 +9,15 @@ import traceback
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks.blind_trials.floor import true_floor
-from benchmarks.blind_trials.judging import judge, named_outside_span, scan_terms, strangers
-from benchmarks.blind_trials.planting import plant, settings, trial_jobs
+from benchmarks.blind_trials.judging import judge, named_outside_span, scan_terms, strangers, true_floor
+from benchmarks.blind_trials.planting import cause_of, knob_settings, plant, printer_of, trial_jobs
 from benchmarks.blind_trials.records import Cost, Draw, ErrorPair, Outcome, Planted, Trial, TrialErrors
 from litho_data.build.build import build_dataset
 from litho_data.store import open_store
 from litho_data.virtual_fab import Truth, simulate
+from litho_models.frozen.card import ModelCard
 from litho_models.loop.result.record import CloseLoop, TermsError
-from litho_models.loop.run import close_loop_on_store
+from litho_models.loop.run import MODEL_FOLDER, close_loop_on_store
 
 
 def trial_folder(out: Path, number: int) -> Path:
@@ -56,19 +56,27 @@ def run_trial(
         planted = plant(draw, jobs)
         fab = folder / "fab"
         card = simulate(
-            fab, jobs=jobs, seed=draw.seed, knobs=settings(planted, draw.seed), metadata="files-only"
+            fab,
+            jobs=jobs,
+            seed=draw.seed,
+            knobs=knob_settings(planted, draw.seed),
+            cause=cause_of(planted, draw.seed),
+            printer=printer_of(draw),
+            metadata="files-only",
         )
         hidden.parent.mkdir(parents=True, exist_ok=True)
         shutil.move(fab / "truth", hidden)
-        store, clock = folder / "store.zarr", time.perf_counter()
+        store, clock, used_s = folder / "store.zarr", time.perf_counter(), _cpu_s()
         report("building the store")
         built = build_dataset(card, store)
         build_s, clock = time.perf_counter() - clock, time.perf_counter()
         result = close_loop_on_store(store, folder / "loop", base="physics", report=report)
-        loop_s = time.perf_counter() - clock
+        loop_s, dataset_cpu_s = time.perf_counter() - clock, _cpu_s() - used_s
+        exported = [*ModelCard.read(folder / "loop" / MODEL_FOLDER).process_effects]
         report("judging")
-        floor = true_floor(Truth.read(hidden), jobs, open_store(store), result)
-        trial = _judged(draw, planted, result, floor, Cost(build_s=build_s, loop_s=loop_s, cpu_s=_cpu_s()))
+        floor = true_floor(Truth.read(hidden), draw, planted, jobs, open_store(store), result)
+        cost = Cost(build_s=build_s, loop_s=loop_s, cpu_s=_cpu_s(), dataset_cpu_s=dataset_cpu_s)
+        trial = _judged(draw, planted, result, exported, floor, cost)
         skipped = [f"{one.id}: {one.reason}" for one in built.skipped]
         trial = trial.model_copy(update={"dropped": skipped + trial.dropped})
     except Exception as error:
@@ -104,15 +112,22 @@ def failed(draw: Draw, planted: list[Planted], reason: str) -> Trial:
     )
 
 
-def _judged(draw: Draw, planted: list[Planted], result: CloseLoop, floor: ErrorPair, cost: Cost) -> Trial:
-    named = named_outside_span(result)
+def _judged(
+    draw: Draw,
+    planted: list[Planted],
+    result: CloseLoop,
+    exported: list[str],
+    floor: ErrorPair,
+    cost: Cost,
+) -> Trial:
+    named = named_outside_span(result, exported)
     # The floor has the terms that the loop accepted, and so have the errors beside it.
     accepted = next(row for row in result.equal_terms or [] if row.terms == "accepted")
     return Trial(
         schema=Trial.SCHEMA,
         draw=draw,
         planted=planted,
-        outcomes=judge(draw.kind, planted, result),
+        outcomes=judge(draw.kind, planted, result, exported),
         also_named=strangers(named, planted),
         named=named,
         scan_terms=scan_terms(result),

@@ -3,7 +3,7 @@
 from litho_data.virtual_fab.fab import Fab, FabScan, scan_job
 from litho_data.virtual_fab.jobs import jobs_of_card
 from litho_data.virtual_fab.knobs import KNOBS, Knob, KnobSetting
-from litho_data.virtual_fab.printer import Job
+from litho_data.virtual_fab.printer import Cause, Job
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 from litho_data.virtual_fab.simulate import simulate
 from litho_data.virtual_fab.strength import KnobStrength, knob_rms_nm, strength_for_rms
@@ -11,6 +11,7 @@ from litho_data.virtual_fab.truth import Truth
 
 __all__ = [
     "KNOBS",
+    "Cause",
     "Fab",
     "FabScan",
     "Job",

@@ -10,19 +10,20 @@ from litho_data.virtual_fab.afm import scan_surface
 from litho_data.virtual_fab.canvas import cut_layout
 from litho_data.virtual_fab.geometry import ScanFrame, place_scan, sample_surface
 from litho_data.virtual_fab.knobs import KnobBoard
-from litho_data.virtual_fab.printer import Job, print_clean, surface_noise
+from litho_data.virtual_fab.printer import Cause, Job, print_clean, surface_noise
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 
 
 @dataclass(frozen=True)
 class Fab:
-    """A printer and a microscope with their knobs and their noise."""
+    """A printer and a microscope with their knobs, their noise, and what is no knob."""
 
     printer: Printer
     microscope: Microscope
     noise: Noise
     knobs: KnobBoard
     seed: int
+    cause: Cause | None = None
 
 
 @dataclass(frozen=True)
@@ -52,11 +53,13 @@ def scan_job(fab: Fab, job: Job) -> FabScan:
     frame = place_scan(
         job.level.shape, fab.printer.pitch_um, fab.microscope, np.random.default_rng(geometry_seed)
     )
-    surface = print_clean(job, fab.printer, fab.knobs)
+    surface = print_clean(job, fab.printer, fab.knobs, fab.cause)
     rough = surface_noise(job, fab.printer, fab.noise, fab.knobs, np.random.default_rng(roughness_seed))
 
     def scan(true_surface: np.ndarray, noise: Noise) -> np.ndarray:
         sampled = sample_surface(true_surface, frame, fab.knobs, job.index)
+        if fab.cause is not None:
+            sampled = fab.cause.on_scan(sampled, frame, job)
         instrument = np.random.default_rng(instrument_seed)
         return scan_surface(sampled, frame, noise, fab.knobs, job.index, instrument)
 

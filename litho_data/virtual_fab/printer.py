@@ -9,6 +9,7 @@ import numpy as np
 
 from litho_data.virtual_fab.canvas import Canvas, frame_layout, gaussian_transfer
 from litho_data.virtual_fab.exposure import accumulate_dose
+from litho_data.virtual_fab.geometry import ScanFrame
 from litho_data.virtual_fab.knobs import KnobBoard
 from litho_data.virtual_fab.random_curves import gaussian_field, line_roughness
 from litho_data.virtual_fab.resist import develop
@@ -49,21 +50,42 @@ class Job:
         return Canvas(frame_layout(self.level), pitch_um, self.field_um, side_um)
 
 
-def print_clean(job: Job, printer: Printer, knobs: KnobBoard) -> np.ndarray:
+class Cause:
+    """An effect that is no knob, for experiments of your own; as it stands it changes nothing.
+
+    A subclass overrides one stage or more. Each must follow from its arguments alone: a field is printed
+    and scanned more than once.
+    """
+
+    def on_dose(self, dose: np.ndarray, canvas: Canvas, job: Job) -> np.ndarray:
+        """The two-photon dose on the canvas, 1 = full, never negative."""
+        return dose
+
+    def on_surface(self, surface_um: np.ndarray, canvas: Canvas, job: Job) -> np.ndarray:
+        """The dry surface on the canvas, without roughness, µm."""
+        return surface_um
+
+    def on_scan(self, height_um: np.ndarray, frame: ScanFrame, job: Job) -> np.ndarray:
+        """The true surface at the pixels of the scan, before the microscope's own errors, µm."""
+        return height_um
+
+
+def print_clean(job: Job, printer: Printer, knobs: KnobBoard, cause: Cause | None = None) -> np.ndarray:
     """Surface of one print without noise, on the canvas, µm; a bare substrate is 0."""
+    cause = cause or Cause()
     canvas = job.canvas(printer.pitch_um)
     if job.use == "substrate":
         return np.zeros(canvas.level.shape)
     dose = accumulate_dose(
         canvas, printer, knobs, relative_dose=job.dose, order=job.order, scan_index=job.index
     )
-    height = develop(dose, canvas, printer, knobs)
+    height = develop(cause.on_dose(dose, canvas, job), canvas, printer, knobs)
     if strength := knobs["hatch-ripple"]:
         rng = knobs.machine_rng("hatch-ripple")
         hatch_um = printer.pitch_um * (1 + rng.choice([-1, 1]) * rng.uniform(0.02, 0.04))
         ripple = np.cos(2 * np.pi * canvas.y_um / hatch_um + rng.uniform(0, 2 * np.pi))
         height = height + 1e-3 * strength * ripple * (canvas.level > 0)
-    return height
+    return cause.on_surface(height, canvas, job)
 
 
 def surface_noise(

@@ -19,7 +19,7 @@ from litho_data.readers.text_matrix import write_text_matrix
 from litho_data.virtual_fab.fab import Fab, FabScan, scan_job
 from litho_data.virtual_fab.jobs import PRINT_PATTERN, Plan, random_jobs
 from litho_data.virtual_fab.knobs import KnobBoard, KnobSetting
-from litho_data.virtual_fab.printer import Job
+from litho_data.virtual_fab.printer import Cause, Job
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 from litho_data.virtual_fab.truth import KnobTruth, ScanTruth, Truth, noise_floor
 
@@ -33,6 +33,7 @@ def simulate(
     size_px: int | tuple[int, int] = 256,
     seed: int = 0,
     knobs: Iterable[KnobSetting | str] = (),
+    cause: Cause | None = None,
     noise: Noise | str = "default",
     microscope: Microscope | str = "default",
     printer: Printer | None = None,
@@ -55,6 +56,7 @@ def simulate(
         size_px: size of a layout, pixels (one number, or ny and nx).
         seed: of every random draw of the run.
         knobs: effects beyond plain printing, as settings or ``name=strength[@seed]``.
+        cause: an effect of your own that is no knob; the truth file does not know it.
         noise: ``default``, ``off``, or own standard deviations.
         microscope: ``default`` (margin, small affine errors), ``aligned`` (margin only), or own values.
         fields_per_print: fields that share a print block.
@@ -87,6 +89,7 @@ def simulate(
         noise=_named(noise, "noise", {"default": Noise(), "off": Noise.off()}),
         knobs=KnobBoard(settings, seed),
         seed=seed,
+        cause=cause,
     )
     shape = (size_px, size_px) if isinstance(size_px, int) else size_px
     plan = Plan(count, shape, fields_per_print, tuple(cutoffs_per_um), write_field_um, references)

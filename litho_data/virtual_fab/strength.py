@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -72,17 +72,35 @@ def strength_for_rms(
         )
     if at_limit <= rms_nm:
         return KnobStrength(KnobSetting(name, highest, seed), at_limit)
+    strength, found = search_strength(measured, rms_nm, highest=highest, at_highest=at_limit)
+    return KnobStrength(KnobSetting(name, strength, seed), found)
+
+
+def search_strength(
+    measured: Callable[[float], float],
+    wanted: float,
+    *,
+    highest: float,
+    at_highest: float,
+    precision: float = _RELATIVE_PRECISION,
+) -> tuple[float, float]:
+    """The strength below ``highest`` at which a growing measure is ``wanted``, and what it is there.
+
+    Args:
+        measured: the measure at a strength; ``at_highest``: at ``highest``, more than ``wanted``.
+        precision: how close to ``wanted``, relative.
+    """
     low, high = 0.0, highest
     # Most effects grow about linearly, some quadratically: the first guess assumes linear growth.
-    strength = highest * rms_nm / at_limit
+    strength = highest * wanted / at_highest
     for _ in range(_MAX_STEPS):
         found = measured(strength)
-        if abs(found - rms_nm) <= _RELATIVE_PRECISION * rms_nm:
+        if abs(found - wanted) <= precision * wanted:
             break
-        low, high = (strength, high) if found < rms_nm else (low, strength)
-        guess = strength * rms_nm / found if found > 0 else 0.0
+        low, high = (strength, high) if found < wanted else (low, strength)
+        guess = strength * wanted / found if found > 0 else 0.0
         strength = guess if low < guess < high else (low + high) / 2
-    return KnobStrength(KnobSetting(name, strength, seed), found)
+    return strength, found
 
 
 def knob_rms_nm(
