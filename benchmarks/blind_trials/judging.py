@@ -64,7 +64,7 @@ def named_outside_span(result: CloseLoop, exported: Sequence[str] = ()) -> list[
     # Some effects are seen without being added: rounding, scars.
     for one in result.candidates:
         if one.name not in known and one.verdict in ("explained", "partial"):
-            named.append(Named(names=[one.name], verdict=one.verdict))  # type: ignore[arg-type]
+            named.append(Named(names=[one.name], verdict=one.verdict))
     return named
 
 

@@ -111,11 +111,11 @@ def _oriented_ringing(rng: np.random.Generator) -> Law:
     def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
         along = _frequency_along(canvas, direction)
 
-        def ringing(at: np.ndarray | float) -> np.ndarray | float:
-            sides = (at - 1 / period_um, at + 1 / period_um)
-            return sum(1 / (1 + (2 * np.pi * decay_um * side) ** 2) for side in sides)
+        def peak(at: np.ndarray | float) -> np.ndarray:
+            return 1 / (1 + (2 * np.pi * decay_um * np.asarray(at)) ** 2)
 
-        return apply_transfer(dose, 1 + strength * (ringing(along) - ringing(0.0)))
+        ringing = peak(along - 1 / period_um) + peak(along + 1 / period_um) - 2 * peak(1 / period_um)
+        return apply_transfer(dose, 1 + strength * ringing)
 
     return law
 
@@ -278,7 +278,7 @@ def _blur_with_height(rng: np.random.Generator) -> Law:
 @_form("blur-across-field", "surface", "1", 1.0)
 def _blur_across_field(rng: np.random.Generator) -> Law:
     """Share of a blurred surface (0.7–1.2 µm) at one side of the field; none at the other side."""
-    reach_um, side = rng.uniform(0.7, 1.2), rng.integers(4)
+    reach_um, side = rng.uniform(0.7, 1.2), int(rng.integers(4))
 
     def law(surface: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
         across = _across(canvas, axis=side // 2)
@@ -291,7 +291,7 @@ def _blur_across_field(rng: np.random.Generator) -> Law:
 @_form("seam-in-gain", "surface", "1", 0.6)
 def _seam_in_gain(rng: np.random.Generator) -> Law:
     """Share of the height lost on one side of a seam in the middle of the field."""
-    side, place = rng.integers(4), rng.uniform(0.35, 0.65)
+    side, place = int(rng.integers(4)), rng.uniform(0.35, 0.65)
 
     def law(surface: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
         return surface * (1 - strength * _beyond(canvas, side, place))
@@ -302,7 +302,7 @@ def _seam_in_gain(rng: np.random.Generator) -> Law:
 @_form("seam-in-height", "surface", "nm", 300.0)
 def _seam_in_height(rng: np.random.Generator) -> Law:
     """Step of the height at a seam in the middle of the field."""
-    side, place = rng.integers(4), rng.uniform(0.35, 0.65)
+    side, place = int(rng.integers(4)), rng.uniform(0.35, 0.65)
 
     def law(surface: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
         return surface + 1e-3 * strength * _beyond(canvas, side, place)
@@ -313,7 +313,7 @@ def _seam_in_height(rng: np.random.Generator) -> Law:
 @_form("seam-in-place", "surface", "µm", 1.5)
 def _seam_in_place(rng: np.random.Generator) -> Law:
     """Displacement along the seam of what lies on one side of it."""
-    side, place = rng.integers(4), rng.uniform(0.35, 0.65)
+    side, place = int(rng.integers(4)), rng.uniform(0.35, 0.65)
 
     def law(surface: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
         shift = np.zeros(2)

@@ -40,7 +40,7 @@ _PRECISION = 0.03
 
 def printer_of(draw: Draw) -> Printer:
     """The printer of a trial: the default one but for what was drawn."""
-    return replace(Printer(), **draw.printer)
+    return replace(Printer(), **draw.printer)  # type: ignore[arg-type]
 
 
 def trial_jobs(draw: Draw, n_scans: int, size_px: int) -> tuple[Job, ...]:
