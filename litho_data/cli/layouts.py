@@ -36,6 +36,12 @@ def masks(
     levels: Annotated[int, typer.Option(min=2, max=256, help="number of levels, 0 … levels − 1")] = 13,
     cutoff_per_um: Annotated[float, typer.Option(help="low-pass cut-off, cycles/µm")] = 0.25,
     passband: Annotated[str, typer.Option(help="square (as the measured layouts) or round")] = "square",
+    quantiser: Annotated[
+        str, typer.Option(help="round (the paper's equation) or floor (as the published layouts)")
+    ] = "round",
+    field_px: Annotated[
+        int | None, typer.Option(help="side of a larger field that random layouts are cut from, pixels")
+    ] = None,
     pitch_um: Annotated[float, typer.Option(help="pixel pitch, µm")] = 0.1,
     level_height_um: Annotated[float, typer.Option(help="nominal height of one level, µm")] = 0.1,
     seed: Annotated[int, typer.Option(min=0, help="seed of every random draw")] = 0,
@@ -60,6 +66,8 @@ def masks(
         pitch_um=pitch_um,
         level_height_um=level_height_um,
         seed=seed,
+        quantiser=quantiser,
+        field_px=field_px,
     )
     typer.echo(f"card    {card}\nreport  {card.parent / 'report.html'}")
 

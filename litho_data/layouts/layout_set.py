@@ -52,6 +52,8 @@ class SetSettings:
     passband: str
     pitch_um: float
     seed: int
+    quantiser: str = "round"
+    field_px: int | None = None
 
     @property
     def highest(self) -> int:
@@ -71,6 +73,8 @@ def write_layout_set(
     pitch_um: float = 0.1,
     level_height_um: float = 0.1,
     seed: int = 0,
+    quantiser: str = "round",
+    field_px: int | None = None,
 ) -> Path:
     """Write a set of layouts into ``out``; returns the path of its card.
 
@@ -87,6 +91,8 @@ def write_layout_set(
         pitch_um: pixel pitch, µm.
         level_height_um: nominal height of a level, µm.
         seed: decides every random draw.
+        quantiser: ``round`` or ``floor``; ``field_px``: side of a larger field that random layouts are cut
+            from, see ``random_layout``.
 
     Raises:
         InputError: an unknown pattern, one that does not fit the size, lengths that are not positive, or a
@@ -97,7 +103,7 @@ def write_layout_set(
     if not 2 <= levels <= 256:
         raise InputError("levels of a layout", got=levels, wanted="2 to 256")
     shape = (size_px, size_px) if isinstance(size_px, int) else size_px
-    settings = SetSettings(count, shape, levels, cutoff_per_um, passband, pitch_um, seed)
+    settings = SetSettings(count, shape, levels, cutoff_per_um, passband, pitch_um, seed, quantiser, field_px)
     require_replaceable_folder(
         out, CARD_NAME, TABLE_NAME, "layouts", LayoutStatistics.FILE_NAME, "levels.csv", "report.html"
     )
@@ -133,6 +139,8 @@ def _random(settings: SetSettings) -> Iterator[NamedLayout]:
             pitch_um=settings.pitch_um,
             seed=np.random.SeedSequence(settings.seed, spawn_key=(index,)),
             passband=settings.passband,
+            quantiser=settings.quantiser,
+            field_px=settings.field_px,
         )
         yield NamedLayout(f"R{index + 1:0{digits}}", level)
 

@@ -7,6 +7,7 @@ import numpy as np
 from litho_data.foundation.errors import InputError
 
 PASSBANDS = ("square", "round")
+QUANTISERS = ("round", "floor")
 
 
 def random_layout(
@@ -17,13 +18,16 @@ def random_layout(
     pitch_um: float = 0.1,
     seed: int | np.random.SeedSequence | np.random.Generator = 0,
     passband: str = "square",
+    quantiser: str = "round",
+    field_px: int | None = None,
 ) -> np.ndarray:
     """One random layout, ``M = Q(norm(Re(F⁻¹(F(R)·LPF))))`` with ``R ~ U(0, 1)``.
 
     ``norm`` maps the smallest value to 0 and the largest to 1, and ``Q`` rounds half up to the
     nearest of ``levels`` values. The result is periodic in both directions. The paper leaves the
     low-pass filter open: the measured layouts show a sharp square pass band of ±0.25 cycles/µm
-    (prints 1–4) and ±0.5 cycles/µm (prints 6 and 7), cut from a larger, periodic field.
+    (prints 1–4) and ±0.5 cycles/µm (prints 6 and 7). They were cut from a larger field, and their levels
+    were cut off, not rounded: ``quantiser="floor", field_px=540`` makes layouts like them.
 
     Args:
         shape: (ny, nx), pixels.
@@ -32,17 +36,25 @@ def random_layout(
         pitch_um: pixel pitch, µm.
         seed: anything that `numpy.random.default_rng` accepts.
         passband: ``square`` limits each axis, ``round`` the length of the frequency vector.
+        quantiser: ``round`` as the paper's equation, or ``floor``: then only the largest value has the
+            highest level.
+        field_px: side of a larger field, pixels, from whose middle the layout is cut: no longer periodic,
+            and it may lack the lowest or the highest level. None: the layout is the field.
 
     Returns:
         uint8, shape (ny, nx).
 
     Raises:
-        InputError: fewer than 2 or more than 256 levels, or a cut-off that leaves nothing to vary.
+        InputError: fewer than 2 or more than 256 levels, a cut-off that leaves nothing to vary, or a field
+            smaller than the layout.
     """
     if not 2 <= levels <= 256:
         raise InputError("levels of a layout", got=levels, wanted="2 to 256")
+    whole = shape if field_px is None else (field_px, field_px)
+    if min(whole) < max(shape) and field_px is not None:
+        raise InputError("field_px of a random layout", got=field_px, wanted=f"at least {max(shape)}")
     field = low_pass(
-        np.random.default_rng(seed).random(shape),
+        np.random.default_rng(seed).random(whole),
         cutoff_per_um=cutoff_per_um,
         pitch_um=pitch_um,
         passband=passband,
@@ -53,9 +65,11 @@ def random_layout(
         raise InputError(
             "cutoff_per_um of a random layout",
             got=cutoff_per_um,
-            wanted=f"at least {1 / (max(shape) * pitch_um):.4g} cycles/µm for {shape[0]} x {shape[1]} pixels",
+            wanted=f"at least {1 / (max(whole) * pitch_um):.4g} cycles/µm for {whole[0]} x {whole[1]} pixels",
         )
-    return quantise((field - lowest) / (highest - lowest), levels)
+    level = quantise((field - lowest) / (highest - lowest), levels, quantiser)
+    top, left = ((all_px - px) // 2 for all_px, px in zip(whole, shape, strict=True))
+    return level[top : top + shape[0], left : left + shape[1]]
 
 
 def low_pass(field: np.ndarray, *, cutoff_per_um: float, pitch_um: float, passband: str) -> np.ndarray:
@@ -76,6 +90,8 @@ def low_pass(field: np.ndarray, *, cutoff_per_um: float, pitch_um: float, passba
     return np.fft.irfft2(np.fft.rfft2(field) * (distance <= cutoff_per_um), s=field.shape)
 
 
-def quantise(unit_field: np.ndarray, levels: int) -> np.ndarray:
-    """Values in [0, 1] to the nearest of ``levels`` integers, halves rounded up, uint8."""
-    return np.floor(unit_field * (levels - 1) + 0.5).astype(np.uint8)
+def quantise(unit_field: np.ndarray, levels: int, quantiser: str = "round") -> np.ndarray:
+    """Values in [0, 1] to the nearest of ``levels`` integers, halves up, or to the one below; uint8."""
+    if quantiser not in QUANTISERS:
+        raise InputError("quantiser", got=repr(quantiser), wanted=" or ".join(QUANTISERS))
+    return np.floor(unit_field * (levels - 1) + 0.5 * (quantiser == "round")).astype(np.uint8)

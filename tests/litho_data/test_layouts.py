@@ -71,6 +71,52 @@ class TestRandomLayout:
             random_layout((32, 32), cutoff_per_um=0.01)
         with pytest.raises(InputError, match="passband"):
             random_layout((32, 32), passband="triangle")
+        with pytest.raises(InputError, match="quantiser"):
+            random_layout((64, 64), quantiser="ceil")
+        with pytest.raises(InputError, match="at least 40"):
+            random_layout((32, 40), field_px=39)
+
+    def test_floor_gives_the_highest_level_to_the_largest_value_only(self):
+        unit = np.array([0.0, 0.99 / 12, 1 / 12, 11.99 / 12, 1.0])
+        assert quantise(unit, 13, "floor").tolist() == [0, 0, 1, 11, 12]
+        layout = random_layout((64, 64), cutoff_per_um=0.5, seed=1, quantiser="floor")
+        assert (layout == 12).sum() == 1
+
+    def test_a_cut_layout_is_the_middle_of_the_larger_one(self):
+        whole = random_layout((60, 60), cutoff_per_um=0.5, seed=8)
+        cut = random_layout((41, 30), cutoff_per_um=0.5, seed=8, field_px=60)
+        np.testing.assert_array_equal(cut, whole[9:50, 15:45])
+
+    @pytest.mark.measured
+    @pytest.mark.parametrize(
+        ("prints", "cutoff_per_um", "largest"), [("1234", 0.25, 0.05), ("5678", 0.5, 0.02)]
+    )
+    def test_the_published_levels_come_from_floor_and_a_larger_field(
+        self, measured_prints, prints, cutoff_per_um, largest
+    ):
+        published = [
+            read_layout(path)
+            for number in prints
+            for path in sorted((measured_prints / "mask_ug").glob(f"FOV{number}?.tif"))
+        ]
+        made = {
+            quantiser: [
+                random_layout(
+                    (512, 512), cutoff_per_um=cutoff_per_um, seed=seed, quantiser=quantiser, field_px=540
+                )
+                for seed in range(32)
+            ]
+            for quantiser in ("floor", "round")
+        }
+        assert level_distance(made["floor"], published) <= largest
+        assert level_distance(made["round"], published) > largest
+        # The maximum of the field lies inside the cut with a probability of (512/540)² = 0.90: binomially,
+        # 11 of 16 or more in 99.6 % of all sets, and never more than one pixel.
+        highest = [int((level == 12).sum()) for level in published]
+        assert set(highest) <= {0, 1}
+        assert sum(highest) >= 11
+        assert {int((level == 12).sum()) for level in made["floor"]} == {0, 1}
+        assert np.median([(level == 12).sum() for level in made["round"]]) > 10
 
     @pytest.mark.measured
     def test_measured_layouts_have_the_stated_passbands(self, measured_prints):
@@ -86,6 +132,12 @@ class TestRandomLayout:
             below = along_x[edge < cutoff_per_um - 0.06].sum() / along_x.sum()
             assert inside > 0.97
             assert below < 0.93
+
+
+def level_distance(layouts: list[np.ndarray], others: list[np.ndarray]) -> float:
+    """Total-variation distance of the shares of the levels."""
+    shares = [np.bincount(np.ravel(each), minlength=13) / np.size(each) for each in (layouts, others)]
+    return 0.5 * float(np.abs(shares[0] - shares[1]).sum())
 
 
 class TestPatterns:
