@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from litho_data.foundation.errors import InputError
 from litho_models.layers.gaussian import pad_field
+from litho_models.layers.ranges import Range
 
 Variant = Literal["default", "paper", "authors"]
 VARIANTS: tuple[str, ...] = get_args(Variant)
@@ -92,6 +93,18 @@ class Simulator(nn.Module, ABC):
         """Height of the whole field; beyond its edge the outermost pixels are continued."""
         reach = self.reach_px or 0
         return self.interior(pad_field(layout_um, reach, reach))
+
+    @property
+    def ranges(self) -> dict[str, Range]:
+        """Ranges of fitted values, each by the parameter (one raw number) behind it; any other is free."""
+        return {}
+
+    @property
+    def at_bounds(self) -> dict[str, float]:
+        """Values that stand on a bound of their range, and that bound."""
+        parameters = dict(self.named_parameters())
+        bounds = {own.name: own.bound_at(parameters[key].item()) for key, own in self.ranges.items()}
+        return {name: bound for name, bound in bounds.items() if bound is not None}
 
     @property
     def pitch_um(self) -> float:

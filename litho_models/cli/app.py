@@ -73,11 +73,15 @@ def train(
     ] = False,
 ) -> None:
     """Train a model on all scans but the locked ones; resumable."""
+    from litho_models.frozen.readme import bounds_text
+
     settings = {"seed": seed, **_given(steps=steps, precision=precision)}
     run = litho_models.train(
         store, model, out, recipe=recipe, variant=variant, settings=settings, use_lock_box=use_lock_box
     )
     typer.echo(f"{model} trained on {len(run.training_ids)} scans in {run.seconds:.0f} s: {out}")
+    if run.at_bounds:
+        typer.echo(bounds_text(run.at_bounds))
 
 
 @app.command()

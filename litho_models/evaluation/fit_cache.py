@@ -8,6 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from pydantic import Field
 
 from litho_data.foundation.files import atomic_file, atomic_folder
 from litho_data.foundation.results import Record
@@ -25,7 +26,8 @@ _FIT, _DIAGNOSTICS, _PREDICTION = "fit.json", "diagnostics.json", "prediction_{:
 class FitRecord(Record):
     """One fit: what it saw and what it cost; errors are nm, None where the model has no rounds.
 
-    ``diagnostics`` are None in older result files.
+    ``at_bounds`` are fitted values on a bound of their range, and that bound. ``diagnostics`` are None in
+    older result files.
     """
 
     model: str
@@ -39,6 +41,7 @@ class FitRecord(Record):
     steps: list[int]
     training_mae_nm: list[float]
     validation_mae_datum_free_nm: list[float | None]
+    at_bounds: dict[str, float] = Field(default_factory=dict)
     diagnostics: FitDiagnostics | None = None
 
 
@@ -96,6 +99,7 @@ def _keep_fit(folder: Path, fitted: Fitted, fold: Fold, key: str) -> None:
         parameters=fitted.model.parameter_count,
         seconds=fitted.seconds,
         steps=[entry.step for entry in fitted.history],
+        at_bounds=fitted.model.at_bounds,
         training_mae_nm=[entry.training_mae_nm for entry in fitted.history],
         validation_mae_datum_free_nm=[entry.validation_mae_datum_free_nm for entry in fitted.history],
     )

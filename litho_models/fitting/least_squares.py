@@ -50,7 +50,7 @@ class Problem(Protocol):
         """Measured minus predicted (n,) of all scans, µm."""
 
     def room(self, vector: np.ndarray) -> Room | None:
-        """Smallest and largest step (p,) allowed from here; None where only its length has a bound."""
+        """Smallest and largest step (p,) allowed from here; None where any is."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,6 @@ class Rules:
         pinned: leading scan terms whose mean over the scans is held at zero, with ``absolute``.
         steps: at most so many; ``relative_gain``: a smaller gain of one step ends the fit.
         tries: of a step, each with ten times the damping; ``lowest_damping``: never less than this.
-        step_limit: largest change of a parameter in one step, where the problem has no ``room``.
     """
 
     loss: Loss
@@ -74,7 +73,6 @@ class Rules:
     relative_gain: float = 5e-4
     tries: int = 4
     lowest_damping: float = 0.0
-    step_limit: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -97,7 +95,7 @@ def fit_least_squares(problem: Problem, start: np.ndarray, rules: Rules) -> Leas
         equations = NormalEquations.at(linear, terms, rules)
         room = problem.room(vector)
         for _ in range(rules.tries):
-            step, term_step = equations.solve(damping, room, rules.step_limit)
+            step, term_step = equations.solve(damping, room)
             trial = vector + step.astype(start.dtype)
             moved = None if terms is None else terms + term_step
             loss = _total_loss(problem.residuals(trial), linear, moved, rules)
@@ -152,7 +150,7 @@ class NormalEquations:
             losses.append(magnitude.mean())
         return cls(matrix, right, count, terms.shape, float(np.mean(losses)))
 
-    def solve(self, damping: float, room: Room | None, step_limit: float) -> tuple[np.ndarray, np.ndarray]:
+    def solve(self, damping: float, room: Room | None) -> tuple[np.ndarray, np.ndarray]:
         """Changes of the parameters within their room, and of the terms (scans, k)."""
         count = self.count
         if room is not None:
@@ -162,7 +160,7 @@ class NormalEquations:
             diagonal = np.arange(count)
             scale = damped[diagonal, diagonal]
             damped[diagonal, diagonal] += damping * np.maximum(scale, 1e-9 * scale.max())
-            step = np.linalg.lstsq(damped, self.right, rcond=1e-14)[0][:count].clip(-step_limit, step_limit)
+            step = np.linalg.lstsq(damped, self.right, rcond=1e-14)[0][:count]
         # The best terms for the step as it is taken, not as it was asked for.
         rest = self.right[count:] - self.matrix[count:, :count] @ step
         scans, each = self.term_shape

@@ -45,6 +45,7 @@ class TrainingRun(Result):
     lock_box: list[str]
     history: list[RoundRecord]
     seconds: float
+    at_bounds: dict[str, float] = Field(default_factory=dict)
 
 
 def train(
@@ -91,6 +92,7 @@ def train(
         lock_box=locked,
         history=fitted.history,
         seconds=fitted.seconds,
+        at_bounds=fitted.model.at_bounds,
     )
     if int(os.environ.get("RANK", "0")) > 0:
         return record  # under torchrun the first process writes

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from litho_data.store import PrintedScan
 from litho_models.fitting.crops import Window, cut, stack
-from litho_models.fitting.least_squares import Linearised, Rules, fit_least_squares
+from litho_models.fitting.least_squares import Linearised, Room, Rules, fit_least_squares
 from litho_models.scan_terms import Policy, TermPixels, Terms, line_terms, term_maps
 from litho_models.scan_terms.training import PINNED, training_terms
 from litho_models.simulator import Simulator
@@ -19,8 +20,8 @@ from litho_models.simulator import Simulator
 # A small model needs no more than a quarter of each scan: another quadrant from scan to scan.
 WINDOW_PX = 256
 THINNING_PX = 2
-# Parameters are heights in µm, logits or logarithms: one step beyond a unit would leave the range in
-# which the linearisation means anything, and a sigmoid's flat end is never left again.
+# Parameters are heights in µm and raw numbers of ranges: one step beyond a unit would leave the range in
+# which the linearisation means anything.
 STEP_LIMIT = 1.0
 RULES = Rules("absolute", term_weight=0.0, steps=30, relative_gain=1e-4, tries=10, lowest_damping=1e-3)
 
@@ -40,8 +41,7 @@ def fit_small_model(
         return []
     terms = training_terms(policy, free_gain)
     terms -= {term.name for term in line_terms(terms)}
-    limit = np.inf if model.is_linear else STEP_LIMIT
-    rules = Rules(**{**vars(RULES), "pinned": len(PINNED & terms), "step_limit": limit})
+    rules = replace(RULES, pinned=len(PINNED & terms))
     fitted = fit_least_squares(ModelProblem(model, scans, terms), _vector(model), rules)
     _load(model, fitted.vector)
     return fitted.losses
@@ -69,8 +69,23 @@ class ModelProblem:
         _load(self._model, vector)
         return [sample.residual(sample.height_um(self._model)) for sample in self._samples]
 
-    def room(self, vector: np.ndarray) -> None:
-        """No bounds: the models' own parameters are free."""
+    def room(self, vector: np.ndarray) -> Room | None:
+        """Within the ranges of the model; a linear one may go anywhere at once."""
+        return None if self._model.is_linear else parameter_room(self._model, vector)
+
+
+def parameter_room(model: nn.Module, vector: np.ndarray) -> Room:
+    """Smallest and largest step (p,) of a model's trainable numbers: their ranges and ``STEP_LIMIT``."""
+    ranges = model.ranges if isinstance(model, Simulator) else {}
+    free = (-np.inf, np.inf)
+    ends = [
+        ranges[name].raw_ends if name in ranges else free
+        for name, parameter in model.named_parameters()
+        if parameter.requires_grad
+        for _ in range(parameter.numel())
+    ]
+    lowest, highest = np.reshape(ends, (-1, 2)).T - vector
+    return np.clip(lowest, -STEP_LIMIT, 0), np.clip(highest, 0, STEP_LIMIT)
 
 
 class _Sample:
@@ -147,7 +162,7 @@ def _load(model: Simulator, vector: np.ndarray) -> None:
         torch.nn.utils.vector_to_parameters(torch.as_tensor(vector, dtype=torch.float32), model.parameters())
 
 
-class _WindowPrediction(torch.nn.Module):
+class _WindowPrediction(nn.Module):
     """``sample.predict`` as a module, the form in which torch swaps parameters for tangents."""
 
     def __init__(self, model: Simulator, sample: _Sample):

@@ -37,7 +37,8 @@ class ModelCard(RunFacts, Result):
     """All that is needed to load, use and judge a frozen model.
 
     ``background`` is what the microscope added to the training scans on average; only a comparison with
-    measured maps uses it, the model's height never contains it.
+    measured maps uses it, the model's height never contains it. ``at_bounds`` are fitted values on a bound of
+    their range, and that bound.
     """
 
     model_config = ConfigDict(allow_inf_nan=False)
@@ -58,6 +59,7 @@ class ModelCard(RunFacts, Result):
     calibrated_range_um: tuple[float, float]
     training_level_share: list[float] = Field(default_factory=list)
     receptive_radius_um: float | None
+    at_bounds: dict[str, float] = Field(default_factory=dict)
     dataset: DatasetId | None = None
     training: dict[str, JsonValue] = Field(default_factory=dict)
     split: dict[str, JsonValue] = Field(default_factory=dict)

@@ -74,6 +74,7 @@ def save_frozen(
                 levels=config.levels,
                 calibrated_range_um=(0.0, config.full_height_um),
                 receptive_radius_um=None if process_effects else simulator.reach_um,
+                at_bounds=simulator.at_bounds,
                 process_effects=process_effects or {},
                 **{**run_facts(), **card_fields},
             )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -68,6 +69,7 @@ def model_readme(card: ModelCard) -> str:
         ),
         "## Training\n",
         _training(card),
+        *([f"{bounds_text(card.at_bounds)}\n"] if card.at_bounds else []),
         "## Errors\n",
         _metrics(card),
         "## Effects\n",
@@ -78,6 +80,12 @@ def model_readme(card: ModelCard) -> str:
         "",
     ]
     return "\n".join(sections)
+
+
+def bounds_text(at_bounds: Mapping[str, float]) -> str:
+    """What it means that fitted values stand on their bounds."""
+    named = ", ".join(f"{name} ({bound:g})" for name, bound in at_bounds.items())
+    return f"On a bound of its range, so that the fit may want more than the model allows: {named}."
 
 
 def _training(card: ModelCard) -> str:

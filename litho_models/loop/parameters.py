@@ -10,13 +10,11 @@ from torch import nn
 
 from litho_models.effects import get_effect
 from litho_models.effects.chain import EffectChain
+from litho_models.fitting.small_models import parameter_room
 from litho_models.loop.folded_base import FoldedBase
-from litho_models.simulator import is_small
+from litho_models.simulator import Simulator, is_small
 
 _RELATIVE_STEP = 5e-3
-# Base parameters are lengths in µm or logits of order 1. Beyond 4 a logit has no slope left, and a
-# fit that has run there (on scans that a fold holds out, say) could not come back.
-_LONGEST_STEP, _LARGEST_VALUE = 1.0, 4.0
 _AT_BOUND = 1e-6
 
 
@@ -62,9 +60,11 @@ def effect_slots(chain: EffectChain) -> dict[tuple[str, str], int]:
 
 
 def room(chain: EffectChain, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Smallest and largest step (p,) allowed from here: effects within their range, the base not too far."""
-    lowest = np.maximum(-_LONGEST_STEP, -_LARGEST_VALUE - vector)
-    highest = np.minimum(_LONGEST_STEP, _LARGEST_VALUE - vector)
+    """Smallest and largest step (p,) allowed from here: base and effects within their ranges."""
+    own = len(vector) - len(chain.fitted)
+    lowest, highest = np.zeros(len(vector)), np.zeros(len(vector))
+    if own:
+        lowest[:own], highest[:own] = parameter_room(chain.base, vector[:own])
     for (name, parameter), slot in effect_slots(chain).items():
         limits = get_effect(name).parameters[parameter]
         lowest[slot], highest[slot] = limits.lower - vector[slot], limits.upper - vector[slot]
@@ -75,6 +75,19 @@ def within_bounds(chain: EffectChain, vector: np.ndarray) -> np.ndarray:
     """True for parameters (p,) with room on both sides."""
     lowest, highest = room(chain, vector)
     return (lowest < -_AT_BOUND) & (highest > _AT_BOUND)
+
+
+def at_bounds(chain: EffectChain) -> dict[str, float]:
+    """Fitted values of base and effects that stand on a bound of their range, and that bound."""
+    base = chain.base
+    found = base.at_bounds if isinstance(base, Simulator) and is_refitted(base) else {}
+    values = chain.values()
+    for name, parameter in chain.fitted:
+        limits, value = get_effect(name).parameters[parameter], values[name][parameter]
+        for bound in (limits.lower, limits.upper):
+            if abs(value - bound) < _AT_BOUND * max(1.0, abs(bound)):
+                found[f"{name}: {parameter}"] = bound
+    return found
 
 
 def difference_steps(chain: EffectChain, vector: np.ndarray) -> np.ndarray:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 
 from litho_models.layers.gaussian import blur_interior, kernel_radius_px
 from litho_models.layers.lookup import interpolate
+from litho_models.layers.ranges import Range
 from litho_models.simulator import Simulator, SimulatorConfig
 
 
@@ -27,14 +26,17 @@ class BlurTable(Simulator):
 
     def __init__(self, config: BlurTableConfig):
         super().__init__(config)
-        ratio = config.sigma_init_um / config.sigma_max_um
-        self.tau = nn.Parameter(torch.tensor(math.log(ratio / (1 - ratio))))
+        self.tau = nn.Parameter(self.ranges["tau"].raw(config.sigma_init_um))
         self.table_um = nn.Parameter(torch.arange(config.levels) * config.level_height_um)
+
+    @property
+    def ranges(self) -> dict[str, Range]:
+        return {"tau": Range("sigma_um", 0.0, self.config.sigma_max_um)}
 
     @property
     def sigma_um(self) -> Tensor:
         """Blur, between 0 and ``sigma_max_um``."""
-        return self.config.sigma_max_um * torch.sigmoid(self.tau)
+        return self.ranges["tau"].value(self.tau)
 
     @property
     def reach_px(self) -> int:

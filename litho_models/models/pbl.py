@@ -20,6 +20,7 @@ from litho_models.fast import convolution_stack
 from litho_models.layers.gaussian import Edge, blur_interior, kernel_radius_px, pad_field
 from litho_models.layers.lookup import PointwiseNet
 from litho_models.layers.precision import adjoint_dtype
+from litho_models.layers.ranges import Range
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 
 Channels = Annotated[int, Field(ge=1, le=1024)]
@@ -70,16 +71,19 @@ class Pbl(Simulator):
         self.thresh = PointwiseNet(config.pointwise_channels, slope, config.knots)
         self.shrink = PointwiseNet(config.pointwise_channels, slope, config.knots)
         self.mismatch = AreawiseNet(config.areawise_channels, slope)
-        ratio = config.sigma_diffusion_init_um / config.sigma_diffusion_max_um
-        self.tau = nn.Parameter(torch.tensor(math.log(ratio / (1 - ratio))))
+        self.tau = nn.Parameter(self.ranges["tau"].raw(config.sigma_diffusion_init_um))
         if config.starts_as_blur:
             for part in (self.thresh, self.shrink, self.mismatch):
                 part.start_at_zero()
 
     @property
+    def ranges(self) -> dict[str, Range]:
+        return {"tau": Range("sigma_diffusion_um", 0.0, self.config.sigma_diffusion_max_um)}
+
+    @property
     def sigma_diffusion_um(self) -> Tensor:
         """η / (1 + exp(-τ)), µm."""
-        return self.config.sigma_diffusion_max_um * torch.sigmoid(self.tau)
+        return self.ranges["tau"].value(self.tau)
 
     @property
     def reach_px(self) -> int:

@@ -1,4 +1,4 @@
-"""Physics: the parameterised simulator of the paper, five values with a meaning each.
+"""Physics: the parameterised simulator of the paper, five or six values with a meaning each.
 
 Optical blur, normalised tanh projection (Zhou et al. 2014), diffusion blur, dose-dependent
 shrinkage, height bias; arXiv:2309.17343, appendix "Parameterized physics model".
@@ -12,27 +12,32 @@ from typing import Any, ClassVar, Literal
 import torch
 from pydantic import Field
 from torch import Tensor, nn
-from torch.nn import functional
 
 from litho_models.layers.gaussian import Edge, blur_interior, gaussian_blur, kernel_radius_px, pad_field
+from litho_models.layers.ranges import Range
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 
 Shrinkage = Literal["fixed-reference", "image-range", "image-maximum"]
 
 
 class PhysicsConfig(SimulatorConfig):
+    """The bare defaults are the form of models frozen before there was a gain; variants set the others."""
+
     sigma_optical_um: float = Field(0.2, gt=0, description="optical spot, standard deviation, µm")
     sigma_diffusion_max_um: float = Field(2.5, gt=0, description="upper bound of the diffusion, µm")
     # The start matters: from a steep threshold in mid-range a fit ends where the projection is a line.
     sigma_diffusion_init_um: float = Field(1.5, gt=0, description="diffusion before fitting, µm")
     alpha_init: float = Field(1.0, gt=0, description="steepness of the projection")
-    eta_init: float = Field(0.1, gt=0, lt=1, description="threshold of the projection")
+    eta_init: float = Field(0.1, lt=1, description="threshold of the projection")
+    eta_min: float = Field(0.0, le=0, description="lower bound of the threshold")
     kappa_min_init: float = Field(0.5, gt=0, lt=1, description="remaining height at the lowest dose")
+    gain_init: float | None = Field(None, gt=0, description="gain before fitting; None: no gain, 1")
     bias_init_um: float = Field(0.0, description="height bias, µm")
     shrinkage: Shrinkage = "fixed-reference"
     edge: Edge = "replicate"
 
     VARIANT_FIELDS: ClassVar[dict[str, dict[str, Any]]] = {
+        "default": {"gain_init": 1.0, "eta_min": -3.0},
         "paper": {"shrinkage": "image-range"},
         "authors": {
             "shrinkage": "image-maximum",
@@ -45,11 +50,13 @@ class PhysicsConfig(SimulatorConfig):
 
 
 class Physics(Simulator):
-    """H = H₀ · Ĥ · S + b with Ĥ = projection(G_optical * M / H₀) and S from G_diffusion * Ĥ.
+    """H = g · H₀ · Ĥ · S + b with Ĥ = projection(G_optical * M / H₀) and S from G_diffusion * Ĥ.
 
-    H₀ is the nominal full height. S = κ + (1 - κ) · u, u the diffused dose on 0 ... 1: against the
-    fixed reference 0 ... 1 (``default``), the range of the image (``paper``) or its maximum
-    (``authors``). The last two depend on the crop.
+    H₀ is the nominal full height, g the gain of ``default``: without it a full level is pinned to H₀ + b.
+    Below 0 the threshold lies before the first level, and the projection is the concave part of the tanh
+    alone. S = κ + (1 - κ) · u, u the diffused dose on 0 ... 1: against the fixed reference 0 ... 1
+    (``default``), the range of the image (``paper``) or its maximum (``authors``). The last two depend on
+    the crop.
     """
 
     name = "physics"
@@ -58,22 +65,30 @@ class Physics(Simulator):
 
     def __init__(self, config: PhysicsConfig):
         super().__init__(config)
-        self.raw_alpha = nn.Parameter(torch.tensor(math.log(math.expm1(config.alpha_init))))
-        self.raw_eta = nn.Parameter(_logit(config.eta_init))
-        self.raw_kappa_min = nn.Parameter(_logit(config.kappa_min_init))
-        self.tau = nn.Parameter(_logit(config.sigma_diffusion_init_um / config.sigma_diffusion_max_um))
+        self.raw_alpha = nn.Parameter(self.ranges["raw_alpha"].raw(config.alpha_init))
+        self.raw_eta = nn.Parameter(self.ranges["raw_eta"].raw(config.eta_init))
+        self.raw_kappa_min = nn.Parameter(self.ranges["raw_kappa_min"].raw(config.kappa_min_init))
+        self.tau = nn.Parameter(self.ranges["tau"].raw(config.sigma_diffusion_init_um))
         self.bias_um = nn.Parameter(torch.tensor(config.bias_init_um))
+        if config.gain_init is not None:
+            self.raw_gain = nn.Parameter(self.ranges["raw_gain"].raw(config.gain_init))
+
+    @property
+    def ranges(self) -> dict[str, Range]:
+        gain = {} if self.config.gain_init is None else {"raw_gain": Range("gain")}
+        return {
+            "raw_alpha": Range("alpha"),
+            "raw_eta": Range("eta", self.config.eta_min, 1.0),
+            "raw_kappa_min": Range("kappa_min", 0.0, 1.0),
+            "tau": Range("sigma_diffusion_um", 0.0, self.config.sigma_diffusion_max_um),
+            **gain,
+        }
 
     @property
     def values(self) -> dict[str, Tensor]:
-        """The five physical values: alpha, eta, kappa_min, sigma_diffusion_um, bias_um."""
-        return {
-            "alpha": functional.softplus(self.raw_alpha),
-            "eta": torch.sigmoid(self.raw_eta),
-            "kappa_min": torch.sigmoid(self.raw_kappa_min),
-            "sigma_diffusion_um": self.config.sigma_diffusion_max_um * torch.sigmoid(self.tau),
-            "bias_um": self.bias_um,
-        }
+        """The physical values: alpha, eta, kappa_min, sigma_diffusion_um, bias_um, and the gain if any."""
+        ranged = {own.name: own.value(getattr(self, key)) for key, own in self.ranges.items()}
+        return {**ranged, "bias_um": self.bias_um}
 
     @property
     def reach_px(self) -> int | None:
@@ -120,8 +135,5 @@ class Physics(Simulator):
             dose = dose / dose.amax((-2, -1), keepdim=True).clamp(min=torch.finfo(dose.dtype).eps)
         kappa_min = self.values["kappa_min"]
         remaining = kappa_min + (1 - kappa_min) * dose
-        return self.config.full_height_um * initial * remaining + self.values["bias_um"]
-
-
-def _logit(probability: float) -> Tensor:
-    return torch.tensor(math.log(probability / (1 - probability)))
+        height = self.config.full_height_um * initial * remaining
+        return self.values.get("gain", 1.0) * height + self.values["bias_um"]

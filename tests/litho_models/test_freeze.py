@@ -49,6 +49,18 @@ def test_saving_and_loading_again_gives_the_same_weights_and_identity(folder, tm
     assert load_frozen(again).sha256 == frozen.sha256
 
 
+def test_values_on_a_bound_are_named_in_card_and_page(tmp_path):
+    model = build_model("physics")
+    with torch.no_grad():
+        model.tau.fill_(9.0)
+        model.raw_alpha.fill_(-5.0)
+    folder = save_frozen(model, tmp_path / "model")
+    assert ModelCard.read(folder).at_bounds == {"alpha": 0.0, "sigma_diffusion_um": 2.5}
+    assert "more than the model allows: alpha (0), sigma_diffusion_um (2.5)." in (
+        folder / README_FILE
+    ).read_text(encoding="utf-8")
+
+
 def test_it_stays_frozen(folder):
     frozen = load_frozen(folder).train()
     assert not frozen.training

@@ -17,10 +17,11 @@ from litho_data.store.schema import DatasetId
 from litho_models.effects import CATALOGUE, UNTESTABLE, get_effect
 from litho_models.fitting.runs import train
 from litho_models.frozen.card import ModelCard
+from litho_models.layers.ranges import FLAT_FROM
 from litho_models.loop import LoopConfig, close_loop, close_loop_on_store, parse_priors
 from litho_models.loop.findings import LoopFindings
 from litho_models.loop.fold_fits import fit_folds, predict
-from litho_models.loop.parameters import get_vector
+from litho_models.loop.parameters import at_bounds, chain_at, effect_slots, get_vector, room
 from litho_models.loop.prepared import LARGE_PX, prepare_scans
 from litho_models.loop.report.wording import plain_words, verdict_text
 from litho_models.loop.result.exporting import exported_effects
@@ -127,6 +128,26 @@ def test_the_headline_has_one_term_per_scan_before_and_after(planted) -> None:
         assert (row.mae_nm, row.rmse_nm) == (errors.mae_datum_free_nm, errors.rmse_datum_free_nm)
     assert [row.before.k for row in result.locked_equal_terms[:3]] == [1, 2, 7]
     assert result.locked_equal_terms[0].after.mae_nm == result.locked_after.mae_datum_free_nm
+
+
+def test_a_gain_that_the_base_fits_itself_is_absorbed(null) -> None:
+    findings, result = null
+    assert verdicts(result)["vertical-shrinkage"] == "absorbed"
+    assert findings.search.first["vertical-shrinkage"].beside_base > 0.1
+
+
+def test_values_on_a_bound_are_named_with_what_they_belong_to(null) -> None:
+    findings, result = null
+    assert result.at_bounds == {}
+    chain = findings.final.fits.chain.with_effects({"vignetting": {"strength": 0.0}})
+    upper = get_effect("vignetting").parameters["strength"].upper
+    slot = effect_slots(chain)["vignetting", "strength"]
+    vector = get_vector(chain)
+    vector[[1, slot]] = FLAT_FROM, upper
+    assert at_bounds(chain_at(chain, vector)) == {"eta": 1.0, "vignetting: strength": upper}
+    lowest, highest = room(chain, vector)
+    assert (highest[[1, slot]] == 0).all()
+    assert (lowest[[1, slot]] < 0).all()
 
 
 def test_the_datum_of_the_scans_is_recognised(null) -> None:
@@ -361,7 +382,7 @@ def test_fold_fits_do_not_depend_on_the_scans_they_hold_out() -> None:
     # has converged, a few hundredths of that.
     assert np.abs(moved).max() > 0.005
     assert np.abs(a - b).max() < 0.05 * np.abs(moved).max()
-    assert len(get_vector(chain)) == 5
+    assert len(get_vector(chain)) == 6
 
 
 def test_a_covariate_that_the_model_lacks_is_seen_in_what_is_left() -> None:

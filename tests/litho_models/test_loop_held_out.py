@@ -23,8 +23,8 @@ def test_scans_are_screened_by_the_fit_that_has_not_seen_them() -> None:
     chain, scans = true_model({}), prepare_scans(printed_scans(count=4, seed=9))
     common = get_vector(chain)
     # Fits that differ in their bias alone, 10 nm from fold to fold.
-    per_fold = np.stack([common + 0.01 * (fold + 1) * (np.arange(5) == 4) for fold in range(3)])
-    fits = FoldFits(chain, common, per_fold, np.zeros(3), np.eye(5), [])
+    per_fold = np.stack([common + 0.01 * (fold + 1) * (np.arange(len(common)) == 4) for fold in range(3)])
+    fits = FoldFits(chain, common, per_fold, np.zeros(3), np.eye(len(common)), [])
     state = State(fits, [predict(chain, per_fold[f], scan) for f, scan in zip(FOLD_OF, scans, strict=True)])
     for scan, fold, residual in zip(
         scans, FOLD_OF, held_out_residuals(state, Study(scans, FOLD_OF)), strict=True

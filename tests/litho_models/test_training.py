@@ -20,6 +20,7 @@ from litho_models.fitting.config import FAST_STEPS, PAPER_LEARNING_RATE
 from litho_models.fitting.crops import Window, cut, plan_batch
 from litho_models.fitting.small_models import fit_small_model
 from litho_models.fitting.stochastic import learning_rate
+from litho_models.layers.ranges import FLAT_FROM
 from litho_models.models import build_model
 from litho_models.models.pbl import Pbl
 from litho_models.prediction.tiles import predict_scan
@@ -80,18 +81,36 @@ def test_physics_recovers_a_printer_of_its_own_kind():
         eta_init=0.3,
         kappa_min_init=0.6,
         sigma_diffusion_init_um=0.4,
+        gain_init=0.7,
         bias_init_um=0.02,
     )
+    model = fit("physics", printed_by(printer), TrainingConfig(nuisance="offset"))
+    unseen = make_scan(20)
+    difference = predict_scan(model, unseen) - predict_scan(printer, unseen)
+    # Noise of 4 nm on 9,000 used pixels fixes six values to well below 1 nm of height.
+    assert 1000 * np.abs(difference).mean() < 1.0
+    assert model.at_bounds == {}
+
+
+def test_a_fit_stops_at_a_bound_and_names_it():
+    printer = build_model("physics", sigma_diffusion_init_um=0.6, kappa_min_init=0.5)
+    narrow = {"sigma_diffusion_max_um": 0.2, "sigma_diffusion_init_um": 0.1}
+    fitted = fit_with_record(
+        "physics", printed_by(printer), TrainingConfig(nuisance="offset"), model_fields=narrow
+    )
+    assert fitted.model.at_bounds == {"sigma_diffusion_um": 0.2}
+    # The raw number stays where the value still follows it.
+    assert abs(float(fitted.model.tau.detach())) == pytest.approx(FLAT_FROM)
+
+
+def printed_by(printer):
+    """Four scans of a printer with a datum each, of zero mean, and noise of 4 nm."""
     scans = []
     for scan in make_scans(4, size_px=96):
         noise = np.random.default_rng(scan.order).normal(0, 0.004, scan.shape)
         height = predict_scan(printer, scan) + 0.03 * (-1) ** scan.order + noise
         scans.append(replace(scan, height_um=height.astype(np.float32)))
-    model = fit("physics", scans, TrainingConfig(nuisance="offset"))
-    unseen = make_scan(20)
-    difference = predict_scan(model, unseen) - predict_scan(printer, unseen)
-    # Noise of 4 nm on 9,000 used pixels fixes five values to well below 1 nm of height.
-    assert 1000 * np.abs(difference).mean() < 1.0
+    return scans
 
 
 def test_training_nuisances_are_pinned_to_the_process():

@@ -68,6 +68,18 @@ def test_every_shipped_model_works_and_says_where_it_comes_from(name):
     assert (zoo.folder(name) / "README.md").read_text(encoding="utf-8") == model_readme(card)
 
 
+def test_a_physics_model_frozen_before_there_was_a_gain_prints_as_it_did():
+    model = zoo.load("physics")
+    assert "gain_init" not in model.card["hyper_parameters"]
+    y = torch.arange(120.0)
+    wave = torch.sin(y[:, None] / 7) * torch.cos(y[None, :] / 11)
+    height = model((torch.floor(6.5 + 6 * wave) * 0.1)[None, None], pitch_um=0.1)[0, 0]
+    # Heights by the code of before, to 1e-4 nm; a float32 of this size is known to 6e-5 nm.
+    places = ((0, 0), (60, 60), (13, 90), (119, 40))
+    before = [0.6176856, 0.7219032, 0.4331597, 0.8068057]
+    assert [float(height[at]) for at in places] == pytest.approx(before, abs=2e-7)
+
+
 def test_the_shipped_zoo_stays_small():
     assert zoo.size_bytes() <= zoo.LARGEST_ZOO_BYTES == 8_000_000
 

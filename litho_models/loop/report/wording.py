@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from litho_models.effects import get_effect
+from litho_models.frozen.readme import bounds_text
 from litho_models.loop.findings import LoopFindings
 from litho_models.loop.result.record import AddedEffect, CloseLoop, EqualTerms
 from litho_models.loop.selection.confirming import FEWEST_SCANS
@@ -127,6 +128,8 @@ def warnings_for(findings: LoopFindings, result: CloseLoop) -> list[str]:
     flagged = [findings.development[i].id for i in findings.probed.defects.suspicious]
     if flagged:
         warnings.append(f"More than 2 % of the pixels lie in localised defects: {', '.join(flagged)}.")
+    if result.at_bounds:
+        warnings.append(bounds_text(result.at_bounds))
     if result.prior_hypotheses:
         warnings.append(
             f"Known from earlier looks at these data, so only a new print confirms them cleanly: "

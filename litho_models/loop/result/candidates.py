@@ -113,9 +113,11 @@ def _process_candidate(
     elif len(findings.development) < FEWEST_SCANS:
         verdict = "not-testable"
         reason = f"{len(findings.development)} scans to select and confirm on, at least {FEWEST_SCANS} needed"
+    elif screened.retained < SMALLEST_RETAINED <= screened.beside_base:
+        verdict, reason = "absorbed", "parameters of the base model do the same: its fit has taken it up"
     elif screened.retained < SMALLEST_RETAINED:
         verdict = "not-testable"
-        reason = "on these layouts it changes nothing that the base model or the per-scan terms do not"
+        reason = "on these layouts it changes nothing that the terms of single scans do not"
     elif wrong := next((s for s in (screened, first) if s and s.p <= FAMILY_P and not s.in_range), None):
         verdict, reason = "contradicted", f"best value leaves the physical range: {_values(wrong)}"
     else:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, ClassVar, Literal
 
-from pydantic import SerializerFunctionWrapHandler, model_serializer
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
 
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunInfo
@@ -149,6 +149,7 @@ class CloseLoop(Result):
     run: RunInfo
     dataset: DatasetId
     base_model: str
+    at_bounds: dict[str, float] = Field(default_factory=dict)
     split: Split
     nuisance: NuisanceProtocol
     prior_hypotheses: list[str]

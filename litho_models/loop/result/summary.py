@@ -13,6 +13,7 @@ from litho_models.effects import CATALOGUE
 from litho_models.loop import equal_terms
 from litho_models.loop.equal_terms import BeforeAfter, TermSet
 from litho_models.loop.findings import LoopFindings
+from litho_models.loop.parameters import at_bounds
 from litho_models.loop.result.added_effects import added_effects
 from litho_models.loop.result.candidates import all_candidates
 from litho_models.loop.result.record import (
@@ -63,6 +64,7 @@ def summarise(findings: LoopFindings, *, dataset: DatasetId, base_name: str, dro
         run=run_info([findings.config.seed], len(findings.development) + len(findings.locked), dropped),
         dataset=dataset,
         base_model=base_name,
+        at_bounds=at_bounds(findings.final.fits.chain),
         split=Split(kind="grouped", folds=findings.study.folds, lock_box=findings.lock_box),
         nuisance=NuisanceProtocol.of_policy("offset", findings.config.seed, findings.config.background),
         prior_hypotheses=list(findings.config.prior_hypotheses),

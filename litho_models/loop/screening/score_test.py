@@ -37,7 +37,9 @@ class Screened:
     """What the score test says of one effect.
 
     ``gain_nm2``: predicted gain in squared error of each scan, its amplitudes estimated without the
-    scan's fold. ``signature``: multiples of the directions' columns of the best block.
+    scan's fold. ``signature``: multiples of the directions' columns of the best block. ``retained``: share
+    of the information that terms of single scans and the base model's own parameters leave;
+    ``beside_base``: what the terms alone leave.
     """
 
     effect: Effect
@@ -50,6 +52,7 @@ class Screened:
     projection: str
     in_range: bool
     retained: float
+    beside_base: float
     detectable: str
 
     @property
@@ -140,8 +143,16 @@ def _screen_one(
         projection=chosen,
         in_range=estimates[best].physical,
         retained=retained,
+        beside_base=_beside_base(directions, block, raw),
         detectable=_detectable(block, free[chosen], float(np.quantile(null_max, 1 - FAMILY_P))),
     )
+
+
+def _beside_base(directions: Directions, block: Block, raw: np.ndarray) -> float:
+    """Share of a block's information that the best projection leaves, base parameters aside."""
+    grams = [directions.grams[name] for name in PROJECTIONS]
+    columns = [(c, 1 + directions.parameters + c) for c in block.columns]
+    return max(float(g[:, at, at].sum() / max(raw[c], 1e-300)) for g in grams for c, at in columns)
 
 
 def _held_out_gain(

@@ -164,9 +164,22 @@ def _fitted(state: State, entering: Sequence[Screened], study: Study) -> list[En
     entrants, chain = [], state.fits.chain
     for s in entering:
         study.report(f"fitting {s.effect.name}")
-        extended = chain.with_effects({**chain.values(), s.effect.name: s.values})
+        extended = chain.with_effects({**chain.values(), s.effect.name: _start(s)})
         entrants.append(Entrant(s, fit_state(extended, study)))
     return entrants
+
+
+def _start(s: Screened) -> dict[str, float]:
+    """The screened values, no amplitude farther from its null than its largest trial: the line ends there.
+
+    A fit that starts beyond may end on the far side of a kink.
+    """
+    values = dict(s.values)
+    for name in s.effect.amplitudes:
+        null = s.effect.parameters[name].null
+        reach = max(abs(trial.get(name, null) - null) for trial in s.effect.trials)
+        values[name] = null + min(max(values[name] - null, -reach), reach)
+    return values
 
 
 def _confusable_unfitted(

@@ -1,0 +1,58 @@
+"""Ranges of fitted values, and what it means that one stands on a bound.
+
+A fit moves a raw number; the model uses the value inside its range. Near a bound the value hardly follows the
+raw number any more, and a fit that has run there could not come back. So fits keep raw numbers within
+``FLAT_FROM``, and a value whose raw number is that far out stands on its bound.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+# A sigmoid has 7 % of its slope left, and is 2 % of the range away from the bound.
+FLAT_FROM = 4.0
+_ROUNDING = 1e-4
+
+
+@dataclass(frozen=True)
+class Range:
+    """Range of one fitted value: lower + (upper - lower) · sigmoid(raw), or lower + softplus(raw).
+
+    Attributes:
+        name: of the value, with its unit.
+        lower, upper: its bounds; an infinite ``upper`` takes the softplus.
+    """
+
+    name: str
+    lower: float = 0.0
+    upper: float = math.inf
+
+    def value(self, raw: Tensor) -> Tensor:
+        """The value that the model uses."""
+        if math.isinf(self.upper):
+            return self.lower + functional.softplus(raw)
+        return self.lower + (self.upper - self.lower) * torch.sigmoid(raw)
+
+    def raw(self, value: float) -> Tensor:
+        """The raw number of a value inside the range; ``ValueError`` or ``ArithmeticError`` outside."""
+        above = value - self.lower
+        if math.isinf(self.upper):
+            return torch.tensor(math.log(math.expm1(above)))
+        return torch.tensor(math.log(above / (self.upper - value)))
+
+    @property
+    def raw_ends(self) -> tuple[float, float]:
+        """Smallest and largest raw number that a fit gives."""
+        return -FLAT_FROM, math.inf if math.isinf(self.upper) else FLAT_FROM
+
+    def bound_at(self, raw: float) -> float | None:
+        """The bound on which a raw number stands; None inside the range."""
+        low, high = self.raw_ends
+        if raw <= low + _ROUNDING:
+            return self.lower
+        return self.upper if raw >= high - _ROUNDING else None
