@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from litho_models.loop import LoopConfig as LoopConfig
     from litho_models.loop import close_loop_on_store as close_loop
     from litho_models.models import build_model as build_model
+    from litho_models.models.authors import model_of_authors as model_of_authors
     from litho_models.noise import analyse_noise as analyse_noise
     from litho_models.scan_terms import register_scan_term as register_scan_term
     from litho_models.scoring.metric_registry import register_metric as register_metric
@@ -39,6 +40,7 @@ else:
             "evaluate": "litho_models.evaluation.evaluate",
             "freeze": "litho_models.frozen.freezing",
             "load_frozen": "litho_models.frozen.files",
+            "model_of_authors": "litho_models.models.authors",
             "register_effect": "litho_models.effects",
             "register_metric": "litho_models.scoring.metric_registry",
             "register_scan_term": "litho_models.scan_terms",
@@ -61,6 +63,7 @@ __all__ = [
     "evaluate",
     "freeze",
     "load_frozen",
+    "model_of_authors",
     "register_effect",
     "register_metric",
     "register_scan_term",

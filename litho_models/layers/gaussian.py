@@ -26,6 +26,8 @@ _SMALLEST_BLOCK_PX = 64
 _LARGEST_RADIUS_PX = 4096
 
 Edge = Literal["replicate", "zero"]
+# How far a kernel reaches: four sigma, or three times the whole pixels of one (the authors' code).
+Support = Literal["four-sigma", "three-whole-sigma"]
 
 
 def gaussian_blur(
@@ -34,6 +36,7 @@ def gaussian_blur(
     pitch_um: float,
     *,
     edge: Edge = "replicate",
+    radius_px: int | None = None,
 ) -> Tensor:
     """Blur ``field`` (..., y, x) to the same size with a Gaussian of standard deviation ``sigma_um``.
 
@@ -45,6 +48,7 @@ def gaussian_blur(
             carry gradients.
         pitch_um: sampling of the field, µm.
         edge: ``replicate`` continues the outermost pixels, ``zero`` adds nothing outside.
+        radius_px: of the kernel on each side; four sigma by default.
 
     Raises:
         InputError: a pitch that is not positive.
@@ -56,7 +60,7 @@ def gaussian_blur(
         torch.as_tensor(sigma, dtype=field.dtype, device=field.device) / pitch_um
         for sigma in (along_y, along_x)
     ]
-    radii = [kernel_radius_px(float(sigma.detach())) for sigma in sigmas]
+    radii = [kernel_radius_px(float(sigma.detach())) if radius_px is None else radius_px for sigma in sigmas]
     if edge == "replicate" and not _is_wide(field.shape, radii):
         return _blur(field, sigmas, radii, _continuing_band)
     padded = pad_field(field, radii[0], radii[1], edge)
@@ -108,6 +112,12 @@ def kernel_radius_px(sigma_px: float, support: float = SUPPORT_SIGMAS) -> int:
             wanted=f"at most {_LARGEST_RADIUS_PX / support:g} px",
         )
     return max(1, math.ceil(support * sigma_px))
+
+
+def supported_radius_px(sigma_px: float, support: Support, cap_px: int | None) -> int:
+    """Radius of a kernel by the rule of a model, at most ``cap_px`` where there is a cap."""
+    radius = kernel_radius_px(sigma_px) if support == "four-sigma" else 3 * int(sigma_px)
+    return radius if cap_px is None else min(radius, cap_px)
 
 
 def pad_field(field: Tensor, rows_px: int, columns_px: int, edge: Edge = "replicate") -> Tensor:

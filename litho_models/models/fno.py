@@ -33,22 +33,22 @@ class FnoConfig(SimulatorConfig):
     local_px: int = Field(3, ge=1, le=15, description="side of the local convolution, odd")
     coordinates: bool = Field(False, description="y and x on 0 ... 1 of the image as further inputs")
     padding_fraction: float = Field(0.0, ge=0, le=1, description="zeros at bottom and right, share of image")
+    padding_px: int = Field(0, ge=0, le=4096, description="zeros at bottom and right of an image of any size")
     tile_px: int | None = Field(128, ge=8, le=4096, description="side of a tile; None: the whole image")
     overlap_px: int = Field(32, ge=0, description="blended pixels of neighbouring tiles, at most half a tile")
     # Start as the layout and learn what differs; the paper's network starts at random.
     starts_as_layout: bool = True
 
+    _PUBLISHED: ClassVar[dict[str, Any]] = {
+        "local_px": 1,
+        "coordinates": True,
+        "tile_px": None,
+        "starts_as_layout": False,
+    }
     VARIANT_FIELDS: ClassVar[dict[str, dict[str, Any]]] = {
-        variant: {
-            "local_px": 1,
-            "coordinates": True,
-            # 9 px of the published quadrants of 256 px.
-            "padding_fraction": 9 / 256,
-            "tile_px": None,
-            "starts_as_layout": False,
-            **fields,
-        }
-        for variant, fields in {"paper": {}, "authors": {"width": 12}}.items()
+        # 9 px of the published quadrants of 256 px.
+        "paper": {**_PUBLISHED, "padding_fraction": 9 / 256},
+        "authors": {**_PUBLISHED, "padding_px": 9, "width": 12},
     }
 
     @model_validator(mode="after")
@@ -103,7 +103,7 @@ class Fno(Simulator):
         with torch.autocast(device_type=layout_um.device.type, enabled=False):
             inputs = torch.cat([layout_um, _coordinates(layout_um)], 1) if config.coordinates else layout_um
             features = _pointwise(self.lift, inputs.permute(0, 2, 3, 1))
-        padding = [round(config.padding_fraction * size) for size in (nx, ny)]
+        padding = [config.padding_px + round(config.padding_fraction * size) for size in (nx, ny)]
         if any(padding):
             features = functional.pad(features, (0, 0, 0, padding[0], 0, padding[1]))
         for number, (spectral, local) in enumerate(zip(self.spectral, self.local, strict=True)):

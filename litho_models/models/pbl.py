@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from litho_models.fast import convolution_stack
-from litho_models.layers.gaussian import Edge, blur_interior, kernel_radius_px, pad_field
+from litho_models.layers.gaussian import Edge, Support, blur_interior, pad_field, supported_radius_px
 from litho_models.layers.lookup import PointwiseNet
 from litho_models.layers.precision import adjoint_dtype
 from litho_models.layers.ranges import Range
@@ -36,7 +36,8 @@ class PblConfig(SimulatorConfig):
     leaky_slope: float = Field(0.02, ge=0)
     # Start as the optically blurred layout and learn what differs; the paper's networks start at random.
     starts_as_blur: bool = True
-    kernel_cap_px: int | None = Field(None, ge=1, description="largest kernel radius; None keeps four sigma")
+    kernel_support: Support = "four-sigma"
+    kernel_cap_px: int | None = Field(None, ge=1, description="largest kernel radius; None: no cap")
     blur_modulus: bool = Field(False, description="absolute value after the diffusion blur")
     edge: Edge = "replicate"
     knots: int = Field(1025, ge=0, le=1_000_000, description="points of a pointwise network; 0: each pixel")
@@ -48,6 +49,7 @@ class PblConfig(SimulatorConfig):
             "edge": "zero",
             "leaky_slope": 0.2,
             "sigma_diffusion_init_um": 2.5 / (1 + math.exp(-2.5)),
+            "kernel_support": "three-whole-sigma",
             "kernel_cap_px": 50,
             "blur_modulus": True,
         },
@@ -109,12 +111,11 @@ class Pbl(Simulator):
         return torch.tensor(self.config.sigma_optical_um, device=layout_um.device)
 
     def _radii_px(self) -> tuple[int, int]:
-        diffusion = float(self.sigma_diffusion_um.detach())
-        radii = [
-            kernel_radius_px(sigma / self.pitch_um) for sigma in (self.config.sigma_optical_um, diffusion)
-        ]
-        cap = self.config.kernel_cap_px
-        optical, diffused = radii if cap is None else [min(radius, cap) for radius in radii]
+        config, diffusion = self.config, float(self.sigma_diffusion_um.detach())
+        optical, diffused = (
+            supported_radius_px(sigma / self.pitch_um, config.kernel_support, config.kernel_cap_px)
+            for sigma in (config.sigma_optical_um, diffusion)
+        )
         return optical, diffused
 
     def _blur(self, field: Tensor, sigma_um: Tensor, radius_px: int) -> Tensor:

@@ -13,7 +13,14 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from litho_models.layers.gaussian import Edge, blur_interior, gaussian_blur, kernel_radius_px, pad_field
+from litho_models.layers.gaussian import (
+    Edge,
+    Support,
+    blur_interior,
+    gaussian_blur,
+    pad_field,
+    supported_radius_px,
+)
 from litho_models.layers.ranges import Range
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 
@@ -33,15 +40,26 @@ class PhysicsConfig(SimulatorConfig):
     kappa_min_init: float = Field(0.5, gt=0, lt=1, description="remaining height at the lowest dose")
     gain_init: float | None = Field(None, gt=0, description="gain before fitting; None: no gain, 1")
     bias_init_um: float = Field(0.0, description="height bias, µm")
+    # The equations are in µm with 1, and in the full height without: the paper has none.
+    reference_height_um: float | None = Field(
+        None, gt=0, description="height that is 1; None: the highest level"
+    )
     shrinkage: Shrinkage = "fixed-reference"
+    kernel_support: Support = "four-sigma"
+    kernel_cap_px: int | None = Field(None, ge=1, description="largest kernel radius; None: no cap")
     edge: Edge = "replicate"
 
     VARIANT_FIELDS: ClassVar[dict[str, dict[str, Any]]] = {
         "default": {"gain_init": 1.0, "eta_min": -3.0},
-        "paper": {"shrinkage": "image-range"},
+        "paper": {"reference_height_um": 1.0, "shrinkage": "image-range", "edge": "zero"},
         "authors": {
+            "reference_height_um": 1.0,
             "shrinkage": "image-maximum",
+            "kernel_support": "three-whole-sigma",
+            "kernel_cap_px": 50,
             "edge": "zero",
+            "alpha_init": 5.2514,
+            "bias_init_um": -0.1374,
             "sigma_diffusion_init_um": 2.5 / (1 + math.exp(-2.5)),
             "eta_init": 1 / (1 + math.exp(-0.5)),
             "kappa_min_init": 1 / (1 + math.exp(-0.5)),
@@ -52,7 +70,8 @@ class PhysicsConfig(SimulatorConfig):
 class Physics(Simulator):
     """H = g · H₀ · Ĥ · S + b with Ĥ = projection(G_optical * M / H₀) and S from G_diffusion * Ĥ.
 
-    H₀ is the nominal full height, g the gain of ``default``: without it a full level is pinned to H₀ + b.
+    In ``default`` H₀ is the nominal full height and g a gain, without which a full level would be pinned to
+    H₀ + b. ``paper`` and ``authors`` have neither: H₀ is 1 µm and g is 1.
     Below 0 the threshold lies before the first level, and the projection is the concave part of the tanh
     alone. S = κ + (1 - κ) · u, u the diffused dose on 0 ... 1: against the fixed reference 0 ... 1
     (``default``), the range of the image (``paper``) or its maximum (``authors``). The last two depend on
@@ -96,31 +115,37 @@ class Physics(Simulator):
             return None
         return sum(self._radii_px())
 
+    @property
+    def _reference_um(self) -> float:
+        return self.config.reference_height_um or self.config.full_height_um
+
     def interior(self, layout_um: Tensor) -> Tensor:
         optical, diffusion = self._radii_px()
         sigma_optical = torch.tensor(self.config.sigma_optical_um / self.pitch_um, device=layout_um.device)
-        aerial = blur_interior(layout_um / self.config.full_height_um, sigma_optical, optical)
+        aerial = blur_interior(layout_um / self._reference_um, sigma_optical, optical)
         initial = self._project(aerial)
         dose = blur_interior(initial, self.values["sigma_diffusion_um"] / self.pitch_um, diffusion)
         return self._develop(crop_border(initial, diffusion), dose)
 
     def forward(self, layout_um: Tensor) -> Tensor:
         """Height of the whole field, (batch, 1, y, x) µm."""
-        config = self.config
+        edge, (optical, diffusion) = self.config.edge, self._radii_px()
         # A continued layout, blurred, is itself continued from the radius of the optical blur on.
-        margin = self._radii_px()[0] if config.edge == "replicate" else 0
-        relative = pad_field(layout_um, margin, margin) / config.full_height_um
-        aerial = gaussian_blur(relative, config.sigma_optical_um, self.pitch_um, edge=config.edge)
+        margin = optical if edge == "replicate" else 0
+        relative = pad_field(layout_um, margin, margin) / self._reference_um
+        sigma_optical, sigma_diffusion = self.config.sigma_optical_um, self.values["sigma_diffusion_um"]
+        aerial = gaussian_blur(relative, sigma_optical, self.pitch_um, edge=edge, radius_px=optical)
         initial = self._project(aerial)
-        dose = gaussian_blur(initial, self.values["sigma_diffusion_um"], self.pitch_um, edge=config.edge)
+        dose = gaussian_blur(initial, sigma_diffusion, self.pitch_um, edge=edge, radius_px=diffusion)
         return self._develop(crop_border(initial, margin), crop_border(dose, margin))
 
     def _radii_px(self) -> tuple[int, int]:
-        diffusion = float(self.values["sigma_diffusion_um"].detach())
-        return (
-            kernel_radius_px(self.config.sigma_optical_um / self.pitch_um),
-            kernel_radius_px(diffusion / self.pitch_um),
+        config, diffusion = self.config, float(self.values["sigma_diffusion_um"].detach())
+        optical, diffused = (
+            supported_radius_px(sigma / self.pitch_um, config.kernel_support, config.kernel_cap_px)
+            for sigma in (config.sigma_optical_um, diffusion)
         )
+        return optical, diffused
 
     def _project(self, aerial: Tensor) -> Tensor:
         alpha, eta = self.values["alpha"], self.values["eta"]
@@ -135,5 +160,5 @@ class Physics(Simulator):
             dose = dose / dose.amax((-2, -1), keepdim=True).clamp(min=torch.finfo(dose.dtype).eps)
         kappa_min = self.values["kappa_min"]
         remaining = kappa_min + (1 - kappa_min) * dose
-        height = self.config.full_height_um * initial * remaining
+        height = self._reference_um * initial * remaining
         return self.values.get("gain", 1.0) * height + self.values["bias_um"]

@@ -122,8 +122,8 @@ def test_the_variants_are_those_of_paper_and_code():
     assert authors.config.coordinates
     assert not ours.config.coordinates
     # 9 px of 256, and the same share of another size.
-    assert round(authors.config.padding_fraction * 256) == 9
-    assert round(authors.config.padding_fraction * 540) == 19
+    assert [round(paper.config.padding_fraction * size) for size in (256, 540)] == [9, 19]
+    assert (authors.config.padding_px, authors.config.padding_fraction) == (9, 0)
     # Lift, four layers of two spectral blocks and one 1 x 1 convolution, projection.
     width = 24
     spectral = 4 * 2 * width**2 * 12 * 12 * 2

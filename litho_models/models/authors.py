@@ -1,0 +1,112 @@
+"""The authors' weights in our models: their classes are variant ``authors``, their names are read here.
+
+Source: Neural-Litho/Neural_Lithography at e97f907 (Apache-2.0).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from litho_data.foundation.errors import InputError
+from litho_models.layers.ranges import Range
+from litho_models.models.fno import Fno
+from litho_models.models.pbl import Pbl
+from litho_models.models.physics import Physics
+from litho_models.simulator import Simulator
+
+_PHYSICS = {
+    "sigmac_param": "tau",
+    "thresh": "raw_eta",
+    "alpha": "raw_alpha",
+    "kmin": "raw_kappa_min",
+    "height_bias": "bias_um",
+}
+
+
+def model_of_authors(weights: Mapping[str, Any], **fields: Any) -> Simulator:
+    """PBL, Physics or FNO of variant ``authors`` with the weights of the authors' class of the same kind.
+
+    Args:
+        weights: their ``state_dict``: name to array or tensor; complex numbers as such, or as pairs of
+            reals along the last axis.
+        fields: config fields of the model (geometry).
+
+    Raises:
+        InputError: weights of no class of theirs, or some that are missing, unknown or of another shape.
+    """
+    own = {name: _as_real(value) for name, value in weights.items()}
+    model: Simulator
+    if "fc0.weight" in own:
+        model = Fno(Fno.Config.of_variant("authors", **{"width": own["fc0.weight"].shape[0], **fields}))
+        state = _fno_state(own)
+    elif "height_bias" in own:
+        model = Physics(Physics.Config.of_variant("authors", **fields))
+        state = _physics_state(own, model.ranges["raw_alpha"])
+    elif "sigmac_param" in own:
+        model = Pbl(Pbl.Config.of_variant("authors", **fields))
+        state = _pbl_state(own)
+    else:
+        raise InputError("weights", got=", ".join(own) or "none", wanted="those of a class of the authors")
+    wanted = model.state_dict()
+    wrong = sorted(
+        name
+        for name in wanted.keys() | state.keys()
+        if name not in wanted or name not in state or wanted[name].numel() != state[name].numel()
+    )
+    if wrong:
+        raise InputError(
+            f"weights of the authors' {model.name}",
+            got=f"missing, unknown or of another size: {', '.join(wrong)}",
+            wanted="their state_dict as a whole",
+        )
+    # Theirs are convolutions of 1 x 1 and numbers of shape (1,) where ours are matrices and numbers.
+    model.load_state_dict({name: state[name].reshape(wanted[name].shape) for name in wanted})
+    return model.eval()
+
+
+def _physics_state(own: Mapping[str, Tensor], steepness: Range) -> dict[str, Tensor]:
+    state = {_PHYSICS.get(name, name): value for name, value in own.items()}
+    if "raw_alpha" in state:
+        alpha = float(state["raw_alpha"])
+        if not alpha > 0:
+            raise InputError("alpha of the authors' physics", got=alpha, wanted="above 0")
+        # Theirs is the steepness itself, ours the raw number behind it.
+        state["raw_alpha"] = steepness.raw(alpha)
+    return state
+
+
+def _pbl_state(own: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    names = {"sigmac_param": "tau"}
+    for kind in ("weight", "bias"):
+        for part in ("thresh", "shrink"):
+            names |= {f"{part}_approx.conv{i}.{kind}": f"{part}.layers.{2 * i}.{kind}" for i in range(3)}
+        names |= {f"out_layer.conv{i}.{kind}": f"mismatch.hidden.{i}.{kind}" for i in range(4)}
+        names[f"out_layer.conv4.{kind}"] = f"mismatch.last.{kind}"
+    return {names.get(name, name): value for name, value in own.items()}
+
+
+def _fno_state(own: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    names: dict[str, str] = {}
+    for kind in ("weight", "bias"):
+        names |= {
+            f"{a}.{kind}": f"{b}.{kind}" for a, b in (("fc0", "lift"), ("fc1", "hidden"), ("fc2", "last"))
+        }
+        names |= {f"w{i}.{kind}": f"local.{i}.{kind}" for i in range(4)}
+    state = {names.get(name, name): value for name, value in own.items()}
+    for i in range(4):
+        # Ours holds the matrices of both signs of the frequency along y.
+        signs = [state.pop(f"conv{i}.weights{sign}", None) for sign in (1, 2)]
+        pair = [matrix for matrix in signs if matrix is not None]
+        if len(pair) == 2 and pair[0].shape == pair[1].shape:
+            state[f"spectral.{i}.weight"] = torch.stack(pair)
+    return state
+
+
+def _as_real(value: Any) -> Tensor:
+    tensor = value.detach() if isinstance(value, Tensor) else torch.from_numpy(np.asarray(value))
+    return (torch.view_as_real(tensor) if tensor.is_complex() else tensor).float()
