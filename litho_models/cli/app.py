@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -9,6 +10,7 @@ import typer
 
 import litho_models
 from litho_data.foundation.commands import new_app, run_app
+from litho_data.foundation.errors import InputError
 from litho_models.cli.loop import close_loop
 from litho_models.cli.noise import noise
 
@@ -231,14 +233,35 @@ def freeze(
         str, typer.Argument(help="folder of `train` or `close-loop`, or a frozen model (a folder, zoo:NAME)")
     ],
     out: Out,
-    declare_process: Annotated[
+    attribute: Annotated[
         list[str] | None,
-        typer.Option(help="an undetermined effect that you declare part of the printer; repeatable"),
+        typer.Option(
+            metavar="[EFFECT=]microscope|printer",
+            help="whose the effects of undetermined role are, of all of them or of one; repeatable",
+        ),
     ] = None,
+    declare_process: Annotated[list[str] | None, typer.Option(hidden=True)] = None,
 ) -> None:
     """Write the process model only: weights, card and a page for people."""
-    card = litho_models.freeze(run, out, declare_process or [])
+    if declare_process:
+        raise InputError(
+            "option",
+            got=f"--declare-process {declare_process[0]}",
+            wanted=f"--attribute {declare_process[0]}=printer",
+        )
+    card = litho_models.freeze(run, out, _attribution(attribute or []))
     typer.echo(f"{card.name}: {card.parameters} parameters, frozen in {out}")
+
+
+def _attribution(given: Sequence[str]) -> Any:
+    """One side for all effects, or sides by name."""
+    if len(given) == 1 and "=" not in given[0]:
+        return given[0]
+    if wrong := [text for text in given if "=" not in text]:
+        raise InputError(
+            "--attribute", got=wrong[0], wanted="EFFECT=microscope or EFFECT=printer, where several"
+        )
+    return dict(text.split("=", 1) for text in given)
 
 
 def main() -> None:

@@ -17,6 +17,8 @@ from litho_models.scan_terms.background import Background
 CARD_FILE = "card.json"
 
 EffectValues = dict[str, dict[str, float]]
+# Whose an effect of undetermined role is taken to be.
+Attribution = Literal["printer", "microscope"]
 
 # Lists that are looked up in `training` and `split`, which hold free facts otherwise.
 _LISTS_OF_NAMES = ("scan_ids", "lock_box", "lock_box_files_sha256")
@@ -38,7 +40,8 @@ class ModelCard(RunFacts, Result):
 
     ``background`` is what the microscope added to the training scans on average; only a comparison with
     measured maps uses it, the model's height never contains it. ``at_bounds`` are fitted values on a bound of
-    their range, and that bound.
+    their range, and that bound. ``attributed`` says whose an effect of undetermined role was taken to be when
+    the model was frozen; older cards list those of the printer in ``declared_processes``.
     """
 
     model_config = ConfigDict(allow_inf_nan=False)
@@ -71,6 +74,7 @@ class ModelCard(RunFacts, Result):
     measurement_effects: EffectValues = Field(default_factory=dict)
     undetermined_effects: EffectValues = Field(default_factory=dict)
     declared_processes: list[str] = Field(default_factory=list)
+    attributed: dict[str, Attribution] = Field(default_factory=dict)
     confusable_sets: list[list[str]] = Field(default_factory=list)
     unexplained_fraction: float | None = None
     fabrication_batch: str = ""

@@ -183,11 +183,12 @@ def _check_effects(card: ModelCard) -> None:
 
     for name, values in card.process_effects.items():
         effect = get_effect(name)
-        if effect.role != "process" and name not in card.declared_processes:
+        taken = name in card.declared_processes or card.attributed.get(name) == "printer"
+        if effect.role != "process" and not taken:
             raise InputError(
                 "process effect",
                 got=f"{name}, whose role is {effect.role}",
                 wanted="an effect of the printer",
-                hint="`litho-models freeze --declare-process` takes in an undetermined one",
+                hint="`litho-models freeze --attribute printer` takes in an undetermined one",
             )
         effect.require_in_range(values)

@@ -75,6 +75,7 @@ def model_readme(card: ModelCard) -> str:
         "## Effects\n",
         f"Process effects inside the model: {_names(card.process_effects)}. Measurement effects, left out: "
         f"{_names(card.measurement_effects)}. Undetermined, left out: {_names(card.undetermined_effects)}.\n",
+        *([f"{_attribution(card)}\n"] if card.attributed else []),
         "## Limitations\n",
         "\n".join(f"- {line}" for line in card.limitations) or "- none stated",
         "",
@@ -106,6 +107,14 @@ def _metrics(card: ModelCard) -> str:
         for m in card.metrics
     ]
     return head + "\n".join(lines) + "\n"
+
+
+def _attribution(card: ModelCard) -> str:
+    given = ", ".join(f"{name} to the {side}" for name, side in card.attributed.items())
+    return (
+        f"Attributed when it was frozen, because the prints cannot tell: {given}. The other attribution is "
+        "another model; a design that holds under both does not depend on it."
+    )
 
 
 def _names(effects: dict[str, dict[str, float]]) -> str:

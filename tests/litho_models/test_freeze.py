@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import pickle
+import re
 import subprocess
 import sys
 
@@ -11,9 +12,11 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
+from typer.testing import CliRunner
 
 from litho_data.foundation.errors import InputError
 from litho_models import load_frozen, save_frozen
+from litho_models.cli.app import app
 from litho_models.frozen.card import CARD_FILE, ModelCard
 from litho_models.frozen.files import README_FILE, WEIGHTS_FILE
 from litho_models.frozen.freezing import freeze
@@ -297,16 +300,41 @@ def test_process_effects_are_part_of_the_model_and_measurement_effects_are_not(t
     assert torch.equal(measured(layout), plain(layout))
 
 
-def test_an_undetermined_effect_enters_only_by_declaration_and_the_card_says_so(tmp_path):
-    effects = {"vertical-shrinkage": {"fraction": 0.1}}
+def test_an_undetermined_effect_is_frozen_under_either_attribution_and_the_card_says_which(tmp_path):
+    effects = {"slope-thinning": {"along_x_um": 0.4, "along_y_um": 0.0}}
     source = save_frozen(build_model("physics"), tmp_path / "source", undetermined_effects=effects)
-    assert freeze(source, tmp_path / "kept").process_effects == {}
-    declared = freeze(source, tmp_path / "declared", ["vertical-shrinkage"])
-    assert declared.process_effects == effects
-    assert declared.declared_processes == ["vertical-shrinkage"]
-    assert declared.undetermined_effects == {}
-    with pytest.raises(InputError, match="declare-process"):
-        freeze(source, tmp_path / "wrong", ["vignetting"])
+    assert freeze(source, tmp_path / "kept").undetermined_effects == effects
+    printed = freeze(source, tmp_path / "printer", "printer")
+    measured = freeze(source, tmp_path / "microscope", {"slope-thinning": "microscope"})
+    assert (printed.process_effects, measured.measurement_effects) == (effects, effects)
+    for card, side in ((printed, "printer"), (measured, "microscope")):
+        assert card.undetermined_effects == {}
+        assert card.attributed == {"slope-thinning": side}
+        page = (tmp_path / side / README_FILE).read_text(encoding="utf-8")
+        assert f"cannot tell: slope-thinning to the {side}." in page
+    # What the printer did is part of a design; what the microscope did is not.
+    layout = 0.1 * torch.arange(13.0).repeat_interleave(8).expand(1, 1, 104, 104).contiguous()
+    heights = [load_frozen(tmp_path / name)(layout) for name in ("printer", "microscope", "kept")]
+    assert torch.equal(heights[1], heights[2])
+    assert float((heights[0] - heights[1]).min()) < -0.01
+    for wrong in ({"vignetting": "printer"}, {"slope-thinning": "operator"}):
+        with pytest.raises(InputError, match=r"wanted slope-thinning|wanted printer or microscope"):
+            freeze(source, tmp_path / "wrong", wrong)
+    with pytest.raises(InputError, match="has none"):
+        freeze(tmp_path / "printer", tmp_path / "again", "microscope")
+
+
+def test_the_older_option_tells_the_new_one(folder, tmp_path):
+    command = ["freeze", str(folder), "--out", str(tmp_path / "out")]
+    for words, said in (
+        (["--declare-process", "slope-thinning"], r"wanted --attribute slope-thinning=printer"),
+        (["--attribute", "printer", "--attribute", "microscope"], r"EFFECT=microscope"),
+        (["--attribute", "slope-thinning=printer"], r"an effect of undetermined role"),
+    ):
+        refused = CliRunner().invoke(app, command + words).exception
+        assert isinstance(refused, InputError)
+        assert re.search(said, str(refused))
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_card_is_public_and_validated():
