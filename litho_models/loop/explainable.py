@@ -16,17 +16,16 @@ from numpy.typing import NDArray
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.fitting.least_squares import gram_inside, orthonormal
 from litho_models.fitting.ridge import feature_rows
+from litho_models.loop.linear import ALL_FREE
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.probes.linear import held_out_ridge
 from litho_models.loop.probes.places import map_columns_at
 from litho_models.loop.selection.confirming import SMALLEST_SHARE
 from litho_models.loop.study import Study
 from litho_models.models.features import Features, FeaturesConfig
-from litho_models.scan_terms import POLICIES, Terms
+from litho_models.scan_terms import Terms
 from litho_models.scoring.statistics import interval
 
-# Offset, gain, tilt and bow of each scan belong to nobody else: k = 7.
-FREE: Terms = POLICIES["full"]
 # All rows of all scans; with more scans each is thinned.
 _KEPT_BYTES, _MOST_ROWS = 512 * 2**20, 256
 # Features whose strength may follow order or dose: height, |∂y| and |∂x| at 0.3 µm, surroundings of 1.6 µm.
@@ -94,7 +93,7 @@ class Learner:
         self._grams = [_gram(one) for one in self._rows_of]
         self._freed: dict[Terms, tuple[list[np.ndarray], np.ndarray]] = {}
 
-    def rest(self, predictions: Sequence[np.ndarray], terms: Terms = FREE) -> Rest:
+    def rest(self, predictions: Sequence[np.ndarray], terms: Terms = ALL_FREE) -> Rest:
         """What the features explain of measured minus predicted, each scan by a ridge that has not seen it.
 
         Args:

@@ -53,7 +53,8 @@ def test_where_nothing_is_missing_nothing_can_be_learned(scene) -> None:
     rest = Learner(Study(scans, FOLD_OF), predictions).rest(predictions)
     assert not rest.matters
     assert rest.share < 0.01
-    assert rest.k == 7
+    # Offset, gain, five of tilt and bow, six of an affine error of the registration.
+    assert rest.k == 13
 
 
 @pytest.mark.parametrize("change", [bead, later, placed])
@@ -90,6 +91,12 @@ def test_rows_are_thinned_where_they_would_not_fit(scene, monkeypatch) -> None:
     assert sum(rows.nbytes for rows in thinned._rows_of) <= 4 * 256 * pixels // 2
     # Half of the pixels; neighbours share most of their roughness, so little is lost.
     assert thinned.rest(lacking).mean_nm2 == pytest.approx(full.mean_nm2, rel=0.15)
+
+
+def test_a_shift_of_the_registration_is_nothing_to_learn(scene) -> None:
+    scans, predictions = scene
+    shifted = changed(scans, predictions, lambda f, p: 0.1 * np.gradient(p, axis=1))
+    assert not Learner(Study(scans, FOLD_OF), predictions).rest(shifted).matters
 
 
 def test_the_squared_error_is_that_of_the_residual_without_what_a_scan_adds(scene) -> None:

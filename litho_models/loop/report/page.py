@@ -285,7 +285,7 @@ def _rest_section(page: Page, findings: LoopFindings, result: CloseLoop) -> None
             ]
         ),
         "What a ridge regression over features of layout, place, order and dose still explains, each scan by "
-        "one that has not seen it; offset, gain, tilt and bow of each scan are free "
+        "one that has not seen it; offset, gain, tilt, bow and affine registration of each scan are free "
         f"(k = {findings.rest.k}). It says that something could be learned, not what.",
         "explainable.csv",
         digits=1,
