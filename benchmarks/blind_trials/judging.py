@@ -33,27 +33,25 @@ from litho_models.loop.result.record import CloseLoop
 from litho_models.loop.study import DATUM_FREE, names_to_terms, score
 
 _CAUSES = ("explained", "confusable")
-# The default noise has both kinds of line-shaped noise: who sees them invents nothing.
-_IN_THE_NOISE = {"line-roughness", "scan-line-stripes"}
 # Offsets of lines are what single scans add: to accept these is to notice a cause that is made of them.
 _LINES = {"periodic-lines"}
 
 
 def scan_terms(result: CloseLoop) -> list[str]:
     """Effects of single scans that the loop accepted: the nuisance span. Probes are no catalogue names."""
-    return [e.name for e in result.effects if e.name in CATALOGUE and CATALOGUE[e.name].per_scan]
+    return [e.name for e in result.effects if e.name in _span()]
 
 
 def named_outside_span(result: CloseLoop, exported: Sequence[str] = ()) -> list[Named]:
-    """What the loop reports beyond what the default noise has in every scan anyway.
+    """What the loop reports beyond the nuisance span, which the default noise has in every scan anyway.
 
-    Datum, gain, tilt and bow, line offsets and warp of single scans are in the nuisance span.
+    Datum, gain, tilt and bow, offsets of lines, line-shaped roughness and warp of single scans are in it.
 
     Args:
         exported: names of the process effects in the model that the loop hands to design: whatever it says
             about them, they are used as causes.
     """
-    span = {*scan_terms(result), *_IN_THE_NOISE}
+    span = _span()
     added = [effect for effect in result.effects if effect.name not in span]
     named = []
     for effect in added:
@@ -96,6 +94,10 @@ def judge(
         )
         for one in planted
     ]
+
+
+def _span() -> set[str]:
+    return {name for name, effect in CATALOGUE.items() if effect.per_scan}
 
 
 def _structured(result: CloseLoop) -> bool:

@@ -122,6 +122,7 @@ def trial_table(scoreboard: Scoreboard) -> pd.DataFrame:
                     "floor_rmse_nm": errors.floor.rmse_nm if errors else float("nan"),
                     "loop_s": trial.cost.loop_s if trial.cost else float("nan"),
                     "cpu_s": trial.cost.cpu_s if trial.cost else float("nan"),
+                    "dataset_cpu_s": (trial.cost and trial.cost.dataset_cpu_s) or float("nan"),
                     "loop_says": outcome.loop_says,
                     "failure": trial.failure,
                 }

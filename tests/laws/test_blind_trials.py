@@ -343,8 +343,10 @@ def test_absorbed_is_right_for_what_a_refit_takes_up_only():
 
 
 def test_what_is_seen_without_a_model_or_handed_to_design_is_named_too():
-    found = loop_result(quantisation="explained", line_roughness="explained")
-    # The default noise is line-shaped.
+    found = loop_result(
+        quantisation="explained", line_roughness="explained", registration_residual="explained"
+    )
+    # The default noise is line-shaped, and a scan may be bent.
     assert [one.names for one in named_outside_span(found)] == [["quantisation"]]
     assert judge("empty", [], found)[0].judgement == "false-positive"
     assert judge("in-form", [planted_effect("quantisation")], found)[0].judgement == "right"
