@@ -82,6 +82,22 @@ class FieldJob:
         code = {name: [operation.version, operation.code_sha256] for name, operation in OPERATIONS.items()}
         return record_sha256([*plan, files, code])
 
+    def layout(self) -> np.ndarray | None:
+        """Levels of its layout; None if there is none that can be read."""
+        if self.field.layout is None or self.layout_name is None:
+            return None
+        try:
+            done = OPERATIONS["read-layout"].run(
+                {"levels": self.card.layout.levels}, {self.layout_name: self.field.layout}, {}
+            )
+        except InputError:
+            return None
+        return done.arrays["mask_level"]
+
+    def read(self) -> Done:
+        """The scan as it was read; InputError if that fails."""
+        return OPERATIONS["read-scan"].run(self._read_params, {self.scan_name: self.field.scan}, {})
+
     def run(self) -> Piece:
         """The finished scan; InputError if its files do not allow it."""
         steps = list(self._steps())
@@ -113,11 +129,13 @@ class FieldJob:
             done = OPERATIONS["read-layout"].run({"levels": self.card.layout.levels}, file, {})
             layout = done.arrays
             yield done
-        read = OPERATIONS["read-scan"].run(self._read_params, {self.scan_name: self.field.scan}, {})
+        read = self.read()
         yield read
         pitch = {"scan_pitch_um": read.facts["pitch_um"]}
         pitches = {**pitch, "layout_pitch_um": self.card.layout.pitch_um}
         register_params = {**pitches, "model": self.card.process.registration, "seed": self.seed}
+        if read.facts["fast_axis"] == "y":
+            register_params["fast_axis"] = "y"  # otherwise the lines are rows
 
         level_inputs = dict(read.arrays)
         if any(step["op"] == "layout-aware" for step in self.recipe["step"]):

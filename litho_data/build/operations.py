@@ -18,6 +18,7 @@ from litho_data.foundation.errors import InputError
 if TYPE_CHECKING:
     from litho_data.register import Registration
 
+UNREGISTERED = "registration failed"
 # Beyond it, the message of a failed registration asks whether rows are missing.
 _OBLONG = 0.01
 
@@ -102,11 +103,14 @@ def _register(
         pitch_y_um, pitch_x_um = params["scan_pitch_um"]
         oblong = abs(pitch_y_um / pitch_x_um - 1) > _OBLONG
         pixels = f"pixels of {pitch_y_um:.4g} × {pitch_x_um:.4g} µm (y × x): are rows missing?"
-        raise InputError(f"registration failed: {found.quality.reason}", hint=pixels if oblong else "")
-    if found.bend_um is None:
-        return {"scan_to_layout": found.scan_to_layout}, asdict(found.quality)
-    arrays_found = {"scan_to_layout": found.scan_to_layout, "bend_um": found.bend_um.amount}
-    return arrays_found, asdict(found.quality) | found.bend_um.figures
+        raise InputError(f"{UNREGISTERED}: {found.quality.reason}", hint=pixels if oblong else "")
+    arrays_found, figures = {"scan_to_layout": found.scan_to_layout}, asdict(found.quality)
+    if found.bend_um is not None:
+        arrays_found["bend_um"] = found.bend_um.amount
+        figures |= found.bend_um.figures
+    if found.defects is not None:
+        arrays_found["defect"] = found.defects
+    return arrays_found, figures
 
 
 def _registration(height_um: np.ndarray, layout_level: np.ndarray, params: Mapping[str, Any]) -> Registration:
@@ -118,6 +122,7 @@ def _registration(height_um: np.ndarray, layout_level: np.ndarray, params: Mappi
         scan_pitch_um=tuple(params["scan_pitch_um"]),
         layout_pitch_um=params["layout_pitch_um"],
         model=params["model"],
+        fast_axis=params.get("fast_axis"),
         seed=params["seed"],
     )
 
@@ -137,6 +142,9 @@ def _resample(
         layout_pitch_um=params["layout_pitch_um"],
         bend_um=Bend.of_scan(arrays["bend_um"], levelled.shape, pitch_um) if bent else None,
     )
+    if "defect" in arrays:
+        valid &= ~arrays["defect"]
+        height = np.where(valid, height, np.float32(np.nan))
     return {"height_um": height, "valid": valid}, {}
 
 

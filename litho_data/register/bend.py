@@ -7,15 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 
 _ITERATIONS = 30
+_QUADRATIC_TERMS = 3
+CREEP_DEGREE = 6
 # Of the half width of the scan: far below a thousandth of a pixel.
 _SETTLED = 1e-9
 
 
 @dataclass(frozen=True)
 class Bend:
-    """Displacement of the points of a scan, quadratic in u and v, which run from -1 to 1 over the frame.
+    """Displacement of the points of a scan, a polynomial of u and v, which run from -1 to 1 over the frame.
 
-    ``amount`` is (2, 3): along x and y, for u² - 1/3, uv and v² - 1/3. These terms are centred: over the
+    ``amount`` is (2, 3): along x and y, for u² - 1/3, uv and v² - 1/3; or (2, 11) for a scanner that creeps,
+    with the Legendre polynomials P₃(u), P₃(v), P₄(u), … P₆(v) behind. These terms are centred: over the
     frame the best affine part of a bend is zero. ``middle`` and ``half`` are the frame's centre and half its
     size (x, y), in the unit of ``amount``; u = (x - middle) / half.
     """
@@ -39,7 +42,7 @@ class Bend:
         ``bend_x_by_xx_um`` is the displacement along x per u² - 1/3, and so on.
         """
         names = [f"bend_{axis}_by_{term}_um" for axis in "xy" for term in ("xx", "xy", "yy")]
-        values = (float(value) for value in self.amount.ravel())
+        values = (float(value) for value in self.amount[:, :3].ravel())
         return {"bend_um": self.largest, **dict(zip(names, values, strict=True))}
 
     @classmethod
@@ -59,8 +62,7 @@ class Bend:
 
     def shift(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distance (along x, along y) of points of the scan from their nominal position."""
-        u, v = self._unit(x, y)
-        terms = (u * u - 1 / 3, u * v, v * v - 1 / 3)
+        terms = _terms(*self.unit(x, y), self._degree)
         along_x, along_y = (sum(a * term for a, term in zip(row, terms, strict=True)) for row in self.amount)
         return along_x, along_y
 
@@ -100,8 +102,8 @@ class Bend:
     @property
     def slope(self) -> float:
         """The largest local stretch or rotation of the bend, as a fraction; from 1 on it may fold."""
-        # The gradient is linear in u and v, its norm convex: it is largest in a corner.
-        gradient = np.array(self._gradient(*self._grid(2)))
+        # Linear in u and v the gradient of a quadratic bend is largest in a corner; that of creep at an end.
+        gradient = np.array(self._gradient(*self._grid(2 if self._degree == 2 else 33)))
         return float(np.linalg.norm(np.moveaxis(gradient, (0, 1), (-2, -1)), ord=2, axis=(-2, -1)).max())
 
     def _grid(self, count: int) -> np.ndarray:
@@ -109,31 +111,59 @@ class Bend:
         u, v = (one.ravel() for one in np.meshgrid(unit, unit))
         return self.middle[:, None] + self.half[:, None] * np.stack([u, v])
 
-    def _unit(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    @property
+    def kind(self) -> str:
+        """``quadratic`` or ``creep``."""
+        return "quadratic" if self._degree == 2 else "creep"
+
+    @property
+    def _degree(self) -> int:
+        return 2 if self.amount.shape[1] == _QUADRATIC_TERMS else CREEP_DEGREE
+
+    def unit(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """(u, v) of points."""
         return (x - self.middle[0]) / self.half[0], (y - self.middle[1]) / self.half[1]
 
     def _gradient(self, x: np.ndarray, y: np.ndarray) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
         """d(shift x)/dx, d(shift x)/dy; d(shift y)/dx, d(shift y)/dy."""
-        u, v = self._unit(x, y)
+        u, v = self.unit(x, y)
+        by_u = [2 * u, v, np.zeros_like(v)]
+        by_v = [np.zeros_like(u), u, 2 * v]
+        for k in range(3, self._degree + 1):
+            slope = np.polynomial.legendre.Legendre.basis(k).deriv()
+            by_u += [slope(u), np.zeros_like(v)]
+            by_v += [np.zeros_like(u), slope(v)]
         return tuple(
-            ((2 * a * u + b * v) / self.half[0], (b * u + 2 * c * v) / self.half[1])
-            for a, b, c in self.amount
+            (
+                sum(a * term for a, term in zip(row, by_u, strict=True)) / self.half[0],
+                sum(a * term for a, term in zip(row, by_v, strict=True)) / self.half[1],
+            )
+            for row in self.amount
         )
 
 
+def _terms(u: np.ndarray, v: np.ndarray, degree: int) -> list[np.ndarray]:
+    terms = [u * u - 1 / 3, u * v, v * v - 1 / 3]
+    for k in range(3, degree + 1):
+        polynomial = np.polynomial.legendre.Legendre.basis(k)
+        terms += [polynomial(u), polynomial(v)]
+    return terms
+
+
 def fit_bent_affine(
-    points: np.ndarray, images: np.ndarray, middle: np.ndarray, half: np.ndarray
+    points: np.ndarray, images: np.ndarray, middle: np.ndarray, half: np.ndarray, degree: int = 2
 ) -> tuple[np.ndarray, Bend]:
     """The affine (3×3) and the bend that take points (n, 2) to their images, by least squares.
 
-    ``images`` ≈ affine(``points`` + bend(``points``)); ``middle`` and ``half`` are those of the bend's frame.
+    ``images`` ≈ affine(``points`` + bend(``points``)); ``middle`` and ``half`` are those of the bend's frame,
+    ``degree`` is 2, or 6 for creep.
 
     Raises:
         numpy.linalg.LinAlgError: points that do not determine six coefficients per axis (too few, or all on
             one conic, as on a line), or images on a line.
     """
     u, v = ((points - middle) / half).T
-    basis = np.stack([np.ones_like(u), u, v, u * u - 1 / 3, u * v, v * v - 1 / 3], axis=1)
+    basis = np.stack([np.ones_like(u), u, v, *_terms(u, v, degree)], axis=1)
     coefficients, _, rank, _ = np.linalg.lstsq(basis, images, rcond=None)
     if rank < basis.shape[1]:
         raise np.linalg.LinAlgError(f"{len(points)} points do not determine an affine and a bend")

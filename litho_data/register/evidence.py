@@ -14,6 +14,8 @@ WINDOW_CELLS = 4
 WINDOW_SEARCH_PX = 6
 MIN_MEASURED = 0.9
 BOOTSTRAP_SAMPLES = 200
+# The mean shifts of blocks differ by this much on straight scans, and by up to 4 standard errors.
+SMALLEST_CURVE_PX, CLEAR_CURVE_SIGMA = 0.2, 5.0
 
 
 @dataclass(frozen=True)
@@ -33,18 +35,31 @@ class BlockShifts:
         lengths = np.hypot(*self.held_out_px.T)
         return [float(np.percentile(lengths, p)) if len(lengths) else float("nan") for p in percents]
 
-    def curve_px(self, axis: int) -> float:
-        """Peak to valley of the mean shift along an axis (0 = x, 1 = y) as a function of that coordinate.
+    def curve_px(self, axis: int, along: int) -> float:
+        """Peak to valley of the mean shift along ``axis`` (0 = x, 1 = y) as a function of ``along``.
 
         A straight scanner and a sufficient model leave only noise. A curve means that the scanner's axis is
-        not linear, which no rung of the ladder can follow.
+        not linear, or that it creeps, which no rung of the ladder can follow.
         """
-        places = np.unique(self.middle_px[:, axis])
-        if len(places) < 3:
-            return float("nan")
-        return float(
-            np.ptp([self.shift_px[self.middle_px[:, axis] == place, axis].mean() for place in places])
-        )
+        means = [shifts.mean() for shifts in self._by_place(axis, along)]
+        return float(np.ptp(means)) if len(means) >= 3 else float("nan")
+
+    def bends_along(self, along: int) -> bool:
+        """Whether a curve along this axis is large, and beyond the scatter of the blocks of one place."""
+        for axis in (0, 1):
+            groups = self._by_place(axis, along)
+            if len(groups) < 3 or min(len(group) for group in groups) < 3:
+                continue
+            means = np.array([group.mean() for group in groups])
+            errors = np.array([group.std(ddof=1) / len(group) ** 0.5 for group in groups])
+            sigmas = np.sqrt((((means - means.mean()) / np.maximum(errors, 1e-6)) ** 2).mean())
+            if np.ptp(means) > SMALLEST_CURVE_PX and sigmas > CLEAR_CURVE_SIGMA:
+                return True
+        return False
+
+    def _by_place(self, axis: int, along: int) -> list[np.ndarray]:
+        places = self.middle_px[:, along]
+        return [self.shift_px[places == place, axis] for place in np.unique(places)]
 
 
 def match_blocks_of_field(

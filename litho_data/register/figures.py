@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from litho_data.register.coarse import CoarseFit
-from litho_data.register.evidence import bootstrap_corner_sd_px, match_blocks_of_field
+from litho_data.register.evidence import BlockShifts, bootstrap_corner_sd_px, match_blocks_of_field
 from litho_data.register.geometry import centre, linear_part, overlap_of
 from litho_data.register.orientation import rival_alignment, rival_orientation
 from litho_data.register.pyramid import FineFit
@@ -18,7 +18,7 @@ def figures_of_fit(coarse: CoarseFit, fine: FineFit, pitch_um: float) -> dict[st
     """How the warp was found, and how well it explains the matches and the heights."""
     points, warp, bend = coarse.points, fine.refinement.layout_to_scan, fine.refinement.bend
     figures: dict[str, Any] = {
-        "model": fine.refinement.model if bend is None else "quadratic",
+        "model": fine.refinement.model if bend is None else bend.kind,
         "method": coarse.method,
         "dihedral": coarse.orientation,
         "polarity": coarse.polarity,
@@ -52,8 +52,8 @@ def figures_of_warp(
     }
 
 
-def figures_of_evidence(fine: FineFit, pitch_um: float, seed: int) -> dict[str, Any]:
-    """How well the warp is known: held-out blocks, bootstrap, other candidates."""
+def figures_of_evidence(fine: FineFit, pitch_um: float, seed: int) -> tuple[dict[str, Any], BlockShifts]:
+    """How well the warp is known: held-out blocks, bootstrap, other candidates; and the blocks."""
     warp, shape = fine.refinement.layout_to_scan, _shape(fine.topography)
     background = np.einsum("k,kyx->yx", fine.refinement.background, quadratic_basis(shape))
     aligned = fine.refinement.warped - background
@@ -63,19 +63,22 @@ def figures_of_evidence(fine: FineFit, pitch_um: float, seed: int) -> dict[str, 
     median, p95 = blocks.held_out_error_percentiles_px(50, 95)
     corner_sd = bootstrap_corner_sd_px(fine.refinement, shape, seed)
     nm_per_px = pitch_um * 1e3
-    return {
+    figures = {
         "tre_windows": len(blocks.shift_px),
         "tre_median_px": median,
         "tre_p95_px": p95,
         "tre_median_nm": median * nm_per_px,
         "tre_p95_nm": p95 * nm_per_px,
-        "curve_x_px": blocks.curve_px(axis=0),
-        "curve_y_px": blocks.curve_px(axis=1),
+        "curve_x_px": blocks.curve_px(axis=0, along=0),
+        "curve_y_px": blocks.curve_px(axis=1, along=1),
+        "curve_x_by_y_px": blocks.curve_px(axis=0, along=1),
+        "curve_y_by_x_px": blocks.curve_px(axis=1, along=0),
         "corner_sd_px": corner_sd,
         "corner_sd_nm": corner_sd * nm_per_px,
         "second_alignment": rival_alignment(registered, fine.topography),
         "second_orientation": rival_orientation(registered, fine.topography),
     }
+    return figures, blocks
 
 
 def _shape(image: np.ndarray) -> tuple[int, int]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from litho_data.register.bend import Bend
+from litho_data.scan import Axis
 
 # name: (transpose, then flip rows, then flip columns); the operation that brings the scan onto the layout.
 ORIENTATIONS: dict[str, tuple[bool, bool, bool]] = {
@@ -50,6 +51,15 @@ def orientation_matrix(orientation: str, shape: tuple[int, int]) -> np.ndarray:
     if flip_x:
         matrix = np.array([[-1.0, 0, nx - 1], [0, 1, 0], [0, 0, 1]]) @ matrix
     return matrix
+
+
+def slow_axis(orientation: str, fast_axis: Axis | None) -> int:
+    """The axis (0 = x, 1 = y) of an oriented scan along which its lines follow each other.
+
+    Lines run along the ``fast_axis`` of the scan as it was read; x if unknown.
+    """
+    transposed = ORIENTATIONS[orientation][0]
+    return int((fast_axis == "y") == transposed)
 
 
 def nearest_orientation(linear: np.ndarray) -> str:

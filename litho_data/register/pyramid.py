@@ -9,7 +9,7 @@ import numpy as np
 from litho_data.register.bend import Bend
 from litho_data.register.flows import LADDER, Model
 from litho_data.register.geometry import apply_transform, corners, linear_part, warped_grid
-from litho_data.register.refine import Refinement, refine
+from litho_data.register.refine import TOLERANCE_PX, Refinement, refine
 from litho_data.register.topography import (
     fill_gaps,
     pearson,
@@ -34,7 +34,14 @@ class FineFit:
     blur_px: float
 
 
-def refine_pyramid(scan: np.ndarray, layout_level: np.ndarray, start: np.ndarray, model: Model) -> FineFit:
+def refine_pyramid(
+    scan: np.ndarray,
+    layout_level: np.ndarray,
+    start: np.ndarray,
+    model: Model,
+    *,
+    tolerance_px: float = TOLERANCE_PX,
+) -> FineFit:
     """Refine a coarse warp at a quarter, half and full resolution.
 
     Args:
@@ -42,16 +49,17 @@ def refine_pyramid(scan: np.ndarray, layout_level: np.ndarray, start: np.ndarray
         layout_level: (ny, nx) integer levels.
         start: 3×3 index matrix, layout to scan.
         model: rung of the ladder; the reduced levels use at most an affine.
+        tolerance_px: of the last level.
 
     If the last level does not converge the coarse warp stays, marked as not converged.
     """
     low_model: Model = "affine" if model == "homography" else model
     coarse = project_to_model(start, low_model, (layout_level.shape[0], layout_level.shape[1]))
     matrix, _ = _from_coarse_to_fine(scan, layout_level, coarse, low_model, None)
-    smooth_scan = _smooth(scan, SCAN_BLUR_PX)
+    smooth_scan = smoothed(scan, SCAN_BLUR_PX)
     blur_px = match_blur(smooth_scan, layout_level, matrix)
     topography = predicted_topography(layout_level, blur_px)
-    refinement = refine(smooth_scan, topography, matrix, model)
+    refinement = refine(smooth_scan, topography, matrix, model, tolerance_px=tolerance_px)
     if not refinement.converged:
         refinement = refine(smooth_scan, topography, coarse, model, max_iterations=0)
     return FineFit(refinement, smooth_scan, topography, blur_px)
@@ -103,7 +111,7 @@ def _from_coarse_to_fine(
         if min(*layout_level.shape, *scan.shape) < factor * SMALLEST_LEVEL_PX:
             continue
         # The extra blur widens the basin of convergence to the few pixels by which a coarse fit may be off.
-        small_scan = _smooth(scan, factor)[::factor, ::factor]
+        small_scan = smoothed(scan, factor)[::factor, ::factor]
         small_topography = predicted_topography(layout_level, 1.5 * factor)[::factor, ::factor]
         scale = np.diag([1.0 / factor, 1.0 / factor, 1.0])
         found = refine(
@@ -170,6 +178,6 @@ def _about(linear: np.ndarray, point: np.ndarray, image: np.ndarray) -> np.ndarr
     return matrix
 
 
-def _smooth(scan: np.ndarray, sigma_px: float) -> np.ndarray:
+def smoothed(scan: np.ndarray, sigma_px: float) -> np.ndarray:
     """Smoothed where measured: what fills a gap comes from its surroundings and is no evidence."""
     return np.where(np.isfinite(scan), smooth_measured(scan, sigma_px), np.nan)

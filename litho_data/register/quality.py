@@ -30,6 +30,7 @@ class RegistrationQuality:
     reprojection_nm: float
     coverage: float
     overlap: float
+    defect_share: float
     ncc_before: float
     ncc_after: float
     mutual_information_before_bit: float
@@ -43,6 +44,8 @@ class RegistrationQuality:
     tre_p95_nm: float
     curve_x_px: float
     curve_y_px: float
+    curve_x_by_y_px: float
+    curve_y_by_x_px: float
     corner_sd_px: float
     corner_sd_nm: float
     singular_max: float
@@ -124,7 +127,13 @@ def judge(
     warnings = []
     if bend_um is not None:
         size = f"{bend_um.largest:.2f} µm"
-        warnings.append(f"scan bent by up to {size}: registered with a quadratic distortion")
+        how = "registered with a quadratic distortion"
+        if bend_um.kind == "creep":
+            how = "its lines creep along the slow axis, and are put back"
+        warnings.append(f"scan bent by up to {size}: {how}")
+    if figures["defect_share"] > 0:
+        share = figures["defect_share"]
+        warnings.append(f"{share:.1%} of the field shows something else than the print and is left out")
     low, high = thresholds.singular_warning_range
     if not low <= smallest <= largest <= high:
         warnings.append(f"scale {smallest:.3f} to {largest:.3f}; is the pitch right?")

@@ -8,12 +8,14 @@ from typing import Literal
 import numpy as np
 
 from litho_data.foundation.errors import InputError
-from litho_data.register.bend import Bend, fit_bent_affine
+from litho_data.register.bend import CREEP_DEGREE, Bend, fit_bent_affine
 from litho_data.register.coarse import SEARCH_BLUR_PX, CoarseFit, find_coarse
-from litho_data.register.evidence import height_correlation, mutual_information_bit
+from litho_data.register.creep import refine_with_creep
+from litho_data.register.defects import refine_around_defects, without_defects
+from litho_data.register.evidence import BlockShifts, height_correlation, mutual_information_bit
 from litho_data.register.figures import figures_of_evidence, figures_of_fit, figures_of_warp
 from litho_data.register.flows import Model
-from litho_data.register.geometry import apply_transform, index_to_um, orient, orientation_matrix
+from litho_data.register.geometry import apply_transform, index_to_um, orient, orientation_matrix, slow_axis
 from litho_data.register.ladder import climb
 from litho_data.register.orientation import rival_alignment
 from litho_data.register.pyramid import FineFit, refine_bent, refine_pyramid
@@ -21,7 +23,7 @@ from litho_data.register.quality import RegistrationQuality, Thresholds, judge, 
 from litho_data.register.refine import Refinement
 from litho_data.register.resample import Resampler, noise_variance_factor, resample_to_layout
 from litho_data.register.topography import predicted_topography, remove_bow
-from litho_data.scan import Scan
+from litho_data.scan import Axis, Scan
 
 MIN_SIZE_PX = 32
 # A picometre: below any instrument, above rounding.
@@ -42,11 +44,15 @@ class Registration:
 
     ``bend_um`` is set if the scanner has bent the scan: the true position of a point (x_um, y_um) is then
     ``bend_um.straighten``, and ``scan_to_layout``, the affine closest to the whole map, acts on that.
+
+    ``defects`` (ny, nx) bool, on the layout's pixels, is where the scan shows something else than the print
+    (dust, collapsed or lifted parts); None if that is nowhere.
     """
 
     scan_to_layout: np.ndarray
     quality: RegistrationQuality
     bend_um: Bend | None = None
+    defects: np.ndarray | None = None
 
 
 def register_scan(
@@ -58,6 +64,7 @@ def register_scan(
     model: Model | Literal["ladder"] = "affine",
     orientation: Literal["search", "identity"] = "search",
     thresholds: Thresholds | None = None,
+    fast_axis: Axis | None = None,
     seed: int = 0,
 ) -> Registration:
     """Find the warp from a scan to its layout, and say how far it can be trusted.
@@ -70,6 +77,7 @@ def register_scan(
         model: a rung of the ladder, or ``ladder`` to let held-out blocks choose it.
         orientation: ``search`` tries eight orientations and both polarities, ``identity`` upright only.
         thresholds: limits of a pass.
+        fast_axis: of plain heights, along which the tip moved fast; ``x`` if unknown.
         seed: of the robust estimator and the bootstrap.
 
     Raises:
@@ -77,7 +85,7 @@ def register_scan(
             positive. A fit that fails does not raise: ``quality.passed`` and ``quality.reason`` tell.
     """
     if isinstance(scan, Scan):
-        scan_pitch_um, scan = scan.require_pitch(), scan.height_um
+        scan_pitch_um, fast_axis, scan = scan.require_pitch(), scan.fast_axis or fast_axis, scan.height_um
     if scan_pitch_um is None:
         raise InputError("registration of plain heights", got="no scan_pitch_um", wanted="(y, x) in µm")
     height = np.asarray(scan, dtype=np.float64)
@@ -86,7 +94,7 @@ def register_scan(
     centred = centred_placement(height.shape, scan_pitch_um, layout.shape, layout_pitch_um)
     if not np.isfinite(height).any():
         return Registration(centred, unregistered_quality("no measured pixel in the scan"))
-    flat = remove_bow(_at_layout_pitch(height, scan_pitch_um, layout_pitch_um))
+    flat = remove_bow(at_layout_pitch(height, scan_pitch_um, layout_pitch_um))
     has_structure = layout.min() < layout.max() and np.nanstd(flat) > SMALLEST_STRUCTURE_UM
     limits = thresholds or Thresholds()
     smooth_layout = predicted_topography(layout, SEARCH_BLUR_PX)
@@ -103,16 +111,27 @@ def register_scan(
         return Registration(centred, unregistered_quality(why))
 
     oriented = coarse.polarity * orient(flat, coarse.orientation)
-    fine = refine_pyramid(
-        oriented, layout, coarse.layout_to_oriented, "affine" if model == "ladder" else model
-    )
+    start, rung = coarse.layout_to_oriented, "affine" if model == "ladder" else model
+    fine = refine_pyramid(oriented, layout, start, rung)
+    fine, defects = refine_around_defects(fine, oriented, layout, start, rung)
+    if defects is not None:
+        oriented = without_defects(oriented, defects, fine.refinement.layout_to_scan)
     if model == "ladder":
         fine = climb(fine)
-    case = _Case(height, layout, scan_pitch_um, layout_pitch_um, centred, layout_repeats, limits, seed)
-    straight = case.registration(coarse, fine)
-    if straight.quality.passed or model not in BENDABLE or not features:
+    case = _Case(
+        height, layout, scan_pitch_um, layout_pitch_um, centred, layout_repeats, limits, seed, defects
+    )
+    straight, blocks = case.registration(coarse, fine)
+    if model not in BENDABLE or not features:
         return straight
-    bent = case.registration(coarse, refine_bent(oriented, layout, fine))
+    slow = slow_axis(coarse.orientation, fast_axis)
+    if blocks.bends_along(slow) and (crept := refine_with_creep(oriented, layout, fine, slow)):
+        found, _ = case.registration(coarse, crept)
+        if found.quality.passed:
+            return found
+    if straight.quality.passed:
+        return straight
+    bent, _ = case.registration(coarse, refine_bent(oriented, layout, fine))
     return bent if _explains(bent.quality, straight.quality) else straight
 
 
@@ -133,21 +152,26 @@ class _Case:
     layout_repeats: float
     limits: Thresholds
     seed: int
+    defects: np.ndarray | None
 
-    def registration(self, coarse: CoarseFit, fine: FineFit) -> Registration:
-        """The fit in µm of both frames, with its figures and the verdict."""
+    def registration(self, coarse: CoarseFit, fine: FineFit) -> tuple[Registration, BlockShifts]:
+        """The fit in µm of both frames, with its figures and the verdict; and the shifts of its blocks."""
         height, layout, pitch_um = self.height_um, self.layout, self.layout_pitch_um
         layout_to_scan, bend_um = self._in_um(coarse, fine.refinement)
         scan_to_layout = _rounded(np.linalg.inv(layout_to_scan))
         resampler = Resampler(height, scan_pitch_um=self.scan_pitch_um, layout_pitch_um=pitch_um)
         before, _ = resampler.at(self.centred, _shape(layout))
         after, _ = resampler.at(scan_to_layout, _shape(layout), bend_um)
+        if self.defects is not None:
+            after = np.where(self.defects, np.nan, after)
+        evidence, blocks = figures_of_evidence(fine, pitch_um, self.seed)
         figures = {
             **figures_of_fit(coarse, fine, pitch_um),
             **figures_of_warp(layout_to_scan, _shape(layout), pitch_um),
-            **figures_of_evidence(fine, pitch_um, self.seed),
+            **evidence,
             "layout_repeats": self.layout_repeats,
             "overlap": float(np.isfinite(after).mean()),
+            "defect_share": 0.0 if self.defects is None else float(self.defects.mean()),
             "ncc_before": height_correlation(before, layout),
             "ncc_after": height_correlation(after, layout),
             "mutual_information_before_bit": mutual_information_bit(before, layout),
@@ -156,7 +180,7 @@ class _Case:
         }
         passed, reason, warning = judge(figures, self.limits, fine.blur_px, bend_um)
         quality = RegistrationQuality(passed=passed, reason=reason, warning=warning, **figures)
-        return Registration(scan_to_layout, quality, bend_um)
+        return Registration(scan_to_layout, quality, bend_um, self.defects), blocks
 
     def _in_um(self, coarse: CoarseFit, found: Refinement) -> tuple[np.ndarray, Bend | None]:
         """The layout's µm to the (straightened) scan's, and the bend in the scan's own frame."""
@@ -168,13 +192,14 @@ class _Case:
         if found.bend is None:
             to_scan = np.linalg.inv(to_oriented)
             return frame @ to_scan @ found.layout_to_scan @ np.linalg.inv(frame), None
-        # A rotated polynomial of second degree is again one: points and their images determine it.
+        # Turned by 90° a bend is again one: points and their images determine it.
         u, v = (one.ravel() for one in np.meshgrid(*[np.linspace(0, 1, 9)] * 2))
         points_um = np.stack([u, v], axis=1) * size_um
         oriented = apply_transform(to_oriented @ np.linalg.inv(frame), points_um)
         to_layout = frame @ np.linalg.inv(found.layout_to_scan)
         images_um = apply_transform(to_layout, found.bend.straighten(oriented))
-        scan_to_layout, bend_um = fit_bent_affine(points_um, images_um, size_um / 2, size_um / 2)
+        degree = 2 if found.bend.kind == "quadratic" else CREEP_DEGREE
+        scan_to_layout, bend_um = fit_bent_affine(points_um, images_um, size_um / 2, size_um / 2, degree)
         # Rounded like the matrix: no digits below physical meaning.
         bend_um = replace(bend_um, amount=np.round(bend_um.amount, 6) + 0.0)
         return np.linalg.inv(scan_to_layout), bend_um
@@ -204,7 +229,7 @@ def _check(
         raise InputError("pitch", got=(scan_pitch_um, layout_pitch_um), wanted="positive numbers in µm")
 
 
-def _at_layout_pitch(
+def at_layout_pitch(
     height: np.ndarray, scan_pitch_um: tuple[float, float], layout_pitch_um: float
 ) -> np.ndarray:
     """A copy for comparison; the heights that are kept are resampled once, from the original."""

@@ -63,7 +63,10 @@ SCAN_VARIABLES = (
         "layout_in_scan", ("y", "x"), "float32", "1", "layout level under each scan pixel; only where needed"
     ),
     Variable("bend_um", ("axis", "term"), "float64", "um",
-             "displacement along x, y per u² - 1/3, uv, v² - 1/3 of the scan frame; only of a bent scan"),
+             "displacement along x, y per u² - 1/3, uv, v² - 1/3 (and, if it creeps, P3(u), P3(v), … P6(v)) "
+             "of the scan frame; only of a bent scan"),
+    Variable("defect", ("layout_y", "layout_x"), "bool", "1",
+             "shows something else than the print, layout grid; not valid there; only where there is any"),
     Variable("vendor_mask", ("y", "x"), "bool", "1", "mask kept in the raw file; only where there is one"),
 )  # fmt: skip
 VARIABLES = {variable.name: variable for variable in (*SAMPLE_VARIABLES, *SCAN_VARIABLES)}

@@ -153,6 +153,7 @@ def test_a_bend_that_may_fold_the_scan_is_refused():
     figures = {
         **{"ecc": 0.95, "second_orientation": 0.3, "layout_repeats": 0.2, "second_alignment": 0.3},
         **{"singular_min": 1.0, "singular_max": 1.0, "overlap": 1.0, "tre_median_px": 0.3},
+        "defect_share": 0.0,
         **{"corner_sd_px": 0.2, "dihedral": "identity", "polarity": 1, "method": "orb", "converged": True},
     }
     # d(shift)/dx is 2 a u / half: at u = 1 it reaches 1 for a = half / 2.

@@ -11,7 +11,14 @@ from litho_data.register.quality import Thresholds, judge
 
 GOOD = {
     **{"ecc": 0.95, "second_orientation": 0.3, "layout_repeats": 0.2, "second_alignment": 0.3},
-    **{"singular_min": 1.0, "singular_max": 1.0, "overlap": 1.0, "tre_median_px": 0.3, "corner_sd_px": 0.2},
+    **{
+        "singular_min": 1.0,
+        "singular_max": 1.0,
+        "overlap": 1.0,
+        "defect_share": 0.0,
+        "tre_median_px": 0.3,
+        "corner_sd_px": 0.2,
+    },
     **{"dihedral": "identity", "polarity": 1, "method": "orb", "converged": True},
 }
 

@@ -1,0 +1,152 @@
+"""Where a scan shows something else than the print: dust, collapsed or missing parts, lifted film.
+
+Such an area pulls a least-squares warp by pixels. Its heights differ from what the layout predicts by many
+times the usual misfit over a connected area, whatever the response of the printer is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from litho_data.register.flows import Model
+from litho_data.register.geometry import apply_transform, corners, overlap_of, warped_grid
+from litho_data.register.pyramid import FineFit, refine_pyramid
+from litho_data.register.refine import BORDER_PX
+from litho_data.register.topography import fill_gaps, quadratic_basis
+
+# Misfit in units of its robust standard deviation. An area is suspected from the first on, followed down to
+# the second, and is a defect if it reaches the third once the warp is fitted without it. What a printer does
+# that is no Gaussian blur stays below that: 13.5 on the measured prints.
+SUSPECT_SIGMA, EDGE_SIGMA, DEFECT_SIGMA = 8.0, 3.0, 16.0
+SMALLEST_AREA_PX = 30
+MARGIN_PX, POCKET_PX = 4, 12
+# Beyond it there is no main surface left, and the whole print is in question.
+LARGEST_SHARE = 0.45
+_KNOTS = 8
+_EVERY = 3
+_ROUNDS = 6
+_SETTLED_PX = 0.02
+# Pixels that leave and enter at the edge of a mask keep the steps above a thousandth of a pixel.
+_TOLERANCE_PX = 0.01
+# Share of the field from which a suspected area may have spoiled the fit that makes it look small.
+_WORTH_A_FIT = 0.005
+# Correlation below which a whole print may misfit; the measured ones have 0.945 and more.
+_SUSPICIOUS = 0.9
+_MAD_PER_SIGMA = 0.6745
+_TUKEY = 4.685
+_PASSES = 8
+
+
+def refine_around_defects(
+    plain: FineFit, scan: np.ndarray, layout_level: np.ndarray, start: np.ndarray, model: Model
+) -> tuple[FineFit, np.ndarray | None]:
+    """The fit of what shows the print, and the defects, bool (ny, nx) of the layout; or the plain fit.
+
+    The coarse warp is robust and starts every round: defects are found under the last warp, and the warp
+    is fitted to the rest, until its corners stay.
+
+    Args:
+        plain: ``refine_pyramid(scan, layout_level, start, model)``.
+        scan, layout_level, start, model: as there.
+    """
+    fine, defects = plain, None
+    for round in range(_ROUNDS):
+        found, largest_sigma = find_defects(plain.scan, fine)
+        if not found.any() and round == 0 and plain.refinement.correlation < _SUSPICIOUS:
+            # A large defect may have pulled the plain fit so far that all of the print misfits.
+            fine = replace(plain, refinement=replace(plain.refinement, layout_to_scan=start))
+            found, largest_sigma = find_defects(plain.scan, fine)
+        if not found.any() or (largest_sigma < DEFECT_SIGMA and found.mean() < _WORTH_A_FIT):
+            return plain, None
+        warp = fine.refinement.layout_to_scan
+        masked = without_defects(scan, found, warp)
+        fine = refine_pyramid(masked, layout_level, start, model, tolerance_px=_TOLERANCE_PX)
+        defects = found
+        if not fine.refinement.converged:
+            return plain, None
+        ends = corners((layout_level.shape[0], layout_level.shape[1]))
+        moved = apply_transform(fine.refinement.layout_to_scan, ends) - apply_transform(warp, ends)
+        if np.abs(moved).max() < _SETTLED_PX:
+            break
+    return (fine, defects) if largest_sigma >= DEFECT_SIGMA else (plain, None)
+
+
+def find_defects(scan: np.ndarray, fine: FineFit) -> tuple[np.ndarray, float]:
+    """Pixels of the layout that show something else than the print, with a margin, and their largest misfit.
+
+    The misfit is the scan on the layout's pixels minus a free function of the predicted topography
+    (piecewise linear, 8 knots) and a quadratic background, fitted with Tukey's weights. A defect is a
+    connected area of 30 pixels or more with a misfit of 3 sigma that reaches 8 sigma somewhere.
+
+    Args:
+        scan: (ny, nx) smoothed, with the defects, in the frame of the scan of ``fine``.
+        fine: the warp, perhaps fitted without some defects.
+
+    Returns:
+        bool (ny, nx) of the layout, and the misfit in units of its robust standard deviation.
+    """
+    from scipy.ndimage import binary_dilation, binary_erosion, binary_fill_holes, label, sum_labels
+
+    misfit = _misfit(scan, fine)
+    size = np.nan_to_num(np.abs(misfit) * (_MAD_PER_SIGMA / np.nanmedian(np.abs(misfit))))
+    regions, count = label(size > EDGE_SIGMA)
+    index = np.arange(1, count + 1)
+    suspect = sum_labels(size > SUSPECT_SIGMA, regions, index) > 0
+    large = sum_labels(regions > 0, regions, index) >= SMALLEST_AREA_PX
+    found = np.isin(regions, index[suspect & large])
+    if not found.any() or found.mean() > LARGEST_SHARE:
+        return np.zeros(found.shape, bool), 0.0
+    # Where a missing part happens to have the right height, it is missing all the same.
+    whole = binary_fill_holes(binary_dilation(found, iterations=MARGIN_PX + POCKET_PX))
+    return binary_erosion(whole, iterations=POCKET_PX, border_value=1), float(size[found].max())
+
+
+def without_defects(scan: np.ndarray, defects: np.ndarray, layout_to_scan: np.ndarray) -> np.ndarray:
+    """A copy of the scan (ny, nx) with NaN where it shows a defect of the layout's pixels."""
+    rows, columns = warped_grid(np.linalg.inv(layout_to_scan), (scan.shape[0], scan.shape[1]))
+    ny, nx = defects.shape
+    inside = (rows > -0.5) & (rows < ny - 0.5) & (columns > -0.5) & (columns < nx - 0.5)
+    nearest = (np.clip(np.rint(k), 0, n - 1).astype(int) for k, n in ((rows, ny), (columns, nx)))
+    return np.where(inside & defects[tuple(nearest)], np.nan, scan)
+
+
+def _misfit(scan: np.ndarray, fine: FineFit) -> np.ndarray:
+    """Scan minus what the layout explains, (ny, nx), NaN at the border and where the scan shows nothing."""
+    from scipy.ndimage import map_coordinates
+
+    topography, found = fine.topography, fine.refinement
+    shape = (topography.shape[0], topography.shape[1])
+    seen = overlap_of(found.layout_to_scan, shape, np.isfinite(scan), found.bend)
+    places = warped_grid(found.layout_to_scan, shape, found.bend)
+    warped = np.where(seen, map_coordinates(fill_gaps(scan), places, order=1, mode="nearest"), np.nan)
+    knots = np.linspace(topography.min(), topography.max(), _KNOTS)
+    design = [np.interp(topography, knots, hat) for hat in np.eye(_KNOTS)]
+    design += list(quadratic_basis(shape)[1:])
+    sparse = (slice(None, None, _EVERY),) * 2
+    seen = np.isfinite(warped[sparse])
+    columns_of = np.stack([one[sparse][seen] for one in design], axis=1)
+    coefficients = _robust(columns_of, warped[sparse][seen])
+    misfit = warped - np.einsum("k,kyx->yx", coefficients, np.stack(design))
+    inner = (slice(BORDER_PX, -BORDER_PX),) * 2
+    framed = np.full(shape, np.nan)
+    framed[inner] = misfit[inner]
+    return framed
+
+
+def _robust(design: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Coefficients under Tukey's weights, from a start under weights that fall off slowly."""
+    weights = np.ones(len(values))
+    coefficients = np.zeros(design.shape[1])
+    for step in range(_PASSES):
+        weighted = design * weights[:, None]
+        normal = weighted.T @ design + 1e-9 * len(values) * np.eye(design.shape[1])
+        coefficients = np.linalg.solve(normal, weighted.T @ values)
+        residual = np.abs(values - design @ coefficients)
+        scale = max(float(np.median(residual)) / _MAD_PER_SIGMA, 1e-12)
+        if step < _PASSES // 2:
+            weights = 1 / np.maximum(residual / scale, 1.0)
+        else:
+            weights = np.clip(1 - (residual / (_TUKEY * scale)) ** 2, 0, None) ** 2
+    return coefficients

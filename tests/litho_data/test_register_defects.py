@@ -1,0 +1,201 @@
+"""Scans that show more or less than the print, or whose lines creep: located, named, and put back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter, map_coordinates
+
+from litho_data.build.build import build_dataset
+from litho_data.provenance.replay import replay
+from litho_data.provenance.verify import verify
+from litho_data.register import Registration, apply_transform, register_scan
+from litho_data.register.bend import CREEP_DEGREE, Bend, fit_bent_affine
+from litho_data.register.geometry import index_to_um
+from litho_data.store import open_store
+from tests.litho_data.campaigns import height_of, layout_of, write_campaign, write_scan
+from tests.litho_data.register_phantoms import (
+    PITCH_UM,
+    random_layout,
+    scan_of,
+    true_scan_to_layout,
+    warp_about_centre,
+)
+
+SHAPE, SCAN_SHAPE = (384, 384), (440, 440)
+BARE_UM = 0.005
+
+
+def register(scan: np.ndarray, layout: np.ndarray, **options) -> Registration:
+    return register_scan(scan, layout, scan_pitch_um=(PITCH_UM,) * 2, layout_pitch_um=PITCH_UM, **options)
+
+
+def print_of(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    layout = random_layout(SHAPE, seed, blob_px=7.0)
+    warp = warp_about_centre(
+        SHAPE, rotation_deg=0.6, scale=(1.015, 0.99), shift_px=(3.3, -2.2), margin_px=(28.0, 28.0)
+    )
+    return layout, warp
+
+
+def rms_error_px(found: Registration, warp: np.ndarray, seen: Callable | None = None) -> float:
+    """Over the layout, 8 px from its border; ``seen`` takes true points of the scan to where they appear."""
+    truth = true_scan_to_layout(warp, "identity", SCAN_SHAPE)
+    y, x = np.meshgrid(*(np.linspace(8, n - 8, 33) for n in SHAPE), indexing="ij")
+    points_um = PITCH_UM * np.stack([x.ravel(), y.ravel()], axis=1)
+    on_scan = apply_transform(np.linalg.inv(truth), points_um)
+    at = on_scan if seen is None else seen(on_scan)
+    at = at if found.bend_um is None else found.bend_um.straighten(at)
+    error_um = apply_transform(found.scan_to_layout, at) - points_um
+    return float(np.sqrt((error_um**2).sum(axis=1).mean()) / PITCH_UM)
+
+
+def dust(scan: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    y, x = np.mgrid[: scan.shape[0], : scan.shape[1]]
+    for _ in range(8):
+        middle, radius = rng.uniform(0.08, 0.92, 2) * scan.shape, rng.uniform(5, 16)
+        cap = np.clip(1 - ((y - middle[0]) ** 2 + (x - middle[1]) ** 2) / radius**2, 0, 1) ** 0.5
+        scan = scan + rng.uniform(1, 4) * cap
+    return scan
+
+
+def missing_corner(scan: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    scan, side = scan.copy(), 28 + SCAN_SHAPE[0] // 3
+    scan[:side, :side] = BARE_UM * rng.standard_normal((side, side))
+    return scan
+
+
+def delaminated(scan: np.ndarray, rng: np.random.Generator, lift_um: float) -> np.ndarray:
+    smooth = gaussian_filter(rng.standard_normal(scan.shape), 25)
+    off = smooth > np.quantile(smooth, 0.9)
+    return np.where(off, scan + lift_um if lift_um else BARE_UM * rng.standard_normal(scan.shape), scan)
+
+
+DEFECTS = {
+    "dust of 8 particles": dust,
+    "a third of both sides missing": missing_corner,
+    "a tenth gone": lambda scan, rng: delaminated(scan, rng, 0.0),
+    "a tenth lifted": lambda scan, rng: delaminated(scan, rng, 0.6),
+}
+
+
+@pytest.mark.parametrize("name", DEFECTS)
+def test_a_defect_does_not_pull_the_warp_and_is_mapped(name: str) -> None:
+    layout, warp = print_of(seed=2)
+    clean = scan_of(layout, warp, SCAN_SHAPE, snr=10, seed=2)
+    spoiled = DEFECTS[name](clean, np.random.default_rng(9))
+    found = register(spoiled, layout)
+    assert found.quality.passed, found.quality.reason
+    # The target. A plain fit is off by 0.5 to 1.2 px.
+    assert rms_error_px(found, warp) < 0.1
+    assert found.defects is not None
+    assert "something else than the print" in found.quality.warning
+    # The map holds what was put in, up to what differs from the print by less than its misfit.
+    truth = true_scan_to_layout(warp, "identity", SCAN_SHAPE)
+    frame = index_to_um((PITCH_UM, PITCH_UM))
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    points = np.stack([x.ravel(), y.ravel()], axis=1).astype(float)
+    at = apply_transform(np.linalg.inv(frame) @ np.linalg.inv(truth) @ frame, points).T[::-1]
+    changed = map_coordinates(np.abs(spoiled - clean), at, order=1).reshape(SHAPE) > 0.3
+    inner = (slice(12, -12),) * 2
+    assert found.defects[inner][changed[inner]].mean() > 0.97
+    assert found.defects.mean() < changed.mean() + 0.12
+
+
+def test_a_clean_print_has_no_defects_and_keeps_its_warp() -> None:
+    layout, warp = print_of(seed=1)
+    found = register(scan_of(layout, warp, SCAN_SHAPE, snr=5, seed=1), layout)
+    assert (found.defects, found.bend_um, found.quality.defect_share) == (None, None, 0)
+    assert rms_error_px(found, warp) < 0.02
+
+
+def creeping(
+    layout: np.ndarray, warp: np.ndarray, creep_um: float, slow: int
+) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
+    """A scan whose scanner settles within a quarter of it, and where its true points appear (µm)."""
+    place = np.arange(SCAN_SHAPE[0])
+    settling_px = creep_um / PITCH_UM * np.exp(-4 * place / SCAN_SHAPE[0])
+    amount = (1.0, 0.4)  # along x and y
+    y, x = np.mgrid[: SCAN_SHAPE[0], : SCAN_SHAPE[1]].astype(float)
+    along = np.interp(y if slow else x, place, settling_px)
+    whole = scan_of(layout, warp, SCAN_SHAPE)
+    scan = map_coordinates(whole, (y - amount[1] * along, x - amount[0] * along), order=5)
+
+    def seen(points_um: np.ndarray) -> np.ndarray:
+        true = points_um / PITCH_UM - 0.5
+        at = true.copy()
+        for _ in range(50):
+            shift = np.interp(at[:, slow], place, settling_px)
+            at = true + np.stack([amount[0] * shift, amount[1] * shift], axis=1)
+        return (at + 0.5) * PITCH_UM
+
+    return scan + 0.1 * scan.std() * np.random.default_rng(0).standard_normal(scan.shape), seen
+
+
+@pytest.mark.parametrize(("creep_um", "slow"), [(0.5, 1), (1.5, 1), (1.0, 0)])
+def test_creep_along_the_slow_axis_is_put_back(creep_um: float, slow: int) -> None:
+    layout, warp = print_of(seed=3)
+    scan, seen = creeping(layout, warp, creep_um, slow)
+    found = register(scan, layout, fast_axis="x" if slow else "y")
+    assert found.quality.passed, found.quality.reason
+    assert found.quality.model == "creep"
+    assert "creep along the slow axis" in found.quality.warning
+    # The target; the straight warp leaves 0.8 px per µm of creep.
+    assert rms_error_px(found, warp, seen) < 0.15
+    assert found.quality.tre_median_px < 0.1
+
+
+def test_a_curve_along_the_fast_axis_is_reported_and_left() -> None:
+    layout, warp = print_of(seed=3)
+    scan, _ = creeping(layout, warp, 0.5, slow=0)
+    found = register(scan, layout, fast_axis="x")
+    assert found.bend_um is None
+    assert found.quality.curve_x_px > 0.4
+
+
+def test_creep_is_determined_by_points_and_undone() -> None:
+    """The map of degree 6 goes through its points, its inverse leads back, and its gradient is its slope."""
+    rng = np.random.default_rng(4)
+    middle, half = np.array([20.0, 15.0]), np.array([20.0, 15.0])
+    bend = Bend(0.05 * rng.standard_normal((2, 11)), middle, half)
+    points = middle + half * rng.uniform(-1, 1, (200, 2))
+    matrix = np.array([[1.01, 0.02, 3.0], [-0.01, 0.98, -2.0], [0, 0, 1]])
+    images = apply_transform(matrix, bend.straighten(points))
+    again, found = fit_bent_affine(points, images, middle, half, CREEP_DEGREE)
+    np.testing.assert_allclose(again, matrix, atol=1e-10)
+    np.testing.assert_allclose(found.amount, bend.amount, atol=1e-10)
+    back = np.stack(bend.undo(*bend.straighten(points).T), axis=1)
+    np.testing.assert_allclose(back, points, atol=1e-8)
+    assert bend.kind == "creep"
+    step = 1e-6
+    for axis in (0, 1):
+        moved = points + step * np.eye(2)[axis]
+        numeric = (np.array(bend.shift(*moved.T)) - np.array(bend.shift(*points.T))) / step
+        exact = [row[axis] for row in bend._gradient(*points.T)]
+        np.testing.assert_allclose(numeric, exact, atol=1e-6)
+
+
+def test_a_defect_is_stored_and_not_valid(tmp_path: Path) -> None:
+    shape = (224, 224)
+    card = write_campaign(tmp_path, count=1, shape=shape)
+    height_um = height_of(layout_of(0, shape), 0)
+    corner = slice(0, 70)
+    height_um[corner, corner] = 0.0
+    write_scan(tmp_path / "scans" / "P11.txt", height_um)
+    build_dataset(card, tmp_path / "prints.zarr")
+    store = open_store(tmp_path / "prints.zarr")
+    defect, scan = store.scan_frame("P11", "defect"), store.scan("P11")
+    assert defect.shape == scan.valid.shape == shape
+    # The corner begins a margin outside the field; the border of 8 px is not asked.
+    assert defect[12:55, 12:55].mean() > 0.95
+    assert not (scan.valid & defect).any()
+    assert np.isnan(scan.height_um[defect]).all()
+    assert scan.valid[90:, 90:].mean() > 0.9
+    assert store.quality["defect_share"][0] == pytest.approx(defect.mean())
+    assert verify(tmp_path / "prints.zarr").findings == ()
+    again = replay(tmp_path / "prints.zarr", ["P11"])
+    assert again["same_hash"].all()
+    assert "defect" in set(again["array"])
