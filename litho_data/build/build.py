@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from litho_data.build.assemble import Campaign, assemble, files_table, records_of_use
-from litho_data.build.jobs import Job, Skipped, attempt, field_jobs
-from litho_data.build.operations import load_recipe
+from litho_data.build.jobs import FieldJob, Job, Skipped, attempt, field_jobs
+from litho_data.build.operations import UNREGISTERED, load_recipe
 from litho_data.build.report import write_report
 from litho_data.build.result import BuildResult, LeftOut, report_folder
+from litho_data.build.right_layout import doubts, fitting_layout
 from litho_data.cards.card import Card
 from litho_data.cards.listing import Listing, list_fields
 from litho_data.foundation.commands import progress
@@ -132,10 +133,16 @@ def make_store(
                 _report_skipped(scan_id, reason)
                 del records[scan_id]
                 shutil.rmtree(partial.store / "scans" / scan_id)
+            _name_layouts(source.jobs, skipped)
             _require_enough(records, {**skipped, **source.unpaired}, strict, out)
         except InputError:
             partial.discard()
             raise
+        for scan_id, doubt in doubts(records_of_use(list(records.values())), partial.samples).items():
+            print(f"check {scan_id}: {doubt}", file=sys.stderr)
+            quality = dict(records[scan_id]["quality"])
+            quality["warning"] = "; ".join(filter(None, (quality["warning"], doubt)))
+            records[scan_id]["quality"] = quality
         kept = [records[scan_id] for scan_id in sorted(records)]
         campaign = Campaign(
             card=source.card,
@@ -173,6 +180,21 @@ def _relative(folder: Path, start: Path) -> str:
         return Path(os.path.relpath(folder, start)).as_posix()
     except ValueError:  # another drive
         return str(folder)
+
+
+def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> None:
+    """Say of scans that did not register which other layout of the set they show, if there is one."""
+    fields = {job.id: job for job in jobs if isinstance(job, FieldJob)}
+    lost = [key for key in skipped if key in fields and UNREGISTERED in skipped[key]]
+    layouts = {key: layout for key, job in fields.items() if lost and (layout := job.layout()) is not None}
+    for key in lost:
+        read = fields[key].read()
+        others = {name: layout for name, layout in layouts.items() if name != key}
+        height_um, pitch_y_x = read.arrays["raw_height_um"], read.facts["pitch_um"]
+        pitch_um = fields[key].card.layout.pitch_um
+        if fits := fitting_layout(height_um, (pitch_y_x[0], pitch_y_x[1]), others, pitch_um):
+            skipped[key] += f"; it shows the layout of {fits}"
+            print(f"check {key}: it shows the layout of {fits}", file=sys.stderr)
 
 
 def _odd_pixels(records: Mapping[str, Mapping[str, Any]], card: Card) -> dict[str, str]:

@@ -1,0 +1,130 @@
+"""Mixed-up layouts, files and doses are named at the build; a sound set is left in peace."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tifffile
+from scipy.ndimage import gaussian_filter
+
+from litho_data.build.build import build_dataset
+from litho_data.build.right_layout import doubts
+from litho_data.store import open_store
+from tests.litho_data.campaigns import MARGIN_PX, height_of, layout_of, write_campaign
+
+SHAPE = (112, 112)
+
+
+def built(card: Path) -> tuple[dict[str, str], dict[str, str]]:
+    """Warnings of the scans in the store, and reasons of those that are not, by id."""
+    result = build_dataset(card, card.parent / "prints.zarr")
+    quality = open_store(card.parent / "prints.zarr").quality
+    warnings = dict(zip(quality["scan"], quality["warning"], strict=True))
+    return warnings, {one.id: one.reason for one in result.skipped}
+
+
+def doubted(warnings: dict[str, str]) -> set[str]:
+    said = ("layout of", "unlike the other", "mirror image", "height per level")
+    return {name for name, text in warnings.items() if any(word in text for word in said)}
+
+
+DOSES = {0.8: 0.85, 0.9: 0.93, 1.0: 1.0, 1.1: 1.06}
+
+
+def doses(layouts: int, seed: int) -> dict[str, dict[str, Any]]:
+    """Every layout printed at every dose: scans P<dose><layout>, heights in proportion to the gain."""
+    prints = {}
+    for block, (dose, gain) in enumerate(DOSES.items(), start=1):
+        for field in range(1, layouts + 1):
+            level = layout_of(10 * seed + field, SHAPE)
+            whole = gain * height_of(level, 100 * seed + 10 * block + field)
+            height_um = whole[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX]
+            arrays = {"mask_level": level, "height_um": height_um.astype(np.float32)}
+            prints[f"P{block}{field}"] = {"dose": dose, **arrays}
+    return prints
+
+
+def doubts_of(prints: dict[str, dict[str, Any]]) -> dict[str, str]:
+    records = [
+        {"id": name, "print": name[1], "columns": {"dose": one["dose"]}, "quality": {"dihedral": "identity"}}
+        for name, one in prints.items()
+    ]
+    return doubts(records, lambda name: prints[name])
+
+
+def swap_heights(prints: dict[str, dict[str, Any]], one: str, other: str) -> None:
+    first, second = prints[one], prints[other]
+    first["height_um"], second["height_um"] = second["height_um"], first["height_um"]
+
+
+def swap(folder: Path, one: str, other: str) -> None:
+    paths = [folder / "scans" / f"{name}.txt" for name in (one, other)]
+    texts = [path.read_bytes() for path in paths]
+    for path, text in zip(paths, reversed(texts), strict=True):
+        path.write_bytes(text)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("layouts", [1, 3])
+def test_doses_that_were_mixed_up_are_named(layouts: int, seed: int) -> None:
+    assert doubts_of(doses(layouts, seed)) == {}
+    prints = doses(layouts, seed)
+    for field in range(1, layouts + 1):
+        swap_heights(prints, f"P2{field}", f"P3{field}")
+    said = doubts_of(prints)
+    assert set(said) == {f"P{block}{field}" for block in (2, 3) for field in range(1, layouts + 1)}
+    assert "are these two swapped" in said["P21"]
+    if layouts == 3:
+        prints = doses(layouts, seed)
+        swap_heights(prints, "P11", "P31")
+        said = doubts_of(prints)
+        assert set(said) == {"P11", "P31"}
+        assert "+" in said["P11"]
+        assert "as in 0.8" in said["P31"]
+
+
+def test_a_process_whose_height_falls_with_the_dose_is_left_in_peace() -> None:
+    prints = doses(1, 0)
+    for one, dose in zip(prints.values(), reversed(DOSES), strict=True):
+        one["dose"] = dose
+    assert doubts_of(prints) == {}
+
+
+def test_a_mirrored_layout_is_named(tmp_path: Path) -> None:
+    card = write_campaign(tmp_path, count=3)
+    path = tmp_path / "layouts" / "P12.tif"
+    tifffile.imwrite(path, np.ascontiguousarray(tifffile.imread(path)[:, ::-1]))
+    warnings, skipped = built(card)
+    assert not skipped
+    assert doubted(warnings) == {"P12"}
+    assert "mirror image" in warnings["P12"]
+
+
+def test_scans_under_wrong_ids_are_named_with_the_right_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    card = write_campaign(tmp_path, count=4)
+    swap(tmp_path, "P11", "P21")
+    warnings, skipped = built(card)
+    assert set(skipped) == {"P11", "P21"}
+    assert skipped["P11"].endswith("it shows the layout of P21")
+    assert skipped["P21"].endswith("it shows the layout of P11")
+    assert "check P11: it shows the layout of P21" in capsys.readouterr().err
+    assert not doubted(warnings)
+
+
+def test_a_scan_of_a_similar_layout_is_named(tmp_path: Path) -> None:
+    """A second version of a layout registers as well; its details do not."""
+    card = write_campaign(tmp_path, count=2)
+    first = layout_of(0, SHAPE)
+    change = gaussian_filter(np.random.default_rng(5).standard_normal(SHAPE), 3)
+    second = np.clip(first + np.round(1.2 * change / change.std()), 0, 12).astype(np.uint8)
+    tifffile.imwrite(tmp_path / "layouts" / "P12.tif", second)
+    shutil.copy(tmp_path / "scans" / "P11.txt", tmp_path / "scans" / "P12.txt")
+    warnings, _ = built(card)
+    assert doubted(warnings) == {"P12"}
+    assert "fit the layout of P11 better" in warnings["P12"]
