@@ -8,6 +8,13 @@ from litho_data.roughness.amplitude import (
     effective_samples,
     sq_uncertainty_nm,
 )
+from litho_data.roughness.areal import (
+    ArealParameters,
+    areal_parameters,
+    decay_lengths_um,
+    high_pass,
+    low_pass,
+)
 from litho_data.roughness.levelling_bias import (
     exponential_correlation,
     gaussian_correlation,
@@ -20,17 +27,22 @@ from litho_data.roughness.step_height import StepHeight, groove_depth, stair_ste
 
 __all__ = [
     "AmplitudeParameters",
+    "ArealParameters",
     "NoiseSplit",
     "PrintRoughness",
     "Spectrum",
     "StepHeight",
     "amplitude_parameters",
+    "areal_parameters",
     "autocorrelation",
     "correlation_length_um",
+    "decay_lengths_um",
     "effective_samples",
     "exponential_correlation",
     "gaussian_correlation",
     "groove_depth",
+    "high_pass",
+    "low_pass",
     "print_roughness",
     "psd_along",
     "psd_radial",
