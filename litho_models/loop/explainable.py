@@ -20,6 +20,7 @@ from litho_models.loop.linear import ALL_FREE
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.probes.linear import held_out_ridge
 from litho_models.loop.probes.places import map_columns_at
+from litho_models.loop.probes.tables import FEWEST_ORDERS, ORDER_STEPS
 from litho_models.loop.selection.confirming import SMALLEST_SHARE
 from litho_models.loop.study import Study
 from litho_models.models.features import Features, FeaturesConfig
@@ -30,8 +31,6 @@ from litho_models.scoring.statistics import interval
 _KEPT_BYTES, _MOST_ROWS = 512 * 2**20, 256
 # Features whose strength may follow order or dose: height, |∂y| and |∂x| at 0.3 µm, surroundings of 1.6 µm.
 _HEIGHT, _VARYING = 18, (18, 21, 22, 7)
-# Of the order, which runs from -0.5 to 0.5.
-_STEPS = (-0.25, 0.0, 0.25)
 
 
 @dataclass(frozen=True)
@@ -86,7 +85,7 @@ class Learner:
         )
         pixels = sum(len(scan.sample) for scan in study.scans)
         self._every = -(-pixels * 4 * _MOST_ROWS // _KEPT_BYTES)
-        varied = [of for of in (_order, _dose) if len({of(scan) for scan in study.scans}) > 2]
+        varied = [of for of in (_order, _dose) if len({of(scan) for scan in study.scans}) >= FEWEST_ORDERS]
         rows = [self._rows(model, scan, varied) for scan in study.scans]
         scale = np.sqrt(np.mean([one.var(axis=1) for one in rows], axis=0))[:, None]
         self._rows_of = [one / np.where(scale > 0, scale, np.float32(1)) for one in rows]
@@ -137,7 +136,7 @@ class Learner:
         columns = [of_layout, of_place, of_place * height]
         for of in varied:
             value = of(scan)
-            columns += [value * varying, *((value > step) * varying for step in _STEPS)]
+            columns += [value * varying, *((value > step) * varying for step in ORDER_STEPS)]
         return np.concatenate(columns).astype(np.float32)
 
 

@@ -132,6 +132,18 @@ def test_a_product_of_slope_and_height_comes_back_as_powers_of_the_shape() -> No
     assert probe_figure(found.added[0]).axes
 
 
+def test_a_jump_over_the_order_is_seen() -> None:
+    scans, predictions = scene()
+    along_y = {
+        f.id: np.abs(np.gradient(p.astype(float), f.stored.pitch_um, axis=0))
+        for f, p in zip(scans, predictions, strict=True)
+    }
+    # Half as much before and after: the mean over the scans a base model takes up.
+    entry = probed(*scene(lambda f: 0.02 * ((f.context.order > 0) - 0.5) * along_y[f.id])).added[0]
+    assert entry.probe.name == "order-shapes"
+    assert probe_figure(entry).axes
+
+
 def test_a_jump_over_the_rows_is_seen() -> None:
     def jump(scan: PreparedScan) -> np.ndarray:
         return 0.008 * (np.arange(SIZE_PX) > 50)[:, None] * np.ones(SIZE_PX)

@@ -13,7 +13,13 @@ from litho_models.loop.probes.displaced import displaced_copy
 from litho_models.loop.probes.kernel import missing_kernel
 from litho_models.loop.probes.places import position_map, profile
 from litho_models.loop.probes.probe import Estimate, Probe
-from litho_models.loop.probes.tables import axis_slope_table, level_table, shape_powers, slope_table
+from litho_models.loop.probes.tables import (
+    axis_slope_table,
+    level_table,
+    order_shapes,
+    shape_powers,
+    slope_table,
+)
 from litho_models.loop.probes.trend import OrderTrend, order_trends
 from litho_models.loop.selection.confirming import SMALLEST_SHARE, Confirmation
 from litho_models.loop.study import Correction, Score, State, Study
@@ -97,7 +103,7 @@ def generic_terms(
 ) -> list[Probe]:
     """All probes, measured on the residual of these held-out predictions."""
     kept = [~mask.reshape(-1)[scan.sample] for mask, scan in zip(defects.masks, scans, strict=True)]
-    table = level_table(scans, predictions, kept)
+    others = [make(scans, predictions, kept) for make in (level_table, order_shapes)]
     places: list[Probe] = []
     for times in (False, True):
         places.append(position_map(scans, predictions, kept, times_height=times))
@@ -107,7 +113,7 @@ def generic_terms(
     kernel = missing_kernel(scans, predictions, defects.masks)
     shapes = [make(scans, predictions, kept) for make in (slope_table, axis_slope_table, shape_powers)]
     far = displaced_copy(scans, predictions, defects.masks)
-    return [*([table] if table else []), *shapes, *places, kernel, *([far] if far else [])]
+    return [*shapes, *places, kernel, *(probe for probe in (*others, far) if probe is not None)]
 
 
 def _best(

@@ -16,6 +16,11 @@ from litho_models.loop.probes.linear import ColumnsOf, LinearProbe, linear_probe
 SPOT_UM = 0.2
 SLOPE_KNOTS = 8
 _FEWEST_SCANS, _SMALLEST_SHARE = 5, 0.01
+# Places in the order, which runs from -0.5 to 0.5, where something may jump.
+ORDER_STEPS = (-0.25, 0.0, 0.25)
+FEWEST_ORDERS = 3
+_DRIFTING = ("h²", "|y|", "|x|")
+_OVER_ORDER = ("over order", *(f"after {0.5 + step:.0%} of the order" for step in ORDER_STEPS))
 # h: height, y and x: slopes along y and x.
 _POWERS = (
     *("h²", "h³", "y²", "x²", "yx", "y³", "x³"),
@@ -92,6 +97,30 @@ def shape_powers(
     )
 
 
+def order_shapes(
+    scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray], kept: Sequence[np.ndarray]
+) -> LinearProbe | None:
+    """Height and slopes whose part in the error drifts or jumps over the writing order.
+
+    None where the order is unknown. What acts as a gain of single scans is theirs, see ``order_trends``.
+    """
+    if len({scan.context.order for scan in scans}) < FEWEST_ORDERS:
+        return None
+    names = [f"{shape} {over}" for over in _OVER_ORDER for shape in _DRIFTING]
+    return linear_probe(
+        "order-shapes",
+        _order_columns,
+        np.eye(len(names)),
+        lambda random, count: random.permutation(count),
+        lambda heights: {
+            name: (float(height) * NM_PER_UM, "nm") for name, height in zip(names, heights, strict=True)
+        },
+        scans,
+        predictions,
+        kept,
+    )
+
+
 def _table(
     name: str,
     entries: Sequence[str],
@@ -129,6 +158,14 @@ def _power_columns(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
             *(height**2 * slope for slope in (size_y, size_x)),
         ]
     )
+
+
+def _order_columns(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
+    """``_DRIFTING`` times order, and beyond each step of it, (m, y, x)."""
+    order = scan.context.order
+    squared = (prediction.astype(np.float64) / scan.context.full_height_um) ** 2
+    drifting = np.stack([squared, *(steepness(scan, prediction) for steepness in _ALONG.values())])
+    return np.concatenate([order * drifting, *((order > step) * drifting for step in ORDER_STEPS)])
 
 
 def _level_columns(scan: PreparedScan, prediction: np.ndarray, levels: Sequence[int]) -> np.ndarray:

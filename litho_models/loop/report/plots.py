@@ -112,7 +112,7 @@ def probe_figure(entry: AddedProbe) -> Figure:
         return _image(kernel, shown, "height per layout height and µm²", min(5.5, shown[0]))
     if isinstance(probe, DisplacedCopy):
         return _copy_figure(probe, common)
-    if probe.name == "shape-powers":
+    if probe.name in ("shape-powers", "order-shapes"):
         return _bars_figure(entry)
     if probe.name in _TABLES:
         return _table_figure(entry)
