@@ -19,10 +19,11 @@ from litho_models.scan_terms.training import training_terms
 # apart feels it. On the measured prints nothing changes from 1e-6 to 1e-4.
 RIDGE = 1e-5
 # Pixels of a scan that are fitted, on a square grid: with twice as many the measured prints are predicted
-# alike. The rows of one scan are all that is kept (16,384 × 8 B × 654 features: 86 MB), and the maps of one
-# tile (0.3 GB).
+# alike. The rows of a scan (16,384 × 8 B × 716 features: 94 MB) are kept while all together take no more than
+# KEPT_BYTES, and made again in each pass otherwise; beside them there are the maps of one tile (0.3 GB).
 FITTED_PX = 16_384
 TILE_PX = 512
+KEPT_BYTES = 2**31
 # The first pass minimises squares; the second reweights them to absolute values, so that blobs weigh little.
 PASSES = 2
 # Of what the scans may add by themselves: fixes what only these terms carry, the common datum.
@@ -46,12 +47,17 @@ def fit_ridge(
     if isinstance(model, RandomFeatures):
         _standardise(model, scans)
     weights: FloatMap | None = None
-    losses = []
+    losses: list[float] = []
+    kept: dict[int, tuple[FloatMap, FloatMap, FloatMap]] = {}
+    keeps = 8 * FITTED_PX * model.parameter_count * len(scans) <= KEPT_BYTES
     for _ in range(PASSES):
         size = model.parameter_count
         matrix, right, errors = np.zeros((size, size)), np.zeros(size), []
-        for scan in progress(scans, f"fitting {model.name}"):
-            design, height, basis = _rows(model, scan, terms)
+        for number, scan in enumerate(progress(scans, f"fitting {model.name}")):
+            rows = kept.get(number) or _rows(model, scan, terms)
+            if keeps:
+                kept[number] = rows
+            design, height, basis = rows
             certainty = np.ones_like(height)
             if weights is not None:
                 rest = height - weights @ design

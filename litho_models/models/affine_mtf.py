@@ -7,7 +7,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from litho_models.layers.gaussian import blur_interior, kernel_radius_px
-from litho_models.simulator import Simulator, SimulatorConfig, crop_border
+from litho_models.simulator import Simulator, SimulatorConfig
 
 
 class AffineMtfConfig(SimulatorConfig):
@@ -41,8 +41,15 @@ class AffineMtf(Simulator):
         return self.offset_um + (self.weights * torch.stack(blurred, dim=-1)).sum(dim=-1)
 
 
-def blurred_interior(layout_um: Tensor, sigma_um: float, pitch_um: float, reach_px: int) -> Tensor:
-    """One blur, cut to the pixels farther than ``reach_px`` from the edge."""
-    radius = kernel_radius_px(sigma_um / pitch_um)
-    inner = crop_border(layout_um, reach_px - radius)
-    return blur_interior(inner, torch.tensor(sigma_um / pitch_um, device=layout_um.device), radius)
+def blurred_interior(
+    layout_um: Tensor, sigma_um: float | tuple[float, float], pitch_um: float, reach_px: int
+) -> Tensor:
+    """One blur (a pair: along y, along x), cut to the pixels farther than ``reach_px`` from the edge."""
+    pair = sigma_um if isinstance(sigma_um, tuple) else (sigma_um, sigma_um)
+    radii = kernel_radius_px(pair[0] / pitch_um), kernel_radius_px(pair[1] / pitch_um)
+    rows, columns = (
+        slice(reach_px - radius, length - reach_px + radius)
+        for radius, length in zip(radii, layout_um.shape[-2:], strict=True)
+    )
+    y, x = (torch.tensor(sigma / pitch_um, device=layout_um.device) for sigma in pair)
+    return blur_interior(layout_um[..., rows, columns], (y, x), radii)

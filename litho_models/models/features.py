@@ -29,6 +29,9 @@ class FeaturesConfig(SimulatorConfig):
     slope_sigmas_um: tuple[float, ...] = Field((0.15, 0.3, 0.6), min_length=1, description="µm")
     shifts_um: tuple[float, ...] = Field((0.2, 0.5, 1.0), min_length=1, description="displacements, µm")
     shift_sigma_um: float = Field(0.1, gt=0, description="blur of what is displaced, µm")
+    streak_sigmas_um: tuple[float, ...] = Field((), description="blurs along one axis only, µm")
+    steep_sigmas_um: tuple[float, ...] = Field((), description="blurs whose slopes are averaged, µm")
+    steep_widths_um: tuple[float, ...] = Field((), description="over how much around a pixel, µm")
 
 
 class Features(Simulator):
@@ -36,7 +39,8 @@ class Features(Simulator):
 
     φ: blurs with their cubes and the products of each two; slopes along y and x at several blurs, their
     sizes, products and second derivatives; copies displaced to one side, and the sizes of the steps up to
-    them. Sizes |∂x| and |∂y| are features of their own because a microscope's lines make the two axes unlike.
+    them; blurs along one axis; how steep the surroundings are along each. Sizes |∂x| and |∂y| are features of
+    their own because a microscope's lines make the two axes unlike.
     The weights are found in closed form, see ``litho_models.fitting.ridge``.
     """
 
@@ -54,9 +58,10 @@ class Features(Simulator):
     @property
     def reach_px(self) -> int:
         config = self.config
-        blurred = max(self._radius(sigma) for sigma in (*config.sigmas_um, *config.slope_sigmas_um))
+        blurs = (*config.sigmas_um, *config.slope_sigmas_um, *config.streak_sigmas_um)
         displaced = self._steps_px()[-1] + self._radius(config.shift_sigma_um)
-        return max(blurred + 1, displaced)
+        steep = self._widest(config.steep_sigmas_um) + self._widest(config.steep_widths_um)
+        return max(self._widest(blurs) + 1, displaced, steep + 1)
 
     def interior(self, layout_um: Tensor) -> Tensor:
         simple, products = self.features(layout_um)
@@ -74,6 +79,7 @@ class Features(Simulator):
             products += [y * y, x * x, y * x, *(height * slope for slope in (y, x, size_y, size_x))]
             products.append((y * y + x * x + _LEAST_SLOPE**2).sqrt())
         simple = [*blurs, *(one for group in slopes for one in group), *self._displaced(layout)]
+        simple += [*self._streaks(layout), *self._steepness(layout)]
         return simple, [*products, torch.ones_like(blurs[0])]
 
     def at_pixels(self, layout_um: Tensor, at: Tensor) -> Tensor:
@@ -102,6 +108,26 @@ class Features(Simulator):
                 found += [(before - here).abs(), (after - here).abs(), (after - before).abs()]
         return found
 
+    def _streaks(self, layout: Tensor) -> list[Tensor]:
+        """Blurs that are wide along y, and along x, and a pixel along the other axis."""
+        wide, narrow = self.config.streak_sigmas_um, self.pitch_um
+        pairs = [pair for sigma in wide for pair in ((sigma, narrow), (narrow, sigma))]
+        return [blurred_interior(layout, pair, self.pitch_um, self.reach_px) for pair in pairs]
+
+    def _steepness(self, layout: Tensor) -> list[Tensor]:
+        """Means around each pixel of the sizes and squares of slopes along y and x; of slopes in σ per σ."""
+        widths, found = self.config.steep_widths_um, []
+        margin = self._widest(widths)
+        for sigma in self.config.steep_sigmas_um:
+            up, down, left, right = _neighbours(self._blurred(layout, sigma, margin_px=margin + 1), 1)
+            for slope in (
+                (down - up) * (sigma / self.pitch_um / 2),
+                (right - left) * (sigma / self.pitch_um / 2),
+            ):
+                sizes = slope.abs(), slope * slope
+                found += [blurred_interior(s, w, self.pitch_um, margin) for s in sizes for w in widths]
+        return found
+
     def _blurred(self, layout: Tensor, sigma_um: float, margin_px: int = 0) -> Tensor:
         reach = self.reach_px - margin_px
         if not sigma_um:
@@ -111,11 +137,18 @@ class Features(Simulator):
     def _steps_px(self) -> list[int]:
         return sorted(max(1, round(shift_um / self.pitch_um)) for shift_um in self.config.shifts_um)
 
+    def _widest(self, sigmas_um: Sequence[float]) -> int:
+        return max((self._radius(sigma) for sigma in sigmas_um), default=0)
+
     def _radius(self, sigma_um: float) -> int:
         return kernel_radius_px(sigma_um / self.pitch_um)
 
 
 class RandomFeaturesConfig(FeaturesConfig):
+    shifts_um: tuple[float, ...] = (0.1, 0.2, 0.4, 0.8, 1.6)
+    streak_sigmas_um: tuple[float, ...] = (0.3, 0.6, 1.2, 2.5, 4.0)
+    steep_sigmas_um: tuple[float, ...] = (0.1, 0.2, 0.4, 0.8)
+    steep_widths_um: tuple[float, ...] = (1.0, 2.5)
     units: int = Field(500, ge=1, description="random features")
     inputs: int = Field(8, ge=1, description="simple features that each of them sees")
     seed: int = Field(0, ge=0, description="of what they see")
@@ -195,7 +228,9 @@ def _neighbours(field: Tensor, step: int) -> tuple[Tensor, Tensor, Tensor, Tenso
 
 def simple_count(config: FeaturesConfig) -> int:
     """Number of features that are no products."""
-    return len(config.sigmas_um) + 8 * len(config.slope_sigmas_um) + 10 * len(config.shifts_um)
+    count = len(config.sigmas_um) + 8 * len(config.slope_sigmas_um) + 10 * len(config.shifts_um)
+    steep = 4 * len(config.steep_sigmas_um) * len(config.steep_widths_um)
+    return count + 2 * len(config.streak_sigmas_um) + steep
 
 
 def feature_count(config: FeaturesConfig) -> int:

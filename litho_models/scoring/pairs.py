@@ -80,7 +80,7 @@ def paired_scores(first: ModelScores, second: ModelScores, seed: int = 0) -> Pai
         first=first.model,
         second=second.model,
         mean_nm=found.mean,
-        ci95_nm=found.interval if found.units > 1 else None,
+        ci95_nm=found.interval if found.units >= FEWEST_FOR_INTERVAL else None,
         p=found.p,
         first_better=found.first_better,
         scans=found.units,

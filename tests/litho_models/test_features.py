@@ -17,11 +17,18 @@ from tests.litho_models.prints import make_scan, make_scans
 
 pytestmark = pytest.mark.numerics
 
-NARROW = {"sigmas_um": (0.0, 0.1, 0.3, 0.6), "slope_sigmas_um": (0.15,), "shifts_um": (0.2,)}
+NARROW = {
+    "sigmas_um": (0.0, 0.1, 0.3, 0.6),
+    "slope_sigmas_um": (0.15,),
+    "shifts_um": (0.2,),
+    "streak_sigmas_um": (),
+    "steep_sigmas_um": (),
+    "steep_widths_um": (),
+}
 
 
 def fitted(name: str, scans, policy="full", **fields):
-    model = build_model(name, **NARROW, **fields)
+    model = build_model(name, **NARROW | fields)
     ridge.fit_ridge(model, scans, policy)
     return model.eval()
 
@@ -66,6 +73,31 @@ def test_a_bead_on_slopes_along_x_is_seen():
     }
     # The bead is 12 nm high on average; squares of slopes follow a size only roughly.
     assert errors["features"] < 0.25 * errors["linear"]
+
+
+def test_steep_surroundings_along_x_are_seen():
+    scans = make_scans(6, noise_um=0.0, datum_um=0.0)
+    around = [
+        gaussian_filter(np.abs(np.gradient(gaussian_filter(s.layout_um, 2), axis=1)), 10) for s in scans
+    ]
+    lowered = [
+        replace(scan, height_um=scan.height_um - 2 * one.astype(np.float32))
+        for scan, one in zip(scans, around, strict=True)
+    ]
+    wide = {"steep_sigmas_um": (0.2,), "steep_widths_um": (1.0,)}
+    errors = []
+    for fields in ({}, wide):
+        model = fitted("features", lowered[:-1], policy="offset", **fields)
+        errors.append(error_nm(model, lowered[-1], lowered[-1].height_um))
+    # The feature is what was planted but for the edge, so that only what blurs and slopes know badly is left.
+    assert errors[1] < 0.5 * errors[0]
+
+
+def test_rows_that_do_not_fit_are_made_again_and_give_the_same_weights(monkeypatch):
+    scans = make_scans(3)
+    kept = fitted("features", scans)
+    monkeypatch.setattr(ridge, "KEPT_BYTES", 0)
+    assert torch.equal(fitted("features", scans).weights, kept.weights)
 
 
 def test_weights_do_not_depend_on_the_tiles_that_features_are_made_in(monkeypatch):
