@@ -10,7 +10,7 @@ from litho_models.effects import Effect
 from litho_models.loop.findings import LoopFindings
 from litho_models.loop.parameters import effect_slots
 from litho_models.loop.probes import AddedProbe, with_intervals
-from litho_models.loop.result.record import AddedEffect, EffectVerdict, ParameterEstimate
+from litho_models.loop.result.record import AddedEffect, EffectVerdict, ParameterEstimate, VarianceByPrint
 from litho_models.loop.selection.contest import Added
 from litho_models.loop.selection.search import separating_experiment
 from litho_models.loop.single_scans.nested_tests import MeasurementTest
@@ -39,8 +39,9 @@ def _added_measurement(findings: LoopFindings, test: MeasurementTest) -> AddedEf
     return AddedEffect(
         name=effect.name,
         stage=effect.stage,
-        role=effect.role,
+        role=test.role,
         verdict="confusable" if test.confusable_with else "explained",
+        by_print=None if test.by_print is None else VarianceByPrint(**vars(test.by_print)),
         prior_hypothesis=effect.name in findings.config.prior_hypotheses,
         parameters={
             name if name.startswith("sd") else f"{name}_sd_between_scans": ParameterEstimate(

@@ -71,6 +71,15 @@ class ParameterEstimate(Record):
     ci95: tuple[float, float] | None
 
 
+class VarianceByPrint(Record):
+    """One-way analysis of variance over prints of a term of single scans; ``p`` by permutation."""
+
+    f: float
+    degrees: tuple[int, int]
+    icc: float
+    p: float
+
+
 class AddedEffect(Record):
     """``terms_per_scan``: effective number before and after; ``over_prints``: as in ``EqualTerms``.
 
@@ -96,6 +105,7 @@ class AddedEffect(Record):
     terms_per_scan: tuple[float, float] | None = None
     over_prints: OverUnits | None = None
     share: float | None = None
+    by_print: VarianceByPrint | None = None
 
 
 class Candidate(Record):

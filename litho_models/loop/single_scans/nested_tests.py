@@ -13,6 +13,7 @@ import numpy as np
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import Effect, get_effect
+from litho_models.effects.effect import Role
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.selection.confirming import BINOMIAL_P, Confirmation, confirm_variance
 from litho_models.loop.single_scans.line_period import LinePeriod, line_period
@@ -32,12 +33,17 @@ from litho_models.scan_terms import (
     terms_of_effect,
 )
 from litho_models.scoring.statistics import bootstrap_interval, one_sided_flip_p, paired_difference
+from litho_models.scoring.variance_components import ByPrint, by_print
+
+# Of estimates that do not depend on the print, one set in twenty is called grouped.
+GROUPED_P = 0.05
 
 
 @dataclass(frozen=True)
 class MeasurementTest:
     """One nested step: per-scan terms without and with those of ``effect``.
 
+    ``by_print``: whether the estimates vary by print or from scan to scan; None where one cannot tell.
     ``spread``: parameter name to (standard deviation over scans, unit); ``evidence`` is a sentence;
     ``confusable_with``: effects that these scans cannot tell from it.
     """
@@ -50,6 +56,13 @@ class MeasurementTest:
     spread: dict[str, tuple[float, tuple[float, float], str]]
     evidence: str
     confusable_with: tuple[str, ...] = ()
+    by_print: ByPrint | None = None
+
+    @property
+    def role(self) -> Role:
+        """That of the catalogue; where scans of one print are alike, the printer may have done it too."""
+        grouped = self.by_print is not None and self.by_print.p <= GROUPED_P
+        return "undetermined" if grouped and self.effect.role == "measurement" else self.effect.role
 
 
 def measurement_tests(study: Study, predictions: Sequence[np.ndarray]) -> list[MeasurementTest]:
@@ -112,6 +125,7 @@ def _test_terms(
         p_screen=paired_difference(before.mse_nm2.tolist(), after.mse_nm2.tolist(), seed=study.seed).p,
         spread=spread,
         evidence=_sentence(before, after),
+        by_print=by_print(coefficients[:, own], [s.stored.print_id for s in study.scans], study.seed),
     )
 
 

@@ -1,0 +1,51 @@
+"""Variance components: the F of a textbook, its p by permutation, and planted roles."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.stats import f_oneway
+
+from litho_models.effects import get_effect
+from litho_models.loop.single_scans.nested_tests import MeasurementTest
+from litho_models.scoring.variance_components import ByPrint, by_print
+
+PRINTS = ["1"] * 4 + ["2"] * 3 + ["3"] * 4 + ["4"] * 3
+
+
+def test_f_is_that_of_a_one_way_analysis_and_p_close_to_its_own():
+    values = np.random.default_rng(1).normal(size=14) + 0.8 * np.repeat([0, 1, 0, -1], [4, 3, 4, 3])
+    found = by_print(values, PRINTS)
+    groups = [values[[own == name for own in PRINTS]] for name in "1234"]
+    wanted = f_oneway(*groups)
+    assert found.f == pytest.approx(wanted.statistic)
+    assert found.degrees == (3, 10)
+    # 1,999 permutations: a standard error of sqrt(p (1 - p) / 1999), at most 0.011.
+    assert found.p == pytest.approx(wanted.pvalue, abs=0.035)
+
+
+def test_the_share_that_scans_of_one_print_have_in_common_is_recovered():
+    random = np.random.default_rng(2)
+    prints = np.repeat(np.arange(300), 4)
+    values = random.normal(0, 2.0, 300)[prints] + random.normal(0, 1.0, 1200)
+    # 4 / (4 + 1), from 300 prints to about 0.02.
+    assert by_print(values[:400], prints[:400]).icc == pytest.approx(0.8, abs=0.08)
+    assert by_print(random.permutation(values)[:400], prints[:400]).icc < 0.1
+
+
+def test_columns_count_alike_whatever_their_unit_and_nothing_to_tell_is_none():
+    random = np.random.default_rng(3)
+    two = random.normal(size=(14, 2))
+    assert by_print(two * [1.0, 1e6], PRINTS).f == pytest.approx(by_print(two, PRINTS).f)
+    assert by_print(two, ["1"] * 14) is None
+    assert by_print(two, range(14)) is None
+    assert by_print(np.ones(14), PRINTS) is None
+
+
+def test_a_gain_that_goes_with_the_print_is_not_called_the_microscopes():
+    def role(name: str, p: float) -> str:
+        grouped = ByPrint(5.6, (5, 14), 0.58, p)
+        return MeasurementTest(get_effect(name), None, None, None, 0.0, {}, "", by_print=grouped).role
+
+    assert (role("z-gain", 0.003), role("z-gain", 0.3)) == ("undetermined", "measurement")
+    assert role("line-roughness", 0.003) == get_effect("line-roughness").role == "nuisance"
