@@ -85,7 +85,7 @@ class Learner:
         )
         pixels = sum(len(scan.sample) for scan in study.scans)
         self._every = -(-pixels * 4 * _MOST_ROWS // _KEPT_BYTES)
-        varied = [of for of in (_order, _dose) if len({of(scan) for scan in study.scans}) >= FEWEST_ORDERS]
+        varied = [of for of in _VARIED if len({of(scan) for scan in study.scans}) >= FEWEST_ORDERS]
         rows = [self._rows(model, scan, varied) for scan in study.scans]
         scale = np.sqrt(np.mean([one.var(axis=1) for one in rows], axis=0))[:, None]
         self._rows_of = [one / np.where(scale > 0, scale, np.float32(1)) for one in rows]
@@ -145,7 +145,11 @@ def _order(scan: PreparedScan) -> float:
 
 
 def _dose(scan: PreparedScan) -> float:
-    return scan.stored.dose or 1.0
+    """Less its nominal value, so that it has both signs as the order has."""
+    return (scan.stored.dose or 1.0) - 1.0
+
+
+_VARIED = (_order, _dose)
 
 
 def _gram(rows: np.ndarray) -> np.ndarray:

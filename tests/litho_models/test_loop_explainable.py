@@ -8,12 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import gaussian_filter
 
 from litho_data.foundation.units import NM_PER_UM
+from litho_models.fitting.ridge import feature_rows
 from litho_models.loop import explainable
 from litho_models.loop.explainable import Learner
 from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.loop.study import Study
+from litho_models.models import build_model
 from tests.litho_models.loop_scans import printed_scans, true_model
 
 FOLD_OF = np.arange(10) % 5
@@ -78,6 +81,18 @@ def test_a_scan_is_judged_by_a_ridge_that_has_not_seen_it(scene) -> None:
     alone[0] = alone[0] - bead(scans[0], alone[0])
     gains, before = learner.rest(alone).gains_nm2, learner.rest(alone).squares_nm2
     assert gains[0] < 0.05 * (before[0] - learner.rest(predictions).squares_nm2[0])
+
+
+def test_what_may_follow_the_order_are_height_slopes_and_surroundings(scene) -> None:
+    """The learner takes them by their place in a default model's features."""
+    scan = scene[0][0]
+    rows = feature_rows(build_model("features"), scan.stored, scan.sample)
+    layout, pitch = scan.stored.layout_um / 1.2, scan.stored.pitch_um
+    height, near = (gaussian_filter(layout, sigma / pitch, mode="nearest") for sigma in (0.3, 1.6))
+    slopes = [np.abs(slope) for slope in np.gradient(height, pitch)]
+    for number, expected in zip(explainable._VARYING, (height, *slopes, near), strict=True):
+        # float32, and a Gaussian cut at four standard deviations.
+        assert rows[number] == pytest.approx(scan.at_sample(expected), abs=1e-3)
 
 
 def test_rows_are_thinned_where_they_would_not_fit(scene, monkeypatch) -> None:
