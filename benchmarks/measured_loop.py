@@ -27,17 +27,11 @@ def equal_freedom_table(loops: Sequence[dict[str, Any]], errors: Sequence[dict[s
         return _equal_freedom_of_schema_1(errors)
     rows = []
     for loop in loops:
-        for row in loop["equal_terms"]:
-            before, after = row["before"], row["after"]
-            rows.append(
-                (
-                    loop["base_model"],
-                    _terms_per_scan(row["terms"], before["k"], after["k"]),
-                    with_interval(before["mae_nm"], before["mae_ci95_nm"]),
-                    with_interval(after["mae_nm"], after["mae_ci95_nm"]),
-                    f"{row['gain_nm']:.2f} nm",
-                    *(_over(row[unit]) for unit in ("over_scans", "over_prints")),
-                )
+        nested = loop.get("nested")
+        rows += _equal_rows(loop["base_model"], loop["equal_terms"])
+        if nested is not None:
+            rows += _equal_rows(
+                f"{loop['base_model']}, chosen anew ({nested['held_out']})", nested["equal_terms"]
             )
     first = loops[0]["equal_terms"][0]
     prints = first["over_prints"]
@@ -53,6 +47,44 @@ def equal_freedom_table(loops: Sequence[dict[str, Any]], errors: Sequence[dict[s
         f"Mean absolute error on {first['over_scans']['count']} held-out scans, on the benchmark's pixels, "
         f"{_background(loops)}; terms are fitted on pixels that are not scored. Intervals of 95 % resample "
         "whole scans, or whole prints; p is of sign flips of these." + best,
+        *(_split_text(loop) for loop in loops if loop.get("gain_split")),
+        *(_chosen_text(loop) for loop in loops if loop.get("nested")),
+    )
+
+
+def _equal_rows(name: str, equal_terms: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
+    return [
+        (
+            name,
+            _terms_per_scan(row["terms"], row["before"]["k"], row["after"]["k"]),
+            *(with_interval(row[side]["mae_nm"], row[side]["mae_ci95_nm"]) for side in ("before", "after")),
+            f"{row['gain_nm']:.2f} nm",
+            *(_over(row[unit]) for unit in ("over_scans", "over_prints")),
+        )
+        for row in equal_terms
+    ]
+
+
+def _split_text(loop: dict[str, Any]) -> str:
+    """The steps of the gain at k = 1, in the order added and left out of the final set."""
+    steps = "; ".join(
+        f"`{step['name']}` ({step['part']}) {step['in_order_k1_nm']:.2f} / {step['left_out_k1_nm']:.2f} nm"
+        for step in loop["gain_split"]
+        if step["part"] != "per-scan"
+    )
+    return (
+        f"What each step gains on {loop['base_model']} at k = 1, in the order added / lost where it is left "
+        f"out of the final set and the rest refitted: {steps or 'none but terms of single scans'}."
+    )
+
+
+def _chosen_text(loop: dict[str, Any]) -> str:
+    nested = loop["nested"]
+    times = ", ".join(f"{one['name']} {one['times']}" for one in nested["chosen"])
+    return (
+        f"Chosen anew on {loop['base_model']}: named effects, generic terms, terms of single scans, without "
+        f"the {nested['held_out']} that they are judged on, {nested['selections']} times. How often each was "
+        f"chosen: {times or 'nothing'}."
     )
 
 

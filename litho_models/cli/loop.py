@@ -41,7 +41,7 @@ def close_loop(
     ] = None,
     cache: Annotated[
         Path | None,
-        typer.Option("--cache", help="folder of trained folds, e.g. of a benchmark; beside --out by default"),
+        typer.Option("--cache", help="folder of trained folds and nested choices; beside --out by default"),
     ] = None,
     loss: Annotated[
         Literal["squares", "absolute"],
@@ -51,6 +51,14 @@ def close_loop(
         Literal["none", "training"],
         typer.Option("--background", help="training: report errors with the background of a benchmark"),
     ] = "none",
+    nested: Annotated[
+        Literal["folds", "prints"] | None,
+        typer.Option(
+            "--nested",
+            help="also choose everything anew without each fold, or each print, and judge it there; takes as "
+            "many runs of the loop, resumes where it was interrupted; small bases only",
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="folds and bootstrap, not the lock box")] = 0,
 ) -> None:
     """Find what a model lacks on measured prints, add it, and report the error on held-out scans (nm)."""
@@ -62,6 +70,7 @@ def close_loop(
         seed=seed,
         loss=loss,
         background=background,
+        nested=nested,
         open_lock_box=open_lock_box,
         prior_hypotheses=parse_priors(prior),
         inject=tuple(inject or ()),

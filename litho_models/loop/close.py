@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 
-import numpy as np
 from torch import nn
 
 from litho_data.foundation.errors import InputError
@@ -17,14 +17,17 @@ from litho_models.loop.equal_terms import scores_elsewhere
 from litho_models.loop.explainable import Learner, Rest
 from litho_models.loop.findings import LoopConfig, LoopFindings
 from litho_models.loop.folded_base import Trainer
+from litho_models.loop.gain_split import split_gain
 from litho_models.loop.identifiability import identifiability, profiles
-from litho_models.loop.prepared import PreparedScan, prepare_scans
+from litho_models.loop.nested import nest
+from litho_models.loop.parameters import is_refitted
+from litho_models.loop.prepared import prepare_scans
 from litho_models.loop.screening.power import parse_injection, plant
+from litho_models.loop.selection.search import EffectSets
 from litho_models.loop.selection.weight import weigh_effects
 from litho_models.loop.single_scans.observed import observe
 from litho_models.loop.structure import covariate_tests
-from litho_models.loop.study import DATUM_FREE, State, Study, names_to_terms, noise_lower_bound_nm
-from litho_models.splits.folds import grouped_folds
+from litho_models.loop.study import DATUM_FREE, State, Study, deal, names_to_terms, noise_lower_bound_nm
 
 
 def close_loop(
@@ -35,6 +38,7 @@ def close_loop(
     trainer: Trainer | None = None,
     rounding_um: Mapping[str, float] | None = None,
     lock_box: Sequence[str] | None = None,
+    cache: Path | None = None,
     report: Callable[[str], None] = lambda message: None,
 ) -> LoopFindings:
     """Find what the base model lacks on these scans, add it, and measure the error on held-out scans.
@@ -48,17 +52,25 @@ def close_loop(
         rounding_um: step of the heights in each scan's raw file, by id, if known.
         lock_box: ids of the locked scans; ``locked_ids`` of ``scans`` if None. Neither the seed nor the
             scans left out of ``scans`` may change it: whoever holds them all says which are locked.
+        cache: folder where the finished parts of a nested selection are kept.
         report: told what happens, a sentence at a time.
 
     Raises:
-        InputError: fewer than two usable scans outside the lock box, or an unknown effect among the prior
-            hypotheses.
+        InputError: fewer than two usable scans outside the lock box, an unknown effect among the prior
+            hypotheses, or a nested selection for a base that is not refitted.
     """
     config = config or LoopConfig.model_validate({})
     for name in config.prior_hypotheses:
         get_effect(name)
     for text in config.inject:
         parse_injection(text)
+    if config.nested and not is_refitted(base):
+        raise InputError(
+            "nested selection",
+            got="a base that is not fitted here, or has many parameters",
+            wanted="one with few parameters, by its name",
+            hint="it is fitted anew in every selection: --base physics, for example",
+        )
     prepared = [scan for scan in prepare_scans(scans) if len(scan.sample) >= 64]
     lock_box = locked_ids(scans) if lock_box is None else list(lock_box)
     development = [scan for scan in prepared if scan.id not in lock_box]
@@ -69,7 +81,8 @@ def close_loop(
             got=f"{len(development)} usable and not locked",
             wanted="at least 2",
         )
-    study = Study(development, _folds(development, config), config.seed, config.loss, report=report)
+    fold_of = deal(development, config.folds, config.seed)
+    study = Study(development, fold_of, config.seed, config.loss, report=report)
     choice = choose(study, base, trainer)
     final, search = choice.final, choice.search
     terms = DATUM_FREE | names_to_terms(passed(choice.first_tests))
@@ -79,7 +92,9 @@ def close_loop(
         planted += plant(text, choice.guide, choice.study, terms)
     report("measuring what could still be learned")
     learner = Learner(choice.study, choice.base.predictions)
-    choice = replace(choice, study=replace(choice.study, background=config.background))
+    reported = replace(choice.study, background=config.background)
+    choice = replace(choice, study=reported)
+    fitted = EffectSets(search, choice.base, reported)
     return LoopFindings(
         **vars(choice),
         locked=locked,
@@ -89,12 +104,14 @@ def close_loop(
         if choice.probed.added
         else choice.left_by_named,
         explainable=_explainable(choice, learner),
-        weights=weigh_effects(choice.search, choice.study, learner),
+        weights=weigh_effects(search, choice.study, learner, fitted),
         locked_scores=scores_elsewhere(choice, locked) if config.open_lock_box and locked else None,
         observed=observe(choice.study, final.predictions, choice.terms, choice.probed.defects, rounding_um),
         identifiability=identifiability(search.state.fits),
         profiles=profiles(search.state.fits, study.windows),
+        gain_steps=split_gain(choice, fitted),
         planted=planted,
+        nested=nest(reported, base, config.nested, cache) if config.nested else None,
         config=config,
     )
 
@@ -111,10 +128,3 @@ def _explainable(choice: Choice, learner: Learner) -> dict[str, Rest]:
             seen.append(state)
             rests[name] = learner.rest(state.predictions)
     return rests
-
-
-def _folds(scans: Sequence[PreparedScan], config: LoopConfig) -> np.ndarray:
-    ids = [scan.id for scan in scans]
-    folds = grouped_folds(ids, min(config.folds, len(ids)), config.seed)
-    fold = {scan_id: number for number, members in enumerate(folds) for scan_id in members}
-    return np.array([fold[scan_id] for scan_id in ids])

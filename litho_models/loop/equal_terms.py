@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Literal, get_args
+
+import numpy as np
 
 from litho_models.loop.choice import Choice
 from litho_models.loop.prepared import PreparedScan
@@ -33,13 +35,27 @@ def scores(choice: Choice) -> dict[TermSet, BeforeAfter]:
 
 def scores_elsewhere(choice: Choice, scans: Sequence[PreparedScan]) -> dict[TermSet, BeforeAfter]:
     """Errors of scans that took no part in the choice, by the fits to all that did."""
-    study, maps = choice.study, []
-    for predict in (choice.before, choice.after):
+    before, after = predictions_elsewhere(choice, scans)
+    blocks = choice.study.blocks
+    return {
+        name: (score(scans, before, terms, blocks), score(scans, after, terms, blocks))
+        for name, terms in term_sets(choice.terms).items()
+    }
+
+
+def predictions_elsewhere(
+    choice: Choice, scans: Sequence[PreparedScan]
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Maps (y, x), µm, of scans that took no part in the choice, by the base and by the final model.
+
+    With the background of the scans that it was made on, if their study has one.
+    """
+    study = choice.study
+
+    def maps(predict: Callable[[PreparedScan], np.ndarray]) -> list[np.ndarray]:
         learned = None
         if study.background == "training":
             learned = learn_background([s.stored for s in study.scans], [predict(s) for s in study.scans])
-        maps.append([Prediction.beside(learned, predict(scan)).map_um for scan in scans])
-    return {
-        name: (score(scans, maps[0], terms, study.blocks), score(scans, maps[1], terms, study.blocks))
-        for name, terms in term_sets(choice.terms).items()
-    }
+        return [Prediction.beside(learned, predict(scan)).map_um for scan in scans]
+
+    return maps(choice.before), maps(choice.after)

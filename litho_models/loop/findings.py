@@ -15,7 +15,9 @@ from litho_models.loop.choice import Choice
 from litho_models.loop.equal_terms import BeforeAfter, TermSet
 from litho_models.loop.explainable import Rest
 from litho_models.loop.folded_base import FoldedBase
+from litho_models.loop.gain_split import GainStep
 from litho_models.loop.identifiability import Identifiability, Profile
+from litho_models.loop.nested import HeldOut, Nested
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.screening.power import Planted
 from litho_models.loop.selection.weight import Weight
@@ -36,6 +38,9 @@ class LoopConfig(BaseModel):
     background: BackgroundUse = Setting(
         "none", description="training: reported errors with the background that a benchmark learns"
     )
+    nested: HeldOut | None = Setting(
+        None, description="also choose everything anew without each fold, or each print, and judge it there"
+    )
     open_lock_box: bool = False
     prior_hypotheses: tuple[str, ...] = ()
     inject: tuple[str, ...] = ()
@@ -55,7 +60,8 @@ class LoopFindings(Choice):
         locked_scores: by name of the terms, errors of the locked scans before and after, if opened.
         observed: what is seen without a model, by name.
         identifiability, profiles: how well the scans pin down what was fitted to name the causes.
-        planted: power of the screening, if asked for.
+        gain_steps: what each thing that was added gains; ``planted``: power of the screening, if asked for.
+        nested: the choice made without the scans that it is judged on, if asked for.
     """
 
     locked: list[PreparedScan]
@@ -68,7 +74,9 @@ class LoopFindings(Choice):
     observed: dict[str, Observed]
     identifiability: Identifiability | None
     profiles: list[Profile]
+    gain_steps: list[GainStep]
     planted: list[Planted]
+    nested: Nested | None
     config: LoopConfig
 
     @property

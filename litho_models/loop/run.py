@@ -46,8 +46,8 @@ def close_loop_on_store(
         base: name of a model, or a frozen one (its folder, ``zoo:NAME``).
         config: settings; ``report`` is told what happens, a sentence at a time.
         steps: optimiser steps of a base that is trained per fold; the recipe's by default.
-        cache: folder where such trainings are kept and continued, by default beside ``out``; that of a
-            benchmark with the same folds and settings spares its trainings.
+        cache: folder where such trainings, and the parts of a nested selection, are kept and continued, by
+            default beside ``out``; that of a benchmark with the same folds and settings spares its trainings.
 
     Raises:
         InputError: no store, no such base, a base of another pitch, or too few usable scans.
@@ -61,9 +61,9 @@ def close_loop_on_store(
     usable = [scan for scan in scans if np.count_nonzero(scan.valid & np.isfinite(scan.height_um)) >= 1024]
     kept = {scan.id for scan in usable}
     dropped = [f"{scan.id}: fewer than 1024 measured pixels" for scan in scans if scan.id not in kept]
-    trainer = None
+    trainer, kept_in = None, Path(cache or f"{out}-cache")
     if base in MODELS and not is_small(simulator):
-        trainer = _trainer(base, config, steps, Path(cache or f"{out}-cache"))
+        trainer = _trainer(base, config, steps, kept_in)
     findings = close_loop(
         usable,
         simulator,
@@ -71,6 +71,7 @@ def close_loop_on_store(
         trainer=trainer,
         rounding_um=_rounding_um(opened, usable),
         lock_box=opened.locked_ids,
+        cache=kept_in,
         report=report,
     )
     result = summarise(findings, dataset=opened.dataset_id, base_name=name, dropped=dropped)

@@ -17,6 +17,7 @@ from litho_models.scan_terms import BackgroundUse, Blocks, Terms, cross_fit, ter
 from litho_models.scan_terms.background import learn_background
 from litho_models.scoring.records import Prediction
 from litho_models.scoring.statistics import bootstrap_interval
+from litho_models.splits.folds import grouped_folds
 
 DATUM_FREE: Terms = frozenset({"offset"})
 
@@ -182,6 +183,17 @@ def score(
         degrees_of_freedom=float(np.mean([fit.degrees_of_freedom for fit in fits])),
         residual_um=[fit.residual_um for fit in fits],
     )
+
+
+def deal(scans: Sequence[PreparedScan], folds: int, seed: int) -> np.ndarray:
+    """Number of the fold that holds out each scan, (scans,); at most one fold per scan."""
+    ids = [scan.id for scan in scans]
+    fold = {
+        scan_id: number
+        for number, members in enumerate(grouped_folds(ids, min(folds, len(ids)), seed))
+        for scan_id in members
+    }
+    return np.array([fold[scan_id] for scan_id in ids])
 
 
 def noise_lower_bound_nm(

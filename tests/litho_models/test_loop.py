@@ -11,6 +11,7 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
+from benchmarks.measured_loop import equal_freedom_table
 from litho_data.foundation.errors import InputError
 from litho_data.store.lock_box import lock_box, locked_ids
 from litho_data.store.schema import DatasetId
@@ -18,12 +19,20 @@ from litho_models.effects import CATALOGUE, UNTESTABLE, get_effect
 from litho_models.fitting.runs import train
 from litho_models.frozen.card import ModelCard
 from litho_models.layers.ranges import FLAT_FROM
-from litho_models.loop import LoopConfig, close_loop, close_loop_on_store, parse_priors
+from litho_models.loop import (
+    LoopConfig,
+    close_loop,
+    close_loop_on_store,
+    equal_terms,
+    nested,
+    parse_priors,
+)
 from litho_models.loop.findings import LoopFindings
 from litho_models.loop.fold_fits import fit_folds, predict
 from litho_models.loop.parameters import at_bounds, chain_at, effect_slots, get_vector, room
 from litho_models.loop.prepared import LARGE_PX, prepare_scans
-from litho_models.loop.report.wording import plain_words, verdict_text
+from litho_models.loop.report.page import write_report
+from litho_models.loop.report.wording import error_lines, plain_words, verdict_text
 from litho_models.loop.result.exporting import exported_effects
 from litho_models.loop.result.record import CloseLoop
 from litho_models.loop.result.summary import summarise
@@ -168,6 +177,38 @@ def test_a_missing_effect_is_named_with_its_size(planted) -> None:
     assert entry.scans_improved == (8, 8)
     assert result.verdict == "traced"
     assert result.after.mae_datum_free_nm < 0.8 * result.before.mae_datum_free_nm
+
+
+def test_the_gain_of_a_planted_effect_of_the_printer_is_the_process_part(planted, null) -> None:
+    _, result = planted
+    parts = result.gain_by_part("in_order_k1_nm")
+    assert parts["process"] == pytest.approx(result.equal_terms[0].gain_nm, abs=1e-9)
+    assert sum(gain for part, gain in parts.items() if part != "process") == 0
+    # Free on both sides of every figure, the zero of the scans has no share in a gain.
+    assert "datum-offset" not in {step.name for step in result.gain_split}
+    assert "process" not in null[1].gain_by_part("in_order_nm")
+
+
+def test_terminal_and_pages_name_the_terms_and_what_was_resampled(planted, tmp_path) -> None:
+    findings, _ = planted
+    scans = list(findings.development)
+    anew = nested.Part(scans, ["vignetting"], [], ["datum-offset"], [], [])
+    findings = replace(findings, nested=nested.Nested("prints", [anew], equal_terms.scores(findings)))
+    result = summarise(
+        findings, dataset=DatasetId(name="x", sha256="0" * 64), base_name="physics", dropped=[]
+    )
+    prints = len(set(findings.prints))
+    said = "\n".join(error_lines(result))
+    assert said.count("  k = 1: ") == said.count("  k = 7: ") == 2
+    assert f"over {len(scans)} scans" in said
+    assert f"the smallest that {prints} prints can have" in said
+    assert "chosen in so many of 1 selections: vignetting 1, datum-offset 1" in said
+    table = equal_freedom_table([result.model_dump(mode="json")], [])
+    assert "| physics, chosen anew (prints) | k = 7 |" in table
+    assert f"what {prints} prints can show at best is p = {2 / 2**prints:.3f}" in table
+    write_report(findings, result, tmp_path)
+    assert "vignetting" in (tmp_path / "gain_split.csv").read_text()
+    assert (tmp_path / "nested.csv").exists()
 
 
 def test_the_locked_scans_agree(planted) -> None:

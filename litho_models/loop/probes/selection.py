@@ -22,7 +22,7 @@ from litho_models.loop.probes.tables import (
 )
 from litho_models.loop.probes.trend import OrderTrend, order_trends
 from litho_models.loop.selection.confirming import SMALLEST_SHARE, Confirmation
-from litho_models.loop.study import Correction, Score, State, Study
+from litho_models.loop.study import Score, State, Study
 from litho_models.scan_terms import Terms
 from litho_models.scan_terms.term import smooth_shapes
 
@@ -142,12 +142,8 @@ def _best(
         controls = np.array([probe.control(fold_of, random) for _ in range(CONTROLS)])
         limit = float(np.quantile(controls, CONTROL_QUANTILE))
         agreement = probe.agreement()
-        anchors = [_anchor(probe, own, scans, state.predictions) for own in estimate.per_fold]
-        corrected = [
-            _corrected(probe, estimate.per_fold[fold], anchors[fold], scan, p)
-            for scan, p, fold in zip(scans, state.predictions, fold_of, strict=True)
-        ]
-        after = study.score(corrected, terms)
+        extended = _with_probe(state, study, probe, estimate)
+        after = extended.score(study, terms)
         confirmation = study.confirm(before, after)
         reasons = [confirmation.reason] if confirmation.reason else []
         if gain <= limit:
@@ -158,17 +154,29 @@ def _best(
         if not reasons:
             p_control = float((1 + (controls >= gain).sum()) / (CONTROLS + 1))
             anchor = _anchor(probe, estimate.common, scans, state.predictions)
-            entry = AddedProbe(probe, estimate, anchor, before, after, confirmation, p_control)
-            return entry, State(
-                state.fits, corrected, (*state.corrections, _correction(probe, estimate, anchors))
-            )
+            return AddedProbe(probe, estimate, anchor, before, after, confirmation, p_control), extended
     return None
 
 
-def _correction(probe: Probe, estimate: Estimate, anchors: Sequence[np.ndarray]) -> Correction:
-    return lambda fold, scan, prediction: _corrected(
-        probe, estimate.per_fold[fold], anchors[fold], scan, prediction
-    )
+def with_generic_terms(state: State, study: Study, names: Sequence[str]) -> State:
+    """The state with generic terms of these names, estimated one after another on what is left, unjudged."""
+    defects = find_defects(study.scans, state.predictions)
+    for name in names:
+        for probe in generic_terms(study.scans, state.predictions, defects):
+            if probe.name == name:
+                state = _with_probe(state, study, probe, probe.held_out(study.fold_of))
+    return state
+
+
+def _with_probe(state: State, study: Study, probe: Probe, estimate: Estimate) -> State:
+    anchors = [_anchor(probe, own, study.scans, state.predictions) for own in estimate.per_fold]
+
+    def correct(fold: int, scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
+        return _corrected(probe, estimate.per_fold[fold], anchors[fold], scan, prediction)
+
+    held_out = zip(study.fold_of, study.scans, state.predictions, strict=True)
+    corrected = [correct(int(fold), scan, prediction) for fold, scan, prediction in held_out]
+    return State(state.fits, corrected, (*state.corrections, correct))
 
 
 def _corrected(

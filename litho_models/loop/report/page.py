@@ -15,7 +15,7 @@ from litho_models.loop.equal_terms import TermSet
 from litho_models.loop.findings import LoopFindings
 from litho_models.loop.report.plots import curve_figure, map_figure, probe_figure, staircase_figure
 from litho_models.loop.report.power import identifiability_section, power_section
-from litho_models.loop.report.wording import plain_words, warnings_for
+from litho_models.loop.report.wording import parts_text, plain_words, warnings_for
 from litho_models.loop.result.record import CloseLoop, EqualTerms
 from litho_models.loop.single_scans.nested_tests import scan_parameters
 from litho_models.loop.structure import PLACE
@@ -84,6 +84,43 @@ def _error_section(page: Page, findings: LoopFindings, result: CloseLoop) -> Non
         "equal_terms.csv",
         digits=3,
     )
+    if result.nested is not None:
+        page.heading("The same where the choice itself has not seen the scans")
+        page.table(
+            pd.DataFrame([_equal_row(row) for row in result.nested.equal_terms]),
+            f"Named effects, generic terms and terms of single scans were chosen anew without each of the "
+            f"{result.nested.selections} {result.nested.held_out}, and judged there.",
+            "nested.csv",
+            digits=3,
+        )
+        page.table(
+            pd.DataFrame([one.model_dump() for one in result.nested.chosen]),
+            f"In how many of the {result.nested.selections} selections each was chosen.",
+            "nested_chosen.csv",
+        )
+    if result.gain_split:
+        page.heading("Whose the gain is")
+        page.paragraph(f"{parts_text(result).capitalize()}.")
+        page.table(
+            pd.DataFrame(
+                [
+                    {
+                        "step": step.name,
+                        "part": step.part,
+                        "terms per scan": step.k,
+                        "gain in order (nm)": step.in_order_nm,
+                        "in order, k = 1 (nm)": step.in_order_k1_nm,
+                        "lost if left out (nm)": step.left_out_nm,
+                        "lost if left out, k = 1 (nm)": step.left_out_k1_nm,
+                    }
+                    for step in result.gain_split
+                ]
+            ),
+            "Held-out MAE. In the order added, with the terms of single scans accepted so far, and with one "
+            "term per scan throughout. Left out: the final set without it, the rest fitted again, with all "
+            "accepted terms and with one. Only what is called process goes into the exported model.",
+            "gain_split.csv",
+        )
     page.heading("Error, step by step")
     rows = _staircase(findings)
     frame = pd.DataFrame(

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from litho_models.effects import get_effect
 from litho_models.frozen.readme import bounds_text
 from litho_models.loop.findings import LoopFindings
-from litho_models.loop.result.record import AddedEffect, CloseLoop, EqualTerms
+from litho_models.loop.result.record import AddedEffect, CloseLoop, EqualTerms, NestedResult, Part
 from litho_models.loop.selection.confirming import FEWEST_SCANS
 from litho_models.scoring.pairs import OverUnits
 
@@ -21,13 +23,50 @@ def verdict_text(result: CloseLoop) -> str:
 
 
 def error_lines(result: CloseLoop) -> list[str]:
-    """The errors before and after with the same terms per scan, a line each."""
-    rows = result.equal_terms or []
-    return ["held-out error (MAE) before -> after, with the same terms per scan:"] + [
+    """The errors before and after with the same terms per scan, whose the gain is, and the nested errors."""
+    lines = ["held-out error (MAE) before -> after, with the same terms per scan:"]
+    lines += [_row_text(row) for row in result.equal_terms or []]
+    lines += [f"  {text}" for text in [parts_text(result)] if text]
+    if result.nested is not None:
+        lines.append(f"the same where everything was chosen without {_UNSEEN[result.nested.held_out]}:")
+        lines += [_row_text(row) for row in result.nested.equal_terms]
+        lines.append(f"  {chosen_text(result.nested)}")
+    return lines
+
+
+_UNSEEN = {"folds": "the scans it is judged on", "prints": "the print it is judged on"}
+
+
+def chosen_text(nested: NestedResult) -> str:
+    """How often each effect was chosen."""
+    times = ", ".join(f"{one.name} {one.times}" for one in nested.chosen)
+    return f"chosen in so many of {nested.selections} selections: {times or 'nothing'}"
+
+
+def _row_text(row: EqualTerms) -> str:
+    over = [over_text(row.over_scans, "scans")]
+    if row.over_prints is not None:
+        over.append(over_text(row.over_prints, "prints"))
+    return (
         f"  {terms_text(row)}: {row.before.mae_nm:.2f} -> {row.after.mae_nm:.2f} nm; "
-        f"gain {row.gain_nm:.2f} nm, {', '.join(_resampled(row))}"
-        for row in rows
-    ]
+        f"gain {row.gain_nm:.2f} nm, {', '.join(over)}"
+    )
+
+
+def parts_text(result: CloseLoop) -> str:
+    """Whose the gain is, in the order added: with one term per scan, and on the way to all accepted terms."""
+    if not result.gain_split:
+        return ""
+    model, way = (result.gain_by_part(figure) for figure in ("in_order_k1_nm", "in_order_nm"))
+    model.pop("per-scan", None)
+    return (
+        f"gain with k = 1, in the order added: {_listed(model)}; "
+        f"on the way from k = 1 to k = {result.gain_split[-1].k:.0f}: {_listed(way)}"
+    )
+
+
+def _listed(parts: Mapping[Part, float]) -> str:
+    return ", ".join(f"{part} {gain:.2f} nm" for part, gain in parts.items()) or "none"
 
 
 def terms_text(row: EqualTerms) -> str:
@@ -42,12 +81,6 @@ def over_text(over: OverUnits, unit: str) -> str:
     interval = "no interval" if over.ci95_nm is None else "{:.2f} … {:.2f}".format(*over.ci95_nm)
     best = f", the smallest that {over.count} {unit} can have" if over.p <= over.smallest_p else ""
     return f"{interval} over {over.count} {unit} (p = {over.p:.2g}{best})"
-
-
-def _resampled(row: EqualTerms) -> list[str]:
-    return [over_text(row.over_scans, "scans")] + (
-        [over_text(row.over_prints, "prints")] if row.over_prints else []
-    )
 
 
 def plain_words(findings: LoopFindings, result: CloseLoop) -> str:

@@ -12,7 +12,7 @@ from litho_models.effects import get_effect
 from litho_models.effects.chain import EffectChain
 from litho_models.loop.findings import LoopFindings
 from litho_models.loop.result.added_effects import NEAR_A_CAUSE
-from litho_models.loop.result.record import CloseLoop
+from litho_models.loop.result.record import AddedEffect, CloseLoop, Part
 from litho_models.loop.single_scans.nested_tests import scan_parameters
 from litho_models.scan_terms import parameter_names
 
@@ -25,14 +25,23 @@ def exported_effects(chain: EffectChain, result: CloseLoop) -> dict[str, EffectV
     A process effect that these data cannot tell from one of the microscope is undetermined, and so is
     one that only comes near the cause, or is a part of what is missing.
     """
-    alike = {e.name: e.confusable_with for e in result.effects}
-    doubtful = {e.name for e in result.effects if e.verdict in NEAR_A_CAUSE}
+    added = {effect.name: effect for effect in result.effects}
     groups: dict[str, EffectValues] = {"process": {}, "measurement": {}, "undetermined": {}}
     for name, values in chain.values().items():
-        roles = {get_effect(other).role for other in (name, *alike.get(name, []))}
-        group = next(iter(roles)) if len(roles) == 1 and name not in doubtful else "undetermined"
-        groups[group if group in groups else "undetermined"][name] = values
+        groups[part_of(added[name])][name] = values
     return groups
+
+
+def part_of(effect: AddedEffect) -> Part:
+    """Whose an added effect is: the printer's or the microscope's only if all that look like it are."""
+    if effect.verdict in NEAR_A_CAUSE:
+        return "undetermined"
+    if get_effect(effect.name).per_scan:
+        return "per-scan"
+    roles = {get_effect(name).role for name in (effect.name, *effect.confusable_with)}
+    if roles == {"process"}:
+        return "process"
+    return "measurement" if roles == {"measurement"} else "undetermined"
 
 
 def write_measurement_model(findings: LoopFindings, result: CloseLoop, path: Path) -> None:

@@ -14,6 +14,8 @@ from litho_models.scoring.noise_floor import NoiseFloor
 from litho_models.scoring.pairs import OverUnits
 from litho_models.splits.folds import Split
 
+ChosenKind = Literal["named", "generic", "per-scan"]
+Part = Literal["process", "undetermined", "measurement", "per-scan"]
 EffectVerdict = Literal["explained", "confusable", "partial", "traced-to-covariate"]
 Verdict = Literal["traced", "nothing-missing", "unexplained", "too-few-scans"]
 CandidateVerdict = Literal[
@@ -63,6 +65,43 @@ class EqualTerms(Record):
     gain_nm: float
     over_scans: OverUnits
     over_prints: OverUnits | None
+
+
+class GainPart(Record):
+    """What one of the added things gains, MAE in nm: see ``gain_split.GainStep`` for the figures.
+
+    ``part``: ``process``, what the exported model has; ``measurement``, of the microscope and the same in all
+    scans; ``per-scan``, terms of single scans; ``undetermined``, everything else.
+    """
+
+    name: str
+    part: Part
+    k: float
+    in_order_nm: float
+    in_order_k1_nm: float
+    left_out_nm: float
+    left_out_k1_nm: float
+
+
+class Chosen(Record):
+    """An effect, generic term or effect of single scans, and in how many of the selections it was chosen."""
+
+    name: str
+    kind: ChosenKind
+    times: int
+
+
+class NestedResult(Record):
+    """Everything chosen anew without each fold of scans, or each print, and judged there.
+
+    ``equal_terms``: as for the loop itself; ``accepted`` are the terms that each selection accepted.
+    ``chosen``: by kind, the most frequent first.
+    """
+
+    held_out: Literal["folds", "prints"]
+    selections: int
+    equal_terms: list[EqualTerms]
+    chosen: list[Chosen]
 
 
 class ParameterEstimate(Record):
@@ -148,7 +187,8 @@ class CloseLoop(Result):
     """What the loop found.
 
     ``fewest_scans``: with fewer to work on the verdict is ``too-few-scans`` unless something is found.
-    ``equal_terms``, ``explainable``, ``fewest_scans`` and, where the lock box was opened,
+    ``gain_split``: what each step gains, in the order added; ``nested``: if asked for. ``equal_terms``,
+    ``gain_split``, ``explainable``, ``fewest_scans`` and, where the lock box was opened,
     ``locked_equal_terms`` are None in results of schema 1.
     """
 
@@ -170,6 +210,8 @@ class CloseLoop(Result):
     locked_after: Errors | None = None
     equal_terms: list[EqualTerms] | None = None
     locked_equal_terms: list[EqualTerms] | None = None
+    gain_split: list[GainPart] | None = None
+    nested: NestedResult | None = None
     effects: list[AddedEffect]
     candidates: list[Candidate]
     shares: Shares
@@ -182,6 +224,13 @@ class CloseLoop(Result):
     def headline(self) -> EqualTerms | None:
         """The zero of each scan free, before and after; None in results of schema 1."""
         return self.equal_terms[0] if self.equal_terms else None
+
+    def gain_by_part(self, figure: Literal["in_order_nm", "in_order_k1_nm"]) -> dict[Part, float]:
+        """Sums of a figure of ``gain_split`` over the parts that have any, in nm."""
+        sums: dict[Part, float] = {}
+        for step in self.gain_split or []:
+            sums[step.part] = sums.get(step.part, 0.0) + getattr(step, figure)
+        return sums
 
     @model_serializer(mode="wrap")
     def _without_unopened_lock_box(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -13,14 +14,21 @@ from litho_models.effects import CATALOGUE
 from litho_models.loop import equal_terms
 from litho_models.loop.equal_terms import BeforeAfter, TermSet
 from litho_models.loop.findings import LoopFindings
+from litho_models.loop.nested import Nested
 from litho_models.loop.parameters import at_bounds
 from litho_models.loop.result.added_effects import added_effects
 from litho_models.loop.result.candidates import all_candidates
+from litho_models.loop.result.exporting import part_of
 from litho_models.loop.result.record import (
+    AddedEffect,
+    Chosen,
+    ChosenKind,
     CloseLoop,
     EqualTerms,
     Errors,
     Explainable,
+    GainPart,
+    NestedResult,
     Residual,
     Shares,
     TermsError,
@@ -80,6 +88,8 @@ def summarise(findings: LoopFindings, *, dataset: DatasetId, base_name: str, dro
         locked_after=_errors(locked, 1, findings.config.seed) if locked else None,
         equal_terms=_equal_terms(found, findings.prints, findings.config.seed),
         locked_equal_terms=_equal_terms(locked, elsewhere, findings.config.seed) if locked else None,
+        gain_split=_gain_split(findings, effects),
+        nested=_nested(findings.nested, findings.config.seed) if findings.nested else None,
         effects=effects,
         candidates=all_candidates(findings, {e.name for e in effects}),
         shares=_shares(findings),
@@ -144,6 +154,29 @@ def _equal_terms(found: Mapping[TermSet, BeforeAfter], prints: Sequence[str], se
             )
         )
     return rows
+
+
+def _gain_split(findings: LoopFindings, effects: Sequence[AddedEffect]) -> list[GainPart]:
+    by_name = {effect.name: effect for effect in effects}
+    return [GainPart(part=part_of(by_name[step.name]), **vars(step)) for step in findings.gain_steps]
+
+
+def _nested(found: Nested, seed: int) -> NestedResult:
+    kinds: dict[ChosenKind, list[str]] = {
+        "named": [name for part in found.parts for name in part.named],
+        "generic": [name for part in found.parts for name in part.generic],
+        "per-scan": [name for part in found.parts for name in part.accepted],
+    }
+    return NestedResult(
+        held_out=found.held_out,
+        selections=len(found.parts),
+        equal_terms=_equal_terms(found.scores, found.prints, seed),
+        chosen=[
+            Chosen(name=name, kind=kind, times=times)
+            for kind, names in kinds.items()
+            for name, times in Counter(names).most_common()
+        ],
+    )
 
 
 def _terms_error(score: Score) -> TermsError:

@@ -140,6 +140,33 @@ def _decide_again(
     found.add(*held.winner, before=without)
 
 
+class EffectSets:
+    """The model with some of the effects of a search, fitted where the search has not done it.
+
+    Args:
+        found: what was selected; ``base``: the model without any effect; ``study``: the scans of both.
+    """
+
+    def __init__(self, found: Search, base: State, study: Study):
+        self._found = found
+        self._study = study
+        self._known = {frozenset(s.fits.chain.names): s for pair in found.steps.values() for s in pair}
+        self._known |= {frozenset(): base, frozenset(found.names): found.state}
+
+    def state(self, names: Sequence[str]) -> State:
+        """The model with these effects."""
+        wanted = frozenset(names)
+        if wanted not in self._known:
+            chain = self._found.state.fits.chain
+            values = {name: own for name, own in chain.values().items() if name in wanted}
+            self._known[wanted] = fit_state(chain.with_effects(values), self._study)
+        return self._known[wanted]
+
+    def without(self, name: str) -> State:
+        """The final set without one of its effects."""
+        return self.state([other for other in self._found.names if other != name])
+
+
 def separating_experiment(names: Sequence[str]) -> str:
     """What would tell the members of a set apart."""
     experiments = dict.fromkeys(get_effect(name).separating for name in names)

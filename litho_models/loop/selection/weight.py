@@ -14,8 +14,8 @@ from litho_models.loop.probes.defects import find_defects
 from litho_models.loop.probes.selection import generic_terms
 from litho_models.loop.screening.directions import PROJECTIONS
 from litho_models.loop.selection.rivals import freed_changes, gains_nm2
-from litho_models.loop.selection.search import Search
-from litho_models.loop.study import State, Study, fit_state
+from litho_models.loop.selection.search import EffectSets, Search
+from litho_models.loop.study import State, Study
 from litho_models.scan_terms import Terms
 from litho_models.scoring.statistics import bootstrap_interval
 
@@ -61,14 +61,14 @@ class Weight:
         return f"it gains {self.gain_nm2:.1f} nm², {', '.join(reasons)}" if reasons else ""
 
 
-def weigh_effects(found: Search, study: Study, learner: Learner) -> dict[str, Weight]:
-    """The weight of every effect of a search, by name."""
+def weigh_effects(found: Search, study: Study, learner: Learner, fitted: EffectSets) -> dict[str, Weight]:
+    """The weight of every effect of a search, by name; ``fitted``: the model with each set of its effects."""
     weights = {}
     for entry in found.added:
         name = entry.effect.name
         study.report(f"weighing {name}")
         terms = PROJECTIONS[found.first[name].projection]
-        weights[name] = weigh(_without(name, found, study), found.state, study, learner, terms)
+        weights[name] = weigh(fitted.without(name), found.state, study, learner, terms)
     return weights
 
 
@@ -96,13 +96,3 @@ def weigh(without: State, final: State, study: Study, learner: Learner, terms: T
         probe_ahead=bool(bootstrap_interval((other - own).tolist(), seed=study.seed)[0] > 0),
         learner_gain_nm2=rest.mean_nm2 if rest.matters else 0.0,
     )
-
-
-def _without(name: str, found: Search, study: Study) -> State:
-    """The final model without one effect, the rest fitted again; known already if it was added last."""
-    chain = found.state.fits.chain
-    kept = {other: values for other, values in chain.values().items() if other != name}
-    before = found.steps[name][0] if name in found.steps else None
-    if before is not None and set(before.fits.chain.names) == set(kept):
-        return before
-    return fit_state(chain.with_effects(kept), study)
