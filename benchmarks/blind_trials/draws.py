@@ -18,8 +18,9 @@ from litho_data.virtual_fab.knobs import KNOBS, OFF_CATALOGUE
 
 # The board: at least 20 causes in form and 16 of another form are to count, so one more of each is drawn.
 BOARD: dict[Kind, int] = {"in-form": 21, "alias": 2, "other-form": 17, "empty": 8}
-BOARD_RMS_NM = (9.0, 25.0)
-# The default noise has the first, so it is seen in every trial; a refit leaves less than 9 nm of the second.
+# Sought on four scans, a size is up to 13 % off on all of them: what is drawn is to count nevertheless.
+BOARD_RMS_NM = (10.0, 25.0)
+# The default noise has the first, so it is seen in every trial; a refit leaves less than 10 nm of the second.
 _NOT_DEALT = {"line-roughness", "long-range-proximity"}
 # Base parameters within the Physics model and its bounds, other than the fab's own.
 _PRINTER_RANGES = {

@@ -22,7 +22,7 @@ from litho_data.virtual_fab.knobs import OFF_CATALOGUE, KnobBoard
 from litho_data.virtual_fab.settings import Microscope, Noise
 from litho_data.virtual_fab.strength import search_strength
 from litho_models.fitting.least_squares import Linearised, Rules, fit_least_squares, gram, orthonormal
-from litho_models.fitting.small_models import STEP_LIMIT, ModelProblem
+from litho_models.fitting.small_models import ModelProblem
 from litho_models.models import build_model
 from litho_models.scan_terms import POLICIES
 from litho_models.simulator import Simulator
@@ -32,7 +32,7 @@ _NOISE_KNOB = "line-roughness"
 # strength_for_rms refuses a knob that leaves less than this under the policy.
 _TRACE_NM = 1e-3
 _SCAN_TERMS = POLICIES["full"] | {"warp"}
-_RULES = Rules("squares", term_weight=0.0, steps=8, relative_gain=0.01, step_limit=STEP_LIMIT)
+_RULES = Rules("squares", relative_gain=5e-3)
 # A strength is sought on four scans (both cut-offs, all of the order) and measured on all.
 _SOUGHT_ON = 4
 _PRECISION = 0.03

@@ -68,9 +68,9 @@ def test_a_board_follows_from_its_seed_and_has_what_was_promised():
     assert Counter(draw.kind for draw in draws) == BOARD
     assert all(len(draw.knobs) == (draw.kind != "empty") for draw in draws)
     rms_nm = np.array([knob.wanted_rms_nm for draw in draws for knob in draw.knobs])
-    # All that is drawn is to count: above 8 nm with room for the precision of the search.
+    # All that is drawn is to count: above 8 nm with room for what the search on four scans is off by.
     assert BOARD_RMS_NM[0] <= rms_nm.min() <= rms_nm.max() <= BOARD_RMS_NM[1]
-    assert BOARD_RMS_NM[0] > 1.05 * 8
+    assert 0.87 * BOARD_RMS_NM[0] > 8
     assert len({tuple(draw.printer.items()) for draw in draws}) == 48
 
 
@@ -216,9 +216,9 @@ def test_what_the_base_can_imitate_does_not_count():
     jobs = trial_jobs(draw, 4, 96)
     other = replace(Printer(), threshold_steepness=2.2, loose_retention=0.45, network_reach_um=1.6)
     heights = [1.02 * height + 0.03 for height in noise_free(None, jobs, other)]
-    # 4 % of the steps are float32 of the fit; the size of the change itself is 25 nm and more.
-    assert refitted_rms_nm(heights, jobs, Printer()) < 0.5
-    assert refitted_rms_nm(heights, jobs, other) < 0.05
+    # Kernels cut at 4 σ leave 0.001 nm of a change of more than 25 nm.
+    assert refitted_rms_nm(heights, jobs, Printer()) < 0.01
+    assert refitted_rms_nm(heights, jobs, other) < 0.01
 
 
 def test_an_alias_is_planted_at_the_drawn_size_and_hardly_any_of_it_counts():
