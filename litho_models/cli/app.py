@@ -192,7 +192,7 @@ def predict(
 
     Example: litho-models predict zoo:pbl layout.png --out height.gsf
     """
-    from litho_models.frozen.predicting import predict_file
+    from litho_models.frozen.on_store import predict_file
 
     frozen = litho_models.load_frozen(litho_models.zoo.model_folder(model), extrapolate=extrapolate)
     height = predict_file(frozen, layout, out)

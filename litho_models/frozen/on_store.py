@@ -1,15 +1,34 @@
-"""A frozen model on the scans of a store: what it predicts, and which of them it has seen."""
+"""A frozen model on stored data: a file of levels, or the scans of a store and which of them it has seen."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 import torch
 
+from litho_data.level.scan import write_heights
+from litho_data.readers.layout import read_layout
 from litho_data.store import PrintedScan, Store
 from litho_models.frozen.simulator import FrozenSimulator
 from litho_models.scan_terms.background import Background
+
+
+def predict_file(model: FrozenSimulator, layout: str | Path, out: str | Path) -> np.ndarray:
+    """Predict the print of a layout of levels and write its height to ``out``; returns it, (ny, nx) µm.
+
+    Args:
+        layout: TIFF, PNG, BMP or NPY of integer levels, sampled at the model's pitch.
+        out: a ``.gsf`` (opens in Gwyddion) or ``.npy`` file.
+
+    Raises:
+        InputError: a layout that cannot be read or has levels beyond the calibrated range, or another suffix.
+    """
+    pitch_um = model.pitch_um
+    height = model.predict(read_layout(layout) * np.float32(model.card["level_height_um"]))
+    write_heights(out, height, pitch_um=(pitch_um, pitch_um), title=f"{Path(layout).name} by {model.name}")
+    return height
 
 
 def predict_frozen(model: FrozenSimulator, scan: PrintedScan) -> np.ndarray:

@@ -104,7 +104,8 @@ class FrozenSimulator(nn.Module):
             InputError: as ``forward``; whole numbers, which would be levels; fewer than two dimensions.
         """
         self.check_geometry(pitch_um)
-        return predict_layout(self, layout_um)
+        step_um = self.card["level_height_um"]
+        return predict_layout(self, layout_um, pitch_um=self.pitch_um, level_height_um=step_um)
 
     def __repr__(self) -> str:
         card = self.card
