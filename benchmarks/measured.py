@@ -19,6 +19,7 @@ from benchmarks.measured_figures import draw_prediction, draw_steps
 from benchmarks.measured_loop import equal_freedom_table, locked_table, loop_table
 from benchmarks.measured_models import (
     benchmark_table,
+    coverage_table,
     design_table,
     extrapolation_table,
     further_table,
@@ -52,7 +53,7 @@ NAMES = ("benchmark", "paper split", "loop", "loop with PBL", "locked scans", "d
 PAGES = {
     ROOT / "README.md": ("headline",),
     FOLDER / "README.md": (*NAMES, "equal freedom", "whole prints", "paired differences", "further figures"),
-    ROOT / "docs" / "noise.md": ("noise",),
+    ROOT / "docs" / "noise.md": ("noise", "coverage"),
 }
 
 
@@ -73,10 +74,13 @@ def texts(folder: Path) -> dict[str, str]:
         "paper split": paper_table(
             [found(f"benchmark_paper_{seed}.json") for seed in PAPER_SEEDS], found("benchmark.json")
         ),
-        "whole prints": extrapolation_table(found("benchmark_prints.json"), found("benchmark.json")),
+        "whole prints": extrapolation_table(
+            found("benchmark_prints.json"), found("benchmark.json"), found("noise.json")
+        ),
         "paired differences": paired_table(found("benchmark.json")),
         "further figures": further_table(found("benchmark.json")),
         "noise": noise_table(found("noise.json")),
+        "coverage": coverage_table(found("noise.json")),
         "loop": loop_table(found("close_loop.json")),
         "loop with PBL": loop_table(found("close_loop_pbl.json"), found("close_loop.json")),
         "locked scans": locked_table(

@@ -151,7 +151,7 @@ def plan(out: Path, dataset: str) -> list[Step]:
             ),
             Step(
                 "What no model can predict: the noise",
-                _models("noise", store, "--out", noise),
+                _models("noise", store, "--residuals", out / "benchmark", "--out", noise),
                 noise / "noise.json",
                 noise / "report.html",
             ),

@@ -172,7 +172,8 @@ def benchmark(
         open_lock_box=open_lock_box,
         seed=seed,
     )
-    typer.echo(headline_table(result.scores, result.noise_floor).round(2).to_string(index=False, na_rep="–"))
+    table = headline_table(result.scores, result.nuisance, result.noise_floor)
+    typer.echo(table.round(2).to_string(index=False, na_rep="–"))
     scored = len(result.split.scored_ids)
     if scored < FEWEST_FOR_INTERVAL:
         typer.echo(f"no intervals: {scored} scans are too few, {FEWEST_FOR_INTERVAL} are needed")

@@ -24,7 +24,7 @@ from litho_models.fitting.fit import common_geometry
 from litho_models.fitting.runs import training_config
 from litho_models.models import build_model, require_models
 from litho_models.scan_terms import BackgroundUse, NuisanceProtocol, Policy
-from litho_models.scoring.noise_floor import noise_floor
+from litho_models.scoring.noise_floor import estimated_floor, stated_floor
 from litho_models.scoring.pairs import paired_scores
 from litho_models.scoring.records import ModelScores, Prediction
 from litho_models.scoring.scores import score_model
@@ -60,7 +60,8 @@ def benchmark(
         folds: number of folds of ``grouped``, at most the number of development scans.
         policy: nuisances of ``mae_datum_free_nm``.
         background: whether each fit's background, learned on its training scans, is added to its predictions.
-        noise: ``noise.json`` of this dataset, or its folder: its floor is shown beside the errors.
+        noise: ``noise.json`` of this dataset, or its folder: its floor is shown beside the errors. Without it
+            the floor is estimated from the held-out residuals of the best model here.
         open_lock_box: also train on all development scans and score the locked ones.
         seed: of the split, the nuisance blocks and the training.
 
@@ -73,7 +74,7 @@ def benchmark(
     dataset = open_store(store)
     _require_same_benchmark(Path(out), dataset.name, models, split, seed)
     scans = dataset.scans()
-    floor = noise_floor(dataset.name, noise)
+    floor = stated_floor(dataset.name, noise)
     locked = dataset.locked_ids
     plan = plan_folds(scans, locked, split, folds=folds, seed=seed, open_lock_box=open_lock_box)
     _say_fewer_folds(folds, sum(not fold.locked for fold in plan), split)
@@ -100,6 +101,10 @@ def benchmark(
 
     scores = [score(name, scored, False) for name in models]
     ids = [scan.id for scan in scored]
+    maps = {name: {scan.id: predicted[name, False][scan.id].map_um for scan in scored} for name in models}
+    if noise is None:
+        best = min(scores, key=lambda entry: entry.mae_datum_free_nm).model
+        floor = estimated_floor(best, scored, list(maps[best].values()), protocol.blocks, seed)
     result = Benchmark(
         schema="litho-models/benchmark/1",
         run=run_info([seed], len(scans)),
@@ -122,7 +127,6 @@ def benchmark(
         fits=fits,
     )
     result.write(out)
-    maps = {name: {scan.id: predicted[name, False][scan.id].map_um for scan in scored} for name in models}
     write_benchmark_report(result, scored, maps, out)
     return result
 

@@ -23,7 +23,7 @@ from litho_models.frozen.on_store import (
 )
 from litho_models.prediction.cost import measured_predictions
 from litho_models.scan_terms import BackgroundUse, NuisanceProtocol, Policy
-from litho_models.scoring.noise_floor import noise_floor
+from litho_models.scoring.noise_floor import stated_floor
 from litho_models.scoring.records import Prediction
 from litho_models.scoring.scores import score_model
 from litho_models.splits.folds import ScoredSplit
@@ -66,7 +66,7 @@ def evaluate(
             other data.
     """
     dataset = open_store(store)
-    floor = noise_floor(dataset.name, noise)
+    floor = stated_floor(dataset.name, noise)
     frozen = load_frozen(zoo.model_folder(model), device=device, extrapolate=extrapolate)
     frozen.check_geometry(dataset.pitch_um, dataset.level_height_um)
     every = dataset.scans()

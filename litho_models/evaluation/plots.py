@@ -10,7 +10,6 @@ import numpy as np
 from litho_data.foundation.report import new_figure
 from litho_data.store import PrintedScan
 from litho_models.scan_terms import NuisanceProtocol, cross_fit, policy_terms
-from litho_models.scoring.noise_floor import NoiseFloor
 from litho_models.scoring.records import ModelScores
 
 if TYPE_CHECKING:
@@ -24,7 +23,7 @@ _RESIDUAL_RANGE_NM = 80.0
 _CHI2_95_OF_2 = 5.991
 
 
-def error_bars(scores: Sequence[ModelScores], floor: NoiseFloor, paper_line: bool) -> Figure:
+def error_bars(scores: Sequence[ModelScores], floor_nm: float | None, paper_line: bool) -> Figure:
     """Both headline errors of each model with their intervals over scans, the noise floor and the paper."""
     figure = new_figure(8.5, 0.55 * len(scores) + 2.0)
     axes = figure.subplots()
@@ -50,10 +49,8 @@ def error_bars(scores: Sequence[ModelScores], floor: NoiseFloor, paper_line: boo
             capsize=3,
             lw=1,
         )
-    if floor.mae_nm is not None:
-        axes.axvline(
-            floor.mae_nm, color="#2d8a4e", ls="--", label=f"noise floor, {floor.kind}: {floor.mae_nm:.1f} nm"
-        )
+    if floor_nm is not None:
+        axes.axvline(floor_nm, color="#2d8a4e", ls="--", label=f"noise floor, datum-free: {floor_nm:.1f} nm")
     if paper_line:
         axes.axvline(
             PAPER_MAE_NM, color="#c23b22", ls=":", label=f"paper, PBL: {PAPER_MAE_NM} nm (other protocol)"

@@ -13,6 +13,7 @@ from litho_data.store import PrintedScan
 from litho_models.evaluation import plots, tables
 from litho_models.evaluation.results import Benchmark, Evaluation, ModelRecord
 from litho_models.scan_terms import NuisanceProtocol
+from litho_models.scoring.noise_floor import NoiseFloor
 from litho_models.scoring.records import ModelScores, ScanRow
 from litho_models.splits.folds import ScoredSplit
 
@@ -51,10 +52,17 @@ def write_evaluation_report(
     if result.model.extrapolated:
         page.note("Layouts beyond the calibrated range were accepted (extrapolate).")
     page.paragraph(tables.protocol_text(result.nuisance))
-    page.figure(plots.error_bars([scores], result.noise_floor, False), "Error and noise floor.")
-    page.table(tables.headline_table([scores], result.noise_floor), "Error over scans.", "headline.csv")
+    page.figure(
+        plots.error_bars([scores], result.noise_floor.mae_at(result.nuisance.policy), False),
+        "Error and noise floor.",
+    )
+    page.table(
+        tables.headline_table([scores], result.nuisance, result.noise_floor),
+        "Error over scans.",
+        "headline.csv",
+    )
     page.paragraph(tables.floor_text(result.noise_floor))
-    _policies(page, [scores], result.nuisance)
+    _policies(page, [scores], result.nuisance, result.noise_floor)
     page.table(tables.metric_table([scores]), "Phase, similarity, edges.", "metrics.csv", digits=3)
     page.paragraph(tables.metric_text())
     page.table(
@@ -89,8 +97,13 @@ def write_benchmark_report(
         f"over {len(best.scans)} held-out {'quadrants' if result.split.kind == 'paper' else 'scans'}.",
     )
     page.paragraph(f"Split '{result.split.kind}': {_SPLIT_TEXT[result.split.kind]}.")
-    page.figure(plots.error_bars(scores, result.noise_floor, on_paper_data), "Held-out error of every model.")
-    page.table(tables.headline_table(scores, result.noise_floor), "Held-out error.", "benchmark.csv")
+    page.figure(
+        plots.error_bars(scores, result.noise_floor.mae_at(result.nuisance.policy), on_paper_data),
+        "Held-out error of every model.",
+    )
+    page.table(
+        tables.headline_table(scores, result.nuisance, result.noise_floor), "Held-out error.", "benchmark.csv"
+    )
     page.paragraph(tables.protocol_text(result.nuisance))
     if on_paper_data:
         page.note(paper_sentence(result.split.kind))
@@ -98,11 +111,11 @@ def write_benchmark_report(
     if result.locked_scores:
         page.heading("Lock box")
         page.table(
-            tables.headline_table(result.locked_scores, result.noise_floor),
+            tables.headline_table(result.locked_scores, result.nuisance, result.noise_floor),
             "Trained on all development scans, scored once on the locked scans.",
             "lock_box.csv",
         )
-    _policies(page, scores, result.nuisance)
+    _policies(page, scores, result.nuisance, result.noise_floor)
     page.heading("Pairs of models")
     page.table(
         _pairs(result), "Datum-free MAE, first minus second, over the same scans.", "pairs.csv", digits=3
@@ -170,9 +183,11 @@ def paper_sentence(split: str) -> str:
     )
 
 
-def _policies(page: Page, scores: Sequence[ModelScores], protocol: NuisanceProtocol) -> None:
+def _policies(
+    page: Page, scores: Sequence[ModelScores], protocol: NuisanceProtocol, floor: NoiseFloor
+) -> None:
     page.table(
-        tables.policy_table(scores, protocol),
+        tables.policy_table(scores, protocol, floor),
         "MAE under every nuisance policy, with and without the background, nm.",
         "policies.csv",
     )

@@ -18,15 +18,23 @@ if TYPE_CHECKING:
     from litho_models.prediction.cost import PredictionCost
 
 
-def headline_table(scores: Sequence[ModelScores], floor: NoiseFloor) -> pd.DataFrame:
-    """One row per model: both errors with intervals, spread and bias; below them the noise floor."""
+def headline_table(
+    scores: Sequence[ModelScores], protocol: NuisanceProtocol, floor: NoiseFloor
+) -> pd.DataFrame:
+    """One row per model: both errors with intervals, what they have above the noise floor, spread and bias.
+
+    Below them the floor itself, under each column that of its own scan terms.
+    """
     import pandas as pd
 
+    below = floor.at(protocol.policy)
+    least = floor.mae_at(protocol.policy)
     rows = [
         {
             "model": s.model,
             "mae_datum_free_nm": s.mae_datum_free_nm,
             "mae_datum_free_ci95_nm": interval_text(s.mae_datum_free_ci95_nm),
+            "above_floor_nm": None if least is None else s.mae_datum_free_nm - least,
             "rmse_datum_free_nm": s.rmse_datum_free_nm,
             "mae_abs_nm": s.mae_abs_nm,
             "mae_abs_ci95_nm": interval_text(s.mae_abs_ci95_nm),
@@ -37,15 +45,22 @@ def headline_table(scores: Sequence[ModelScores], floor: NoiseFloor) -> pd.DataF
     ]
     known = {
         "model": f"noise floor ({floor.kind})",
-        "mae_datum_free_nm": floor.mae_nm,
-        "rmse_datum_free_nm": floor.rmse_nm,
+        "mae_datum_free_nm": least,
+        "mae_datum_free_ci95_nm": interval_text(below.mae_ci95_nm if below else None),
+        "rmse_datum_free_nm": below.rmse_nm if below else floor.rmse_nm if least is not None else None,
+        "mae_abs_nm": floor.mae_at("none"),
         "scans": "",
     }
     return pd.DataFrame([*rows, known])
 
 
-def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol) -> pd.DataFrame:
-    """One row per model and background, one column per policy; for line offsets the effective number."""
+def policy_table(
+    scores: Sequence[ModelScores], protocol: NuisanceProtocol, floor: NoiseFloor
+) -> pd.DataFrame:
+    """One row per model and background, one column per policy; for line offsets the effective number.
+
+    The last row is the noise floor under each.
+    """
     import pandas as pd
 
     rows = []
@@ -55,6 +70,9 @@ def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol) -> p
                 named = {f"{error.policy}_mae_nm": error.mae_nm for error in errors}
                 lines = {f"{error.policy}_k": error.k for error in errors if error.policy == "full+rows"}
                 rows.append({"model": s.model, "background": background, **named, **lines})
+    if floor.by_policy:
+        below = {f"{row.policy}_mae_nm": row.mae_nm for row in floor.by_policy}
+        rows.append({"model": f"noise floor ({floor.kind})", "background": protocol.background, **below})
     return pd.DataFrame(rows)
 
 
@@ -143,7 +161,8 @@ _BACKGROUND_TEXT = {
 def floor_text(floor: NoiseFloor) -> str:
     """The noise floor and how it is known."""
     known = f"MAE {floor.mae_nm:.2f} nm, RMSE {floor.rmse_nm:.2f} nm; " if floor.mae_nm is not None else ""
-    return f"Noise floor ({floor.kind}): {known}{floor.source}"
+    upper = "; at least what a model has above it can still be won" if floor.kind == "upper-estimate" else ""
+    return f"Noise floor ({floor.kind}): {known}{floor.source}{upper}."
 
 
 def metric_text() -> str:

@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from litho_data.foundation.errors import InputError
 from litho_data.store import PrintedScan, Store, open_store
+from litho_models.evaluation.results import Benchmark
 from litho_models.fitting.config import Recipe
 from litho_models.fitting.runs import train
 from litho_models.frozen import zoo
@@ -19,7 +20,7 @@ from litho_models.frozen.files import load_frozen
 from litho_models.frozen.freezing import MODEL_FOLDER, freeze
 from litho_models.frozen.on_store import card_background, predict_frozen
 from litho_models.scan_terms import BackgroundUse, NuisanceProtocol, Policy
-from litho_models.scoring.noise_floor import noise_floor
+from litho_models.scoring.noise_floor import UNKNOWN_FLOOR
 from litho_models.scoring.records import ModelScores, Prediction
 from litho_models.scoring.scores import score_model
 from litho_models.simulator import Variant
@@ -50,7 +51,7 @@ def make_zoo(
         recipe, variant, steps, seed: as in ``litho-models train``, which makes the same weights.
         open_lock_box: score the locked scans too; once per release.
         benchmark: result of ``litho-models benchmark`` with split ``grouped``; its out-of-fold errors of
-            the same models go into the cards, marked as those of other fits.
+            the same models go into the cards, marked as those of other fits, and so does its noise floor.
 
     Raises:
         InputError: a store or benchmark that cannot be used, or a zoo that is too large.
@@ -59,6 +60,7 @@ def make_zoo(
     every = dataset.scans()
     locked = dataset.locked_ids
     out_of_fold = _out_of_fold(benchmark, dataset) if benchmark is not None else {}
+    floor = Benchmark.read(benchmark).noise_floor if benchmark is not None else UNKNOWN_FLOOR
     given = {"seed": seed, **({"steps": steps} if steps is not None else {})}
     cards = {}
     for name in models:
@@ -73,7 +75,7 @@ def make_zoo(
             "metrics": metrics,
             "command": _command(dataset.name, name, recipe, variant, given),
             "nuisance": NuisanceProtocol.of_policy("offset", background="training").model_dump(mode="json"),
-            "noise_floor": noise_floor(dataset.name).model_dump(mode="json"),
+            "noise_floor": floor.model_dump(mode="json"),
             "limitations": _limitations(metrics),
         }
         card.model_copy(update=described).write(run / MODEL_FOLDER)
@@ -144,8 +146,6 @@ def _metrics(scores: ModelScores, split: str, background: BackgroundUse) -> list
 
 
 def _out_of_fold(benchmark: str | Path, dataset: Store) -> dict[str, list[CardMetric]]:
-    from litho_models.evaluation.results import Benchmark
-
     result = Benchmark.read(benchmark)
     if (result.dataset.sha256, result.split.kind) != (dataset.sha256, "grouped"):
         raise InputError(

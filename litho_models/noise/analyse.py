@@ -9,10 +9,11 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import run_info
 from litho_data.readers import read_scan
 from litho_data.store import open_store
-from litho_models.noise.bounds import NoiseBound, noise_bounds
+from litho_models.noise.budget import noise_budget
 from litho_models.noise.calibration import analyse_spread
 from litho_models.noise.dose import dose_matrix
 from litho_models.noise.references import Reference, ReferencePrints, reference_prints, store_references
+from litho_models.noise.repeats import RepeatedPrints, repeated_prints
 from litho_models.noise.report import write_noise_report
 from litho_models.noise.residuals import read_residuals
 from litho_models.noise.result import NoiseAnalysis, floor_of
@@ -32,7 +33,8 @@ def analyse_noise(
         store: dataset store, with or without scans of use substrate, flat and steps, with or without doses.
         out: result folder.
         residuals: folders of ``litho-models benchmark`` (out of fold), or frozen models (folders,
-            ``zoo:NAME``): adds σ(x) and its calibration; several of one kind are taken as an ensemble.
+            ``zoo:NAME``): adds σ(x) and its calibration, and the budget if the residuals are out of fold;
+            several of one kind are taken as an ensemble.
         model: which model of the benchmarks; their best one by default.
         seed: of the pixels drawn.
 
@@ -57,17 +59,19 @@ def analyse_noise(
         f"{scan_id}: lock box" + (", in the dose matrix only" if scan_id in in_matrix else "")
         for scan_id in locked
     ]
-    bounds = noise_bounds(dataset, scans, seed)
+    repeats = repeated_prints(scans)
+    budget = noise_budget(spread, seed) if spread is not None and spread.held_out else None
     result = NoiseAnalysis(
         schema="litho-models/noise/1",
         run=run_info([seed], len(scans), dropped),
         dataset=dataset.dataset_id,
-        noise_floor=floor_of(found, bounds),
+        noise_floor=floor_of(found, repeats, budget),
         references=found,
+        repeats=repeats,
         dose=dose,
-        bounds=bounds,
+        budget=budget,
         spread=analyse_spread(spread, seed) if spread is not None else None,
-        notes=[*_notes(found, bounds), *notes],
+        notes=[*_notes(found, repeats), *notes],
     )
     result.write(out)
     write_noise_report(result, references, out)
@@ -105,10 +109,9 @@ def analyse_noise_of_files(
         schema="litho-models/noise/1",
         run=run_info([], len(references)),
         dataset=None,
-        noise_floor=floor_of(found, []),
+        noise_floor=floor_of(found, None, None),
         references=found,
         dose=None,
-        bounds=[],
         spread=None,
         notes=["Single scans as read: levelling is an offset or a polynomial of second degree, as stated."],
     )
@@ -117,12 +120,13 @@ def analyse_noise_of_files(
     return result
 
 
-def _notes(found: ReferencePrints, bounds: Sequence[NoiseBound]) -> list[str]:
+def _notes(found: ReferencePrints, repeats: RepeatedPrints | None) -> list[str]:
     notes = []
-    if not found.flats and not any(bound.name.startswith("repeated") for bound in bounds):
+    if not found.flats and repeats is None:
         notes.append(
-            "No flat and no repeated print in the store: the floor is a lower bound and cannot stop a loop. "
-            "One flat print and one repeat of any layout would measure it."
+            "No flat and no repeated print in the store: the noise is not measured. It can be estimated "
+            "from the out-of-fold residuals of a model (--residuals); one flat print, or one repeat of any "
+            "layout, would measure it."
         )
     if found.flats and not found.substrates:
         notes.append("No bare substrate: the flat print's roughness includes microscope and substrate.")

@@ -1,8 +1,9 @@
-"""Is a stated σ right? Judged scan by scan, with a variance fitted on other scans."""
+"""Is a stated spread right? Judged on prints that it was not fitted on."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -11,39 +12,41 @@ from pydantic import Field
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
+from litho_models.noise.residuals import Residuals
 from litho_models.noise.spread_scores import (
     COVERAGE_LEVELS,
-    coverage,
-    crps,
-    half_width,
-    negative_log_likelihood,
+    GAUSSIAN,
+    Tails,
     normalised_calibration_error,
-    probability_below,
     sparsification_error,
 )
 from litho_models.noise.variance import (
-    SigmaBin,
     VarianceModel,
-    covariate_maps,
-    fit_log_variance,
-    sigma_bins,
-    sigma_nm,
+    covariates_of,
+    fit_spread,
+    place_maps,
+    scale_nm,
     variance_model,
 )
 from litho_models.scan_terms import NuisanceProtocol
+from litho_models.scoring.statistics import pixel_interval
 
 _FOLDS = 5
-_PIXELS_PER_SCAN = 20_000
+# Their roughness is correlated over ten pixels and more: more of them tell nothing new.
+_PIXELS_PER_SCAN = 5000
 _PIT_BINS = 20
+_BINS = 8
+# What the groups of pixels are judged at: one and two σ of a Gaussian.
+_GROUP_LEVELS = (0.68, 0.95)
 # Share of scans that the scan-level factor promises to hold; it takes nine scans to promise 90 %.
 CONFORMAL_LEVEL = 0.9
 
 
 class ScanCalibration(Record):
-    """One scan: likelihood and CRPS (nm, lower is better), coverage at 50, 80, 90, 95 %, rms of r/σ.
+    """One scan: likelihood and CRPS (nm, lower is better), coverage at the levels stated, rms of r/σ.
 
-    ``factor_90`` is what σ has to be multiplied by for 90 % of this scan's pixels to be covered; ``ence`` and
-    ``ause`` are shares (see ``spread_scores``), None in older result files.
+    ``factor_90`` is what the scale has to be multiplied by for 90 % of this scan's pixels to be covered;
+    ``ence`` and ``ause`` are shares (see ``spread_scores``), None in older result files.
     """
 
     scan: str
@@ -57,13 +60,13 @@ class ScanCalibration(Record):
 
 
 class Calibration(Record):
-    """A description of the spread and how it holds on scans it was not fitted on.
+    """A description of the spread and how it holds on prints that it was not fitted on.
 
     Args:
         name: constant, by covariates, or with the ensemble's disagreement added.
         nll, crps_nm, coverage, ence, ause: means over scans; ``levels`` are what the coverages should be.
-        pit: histogram of Φ(r/σ) in 20 equal bins, sums to one; flat if the shape is Gaussian.
-        conformal_factor: σ times this covers 90 % of the pixels in 90 % of new scans, the scan being
+        pit: histogram of the distribution at r/s in 20 equal bins, sums to one; flat if the shape is right.
+        conformal_factor: scale times this covers 90 % of the pixels in 90 % of new scans, the scan being
             the exchangeable unit; None with fewer than nine scans.
     """
 
@@ -80,10 +83,32 @@ class Calibration(Record):
     ause: float | None = None
 
 
+class SigmaBin(Record):
+    """Pixels within one range of one covariate: measured and predicted spread, and how far the latter holds.
+
+    Coverage at 68 and 95 % with 95 % intervals over prints; ENCE and AUSE within the group. None in older
+    result files, whose levels are shares of the range.
+    """
+
+    covariate: str
+    low: float
+    high: float
+    pixels: int
+    rms_nm: float
+    predicted_nm: float
+    coverage_68: float | None = None
+    coverage_68_ci95: tuple[float, float] | None = None
+    coverage_95: float | None = None
+    coverage_95_ci95: tuple[float, float] | None = None
+    ence: float | None = None
+    ause: float | None = None
+
+
 class SpreadAnalysis(Record):
     """σ(x) of one model's residuals and its calibration; ``bins`` are out of fold, the model is of all.
 
-    ``nuisance``: what the residuals were freed of; an offset only in older result files.
+    ``nuisance``: what the residuals were freed of; an offset only in older result files. ``left_out``: what
+    was left out of a fit to be judged with it.
     """
 
     model: str
@@ -96,24 +121,21 @@ class SpreadAnalysis(Record):
     bins: list[SigmaBin]
     calibrations: list[Calibration]
     nuisance: NuisanceProtocol = Field(default_factory=NuisanceProtocol)
+    left_out: str = "scans"
 
 
-class Residuals(NamedTuple):
-    """Out-of-fold residuals of one model: scans, measured minus predicted (nm, NaN where not scored), and
-    the standard deviation of the members' predictions (nm), None for a single one; ``protocol`` is what the
-    residuals were freed of."""
+class Stated(NamedTuple):
+    """What is said of the residual of one scan: its scale at each pixel, nm, and the shape over it."""
 
-    model: str
-    scans: Sequence[PrintedScan]
-    residuals_nm: Sequence[np.ndarray]
-    disagreement_nm: Sequence[np.ndarray] | None
-    members: int
-    held_out: bool
-    protocol: NuisanceProtocol = NuisanceProtocol()
+    scale_nm: np.ndarray
+    tails: Tails
 
 
 def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
-    """Fit a constant and a covariate variance out of fold by scan, and judge both on the scans left out.
+    """Fit a constant and a covariate spread without each print, and judge both on the prints left out.
+
+    With fewer than three prints scans are left out instead. The tails are chosen with the scale, on the
+    prints that both are fitted to.
 
     Raises:
         InputError: fewer than three scans.
@@ -121,31 +143,40 @@ def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
     scans, residuals = found.scans, found.residuals_nm
     if len(scans) < 3:
         raise InputError("scans for a calibration", got=len(scans), wanted="at least 3, to leave some out")
-    maps = [np.moveaxis(covariate_maps(scan), 0, -1) for scan in scans]
-    samples = [_sample(residual, seed + number) for number, residual in enumerate(residuals)]
-    chosen = [(m[s], r[s]) for m, r, s in zip(maps, residuals, samples, strict=True)]
-    fold = np.arange(len(scans)) % min(_FOLDS, len(scans))
-    constant: list[np.ndarray] = [np.empty(0)] * len(scans)
-    by_covariates: list[np.ndarray] = [np.empty(0)] * len(scans)
-    for number in range(fold.max() + 1):
-        learned = [chosen[i] for i in np.flatnonzero(fold != number)]
-        design = np.concatenate([part[0] for part in learned])
-        residual = np.concatenate([part[1] for part in learned])
-        beta = fit_log_variance(design, residual)
-        for held_out in np.flatnonzero(fold == number).tolist():
-            constant[held_out] = np.full(scans[held_out].shape, np.sqrt(np.mean(residual**2)))
-            by_covariates[held_out] = sigma_nm(beta, maps[held_out])
+    places = [place_maps(scan) for scan in scans]
+    drawn = [_sample(residual, seed + number) for number, residual in enumerate(residuals)]
+    designs = [
+        covariates_of({name: field[at] for name, field in own.items()})
+        for own, at in zip(places, drawn, strict=True)
+    ]
+    samples = [residual[at] for residual, at in zip(residuals, drawn, strict=True)]
+    prints = [scan.print_id for scan in scans]
+    by_print = len(set(prints)) > 2
+    fold = np.unique(prints, return_inverse=True)[1] if by_print else np.arange(len(scans)) % _FOLDS
+    constant: dict[int, Stated] = {}
+    by_covariates: dict[int, Stated] = {}
+    for number in np.unique(fold):
+        learned = np.flatnonzero(fold != number)
+        residual = np.concatenate([samples[i] for i in learned])
+        flat = float(np.sqrt(np.mean(residual**2)))
+        beta, tails = fit_spread(np.concatenate([designs[i] for i in learned]), residual)
+        for i in np.flatnonzero(fold == number).tolist():
+            constant[i] = Stated(np.full(scans[i].shape, flat), GAUSSIAN)
+            by_covariates[i] = Stated(scale_nm(beta, covariates_of(places[i])), tails)
+    stated = [by_covariates[i] for i in range(len(scans))]
     calibrations = [
-        calibrate("constant", scans, residuals, constant),
-        calibrate("by covariates", scans, residuals, by_covariates),
+        calibrate("constant", scans, residuals, [constant[i] for i in range(len(scans))]),
+        calibrate("by covariates", scans, residuals, stated),
     ]
     epistemic = None
     if found.disagreement_nm is not None:
-        total = [np.hypot(s, d) for s, d in zip(by_covariates, found.disagreement_nm, strict=True)]
-        calibrations.append(calibrate("by covariates, disagreement added", scans, residuals, total))
+        wider = [
+            Stated(np.hypot(own.scale_nm, apart), own.tails)
+            for own, apart in zip(stated, found.disagreement_nm, strict=True)
+        ]
+        calibrations.append(calibrate("by covariates, disagreement added", scans, residuals, wider))
         epistemic = float(np.sqrt(np.mean([np.mean(d**2) for d in found.disagreement_nm])))
     finite = np.concatenate([residual[np.isfinite(residual)] for residual in residuals])
-    everything = fit_log_variance(*(np.concatenate([part[i] for part in chosen]) for i in (0, 1)))
     return SpreadAnalysis(
         model=found.model,
         members=found.members,
@@ -153,36 +184,34 @@ def analyse_spread(found: Residuals, seed: int = 0) -> SpreadAnalysis:
         residual_rms_nm=float(np.sqrt(np.mean(finite**2))),
         residual_mae_nm=float(np.abs(finite).mean()),
         epistemic_rms_nm=epistemic,
-        variance=variance_model(everything),
-        bins=sigma_bins(scans, residuals, by_covariates),
+        variance=variance_model(*fit_spread(np.concatenate(designs), np.concatenate(samples))),
+        bins=_bins(scans, places, residuals, stated),
         calibrations=calibrations,
         nuisance=found.protocol,
+        left_out="prints" if by_print else "scans",
     )
 
 
 def calibrate(
-    name: str,
-    scans: Sequence[PrintedScan],
-    residuals_nm: Sequence[np.ndarray],
-    sigmas_nm: Sequence[np.ndarray],
+    name: str, scans: Sequence[PrintedScan], residuals_nm: Sequence[np.ndarray], stated: Sequence[Stated]
 ) -> Calibration:
-    """Judge a stated σ on every scan; pixels first, then scans."""
+    """Judge a stated spread on every scan; pixels first, then scans."""
     rows = []
     histogram = np.zeros(_PIT_BINS)
-    for scan, residual, sigma in zip(scans, residuals_nm, sigmas_nm, strict=True):
+    for scan, residual, (scale, tails) in zip(scans, residuals_nm, stated, strict=True):
         scored = np.isfinite(residual)
-        r, s = residual[scored], sigma[scored]
-        counts = np.histogram(probability_below(r / s), bins=_PIT_BINS, range=(0, 1))[0]
+        r, s = residual[scored], scale[scored]
+        counts = np.histogram(tails.probability_below(r / s), bins=_PIT_BINS, range=(0, 1))[0]
         histogram += counts / counts.sum()
         rows.append(
             ScanCalibration(
                 scan=scan.id,
-                nll=float(negative_log_likelihood(r, s).mean()),
-                crps_nm=float(crps(r, s).mean()),
-                coverage=[coverage(r, s, level) for level in COVERAGE_LEVELS],
-                standardised_rms=float(np.sqrt(np.mean((r / s) ** 2))),
-                factor_90=float(np.quantile(np.abs(r / s), 0.9) / half_width(0.9)),
-                ence=normalised_calibration_error(r, s),
+                nll=float(-tails.log_likelihood(r, s).mean()),
+                crps_nm=float(tails.crps(r, s).mean()),
+                coverage=[float(tails.covered(r, s, level).mean()) for level in COVERAGE_LEVELS],
+                standardised_rms=float(np.sqrt(np.mean((r / s) ** 2)) / tails.sd),
+                factor_90=float(np.quantile(np.abs(r / s), 0.9) / tails.half_width(0.9)),
+                ence=normalised_calibration_error(r, tails.sd * s),
                 ause=sparsification_error(r, s),
             )
         )
@@ -202,6 +231,63 @@ def calibrate(
     )
 
 
+def _bins(
+    scans: Sequence[PrintedScan],
+    places: Sequence[dict[str, np.ndarray]],
+    residuals_nm: Sequence[np.ndarray],
+    stated: Sequence[Stated],
+) -> list[SigmaBin]:
+    """All pixels, each level, and ranges of equal count of what else the spread depends on."""
+    used = [np.isfinite(residual) for residual in residuals_nm]
+
+    def pooled(maps: Sequence[np.ndarray]) -> np.ndarray:
+        return np.concatenate([field[use] for field, use in zip(maps, used, strict=True)])
+
+    residual = pooled(residuals_nm)
+    sigma = pooled([own.tails.sd * own.scale_nm for own in stated])
+    owner = np.repeat(np.arange(len(scans)), [int(use.sum()) for use in used])
+    inside = [
+        pooled(
+            [own.tails.covered(r, own.scale_nm, level) for r, own in zip(residuals_nm, stated, strict=True)]
+        )
+        for level in _GROUP_LEVELS
+    ]
+    prints = [scan.print_id for scan in scans]
+
+    def judged(covariate: str, low: float, high: float, mine: np.ndarray) -> SigmaBin:
+        coverage = [float(within[mine].mean()) for within in inside]
+        intervals = [pixel_interval(within[mine], owner[mine], prints) for within in inside]
+        return SigmaBin(
+            covariate=covariate,
+            low=low,
+            high=high,
+            pixels=int(mine.sum()),
+            rms_nm=float(np.sqrt(np.mean(residual[mine] ** 2))),
+            predicted_nm=float(np.sqrt(np.mean(sigma[mine] ** 2))),
+            coverage_68=coverage[0],
+            coverage_68_ci95=intervals[0],
+            coverage_95=coverage[1],
+            coverage_95_ci95=intervals[1],
+            ence=normalised_calibration_error(residual[mine], sigma[mine]),
+            ause=sparsification_error(residual[mine], sigma[mine]),
+        )
+
+    rows = [judged("all", 0, 0, np.ones(residual.size, bool))]
+    levels = pooled([scan.mask_level for scan in scans])
+    for level in np.unique(levels).tolist():
+        mine = levels == level
+        if residual[mine].any():
+            rows.append(judged("level", level, level, mine))
+    for name in ("slope", "edge distance", "radius²"):
+        values = pooled([own[name] for own in places])
+        limits = np.unique(np.quantile(values, np.linspace(0, 1, _BINS + 1)))
+        for low, high in pairwise(limits.tolist()):
+            mine = (values >= low) & ((values <= high) if high == limits[-1] else (values < high))
+            if residual[mine].any():
+                rows.append(judged(name, low, high, mine))
+    return rows
+
+
 def conformal_factor(factors: Sequence[float], level: float = CONFORMAL_LEVEL) -> float | None:
     """The ⌈(n + 1) level⌉-th smallest factor of n scans: a new scan needs no more with probability ``level``.
 
@@ -213,7 +299,7 @@ def conformal_factor(factors: Sequence[float], level: float = CONFORMAL_LEVEL) -
 
 
 def _sample(residual: np.ndarray, seed: int) -> tuple[np.ndarray, ...]:
-    """Row and column indices of at most 20,000 scored pixels."""
+    """Row and column indices of at most ``_PIXELS_PER_SCAN`` scored pixels."""
     scored = np.flatnonzero(np.isfinite(residual))
     if scored.size > _PIXELS_PER_SCAN:
         scored = np.random.default_rng(seed).choice(scored, _PIXELS_PER_SCAN, replace=False)

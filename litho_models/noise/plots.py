@@ -9,19 +9,15 @@ import numpy as np
 
 from litho_data.foundation.report import new_figure
 from litho_data.foundation.units import NM_PER_UM
-from litho_models.noise.bounds import NoiseBound
 from litho_models.noise.calibration import SpreadAnalysis
 from litho_models.noise.dose import DoseMatrix
 from litho_models.noise.staircase import READABLE_AT, StepPrint
 from litho_models.noise.surface import without_background
-from litho_models.scoring.noise_floor import NoiseFloor
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from litho_models.noise.references import Reference
-
-_COLOURS = {"lower bound": "#2d8a4e", "upper bound": "#c23b22", "estimate": "#0b6aa2", "control": "#9aa7b5"}
 
 
 def surfaces(references: Sequence[Reference]) -> Figure:
@@ -50,27 +46,6 @@ def surfaces(references: Sequence[Reference]) -> Figure:
         profile.set_xlabel("x, µm", fontsize=8)
         profile.grid(alpha=0.3)
     grid[1, 0].set_ylabel("middle row, nm")
-    return figure
-
-
-def bounds(found: Sequence[NoiseBound], floor: NoiseFloor) -> Figure:
-    """σ of every estimate of the noise, coloured by what it is."""
-    figure = new_figure(8.5, 0.42 * len(found) + 1.5)
-    axes = figure.subplots()
-    for number, bound in enumerate(found):
-        low, high = bound.ci95_nm or (bound.sigma_nm, bound.sigma_nm)
-        axes.barh(number, bound.sigma_nm, 0.6, color=_COLOURS[bound.direction])
-        axes.plot([low, high], [number, number], color="#1c2430", lw=1.2)
-    labels = [f"{bound.name}\n({bound.of} noise)" for bound in found]
-    axes.set_yticks(range(len(found)), labels, fontsize=7.5)
-    axes.invert_yaxis()
-    if floor.rmse_nm is not None:
-        axes.axvline(floor.rmse_nm, color="#1c2430", ls="--", lw=1)
-    for direction, colour in _COLOURS.items():
-        axes.barh(0, 0, color=colour, label=direction)
-    axes.set_xlabel("σ, nm (line: 95 % interval over scans; dashed: floor)")
-    axes.legend(fontsize=8)
-    axes.grid(axis="x", alpha=0.3)
     return figure
 
 
@@ -136,7 +111,7 @@ def dose(found: DoseMatrix) -> Figure:
 
 def spread(found: SpreadAnalysis) -> Figure:
     """Observed (points) and predicted (line) rms of the residual in ranges of each covariate."""
-    names = list(dict.fromkeys(row.covariate for row in found.bins))
+    names = list(dict.fromkeys(row.covariate for row in found.bins if row.covariate != "all"))
     figure = new_figure(2.8 * len(names), 2.9)
     grid = figure.subplots(1, len(names), squeeze=False, sharey=True)[0]
     for axes, name in zip(grid, names, strict=True):

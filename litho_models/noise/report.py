@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING
 from litho_data.foundation.report import Page
 from litho_models.evaluation.tables import interval_text
 from litho_models.noise import plots
+from litho_models.noise.budget import NoiseBudget
 from litho_models.noise.calibration import SpreadAnalysis
 from litho_models.noise.dose import DoseMatrix
 from litho_models.noise.staircase import StepPrint
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from litho_models.noise.references import Reference
     from litho_models.noise.result import NoiseAnalysis
 
@@ -35,14 +34,13 @@ def write_noise_report(result: NoiseAnalysis, references: Sequence[Reference], o
         _references(page, result, references)
     if result.dose is not None:
         _dose(page, result.dose)
-    if result.bounds:
-        page.heading("Bounds from ordinary prints")
+    if result.repeats is not None:
         page.paragraph(
-            "Each estimate says on which side it errs. The lower bound holds if the printer is no sharper "
-            "than stated; an upper bound counts topography as well."
+            f"Repeated prints ({result.repeats.scans}): σ {result.repeats.sigma_nm:.2f} nm "
+            f"({interval_text(result.repeats.ci95_nm)}), half the variance of a pair's difference."
         )
-        page.figure(plots.bounds(result.bounds, floor), "σ of each estimate.")
-        page.table(_bounds(result), "What each contains, and what not.", "bounds.csv")
+    if result.budget is not None:
+        _budget(page, result.budget)
     if result.spread is not None:
         _spread(page, result.spread)
     page.code(result.run.command)
@@ -120,7 +118,8 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
     page.paragraph(
         f"Residuals {origin}, each scan freed by policy {found.nuisance.policy}, {background}: RMS "
         f"{found.residual_rms_nm:.2f} nm, MAE {found.residual_mae_nm:.2f} nm. They hold the noise and what "
-        "the model lacks. σ(x) is fitted on other scans than it is judged on."
+        f"the model lacks. σ(x) is fitted on other {found.left_out} than it is judged on; its shape is "
+        f"{_shape(found.variance.freedom)}."
     )
     if found.epistemic_rms_nm is not None:
         page.paragraph(
@@ -169,30 +168,70 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
     page.table(pd.DataFrame(scans), "By scan.", "calibration_scans.csv", digits=3)
     page.table(
         pd.DataFrame(
-            {"covariate": found.variance.covariates, "coefficient of ln σ²": found.variance.coefficients}
+            {"covariate": found.variance.covariates, "coefficient of ln s²": found.variance.coefficients}
         ),
-        "The variance fitted on all scans.",
+        "The scale fitted on all scans.",
         "variance.csv",
         digits=4,
     )
-    page.table(pd.DataFrame([row.model_dump() for row in found.bins]), "The bins.", "spread.csv")
+    bins = [
+        {
+            **row.model_dump(),
+            "coverage_68_ci95": _percent(row.coverage_68_ci95),
+            "coverage_95_ci95": _percent(row.coverage_95_ci95),
+        }
+        for row in found.bins
+    ]
+    page.table(
+        pd.DataFrame(bins),
+        "By level, and in ranges of equal count of what else σ depends on; intervals over prints.",
+        "spread.csv",
+        digits=3,
+    )
 
 
-def _bounds(result: NoiseAnalysis) -> pd.DataFrame:
+def _budget(page: Page, found: NoiseBudget) -> None:
     import pandas as pd
 
-    return pd.DataFrame(
-        [
-            {
-                "estimate from": bound.name,
-                "of": bound.of,
-                "what it is": bound.direction,
-                "sigma_nm": bound.sigma_nm,
-                "ci95_nm": interval_text(bound.ci95_nm),
-                "mae_nm": bound.mae_nm,
-                "contains": bound.contains,
-                "lacks": bound.lacks,
-            }
-            for bound in result.bounds
-        ]
+    page.heading("Noise budget")
+    page.paragraph(
+        f"From residuals of {found.model} on scans that it had not seen. Both estimates are upper ones: what "
+        "the model lacks counts as noise unless like surroundings share it. What levelling took out of the "
+        "scans before is missing, a few percent of the variance."
     )
+    if found.floor.by_policy:
+        rows = [
+            {
+                "policy": row.policy,
+                "k": row.k,
+                "mae_nm": row.mae_nm,
+                "mae_ci95_nm": interval_text(row.mae_ci95_nm),
+                "sigma_nm": row.rmse_nm,
+                "sigma_ci95_nm": interval_text(row.rmse_ci95_nm),
+            }
+            for row in found.floor.by_policy
+        ]
+        page.table(
+            pd.DataFrame(rows),
+            "Noise by the scan terms that are set free (k per scan), from like layout surroundings in "
+            "different scans; 95 % intervals over prints.",
+            "budget.csv",
+        )
+    flat = [
+        {**row.model_dump(exclude={"ci95_nm"}), "sigma_ci95_nm": interval_text(row.ci95_nm)}
+        for row in found.flat_levels
+    ]
+    page.table(
+        pd.DataFrame(flat),
+        f"Where the layout is flat (slope at most {found.flat_slope:.3f}, a quarter of the pixels); tilt, "
+        "bow, gain and line offsets of each scan are free.",
+        "flat_levels.csv",
+    )
+
+
+def _shape(freedom: float | None) -> str:
+    return "Gaussian" if freedom is None else f"Student's t with {freedom:g} degrees of freedom"
+
+
+def _percent(interval: tuple[float, float] | None) -> str:
+    return "–" if interval is None else f"{interval[0]:.3f} … {interval[1]:.3f}"

@@ -4,21 +4,41 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
-from litho_data.store import Store
+from litho_data.store import PrintedScan, Store
 from litho_models.frozen import zoo
 from litho_models.frozen.card import CARD_FILE
 from litho_models.frozen.files import load_frozen
 from litho_models.frozen.on_store import card_background, predict_frozen, trained_ids
-from litho_models.noise.calibration import Residuals
 from litho_models.scan_terms import NuisanceProtocol, cross_fit, policy_terms
 from litho_models.scoring.records import Prediction
 
 Predictions = dict[str, list[np.ndarray]]
+
+
+class Residuals(NamedTuple):
+    """What a model leaves of each scan: measured minus predicted, nm, NaN where not scored.
+
+    Attributes:
+        maps_um: the map that the model, or the mean of its members, expects of each scan, (ny, nx).
+        residuals_nm: freed of the terms of ``protocol``.
+        disagreement_nm: standard deviation of the members' predictions, None for a single one.
+        held_out: whether no member had seen the scan that it predicts.
+    """
+
+    model: str
+    scans: Sequence[PrintedScan]
+    maps_um: Sequence[np.ndarray]
+    residuals_nm: Sequence[np.ndarray]
+    disagreement_nm: Sequence[np.ndarray] | None
+    members: int
+    held_out: bool
+    protocol: NuisanceProtocol = NuisanceProtocol()
 
 
 def read_residuals(store: Store, sources: Sequence[str | Path], model: str | None = None) -> Residuals:
@@ -55,14 +75,14 @@ def read_residuals(store: Store, sources: Sequence[str | Path], model: str | Non
     if not scans:
         raise InputError("residuals", got="no scan of the store", wanted="predictions of its scans")
     count = min(len(members[scan.id]) for scan in scans)
-    residuals = []
+    maps = [np.mean(members[scan.id], axis=0) for scan in scans]
     terms = policy_terms(protocol.policy)
-    for scan in scans:
-        mean = np.mean(members[scan.id], axis=0)
-        fit = cross_fit(scan.height_um, mean, scan.valid, terms, protocol.blocks)
-        residuals.append(NM_PER_UM * fit.residual_um)
+    residuals = [
+        NM_PER_UM * cross_fit(scan.height_um, expected, scan.valid, terms, protocol.blocks).residual_um
+        for scan, expected in zip(scans, maps, strict=True)
+    ]
     spread = [NM_PER_UM * disagreement_um(members[scan.id]) for scan in scans] if count > 1 else None
-    return Residuals(name, scans, residuals, spread, count, held_out, protocol)
+    return Residuals(name, scans, maps, residuals, spread, count, held_out, protocol)
 
 
 def disagreement_um(predictions_um: Sequence[np.ndarray]) -> np.ndarray:

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import ClassVar, Literal
 
-from pydantic import Field
+from pydantic import Field, JsonValue
 
 from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import RunInfo
 from litho_data.store.schema import DatasetId
-from litho_models.noise.bounds import NoiseBound
+from litho_models.noise.budget import NoiseBudget
 from litho_models.noise.calibration import SpreadAnalysis
 from litho_models.noise.dose import DoseMatrix
 from litho_models.noise.references import ReferencePrints
+from litho_models.noise.repeats import RepeatedPrints
 from litho_models.noise.surface import pooled
-from litho_models.scoring.noise_floor import NoiseFloor
+from litho_models.scoring.noise_floor import UNKNOWN_FLOOR, NoiseFloor
 
 
 class NoiseAnalysis(Result):
-    """``noise.json``."""
+    """``noise.json``; ``bounds`` are found in older files, which had them in place of a budget."""
 
     SCHEMA: ClassVar[str] = "litho-models/noise/1"
     FILE_NAME: ClassVar[str] = "noise.json"
@@ -29,22 +29,26 @@ class NoiseAnalysis(Result):
     dataset: DatasetId | None
     noise_floor: NoiseFloor
     references: ReferencePrints
+    repeats: RepeatedPrints | None = None
     dose: DoseMatrix | None
-    bounds: list[NoiseBound]
+    budget: NoiseBudget | None = None
+    bounds: list[dict[str, JsonValue]] = Field(default_factory=list)
     spread: SpreadAnalysis | None
     notes: list[str]
 
 
-def floor_of(found: ReferencePrints, bounds: Sequence[NoiseBound]) -> NoiseFloor:
-    """The floor for ``mae_datum_free`` with policy ``offset``: repeats, a flat print, or a lower bound."""
-    for bound in bounds:
-        if bound.name.startswith("repeated prints"):
-            return NoiseFloor(
-                mae_nm=bound.mae_nm,
-                rmse_nm=bound.sigma_nm,
-                kind="measured",
-                source=f"{bound.name}; contains {bound.contains}; lacks {bound.lacks}",
-            )
+def floor_of(
+    found: ReferencePrints, repeats: RepeatedPrints | None, budget: NoiseBudget | None
+) -> NoiseFloor:
+    """The floor: of repeats, else of a flat print, else what the residuals of a model say."""
+    if repeats is not None:
+        return NoiseFloor(
+            mae_nm=repeats.mae_nm,
+            rmse_nm=repeats.sigma_nm,
+            kind="measured",
+            source=f"half the variance between {repeats.scans} repeated prints, offset and bow of a pair "
+            "removed",
+        )
     flats = [flat for flat in found.flats if flat.background == "offset"]
     if flats:
         flat = pooled(flats)
@@ -55,13 +59,4 @@ def floor_of(found: ReferencePrints, bounds: Sequence[NoiseBound]) -> NoiseFloor
             source=f"flat print ({', '.join(one.id for one in flats)}), offset removed, MAE as measured; one "
             "level only: edges and other levels may be rougher",
         )
-    lower = [bound for bound in bounds if bound.of == "all" and bound.direction == "lower bound"]
-    if lower:
-        best = max(lower, key=lambda bound: bound.sigma_nm)
-        return NoiseFloor(
-            mae_nm=best.mae_nm,
-            rmse_nm=best.sigma_nm,
-            kind="lower-bound",
-            source=f"{best.name}; contains {best.contains}; lacks {best.lacks}",
-        )
-    return NoiseFloor(mae_nm=None, rmse_nm=None, kind="unknown", source="nothing measured that bounds it")
+    return budget.floor if budget is not None else UNKNOWN_FLOOR

@@ -1,48 +1,82 @@
-"""Scores of a stated σ: closed forms for a Gaussian prediction, and two that need no distribution.
+"""Scores of a stated spread: closed forms for a Gaussian or Student's t, and two that need no distribution.
 
-CRPS after Gneiting and Raftery 2007, doi:10.1198/016214506000001437, equation 21 with its sign turned.
+CRPS of a Gaussian after Gneiting and Raftery 2007, doi:10.1198/016214506000001437, equation 21 with its sign
+turned.
 """
 
 from __future__ import annotations
 
-import numpy as np
-from scipy.special import ndtr, ndtri
+from dataclasses import dataclass
 
-COVERAGE_LEVELS = (0.5, 0.8, 0.9, 0.95)
+import numpy as np
+from scipy.special import betaln, gammaln, ndtr, ndtri, stdtr, stdtrit
+
+COVERAGE_LEVELS = (0.5, 0.68, 0.8, 0.9, 0.95)
 # Mean absolute value of a Gaussian of standard deviation 1.
 GAUSSIAN_MAE = float(np.sqrt(2 / np.pi))
 _BINS = 10
 
 
-def negative_log_likelihood(residual: np.ndarray, sigma: np.ndarray | float) -> np.ndarray:
-    """``ln σ + r²/2σ² + ½ ln 2π`` per pixel; residual and σ in one unit, which decides the zero."""
-    z = residual / sigma
-    return np.log(sigma) + 0.5 * z**2 + 0.5 * np.log(2 * np.pi)
+@dataclass(frozen=True)
+class Tails:
+    """Shape of a residual over its scale: Student's t, a Gaussian for ``freedom`` = ∞."""
+
+    freedom: float = float("inf")
+
+    def log_likelihood(self, residual: np.ndarray, scale: np.ndarray | float) -> np.ndarray:
+        """Log density per pixel; residual and scale in one unit, which decides the zero."""
+        z2 = (residual / scale) ** 2
+        if np.isinf(self.freedom):
+            return -np.log(scale) - 0.5 * z2 - 0.5 * np.log(2 * np.pi)
+        n = self.freedom
+        constant = gammaln((n + 1) / 2) - gammaln(n / 2) - 0.5 * np.log(n * np.pi)
+        return constant - np.log(scale) - (n + 1) / 2 * np.log1p(z2 / n)
+
+    def weight(self, z2: np.ndarray) -> np.ndarray | float:
+        """−2 d log density / d z²: how much a squared residual counts, 1 for a Gaussian."""
+        return 1.0 if np.isinf(self.freedom) else (self.freedom + 1) / (self.freedom + z2)
+
+    @property
+    def information(self) -> float:
+        """Fisher information of a pixel about the logarithm of the squared scale."""
+        return 0.5 if np.isinf(self.freedom) else 0.5 * self.freedom / (self.freedom + 3)
+
+    @property
+    def sd(self) -> float:
+        """Standard deviation over the scale; more than two degrees of freedom."""
+        return 1.0 if np.isinf(self.freedom) else float(np.sqrt(self.freedom / (self.freedom - 2)))
+
+    def probability_below(self, z: np.ndarray | float) -> np.ndarray:
+        """Distribution of z; of a residual over its scale it is uniform where both are right (PIT)."""
+        return ndtr(z) if np.isinf(self.freedom) else stdtr(self.freedom, z)
+
+    def half_width(self, level: float) -> float:
+        """Half width of the central interval that holds ``level``, over the scale."""
+        share = 0.5 + level / 2
+        return float(ndtri(share) if np.isinf(self.freedom) else stdtrit(self.freedom, share))
+
+    def covered(self, residual: np.ndarray, scale: np.ndarray | float, level: float) -> np.ndarray:
+        """Whether each pixel lies within the central interval that should hold ``level`` of them."""
+        return np.abs(residual) <= self.half_width(level) * scale
+
+    def crps(self, residual: np.ndarray, scale: np.ndarray | float) -> np.ndarray:
+        """Continuous ranked probability score in the unit of the residual.
+
+        It is the mean absolute error of a prediction that states its own spread; for scale → 0 it is |r|. Of
+        Student's t after Jordan, Krüger and Lerch 2019, doi:10.18637/jss.v090.i12.
+        """
+        z = residual / scale
+        if np.isinf(self.freedom):
+            density = np.exp(-0.5 * z**2) / np.sqrt(2 * np.pi)
+            return scale * (z * (2 * ndtr(z) - 1) + 2 * density - 1 / np.sqrt(np.pi))
+        n = self.freedom
+        density = np.exp(self.log_likelihood(z, 1.0))
+        constant = 2 * np.sqrt(n) / (n - 1) * np.exp(betaln(0.5, n - 0.5) - 2 * betaln(0.5, n / 2))
+        slope = z * (2 * stdtr(n, z) - 1)
+        return scale * (slope + 2 * density * (n + z**2) / (n - 1) - constant)
 
 
-def crps(residual: np.ndarray, sigma: np.ndarray | float) -> np.ndarray:
-    """Continuous ranked probability score ``σ (z (2Φ(z) − 1) + 2φ(z) − 1/√π)``, z = r/σ, in the unit of r.
-
-    It is the mean absolute error of a prediction that states its own spread; for σ → 0 it is |r|.
-    """
-    z = residual / sigma
-    density = np.exp(-0.5 * z**2) / np.sqrt(2 * np.pi)
-    return sigma * (z * (2 * ndtr(z) - 1) + 2 * density - 1 / np.sqrt(np.pi))
-
-
-def coverage(residual: np.ndarray, sigma: np.ndarray | float, level: float) -> float:
-    """Share of pixels within the central interval that should hold ``level`` of them."""
-    return float(np.mean(np.abs(residual) <= half_width(level) * sigma))
-
-
-def half_width(level: float) -> float:
-    """Half width of the central interval of a Gaussian that holds ``level``, in standard deviations."""
-    return float(ndtri(0.5 + level / 2))
-
-
-def probability_below(z: np.ndarray | float) -> np.ndarray:
-    """Φ(z); of a residual over its σ it is uniform on 0 ... 1 where σ is right (PIT)."""
-    return ndtr(z)
+GAUSSIAN = Tails()
 
 
 def normalised_calibration_error(residual: np.ndarray, sigma: np.ndarray, bins: int = _BINS) -> float:

@@ -11,12 +11,12 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.roughness import stair_steps
-from litho_models.noise.spread_scores import half_width, probability_below
+from litho_models.noise.spread_scores import GAUSSIAN
 
 Axis = Literal["x", "y"]
 
 # Two heights are told apart if at most 2.5 % of each lie beyond the middle between them.
-READABLE_AT = 2 * half_width(0.95)
+READABLE_AT = 2 * GAUSSIAN.half_width(0.95)
 # A tread narrower than this share of the field is an edge, not a tread.
 _NARROWEST_TREAD = 1 / 25
 _MOST_TREADS = 24
@@ -109,7 +109,7 @@ def step_print(
                 sigma_nm=sigma,
                 readability=ratio,
                 misread=_misread(flat, treads[number], treads[number + 1]),
-                misread_if_gaussian=float(probability_below(-ratio / 2)),
+                misread_if_gaussian=float(GAUSSIAN.probability_below(-ratio / 2)),
             )
         )
     tread_sigma = float(np.sqrt(np.mean(np.square(sigmas))))

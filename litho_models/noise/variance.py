@@ -1,22 +1,33 @@
-"""σ(x): how the spread of a residual depends on the layout and the place, as a log-linear variance.
+"""σ(x): how the spread of a residual depends on the layout and the place, as a log-linear scale.
 
-The mean comes first and stays as it is; then ln σ² = X β is fitted to its out-of-fold residuals by
-maximum likelihood. In two stages the variance cannot flatter the mean, and with some tens of scans
-a few covariates are all that can be known (compare Seitzer et al. 2022, arXiv:2203.09168).
+The mean comes first and stays as it is; then ln s² = X β is fitted to its out-of-fold residuals by maximum
+likelihood, with the tails of Student's t. In two stages the spread cannot flatter the mean, and with some
+tens of scans a few covariates are all that can be known (compare Seitzer et al. 2022, arXiv:2203.09168).
 """
 
 from __future__ import annotations
-
-from collections.abc import Sequence
-from itertools import pairwise
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
+from litho_models.noise.spread_scores import GAUSSIAN, Tails
 
-COVARIATES = ("constant", "level", "level²", "slope", "slope²", "edge distance", "radius²", "radius⁴")
+# What may matter, each a map over the scan; the slope also squared, the radius also to the fourth power.
+PLACES = ("level", "slope", "edge distance", "radius²")
+# Straight lines in between: rare levels at both ends are twice as rough as the middle.
+_LEVEL_KNOTS = np.linspace(0, 1, 7)
+COVARIATES = (
+    *(f"level {share:.2f}" for share in _LEVEL_KNOTS),
+    "slope",
+    "slope²",
+    "edge distance",
+    "radius²",
+    "radius⁴",
+)
+# From tails far heavier than any seen in prints to a Gaussian.
+_FREEDOMS = (4.0, 6.0, 10.0, 16.0, 30.0, float("inf"))
 # The optical spot: what the printer makes of an edge of the layout.
 _SLOPE_BLUR_UM = 0.2
 _FAR_FROM_EDGE_UM = 2.0
@@ -26,57 +37,72 @@ _STEPS = 60
 
 
 class VarianceModel(Record):
-    """ln σ² = Σ β_j φ_j, σ in nm; ``coefficients`` in the order of ``covariates``.
+    """ln s² = Σ β_j φ_j, s in nm; ``coefficients`` in the order of ``covariates``.
 
-    Level on 0 ... 1 of the range; slope of the blurred layout (height over length); distance to the
-    next change of level, at most 2 µm, in units of that; radius from the field's centre in units of half
-    its diagonal.
+    Level on 0 ... 1 of the range, between knots on a straight line; slope of the blurred layout (height over
+    length); distance to the next change of level, at most 2 µm, in units of that; radius from the field's
+    centre in units of half its diagonal. ``freedom``: of Student's t, whose scale s is; None for a Gaussian.
     """
 
     covariates: list[str]
     coefficients: list[float]
+    freedom: float | None = None
 
 
-class SigmaBin(Record):
-    """Pixels within one range of one covariate: the measured and the predicted spread."""
+def place_maps(scan: PrintedScan) -> dict[str, np.ndarray]:
+    """``PLACES`` of each pixel of a scan, (ny, nx) each."""
+    from scipy.ndimage import distance_transform_edt, maximum_filter, minimum_filter
 
-    covariate: str
-    low: float
-    high: float
-    pixels: int
-    rms_nm: float
-    predicted_nm: float
-
-
-def covariate_maps(scan: PrintedScan) -> np.ndarray:
-    """φ of each pixel of a scan, (covariates, ny, nx)."""
-    from scipy.ndimage import distance_transform_edt, gaussian_filter, maximum_filter, minimum_filter
-
-    level = scan.mask_level / (scan.levels - 1)
-    blurred = gaussian_filter(
-        scan.layout_um.astype(np.float64), _SLOPE_BLUR_UM / scan.pitch_um, mode="nearest"
-    )
-    slope = np.hypot(*np.gradient(blurred, scan.pitch_um))
     changes = maximum_filter(scan.mask_level, 3) != minimum_filter(scan.mask_level, 3)
     edge_um = np.full(scan.shape, _FAR_FROM_EDGE_UM)
     if changes.any():
         edge_um = np.minimum(distance_transform_edt(~changes) * scan.pitch_um, _FAR_FROM_EDGE_UM)
     y, x = np.meshgrid(*(np.linspace(-1, 1, size) for size in scan.shape), indexing="ij")
-    edge = edge_um / _FAR_FROM_EDGE_UM
-    radius2 = (y**2 + x**2) / 2
-    maps = [np.ones(scan.shape), level, level**2, slope, slope**2, edge, radius2, radius2**2]
-    return np.stack(maps)
+    maps = (
+        scan.mask_level / (scan.levels - 1),
+        layout_slope(scan),
+        edge_um / _FAR_FROM_EDGE_UM,
+        (y**2 + x**2) / 2,
+    )
+    return dict(zip(PLACES, maps, strict=True))
 
 
-def fit_log_variance(covariates: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """β of ln σ² = X β by maximum likelihood, Fisher scoring: β += (XᵀX)⁻¹ Xᵀ (r²/σ² − 1).
+def covariates_of(places: dict[str, np.ndarray]) -> np.ndarray:
+    """φ of each pixel, (..., covariates), from ``place_maps`` or a choice of their pixels."""
+    level, slope, edge, radius2 = (places[name] for name in PLACES)
+    between = [np.interp(level, _LEVEL_KNOTS, row) for row in np.eye(len(_LEVEL_KNOTS))]
+    return np.stack([*between, slope, slope**2, edge, radius2, radius2**2], axis=-1)
 
-    The information of a Gaussian about ln σ² is ½ for every pixel, whatever σ is; so one matrix
-    serves all steps.
+
+def layout_slope(scan: PrintedScan) -> np.ndarray:
+    """Slope of the layout behind the optical spot, height over length, (ny, nx)."""
+    from scipy.ndimage import gaussian_filter
+
+    layout = scan.layout_um.astype(np.float64)
+    blurred = gaussian_filter(layout, _SLOPE_BLUR_UM / scan.pitch_um, mode="nearest")
+    return np.hypot(*np.gradient(blurred, scan.pitch_um))
+
+
+def fit_spread(covariates: np.ndarray, residual: np.ndarray) -> tuple[np.ndarray, Tails]:
+    """Scale and tails that make the residuals most likely: β of ln s² = X β, and the shape."""
+    best, chosen = -np.inf, (np.zeros(0), GAUSSIAN)
+    for tails in map(Tails, _FREEDOMS):
+        beta = fit_log_scale(covariates, residual, tails)
+        likelihood = float(tails.log_likelihood(residual, scale_nm(beta, covariates)).mean())
+        if likelihood > best:
+            best, chosen = likelihood, (beta, tails)
+    return chosen
+
+
+def fit_log_scale(covariates: np.ndarray, residual: np.ndarray, tails: Tails = GAUSSIAN) -> np.ndarray:
+    """β of ln s² = X β by maximum likelihood, Fisher scoring: β += (XᵀX)⁻¹ Xᵀ (w r²/s² − 1) / 2I.
+
+    The information I of a pixel about ln s² does not depend on s; so one matrix serves all steps.
 
     Args:
-        covariates: X, (pixels, k), the first column constant.
+        covariates: X, (pixels, k), some sum of columns constant.
         residual: r, (pixels,).
+        tails: shape of r/s, which sets the weights w.
 
     Raises:
         InputError: no pixels, or residuals that are all zero.
@@ -89,10 +115,11 @@ def fit_log_variance(covariates: np.ndarray, residual: np.ndarray) -> np.ndarray
             wanted="more than covariates, and not all zero",
         )
     normal = covariates.T @ covariates
-    beta = np.zeros(covariates.shape[1])
-    beta[0] = np.log(square.mean())
+    level = np.full(square.size, np.log(square.mean()))
+    beta = np.linalg.lstsq(normal, covariates.T @ level, rcond=1e-10)[0]
     for _ in range(_STEPS):
-        score = covariates.T @ (square * np.exp(-covariates @ beta) - 1)
+        z2 = square * np.exp(-covariates @ beta)
+        score = covariates.T @ (tails.weight(z2) * z2 - 1) / (2 * tails.information)
         step = np.linalg.lstsq(normal, score, rcond=1e-10)[0]
         largest = np.abs(covariates @ step).max()
         step *= min(1.0, _LARGEST_STEP / largest) if largest > 0 else 1.0
@@ -102,45 +129,12 @@ def fit_log_variance(covariates: np.ndarray, residual: np.ndarray) -> np.ndarray
     return beta
 
 
-def sigma_nm(beta: np.ndarray, covariates: np.ndarray) -> np.ndarray:
-    """σ of each pixel, nm; ``covariates`` (..., k)."""
+def scale_nm(beta: np.ndarray, covariates: np.ndarray) -> np.ndarray:
+    """s of each pixel, nm; ``covariates`` (..., k)."""
     return np.exp(0.5 * covariates @ beta)
 
 
-def variance_model(beta: np.ndarray) -> VarianceModel:
+def variance_model(beta: np.ndarray, tails: Tails) -> VarianceModel:
     """The fitted coefficients as a record."""
-    return VarianceModel(covariates=list(COVARIATES), coefficients=beta.tolist())
-
-
-def sigma_bins(
-    scans: Sequence[PrintedScan],
-    residuals_nm: Sequence[np.ndarray],
-    sigmas_nm: Sequence[np.ndarray],
-    bins: int = 8,
-) -> list[SigmaBin]:
-    """Observed and predicted spread in ranges of equal count of level, slope, edge distance and radius."""
-    rows: list[SigmaBin] = []
-    maps = [covariate_maps(scan) for scan in scans]
-    usable = [np.isfinite(residual) for residual in residuals_nm]
-    residual = np.concatenate([r[use] for r, use in zip(residuals_nm, usable, strict=True)])
-    sigma = np.concatenate([s[use] for s, use in zip(sigmas_nm, usable, strict=True)])
-    for name in ("level", "slope", "edge distance", "radius²", "radius⁴"):
-        number = COVARIATES.index(name)
-        values = np.concatenate([m[number][use] for m, use in zip(maps, usable, strict=True)])
-        limits = np.unique(np.quantile(values, np.linspace(0, 1, bins + 1)))
-        for low, high in pairwise(limits):
-            last = high == limits[-1]
-            inside = (values >= low) & ((values <= high) if last else (values < high))
-            if inside.sum() < 2:
-                continue
-            rows.append(
-                SigmaBin(
-                    covariate=name,
-                    low=float(low),
-                    high=float(high),
-                    pixels=int(inside.sum()),
-                    rms_nm=float(np.sqrt(np.mean(residual[inside] ** 2))),
-                    predicted_nm=float(np.sqrt(np.mean(sigma[inside] ** 2))),
-                )
-            )
-    return rows
+    freedom = None if np.isinf(tails.freedom) else tails.freedom
+    return VarianceModel(covariates=list(COVARIATES), coefficients=beta.tolist(), freedom=freedom)

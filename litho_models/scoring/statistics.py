@@ -39,6 +39,31 @@ def bootstrap_interval(
     sums, counts = _by_group(values, groups)
     if sums.size < 2:
         return float("nan"), float("nan")
+    return _resampled(sums, counts, level, draws, seed)
+
+
+def pixel_interval(
+    values: np.ndarray, owner: np.ndarray, groups: Sequence[Hashable]
+) -> tuple[float, float] | None:
+    """Interval of a mean over pixels, resampling prints, of which each counts with its pixels.
+
+    None with fewer than ``FEWEST_FOR_INTERVAL`` prints among them.
+
+    Args:
+        values: one per pixel; ``owner``: the number of its scan; ``groups``: the print of each scan.
+    """
+    names = list(dict.fromkeys(groups))
+    member = np.array([names.index(group) for group in groups], np.intp)[owner]
+    sums, counts = np.bincount(member, values), np.bincount(member)
+    seen = counts > 0
+    if seen.sum() < FEWEST_FOR_INTERVAL:
+        return None
+    return _resampled(sums[seen], counts[seen], 0.95, BOOTSTRAP_DRAWS, 0)
+
+
+def _resampled(
+    sums: np.ndarray, counts: np.ndarray, level: float, draws: int, seed: int
+) -> tuple[float, float]:
     picks = np.random.default_rng(seed).integers(0, sums.size, size=(draws, sums.size))
     means = sums[picks].sum(axis=1) / counts[picks].sum(axis=1)
     low, high = np.quantile(means, [(1 - level) / 2, (1 + level) / 2])

@@ -78,7 +78,9 @@ def test_the_result_is_complete_on_disk(result):
     record, out = result
     assert Benchmark.read(out) == record
     table = pd.read_csv(out / "benchmark.csv").set_index("model")
-    assert list(table.index) == [*MODELS, "noise floor (unknown)"]
+    floor = f"noise floor ({record.noise_floor.kind})"
+    assert list(table.index) == [*MODELS, floor]
+    assert table.loc[floor, "mae_datum_free_nm"] == pytest.approx(record.noise_floor.mae_nm)
     scans = pd.read_csv(out / "scans.csv")
     for scores in record.scores:
         assert table.loc[scores.model, "mae_datum_free_nm"] == pytest.approx(scores.mae_datum_free_nm)

@@ -71,8 +71,8 @@ def test_nothing_is_found_where_nothing_is_missing(null) -> None:
     findings, result = null
     assert result.verdict == "nothing-missing"
     assert not findings.search.added
-    # Without structure and yet not at the floor: a lower bound of the noise cannot show that.
-    assert (result.residual.state, result.noise_floor.kind) == ("undecided", "lower-bound")
+    # Without structure and yet not at the floor: an estimate of the noise cannot show that.
+    assert (result.residual.state, result.noise_floor.kind) == ("undecided", "upper-estimate")
     # Roughness of 6 nm is all that is left: E|n| = 0.8 sd, the tilt of single scans adds a little.
     assert 4.5 < result.after.mae_datum_free_nm < 6.5
 

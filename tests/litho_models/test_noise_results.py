@@ -20,9 +20,6 @@ def test_no_dose_and_no_roughness_is_off_what_was_planted():
     assert doses.dose.recommended_dose == 1.0
     gains = [row.height_gain for row in doses.dose.rows]
     assert gains == sorted(gains)
-    planted_nm = Noise().roughness_nm
-    for name in (virtual_noise.DOSES, virtual_noise.REFERENCES):
-        found = NoiseAnalysis.read(virtual_noise.FOLDER / name)
-        gamma = next(bound for bound in found.bounds if "surroundings are alike" in bound.name)
-        # The interval over scans is 2 % of σ to either side; a dose step taken for noise would be 50 nm.
-        assert gamma.sigma_nm == pytest.approx(planted_nm, rel=0.05)
+    found = NoiseAnalysis.read(virtual_noise.FOLDER / virtual_noise.REFERENCES)
+    # 30,000 pixels know σ to 1 %; what `features` lacks of the printer adds as little.
+    assert found.budget.floor.at("full").rmse_nm == pytest.approx(Noise().roughness_nm, rel=0.02)

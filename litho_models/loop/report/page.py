@@ -21,6 +21,7 @@ from litho_models.loop.single_scans.nested_tests import scan_parameters
 from litho_models.loop.structure import PLACE
 from litho_models.loop.study import DATUM_FREE, Score, names_to_terms
 from litho_models.scan_terms import Terms, parameter_names
+from litho_models.scoring.noise_floor import NoiseFloor
 
 _BACKGROUND = {
     "none": "Without the shared background of the benchmark.",
@@ -47,8 +48,8 @@ def write_report(findings: LoopFindings, result: CloseLoop, folder: Path) -> Pat
                 f"absolute error after (before {result.before.mae_abs_nm:.1f})",
             ),
             (
-                f"{result.noise_floor.rmse_nm:.1f} nm" if result.noise_floor.rmse_nm else "–",
-                "lower bound of the noise (rms)",
+                f"{result.noise_floor.mae_nm:.2f} nm" if result.noise_floor.mae_nm else "–",
+                f"noise (MAE, k = 1): {result.noise_floor.kind.replace('-', ' ')}",
             ),
         ]
     )
@@ -77,7 +78,7 @@ def write_report(findings: LoopFindings, result: CloseLoop, folder: Path) -> Pat
 def _error_section(page: Page, findings: LoopFindings, result: CloseLoop) -> None:
     page.heading("Error before and after, with the same terms per scan")
     page.table(
-        pd.DataFrame([_equal_row(row) for row in result.equal_terms or []]),
+        pd.DataFrame([_equal_row(row, result.noise_floor) for row in result.equal_terms or []]),
         "Held-out mean absolute error on the benchmark's pixels; terms are fitted on pixels that are not "
         f"scored. {_BACKGROUND[result.nuisance.background]} Intervals (95 %) resample whole scans, or whole "
         "prints; p by flipping their signs, and what so many can show at best.",
@@ -87,7 +88,7 @@ def _error_section(page: Page, findings: LoopFindings, result: CloseLoop) -> Non
     if result.nested is not None:
         page.heading("The same where the choice itself has not seen the scans")
         page.table(
-            pd.DataFrame([_equal_row(row) for row in result.nested.equal_terms]),
+            pd.DataFrame([_equal_row(row, result.noise_floor) for row in result.nested.equal_terms]),
             f"Named effects, generic terms and terms of single scans were chosen anew without each of the "
             f"{result.nested.selections} {result.nested.held_out}, and judged there.",
             "nested.csv",
@@ -137,9 +138,9 @@ def _error_section(page: Page, findings: LoopFindings, result: CloseLoop) -> Non
         ]
     )
     page.figure(
-        staircase_figure(frame, result),
+        staircase_figure(frame),
         "Held-out mean absolute error; bars are 95 % bootstrap intervals over scans. Grey: per-scan terms of "
-        "the microscope on the base model. Blue: with the effects added. Dotted: lower bound of the noise.",
+        "the microscope on the base model. Blue: with the effects added.",
     )
     page.table(
         frame,
@@ -156,7 +157,7 @@ def _error_section(page: Page, findings: LoopFindings, result: CloseLoop) -> Non
     )
 
 
-def _equal_row(row: EqualTerms) -> dict[str, object]:
+def _equal_row(row: EqualTerms, floor: NoiseFloor) -> dict[str, object]:
     cells: dict[str, object] = {
         "terms": row.terms,
         "terms per scan before": row.before.k,
@@ -164,6 +165,7 @@ def _equal_row(row: EqualTerms) -> dict[str, object]:
         "before (nm)": row.before.mae_nm,
         "after (nm)": row.after.mae_nm,
         "gain (nm)": row.gain_nm,
+        "noise floor (nm)": floor.mae_at(row.terms),
     }
     for unit, over in (("scans", row.over_scans), ("prints", row.over_prints)):
         if over is not None:

@@ -16,7 +16,6 @@ from litho_models.loop.probes import AddedProbe, with_intervals
 from litho_models.loop.probes.displaced import DisplacedCopy
 from litho_models.loop.probes.kernel import MissingKernel
 from litho_models.loop.probes.places import drawn, drawn_profile
-from litho_models.loop.result.record import CloseLoop
 from litho_models.loop.structure import CovariateTest
 from litho_models.loop.study import Score
 
@@ -33,7 +32,7 @@ _TABLES = {
 _BEFORE, _AFTER = "#9aa5b1", "#0b6aa2"
 
 
-def staircase_figure(frame: pd.DataFrame, result: CloseLoop) -> Figure:
+def staircase_figure(frame: pd.DataFrame) -> Figure:
     """Held-out error after each step."""
     figure = new_figure(9, 0.42 * len(frame) + 1.2)
     axes = figure.subplots()
@@ -46,8 +45,6 @@ def staircase_figure(frame: pd.DataFrame, result: CloseLoop) -> Figure:
         axes.annotate(
             f"{value:.1f}", (high, position), (5, 0), textcoords="offset points", va="center", fontsize=9
         )
-    if result.noise_floor.mae_nm:
-        axes.axvline(result.noise_floor.mae_nm, color="k", ls=":", lw=1)
     axes.set_yticks(y, frame["model"])
     axes.set_xlim(0, 1.12 * float(frame["high"].max()))
     axes.set_xlabel("mean absolute error on held-out scans (nm)")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from typing import Literal
 
 import numpy as np
 
@@ -37,13 +38,20 @@ from litho_models.loop.result.record import (
 from litho_models.loop.selection.confirming import FEWEST_SCANS, SMALLEST_SHARE
 from litho_models.loop.structure import fewest_scans_for_structure
 from litho_models.loop.study import Score
-from litho_models.scan_terms import NuisanceProtocol, Terms
-from litho_models.scoring.noise_floor import NoiseFloor
+from litho_models.scan_terms import NuisanceProtocol, Policy, Terms
+from litho_models.scoring.noise_floor import NoiseFloor, floor_of_residuals
 from litho_models.scoring.pairs import over_prints, over_scans
 from litho_models.scoring.statistics import interval
 from litho_models.splits.folds import Split
 
 _NO_TERMS: Terms = frozenset()
+# Sets of terms that the loop scores and the noise is estimated for.
+_SHARED_POLICIES: tuple[Literal["none", "offset", "offset-gain", "full"], ...] = (
+    "none",
+    "offset",
+    "offset-gain",
+    "full",
+)
 
 
 def summarise(findings: LoopFindings, *, dataset: DatasetId, base_name: str, dropped: list[str]) -> CloseLoop:
@@ -66,7 +74,6 @@ def summarise(findings: LoopFindings, *, dataset: DatasetId, base_name: str, dro
         verdict = "unexplained"
     elif len(findings.development) < fewest:
         verdict = "too-few-scans"
-    floor_rms, floor_mae = findings.floor_nm
     return CloseLoop(
         schema=CloseLoop.SCHEMA,
         run=run_info([findings.config.seed], len(findings.development) + len(findings.locked), dropped),
@@ -76,12 +83,7 @@ def summarise(findings: LoopFindings, *, dataset: DatasetId, base_name: str, dro
         split=Split(kind="grouped", folds=findings.study.folds, lock_box=findings.lock_box),
         nuisance=NuisanceProtocol.of_policy("offset", findings.config.seed, findings.config.background),
         prior_hypotheses=list(findings.config.prior_hypotheses),
-        noise_floor=NoiseFloor(
-            mae_nm=floor_mae,
-            rmse_nm=floor_rms,
-            kind="lower-bound",
-            source="second differences along x of the held-out residual: blind to correlated roughness",
-        ),
+        noise_floor=_noise_floor(findings, found),
         before=_errors(found, 0, findings.config.seed),
         after=_errors(found, 1, findings.config.seed),
         locked_before=_errors(locked, 0, findings.config.seed) if locked else None,
@@ -103,7 +105,7 @@ def summarise(findings: LoopFindings, *, dataset: DatasetId, base_name: str, dro
             )
             for stage, rest in findings.explainable.items()
         ],
-        # Only a measured floor can show that it is reached; the loop has a lower bound: never at-floor.
+        # Only a measured floor can show that it is reached; the loop estimates its own: never at-floor.
         residual=Residual(state="unexplained" if unexplained else "undecided", signature=unexplained),
         verdict=verdict,
         fewest_scans=fewest,
@@ -121,6 +123,25 @@ def _signature(findings: LoopFindings) -> str:
     if (blobs := findings.probed.defects.share_of_squares) > SMALLEST_SHARE:
         parts.append(f"localised defects hold {100 * blobs:.1f} % of the squared error")
     return "; ".join(parts)
+
+
+def _noise_floor(findings: LoopFindings, found: Mapping[TermSet, BeforeAfter]) -> NoiseFloor:
+    """What the residuals after correction have in common with none of their like; else a lower bound."""
+    after: dict[Policy, tuple[float, list[np.ndarray]]] = {}
+    for policy in _SHARED_POLICIES:
+        score = found[policy][1]
+        after[policy] = score.degrees_of_freedom, score.residual_um
+    scans = [scan.stored for scan in findings.development]
+    estimate = floor_of_residuals("the corrected model", scans, after, findings.config.seed)
+    if estimate.mae_nm is not None:
+        return estimate
+    rms_nm, mae_nm = findings.floor_nm
+    return NoiseFloor(
+        mae_nm=mae_nm,
+        rmse_nm=rms_nm,
+        kind="lower-bound",
+        source="second differences along x of the held-out residual: blind to correlated roughness",
+    )
 
 
 def _span_names() -> set[str]:

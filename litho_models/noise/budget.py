@@ -1,0 +1,84 @@
+"""The noise of prints that were not made to measure it, from the out-of-fold residuals of a model.
+
+Two estimates that err on the same side: what differs between like surroundings (``estimated_floor``), and how
+rough the places are where the layout is flat, so that a model has little to get wrong.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from litho_data.foundation.results import Record
+from litho_data.foundation.units import NM_PER_UM
+from litho_models.noise.residuals import Residuals
+from litho_models.noise.variance import layout_slope
+from litho_models.scan_terms import POLICIES, cross_fit
+from litho_models.scoring.noise_floor import NoiseFloor, estimated_floor
+from litho_models.scoring.statistics import pixel_interval
+
+FLAT_SHARE = 0.25
+_FEWEST_PIXELS = 1000
+
+
+class FlatLevel(Record):
+    """Residual where the layout is flat, pixels of one level: rms and mean absolute value, nm.
+
+    Each scan is freed of policy ``full+rows``. ``ci95_nm``: of σ, over prints.
+    """
+
+    level: int
+    pixels: int
+    sigma_nm: float
+    ci95_nm: tuple[float, float] | None
+    mae_nm: float
+
+
+class NoiseBudget(Record):
+    """What the prints say about their own noise; both parts are upper estimates.
+
+    ``flat_levels`` are of the pixels whose layout slope is at most ``flat_slope``, the flattest quarter.
+    """
+
+    model: str
+    floor: NoiseFloor
+    flat_slope: float
+    flat_levels: list[FlatLevel]
+
+
+def noise_budget(found: Residuals, seed: int = 0) -> NoiseBudget:
+    """Both estimates from the residuals of one model on scans that it had not seen."""
+    blocks = found.protocol.blocks
+    slopes = [layout_slope(scan) for scan in found.scans]
+    limit = float(np.quantile(np.concatenate([slope.ravel() for slope in slopes]), FLAT_SHARE))
+    level, square, absolute, number = [], [], [], []
+    for at, (scan, expected, slope) in enumerate(zip(found.scans, found.maps_um, slopes, strict=True)):
+        fit = cross_fit(scan.height_um, expected, scan.valid, POLICIES["full+rows"], blocks)
+        flat = np.isfinite(fit.residual_um) & (slope <= limit)
+        residual = NM_PER_UM * fit.residual_um[flat]
+        level.append(scan.mask_level[flat])
+        square.append(residual**2)
+        absolute.append(np.abs(residual))
+        number.append(np.full(residual.size, at))
+    levels, squares, sizes, owner = (np.concatenate(part) for part in (level, square, absolute, number))
+    prints = [scan.print_id for scan in found.scans]
+    rows = []
+    for value in np.unique(levels).tolist():
+        mine = levels == value
+        if mine.sum() < _FEWEST_PIXELS:
+            continue
+        interval = pixel_interval(squares[mine], owner[mine], prints)
+        rows.append(
+            FlatLevel(
+                level=value,
+                pixels=int(mine.sum()),
+                sigma_nm=float(np.sqrt(squares[mine].mean())),
+                ci95_nm=None if interval is None else (interval[0] ** 0.5, interval[1] ** 0.5),
+                mae_nm=float(sizes[mine].mean()),
+            )
+        )
+    return NoiseBudget(
+        model=found.model,
+        floor=estimated_floor(found.model, found.scans, found.maps_um, blocks, seed),
+        flat_slope=limit,
+        flat_levels=rows,
+    )

@@ -1,0 +1,114 @@
+"""The gamma test: how much do residuals differ where the layout around them does not?
+
+What a model of the layout may still learn is the same in like surroundings; what differs there is noise to
+it (Stefánsson, Končar and Jones 1997, doi:10.1007/BF01413858). Each pixel is compared with pixels of other
+scans, so that datum, gain and bow of single scans count as the noise that they are to such a model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from litho_data.store import PrintedScan
+
+_BLURS_UM = (0.1, 0.2, 0.4, 0.8, 1.6)
+_SLOPE_BLUR_UM = 0.3
+# More come from scans less alike, fewer leave the product of two of them noisy.
+PARTNERS = 4
+_PIXELS, _PIXELS_PER_SCAN = 60_000, 3000
+
+
+class LikePixels(NamedTuple):
+    """Pixels of several scans, each with those most like it in ``PARTNERS`` other scans.
+
+    Attributes:
+        owner: number of the scan of each pixel, (n,); ``pixel``: its flat index in that scan, (n,).
+        partners: positions in these arrays, (n, m); no two of a row are of one scan.
+    """
+
+    owner: np.ndarray
+    pixel: np.ndarray
+    partners: np.ndarray
+
+    def noise_squared(self, residuals: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """What each pixel says of the variance of its noise, and its residual squared, (n,) each.
+
+        With residuals r₀ and r₁ ... r_m, each a misfit that like surroundings share and noise, the mean of
+        (r₀ − r_j)(r₀ − r_k), j ≠ k, is the variance of the noise in r₀ alone, whatever that of the partners:
+        rare surroundings, which are rougher, find commoner partners, and half a squared difference would be
+        too small there.
+
+        Args:
+            residuals: of each scan, (ny, nx); the unit of the result, squared.
+        """
+        value = np.empty(len(self.owner))
+        for number, residual in enumerate(residuals):
+            mine = self.owner == number
+            value[mine] = residual.reshape(-1)[self.pixel[mine]]
+        difference = value[:, None] - value[self.partners]
+        squares, count = (difference**2).sum(axis=1), self.partners.shape[1]
+        return (difference.sum(axis=1) ** 2 - squares) / (count * (count - 1)), value**2
+
+
+def like_pixels(
+    scans: Sequence[PrintedScan], scored: Sequence[np.ndarray], seed: int = 0
+) -> LikePixels | None:
+    """Draw pixels and find for each those of other scans whose layout surroundings are most like its own.
+
+    Scans of different doses differ where their layouts do not: only prints of one dose are compared.
+
+    Args:
+        scans: at least three of one dose, or None comes back; ``scored``: bool (ny, nx), which pixels count.
+        seed: of the pixels drawn.
+    """
+    from scipy.spatial import cKDTree
+
+    random = np.random.default_rng(seed)
+    by_dose: dict[float | None, list[int]] = {}
+    for number, scan in enumerate(scans):
+        if scored[number].any():
+            by_dose.setdefault(scan.dose, []).append(number)
+    groups = [group for group in by_dose.values() if len(group) > 2]
+    if not groups:
+        return None
+    used = sorted(number for group in groups for number in group)
+    most = max(1, min(_PIXELS_PER_SCAN, _PIXELS // len(used)))
+    drawn = {}
+    for number in used:
+        candidates = np.flatnonzero(scored[number])
+        drawn[number] = random.choice(candidates, min(most, candidates.size), replace=False)
+    owner = np.concatenate([np.full(len(drawn[number]), number) for number in used])
+    feature = _whitened(np.concatenate([layout_features(scans[n])[:, drawn[n]].T for n in used]))
+    partners = np.empty((len(owner), min(PARTNERS, min(map(len, groups)) - 1)), np.intp)
+    for group in groups:
+        members = {number: np.flatnonzero(owner == number) for number in group}
+        trees = {number: cKDTree(feature[at]) for number, at in members.items()}
+        for number, at in members.items():
+            others = [other for other in group if other != number]
+            distance, nearest = zip(*(trees[other].query(feature[at]) for other in others), strict=True)
+            found = np.stack([members[o][i] for o, i in zip(others, nearest, strict=True)], axis=1)
+            closest = np.argsort(np.stack(distance, axis=1), axis=1)[:, : partners.shape[1]]
+            partners[at] = np.take_along_axis(found, closest, axis=1)
+    return LikePixels(owner, np.concatenate([drawn[number] for number in used]), partners)
+
+
+def layout_features(scan: PrintedScan) -> np.ndarray:
+    """What the surroundings of each pixel look like: blurred layouts and two slopes, (k, ny·nx), µm."""
+    from scipy.ndimage import gaussian_filter
+
+    layout = scan.layout_um.astype(np.float64)
+    maps = [gaussian_filter(layout, sigma / scan.pitch_um, mode="nearest") for sigma in _BLURS_UM]
+    slopes = np.gradient(gaussian_filter(layout, _SLOPE_BLUR_UM / scan.pitch_um, mode="nearest"))
+    maps += [slope * (_SLOPE_BLUR_UM / scan.pitch_um) for slope in slopes]
+    return np.stack([field.ravel() for field in maps])
+
+
+def _whitened(feature: np.ndarray) -> np.ndarray:
+    """Features of unit covariance, so that the distance does not depend on their scale."""
+    centred = feature - feature.mean(axis=0)
+    values, vectors = np.linalg.eigh(np.cov(centred.T))
+    kept = values > 1e-9 * values.max()
+    return centred @ (vectors[:, kept] / np.sqrt(values[kept]))
