@@ -23,12 +23,12 @@ from litho_models.loop.probes.places import map_columns_at
 from litho_models.loop.probes.tables import FEWEST_ORDERS, ORDER_STEPS
 from litho_models.loop.selection.confirming import SMALLEST_SHARE
 from litho_models.loop.study import Study
-from litho_models.models.features import Features, FeaturesConfig
+from litho_models.models.features import Features, FeaturesConfig, RandomFeaturesConfig
 from litho_models.scan_terms import Terms
 from litho_models.scoring.statistics import interval
 
 # All rows of all scans; with more scans each is thinned.
-_KEPT_BYTES, _MOST_ROWS = 512 * 2**20, 256
+_KEPT_BYTES, _MOST_ROWS = 512 * 2**20, 320
 # Features whose strength may follow order or dose: height, |∂y| and |∂x| at 0.3 µm, surroundings of 1.6 µm.
 _HEIGHT, _VARYING = 18, (18, 21, 22, 7)
 
@@ -78,11 +78,10 @@ class Learner:
         self._study = study
         self._predictions = list(predictions)
         first = study.scans[0].stored
-        model = Features(
-            FeaturesConfig.of_variant(
-                pitch_um=first.pitch_um, level_height_um=first.level_height_um, levels=first.levels
-            )
+        richest = RandomFeaturesConfig.of_variant(
+            pitch_um=first.pitch_um, level_height_um=first.level_height_um, levels=first.levels
         )
+        model = Features(FeaturesConfig(**richest.model_dump(include=set(FeaturesConfig.model_fields))))
         pixels = sum(len(scan.sample) for scan in study.scans)
         self._every = -(-pixels * 4 * _MOST_ROWS // _KEPT_BYTES)
         varied = [of for of in _VARIED if len({of(scan) for scan in study.scans}) >= FEWEST_ORDERS]

@@ -101,9 +101,9 @@ def test_rows_are_thinned_where_they_would_not_fit(scene, monkeypatch) -> None:
     lacking = changed(scans, predictions, bead)
     full = Learner(study, predictions).rest(lacking)
     pixels = sum(len(scan.sample) for scan in scans)
-    monkeypatch.setattr(explainable, "_KEPT_BYTES", 4 * 256 * pixels // 2)
+    monkeypatch.setattr(explainable, "_KEPT_BYTES", 4 * 320 * pixels // 2)
     thinned = Learner(study, predictions)
-    assert sum(rows.nbytes for rows in thinned._rows_of) <= 4 * 256 * pixels // 2
+    assert sum(rows.nbytes for rows in thinned._rows_of) <= 4 * 320 * pixels // 2
     # Half of the pixels; neighbours share most of their roughness, so little is lost.
     assert thinned.rest(lacking).mean_nm2 == pytest.approx(full.mean_nm2, rel=0.15)
 
