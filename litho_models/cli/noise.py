@@ -35,8 +35,8 @@ def noise(
     residuals: Annotated[
         list[str] | None,
         typer.Option(
-            help="folder of `benchmark`, or a frozen model (a folder, zoo:NAME): adds σ(x) and calibration; "
-            "repeatable"
+            help="folder of `benchmark`, for the noise budget and σ(x), or a frozen model (a folder, "
+            "zoo:NAME), for σ(x) alone; several are an ensemble (repeatable)"
         ),
     ] = None,
     model: Annotated[
@@ -44,7 +44,7 @@ def noise(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="seed of the pixels drawn")] = 0,
 ) -> None:
-    """Roughness, dose matrix, bounds on the noise, σ(x) and its calibration; lengths in µm, noise in nm."""
+    """Roughness, dose matrix, noise budget, σ(x) and its calibration; lengths in µm, noise in nm."""
     from litho_models.noise import analyse_noise_of_files
 
     _check_given(context)

@@ -629,8 +629,11 @@ def test_residuals_of_a_frozen_model_say_what_it_saw(store, tmp_path):
     from litho_models.noise import analyse_noise
 
     train(store, "linear", tmp_path / "run")
-    spread = analyse_noise(store, tmp_path / "out", residuals=[tmp_path / "run" / "model"]).spread
+    result = analyse_noise(store, tmp_path / "out", residuals=[tmp_path / "run" / "model"])
+    spread = result.spread
     assert not spread.held_out
+    # What is left of scans that a model was fitted to is no estimate of the noise.
+    assert (result.budget, result.noise_floor.kind) == (None, "unknown")
     assert len(spread.calibrations[0].scans) == 7
     with pytest.raises(InputError, match="a frozen one"):
         analyse_noise(store, tmp_path / "none", residuals=[tmp_path / "run" / "model"], model="linear")
