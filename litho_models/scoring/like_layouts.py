@@ -61,7 +61,8 @@ def like_pixels(
     Scans of different doses differ where their layouts do not: only prints of one dose are compared.
 
     Args:
-        scans: at least three of one dose, or None comes back; ``scored``: bool (ny, nx), which pixels count.
+        scans: at least three of one dose, with layouts that vary; otherwise None comes back.
+        scored: bool (ny, nx), which pixels count.
         seed: of the pixels drawn.
     """
     from scipy.spatial import cKDTree
@@ -82,6 +83,8 @@ def like_pixels(
         drawn[number] = random.choice(candidates, min(most, candidates.size), replace=False)
     owner = np.concatenate([np.full(len(drawn[number]), number) for number in used])
     feature = _whitened(np.concatenate([layout_features(scans[n])[:, drawn[n]].T for n in used]))
+    if not feature.shape[1]:
+        return None
     partners = np.empty((len(owner), min(PARTNERS, min(map(len, groups)) - 1)), np.intp)
     for group in groups:
         members = {number: np.flatnonzero(owner == number) for number in group}
