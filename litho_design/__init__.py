@@ -10,8 +10,8 @@ if TYPE_CHECKING:
     from litho_design.holograms.settings import hologram_settings as hologram_settings
     from litho_design.images.targets import load_target as load_target
     from litho_design.judging.loaded import load_design as load_design
-    from litho_design.judging.score import MeasuredSource as MeasuredSource
-    from litho_design.judging.score import PhotoSource as PhotoSource
+    from litho_design.judging.measured import MeasuredSource as MeasuredSource
+    from litho_design.judging.photographs import PhotoSource as PhotoSource
     from litho_design.lenses.settings import lens_settings as lens_settings
     from litho_design.printers.source import load_printer as load_printer
     from litho_design.workflows.compare import compare as compare
@@ -25,8 +25,8 @@ else:
     __getattr__, __dir__ = lazy_face(
         __name__,
         {
-            "MeasuredSource": "litho_design.judging.score",
-            "PhotoSource": "litho_design.judging.score",
+            "MeasuredSource": "litho_design.judging.measured",
+            "PhotoSource": "litho_design.judging.photographs",
             "compare": "litho_design.workflows.compare",
             "design_hologram": "litho_design.workflows.design",
             "design_lens": "litho_design.workflows.design",

@@ -33,6 +33,13 @@ def score(
     scan: Annotated[Path | None, typer.Option(help="AFM height map of the printed part.")] = None,
     scan_unit: Annotated[str | None, typer.Option(help="Unit of its heights, if the file has none.")] = None,
     scan_size_um: Annotated[float | None, typer.Option(help="Its side, µm, if the file has none.")] = None,
+    scan_levelling: Annotated[
+        Literal["none", "plane", "bow"],
+        typer.Option(help="What is removed of the scan: nothing, a plane, or a bow of second order."),
+    ] = "bow",
+    scan_scale_sd: Annotated[
+        float, typer.Option(help="Relative standard uncertainty of the microscope's height scale.")
+    ] = 0.02,
     camera: Annotated[
         Path | None,
         typer.Option(help="Photograph of the printed hologram's image, or through the printed lens."),
@@ -43,12 +50,27 @@ def score(
         str | None,
         typer.Option(help="Object in front of the lens: one of the design's objects by name, or a picture."),
     ] = None,
+    camera_orientation: Annotated[
+        str,
+        typer.Option(
+            help="What brings the photograph upright: identity, rotate-90, rotate-180, rotate-270, flip-x, "
+            "flip-y, transpose or anti-transpose. One that fits another orientation better is refused."
+        ),
+    ] = "identity",
+    camera_power: Annotated[
+        float | None,
+        typer.Option(
+            help="Summed counts of all light that falls on the element, at the same exposure: gives "
+            "efficiencies."
+        ),
+    ] = None,
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
     """Score a design as models print it, as an AFM measured it, or as a camera saw it."""
-    from litho_design.judging.score import MeasuredSource, PhotoSource
-    from litho_design.reports.advice import headline
+    from litho_design.judging.measured import MeasuredSource
+    from litho_design.judging.photographs import PhotoSource
+    from litho_design.reports.advice import baseline_line, headline
     from litho_design.workflows.score import score as score_design
 
     if not judge and scan is None and camera is None:
@@ -64,15 +86,21 @@ def score(
         design,
         out,
         judges=judge or (),
-        scan=None if scan is None else MeasuredSource(scan, scan_unit, size),
+        scan=None if scan is None else MeasuredSource(scan, scan_unit, size, scan_levelling, scan_scale_sd),
         camera=None
         if camera is None
-        else PhotoSource(camera, camera_pitch_um or 0.0, camera_dark_level, camera_object),
+        else PhotoSource(
+            camera, camera_pitch_um or 0.0, camera_dark_level, camera_object, camera_orientation, camera_power
+        ),
         device=device,
         extrapolate=extrapolate,
     )
     for item in result.scores:
-        print(f"{item.kind} {item.judge.name}: {headline(item.figures)}")
+        print(f"{item.kind} {item.judge.name}: {headline(item.figures, item.uncertainty)}")
+        for remark in item.remarks():
+            print(f"  {remark}")
+    if result.baselines:
+        print(baseline_line(result.baselines))
     print(out / "report.html")
 
 

@@ -195,10 +195,17 @@ def _settings(
 
 
 def _print_design(design: Design, out: Path) -> None:
-    from litho_design.reports.advice import distribution_warning, headline, stroke_advice
+    from litho_design.reports.advice import (
+        baseline_line,
+        distribution_warning,
+        headline,
+        stroke_advice,
+    )
 
     warning = distribution_warning(design)
     if warning:
         print(warning, file=sys.stderr)
     print(stroke_advice(design))
+    if design.baselines:
+        print(baseline_line(design.baselines))
     print(f"{out / 'report.html'}: {headline(design.predicted)} (judged by its own model)")

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from litho_data.foundation.grid import PixelGrid
 from litho_data.foundation.results import Record
 from litho_design.holograms.settings import CameraView
-from litho_design.images.similarity import SSIM_WINDOW_PX, matched_scale, paper_rmse, si_psnr_db, ssim
+from litho_design.images.similarity import SSIM_WINDOW_PX, likeness, matched_scale, paper_rmse, ssim
 from litho_design.optics import Optics, RSPropagator, centred_grid, element_field, intensity_share
 from litho_design.printers.layout import LayoutSettings
 
@@ -38,6 +38,10 @@ class HologramBench(nn.Module):
         element = element_field(height_um, self.grid, self.optics)
         return hologram_score(self.propagator(element), element, target, self.grid, self.optics, camera)
 
+    def resolved(self, target: Tensor) -> Tensor:
+        """``target`` (size, size) at the resolution of the element."""
+        return at_resolution(target, self.grid, self.optics)
+
 
 class HologramScore(Record):
     """Efficiencies are shares of the power incident on the element."""
@@ -49,6 +53,10 @@ class HologramScore(Record):
     si_psnr_db: float = Field(description="scale-invariant PSNR, dB")
     rmse_paper: float = Field(description="RMSE at the paper's scale")
     ssim: float = Field(description="SSIM")
+    si_psnr_resolved_db: float = Field(
+        description="scale-invariant PSNR against the target at the element's resolution, dB"
+    )
+    ssim_resolved: float = Field(description="SSIM against the target at the element's resolution")
     clipped_share: float = Field(description="pixels clipped for SSIM, share")
     ssim_camera: float = Field(description="SSIM as the camera sees it")
     speckle_contrast: float = Field(description="speckle contrast on the signal")
@@ -83,15 +91,32 @@ def hologram_score(
         eff_paper=float(share[wanted > 0].sum()),
         eff_window=float(share.sum()),
         zero_order_share=zero_order_share(element),
-        si_psnr_db=si_psnr_db(share, wanted),
+        **likeness(share, wanted, at_resolution(wanted, grid, optics)),
         rmse_paper=float(paper_rmse(share, wanted)),
-        ssim=ssim(scaled.clamp(0, 1), wanted),
         clipped_share=float((scaled > 1).double().mean()),
-        ssim_camera=_camera_ssim(field, wanted, grid, optics, camera),
+        ssim_camera=camera_ssim(field, wanted, grid, optics, camera),
         speckle_contrast=float(lit.std(correction=0) / lit.mean()),
         uniformity=1 - (high - low) / (high + low),
         background_ratio=float(lit.mean() / dark.mean()),
     )
+
+
+def at_resolution(target: Tensor, grid: PixelGrid, optics: Optics) -> Tensor:
+    """A target (m, m) as finely as an element of the same size can draw it, real (m, m).
+
+    It is blurred by the focus of a square aperture, sinc^2(2 NA x / wavelength) along both axes, with the
+    NA from the axis to the edge; dark beyond the window.
+    """
+    blurred = target
+    for axis in (0, 1):
+        size_um, pitch_um, count = grid.size_um[axis], grid.pitch_um[axis], grid.shape[axis]
+        aperture = size_um / 2 / math.hypot(size_um / 2, optics.distance_um)
+        x = torch.arange(1 - count, count, dtype=target.dtype, device=target.device) * pitch_um
+        focus = torch.sinc(2 * aperture * x / optics.wavelength_um).square()
+        rows = blurred.movedim(axis, -1)[:, None]
+        seen = torch.nn.functional.conv1d(rows, (focus / focus.sum())[None, None], padding=count - 1)
+        blurred = seen[:, 0].movedim(-1, axis)
+    return blurred
 
 
 def zero_order_share(element: Tensor) -> float:
@@ -100,7 +125,8 @@ def zero_order_share(element: Tensor) -> float:
     return float(element.to(torch.complex128).mean().abs().square() / power)
 
 
-def _camera_ssim(field: Tensor, target: Tensor, grid: PixelGrid, optics: Optics, camera: CameraView) -> float:
+def camera_ssim(field: Tensor, target: Tensor, grid: PixelGrid, optics: Optics, camera: CameraView) -> float:
+    """SSIM of |field|^2 as a camera records it, against the target on its pixels."""
     import cv2
 
     seen = through_aperture(field, grid, optics.wavelength_um, camera.numerical_aperture).abs().square()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,21 +9,20 @@ import torch
 from torch import Tensor
 
 from litho_data.foundation.errors import InputError
+from litho_design.holograms.baselines import best_signal_efficiency, hologram_baselines
 from litho_design.holograms.bench import HologramBench, HologramScore
 from litho_design.holograms.loss import hologram_loss
 from litho_design.holograms.settings import HologramSettings
 from litho_design.images.similarity import SSIM_WINDOW_PX, si_psnr_db
 from litho_design.images.targets import Target, stroke_width_px
 from litho_design.optimisation.parameters import CellMap, Parametrisation
-from litho_design.optimisation.phases import gerchberg_saxton, printed_phase
+from litho_design.optimisation.phases import printed_phase
 from litho_design.optimisation.process_window import Draw, check_draws, draws
 from litho_design.optimisation.robust import penalised, windowed_loss
 from litho_design.optimisation.starts import Scene, check_start, start_search
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 from litho_design.tasks.design import IMAGE_FILE, TARGET_FILE, TaskName
-
-_REFERENCE_ITERATIONS = 40
 
 
 class HologramTask:
@@ -125,19 +123,13 @@ class HologramTask:
         """Image (share of incident power per pixel) and target."""
         return {IMAGE_FILE: self.bench(height_um).cpu().numpy(), TARGET_FILE: self.target.cpu().numpy()}
 
-    @torch.no_grad()
-    def reference_efficiency(self) -> float:
-        """Signal efficiency of a continuous-phase Gerchberg-Saxton element with the same cells."""
-        phase, _ = gerchberg_saxton(
-            self.bench.propagator,
-            self.target,
-            self.cells,
-            iterations=_REFERENCE_ITERATIONS,
-            weighted=False,
-            seed=self.settings.search.seed,
-        )
-        share = self.bench(self.cells(phase) * (self.settings.optics.wave_height_um / (2 * math.pi)))
-        return float(share[self.target > 0.5].sum())
+    def reference_efficiency(self, height_um: Tensor) -> float:
+        """Signal efficiency of the best continuous phase found from the print, power alone counting."""
+        return best_signal_efficiency(self.bench, height_um, self.target)
+
+    def baselines(self) -> dict[str, dict[str, float]]:
+        """Scores of a black image and of ideal elements on the same grid."""
+        return hologram_baselines(self.bench, self.cells, self.target, self.settings)
 
 
 def _too_fine(target: np.ndarray, settings: HologramSettings) -> list[str]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +13,24 @@ import numpy as np
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Record
+from litho_data.register.geometry import ORIENTATIONS, orient, orientation_matrix
+from litho_design.images.noise import DRAWS, white_noise
 from litho_design.images.targets import ImagedObject
 
 _HOT_SIGMAS = 6.0
 _SMALLEST_CORRELATION = 0.45
 _LARGEST_STRETCH = 1.2
+# Orientations are told apart on images of about this side, px; correlations this close are a tie.
+_SMALL_PX = 192
+_TIE = 0.03
 
 
 class CameraRecord(Record):
-    """Source of a photograph and how it was processed; ``imaged`` is the object in front of a lens."""
+    """Source of a photograph and how it was processed; ``imaged`` is the object in front of a lens.
+
+    ``orientation`` is the operation that brings the photograph onto the image, ``ambiguous`` lists others
+    that fit as well. The last four are None in older results.
+    """
 
     name: str
     sha256: str
@@ -29,6 +41,68 @@ class CameraRecord(Record):
     correlation: float
     photo_to_window: list[list[float]]
     imaged: ImagedObject | None = None
+    orientation: str | None = None
+    ambiguous: list[str] | None = None
+    noise_counts: float | None = None
+    dark_level_sd: float | None = None
+    position_sd_um: float | None = None
+
+    def remarks(self) -> list[str]:
+        """What to know about the orientation, one phrase each."""
+        found = []
+        if self.orientation not in (None, "identity"):
+            found.append(f"the photograph was brought onto the image by {self.orientation}, as asked")
+        if self.ambiguous:
+            others = ", ".join(self.ambiguous)
+            found.append(f"ambiguous: it fits as well after {others}, so a mirrored print would go unnoticed")
+        return found
+
+
+@dataclass(frozen=True)
+class Photograph:
+    """A photograph and where the image lies on it.
+
+    Attributes:
+        counts: cleaned, without the dark level (ny, nx).
+        window_to_photo: affine map (2, 3) from window pixels to its pixels.
+        side_px: side of the window.
+        pitch_um: pixel of the window.
+        record: source and processing.
+    """
+
+    counts: np.ndarray
+    window_to_photo: np.ndarray
+    side_px: int
+    pitch_um: float
+    record: CameraRecord
+
+    def image(self) -> np.ndarray:
+        """Counts per pixel of the photograph, on the pixels of the window (m, m)."""
+        return self._warped(self.counts, np.zeros(2))
+
+    def power_share(self, image: np.ndarray, power_counts: float) -> np.ndarray:
+        """``image`` as the share of the light that falls on the element, of its summed counts."""
+        return image * abs(np.linalg.det(self.window_to_photo[:, :2])) / power_counts
+
+    def as_it_might_be(self) -> Iterator[np.ndarray]:
+        """Images that the photograph would also allow: other noise, dark level and position."""
+        generator = np.random.default_rng(0)
+        record = self.record
+        for _ in range(DRAWS):
+            counts = self.counts + (record.noise_counts or 0) * generator.standard_normal(self.counts.shape)
+            counts = counts - (record.dark_level_sd or 0) * generator.standard_normal()
+            moved = (record.position_sd_um or 0) / self.pitch_um * generator.standard_normal(2)
+            yield self._warped(np.clip(counts, 0, None).astype(np.float32), moved)
+
+    def _warped(self, counts: np.ndarray, moved_px: np.ndarray) -> np.ndarray:
+        import cv2
+
+        warp = self.window_to_photo.copy()
+        warp[:, 2] += warp[:, :2] @ moved_px
+        side = (self.side_px, self.side_px)
+        found = cv2.warpAffine(counts, warp, side, flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP)
+        # Cubic interpolation swings below zero beside bright pixels.
+        return np.clip(found, 0, None)
 
 
 def photographed_image(
@@ -38,47 +112,49 @@ def photographed_image(
     pitch_um: float,
     *,
     dark_level: float | None = None,
-) -> tuple[np.ndarray, CameraRecord]:
-    """A photograph, resampled onto the pixels of the image that the design expects.
+    orientation: str = "identity",
+) -> Photograph:
+    """A photograph, registered on the image that the design expects.
 
     Dark level subtracted (the 1st percentile where none is given), single hot or dead pixels
     replaced by their neighbours' median, then shifted, rotated and scaled onto the expected image:
     the shift by cross-correlation, the rest by maximising the correlation coefficient (Evangelidis
-    and Psarakis 2008). One interpolation.
+    and Psarakis 2008). All eight orientations are tried, and a photograph that fits another one better
+    than ``orientation`` is refused.
 
     Args:
         wanted: expected image (m, m), any scale; ``wanted_pitch_um`` its pixel, µm.
         photo_file: grey image of any bit depth.
         pitch_um: camera pixel in the plane of the image, µm.
-
-    Returns:
-        Image (m, m) in counts, and its record.
+        orientation: what brings the photograph upright, such as ``flip-x`` or ``rotate-180``.
 
     Raises:
-        InputError: not an image, a pitch that is not positive, or a photograph unlike the expected image.
+        InputError: not an image, a pitch that is not positive, an unknown orientation, or a photograph that
+            is unlike the expected image, or mirrored or turned.
     """
     import cv2
 
     if not pitch_um > 0:
         raise InputError("camera pitch", got=f"{pitch_um} µm", wanted="a positive number")
+    if orientation not in ORIENTATIONS:
+        raise InputError("camera orientation", got=repr(orientation), wanted=", ".join(ORIENTATIONS))
     if not Path(photo_file).is_file():
         raise InputError("photograph", got=f"{photo_file}, which does not exist", wanted="an image file")
     raw = cv2.imread(str(photo_file), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
     if raw is None:
         raise InputError("photograph", got=str(photo_file), wanted="an image file")
     photo = raw.astype(np.float32)
-    dark = float(np.percentile(photo, 1)) if dark_level is None else dark_level
+    darkest = np.percentile(photo, [1, 10])
+    dark = float(darkest[0]) if dark_level is None else dark_level
     cleaned, replaced = _replace_outliers(np.clip(photo - dark, 0, None))
-    warp, correlation = _register(cleaned, wanted.astype(np.float32), pitch_um / wanted_pitch_um)
-    if correlation < _SMALLEST_CORRELATION:
-        raise InputError(
-            f"photograph {photo_file}",
-            got=f"correlation {correlation:.2f} with the expected image",
-            wanted=f"at least {_SMALLEST_CORRELATION}",
-            hint="check the camera pitch and the orientation",
-        )
-    side = wanted.shape[0]
-    image = cv2.warpAffine(cleaned, warp, (side, side), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
+    wanted = wanted.astype(np.float32)
+    ambiguous = _check_orientation(cleaned, wanted, pitch_um / wanted_pitch_um, orientation, photo_file)
+    upright = np.ascontiguousarray(orient(cleaned, orientation))
+    fit = _register(upright, wanted, pitch_um / wanted_pitch_um)
+    if fit.correlation < _SMALLEST_CORRELATION:
+        raise _unlike(photo_file, fit.correlation)
+    back = np.linalg.inv(orientation_matrix(orientation, cleaned.shape))
+    warp = (back @ np.vstack([fit.window_to_photo, [0, 0, 1]]))[:2]
     top = float(2 ** (8 * raw.dtype.itemsize) - 1) if raw.dtype.kind == "u" else float(raw.max())
     record = CameraRecord(
         name=Path(photo_file).name,
@@ -87,10 +163,59 @@ def photographed_image(
         dark_level=dark,
         replaced_pixels=replaced,
         saturated_share=float((raw >= top).mean()),
-        correlation=correlation,
+        correlation=fit.correlation,
         photo_to_window=warp.tolist(),
+        orientation=orientation,
+        ambiguous=ambiguous,
+        noise_counts=white_noise(cleaned),
+        dark_level_sd=float(np.diff(darkest)[0]) / 2 if dark_level is None else 0.0,
+        position_sd_um=fit.position_sd_px * wanted_pitch_um,
     )
-    return image, record
+    return Photograph(cleaned, warp, wanted.shape[0], wanted_pitch_um, record)
+
+
+def _check_orientation(
+    photo: np.ndarray, wanted: np.ndarray, scale: float, asked: str, photo_file: str | Path
+) -> list[str]:
+    """Other orientations that fit as well as the one asked for.
+
+    Raises:
+        InputError: another one fits better, or none fits.
+    """
+    import cv2
+
+    shrink = max(1, wanted.shape[0] // _SMALL_PX)
+    side = wanted.shape[0] // shrink
+    small: Any = cv2.resize(wanted, (side, side), interpolation=cv2.INTER_AREA)
+    # The camera is brought to the same pixels, or its noise would decide.
+    finer = max(1, round(wanted.shape[0] / side / scale))
+    counts: Any = cv2.blur(photo, (finer, finer)) if finer > 1 else photo
+    small_scale = scale * side / wanted.shape[0]
+    found = {
+        name: _register(np.ascontiguousarray(orient(counts, name)), small, small_scale).correlation
+        for name in ORIENTATIONS
+    }
+    best = max(found, key=lambda name: found[name])
+    if found[best] < _SMALLEST_CORRELATION:
+        raise _unlike(photo_file, found[best])
+    if found[asked] < found[best] - _TIE:
+        raise InputError(
+            f"photograph {photo_file}",
+            got=f"an image that fits after {best} (correlation {found[best]:.2f}), not after {asked} "
+            f"({found[asked]:.2f})",
+            wanted="an upright photograph",
+            hint=f"if the camera and not the print did that: --camera-orientation {best}",
+        )
+    return [name for name in found if name != asked and found[name] > found[asked] - _TIE]
+
+
+def _unlike(photo_file: str | Path, correlation: float) -> InputError:
+    return InputError(
+        f"photograph {photo_file}",
+        got=f"correlation {correlation:.2f} with the expected image in any orientation",
+        wanted=f"at least {_SMALLEST_CORRELATION}",
+        hint="check the camera pitch",
+    )
 
 
 def _replace_outliers(photo: np.ndarray) -> tuple[np.ndarray, int]:
@@ -104,31 +229,63 @@ def _replace_outliers(photo: np.ndarray) -> tuple[np.ndarray, int]:
     return np.where(outliers, median, photo), int(outliers.sum())
 
 
-def _register(photo: Any, wanted: Any, scale: float) -> tuple[np.ndarray, float]:
-    """Affine map (2, 3) from window pixels to photograph pixels, and the correlation reached."""
+@dataclass(frozen=True)
+class _Fit:
+    """Affine map (2, 3) from window to photograph pixels, its correlation, the shift's uncertainty."""
+
+    window_to_photo: np.ndarray
+    correlation: float
+    position_sd_px: float
+
+
+def _register(photo: Any, wanted: Any, scale: float) -> _Fit:
     import cv2
 
     side = wanted.shape[0]
-    smooth = max(1.0, scale)
-    reference: Any = cv2.GaussianBlur(wanted / wanted.max(), (0, 0), 2 * smooth)
+    blur_px = 2 * max(1.0, scale)
+    reference: Any = cv2.GaussianBlur(wanted / wanted.max(), (0, 0), blur_px)
     centre = (np.array(photo.shape[::-1]) - 1) / 2
     # Window pixel (i, j) looks at photograph pixel (i - middle) / scale + centre.
     start = np.array([[1 / scale, 0, 0], [0, 1 / scale, 0]])
     start[:, 2] = centre - start[:, :2] @ np.full(2, (side - 1) / 2)
     moving: Any = cv2.warpAffine(photo, start, (side, side), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-    moving = cv2.GaussianBlur(moving / max(float(moving.max()), 1e-12), (0, 0), 2 * smooth)
-    shift, _ = cv2.phaseCorrelate(reference.astype(np.float64), moving.astype(np.float64))
-    warp: Any = np.array([[1, 0, shift[0]], [0, 1, shift[1]]], np.float32)
+    moving = cv2.GaussianBlur(moving / max(float(moving.max()), 1e-12), (0, 0), blur_px)
+    warp: Any = np.hstack([np.eye(2), _shift_px(reference, moving)[:, None]]).astype(np.float32)
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 200, 1e-7)
-    try:
-        correlation, warp = cv2.findTransformECC(
-            reference, moving.astype(np.float32), warp, cv2.MOTION_AFFINE, criteria
-        )
-    except cv2.error:
-        correlation = 0.0
+    correlation = 0.0
+    # From coarse to fine: the fine structure of an image has maxima beside the right one.
+    for further in (3.0 * blur_px, 0.0):
+        coarse: list[Any] = [
+            cv2.GaussianBlur(image, (0, 0), further) if further else image for image in (reference, moving)
+        ]
+        try:
+            correlation, warp = cv2.findTransformECC(*coarse, warp, cv2.MOTION_AFFINE, criteria)
+        except cv2.error:
+            correlation = 0.0
     # A fit that strongly shrinks or shears the image has matched noise.
     stretch = np.linalg.svd(warp[:, :2], compute_uv=False)
     if stretch.max() > _LARGEST_STRETCH or stretch.min() < 1 / _LARGEST_STRETCH:
         correlation = 0.0
     whole = np.vstack([start, [0, 0, 1]]) @ np.vstack([warp, [0, 0, 1]])
-    return whole[:2], float(correlation)
+    return _Fit(whole[:2], float(correlation), _position_sd_px(reference, correlation, blur_px))
+
+
+def _shift_px(reference: np.ndarray, moving: np.ndarray) -> np.ndarray:
+    """Whole pixels (x, y) by which ``moving`` (n, n) has to be read later: the maximum of the correlation."""
+    n = len(reference)
+    spectra = [np.fft.rfft2(image - image.mean(), s=(2 * n, 2 * n)) for image in (moving, reference)]
+    correlation = np.fft.irfft2(spectra[0] * spectra[1].conj())
+    y, x = np.unravel_index(int(correlation.argmax()), correlation.shape)
+    return np.array([x - 2 * n * (x > n), y - 2 * n * (y > n)])
+
+
+def _position_sd_px(reference: np.ndarray, correlation: float, blur_px: float) -> float:
+    """Standard deviation of a least-squares shift, from what the correlation leaves unexplained.
+
+    The residual has the variance (1 - r^2) / r^2 of the image and is correlated over 4 pi blur^2 pixels.
+    """
+    if not correlation > 0:
+        return math.inf
+    residual = reference.var() * (1 / correlation**2 - 1)
+    slopes = min(float(np.square(slope).sum()) for slope in np.gradient(reference))
+    return math.sqrt(residual * 4 * math.pi * blur_px**2 / slopes)

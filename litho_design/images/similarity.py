@@ -46,6 +46,16 @@ def ssim(image: Tensor, target: Tensor) -> float:
     )
 
 
+def likeness(image: Tensor, target: Tensor, resolved: Tensor) -> dict[str, float]:
+    """SI-PSNR and SSIM of an image (m, m) against its target and the target at the element's resolution."""
+    figures = {}
+    for name, wanted in (("", target), ("_resolved", resolved)):
+        scaled = matched_scale(image, wanted) * image
+        figures[f"si_psnr{name}_db"] = si_psnr_db(image, wanted)
+        figures[f"ssim{name}"] = ssim(scaled.clamp(0, 1), wanted)
+    return figures
+
+
 @dataclass(frozen=True)
 class Similarity:
     """How far an estimate is from the object: mean absolute error, PSNR in dB, SSIM."""

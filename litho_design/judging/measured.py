@@ -1,8 +1,11 @@
-"""A measured height map of the printed part, registered onto its layout."""
+"""A measured height map of the printed part: levelled, and registered onto its layout."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -11,49 +14,97 @@ from torch import Tensor
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Record
+from litho_design.images.noise import DRAWS, white_noise
 from litho_design.judging.loaded import LoadedDesign
+
+Levelling = Literal["none", "plane", "bow"]
 
 # With fewer measured pixels the score would describe the filled-in part more than the print.
 _SMALLEST_COVERAGE = 0.8
+# Levelled prints of the measured layouts correlate at 0.9 and above with a model's expectation.
+_SMALLEST_NCC = 0.6
+
+
+@dataclass(frozen=True)
+class MeasuredSource:
+    """A height map of the printed part; unit and size for files that do not state them.
+
+    Attributes:
+        levelling: what is removed of the scan: nothing, a plane, or a polynomial of second order (bow).
+        scale_sd: relative standard uncertainty of its heights; a calibrated microscope's is about 0.02.
+    """
+
+    path: Path
+    unit: str | None = None
+    size_um: tuple[float, float] | None = None
+    levelling: Levelling = "bow"
+    scale_sd: float = 0.02
 
 
 class MeasuredRecord(Record):
-    """The scan, its agreement with the expected print, and the share of the element that it covers."""
+    """The scan, its agreement with the expected print, and what was done to it; None in older results.
+
+    ``orientation`` is the operation that brings the scan onto the layout. ``tilt_um_per_um`` (x, y) and
+    ``bow_um``, the range of the curved part over the element, were removed; ``noise_um`` is what is left
+    at frequencies that no print has.
+    """
 
     name: str
     sha256: str
     coverage: float
     registration_ncc: float
     height_offset_um: float
+    orientation: str | None = None
+    warning: str | None = None
+    levelling: Levelling | None = None
+    tilt_um_per_um: tuple[float, float] | None = None
+    bow_um: float | None = None
+    noise_um: float | None = None
+    position_sd_um: float | None = None
+    scale_sd: float | None = None
+
+    def remarks(self) -> list[str]:
+        """What was removed, and whether the scan lies as the layout does, one phrase each."""
+        found = [] if not self.warning else [self.warning]
+        if self.orientation not in (None, "identity"):
+            found.append(f"the scan was brought onto the layout by {self.orientation}")
+        if self.levelling == "none":
+            found.append("nothing was levelled")
+        elif self.tilt_um_per_um is not None and self.bow_um is not None:
+            x, y = self.tilt_um_per_um
+            found.append(
+                f"removed a tilt of {x:+.4f}, {y:+.4f} µm/µm and a bow of {1000 * self.bow_um:.0f} nm"
+            )
+        return found
 
 
-def measured_print(
-    loaded: LoadedDesign,
-    scan_file: str | Path,
-    *,
-    unit: str | None = None,
-    size_um: tuple[float, float] | None = None,
-) -> tuple[Tensor, MeasuredRecord]:
+def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor, MeasuredRecord]:
     """The measured height of a printed design on its layout's pixels.
 
     The zero of an AFM map is arbitrary, and a constant height is only a constant phase: the zero is set so
-    that the medians of measured and designed print agree. Unmeasured pixels take the designed print.
+    that the medians of measured and designed print agree. Tilt and bow of the scanner are fitted together
+    with the designed print, so that they take nothing of its own shape. Unmeasured pixels take the
+    designed print.
 
     Args:
         loaded: the design.
-        scan_file: any format that ``litho-data inspect`` reads.
-        unit, size_um: for files that do not state them.
+        source: in any format that ``litho-data inspect`` reads.
 
     Returns:
         Height (size, size), µm, and its record.
 
     Raises:
-        InputError: a scan that cannot be registered, or that covers too little of the element.
+        InputError: a scan that cannot be registered, covers too little of the element, or does not
+            resemble the print that the design expects.
     """
     from litho_data.readers import read_scan
     from litho_data.register import register_scan, resample_to_layout
 
-    scan = read_scan(scan_file, unit=unit, size_um=size_um)
+    if source.levelling not in get_args(Levelling):
+        raise InputError("levelling", got=repr(source.levelling), wanted=", ".join(get_args(Levelling)))
+    if not source.scale_sd >= 0:
+        raise InputError("uncertainty of the height scale", got=source.scale_sd, wanted="0 or more")
+    scan = read_scan(source.path, unit=source.unit, size_um=source.size_um)
     pitch = scan.require_pitch()
     layout = loaded.record.layout
     levels = loaded.level.cpu().numpy()
@@ -63,7 +114,7 @@ def measured_print(
     quality = registration.quality
     if not quality.passed:
         raise InputError(
-            f"scan {scan_file} on the layout of the design", got=quality.reason, wanted="a match"
+            f"scan {source.path} on the layout of the design", got=quality.reason, wanted="a match"
         )
     height, valid = resample_to_layout(
         scan.height_um,
@@ -76,19 +127,82 @@ def measured_print(
     coverage = float(valid.mean())
     if coverage < _SMALLEST_COVERAGE:
         raise InputError(
-            f"scan {scan_file}",
+            f"scan {source.path}",
             got=f"{100 * coverage:.0f} % of the element",
             wanted=f"at least {100 * _SMALLEST_COVERAGE:.0f} %",
             hint="a hologram needs its whole area; stitch the scans first",
         )
     expected = loaded.expected_um.cpu().numpy()
-    offset = float(np.median(height[valid] - expected[valid]))
-    complete = np.where(valid, height - offset, expected).astype(np.float32)
+    background = fitted_background(height, expected, valid, layout.pitch_um, source.levelling)
+    levelled = height - background.map_um
+    ncc = float(np.corrcoef(levelled[valid], expected[valid])[0, 1])
+    if not ncc >= _SMALLEST_NCC:
+        raise InputError(
+            f"scan {source.path}",
+            got=f"correlation {ncc:.2f} with the print that the design expects",
+            wanted=f"at least {_SMALLEST_NCC}",
+            hint="level it: --scan-levelling bow" if source.levelling != "bow" else "",
+        )
+    offset = float(np.median(levelled[valid] - expected[valid]))
+    complete = np.where(valid, levelled - offset, expected).astype(np.float32)
     record = MeasuredRecord(
-        name=Path(scan_file).name,
-        sha256=file_sha256(scan_file),
+        name=Path(source.path).name,
+        sha256=file_sha256(source.path),
         coverage=coverage,
-        registration_ncc=float(np.corrcoef(height[valid], expected[valid])[0, 1]),
+        registration_ncc=ncc,
         height_offset_um=offset,
+        orientation=quality.dihedral,
+        warning=quality.warning,
+        levelling=source.levelling,
+        tilt_um_per_um=background.tilt_um_per_um,
+        bow_um=background.bow_um,
+        noise_um=white_noise(complete - expected),
+        position_sd_um=quality.corner_sd_nm / 1000,
+        scale_sd=source.scale_sd,
     )
     return torch.from_numpy(complete).to(loaded.device), record
+
+
+@dataclass(frozen=True)
+class Background:
+    """Tilt and bow of a scan: their map (ny, nx), µm, without its mean; slopes (x, y); range of the bow."""
+
+    map_um: np.ndarray
+    tilt_um_per_um: tuple[float, float]
+    bow_um: float
+
+
+def fitted_background(
+    height_um: np.ndarray, expected_um: np.ndarray, valid: np.ndarray, pitch_um: float, levelling: Levelling
+) -> Background:
+    """Tilt and bow of a scan (ny, nx), by least squares together with a gain of the expected print."""
+    ny, nx = height_um.shape
+    y, x = np.mgrid[-1 : 1 : ny * 1j, -1 : 1 : nx * 1j]
+    terms = {"none": [], "plane": [x, y], "bow": [x, y, x * x, x * y, y * y]}[levelling]
+    columns = np.stack([expected_um, np.ones_like(x), *terms], axis=-1)
+    found, *_ = np.linalg.lstsq(columns[valid], height_um[valid].astype(float), rcond=None)
+    slopes = found[2:4] if terms else np.zeros(2)
+    bow = columns[..., 4:] @ found[4:]
+    tilt = slopes[0] * x + slopes[1] * y if terms else np.zeros_like(x)
+    return Background(
+        map_um=tilt + bow - bow.mean(),
+        tilt_um_per_um=(
+            float(2 * slopes[0] / (nx - 1) / pitch_um),
+            float(2 * slopes[1] / (ny - 1) / pitch_um),
+        ),
+        bow_um=float(np.ptp(bow)),
+    )
+
+
+def as_it_might_be(height_um: Tensor, record: MeasuredRecord, pitch_um: float) -> Iterator[Tensor]:
+    """Prints (ny, nx), µm, that the scan would also allow: other noise, position and scale of heights."""
+    from scipy.ndimage import shift
+
+    generator = np.random.default_rng(0)
+    measured = height_um.double().cpu().numpy()
+    position_px = (record.position_sd_um or 0.0) / pitch_um
+    for _ in range(DRAWS):
+        moved = shift(measured, position_px * generator.standard_normal(2), order=3, mode="nearest")
+        scale = 1 + (record.scale_sd or 0.0) * generator.standard_normal()
+        noisy = scale * moved + (record.noise_um or 0.0) * generator.standard_normal(measured.shape)
+        yield torch.from_numpy(noisy.astype(np.float32)).to(height_um)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,10 @@ from torch import Tensor
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
+from litho_design.holograms.bench import HologramBench
+from litho_design.images.noise import uncertainties
 from litho_design.images.photograph import CameraRecord, photographed_image
-from litho_design.images.similarity import matched_scale, si_psnr_db, similarity, ssim
+from litho_design.images.similarity import likeness, matched_scale, similarity
 from litho_design.images.targets import ImagedObject
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.lenses.bench import reconstruct, sensor_psf
@@ -20,14 +23,37 @@ from litho_design.lenses.objects import object_name, object_stack, read_object
 from litho_design.optics.imaging import Blur
 
 
+@dataclass(frozen=True)
+class PhotoSource:
+    """A photograph, its pixel in the image plane, and its dark level if known.
+
+    Attributes:
+        imaged: the object in front of a lens: a name of the design's objects, or a picture's path.
+        orientation: the operation that brings it upright, where the camera turned or mirrored it.
+        power_counts: summed counts, without dark level, of all light that falls on the element, at the same
+            exposure; without it a photograph knows no efficiency.
+    """
+
+    path: Path
+    pitch_um: float
+    dark_level: float | None = None
+    imaged: str | None = None
+    orientation: str = "identity"
+    power_counts: float | None = None
+
+
 class PhotoScore(Record):
-    """Figures of intensity alone: a photograph does not know the incident power."""
+    """Figures of a photographed image; its efficiencies only where the incident power is known."""
 
     si_psnr_db: float
     ssim: float
+    si_psnr_resolved_db: float
+    ssim_resolved: float
     speckle_contrast: float
     uniformity: float
     background_ratio: float
+    eff_signal: float | None = None
+    eff_window: float | None = None
 
 
 class LensPhotoScore(Record):
@@ -48,54 +74,73 @@ class LensPhotoScore(Record):
     ssim_calibrated: float | None = None
 
 
-def score_hologram_photo(
-    loaded: LoadedDesign, photo_file: str | Path, pitch_um: float, *, dark_level: float | None = None
-) -> tuple[PhotoScore, CameraRecord, np.ndarray]:
+@dataclass(frozen=True)
+class PhotoVerdict:
+    """Figures of a photograph with their uncertainties, its record, and pictures by title."""
+
+    figures: Record
+    uncertainty: dict[str, float]
+    record: CameraRecord
+    pictures: dict[str, np.ndarray]
+
+
+def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerdict:
     """Score a photograph of a printed hologram's image.
 
-    Args:
-        loaded: a hologram's design.
-        photo_file: grey image of any bit depth.
-        pitch_um: camera pixel in the image plane, µm.
-        dark_level: counts; the 1st percentile where None.
-
-    Returns:
-        Score, the record of the photograph, and the registered photograph (m, m), counts.
-
     Raises:
-        InputError: no image, or a photograph that does not resemble the expected image.
+        InputError: what ``photographed_image`` refuses, an incident power that is not positive, or an
+            object in front of a hologram.
     """
     assert loaded.target is not None
-    wanted, wanted_pitch_um = loaded.image(loaded.expected_um), loaded.record.layout.pitch_um
-    image, record = photographed_image(wanted, wanted_pitch_um, photo_file, pitch_um, dark_level=dark_level)
-    return photo_score(image, loaded.target), record, image
+    assert isinstance(loaded.bench, HologramBench)
+    if source.imaged is not None:
+        raise InputError(
+            "photographed object", got="the design of a hologram", wanted="a lens", hint="no --camera-object"
+        )
+    power = source.power_counts
+    if power is not None and not power > 0:
+        raise InputError("incident power of the photograph", got=power, wanted="a positive sum of counts")
+    wanted = loaded.image(loaded.expected_um)
+    photo = photographed_image(
+        wanted, loaded.record.layout.pitch_um, source.path, source.pitch_um,
+        dark_level=source.dark_level, orientation=source.orientation,
+    )  # fmt: skip
+    target = loaded.target.cpu().double()
+    resolved = loaded.bench.resolved(target)
+
+    def figures(image: np.ndarray) -> PhotoScore:
+        share = image if power is None else photo.power_share(image, power)
+        return photo_score(share, target, resolved, has_power=power is not None)
+
+    image = photo.image()
+    score = figures(image)
+    return PhotoVerdict(
+        score,
+        uncertainties(figures, score, photo.as_it_might_be()),
+        photo.record,
+        {f"photograph {photo.record.name}": image},
+    )
 
 
-def photo_score(image: np.ndarray, target: Tensor) -> PhotoScore:
-    """Figures of a registered photograph (m, m) of a hologram against its target (m, m)."""
-    share, wanted = torch.from_numpy(image).double(), target.cpu().double()
-    lit, dark = share[wanted > 0.5], share[wanted <= 0.5]
+def photo_score(image: np.ndarray, target: Tensor, resolved: Tensor, *, has_power: bool) -> PhotoScore:
+    """Figures of a registered photograph (m, m) against its target and the target as far as it resolves."""
+    share = torch.from_numpy(image).double()
+    lit, dark = share[target > 0.5], share[target <= 0.5]
     low, high = (float(torch.quantile(lit, q)) for q in (0.05, 0.95))
-    scale = (share * wanted).sum() / share.square().sum()
+    efficiencies = {"eff_signal": float(lit.sum()), "eff_window": float(share.sum())} if has_power else {}
     return PhotoScore(
-        si_psnr_db=si_psnr_db(share, wanted),
-        ssim=ssim((scale * share).clamp(0, 1), wanted),
+        **likeness(share, target, resolved),
         speckle_contrast=float(lit.std(correction=0) / lit.mean()),
         uniformity=1 - (high - low) / (high + low),
         background_ratio=float(lit.mean() / dark.mean().clamp(min=1e-12)),
+        **efficiencies,
     )
 
 
 @torch.no_grad()
 def score_lens_photo(
-    loaded: LoadedDesign,
-    photo_file: str | Path,
-    pitch_um: float,
-    imaged: str | None,
-    *,
-    dark_level: float | None = None,
-    printed_um: Tensor | None = None,
-) -> tuple[LensPhotoScore, CameraRecord, dict[str, np.ndarray]]:
+    loaded: LoadedDesign, source: PhotoSource, printed_um: Tensor | None = None
+) -> PhotoVerdict:
     """Score a photograph of a known object taken through a printed lens.
 
     The photograph is cleaned and registered by ``photographed_image`` on the image that the design
@@ -105,42 +150,51 @@ def score_lens_photo(
 
     Args:
         loaded: a lens's design.
-        photo_file: grey image of any bit depth, upright (a lens turns its image by half a turn).
-        pitch_um: camera pixel in the focal plane of the lens, µm.
-        imaged: name of one of the design's objects, or path of a picture.
-        dark_level: counts; the 1st percentile where None.
+        source: an upright photograph (a lens turns its image by half a turn), or one whose
+            ``orientation`` says how it lies.
         printed_um: measured height (size, size) of the print, µm, for the calibrated PSF.
 
-    Returns:
-        Figures, the record of the photograph, and pictures (n, n) by name: object, photograph and
-        estimates.
-
     Raises:
-        InputError: no object, an unknown one or a name that two have, no image, or a photograph that does
-            not resemble it.
+        InputError: no object, an unknown one or a name that two have, or what ``photographed_image``
+            refuses.
     """
-    wanted, which = _object(loaded, imaged)
+    wanted, which = _object(loaded, source.imaged)
     settings = loaded.lens.imaging
     heights = {"design": loaded.expected_um} | ({} if printed_um is None else {"calibrated": printed_um})
     kernels = {name: sensor_psf(loaded.bench(um), settings.pixel_px) for name, um in heights.items()}
     expected = Blur(kernels["design"], (settings.object_px, settings.object_px)).forward(wanted)
     pixel_um = settings.pixel_px * loaded.record.layout.pitch_um
-    image, record = photographed_image(
-        expected.cpu().numpy(), pixel_um, photo_file, pitch_um, dark_level=dark_level
-    )
-    seen = torch.from_numpy(image).to(expected)
-    seen = seen * matched_scale(seen, expected)
-    estimates = {name: reconstruct(seen, kernel, settings.iterations) for name, kernel in kernels.items()}
-    figures: dict[str, float] = {}
+    photo = photographed_image(
+        expected.cpu().numpy(), pixel_um, source.path, source.pitch_um,
+        dark_level=source.dark_level, orientation=source.orientation,
+    )  # fmt: skip
+
+    def estimates(image: np.ndarray) -> dict[str, Tensor]:
+        seen = torch.from_numpy(image).to(expected)
+        seen = seen * matched_scale(seen, expected)
+        found = {name: reconstruct(seen, kernel, settings.iterations) for name, kernel in kernels.items()}
+        return {
+            name: image * matched_scale(image, wanted) for name, image in ({"direct": seen} | found).items()
+        }
+
+    def figures(image: np.ndarray) -> LensPhotoScore:
+        values: dict[str, float] = {}
+        for name, estimate in estimates(image).items():
+            near = similarity(estimate, wanted)
+            values |= {f"mae_{name}": near.mae, f"psnr_{name}_db": near.psnr_db, f"ssim_{name}": near.ssim}
+        return LensPhotoScore.model_validate(values)
+
+    image = photo.image()
     pictures = {f"object {object_name(which)}": wanted}
-    for name, estimate in {"direct": seen, **estimates}.items():
-        scaled = estimate * matched_scale(estimate, wanted)
-        found = similarity(scaled, wanted)
-        figures |= {f"mae_{name}": found.mae, f"psnr_{name}_db": found.psnr_db, f"ssim_{name}": found.ssim}
-        pictures["photograph" if name == "direct" else f"deconvolved, {name} PSF"] = scaled
-    shown = {name: picture.cpu().numpy() for name, picture in pictures.items()}
-    score = LensPhotoScore.model_validate(figures)
-    return score, record.model_copy(update={"imaged": which}), shown
+    for name, estimate in estimates(image).items():
+        pictures["photograph" if name == "direct" else f"deconvolved, {name} PSF"] = estimate
+    score = figures(image)
+    return PhotoVerdict(
+        score,
+        uncertainties(figures, score, photo.as_it_might_be()),
+        photo.record.model_copy(update={"imaged": which}),
+        {name: picture.cpu().numpy() for name, picture in pictures.items()},
+    )
 
 
 def _object(loaded: LoadedDesign, imaged: str | None) -> tuple[Tensor, ImagedObject]:

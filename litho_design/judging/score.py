@@ -4,49 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
 from torch import Tensor
 
-from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunFacts
+from litho_design.images.noise import uncertainties
 from litho_design.images.photograph import CameraRecord
 from litho_design.judging.loaded import LoadedDesign
-from litho_design.judging.measured import MeasuredRecord, measured_print
-from litho_design.judging.photographs import score_hologram_photo, score_lens_photo
+from litho_design.judging.measured import MeasuredRecord, MeasuredSource, as_it_might_be, measured_print
+from litho_design.judging.photographs import PhotoSource, score_hologram_photo, score_lens_photo
 from litho_design.optics import Optics
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer, PrinterRecord
 
 
-@dataclass(frozen=True)
-class MeasuredSource:
-    """A height map of the printed part; unit and size for files that do not state them."""
-
-    path: Path
-    unit: str | None = None
-    size_um: tuple[float, float] | None = None
-
-
-@dataclass(frozen=True)
-class PhotoSource:
-    """A photograph, its pixel in the image plane, and its dark level if known.
-
-    ``imaged`` is the object in front of a lens: a name of the design's objects, or a picture's path.
-    """
-
-    path: Path
-    pitch_um: float
-    dark_level: float | None = None
-    imaged: str | None = None
-
-
 class JudgedScore(Record):
-    """The figures of one judge: a model, a measured print, or a photographed image."""
+    """The figures of one judge: a model, a measured print, or a photographed image.
+
+    ``uncertainty`` holds one standard deviation of a measured figure; None for models, and in older results.
+    """
 
     kind: Literal["model", "scan", "camera"]
     judge: PrinterRecord | MeasuredRecord | CameraRecord
@@ -54,6 +34,11 @@ class JudgedScore(Record):
     mean_height_difference_um: float | None
     rms_height_difference_um: float | None
     figures: dict[str, float]
+    uncertainty: dict[str, float] | None = None
+
+    def remarks(self) -> list[str]:
+        """What was done to a measurement, and what stays open about it, one phrase each."""
+        return [] if isinstance(self.judge, PrinterRecord) else self.judge.remarks()
 
 
 class ScoreResult(RunFacts, Result):
@@ -73,6 +58,7 @@ class ScoreResult(RunFacts, Result):
     seeds: list[int]
     reference_efficiency: float | None
     designed: dict[str, float]
+    baselines: dict[str, dict[str, float]] | None = None
     scores: list[JudgedScore]
 
 
@@ -117,40 +103,27 @@ def judge_design(
         scores.append(_height_score(loaded, "model", record, independent, height))
         pictures[f"printed by {record.name}"] = loaded.image(height)
     if scan is not None:
-        printed_um, measured = measured_print(loaded, scan.path, unit=scan.unit, size_um=scan.size_um)
+        printed_um, measured = measured_print(loaded, scan)
         scores.append(_height_score(loaded, "scan", measured, True, printed_um))
         pictures[f"measured print {measured.name}"] = loaded.image(printed_um)
-    if camera is not None and loaded.target is None:
-        lens_score, photo, photos = score_lens_photo(
-            loaded, camera.path, camera.pitch_um, camera.imaged,
-            dark_level=camera.dark_level, printed_um=printed_um,
-        )  # fmt: skip
-        scores.append(_camera_score(photo, lens_score))
-    elif camera is not None:
-        if camera.imaged is not None:
-            raise InputError(
-                "photographed object",
-                got="the design of a hologram",
-                wanted="a lens",
-                hint="no --camera-object",
-            )
-        score, photo, image = score_hologram_photo(
-            loaded, camera.path, camera.pitch_um, dark_level=camera.dark_level
+    if camera is not None:
+        of_lens = loaded.target is None
+        photo = (
+            score_lens_photo(loaded, camera, printed_um) if of_lens else score_hologram_photo(loaded, camera)
         )
-        scores.append(_camera_score(photo, score))
-        pictures[f"photograph {photo.name}"] = image
+        (photos if of_lens else pictures).update(photo.pictures)
+        scores.append(
+            JudgedScore(
+                kind="camera",
+                judge=photo.record,
+                independent=True,
+                mean_height_difference_um=None,
+                rms_height_difference_um=None,
+                figures=photo.figures.model_dump(exclude_none=True),
+                uncertainty=photo.uncertainty,
+            )
+        )
     return Judgement(scores, pictures, photos)
-
-
-def _camera_score(photo: CameraRecord, figures: Record) -> JudgedScore:
-    return JudgedScore(
-        kind="camera",
-        judge=photo,
-        independent=True,
-        mean_height_difference_um=None,
-        rms_height_difference_um=None,
-        figures=figures.model_dump(exclude_none=True),
-    )
 
 
 def _height_score(
@@ -160,12 +133,17 @@ def _height_score(
     independent: bool,
     height: Tensor,
 ) -> JudgedScore:
-    difference = height - loaded.expected_um
+    difference, figures = height - loaded.expected_um, loaded.score(height)
+    spread = None
+    if isinstance(judge, MeasuredRecord):
+        variants = as_it_might_be(height, judge, loaded.record.layout.pitch_um)
+        spread = uncertainties(loaded.score, figures, variants)
     return JudgedScore(
         kind=kind,
         judge=judge,
         independent=independent,
         mean_height_difference_um=float(difference.mean()),
         rms_height_difference_um=float(difference.square().mean().sqrt()),
-        figures=loaded.score(height).model_dump(),
+        figures=figures.model_dump(),
+        uncertainty=spread,
     )

@@ -16,6 +16,8 @@ from litho_design.lenses.bench import LensBench, centre_to_background, reconstru
 from litho_design.lenses.objects import object_stack
 from litho_design.lenses.settings import ImagingSettings, LensSettings
 
+# Figures of a lens that make sense where nothing focuses.
+_OF_POWER = ("focusing_efficiency", "strehl", "cbr", "eff_window")
 _TEST_SEEDS = range(1000, 1003)
 
 
@@ -175,3 +177,31 @@ def score_lens(
         return score
     imaging = imaging_score(bench(height_um), bench(design_height_um), settings.imaging, pictures)
     return ImagingLensScore(**score.model_dump(), **imaging.model_dump())
+
+
+@torch.no_grad()
+def lens_baselines(
+    settings: LensSettings, bench: LensBench, pictures: Mapping[str, np.ndarray] | None = None
+) -> dict[str, dict[str, float]]:
+    """Scores of a perfect lens, of a flat plate, and for a computational lens of black images, by name."""
+    ideal = bench.ideal_height_um()
+    flat = lens_score(bench, torch.zeros_like(ideal))
+    found = {
+        "perfect lens": score_lens(settings, bench, ideal, ideal, pictures).model_dump(),
+        "no lens": {
+            name: getattr(flat, name) for name in ("focusing_efficiency", "strehl", "cbr", "eff_window")
+        },
+    }
+    if settings.task == "computational":
+        imaging = settings.imaging
+        objects = object_stack(imaging.test_objects, imaging.object_px, pictures)
+        black = [similarity(torch.zeros_like(wanted), wanted) for wanted in objects]
+        mae, psnr_db, ssim = (
+            sum(getattr(one, name) for one in black) / len(black) for name in ("mae", "psnr_db", "ssim")
+        )
+        found["black image"] = {"mae_direct": mae, "ssim_direct": ssim} | {
+            f"{name}_{by}{unit}": value
+            for by in ("design", "calibrated")
+            for name, unit, value in (("mae", "", mae), ("psnr", "_db", psnr_db), ("ssim", "", ssim))
+        }
+    return found

@@ -20,7 +20,13 @@ from litho_design.lenses.bench import (
     sensor_psf,
 )
 from litho_design.lenses.objects import object_stack, picture_records, pictures_note
-from litho_design.lenses.score import ImagingLensScore, LensScore, lens_score, score_lens
+from litho_design.lenses.score import (
+    ImagingLensScore,
+    LensScore,
+    lens_baselines,
+    lens_score,
+    score_lens,
+)
 from litho_design.lenses.settings import LensSettings
 from litho_design.optics import Optics
 from litho_design.optimisation.parameters import CellMap, Parametrisation
@@ -147,9 +153,13 @@ class LensTask:
             arrays[PICTURES_FILE] = object_stack(records, imaging.object_px, self.pictures).numpy()
         return arrays
 
-    def reference_efficiency(self) -> float:
-        """Focusing efficiency of a perfect lens of this aperture."""
+    def reference_efficiency(self, height_um: Tensor) -> float:
+        """Focusing efficiency of a perfect lens of this aperture, whatever the print."""
         return lens_score(self.bench, self.bench.ideal_height_um()).focusing_efficiency
+
+    def baselines(self) -> dict[str, dict[str, float]]:
+        """Scores of a perfect lens, of no lens, and of black images on the same grid."""
+        return lens_baselines(self.settings, self.bench, self.pictures)
 
     @torch.no_grad()
     def window_scores(self, height_um: Tensor, count: int) -> list[dict[str, float]]:

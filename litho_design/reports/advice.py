@@ -52,17 +52,43 @@ def stroke_advice(design: Design) -> str:
     )
 
 
-def headline(score: Mapping[str, float]) -> str:
-    """The two or three numbers of a score that a command ends with."""
-    if "eff_signal" in score:
-        return (
-            f"{100 * score['eff_signal']:.1f} % on the signal, {score['si_psnr_db']:.2f} dB, "
-            f"SSIM {score['ssim']:.3f}"
-        )
-    if "speckle_contrast" in score:
-        return f"{score['si_psnr_db']:.2f} dB, SSIM {score['ssim']:.3f}"
-    if "focusing_efficiency" not in score:
-        errors = {name: score.get(f"mae_{name}") for name in ("direct", "design", "calibrated")}
-        return "MAE " + ", ".join(f"{name} {mae:.4f}" for name, mae in errors.items() if mae is not None)
-    text = f"{100 * score['focusing_efficiency']:.1f} % in the focus, Strehl {score['strehl']:.3f}"
-    return text + (f", MAE {score['mae_calibrated']:.4f}" if "mae_calibrated" in score else "")
+def headline(score: Mapping[str, float], uncertainty: Mapping[str, float] | None = None) -> str:
+    """The two or three numbers of a score that a command ends with, with a measurement's uncertainty."""
+    sd = uncertainty or {}
+
+    def told(name: str, digits: int, scale: int = 1) -> str:
+        more = f" ± {scale * sd[name]:.{digits}f}" if name in sd else ""
+        return f"{scale * score[name]:.{digits}f}{more}"
+
+    if "focusing_efficiency" in score:
+        text = f"{told('focusing_efficiency', 1, 100)} % in the focus, Strehl {told('strehl', 3)}"
+        return text + (f", MAE {told('mae_calibrated', 4)}" if "mae_calibrated" in score else "")
+    if "si_psnr_db" in score:
+        text = f"{told('si_psnr_db', 2)} dB, SSIM {told('ssim', 3)}"
+        return (f"{told('eff_signal', 1, 100)} % on the signal, " if "eff_signal" in score else "") + text
+    names = [name for name in ("direct", "design", "calibrated") if f"mae_{name}" in score]
+    return "MAE " + ", ".join(f"{name} {told(f'mae_{name}', 4)}" for name in names)
+
+
+def black_ssim(design: Design) -> float:
+    """SSIM of a black image: what is below it shows nothing of the target to this measure."""
+    return (design.baselines or {})["black image"]["ssim"]
+
+
+def baseline_line(baselines: Mapping[str, Mapping[str, float]]) -> str:
+    """The headline figures of the baselines in one line."""
+    found = []
+    for name, figures in baselines.items():
+        shown = [
+            f"{figures[key] * scale:{form}}{unit}"
+            for key, scale, form, unit in (
+                ("focusing_efficiency", 100, ".1f", " % in the focus"),
+                ("eff_signal", 100, ".1f", " %"),
+                ("si_psnr_db", 1, ".2f", " dB"),
+            )
+            if key in figures
+        ]
+        shown += [f"SSIM {figures['ssim']:.3f}"] if "ssim" in figures else []
+        shown += [f"MAE {figures['mae_calibrated']:.4f}"] if "mae_calibrated" in figures else []
+        found.append(f"{name} {', '.join(shown)}")
+    return f"for comparison: {'; '.join(found)}"

@@ -15,6 +15,7 @@ from litho_design.judging.gap import HEADLINE, GapResult, design_folder
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.lenses.score import ImagingLensScore
 from litho_design.printers.printer import Printer
+from litho_design.reports.advice import baseline_line
 from litho_design.reports.parts import image_grid, meanings
 from litho_design.tasks.design import Design
 
@@ -38,13 +39,17 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
         page.note(
             f"Only {len(result.seeds)} seed(s): intervals are missing or wide, so the arms cannot be ranked."
         )
-    for note in Design.read(design_folder(folder, next(iter(result.arms)), result.seeds[0])).notes:
+    own = Design.read(design_folder(folder, next(iter(result.arms)), result.seeds[0]))
+    for note in own.notes:
         page.note(note[0].upper() + note[1:] + ".")
     page.paragraph(
         "An arm is a model that layouts are designed with (rows); a judge is a model that prints them "
         "(columns). On the diagonal a model judges its own design: that is its expectation, not an "
         "independent result."
     )
+    if own.baselines:
+        line = baseline_line(own.baselines)
+        page.paragraph(f"{line[0].upper()}{line[1:]}. No printer is involved in these.")
     headline = HEADLINE[result.task]
     for figure in headline:
         caption = f"{_LABELS[figure]}: mean over seeds [95 % interval]"

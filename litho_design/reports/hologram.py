@@ -9,15 +9,15 @@ import numpy as np
 from litho_data.foundation.report import Page, new_figure
 from litho_design.holograms.bench import HologramScore
 from litho_design.optimisation.process_window import ProcessWindow
-from litho_design.reports.advice import stroke_advice
+from litho_design.reports.advice import black_ssim, stroke_advice
 from litho_design.reports.parts import (
     add_gauge,
     add_notes,
+    add_scores,
     add_yield,
     level_table,
     meanings,
     progress_figure,
-    score_table,
 )
 from litho_design.tasks.design import HEIGHT_FILE, IMAGE_FILE, LEVELS_FILE, TARGET_FILE, Design
 
@@ -39,7 +39,7 @@ def write_hologram_report(
         [
             (f"{100 * score.eff_signal:.1f} %", "of the incident light on the signal"),
             (f"{score.si_psnr_db:.1f} dB", "scale-invariant PSNR"),
-            (f"{score.ssim:.3f}", "SSIM"),
+            (f"{score.ssim:.3f}", f"SSIM (black image {black_ssim(design):.3f})"),
             (f"{score.speckle_contrast:.2f}", "speckle contrast"),
             (f"{design.stroke.stroke_waves:.2f} waves", "printed stroke"),
         ]
@@ -49,10 +49,10 @@ def write_hologram_report(
     page.figure(
         _pictures(design, levels, height_um, image, target), "Rows are y (down), columns x; lengths in µm."
     )
-    page.table(score_table(score.model_dump(), labels), "Scores of the argmax layout", "scores.csv", digits=4)
+    add_scores(page, design, labels)
     if design.reference_efficiency:
         page.paragraph(
-            f"A Gerchberg-Saxton element with the same cells and continuous phase puts "
+            f"A continuous phase that cares for nothing but power puts "
             f"{100 * design.reference_efficiency:.1f} % on the signal; the print reaches "
             f"{score.eff_signal / design.reference_efficiency:.2f} of that."
         )

@@ -16,11 +16,11 @@ from litho_design.reports.advice import stroke_advice
 from litho_design.reports.parts import (
     add_gauge,
     add_notes,
+    add_scores,
     add_yield,
     level_table,
     meanings,
     progress_figure,
-    score_table,
 )
 from litho_design.tasks.design import HEIGHT_FILE, IMAGE_FILE, LEVELS_FILE, Design
 
@@ -58,7 +58,7 @@ def write_lens_report(
     page.figure(
         _curves(design, height, psf, ideal, bench), "Print along the central row, PSF profile, and MTF."
     )
-    page.table(score_table(figures, labels), "Scores of the argmax layout", "scores.csv", digits=4)
+    add_scores(page, design, labels)
     if design.reference_efficiency:
         reached = figures["focusing_efficiency"] / design.reference_efficiency
         page.paragraph(

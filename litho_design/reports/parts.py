@@ -81,13 +81,37 @@ def meanings(score: type[Record]) -> dict[str, str]:
     return {name: field.description or "" for name, field in score.model_fields.items()}
 
 
-def score_table(score: Mapping[str, float], labels: Mapping[str, str]) -> pd.DataFrame:
-    """One row per number of a score, with its meaning."""
+def score_table(columns: Mapping[str, Mapping[str, float]], labels: Mapping[str, str]) -> pd.DataFrame:
+    """One row per figure, one column per print or baseline, and the meaning of each figure."""
     import pandas as pd
 
-    return pd.DataFrame(
-        [(name, value, labels[name]) for name, value in score.items()], columns=["name", "value", "meaning"]
+    names = [
+        name for name in dict.fromkeys(n for figures in columns.values() for n in figures) if name in labels
+    ]
+    rows = [
+        {"name": name, **{title: figures.get(name, np.nan) for title, figures in columns.items()}}
+        for name in names
+    ]
+    table = pd.DataFrame(rows)
+    table["meaning"] = [labels[name] for name in names]
+    return table
+
+
+def add_scores(page: Page, design: Design, labels: Mapping[str, str]) -> None:
+    """The scores of a design beside those of its baselines on the same grid."""
+    columns = {"print": design.predicted} | (design.baselines or {})
+    page.table(
+        score_table(columns, labels),
+        "Scores of the argmax layout as printed, and of what it is to be compared with on the same grid",
+        "scores.csv",
+        digits=4,
     )
+    ceiling = (design.baselines or {}).get("continuous phase", {}).get("loss")
+    if ceiling is not None and not design.settings["window"]["samples"]:
+        page.paragraph(
+            f"The loss of the printed layout is {design.polished_loss:.4f}; a continuous phase on the same "
+            f"cells reaches {ceiling:.4f} ({100 * (design.polished_loss / ceiling - 1):+.1f} % against it)."
+        )
 
 
 def level_table(design: Design) -> pd.DataFrame:

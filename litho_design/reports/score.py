@@ -11,7 +11,7 @@ from litho_design.holograms.bench import HologramScore
 from litho_design.judging.photographs import LensPhotoScore
 from litho_design.judging.score import ScoreResult
 from litho_design.lenses.score import ImagingLensScore
-from litho_design.reports.parts import image_grid, meanings
+from litho_design.reports.parts import image_grid, meanings, score_table
 
 
 def write_score_report(
@@ -39,21 +39,20 @@ def write_score_report(
             "No judge is independent of the design: these scores only repeat the prediction of its own model."
         )
     columns = {f"{result.designed_with.name} (design)": result.designed}
-    columns |= {
-        score.judge.name + ("" if score.independent else " (not independent)"): score.figures
-        for score in result.scores
-    }
-    names = list(dict.fromkeys(name for figures in columns.values() for name in figures))
-    table = pd.DataFrame(
-        [
-            {"figure": name, **{judge: figures.get(name, np.nan) for judge, figures in columns.items()}}
-            for name in names
-        ]
-    )
+    for score in result.scores:
+        name = score.judge.name + ("" if score.independent else " (not independent)")
+        columns[name] = score.figures
+        if score.uncertainty is not None:
+            columns[f"± {score.judge.name}"] = score.uncertainty
     of_lens = meanings(LensPhotoScore) | meanings(ImagingLensScore)
     labels = meanings(HologramScore) if result.task == "hoe" else of_lens
-    table["meaning"] = [labels[name] for name in names]
-    page.table(table, "Figures by judge", "scores.csv", digits=3)
+    table = score_table(columns | (result.baselines or {}), labels)
+    page.table(
+        table, "Figures by judge, ± one standard deviation, and their baselines", "scores.csv", digits=3
+    )
+    for score in result.scores:
+        for remark in score.remarks():
+            page.paragraph(f"{score.judge.name}: {remark}.")
     page.figure(
         image_grid([list(pictures.values())], [list(pictures)], [""], side_um),
         "Behind each print: the image at matched scale, or the square root of the PSF.",

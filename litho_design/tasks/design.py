@@ -69,6 +69,8 @@ class Design(Result):
     polished_loss: float
     reference_efficiency: float | None = None
     predicted: dict[str, float]
+    # Absent in older designs.
+    baselines: dict[str, dict[str, float]] | None = None
     files: dict[str, str]
 
 

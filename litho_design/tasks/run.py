@@ -74,8 +74,11 @@ class Task(Protocol):
     def arrays(self, height_um: Tensor) -> dict[str, np.ndarray]:
         """Arrays saved beside levels and heights, by file name."""
 
-    def reference_efficiency(self) -> float | None:
-        """Efficiency of an ideal element, where that is defined."""
+    def reference_efficiency(self, height_um: Tensor) -> float | None:
+        """Efficiency of an ideal element, found from a print (size, size), µm, where that is defined."""
+
+    def baselines(self) -> dict[str, dict[str, float]]:
+        """Scores on the same grid that a design's are to be compared with, by name."""
 
 
 # Writes the report into the folder of a design, from the record and the history of the search.
@@ -177,8 +180,9 @@ def run_design(
         sample_loss=outcome.state.history[-1]["sample_loss"],
         argmax_loss=outcome.state.best_loss,
         polished_loss=outcome.polished_loss,
-        reference_efficiency=task.reference_efficiency(),
+        reference_efficiency=task.reference_efficiency(height),
         predicted=task.score(height).model_dump(),
+        baselines=task.baselines(),
         files=files,
     )
     report(folder, design, outcome.state.history)

@@ -63,6 +63,7 @@ def score(
         seeds=[int(record.settings["search"]["seed"])],
         reference_efficiency=record.reference_efficiency,
         designed=record.predicted,
+        baselines=record.baselines,
         scores=judgement.scores,
     )
     shown = {title: loaded.display(image) for title, image in judgement.pictures.items()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -16,8 +17,9 @@ from litho_design.cli.app import main
 from litho_design.images.similarity import matched_scale, similarity
 from litho_design.images.targets import TargetRecord
 from litho_design.judging.loaded import LoadedDesign
-from litho_design.judging.photographs import score_lens_photo
-from litho_design.judging.score import MeasuredSource, PhotoSource, ScoreResult
+from litho_design.judging.measured import MeasuredSource
+from litho_design.judging.photographs import PhotoSource, score_lens_photo
+from litho_design.judging.score import ScoreResult
 from litho_design.lenses.bench import reconstruct, sensor_psf
 from litho_design.lenses.objects import object_stack, read_object
 from litho_design.lenses.settings import lens_settings
@@ -146,16 +148,18 @@ def test_an_object_of_the_design_is_known_by_name(tmp_path, lens):
     loaded = LoadedDesign(lens)
     wanted = object_stack(["text"], OBJECT_PX)[0]
     photographed(tmp_path / "photo.png", loaded, loaded.expected_um, wanted)
-    score, record, shown = score_lens_photo(loaded, tmp_path / "photo.png", CAMERA_UM, "text")
+    photo = PhotoSource(tmp_path / "photo.png", CAMERA_UM, imaged="text")
+    verdict = score_lens_photo(loaded, photo)
+    score, record = verdict.figures, verdict.record
     assert record.imaged == "text"
     # The percentile of a dark surround with noise: two or three of its standard deviations below the level.
     assert DARK - 3 * NOISE < record.dark_level < DARK + NOISE
     assert score.mae_calibrated is None
-    assert list(shown) == ["object text", "photograph", "deconvolved, design PSF"]
+    assert list(verdict.pictures) == ["object text", "photograph", "deconvolved, design PSF"]
     assert score.mae_design < score.mae_direct
     # It is this object that was photographed: another one does not match, or is further off.
     with pytest.raises(InputError, match="correlation"):
-        score_lens_photo(loaded, tmp_path / "photo.png", CAMERA_UM, "spots")
+        score_lens_photo(loaded, replace(photo, imaged="spots"))
 
 
 def test_a_name_that_two_objects_have_is_refused(lens):
@@ -164,7 +168,7 @@ def test_a_name_that_two_objects_have_is_refused(lens):
     imaging = loaded.lens.imaging.model_copy(update={"objects": (one,), "test_objects": (other, "ring")})
     loaded.lens = loaded.lens.model_copy(update={"imaging": imaging})
     with pytest.raises(InputError, match="two objects"):
-        score_lens_photo(loaded, "photo.png", CAMERA_UM, "a.png")
+        score_lens_photo(loaded, PhotoSource("photo.png", CAMERA_UM, imaged="a.png"))
 
 
 @pytest.mark.parametrize(
@@ -196,8 +200,11 @@ def test_the_command_tells_the_errors(tmp_path, lens, picture, monkeypatch, caps
     with pytest.raises(SystemExit) as stop:
         main()
     assert stop.value.code == 0
-    figures = ScoreResult.read(tmp_path / "score").scores[0].figures
-    told = f"camera photo.png: MAE direct {figures['mae_direct']:.4f}, design {figures['mae_design']:.4f}"
-    assert told in capsys.readouterr().out
+    score = ScoreResult.read(tmp_path / "score").scores[0]
+    told = ", ".join(
+        f"{name} {score.figures[f'mae_{name}']:.4f} ± {score.uncertainty[f'mae_{name}']:.4f}"
+        for name in ("direct", "design")
+    )
+    assert f"camera photo.png: MAE {told}" in capsys.readouterr().out
     table = (tmp_path / "score" / "scores.csv").read_text()
     assert "psnr_direct_db" in table

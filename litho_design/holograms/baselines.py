@@ -1,0 +1,114 @@
+"""What a hologram's scores have to be compared with, on the same grid: nothing at all, and ideal elements."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from litho_design.holograms.bench import HologramBench, camera_ssim, hologram_score
+from litho_design.holograms.loss import hologram_loss
+from litho_design.holograms.settings import HologramSettings
+from litho_design.images.similarity import likeness
+from litho_design.optimisation.parameters import CellMap
+from litho_design.optimisation.phases import gerchberg_saxton
+
+_ITERATIONS = 40
+_PHASE_ITERATIONS = 100
+_PHASE_RATE = 0.3
+# Figures that make sense for any image, whatever made it.
+_OF_IMAGES = ("si_psnr_db", "ssim", "si_psnr_resolved_db", "ssim_resolved", "ssim_camera")
+
+
+def hologram_baselines(
+    bench: HologramBench, cells: CellMap, target: Tensor, settings: HologramSettings
+) -> dict[str, dict[str, float]]:
+    """Scores of a black image, and of ideal elements in the optics of ``bench``, by name.
+
+    ``diffraction-limited``: an element of free amplitude and phase, with a flat phase in the image, found by
+    forty Gerchberg-Saxton steps. ``continuous phase``: one phase per cell, no printer and no levels, from a
+    Gerchberg-Saxton start by a hundred steps down the design's own loss, which is stated. ``weighted GS``:
+    forty weighted Gerchberg-Saxton steps on the same phases.
+    """
+    wave_um = settings.optics.wave_height_um
+    found = {"black image": _of_black(bench, target, settings)}
+    limited = _free_amplitude(bench, target)
+    score = hologram_score(
+        bench.propagator(limited), limited, target, bench.grid, settings.optics, settings.camera
+    )
+    found["diffraction-limited"] = {name: getattr(score, name) for name in _OF_IMAGES}
+    best, loss = _continuous_phase(bench, cells, target, settings)
+    for name, phase in (
+        ("continuous phase", best),
+        ("weighted GS", _weighted(bench, cells, target, settings)),
+    ):
+        height_um = cells(phase) * (wave_um / (2 * math.pi))
+        found[name] = bench.score(height_um, target, settings.camera).model_dump()
+    found["continuous phase"]["loss"] = loss
+    return found
+
+
+@torch.no_grad()
+def best_signal_efficiency(bench: HologramBench, height_um: Tensor, target: Tensor) -> float:
+    """Power on the signal {T > 0.5} of the best phase found from a print (size, size), power alone counting.
+
+    u <- exp(j arg P^H S P u), with S the signal: the share never falls from step to step, because P^H S P is
+    positive; so the result is never below the print's own. One phase per pixel.
+    """
+    signal = target > 0.5
+    wave = torch.polar(torch.ones_like(height_um), height_um * (2 * math.pi / bench.optics.wave_height_um))
+    for _ in range(_ITERATIONS):
+        back = bench.propagator.adjoint(bench.propagator(wave) * signal)
+        wave = torch.polar(torch.ones_like(height_um), back.angle())
+    return float(bench.propagator(wave)[signal].abs().square().double().sum()) / height_um.numel()
+
+
+def _of_black(bench: HologramBench, target: Tensor, settings: HologramSettings) -> dict[str, float]:
+    black, wanted = torch.zeros_like(target).double(), target.double()
+    figures = likeness(black, wanted, bench.resolved(wanted))
+    field = black.to(torch.complex128)
+    return figures | {"ssim_camera": camera_ssim(field, wanted, bench.grid, settings.optics, settings.camera)}
+
+
+@torch.no_grad()
+def _free_amplitude(bench: HologramBench, target: Tensor) -> Tensor:
+    """The wave (size, size) of unit power whose image comes closest to sqrt(target), from a flat phase."""
+    wanted = target.sqrt()
+    area = math.prod(bench.grid.pitch_um)
+    wave = bench.propagator.adjoint(wanted.to(torch.complex64))
+    for _ in range(_ITERATIONS):
+        seen = bench.propagator(wave)
+        size = seen.abs()
+        scale = size.square().sum() / (wanted * size).sum()
+        wave = wave + bench.propagator.adjoint(torch.polar(wanted * scale, seen.angle()) - seen)
+    return wave / (wave.abs().square().sum() * area).sqrt()
+
+
+def _continuous_phase(
+    bench: HologramBench, cells: CellMap, target: Tensor, settings: HologramSettings
+) -> tuple[Tensor, float]:
+    """The phase per cell with the lowest loss, radian, and that loss."""
+    wave_um = settings.optics.wave_height_um
+    phase, _ = gerchberg_saxton(
+        bench.propagator, target, cells, iterations=_ITERATIONS, weighted=False, seed=settings.search.seed
+    )
+    free = phase.clone().requires_grad_()
+    optimiser = torch.optim.Adam([free], lr=_PHASE_RATE)
+    best, lowest = phase, math.inf
+    for _ in range(_PHASE_ITERATIONS):
+        loss, _ = hologram_loss(bench(cells(free) * (wave_um / (2 * math.pi))), target, settings.loss)
+        value = float(loss.detach())
+        if value < lowest:
+            best, lowest = free.detach().clone(), value
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    return best, lowest
+
+
+def _weighted(bench: HologramBench, cells: CellMap, target: Tensor, settings: HologramSettings) -> Tensor:
+    phase, _ = gerchberg_saxton(
+        bench.propagator, target, cells, iterations=_ITERATIONS, weighted=True, seed=settings.search.seed
+    )
+    return phase
