@@ -13,7 +13,7 @@ from litho_data.foundation.grid import PixelGrid
 from litho_data.foundation.results import Record
 from litho_design.holograms.settings import CameraView
 from litho_design.images.similarity import SSIM_WINDOW_PX, likeness, matched_scale, paper_rmse, ssim
-from litho_design.optics import Optics, RSPropagator, centred_grid, element_field, intensity_share
+from litho_design.optics import Optics, centred_grid, element_field, intensity_share, make_propagator
 from litho_design.printers.layout import LayoutSettings
 
 
@@ -24,9 +24,7 @@ class HologramBench(nn.Module):
         super().__init__()
         self.optics = optics
         self.grid = centred_grid((layout.size_px, layout.size_px), layout.pitch_um)
-        self.propagator = RSPropagator(
-            self.grid, self.grid, optics.distance_um, optics.wavelength_um, dtype=dtype
-        )
+        self.propagator = make_propagator(self.grid, self.grid, optics, dtype=dtype)
 
     def forward(self, height_um: Tensor) -> Tensor:
         """Share of the incident power on each pixel of the window, of heights (..., size, size) in µm."""

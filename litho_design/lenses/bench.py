@@ -12,10 +12,10 @@ from litho_design.lenses.settings import LensView
 from litho_design.optics import (
     Optics,
     RadialPropagator,
-    RSPropagator,
     centred_grid,
     element_field,
     intensity_share,
+    make_propagator,
 )
 from litho_design.optics.imaging import Blur, bin_pixels, richardson_lucy
 from litho_design.printers.layout import LayoutSettings
@@ -31,7 +31,7 @@ class LensBench(nn.Module):
         self.layout, self.optics, self.view = layout, optics, view
         self.grid = centred_grid((layout.size_px, layout.size_px), layout.pitch_um)
         self.window = centred_grid((view.window_px, view.window_px), layout.pitch_um)
-        self.propagator = RSPropagator(self.grid, self.window, optics.distance_um, optics.wavelength_um)
+        self.propagator = make_propagator(self.grid, self.window, optics)
         radius = np.hypot(self.grid.y_um[:, None], self.grid.x_um[None, :])
         inside = radius < layout.size_um / 2 if view.aperture == "circle" else np.ones_like(radius)
         self.register_buffer("aperture", torch.from_numpy(inside).float(), persistent=False)

@@ -8,6 +8,7 @@ from litho_data.foundation.faces import lazy_face
 
 if TYPE_CHECKING:
     from litho_design.optics.angular_spectrum import ASMPropagator as ASMPropagator
+    from litho_design.optics.propagators import make_propagator as make_propagator
     from litho_design.optics.radial import RadialPropagator as RadialPropagator
     from litho_design.optics.rayleigh_sommerfeld import RSPropagator as RSPropagator
     from litho_design.optics.sampling import centred_grid as centred_grid
@@ -31,6 +32,7 @@ else:
             "check_distance": "litho_design.optics.sampling",
             "element_field": "litho_design.optics.thin_element",
             "intensity_share": "litho_design.optics.thin_element",
+            "make_propagator": "litho_design.optics.propagators",
             "sampling_limit_um": "litho_design.optics.sampling",
         },
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -10,16 +11,25 @@ from torch import Tensor, nn
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.grid import PixelGrid
 from litho_design.optics.convolution import convolve
-from litho_design.optics.sampling import fast_length, first_centre_um
+from litho_design.optics.sampling import fast_length, first_centre_um, largest_separation_um
+
+# 4096 pixels along both axes: half a gibibyte while the kernel is made.
+_LONGEST_PERIOD = 4096
 
 
 class ASMPropagator(nn.Module):
     """Carry a complex field to a parallel plane with the transfer function of free space.
 
     H(f) = exp(j 2 pi z sqrt(1/wavelength^2 - f^2)); the root is complex, so evanescent waves decay
-    instead of becoming NaN. Frequencies whose rays leave the padded window are removed, because
-    they would come back wrapped (Matsushima and Shimobaba 2009, doi:10.1364/OE.17.019662). A
-    negative distance runs the propagating waves backwards and drops the evanescent ones.
+    instead of becoming NaN. The period of the sampled H is as long as its steepest rays need not to come
+    back wrapped, up to 4096 pixels; frequencies whose rays are steeper than the period allows are removed
+    (after Matsushima and Shimobaba 2009, doi:10.1364/OE.17.019662). Only the separations between the
+    two grids are kept of the kernel, so that padding costs nothing after construction. A negative distance
+    runs the propagating waves backwards and drops the evanescent ones.
+
+    Pixels above half a wavelength have a steepest ray, and the result is exact for waves within their band.
+    Below, rays up to the grazing one exist: 1 % of the wave of a rough element is missing or wrapped, and
+    ``RSPropagator`` is the better choice.
 
     Args:
         source, target: grids of equal pitch; shape and origin are free.
@@ -51,17 +61,16 @@ class ASMPropagator(nn.Module):
                 hint="use RSPropagator for another pitch",
             )
         self.source, self.target = source, target
-        vertical, horizontal = (
-            _axis_band(source, target, axis, distance_um, wavelength_um) for axis in (0, 1)
-        )
-        fy, fx = vertical[0][:, None], horizontal[0][None, :]
-        band = vertical[1][:, None] & horizontal[1][None, :]
+        axes = [_axis_band(source, target, axis, distance_um, wavelength_um) for axis in (0, 1)]
+        fy, fx = axes[0].frequency[:, None], axes[1].frequency[None, :]
+        band = axes[0].inside[:, None] & axes[1].inside[None, :]
         squared = torch.complex(wavelength_um**-2 - fy**2 - fx**2, torch.zeros(()).double())
         axial = squared.sqrt()
         if distance_um < 0:
             band = band & (axial.imag == 0)
-        shift = 2 * math.pi * (fy * vertical[2] + fx * horizontal[2])
-        transfer = torch.exp(2j * math.pi * distance_um * axial + 1j * shift) * band
+        shift = 2 * math.pi * (fy * axes[0].start_um + fx * axes[1].start_um)
+        kernel = torch.fft.ifft2(torch.exp(2j * math.pi * distance_um * axial + 1j * shift) * band)
+        transfer = torch.fft.fft2(kernel[axes[0].kept[:, None], axes[1].kept[None, :]])
         self.register_buffer("transfer", transfer.to(dtype)[None, None], persistent=False)
 
     def forward(self, field: Tensor) -> Tensor:
@@ -73,17 +82,35 @@ class ASMPropagator(nn.Module):
         return convolve(field.unsqueeze(-3), self.transfer.conj(), self.source.shape).squeeze(-3)
 
 
+@dataclass(frozen=True)
+class _AxisBand:
+    """One axis: frequencies (cycles/µm), those kept, samples of the kernel in use, shift of the grids."""
+
+    frequency: Tensor
+    inside: Tensor
+    kept: Tensor
+    start_um: float
+
+
 def _axis_band(
     source: PixelGrid, target: PixelGrid, axis: int, distance_um: float, wavelength_um: float
-) -> tuple[Tensor, Tensor, float]:
-    """Frequencies (cycles/µm), those whose lateral shift stays inside the window, and the grid shift, µm."""
-    pitch = source.pitch_um[axis]
-    length = fast_length(source.shape[axis] + target.shape[axis] - 1)
+) -> _AxisBand:
+    pitch, there, here = source.pitch_um[axis], target.shape[axis], source.shape[axis]
+    shortest = fast_length(here + there - 1)
+    sine = min(wavelength_um / (2 * pitch), 1 - 1e-6)
+    reach_um = abs(distance_um) * sine / math.sqrt(1 - sine**2)
+    wanted = math.ceil((reach_um + largest_separation_um(source, target, axis)) / pitch) + 1
+    length = fast_length(max(shortest, min(wanted, _LONGEST_PERIOD)))
     frequency = torch.fft.fftfreq(length, pitch, dtype=torch.float64)
     start = first_centre_um(target, axis) - first_centre_um(source, axis)
-    middle = start + (target.shape[axis] - source.shape[axis]) * pitch / 2
+    middle = start + (there - here) * pitch / 2
     cosine = (1 - (wavelength_um * frequency) ** 2).clamp(min=0).sqrt()
     ray_shift = distance_um * wavelength_um * frequency
-    inside = (ray_shift - middle * cosine).abs() <= length * pitch / 2 * cosine
+    # A ray comes back wrapped when it goes a period further than the far edge of the target.
+    furthest_um = (length - (here + there) / 2) * pitch
+    inside = (ray_shift - middle * cosine).abs() <= furthest_um * cosine
+    # Separations in wrapped order; unused places repeat a used one.
+    index = torch.arange(shortest)
+    index = torch.where(index < there, index, index - shortest).clamp(min=1 - here)
     # At zero distance nothing moves, evanescent waves included.
-    return frequency, inside | (distance_um == 0), start
+    return _AxisBand(frequency, inside | (distance_um == 0), index % length, start)

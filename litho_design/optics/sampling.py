@@ -30,7 +30,7 @@ def sampling_limit_um(source: PixelGrid, target: PixelGrid, wavelength_um: float
     limit = 0.0
     for axis in range(2):
         pitch = source.pitch_um[axis]
-        reach = _largest_separation_um(source, target, axis)
+        reach = largest_separation_um(source, target, axis)
         if 2 * pitch > wavelength_um:
             limit = max(limit, reach * math.sqrt((2 * pitch / wavelength_um) ** 2 - 1))
         if pitch < wavelength_um:
@@ -72,7 +72,8 @@ def first_centre_um(grid: PixelGrid, axis: int) -> float:
     return grid.origin_um[axis] + grid.pitch_um[axis] / 2
 
 
-def _largest_separation_um(source: PixelGrid, target: PixelGrid, axis: int) -> float:
+def largest_separation_um(source: PixelGrid, target: PixelGrid, axis: int) -> float:
+    """Largest distance along ``axis`` between a pixel of the source and one of the target, µm."""
     start = first_centre_um(target, axis) - first_centre_um(source, axis)
     source_span = (source.shape[axis] - 1) * source.pitch_um[axis]
     target_span = (target.shape[axis] - 1) * target.pitch_um[axis]

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from litho_data.foundation.results import Record
 from litho_data.foundation.settings import setting
+from litho_design.optics.materials import Resin, refractive_index
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -28,6 +29,21 @@ class Optics(Record):
         option=("--distance-um", "--focal-length-um"),
         gt=0,
     )
+
+    propagation: Literal["auto", "rayleigh-sommerfeld", "angular-spectrum"] = setting(
+        "auto",
+        "Propagator: the Rayleigh-Sommerfeld sum, the angular spectrum, or whichever is valid",
+        option="--propagation",
+    )
+    dispersion: Resin = setting(
+        "ip-dip", "Resin whose index against wavelength is used where the wavelength varies"
+    )
+
+    def at_wavelength(self, wavelength_um: float) -> Optics:
+        """The same optics at another wavelength, with the index step that the resin has there."""
+        there, here = (refractive_index(self.dispersion, one) for one in (wavelength_um, self.wavelength_um))
+        step = self.index_step + there - here
+        return self.model_copy(update={"wavelength_um": wavelength_um, "index_step": step})
 
     @property
     def wave_height_um(self) -> float:

@@ -101,12 +101,9 @@ def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = F
             gain=1 + window.gain_sd * gain,
             offset_um=window.offset_sd_um * (shared * gain + math.sqrt(1 - shared**2) * offset),
             blur_um=abs(window.blur_sd_um * blur),
-            optics=optics.model_copy(
-                update={
-                    "distance_um": optics.distance_um + window.defocus_sd_um * defocus,
-                    "wavelength_um": optics.wavelength_um + window.wavelength_sd_um * wavelength,
-                }
-            ),
+            optics=optics.at_wavelength(
+                optics.wavelength_um + window.wavelength_sd_um * wavelength
+            ).model_copy(update={"distance_um": optics.distance_um + window.defocus_sd_um * defocus}),
         )
         for gain, offset, blur, defocus, wavelength in normal
     ]
@@ -130,6 +127,9 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
             hint="lower --wavelength-sd-um",
         )
     limit_um = max(sampling_limit_um(source, target, draw.optics.wavelength_um) for draw in drawn)
+    # The angular spectrum has no limit, but an image plane behind the element stays behind it.
+    if optics.propagation != "rayleigh-sommerfeld":
+        limit_um = min(draw.optics.wavelength_um for draw in drawn)
     if nearest_um < limit_um:
         raise InputError(
             f"distance {optics.distance_um:g} µm with a defocus spread of {window.defocus_sd_um:g} µm",

@@ -97,6 +97,18 @@ def test_a_spread_needs_three_scans_outside_the_lock_box():
         measured_window(_store(gains[:3], offsets[:3]), ProcessWindow())
 
 
+def test_a_draw_of_another_wavelength_has_the_index_of_its_resin():
+    window = ProcessWindow(wavelength_sd_um=0.01)
+    for draw in draws(window, Optics(), 3):
+        shift_um = draw.optics.wavelength_um - 0.6328
+        # IP-Dip: dn / dlambda = -2 b / lambda^3 - 4 c / lambda^5 = -0.0516 - 0.0100 per µm; the curvature,
+        # 6 b / lambda^4 + 20 c / lambda^6 = 0.33 per µm^2, adds half its square.
+        change = draw.optics.index_step - 0.548
+        assert change == pytest.approx(-0.0616 * shift_um, abs=0.2 * shift_um**2 + 1e-6)
+    constant = Optics(dispersion="constant")
+    assert {draw.optics.index_step for draw in draws(window, constant, 3)} == {0.548}
+
+
 def test_gain_and_offset_are_drawn_together():
     many = draws(ProcessWindow(gain_offset_correlation=-0.8), Optics(), 4000)
     measured = np.corrcoef([d.gain for d in many], [d.offset_um for d in many])[0, 1]

@@ -1,0 +1,31 @@
+"""The propagator of a scene: the one that is valid at its distance, or the one that is asked for."""
+
+from __future__ import annotations
+
+import torch
+
+from litho_data.foundation.grid import PixelGrid
+from litho_design.optics.angular_spectrum import ASMPropagator
+from litho_design.optics.rayleigh_sommerfeld import RSPropagator
+from litho_design.optics.sampling import sampling_limit_um
+from litho_design.optics.thin_element import Optics
+
+Propagator = RSPropagator | ASMPropagator
+
+
+def make_propagator(
+    source: PixelGrid, target: PixelGrid, optics: Optics, *, dtype: torch.dtype = torch.complex64
+) -> Propagator:
+    """Carry waves from ``source`` to ``target`` in ``optics``.
+
+    ``auto`` takes the Rayleigh-Sommerfeld sum wherever its sampled kernel is not aliased, and the angular
+    spectrum below that distance, where its own period is long enough without further padding.
+
+    Raises:
+        InputError: a distance below the sampling limit where ``rayleigh-sommerfeld`` is asked for, or unequal
+            pitches for the angular spectrum.
+    """
+    near = optics.distance_um < sampling_limit_um(source, target, optics.wavelength_um)
+    spectrum = optics.propagation == "angular-spectrum" or (optics.propagation == "auto" and near)
+    kind = ASMPropagator if spectrum else RSPropagator
+    return kind(source, target, optics.distance_um, optics.wavelength_um, dtype=dtype)
