@@ -14,7 +14,10 @@ if TYPE_CHECKING:
     from litho_design.judging.photographs import PhotoSource as PhotoSource
     from litho_design.lenses.settings import lens_settings as lens_settings
     from litho_design.printers.source import load_printer as load_printer
+    from litho_design.tasks.task import Task as Task
+    from litho_design.tasks.task import register_task as register_task
     from litho_design.workflows.compare import compare as compare
+    from litho_design.workflows.design import design as design
     from litho_design.workflows.design import design_hologram as design_hologram
     from litho_design.workflows.design import design_lens as design_lens
     from litho_design.workflows.first import first as first
@@ -27,7 +30,9 @@ else:
         {
             "MeasuredSource": "litho_design.judging.measured",
             "PhotoSource": "litho_design.judging.photographs",
+            "Task": "litho_design.tasks.task",
             "compare": "litho_design.workflows.compare",
+            "design": "litho_design.workflows.design",
             "design_hologram": "litho_design.workflows.design",
             "design_lens": "litho_design.workflows.design",
             "export": "litho_design.exports.files",
@@ -38,6 +43,7 @@ else:
             "load_design": "litho_design.judging.loaded",
             "load_printer": "litho_design.printers.source",
             "load_target": "litho_design.images.targets",
+            "register_task": "litho_design.tasks.task",
             "score": "litho_design.workflows.score",
         },
     )
@@ -45,8 +51,10 @@ else:
 __all__ = [
     "MeasuredSource",
     "PhotoSource",
+    "Task",
     "__version__",
     "compare",
+    "design",
     "design_hologram",
     "design_lens",
     "export",
@@ -57,5 +65,6 @@ __all__ = [
     "load_design",
     "load_printer",
     "load_target",
+    "register_task",
     "score",
 ]

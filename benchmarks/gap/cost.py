@@ -75,7 +75,7 @@ def _beside_s(design: Any, parameters: Any, height: torch.Tensor) -> float:
     from litho_design.lenses.focus_window import focus_window
 
     seconds = _cpu_s(lambda: design.start(parameters, design.printer.level_heights_um()))
-    seconds += _cpu_s(design.reference_efficiency)
+    seconds += _cpu_s(lambda: design.reference_efficiency(height)) + _cpu_s(design.baselines)
     seconds += _WINDOW_DRAWS * _cpu_s(lambda: design.window_scores(height, 1))
     if isinstance(design.bench, LensBench):
         seconds += _cpu_s(lambda: focus_window(design.bench, height))
@@ -164,7 +164,7 @@ def _task(task: Task, source: str) -> tuple[Any, Any]:
     from litho_design.holograms.task import HologramTask
     from litho_design.images.targets import load_target
     from litho_design.lenses.settings import LensSettings, lens_settings
-    from litho_design.lenses.task import LensTask
+    from litho_design.lenses.task import lens_task
     from litho_design.printers.source import load_printer
 
     options = dict(zip(task.options[::2], task.options[1::2], strict=True))
@@ -176,4 +176,4 @@ def _task(task: Task, source: str) -> tuple[Any, Any]:
         wanted = load_target(target, hologram.layout.size_px)
         return HologramTask(hologram, load_printer(source, hologram.layout), wanted), hologram
     lens = lens_settings(task.kind, changes=changes)  # type: ignore[arg-type]
-    return LensTask(lens, load_printer(source, lens.layout)), lens
+    return lens_task(lens, load_printer(source, lens.layout)), lens

@@ -16,7 +16,7 @@ from benchmarks.gap.steps import proof_folders
 from benchmarks.gap.tables import SHOWN, as_markdown, figure_file
 from benchmarks.gap.tasks import Task
 from benchmarks.record import origin, publish, usable_cores, write_record
-from litho_design.judging.gap import HEADLINE, GapResult
+from litho_design.judging.gap import GapResult, headline
 from litho_design.judging.score import ScoreResult
 from litho_design.tasks.design import Design
 
@@ -125,6 +125,6 @@ def _frame(name: str, gap: GapResult) -> pd.DataFrame:
             "high": None if item.judged_ci95 is None else item.judged_ci95[1],
         }
         for item in gap.summary
-        if item.figure in HEADLINE[gap.task]
+        if item.figure in headline(gap.task)
     ]
     return pd.DataFrame(rows)

@@ -150,7 +150,7 @@ def compare(
     else:
         kind = {"task": task.removeprefix("lens-")}
         settings = _settings(given, lambda changes: _lens({**changes, **kind}), task, spread_of)
-    from litho_design.judging.gap import HEADLINE
+    from litho_design.judging.gap import headline
     from litho_design.workflows.compare import compare as run_comparison
 
     result = run_comparison(
@@ -159,7 +159,7 @@ def compare(
         extrapolate=extrapolate,
     )  # fmt: skip
     for item in result.summary:
-        if item.figure == HEADLINE[result.task][0]:
+        if item.figure == headline(result.task)[0]:
             print(f"designed with {item.arm}, printed by {item.judge}: {item.figure} {item.judged_mean:.3f}")
     print(out / "report.html")
 

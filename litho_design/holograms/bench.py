@@ -7,28 +7,18 @@ import math
 import numpy as np
 import torch
 from pydantic import Field
-from torch import Tensor, nn
+from torch import Tensor
 
 from litho_data.foundation.grid import PixelGrid
 from litho_data.foundation.results import Record
 from litho_design.holograms.settings import CameraView
 from litho_design.images.similarity import SSIM_WINDOW_PX, likeness, matched_scale, paper_rmse, ssim
-from litho_design.optics import Optics, centred_grid, element_field, intensity_share, make_propagator
-from litho_design.printers.layout import LayoutSettings
+from litho_design.optics import Optics, element_field
+from litho_design.tasks.bench import ElementBench
 
 
-class HologramBench(nn.Module):
-    """Light through a printed element onto the image plane (element and window of equal size)."""
-
-    def __init__(self, layout: LayoutSettings, optics: Optics, *, dtype: torch.dtype = torch.complex64):
-        super().__init__()
-        self.optics = optics
-        self.grid = centred_grid((layout.size_px, layout.size_px), layout.pitch_um)
-        self.propagator = make_propagator(self.grid, self.grid, optics, dtype=dtype)
-
-    def forward(self, height_um: Tensor) -> Tensor:
-        """Share of the incident power on each pixel of the window, of heights (..., size, size) in µm."""
-        return intensity_share(self.propagator(element_field(height_um, self.grid, self.optics)), self.grid)
+class HologramBench(ElementBench):
+    """The image of a holographic element, and its score."""
 
     @torch.no_grad()
     def score(self, height_um: Tensor, target: Tensor, camera: CameraView) -> HologramScore:

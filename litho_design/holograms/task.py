@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,18 +16,16 @@ from litho_design.holograms.bench import HologramBench, HologramScore
 from litho_design.holograms.loss import hologram_loss
 from litho_design.holograms.settings import HologramSettings
 from litho_design.images.similarity import SSIM_WINDOW_PX, si_psnr_db
-from litho_design.images.targets import Target, stroke_width_px
-from litho_design.optimisation.parameters import CellMap, Parametrisation
-from litho_design.optimisation.phases import printed_phase
-from litho_design.optimisation.process_window import Draw, check_draws, draws
-from litho_design.optimisation.robust import penalised, windowed_loss
-from litho_design.optimisation.starts import Scene, check_start, start_search
+from litho_design.images.targets import Target, load_target, stroke_width_px
+from litho_design.optics import Optics
+from litho_design.optimisation.starts import Scene
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
-from litho_design.tasks.design import IMAGE_FILE, TARGET_FILE, TaskName
+from litho_design.tasks.task import Task, register_task
 
 
-class HologramTask:
+@register_task
+class HologramTask(Task):
     """A hologram, ready for ``run_design``.
 
     Args:
@@ -39,7 +39,13 @@ class HologramTask:
             spreads beyond the range of the propagator.
     """
 
-    name: TaskName = "hoe"
+    name = "hoe"
+    starts = ("random", "gs", "wgs")
+    headline = ("si_psnr_db", "ssim", "ssim_camera", "eff_signal", "speckle_contrast")
+    score_type = HologramScore
+    settings_type = HologramSettings
+    settings: HologramSettings
+    bench: HologramBench
 
     def __init__(
         self,
@@ -49,79 +55,43 @@ class HologramTask:
         ensemble: Sequence[Printer] = (),
     ):
         _check_target(target.pixels, settings.layout)
-        check_start(settings.search.start, "hologram")
-        device, record = printer.device, target.record
-        self.settings, self.printer, self.target_record = settings, printer, record
-        self.printers = [printer, *ensemble]
-        self.notes = [f"target {record.adaptation}"] if record.adaptation else []
+        super().__init__(settings, printer, inputs={"target": target.pixels}, ensemble=ensemble)
+        self.target_record = target.record
+        self.notes += [f"target {target.record.adaptation}"] if target.record.adaptation else []
         self.notes += _too_fine(target.pixels, settings)
-        self.cells = CellMap(settings.layout).to(device)
-        self.bench = HologramBench(settings.layout, settings.optics).to(device)
-        check_draws(settings.window, settings.optics, self.bench.grid, self.bench.grid)
-        self.target = torch.from_numpy(target.pixels).to(device)
-        self.scenes: list[tuple[Draw | None, HologramBench]] = [
-            (draw, HologramBench(settings.layout, draw.optics).to(device))
-            for draw in draws(settings.window, settings.optics, settings.window.samples)
-        ] or [(None, self.bench)]
+        self.target = torch.from_numpy(target.pixels).to(printer.device)
 
-    def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Loss of the printed hologram's image (see ``hologram_loss``), of levels on the pixels.
+    @classmethod
+    def reopened(
+        cls, settings: Mapping[str, Any], inputs: Mapping[str, np.ndarray], printer: Printer
+    ) -> HologramTask:
+        """The task of a finished design; the record of its target stays with the design."""
+        target = load_target(inputs["target"], printer.layout.size_px)
+        return cls(HologramSettings.model_validate(settings), printer, target)
 
-        With process-window samples: the risk of that loss over them; with an ensemble: its mean over
-        the models, and their disagreement.
-        """
-        prints = [printer(level)[0, 0] for printer in self.printers]
-        settings = self.settings
-        loss, parts = windowed_loss(
-            prints, self.scenes, self._loss, settings.window, settings.layout.pitch_um
-        )
-        wave_um = settings.optics.wave_height_um
-        return penalised(loss, prints, settings.ensemble.weight, wave_um), parts
+    def make_bench(self, optics: Optics) -> HologramBench:
+        """Light onto the image plane."""
+        return HologramBench(self.settings.layout, optics).to(self.printer.device)
 
-    @torch.no_grad()
-    def window_scores(self, height_um: Tensor, count: int) -> list[dict[str, float]]:
-        """Loss, SI-PSNR and signal efficiency of a print (size, size) over ``count`` unseen draws."""
-        scores = []
-        for draw in draws(self.settings.window, self.settings.optics, count, unseen=True):
-            bench = HologramBench(self.settings.layout, draw.optics).to(height_um.device)
-            changed = draw.apply(height_um, self.settings.layout.pitch_um)
-            share = bench(changed)
-            loss, _ = hologram_loss(share, self.target, self.settings.loss)
-            scores.append(
-                {
-                    "loss": float(loss),
-                    "si_psnr_db": si_psnr_db(share.double(), self.target.double()),
-                    "eff_signal": float(share[self.target > 0.5].sum()),
-                }
-            )
-        return scores
+    def loss(self, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
+        """See ``hologram_loss``."""
+        return hologram_loss(seen, self.target, self.settings.loss)
 
-    def _loss(self, height_um: Tensor, bench: HologramBench) -> tuple[Tensor, dict[str, float]]:
-        return hologram_loss(bench(height_um), self.target, self.settings.loss)
+    def window_figures(self, seen: Tensor) -> dict[str, float]:
+        """Loss, SI-PSNR and signal efficiency."""
+        return {
+            "loss": float(self.loss(seen)[0]),
+            "si_psnr_db": si_psnr_db(seen.double(), self.target.double()),
+            "eff_signal": float(seen[self.target > 0.5].sum()),
+        }
 
-    def start(self, parameters: Parametrisation, level_heights_um: list[float]) -> None:
-        """Set the start of the search, from the phases of the levels as printed."""
-        search, optics = self.settings.search, self.settings.optics
-        scene = Scene(
-            cells=self.cells,
-            pitch_um=self.settings.layout.pitch_um,
-            optics=optics,
-            level_phase=printed_phase(level_heights_um, optics).to(self.target),
-            iterations=search.start_iterations,
-            seed=search.seed,
-            target=self.target,
-            propagator=self.bench.propagator,
-        )
-        start_search(parameters, search.start, scene, jitter_levels=search.start_jitter_levels)
+    def scene(self, level_phase: Tensor) -> Scene:
+        """With the image that a start approaches."""
+        return replace(super().scene(level_phase), target=self.target, propagator=self.bench.propagator)
 
-    def score(self, height_um: Tensor) -> HologramScore:
+    def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> HologramScore:
         """Score of the image behind a print (size, size), µm."""
         return self.bench.score(height_um, self.target, self.settings.camera)
-
-    @torch.no_grad()
-    def arrays(self, height_um: Tensor) -> dict[str, np.ndarray]:
-        """Image (share of incident power per pixel) and target."""
-        return {IMAGE_FILE: self.bench(height_um).cpu().numpy(), TARGET_FILE: self.target.cpu().numpy()}
 
     def reference_efficiency(self, height_um: Tensor) -> float:
         """Signal efficiency of the best continuous phase found from the print, power alone counting."""
@@ -130,6 +100,11 @@ class HologramTask:
     def baselines(self) -> dict[str, dict[str, float]]:
         """Scores of a black image and of ideal elements on the same grid."""
         return hologram_baselines(self.bench, self.cells, self.target, self.settings)
+
+    def display(self, seen: np.ndarray) -> np.ndarray:
+        """The image scaled to its target."""
+        target = self.inputs["target"]
+        return (seen * target).sum() / max(float((seen**2).sum()), 1e-30) * seen
 
 
 def _too_fine(target: np.ndarray, settings: HologramSettings) -> list[str]:

@@ -255,11 +255,11 @@ def _register(photo: Any, wanted: Any, scale: float) -> _Fit:
     correlation = 0.0
     # From coarse to fine: the fine structure of an image has maxima beside the right one.
     for further in (3.0 * blur_px, 0.0):
-        coarse: list[Any] = [
-            cv2.GaussianBlur(image, (0, 0), further) if further else image for image in (reference, moving)
-        ]
+        fixed, moved = reference, moving.astype(np.float32)
+        if further:
+            fixed, moved = (cv2.GaussianBlur(image, (0, 0), further) for image in (fixed, moved))
         try:
-            correlation, warp = cv2.findTransformECC(*coarse, warp, cv2.MOTION_AFFINE, criteria)
+            correlation, warp = cv2.findTransformECC(fixed, moved, warp, cv2.MOTION_AFFINE, criteria)
         except cv2.error:
             correlation = 0.0
     # A fit that strongly shrinks or shears the image has matched noise.

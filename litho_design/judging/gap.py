@@ -14,15 +14,19 @@ from pydantic import Field
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunFacts
 from litho_design.holograms.settings import HologramSettings
+from litho_design.judging.loaded import task_named
 from litho_design.lenses.settings import LensSettings
+from litho_design.optimisation.settings import DesignSettings
 from litho_design.printers.printer import PrinterRecord
-from litho_design.tasks.design import TaskName
 
-HEADLINE = {
-    "hoe": ("si_psnr_db", "ssim", "ssim_camera", "eff_signal", "speckle_contrast"),
-    "lens-direct": ("cbr", "strehl", "focusing_efficiency", "fwhm_um"),
-    "lens-computational": ("mae_design", "mae_calibrated", "ssim_calibrated", "strehl", "cbr"),
-}
+
+def headline(task: str) -> tuple[str, ...]:
+    """The figures of a task that a comparison ranks by; none where the task names none.
+
+    Raises:
+        InputError: a task that is not registered.
+    """
+    return task_named(task).headline
 
 
 class GapEntry(Record):
@@ -68,8 +72,9 @@ class GapResult(RunFacts, Result):
     FILE_NAME: ClassVar[str] = "gap.json"
 
     schema_: Literal["litho-design/gap/1"] = Field(default="litho-design/gap/1", alias="schema")
-    task: TaskName
-    settings: HologramSettings | LensSettings
+    task: str
+    # From the fewest fields to the most: a task of one's own has those of every design.
+    settings: DesignSettings | HologramSettings | LensSettings
     target: str
     seeds: list[int]
     arms: dict[str, PrinterRecord]

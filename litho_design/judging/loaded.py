@@ -9,26 +9,24 @@ import torch
 from torch import Tensor
 
 from litho_data.foundation.results import Record
-from litho_design.holograms.bench import HologramBench
-from litho_design.holograms.settings import HologramSettings
-from litho_design.lenses.bench import LensBench
-from litho_design.lenses.objects import picture_records
-from litho_design.lenses.score import score_lens
-from litho_design.lenses.settings import ImagingSettings, LensSettings
+from litho_design.holograms.task import HologramTask
+from litho_design.lenses.task import LensTask
 from litho_design.printers.printer import Printer
 from litho_design.printers.source import check_device
-from litho_design.tasks.design import HEIGHT_FILE, LEVELS_FILE, PICTURES_FILE, TARGET_FILE, Design, read_array
+from litho_design.tasks.design import HEIGHT_FILE, IMAGE_FILE, LEVELS_FILE, Design, read_array
+from litho_design.tasks.task import Task, registered_task
 
 
 class LoadedDesign:
-    """The layout of a design folder, its optics and its scores, for holograms and lenses alike.
+    """The layout of a design folder, its optics and its scores, whatever its task.
 
     Attributes:
         folder: where it lies.
         record: what ``design.json`` holds.
         level: layout (size, size).
         expected_um: height (size, size), µm, of the print that the design expects.
-        target: wanted image (size, size) of a hologram; None for a lens.
+        task: what it was designed for.
+        target: wanted image (size, size) of a hologram; None for other tasks.
         bench: the optics, from a height map to an image or a PSF.
 
     Args:
@@ -36,24 +34,26 @@ class LoadedDesign:
         device: where prints and waves are computed.
 
     Raises:
-        InputError: an incomplete or altered folder, or a device that this machine does not have.
+        InputError: an incomplete or altered folder, a task that is not registered here, or a device that
+            this machine does not have.
     """
 
     def __init__(self, folder: str | Path, *, device: str | torch.device = "cpu"):
         check_device(device)
         self.folder, self.record = Path(folder), Design.read(folder)
         self.device = torch.device(device)
-        self.level = self._load(folder, LEVELS_FILE)
-        self.expected_um = self._load(folder, HEIGHT_FILE)
-        self.target = self._load(folder, TARGET_FILE) if TARGET_FILE in self.record.files else None
-        if self.record.task == "hoe":
-            self.hologram = HologramSettings.model_validate(self.record.settings)
-            self.bench: HologramBench | LensBench = HologramBench(self.record.layout, self.record.optics)
-        else:
-            self.lens = LensSettings.model_validate(self.record.settings)
-            self.bench = LensBench(self.record.layout, self.record.optics, self.lens.view)
-            self.pictures = self._read_pictures(folder, self.lens.imaging)
-        self.bench.to(self.device)
+        self.level, self.expected_um = (self._tensor(name) for name in (LEVELS_FILE, HEIGHT_FILE))
+        own = {LEVELS_FILE, HEIGHT_FILE, IMAGE_FILE}
+        arrays = [name for name in self.record.files if name.endswith(".npy") and name not in own]
+        # A design is opened to be scored: its task needs a device, and no model.
+        nominal = Printer(None, self.record.layout, source="none").to(self.device)
+        self.task: Task = registered_task(self.record.task).reopened(
+            self.record.settings,
+            {name.removesuffix(".npy"): read_array(folder, name) for name in arrays},
+            nominal,
+        )
+        self.bench = self.task.bench
+        self.target = self.task.target if isinstance(self.task, HologramTask) else None
 
     @torch.no_grad()
     def printed_um(self, judge: Printer) -> Tensor:
@@ -67,46 +67,42 @@ class LoadedDesign:
 
     def score(self, height_um: Tensor) -> Record:
         """Score of a print (size, size), µm."""
-        if isinstance(self.bench, LensBench):
-            return score_lens(self.lens, self.bench, height_um, self.expected_um, self.pictures)
-        assert self.target is not None
-        return self.bench.score(height_um, self.target, self.hologram.camera)
+        return self.task.score(height_um, self.expected_um)
 
     def display(self, image: np.ndarray) -> np.ndarray:
         """The image as reports show it: scaled to its target, or the root of a PSF over its peak."""
-        if self.target is None:
-            return np.sqrt(image / image.max())
-        target = self.target.cpu().numpy()
-        return (image * target).sum() / max(float((image**2).sum()), 1e-30) * image
+        return self.task.display(image)
 
     @property
     def window_um(self) -> float:
         """Side of the image or of the PSF window, µm."""
-        return (self.bench.window if isinstance(self.bench, LensBench) else self.bench.grid).size_um[0]
+        return self.bench.window.size_um[0]
 
     @property
     def frame_um(self) -> float:
-        """Side of what a lens images, or of the image of a hologram, µm."""
-        if self.target is not None:
+        """Side of what a lens images, or of the image of another task, µm."""
+        if not isinstance(self.task, LensTask):
             return self.window_um
-        imaging = self.lens.imaging
+        imaging = self.task.settings.imaging
         return imaging.object_px * imaging.pixel_px * self.record.layout.pitch_um
 
-    def _read_pictures(self, folder: str | Path, imaging: ImagingSettings) -> dict[str, np.ndarray]:
-        records = picture_records((*imaging.objects, *imaging.test_objects))
-        if not records:
-            return {}
-        pixels = read_array(folder, PICTURES_FILE)
-        return {record.sha256: picture for record, picture in zip(records, pixels, strict=True)}
+    def _tensor(self, name: str) -> Tensor:
+        return torch.from_numpy(read_array(self.folder, name)).to(self.device)
 
-    def _load(self, folder: str | Path, name: str) -> Tensor:
-        return torch.from_numpy(read_array(folder, name)).to(self.device)
+
+def task_named(name: str) -> type[Task]:
+    """The task of that name; importing this module registers holograms and lenses.
+
+    Raises:
+        InputError: no such task.
+    """
+    return registered_task(name)
 
 
 def load_design(folder: str | Path, *, device: str | torch.device = "cpu") -> LoadedDesign:
     """The finished design in ``folder``, ready to be printed and scored on ``device``.
 
     Raises:
-        InputError: an incomplete or altered folder, or a device that this machine does not have.
+        InputError: what ``LoadedDesign`` refuses.
     """
     return LoadedDesign(folder, device=device)

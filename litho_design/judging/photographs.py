@@ -12,7 +12,6 @@ from torch import Tensor
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
-from litho_design.holograms.bench import HologramBench
 from litho_design.images.noise import uncertainties
 from litho_design.images.photograph import CameraRecord, photographed_image
 from litho_design.images.similarity import likeness, matched_scale, similarity
@@ -20,6 +19,7 @@ from litho_design.images.targets import ImagedObject
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.lenses.bench import reconstruct, sensor_psf
 from litho_design.lenses.objects import object_name, object_stack, read_object
+from litho_design.lenses.task import LensTask
 from litho_design.optics.imaging import Blur
 
 
@@ -92,7 +92,6 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
             object in front of a hologram.
     """
     assert loaded.target is not None
-    assert isinstance(loaded.bench, HologramBench)
     if source.imaged is not None:
         raise InputError(
             "photographed object", got="the design of a hologram", wanted="a lens", hint="no --camera-object"
@@ -158,8 +157,9 @@ def score_lens_photo(
         InputError: no object, an unknown one or a name that two have, or what ``photographed_image``
             refuses.
     """
-    wanted, which = _object(loaded, source.imaged)
-    settings = loaded.lens.imaging
+    assert isinstance(loaded.task, LensTask)
+    wanted, which = _object(loaded.task, source.imaged)
+    settings = loaded.task.settings.imaging
     heights = {"design": loaded.expected_um} | ({} if printed_um is None else {"calibrated": printed_um})
     kernels = {name: sensor_psf(loaded.bench(um), settings.pixel_px) for name, um in heights.items()}
     expected = Blur(kernels["design"], (settings.object_px, settings.object_px)).forward(wanted)
@@ -197,9 +197,9 @@ def score_lens_photo(
     )
 
 
-def _object(loaded: LoadedDesign, imaged: str | None) -> tuple[Tensor, ImagedObject]:
+def _object(task: LensTask, imaged: str | None) -> tuple[Tensor, ImagedObject]:
     """The object of a photograph, (n, n) in [0, 1], and its name or record."""
-    settings = loaded.lens.imaging
+    settings = task.settings.imaging
     items = (*settings.objects, *settings.test_objects)
     own = {object_name(item): item for item in items}
     if imaged is None or (imaged not in own and not Path(imaged).is_file()):
@@ -215,7 +215,7 @@ def _object(loaded: LoadedDesign, imaged: str | None) -> tuple[Tensor, ImagedObj
                 got=f"{imaged!r}, the name of two objects of the design",
                 wanted="the path of its picture, with a folder in front",
             )
-        stack = object_stack([own[imaged]], settings.object_px, loaded.pictures)
-        return stack[0].to(loaded.device), own[imaged]
+        stack = object_stack([own[imaged]], settings.object_px, task.pictures)
+        return stack[0].to(task.printer.device), own[imaged]
     pixels, record = read_object(Path(imaged), settings.object_px)
-    return torch.from_numpy(pixels).to(loaded.device), record
+    return torch.from_numpy(pixels).to(task.printer.device), record

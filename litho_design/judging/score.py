@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field
 from torch import Tensor
 
+from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunFacts
 from litho_design.images.noise import uncertainties
@@ -17,6 +18,7 @@ from litho_design.images.photograph import CameraRecord
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.judging.measured import MeasuredRecord, MeasuredSource, as_it_might_be, measured_print
 from litho_design.judging.photographs import PhotoSource, score_hologram_photo, score_lens_photo
+from litho_design.lenses.task import LensTask
 from litho_design.optics import Optics
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer, PrinterRecord
@@ -107,7 +109,11 @@ def judge_design(
         scores.append(_height_score(loaded, "scan", measured, True, printed_um))
         pictures[f"measured print {measured.name}"] = loaded.image(printed_um)
     if camera is not None:
-        of_lens = loaded.target is None
+        of_lens = isinstance(loaded.task, LensTask)
+        if loaded.target is None and not of_lens:
+            raise InputError(
+                "photograph", got=f"a design of {loaded.task.name!r}", wanted="a hologram or a lens"
+            )
         photo = (
             score_lens_photo(loaded, camera, printed_um) if of_lens else score_hologram_photo(loaded, camera)
         )

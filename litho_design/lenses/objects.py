@@ -46,7 +46,7 @@ def with_objects(
 
     Returns:
         The settings, with name, SHA-256 and conversion of each picture, and the pixels by SHA-256 for
-        ``run_lens``; unchanged settings and no pixels where no path is given.
+        ``lens_task``; unchanged settings and no pixels where no path is given.
 
     Raises:
         InputError: a task that images no objects, a file that is not a picture, a picture without light or

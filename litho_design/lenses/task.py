@@ -1,16 +1,17 @@
-"""The lens as a task: from levels on the pixels to a loss, a score and what is kept."""
+"""Lenses as tasks: from levels on the pixels to a loss, a score and what is kept."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from litho_data.foundation.errors import InputError
-from litho_design.images.targets import TargetRecord
 from litho_design.lenses.bench import (
     LensBench,
     RadialLensBench,
@@ -29,23 +30,32 @@ from litho_design.lenses.score import (
 )
 from litho_design.lenses.settings import LensSettings
 from litho_design.optics import Optics
-from litho_design.optimisation.parameters import CellMap, Parametrisation
-from litho_design.optimisation.phases import printed_phase
-from litho_design.optimisation.process_window import Draw, check_draws, draws
-from litho_design.optimisation.robust import penalised, windowed_loss
-from litho_design.optimisation.starts import Scene, check_start, start_search
+from litho_design.optimisation.parameters import CellMap
+from litho_design.optimisation.starts import Scene
 from litho_design.printers.printer import Printer
-from litho_design.tasks.design import IMAGE_FILE, PICTURES_FILE, TaskName
+from litho_design.tasks.task import Task, register_task
 
 # The same noise in every iteration: the search compares layouts, not noise; the score draws its own.
 _DESIGN_NOISE_SEED = 0
+_PICTURES = "object_pictures"
 _PLANE_NOTE = (
     "the search ran on the whole plane, not along a radius: the printer's effects depend on the position"
 )
 
 
-class LensTask:
-    """A lens, ready for ``run_design``.
+def lens_task(
+    settings: LensSettings,
+    printer: Printer,
+    ensemble: Sequence[Printer] = (),
+    pictures: Mapping[str, np.ndarray] | None = None,
+) -> LensTask:
+    """The task that ``settings.task`` names, with arguments and errors of ``LensTask``."""
+    kind = DirectLensTask if settings.task == "direct" else ComputationalLensTask
+    return kind(settings, printer, ensemble, pictures)
+
+
+class LensTask(Task):
+    """A lens, ready for ``run_design``: what direct and computational ones share.
 
     Args:
         settings: geometry, optics, task and search (see ``lens_settings``).
@@ -58,7 +68,10 @@ class LensTask:
             holograms, an object without pixels, or spreads beyond the range of the propagator.
     """
 
-    target_record: TargetRecord | None = None
+    starts = ("random", "fresnel")
+    settings_type = LensSettings
+    settings: LensSettings
+    bench: LensBench
 
     def __init__(
         self,
@@ -68,90 +81,62 @@ class LensTask:
         pictures: Mapping[str, np.ndarray] | None = None,
     ):
         _check(settings)
-        self.settings, self.printer = settings, printer
-        self.printers = [printer, *ensemble]
-        self.name: TaskName = "lens-direct" if settings.task == "direct" else "lens-computational"
-        device = printer.device
-        self.cells = CellMap(settings.layout).to(device)
-        self.bench = LensBench(settings.layout, settings.optics, settings.view).to(device)
-        check_draws(settings.window, settings.optics, self.bench.grid, self.bench.window)
+        self.pictures, imaging = dict(pictures or {}), settings.imaging
+        self.objects = object_stack(imaging.objects, imaging.object_px, self.pictures).to(printer.device)
+        records = picture_records((*imaging.objects, *imaging.test_objects))
+        stack = object_stack(records, imaging.object_px, self.pictures).numpy() if records else None
+        inputs = {} if stack is None else {_PICTURES: stack}
+        super().__init__(settings, printer, inputs=inputs, ensemble=ensemble)
         rings, placed = settings.view.path == "radial", any(p.depends_on_position for p in self.printers)
         self.radial = rings and not placed
-        self.notes = [_PLANE_NOTE] if rings and placed else []
-        self.notes += _narrow_window(self.bench)
         self.strips = (
             [_strip_rings(self.cells, p.strip_halo_px) for p in self.printers] if self.radial else []
         )
-        self.scenes: list[tuple[Draw | None, LensBench | RadialLensBench]] = [
-            (draw, self._search_bench(draw.optics))
-            for draw in draws(settings.window, settings.optics, settings.window.samples)
-        ] or [(None, self._search_bench(settings.optics))]
-        imaging = settings.imaging
-        self.pictures = dict(pictures or {})
-        self.objects = object_stack(imaging.objects, imaging.object_px, self.pictures).to(device)
+        self.notes += [_PLANE_NOTE] if rings and placed else []
+        self.notes += _narrow_window(self.bench)
         self.notes += pictures_note(imaging.objects, imaging.test_objects)
 
-    def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """-log(centre-to-background ratio), or the mean absolute error after Richardson-Lucy.
+    @classmethod
+    def reopened(
+        cls, settings: Mapping[str, Any], inputs: Mapping[str, np.ndarray], printer: Printer
+    ) -> LensTask:
+        """The task of a finished design."""
+        made = LensSettings.model_validate(settings)
+        records = picture_records((*made.imaging.objects, *made.imaging.test_objects))
+        pixels = inputs.get(_PICTURES, ())
+        pictures = {one.sha256: picture for one, picture in zip(records, pixels, strict=True)}
+        return cls(made, printer, (), pictures)
 
-        With process-window samples: the risk of that loss over them; with an ensemble: its mean over
-        the models, and their disagreement.
-        """
-        prints = (
-            [self.printed_rings(level, index) for index in range(len(self.printers))]
-            if self.radial
-            else [printer(level)[0, 0] for printer in self.printers]
-        )
-        settings = self.settings
-        loss, parts = windowed_loss(
-            prints, self.scenes, self._loss, settings.window, settings.layout.pitch_um
-        )
+    def make_bench(self, optics: Optics) -> LensBench:
+        """Light onto the focal window."""
+        return LensBench(self.settings.layout, optics, self.settings.view).to(self.printer.device)
+
+    def search_bench(self, optics: Optics) -> LensBench | RadialLensBench:
+        """Along a radius where layout and printers allow it, else the whole plane."""
+        if not self.radial:
+            return self.make_bench(optics)
+        return RadialLensBench(self.settings.layout, optics, self.settings.view).to(self.printer.device)
+
+    def search_print(self, level: Tensor, printer: int) -> Tensor:
+        """Height of the rings (rings,) or of the plane (size, size), µm."""
+        return self.printed_rings(level, printer) if self.radial else super().search_print(level, printer)
+
+    def search_area(self) -> Tensor | None:
+        """Area of the rings."""
         bench = self.scenes[0][1]
-        area = bench.propagator.ring_area_um2.to(loss) if isinstance(bench, RadialLensBench) else None
-        wave_um = settings.optics.wave_height_um
-        return penalised(loss, prints, settings.ensemble.weight, wave_um, area), parts
+        if not isinstance(bench, RadialLensBench):
+            return None
+        return bench.propagator.ring_area_um2.float().to(self.printer.device)
 
-    def _loss(self, height_um: Tensor, bench: LensBench | RadialLensBench) -> tuple[Tensor, dict[str, float]]:
-        psf = bench(height_um)
-        layout = self.settings.layout
-        centre_px = round(self.settings.view.centre_um / layout.pitch_um)
-        ratio = centre_to_background(psf, centre_px, layout.size_px)
-        parts = {"cbr": float(ratio.detach()), "window": float(psf.detach().sum())}
-        if self.settings.task == "direct":
-            return -ratio.log(), parts
-        imaging = self.settings.imaging
-        kernel = sensor_psf(psf, imaging.pixel_px)
-        seen = record(self.objects, kernel, imaging.read_noise, _DESIGN_NOISE_SEED)
-        error = (reconstruct(seen, kernel, imaging.iterations) - self.objects).abs().mean()
-        return error, parts
+    def scene(self, level_phase: Tensor) -> Scene:
+        """On the CPU, where sums over rings are reproducible."""
+        scene = super().scene(level_phase)
+        return replace(scene, cells=CellMap(self.settings.layout), level_phase=level_phase.cpu())
 
-    def start(self, parameters: Parametrisation, level_heights_um: list[float]) -> None:
-        """Set the start of the search, from the phases of the levels as printed."""
-        settings, search = self.settings, self.settings.search
-        scene = Scene(
-            # On the CPU, where sums over rings are reproducible.
-            cells=CellMap(settings.layout),
-            pitch_um=settings.layout.pitch_um,
-            optics=settings.optics,
-            level_phase=printed_phase(level_heights_um, settings.optics),
-            iterations=search.start_iterations,
-            seed=search.seed,
-        )
-        start_search(parameters, search.start, scene, jitter_levels=search.start_jitter_levels)
-
-    def score(self, height_um: Tensor) -> LensScore | ImagingLensScore:
-        """Score of a print, expected PSF and printed PSF being the same."""
-        return score_lens(self.settings, self.bench, height_um, height_um, self.pictures)
-
-    @torch.no_grad()
-    def arrays(self, height_um: Tensor) -> dict[str, np.ndarray]:
-        """The PSF, and the pictures (n, object, object) in the order of ``picture_records``."""
-        arrays = {IMAGE_FILE: self.bench(height_um).cpu().numpy()}
-        imaging = self.settings.imaging
-        records = picture_records((*imaging.objects, *imaging.test_objects))
-        if records:
-            arrays[PICTURES_FILE] = object_stack(records, imaging.object_px, self.pictures).numpy()
-        return arrays
+    def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> LensScore | ImagingLensScore:
+        """Score of a print whose design expected ``expected_um``, or the same."""
+        expected = height_um if expected_um is None else expected_um
+        return score_lens(self.settings, self.bench, height_um, expected, self.pictures)
 
     def reference_efficiency(self, height_um: Tensor) -> float:
         """Focusing efficiency of a perfect lens of this aperture, whatever the print."""
@@ -161,22 +146,14 @@ class LensTask:
         """Scores of a perfect lens, of no lens, and of black images on the same grid."""
         return lens_baselines(self.settings, self.bench, self.pictures)
 
-    @torch.no_grad()
-    def window_scores(self, height_um: Tensor, count: int) -> list[dict[str, float]]:
-        """Strehl ratio and centre-to-background ratio of a print over ``count`` unseen draws."""
-        settings, scores = self.settings, []
+    def window_figures(self, seen: Tensor) -> dict[str, float]:
+        """Strehl ratio and centre-to-background ratio."""
         peak = float(self.bench(self.bench.ideal_height_um()).max())
-        centre_px = round(settings.view.centre_um / settings.layout.pitch_um)
-        for draw in draws(settings.window, settings.optics, count, unseen=True):
-            bench = LensBench(settings.layout, draw.optics, settings.view).to(height_um.device)
-            psf = bench(draw.apply(height_um, settings.layout.pitch_um))
-            cbr = centre_to_background(psf, centre_px, settings.layout.size_px)
-            scores.append({"strehl": float(psf.max()) / peak, "cbr": float(cbr)})
-        return scores
+        return {"strehl": float(seen.max()) / peak, "cbr": float(self._ratio(seen))}
 
-    def _search_bench(self, optics: Optics) -> LensBench | RadialLensBench:
-        kind = RadialLensBench if self.radial else LensBench
-        return kind(self.settings.layout, optics, self.settings.view).to(self.printer.device)
+    def display(self, seen: np.ndarray) -> np.ndarray:
+        """The root of the PSF over its peak."""
+        return np.sqrt(seen / seen.max())
 
     def printed_rings(self, level: Tensor, printer: int = 0) -> Tensor:
         """Height (rings,), µm, inside the aperture, from one printer's print of a strip along a radius.
@@ -187,6 +164,43 @@ class LensTask:
         press = self.printers[printer]
         strip = rings[self.strips[printer]][None, None]
         return press.print_patch(strip, press.strip_halo_px)[0, 0].mean(0)
+
+    def _ratio(self, psf: Tensor) -> Tensor:
+        layout = self.settings.layout
+        return centre_to_background(
+            psf, round(self.settings.view.centre_um / layout.pitch_um), layout.size_px
+        )
+
+
+@register_task
+class DirectLensTask(LensTask):
+    """A lens that focuses light."""
+
+    name = "lens-direct"
+    headline = ("cbr", "strehl", "focusing_efficiency", "fwhm_um")
+    score_type = LensScore
+
+    def loss(self, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
+        """-log(centre-to-background ratio)."""
+        ratio = self._ratio(seen)
+        return -ratio.log(), {"cbr": float(ratio.detach()), "window": float(seen.detach().sum())}
+
+
+@register_task
+class ComputationalLensTask(LensTask):
+    """A lens whose image is deconvolved."""
+
+    name = "lens-computational"
+    headline = ("mae_design", "mae_calibrated", "ssim_calibrated", "strehl", "cbr")
+    score_type = ImagingLensScore
+
+    def loss(self, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
+        """The mean absolute error of the objects after Richardson-Lucy."""
+        imaging = self.settings.imaging
+        kernel = sensor_psf(seen, imaging.pixel_px)
+        image = record(self.objects, kernel, imaging.read_noise, _DESIGN_NOISE_SEED)
+        error = (reconstruct(image, kernel, imaging.iterations) - self.objects).abs().mean()
+        return error, {"cbr": float(self._ratio(seen).detach()), "window": float(seen.detach().sum())}
 
 
 def _narrow_window(bench: LensBench) -> list[str]:
@@ -212,7 +226,6 @@ def _strip_rings(cells: CellMap, halo_px: int) -> Tensor:
 
 
 def _check(settings: LensSettings) -> None:
-    check_start(settings.search.start, "lens")
     radial = settings.view.path == "radial"
     if radial and (settings.layout.symmetry != "radial" or settings.view.aperture != "circle"):
         raise InputError(

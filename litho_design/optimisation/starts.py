@@ -1,15 +1,15 @@
 """Starts of a search: each is a function that gives one level for every free cell.
 
-To add a start, give it a name in ``StartName`` and a function in ``_STARTS``; where it needs an image or a
-focus, say so in ``_MADE_FOR``.
+To add a start, give it a name in ``StartName`` and a function in ``_STARTS``, and list it in ``starts`` of
+the tasks that have what it needs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal
 
 from litho_data.foundation.errors import InputError
 
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 
 # The command line reads the names: what computes is imported when a start is made, torch with it.
 StartName = Literal["random", "gs", "wgs", "fresnel"]
-# Where a start needs an image or a focus; the others serve both.
-_MADE_FOR = {"gs": "hologram", "wgs": "hologram", "fresnel": "lens"}
 
 
 @dataclass(frozen=True)
@@ -50,15 +48,14 @@ class Scene:
     propagator: Any = None
 
 
-def check_start(name: StartName, task: Literal["hologram", "lens"]) -> None:
-    """Refuse a start that is made for the other kind of task.
+def check_start(name: str, fit: Sequence[str], task: str) -> None:
+    """Refuse a start that a task does not have.
 
     Raises:
         InputError: a start for images where a lens is designed, or the reverse.
     """
-    fit = [other for other in get_args(StartName) if _MADE_FOR.get(other, task) == task]
     if name not in fit:
-        raise InputError("start", got=repr(name), wanted=f"{', '.join(map(repr, fit))} for a {task}")
+        raise InputError("start", got=repr(name), wanted=f"{', '.join(map(repr, fit))} for {task}")
 
 
 def start_search(

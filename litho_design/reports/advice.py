@@ -70,11 +70,6 @@ def headline(score: Mapping[str, float], uncertainty: Mapping[str, float] | None
     return "MAE " + ", ".join(f"{name} {told(f'mae_{name}', 4)}" for name in names)
 
 
-def black_ssim(design: Design) -> float:
-    """SSIM of a black image: what is below it shows nothing of the target to this measure."""
-    return (design.baselines or {})["black image"]["ssim"]
-
-
 def baseline_line(baselines: Mapping[str, Mapping[str, float]]) -> str:
     """The headline figures of the baselines in one line."""
     found = []

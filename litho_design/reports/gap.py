@@ -11,7 +11,7 @@ import numpy as np
 
 from litho_data.foundation.report import Page, new_figure
 from litho_design.holograms.bench import HologramScore
-from litho_design.judging.gap import HEADLINE, GapResult, design_folder
+from litho_design.judging.gap import GapResult, design_folder, headline
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.lenses.score import ImagingLensScore
 from litho_design.printers.printer import Printer
@@ -50,30 +50,32 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
     if own.baselines:
         line = baseline_line(own.baselines)
         page.paragraph(f"{line[0].upper()}{line[1:]}. No printer is involved in these.")
-    headline = HEADLINE[result.task]
-    for figure in headline:
-        caption = f"{_LABELS[figure]}: mean over seeds [95 % interval]"
+    shown = headline(result.task) or tuple(own.predicted)
+    for figure in shown:
+        caption = f"{_LABELS.get(figure, figure)}: mean over seeds [95 % interval]"
         page.table(_matrix(result, figure), caption, f"matrix_{figure}.csv", digits=3)
     page.heading("In design and after printing")
     judged = _judged(folder, result, printers)
     page.figure(
         _pictures(result, judged),
         f"Seed {result.seeds[0]}. Rows: designed with; columns: printed by. "
-        + ("Images at matched scale." if result.task == "hoe" else "Square root of the PSF over its peak."),
+        + (
+            "Square root of the PSF over its peak." if result.task.startswith("lens-") else "Scaled to match."
+        ),
     )
     page.figure(
         _prints(result, judged, printers),
         f"Seed {result.seeds[0]}: layout and prints in the middle of the element, heights in µm, each in the "
         "range of its row.",
     )
-    if result.task != "hoe":
+    if result.task.startswith("lens-"):
         page.figure(
             _profiles(result, judged),
             f"Seed {result.seeds[0]}: PSF across the centre and its Fourier spectrum along x (MTF × power); "
             "thick in design, thin as printed.",
         )
     page.figure(
-        _bars(result, "ssim" if result.task == "hoe" else headline[0]),
+        _bars(result, "ssim" if result.task == "hoe" else shown[0]),
         "Left: expected in design (circles) and after each judge's print (bars), means over seeds. Right: "
         "design minus print, the gap.",
     )
@@ -188,8 +190,8 @@ def _bars(result: GapResult, name: str):
         left.bar(place, [item.judged_mean for item in items], width, color=f"C{index}", label=arm, **error)
         left.plot(place, [item.designed_mean for item in items], "o", mfc="none", color="black", ms=4)
         right.bar(place, [item.gap_mean for item in items], width, color=f"C{index}")
-    left.set_ylabel(textwrap.fill(_LABELS[name], 32))
-    right.set_ylabel(textwrap.fill(f"Δ {_LABELS[name]}", 32))
+    left.set_ylabel(textwrap.fill(_LABELS.get(name, name), 32))
+    right.set_ylabel(textwrap.fill(f"Δ {_LABELS.get(name, name)}", 32))
     right.axhline(0, color="black", linewidth=0.8)
     for axis in (left, right):
         axis.set_xticks(range(len(judges)), judges, fontsize=8)

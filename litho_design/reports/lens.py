@@ -1,104 +1,32 @@
-"""The report of one lens."""
+"""What the report of a lens shows beside that of every design: profiles, MTF, focus and gain."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import torch
+from torch import Tensor
 
 from litho_data.foundation.report import Page, new_figure
 from litho_design.lenses.bench import LensBench
-from litho_design.lenses.focus_window import FocusWindow, focus_window
-from litho_design.lenses.score import ImagingLensScore, mtf
-from litho_design.optimisation.process_window import ProcessWindow
-from litho_design.reports.advice import stroke_advice
-from litho_design.reports.parts import (
-    add_gauge,
-    add_notes,
-    add_scores,
-    add_yield,
-    level_table,
-    meanings,
-    progress_figure,
-)
-from litho_design.tasks.design import HEIGHT_FILE, IMAGE_FILE, LEVELS_FILE, Design
+from litho_design.lenses.focus_window import focus_window
+from litho_design.lenses.score import mtf
+from litho_design.tasks.design import Design
 
 
-def write_lens_report(
-    folder: Path,
-    design: Design,
-    history: list[dict[str, float]],
-    bench: LensBench,
-    window: list[dict[str, float]],
-) -> Path:
-    """Write ``report.html`` and its CSV tables from the arrays in ``folder``."""
-    levels, height, psf = (np.load(folder / name) for name in (LEVELS_FILE, HEIGHT_FILE, IMAGE_FILE))
+def decibels(psf: np.ndarray) -> np.ndarray:
+    """A PSF in decibels below its peak."""
+    return 10 * np.log10(np.maximum(psf, 1e-12) / psf.max())
+
+
+def add_lens_curves(
+    page: Page, design: Design, height: np.ndarray, psf: np.ndarray, bench: LensBench
+) -> None:
+    """Print along the central row, PSF and MTF beside those of a perfect lens."""
     with torch.no_grad():
         ideal = bench(bench.ideal_height_um()).cpu().numpy()
-    figures, labels = design.predicted, meanings(ImagingLensScore)
-    page = Page(
-        "Multi-level diffractive lens",
-        f"Designed through the printer model “{design.printer.name}”; "
-        "all scores are of the printable layout.",
-    )
-    page.tiles(
-        [
-            (f"{100 * figures['focusing_efficiency']:.1f} %", "of the light in the focus"),
-            (f"{figures['strehl']:.3f}", "Strehl ratio"),
-            (f"{figures['fwhm_um']:.2f} µm", f"FWHM (ideal {figures['fwhm_ideal_um']:.2f} µm)"),
-            (f"{figures['cbr']:.0f}", f"centre to background (ceiling {figures['cbr_ceiling']:.0f})"),
-        ]
-    )
-    add_notes(page, design)
-    page.heading("Layout, print and focus")
-    page.figure(
-        _pictures(design, levels, height, psf), "Layout, predicted print, and PSF (decibels below its peak)."
-    )
     page.figure(
         _curves(design, height, psf, ideal, bench), "Print along the central row, PSF profile, and MTF."
     )
-    add_scores(page, design, labels)
-    if design.reference_efficiency:
-        reached = figures["focusing_efficiency"] / design.reference_efficiency
-        page.paragraph(
-            f"A perfect lens of this aperture puts {100 * design.reference_efficiency:.1f} % within the same "
-            f"radius; the print reaches {reached:.2f} of that."
-        )
-    page.heading("Search")
-    page.figure(
-        progress_figure(history, design), "Loss of the sampled layout and of the printable (argmax) layout."
-    )
-    shown = {name: (figures[name], labels[name]) for name in ("strehl", "cbr")}
-    add_yield(page, window, ProcessWindow.model_validate(design.settings["window"]), shown)
-    _add_focus_window(page, focus_window(bench, torch.from_numpy(height).to(bench.aperture.device)))
-    page.heading("Printed height of the levels")
-    page.table(level_table(design), "Printed height of a uniform field of each level", "levels.csv", digits=3)
-    page.paragraph(stroke_advice(design))
-    add_gauge(page, design)
-    page.heading("Settings")
-    page.code(design.model_dump_json(indent=1, include={"settings", "printer", "run", "notes"}))
-    return page.write(folder)
-
-
-def _pictures(design: Design, levels: np.ndarray, height: np.ndarray, psf: np.ndarray):
-    figure = new_figure(13, 4.2)
-    axes = figure.subplots(1, 3)
-    side, window = design.layout.size_um, psf.shape[0] * design.layout.pitch_um
-    decibel = 10 * np.log10(np.maximum(psf, 1e-12) / psf.max())
-    for axis, array, title, colours, limits, unit, extent in (
-        (axes[0], levels, "layout", "viridis", (0, design.layout.levels - 1), "level", side),
-        (axes[1], height, f"print predicted by {design.printer.name}", "viridis", (None, None), "µm", side),
-        (axes[2], decibel, "PSF", "inferno", (-40, 0), "dB", window),
-    ):
-        shown = axis.imshow(
-            array, cmap=colours, vmin=limits[0], vmax=limits[1], extent=(0, extent, extent, 0)
-        )
-        axis.set_title(title)
-        axis.set_xlabel("x, µm")
-        axis.set_ylabel("y, µm")
-        figure.colorbar(shown, ax=axis, label=unit, shrink=0.8)
-    return figure
 
 
 def _curves(design: Design, height: np.ndarray, psf: np.ndarray, ideal: np.ndarray, bench: LensBench):
@@ -133,10 +61,11 @@ def _curves(design: Design, height: np.ndarray, psf: np.ndarray, ideal: np.ndarr
     return figure
 
 
-def _add_focus_window(page: Page, window: FocusWindow) -> None:
+def add_lens_window(page: Page, bench: LensBench, height_um: Tensor) -> None:
     """Bossung curves of FWHM and peak, and the map of the peak."""
     import pandas as pd
 
+    window = focus_window(bench, height_um)
     page.paragraph(
         "Focus and print gain (which represents the dose) are swept. The peak stays above 80 % of its best "
         f"value over {window.depth_of_focus_um:.1f} µm of defocus at the modelled gain and over a gain range "

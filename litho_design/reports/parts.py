@@ -93,7 +93,7 @@ def score_table(columns: Mapping[str, Mapping[str, float]], labels: Mapping[str,
         for name in names
     ]
     table = pd.DataFrame(rows)
-    table["meaning"] = [labels[name] for name in names]
+    table["meaning"] = [labels.get(name, "") for name in names]
     return table
 
 

@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from litho_data.foundation.report import Page
-from litho_design.holograms.bench import HologramScore
+from litho_design.judging.loaded import task_named
 from litho_design.judging.photographs import LensPhotoScore
 from litho_design.judging.score import ScoreResult
-from litho_design.lenses.score import ImagingLensScore
 from litho_design.reports.parts import image_grid, meanings, score_table
 
 
@@ -44,8 +43,7 @@ def write_score_report(
         columns[name] = score.figures
         if score.uncertainty is not None:
             columns[f"± {score.judge.name}"] = score.uncertainty
-    of_lens = meanings(LensPhotoScore) | meanings(ImagingLensScore)
-    labels = meanings(HologramScore) if result.task == "hoe" else of_lens
+    labels = meanings(task_named(result.task).score_type) | meanings(LensPhotoScore)
     table = score_table(columns | (result.baselines or {}), labels)
     page.table(
         table, "Figures by judge, ± one standard deviation, and their baselines", "scores.csv", digits=3

@@ -24,9 +24,6 @@ LEVELS_FILE = "layout_level.npy"
 HEIGHT_FILE = "predicted_height_um.npy"
 IMAGE_FILE = "image_share.npy"
 TARGET_FILE = "target.npy"
-PICTURES_FILE = "object_pictures.npy"
-
-TaskName = Literal["hoe", "lens-direct", "lens-computational"]
 
 
 class RunRecord(RunFacts):
@@ -46,7 +43,7 @@ class Design(Result):
     FILE_NAME: ClassVar[str] = "design.json"
 
     schema_: Literal["litho-design/design/1"] = Field(default="litho-design/design/1", alias="schema")
-    task: TaskName
+    task: str
     variant: str
     fingerprint: str
     run: RunRecord

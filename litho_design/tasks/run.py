@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -18,12 +18,9 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import writable
 from litho_data.foundation.hashes import record_sha256
 from litho_data.foundation.outputs import require_own_folder
-from litho_data.foundation.results import Record
 from litho_data.foundation.run_facts import run_facts
-from litho_design.images.targets import TargetRecord
 from litho_design.optics.stroke import measure_stroke
 from litho_design.optimisation.budget import Budget, measure_budget, peak_memory_gib
-from litho_design.optimisation.parameters import Parametrisation
 from litho_design.optimisation.polish import polish_levels
 from litho_design.optimisation.robust import measure_disagreement
 from litho_design.optimisation.search import (
@@ -41,48 +38,13 @@ from litho_design.tasks.design import (
     LEVELS_FILE,
     Design,
     RunRecord,
-    TaskName,
     write_arrays,
     write_level_image,
 )
-
-
-class Task(Protocol):
-    """A hologram or a lens, ready to be optimised through one printer."""
-
-    @property
-    def name(self) -> TaskName: ...
-    @property
-    def printer(self) -> Printer: ...
-    @property
-    def printers(self) -> Sequence[Printer]: ...
-    @property
-    def target_record(self) -> TargetRecord | None: ...
-    @property
-    def notes(self) -> Sequence[str]:
-        """Remarks for the record, such as how the target was fitted."""
-
-    def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """Loss and its parts, of levels on the pixels (1, 1, size, size)."""
-
-    def start(self, parameters: Parametrisation, level_heights_um: list[float]) -> None:
-        """Set the start of the search."""
-
-    def score(self, height_um: Tensor) -> Record:
-        """Score of a printed height map (size, size), µm."""
-
-    def arrays(self, height_um: Tensor) -> dict[str, np.ndarray]:
-        """Arrays saved beside levels and heights, by file name."""
-
-    def reference_efficiency(self, height_um: Tensor) -> float | None:
-        """Efficiency of an ideal element, found from a print (size, size), µm, where that is defined."""
-
-    def baselines(self) -> dict[str, dict[str, float]]:
-        """Scores on the same grid that a design's are to be compared with, by name."""
-
+from litho_design.tasks.task import Task
 
 # Writes the report into the folder of a design, from the record and the history of the search.
-Report = Callable[[Path, Design, list[dict[str, float]]], object]
+Report = Callable[[Path, Design, Task, list[dict[str, float]]], object]
 
 
 @dataclass(frozen=True)
@@ -97,7 +59,6 @@ class _Outcome:
 
 def run_design(
     task: Task,
-    settings: DesignSettings,
     out: str | Path,
     report: Report,
     *,
@@ -117,12 +78,15 @@ def run_design(
         InputError: ``out`` holds another design or result, a printer can only judge, or the weights
             of a model changed during the run.
     """
+    settings = task.settings
     _check_printers(task.printers)
     folder = Path(out)
     require_own_folder(folder, Design.FILE_NAME)
     hashes_before = [printer.weights_sha256() for printer in task.printers]
     target = task.target_record.model_dump(mode="json") if task.target_record else None
-    fingerprint = record_sha256([task.name, settings.model_dump(mode="json"), hashes_before, target])
+    fingerprint = record_sha256(
+        [task.name, settings.model_dump(mode="json"), hashes_before, target, task.inputs_sha256()]
+    )
     finished = _finished(folder, fingerprint, settings)
     if finished is not None:
         return finished
@@ -185,7 +149,7 @@ def run_design(
         baselines=task.baselines(),
         files=files,
     )
-    report(folder, design, outcome.state.history)
+    report(folder, design, task, outcome.state.history)
     design.write(folder)
     remove_checkpoint(folder)
     return design

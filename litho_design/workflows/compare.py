@@ -13,37 +13,42 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.outputs import require_own_folder
 from litho_data.foundation.run_facts import run_facts
 from litho_design.holograms.settings import HologramSettings
+from litho_design.holograms.task import HologramTask
 from litho_design.images.targets import Target, load_target
 from litho_design.judging.gap import (
-    HEADLINE,
     GapEntry,
     GapResult,
     design_folder,
+    headline,
     paired_differences,
     summarise,
 )
 from litho_design.judging.loaded import load_design
 from litho_design.lenses.objects import with_objects
 from litho_design.lenses.settings import LensSettings
+from litho_design.lenses.task import lens_task
+from litho_design.optimisation.settings import DesignSettings
 from litho_design.printers.printer import Printer
 from litho_design.printers.source import Device, load_printers
+from litho_design.reports.design import write_design_report
 from litho_design.reports.gap import write_gap_report
-from litho_design.tasks.design import Design
-from litho_design.workflows.design import design_hologram, run_lens
+from litho_design.tasks.run import run_design
+from litho_design.tasks.task import Task, registered_task
 
-Settings = HologramSettings | LensSettings
 # Writes what people read into the folder of a comparison.
 GapReport = Callable[[Path, GapResult, Mapping[str, Printer]], object]
 Models = Mapping[str, str | Path | Printer] | Iterable[str | Printer]
 
 
 def compare(
-    settings: Settings,
+    settings: DesignSettings,
     arms: Models,
     out: str | Path,
     *,
     judges: Models = (),
     target: str | Path | np.ndarray | Target = "text",
+    task: type[Task] | None = None,
+    inputs: Mapping[str, np.ndarray] | None = None,
     objects: Sequence[str | Path] = (),
     held_out_objects: Sequence[str | Path] = (),
     seeds: Iterable[int] = (0, 1, 2),
@@ -58,12 +63,13 @@ def compare(
     reused or resumed. The arms' own printers also judge, which completes the matrix.
 
     Args:
-        settings: of a hologram or a lens, which decides what is designed; the seed of the search is
-            replaced by those of ``seeds``.
+        settings: of a hologram or a lens, which decides what is designed, or of ``task``; the seed of the
+            search is replaced by those of ``seeds``.
         arms: printers to design with: models by name, or NAME=MODEL, MODEL, ``none`` and loaded printers.
         out: folder of the comparison.
         judges: further printers that only judge.
         target: wanted image, for holograms.
+        task, inputs: a task of your own and its arrays, as for ``design``.
         objects, held_out_objects: as for ``design_lens``.
         seeds: one design per arm and seed.
         device, extrapolate, announce: as for ``design_hologram``.
@@ -83,29 +89,36 @@ def compare(
     _check(designers, others, every_seed)
     folder = Path(out)
     require_own_folder(folder, GapResult.FILE_NAME)
-    designed: Callable[[Settings, Printer, Path], Design]
     # Printers are checked before a target is drawn or a picture is read.
-    if isinstance(settings, HologramSettings):
+    make: Callable[[Any, Printer], Task]
+    if task is not None:
+        kind = registered_task(task.name)
+
+        def make(settings, printer):
+            return kind(settings, printer, inputs=inputs)
+    elif isinstance(settings, HologramSettings):
         if objects or held_out_objects:
             raise InputError(
                 "objects", got="the hoe task, which has a target", wanted="a lens", hint="--target"
             )
         wanted = load_target(target, settings.layout.size_px)
 
-        def designed(settings, printer, place):
-            return design_hologram(wanted, printer, place, settings=settings, announce=announce)
+        def make(settings, printer):
+            return HologramTask(settings, printer, wanted)
     else:
+        assert isinstance(settings, LensSettings)
         settings, pictures = with_objects(settings, objects, held_out_objects)
 
-        def designed(settings, printer, place):
-            return run_lens(settings, printer, place, pictures, announce=announce)
+        def make(settings, printer):
+            return lens_task(settings, printer, (), pictures)
 
     everyone = {**designers, **others}
     entries: list[GapEntry] = []
     for (arm, printer), seed in itertools.product(designers.items(), every_seed):
         search = settings.search.model_copy(update={"seed": seed})
         place = design_folder(folder, arm, seed)
-        design = designed(settings.model_copy(update={"search": search}), printer, place)
+        made = make(settings.model_copy(update={"search": search}), printer)
+        design = run_design(made, place, write_design_report, announce=announce)
         entries += _judged(place, arm, seed, everyone)
     result = GapResult(
         task=design.task,
@@ -117,7 +130,7 @@ def compare(
         judges={name: printer.record() for name, printer in everyone.items()},
         entries=entries,
         summary=summarise(entries),
-        paired=paired_differences(entries, HEADLINE[design.task]),
+        paired=paired_differences(entries, headline(made.name) or tuple(design.predicted)),
     )
     report(folder, result, everyone)
     result.write(folder)

@@ -6,22 +6,20 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from litho_design.holograms.settings import HologramSettings, hologram_settings
 from litho_design.holograms.task import HologramTask
 from litho_design.images.targets import Target, load_target
 from litho_design.lenses.objects import with_objects
 from litho_design.lenses.settings import LensSettings, lens_settings
-from litho_design.lenses.task import LensTask
-from litho_design.optimisation.process_window import YIELD_DRAWS
+from litho_design.lenses.task import lens_task
+from litho_design.optimisation.settings import DesignSettings
 from litho_design.printers.printer import Printer
 from litho_design.printers.source import Device, load_printer, load_printers
-from litho_design.reports.hologram import write_hologram_report
-from litho_design.reports.lens import write_lens_report
-from litho_design.tasks.design import HEIGHT_FILE, Design
+from litho_design.reports.design import write_design_report
+from litho_design.tasks.design import Design
 from litho_design.tasks.run import run_design
+from litho_design.tasks.task import Task, registered_task
 
 
 def design_hologram(
@@ -61,11 +59,7 @@ def design_hologram(
     wanted = load_target(target, settings.layout.size_px)
     task = HologramTask(settings, printer, wanted, list(others.values()))
 
-    def report(folder: Path, design: Design, history: list[dict[str, float]]) -> None:
-        draws = task.window_scores(_printed_um(folder, printer), YIELD_DRAWS)
-        write_hologram_report(folder, design, history, draws)
-
-    return run_design(task, settings, out, report, announce=announce)
+    return run_design(task, out, write_design_report, announce=announce)
 
 
 def design_lens(
@@ -101,27 +95,41 @@ def design_lens(
     printer = load_printer(model, settings.layout, device=device, extrapolate=extrapolate)
     others = load_printers(ensemble, settings.layout, device=device, extrapolate=extrapolate)
     settings, pictures = with_objects(settings, objects, held_out_objects)
-    return run_lens(settings, printer, out, pictures, ensemble=list(others.values()), announce=announce)
+    task = lens_task(settings, printer, list(others.values()), pictures)
+    return run_design(task, out, write_design_report, announce=announce)
 
 
-def run_lens(
-    settings: LensSettings,
-    printer: Printer,
+def design(
+    task: type[Task],
+    model: str | Path | Printer,
     out: str | Path,
-    pictures: Mapping[str, np.ndarray],
     *,
-    ensemble: Sequence[Printer] = (),
+    settings: DesignSettings | None = None,
+    inputs: Mapping[str, np.ndarray] | None = None,
+    ensemble: Iterable[str | Printer] = (),
+    device: Device = "cpu",
+    extrapolate: bool = False,
     announce: bool = True,
 ) -> Design:
-    """``design_lens`` with its printers loaded and the pixels of its pictures read (``with_objects``)."""
-    task = LensTask(settings, printer, ensemble, pictures)
+    """Optimise the layout for a task of your own (see ``Task``).
 
-    def report(folder: Path, design: Design, history: list[dict[str, float]]) -> None:
-        draws = task.window_scores(_printed_um(folder, printer), YIELD_DRAWS)
-        write_lens_report(folder, design, history, task.bench, draws)
+    Args:
+        task: a class that ``register_task`` knows.
+        model: as for ``design_hologram``.
+        out: folder of the design; an interrupted run in it resumes.
+        settings: geometry, optics, search, process window; ``design_settings()`` by default.
+        inputs: arrays that the task needs, by name.
+        ensemble, device, extrapolate, announce: as for ``design_hologram``.
 
-    return run_design(task, settings, out, report, announce=announce)
+    Returns:
+        The record written to ``out/design.json``.
 
-
-def _printed_um(folder: Path, printer: Printer) -> Tensor:
-    return torch.from_numpy(np.load(folder / HEIGHT_FILE)).to(printer.device)
+    Raises:
+        InputError: a task that is not registered, or what ``design_hologram`` refuses of models and folders.
+    """
+    registered_task(task.name)
+    settings = settings or DesignSettings()
+    printer = load_printer(model, settings.layout, device=device, extrapolate=extrapolate)
+    others = load_printers(ensemble, settings.layout, device=device, extrapolate=extrapolate)
+    made = task(settings, printer, inputs=inputs, ensemble=list(others.values()))
+    return run_design(made, out, write_design_report, announce=announce)

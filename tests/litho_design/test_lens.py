@@ -13,7 +13,7 @@ from litho_design.judging.loaded import LoadedDesign
 from litho_design.lenses.bench import LensBench, RadialLensBench, centre_to_background
 from litho_design.lenses.score import half_maximum_width_um, lens_score
 from litho_design.lenses.settings import ImagingSettings, LensView, lens_settings
-from litho_design.lenses.task import LensTask
+from litho_design.lenses.task import lens_task
 from litho_design.optics import Optics, blaze_efficiency
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
@@ -71,7 +71,7 @@ def test_airy_power_inside_the_focusing_radius():
 def test_staircase_lens_loses_what_the_blaze_formula_says(levels, step_um):
     layout = LAYOUT.model_copy(update={"size_px": 600, "levels": levels, "level_height_um": step_um})
     base = lens_settings("direct")
-    task = LensTask(
+    task = lens_task(
         base.model_copy(
             update={
                 "layout": layout,
@@ -96,7 +96,7 @@ def test_ring_path_sees_what_the_plane_path_sees(make_printer):
     view = LensView(window_px=128, path="radial")
     bench, rings = LensBench(LAYOUT, OPTICS, view), RadialLensBench(LAYOUT, OPTICS, view)
     base = lens_settings("direct")
-    task = LensTask(
+    task = lens_task(
         base.model_copy(update={"layout": LAYOUT, "optics": OPTICS, "view": view}), make_printer(LAYOUT)
     )
     generator = torch.Generator().manual_seed(0)
@@ -114,7 +114,7 @@ def test_ring_path_sees_what_the_plane_path_sees(make_printer):
 def test_a_printer_that_knows_the_position_is_asked_for_the_whole_plane(settings, make_printer):
     printer = make_printer(LAYOUT)
     printer.simulator.card = {"process_effects": {"vignetting": {"strength": 0.1}}}
-    task = LensTask(settings, printer)
+    task = lens_task(settings, printer)
     assert not task.radial
     assert "whole plane" in task.notes[0]
     assert not task.strips
@@ -150,10 +150,10 @@ def test_width_of_a_gaussian_in_an_odd_window():
 
 def test_a_window_that_cuts_the_focus_is_said(settings, make_printer):
     # Radius 3 * 0.514 * 0.6328 / NA = 6.6 µm at NA 0.148: 128 px are 12.8 µm, 133 hold the circle.
-    (note,) = LensTask(settings, make_printer(LAYOUT)).notes
+    (note,) = lens_task(settings, make_printer(LAYOUT)).notes
     assert "--window-px 132" in note
     wide = settings.model_copy(update={"view": settings.view.model_copy(update={"window_px": 132})})
-    task = LensTask(wide, make_printer(LAYOUT))
+    task = lens_task(wide, make_printer(LAYOUT))
     assert task.notes == []
     radius_um = lens_score(task.bench, task.bench.ideal_height_um()).focusing_radius_um
     # The sampled width against the Airy formula of the note.
@@ -203,4 +203,4 @@ def test_lens_design_improves_and_is_judged_with_both_psfs(tmp_path, settings, m
 def test_ring_path_needs_rings(settings, make_printer, change, message):
     changed = settings.model_copy(update=change)
     with pytest.raises(InputError, match=message):
-        LensTask(changed, make_printer(changed.layout))
+        lens_task(changed, make_printer(changed.layout))

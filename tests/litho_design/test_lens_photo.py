@@ -90,7 +90,7 @@ def photographed(path, loaded, height_um, wanted, *, turn_degrees=2.0, scale=1.0
 
 def estimate(loaded, recorded, psf, wanted):
     """What deconvolution makes of an image that needs no registration, at the scale of least error."""
-    found = reconstruct(recorded, psf, loaded.lens.imaging.iterations)
+    found = reconstruct(recorded, psf, loaded.task.settings.imaging.iterations)
     return found * matched_scale(found, wanted)
 
 
@@ -165,8 +165,9 @@ def test_an_object_of_the_design_is_known_by_name(tmp_path, lens):
 def test_a_name_that_two_objects_have_is_refused(lens):
     loaded = LoadedDesign(lens)
     one, other = (TargetRecord(name="a.png", sha256=sha256, adaptation="") for sha256 in ("1" * 64, "2" * 64))
-    imaging = loaded.lens.imaging.model_copy(update={"objects": (one,), "test_objects": (other, "ring")})
-    loaded.lens = loaded.lens.model_copy(update={"imaging": imaging})
+    settings = loaded.task.settings
+    imaging = settings.imaging.model_copy(update={"objects": (one,), "test_objects": (other, "ring")})
+    loaded.task.settings = settings.model_copy(update={"imaging": imaging})
     with pytest.raises(InputError, match="two objects"):
         score_lens_photo(loaded, PhotoSource("photo.png", CAMERA_UM, imaged="a.png"))
 

@@ -16,7 +16,7 @@ from litho_design.images.targets import draw_target, object_name
 from litho_design.judging.gap import GapResult
 from litho_design.lenses.objects import object_stack, picture_records, with_objects
 from litho_design.lenses.settings import lens_settings
-from litho_design.lenses.task import LensTask
+from litho_design.lenses.task import LensTask, lens_task
 from litho_design.optics import Optics
 from litho_design.printers.layout import LayoutSettings
 from litho_design.tasks.design import HEIGHT_FILE, Design, read_array
@@ -122,7 +122,7 @@ def test_a_design_with_pictures_is_scored_without_their_files(tmp_path, folder, 
     own = score_design(tmp_path / "d", tmp_path / "score", judges=[printer]).scores[0]
     assert own.figures == pytest.approx(design.predicted, rel=1e-5)
     # The same print images the drawings with another error.
-    drawn = LensTask(settings, printer).score(torch.from_numpy(read_array(tmp_path / "d", HEIGHT_FILE)))
+    drawn = lens_task(settings, printer).score(torch.from_numpy(read_array(tmp_path / "d", HEIGHT_FILE)))
     assert drawn.mae_calibrated != pytest.approx(design.predicted["mae_calibrated"], rel=0.01)
 
 
@@ -154,10 +154,10 @@ def test_another_set_of_objects_is_another_design(tmp_path, folder, settings, ma
 def test_pixels_must_belong_to_the_settings(folder, settings, make_printer):
     brought, pictures = with_objects(settings, [folder], [])
     with pytest.raises(InputError, match=r"object a\.png, got no pixels"):
-        LensTask(brought, make_printer(settings.layout))
+        lens_task(brought, make_printer(settings.layout))
     wider = brought.model_copy(update={"imaging": brought.imaging.model_copy(update={"object_px": 48})})
     with pytest.raises(InputError, match=r"pixels of shape \(32, 32\)"):
-        LensTask(wider, make_printer(settings.layout), pictures=pictures)
+        lens_task(wider, make_printer(settings.layout), pictures=pictures)
 
 
 def test_commands_take_objects(tmp_path, folder, monkeypatch, capsys):

@@ -1,0 +1,269 @@
+"""A task: what light shall do behind a printed element. Holograms and lenses are tasks; so is your own."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from pydantic import ConfigDict
+from torch import Tensor
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import Record
+from litho_design.images.targets import TargetRecord
+from litho_design.optics import Optics
+from litho_design.optimisation.parameters import CellMap, Parametrisation
+from litho_design.optimisation.phases import printed_phase
+from litho_design.optimisation.process_window import Draw, check_draws, draws
+from litho_design.optimisation.robust import penalised, windowed_loss
+from litho_design.optimisation.settings import DesignSettings
+from litho_design.optimisation.starts import Scene, check_start, start_search
+from litho_design.printers.printer import Printer
+from litho_design.tasks.bench import ViewsBench
+from litho_design.tasks.design import IMAGE_FILE
+
+
+class Figures(Record):
+    """The figures of a task of your own, by name."""
+
+    model_config = ConfigDict(extra="allow")
+
+
+class Task:
+    """What is wanted behind an element, ready to be optimised and scored through printers.
+
+    For a task of your own, give ``name``, ``views`` where one image is not enough, ``loss`` and
+    ``figures``, and pass the class to ``register_task``. Everything else can stay: search, checkpoints,
+    polish, process window, comparison, report, export.
+
+    Attributes:
+        name: in results; one for every task.
+        starts: starts of the search that make sense.
+        headline: figures that reports and commands show first; all of them where empty.
+        score_type: record of the scores, whose field descriptions are the meanings in reports.
+        settings, printer, printers, inputs, notes: as given, and remarks for the record.
+        bench: from a height map to what is seen, in the optics of the settings.
+
+    Args:
+        settings: geometry, optics, search, process window.
+        printer: frozen model, or nominal heights.
+        inputs: arrays that the task needs, such as targets; they are saved as NAME.npy with the design.
+        ensemble: further models: the loss is the mean over all, plus a penalty on their disagreement.
+
+    Raises:
+        InputError: a start that the task does not have, or spreads beyond the range of the propagator.
+    """
+
+    name: ClassVar[str]
+    starts: ClassVar[tuple[str, ...]] = ("random",)
+    headline: ClassVar[tuple[str, ...]] = ()
+    score_type: ClassVar[type[Record]] = Figures
+    settings_type: ClassVar[type[DesignSettings]] = DesignSettings
+
+    def __init__(
+        self,
+        settings: Any,
+        printer: Printer,
+        *,
+        inputs: Mapping[str, np.ndarray] | None = None,
+        ensemble: Sequence[Printer] = (),
+    ):
+        check_start(settings.search.start, self.starts, self.name)
+        self.settings, self.printer, self.printers = settings, printer, [printer, *ensemble]
+        self.inputs = dict(inputs or {})
+        self.target_record: TargetRecord | None = None
+        self.notes: list[str] = []
+        self.cells = CellMap(settings.layout).to(printer.device)
+        self.bench: Any = self.make_bench(settings.optics)
+        for optics in self.views(settings.optics):
+            check_draws(settings.window, optics, self.bench.grid, self.bench.window)
+
+    # What a task of your own gives.
+
+    def views(self, optics: Optics) -> Sequence[Optics]:
+        """The optics of every image: colours (``optics.at_wavelength``), planes, angles of incidence."""
+        return [optics]
+
+    def loss(self, seen: Tensor) -> Tensor | tuple[Tensor, dict[str, float]]:
+        """What is minimised, of what is seen: by default (views, size, size) shares of the incident power.
+
+        Returns:
+            A scalar, or one and its named parts.
+        """
+        raise NotImplementedError
+
+    def figures(self, seen: Tensor) -> Mapping[str, float]:
+        """Scores of what is seen, by name."""
+        raise NotImplementedError
+
+    # What holograms and lenses do in their own way.
+
+    def make_bench(self, optics: Optics) -> Any:
+        """From a height map (size, size), µm, to what is seen."""
+        return ViewsBench(self.settings.layout, self.views(optics)).to(self.printer.device)
+
+    def search_bench(self, optics: Optics) -> Any:
+        """The bench of the search, from ``search_print`` to what the loss sees."""
+        return self.make_bench(optics)
+
+    def search_print(self, level: Tensor, printer: int) -> Tensor:
+        """Printed height of levels (1, 1, size, size), µm, by one of the printers, for the search."""
+        return self.printers[printer](level)[0, 0]
+
+    def search_area(self) -> Tensor | None:
+        """Area that each height of ``search_print`` covers; None for pixels."""
+        return None
+
+    def scene(self, level_phase: Tensor) -> Scene:
+        """What a start can use."""
+        settings, search = self.settings, self.settings.search
+        return Scene(
+            cells=self.cells,
+            pitch_um=settings.layout.pitch_um,
+            optics=settings.optics,
+            level_phase=level_phase.to(self.printer.device),
+            iterations=search.start_iterations,
+            seed=search.seed,
+        )
+
+    def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> Record:
+        """Score of a print (size, size), µm, whose design expected another one, or the same."""
+        with torch.no_grad():
+            return self.score_type(**self.figures(self.bench(height_um)))
+
+    def window_figures(self, seen: Tensor) -> Mapping[str, float]:
+        """Figures of one draw of the process window."""
+        return self.figures(seen)
+
+    def arrays(self, height_um: Tensor) -> dict[str, np.ndarray]:
+        """Arrays saved beside levels and heights: what is seen, and the inputs, by file name."""
+        with torch.no_grad():
+            seen = self.bench(height_um).cpu().numpy()
+        return {IMAGE_FILE: seen} | {f"{name}.npy": array for name, array in self.inputs.items()}
+
+    def reference_efficiency(self, height_um: Tensor) -> float | None:
+        """Efficiency of an ideal element, found from a print (size, size), µm, where that is defined."""
+        return None
+
+    def baselines(self) -> dict[str, dict[str, float]]:
+        """Scores on the same grid that a design's are to be compared with: here those of a flat plate."""
+        flat = torch.zeros(self.bench.grid.shape, device=self.printer.device)
+        return {"no element": self.score(flat).model_dump()}
+
+    def display(self, seen: np.ndarray) -> np.ndarray:
+        """What is seen as reports show it: images over their brightest value, side by side in a square."""
+        images = seen.reshape(-1, *seen.shape[-2:])
+        side = int(np.ceil(np.sqrt(len(images))))
+        tiles = np.zeros((side * side, *images.shape[1:]))
+        tiles[: len(images)] = images / np.maximum(images.max((1, 2), keepdims=True), 1e-30)
+        rows = [
+            np.concatenate(list(tiles[first : first + side]), axis=1) for first in range(0, side**2, side)
+        ]
+        return np.concatenate(rows)
+
+    # What every task shares.
+
+    @classmethod
+    def reopened(
+        cls, settings: Mapping[str, Any], inputs: Mapping[str, np.ndarray], printer: Printer
+    ) -> Task:
+        """The task of a finished design, from its record and its arrays."""
+        return cls(cls.settings_type.model_validate(settings), printer, inputs=inputs)
+
+    @cached_property
+    def scenes(self) -> list[tuple[Draw | None, Any]]:
+        """Draws of the process window in the loss with their benches; the print as modelled where none is."""
+        window, optics = self.settings.window, self.settings.optics
+        drawn = draws(window, optics, window.samples)
+        return [(draw, self.search_bench(draw.optics)) for draw in drawn] or [
+            (None, self.search_bench(optics))
+        ]
+
+    def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
+        """Loss of levels on the pixels (1, 1, size, size), and its parts.
+
+        With process-window samples: the risk of the loss over them; with an ensemble: its mean over
+        the models, and their disagreement.
+        """
+        settings = self.settings
+        prints = [self.search_print(level, number) for number in range(len(self.printers))]
+        loss, parts = windowed_loss(
+            prints, self.scenes, self._loss_of_print, settings.window, settings.layout.pitch_um
+        )
+        wave_um = settings.optics.wave_height_um
+        return penalised(loss, prints, settings.ensemble.weight, wave_um, self.search_area()), parts
+
+    def start(self, parameters: Parametrisation, level_heights_um: list[float]) -> None:
+        """Set the start of the search, from the phases of the levels as printed."""
+        search, phase = self.settings.search, printed_phase(level_heights_um, self.settings.optics)
+        start_search(parameters, search.start, self.scene(phase), jitter_levels=search.start_jitter_levels)
+
+    @torch.no_grad()
+    def window_scores(self, height_um: Tensor, count: int) -> list[dict[str, float]]:
+        """Figures of a print (size, size) over ``count`` unseen draws of the process window."""
+        settings, scores = self.settings, []
+        for draw in draws(settings.window, settings.optics, count, unseen=True):
+            changed = draw.apply(height_um, settings.layout.pitch_um)
+            scores.append(dict(self.window_figures(self.make_bench(draw.optics)(changed))))
+        return scores
+
+    def inputs_sha256(self) -> str:
+        """Hash of the inputs, and of the code of a task that is not of this package."""
+        digest = hashlib.sha256()
+        for name, array in sorted(self.inputs.items()):
+            digest.update(
+                f"{name}:{array.dtype}:{array.shape};".encode() + np.ascontiguousarray(array).tobytes()
+            )
+        if not type(self).__module__.startswith("litho_design."):
+            digest.update(_source(type(self)).encode())
+        return digest.hexdigest()
+
+    def _loss_of_print(self, height_um: Tensor, bench: Any) -> tuple[Tensor, dict[str, float]]:
+        found = self.loss(bench(height_um))
+        return found if isinstance(found, tuple) else (found, {})
+
+
+_TASKS: dict[str, type[Task]] = {}
+
+
+def register_task(task: type[Task]) -> type[Task]:
+    """Make a task of your own known, so that its designs can be opened; also a decorator of the class.
+
+    Raises:
+        InputError: no name, or the name of another task.
+    """
+    name = getattr(task, "name", "")
+    known = _TASKS.get(name)
+    if not name or (known is not None and known.__qualname__ != task.__qualname__):
+        raise InputError("name of a task", got=repr(name), wanted="one that no other task has")
+    _TASKS[name] = task
+    return task
+
+
+def registered_task(name: str) -> type[Task]:
+    """The task of that name.
+
+    Raises:
+        InputError: no such task here.
+    """
+    if name not in _TASKS:
+        raise InputError(
+            "task",
+            got=repr(name),
+            wanted=", ".join(sorted(_TASKS)),
+            hint="run the code that registers it: register_task",
+        )
+    return _TASKS[name]
+
+
+def _source(task: type) -> str:
+    try:
+        return inspect.getsource(task)
+    except (OSError, TypeError):
+        # Typed into an interpreter: nothing to compare.
+        return ""
