@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from litho_design.judging.measured import MeasuredSource as MeasuredSource
     from litho_design.judging.photographs import PhotoSource as PhotoSource
     from litho_design.lenses.settings import lens_settings as lens_settings
+    from litho_design.optimisation.settings import design_settings as design_settings
     from litho_design.printers.source import load_printer as load_printer
     from litho_design.tasks.task import Task as Task
     from litho_design.tasks.task import register_task as register_task
@@ -35,6 +36,7 @@ else:
             "design": "litho_design.workflows.design",
             "design_hologram": "litho_design.workflows.design",
             "design_lens": "litho_design.workflows.design",
+            "design_settings": "litho_design.optimisation.settings",
             "export": "litho_design.exports.files",
             "first": "litho_design.workflows.first",
             "hologram_settings": "litho_design.holograms.settings",
@@ -57,6 +59,7 @@ __all__ = [
     "design",
     "design_hologram",
     "design_lens",
+    "design_settings",
     "export",
     "first",
     "hologram_settings",

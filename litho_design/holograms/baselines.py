@@ -11,6 +11,7 @@ from litho_design.holograms.bench import HologramBench, camera_ssim, hologram_sc
 from litho_design.holograms.loss import hologram_loss
 from litho_design.holograms.settings import HologramSettings
 from litho_design.images.similarity import likeness
+from litho_design.optics import element_field, intensity_share
 from litho_design.optimisation.parameters import CellMap
 from litho_design.optimisation.phases import gerchberg_saxton
 
@@ -57,11 +58,12 @@ def best_signal_efficiency(bench: HologramBench, height_um: Tensor, target: Tens
     positive; so the result is never below the print's own. One phase per pixel.
     """
     signal = target > 0.5
-    wave = torch.polar(torch.ones_like(height_um), height_um * (2 * math.pi / bench.optics.wave_height_um))
+    wave = element_field(height_um, bench.grid, bench.optics)
+    size = wave.abs()
     for _ in range(_ITERATIONS):
         back = bench.propagator.adjoint(bench.propagator(wave) * signal)
-        wave = torch.polar(torch.ones_like(height_um), back.angle())
-    return float(bench.propagator(wave)[signal].abs().square().double().sum()) / height_um.numel()
+        wave = torch.polar(size, back.angle())
+    return float(intensity_share(bench.propagator(wave), bench.grid)[signal].double().sum())
 
 
 def _of_black(bench: HologramBench, target: Tensor, settings: HologramSettings) -> dict[str, float]:

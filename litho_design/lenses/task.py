@@ -233,5 +233,7 @@ def _check(settings: LensSettings) -> None:
             got=f"symmetry {settings.layout.symmetry!r}, aperture {settings.view.aperture!r}",
             wanted="a ring layout behind a circular aperture",
         )
+    if radial and (settings.optics.incidence_x or settings.optics.incidence_y):
+        raise InputError("search path 'radial'", got="oblique incidence", wanted="light along the axis")
     if radial and settings.layout.size_px % 2:
         raise InputError("size_px for the radial path", got=settings.layout.size_px, wanted="an even number")

@@ -30,6 +30,8 @@ class Optics(Record):
         gt=0,
     )
 
+    incidence_x: float = setting(0.0, "Sine of the angle at which light falls in, along x", gt=-1, lt=1)
+    incidence_y: float = setting(0.0, "Sine of the angle at which light falls in, along y", gt=-1, lt=1)
     propagation: Literal["auto", "rayleigh-sommerfeld", "angular-spectrum"] = setting(
         "auto",
         "Propagator: the Rayleigh-Sommerfeld sum, the angular spectrum, or whichever is valid",
@@ -56,9 +58,9 @@ def element_field(
 ) -> Tensor:
     """The wave just behind a thin phase element lit by a plane wave of unit power.
 
-    u = exp(j 2 pi index_step height / wavelength) on the aperture and 0 elsewhere, scaled so that
-    sum |u|^2 dy dx = 1: intensities summed over any window times its pixel area are shares of the
-    incident power.
+    u = exp(j 2 pi (index_step height + incidence . position) / wavelength) on the aperture and 0
+    elsewhere, scaled so that sum |u|^2 dy dx = 1: intensities summed over any window times its pixel area
+    are shares of the incident power.
 
     Args:
         height_um: real (..., ny, nx), µm.
@@ -71,6 +73,10 @@ def element_field(
     import torch  # the command line reads `Optics` without it
 
     phase = height_um * (2 * math.pi / optics.wave_height_um)
+    if optics.incidence_x or optics.incidence_y:
+        x, y = (torch.from_numpy(axis).to(phase) for axis in (grid.x_um, grid.y_um))
+        path_um = optics.incidence_x * x[None, :] + optics.incidence_y * y[:, None]
+        phase = phase + path_um * (2 * math.pi / optics.wavelength_um)
     area = math.prod(grid.pitch_um)
     if aperture is None:
         amplitude = torch.full_like(phase, 1 / math.sqrt(math.prod(grid.shape) * area))

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, get_args
+from collections.abc import Mapping
+from typing import Any, Literal, get_args
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
-from litho_data.foundation.settings import setting
+from litho_data.foundation.settings import changed, setting
 from litho_design.optics import Optics
 from litho_design.optimisation.process_window import ProcessWindow
 from litho_design.optimisation.starts import StartName
@@ -98,6 +99,15 @@ class DesignSettings(Record):
     search: SearchSettings = setting(SearchSettings(), "Search")
     window: ProcessWindow = setting(ProcessWindow(), "Process window")
     ensemble: EnsemblePenalty = setting(EnsemblePenalty(), "Several models")
+
+
+def design_settings(changes: Mapping[str, Any] | None = None) -> DesignSettings:
+    """Settings of a task of your own, with changes by path, such as ``{"layout.size_px": 256}``.
+
+    Raises:
+        InputError: a change of a setting that does not exist, or to a value that it does not accept.
+    """
+    return changed(DesignSettings(), dict(changes or {}))
 
 
 def check_variant(variant: str) -> None:

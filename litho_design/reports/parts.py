@@ -65,7 +65,7 @@ def add_yield(
         f"deviations: {'; '.join(spreads(window))}."
     )
     figure = new_figure(8, 3)
-    axes = figure.subplots(1, len(figures), sharey=True)
+    (axes,) = figure.subplots(1, len(figures), sharey=True, squeeze=False)
     for axis, (name, (modelled, label)) in zip(axes, figures.items(), strict=True):
         values = np.sort([draw[name] for draw in draws])
         axis.step(values, 1 - np.arange(len(values)) / len(values), where="pre")
