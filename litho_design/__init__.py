@@ -15,9 +15,11 @@ if TYPE_CHECKING:
     from litho_design.lenses.settings import lens_settings as lens_settings
     from litho_design.optimisation.settings import design_settings as design_settings
     from litho_design.printers.source import load_printer as load_printer
+    from litho_design.reliefs.settings import relief_settings as relief_settings
     from litho_design.tasks.task import Task as Task
     from litho_design.tasks.task import register_task as register_task
     from litho_design.workflows.compare import compare as compare
+    from litho_design.workflows.design import correct as correct
     from litho_design.workflows.design import design as design
     from litho_design.workflows.design import design_hologram as design_hologram
     from litho_design.workflows.design import design_lens as design_lens
@@ -33,6 +35,7 @@ else:
             "PhotoSource": "litho_design.judging.photographs",
             "Task": "litho_design.tasks.task",
             "compare": "litho_design.workflows.compare",
+            "correct": "litho_design.workflows.design",
             "design": "litho_design.workflows.design",
             "design_hologram": "litho_design.workflows.design",
             "design_lens": "litho_design.workflows.design",
@@ -46,6 +49,7 @@ else:
             "load_printer": "litho_design.printers.source",
             "load_target": "litho_design.images.targets",
             "register_task": "litho_design.tasks.task",
+            "relief_settings": "litho_design.reliefs.settings",
             "score": "litho_design.workflows.score",
         },
     )
@@ -56,6 +60,7 @@ __all__ = [
     "Task",
     "__version__",
     "compare",
+    "correct",
     "design",
     "design_hologram",
     "design_lens",
@@ -69,5 +74,6 @@ __all__ = [
     "load_printer",
     "load_target",
     "register_task",
+    "relief_settings",
     "score",
 ]

@@ -9,13 +9,14 @@ import typer
 
 from litho_data.foundation.commands import new_app, run_app
 from litho_data.foundation.errors import InputError
-from litho_design.cli.design import compare, first, hoe, lens, settings
+from litho_design.cli.design import compare, correct, first, hoe, lens, settings
 from litho_design.cli.options import Device, Extrapolate, Out
 
 app = new_app("Design diffractive optics through a frozen model of the printer, score them, export them.")
 app.command()(first)
 app.command()(hoe)
 app.command()(lens)
+app.command()(correct)
 app.command()(compare)
 app.command()(settings)
 

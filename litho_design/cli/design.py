@@ -21,6 +21,7 @@ from litho_design.cli.options import (
 from litho_design.holograms.settings import HologramSettings, hologram_settings
 from litho_design.lenses.settings import LensSettings, lens_settings
 from litho_design.optimisation.settings import DesignSettings
+from litho_design.reliefs.settings import ReliefSettings, relief_settings
 
 if TYPE_CHECKING:
     from litho_design.tasks.design import Design
@@ -96,6 +97,30 @@ def hoe(
     _print_design(design, out)
 
 
+@takes_settings(ReliefSettings())
+def correct(
+    relief: Annotated[
+        str,
+        typer.Argument(help="Grey picture, float TIFF in µm, or a drawing: lens, blaze, staircase."),
+    ],
+    model: Model,
+    out: Out,
+    given: Given,
+    spread_of: SpreadOf = None,
+    ensemble: Ensemble = None,
+    device: Device = "cpu",
+    extrapolate: Extrapolate = False,
+) -> None:
+    """Find the layout whose print is the wanted relief; an interrupted run in OUT is continued."""
+    settings = _settings(given, _relief, "correct", spread_of)
+    from litho_design.workflows.design import correct as correct_relief
+
+    design = correct_relief(
+        relief, model, out, settings=settings, ensemble=ensemble or (), device=device, extrapolate=extrapolate
+    )
+    _print_design(design, out)
+
+
 @takes_settings(LensSettings())
 def lens(
     model: Model,
@@ -164,16 +189,23 @@ def compare(
     print(out / "report.html")
 
 
-@takes_settings(HologramSettings(), LensSettings())
+@takes_settings(HologramSettings(), LensSettings(), ReliefSettings())
 def settings(
-    element: Annotated[Literal["hoe", "lens"], typer.Argument(help="What would be designed.")], given: Given
+    element: Annotated[Literal["hoe", "lens", "relief"], typer.Argument(help="What would be designed.")],
+    given: Given,
 ) -> None:
     """Print all settings with their meaning, as a file for --config; nothing is designed."""
-    print(as_toml(_settings(given, _hologram if element == "hoe" else _lens, element)), end="")
+    make: Callable[[Mapping[str, Any]], DesignSettings]
+    make = {"hoe": _hologram, "lens": _lens, "relief": _relief}[element]
+    print(as_toml(_settings(given, make, element)), end="")
 
 
 def _hologram(changes: Mapping[str, Any]) -> HologramSettings:
     return hologram_settings(changes=changes)
+
+
+def _relief(changes: Mapping[str, Any]) -> ReliefSettings:
+    return relief_settings(changes)
 
 
 def _lens(changes: Mapping[str, Any]) -> LensSettings:

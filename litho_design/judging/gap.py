@@ -18,6 +18,7 @@ from litho_design.judging.loaded import task_named
 from litho_design.lenses.settings import LensSettings
 from litho_design.optimisation.settings import DesignSettings
 from litho_design.printers.printer import PrinterRecord
+from litho_design.reliefs.settings import ReliefSettings
 
 
 def headline(task: str) -> tuple[str, ...]:
@@ -74,7 +75,7 @@ class GapResult(RunFacts, Result):
     schema_: Literal["litho-design/gap/1"] = Field(default="litho-design/gap/1", alias="schema")
     task: str
     # From the fewest fields to the most: a task of one's own has those of every design.
-    settings: DesignSettings | HologramSettings | LensSettings
+    settings: DesignSettings | ReliefSettings | HologramSettings | LensSettings
     target: str
     seeds: list[int]
     arms: dict[str, PrinterRecord]

@@ -13,6 +13,7 @@ from litho_design.holograms.task import HologramTask
 from litho_design.lenses.task import LensTask
 from litho_design.printers.printer import Printer
 from litho_design.printers.source import check_device
+from litho_design.reliefs.task import UNPRINTABLE_FILE
 from litho_design.tasks.design import HEIGHT_FILE, IMAGE_FILE, LEVELS_FILE, Design, read_array
 from litho_design.tasks.task import Task, registered_task
 
@@ -43,7 +44,7 @@ class LoadedDesign:
         self.folder, self.record = Path(folder), Design.read(folder)
         self.device = torch.device(device)
         self.level, self.expected_um = (self._tensor(name) for name in (LEVELS_FILE, HEIGHT_FILE))
-        own = {LEVELS_FILE, HEIGHT_FILE, IMAGE_FILE}
+        own = {LEVELS_FILE, HEIGHT_FILE, IMAGE_FILE, UNPRINTABLE_FILE}
         arrays = [name for name in self.record.files if name.endswith(".npy") and name not in own]
         # A design is opened to be scored: its task needs a device, and no model.
         nominal = Printer(None, self.record.layout, source="none").to(self.device)
@@ -91,7 +92,7 @@ class LoadedDesign:
 
 
 def task_named(name: str) -> type[Task]:
-    """The task of that name; importing this module registers holograms and lenses.
+    """The task of that name; importing this module registers holograms, lenses and reliefs.
 
     Raises:
         InputError: no such task.

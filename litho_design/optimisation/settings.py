@@ -26,7 +26,9 @@ class SearchSettings(Record):
         option="--parametrisation",
     )
     start: StartName = setting(
-        "random", "Start of the search: random, gs or wgs (holograms), fresnel (lenses)", option="--start"
+        "random",
+        "Start of the search: random, gs or wgs (holograms), fresnel (lenses), inverse (reliefs)",
+        option="--start",
     )
     start_iterations: int = setting(40, "Iterations of the starts gs and wgs", ge=1)
     start_jitter_levels: float = setting(

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from litho_design.optimisation.parameters import CellMap, Parametrisation
 
 # The command line reads the names: what computes is imported when a start is made, torch with it.
-StartName = Literal["random", "gs", "wgs", "fresnel"]
+StartName = Literal["random", "gs", "wgs", "fresnel", "inverse"]
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,11 @@ def headline(score: Mapping[str, float], uncertainty: Mapping[str, float] | None
     if "si_psnr_db" in score:
         text = f"{told('si_psnr_db', 2)} dB, SSIM {told('ssim', 3)}"
         return (f"{told('eff_signal', 1, 100)} % on the signal, " if "eff_signal" in score else "") + text
+    if "rms_nm" in score:
+        return f"{told('rms_nm', 1)} nm rms from the relief"
     names = [name for name in ("direct", "design", "calibrated") if f"mae_{name}" in score]
+    if not names:
+        return ", ".join(f"{name} {told(name, 4)}" for name in score)
     return "MAE " + ", ".join(f"{name} {told(f'mae_{name}', 4)}" for name in names)
 
 
@@ -80,6 +84,7 @@ def baseline_line(baselines: Mapping[str, Mapping[str, float]]) -> str:
                 ("focusing_efficiency", 100, ".1f", " % in the focus"),
                 ("eff_signal", 100, ".1f", " %"),
                 ("si_psnr_db", 1, ".2f", " dB"),
+                ("rms_nm", 1, ".1f", " nm rms"),
             )
             if key in figures
         ]

@@ -11,6 +11,7 @@ from litho_data.foundation.report import Page, new_figure
 from litho_design.holograms.task import HologramTask
 from litho_design.lenses.task import LensTask
 from litho_design.optimisation.process_window import YIELD_DRAWS
+from litho_design.reliefs.task import UNPRINTABLE_FILE, ReliefTask
 from litho_design.reports.advice import stroke_advice
 from litho_design.reports.lens import add_lens_curves, add_lens_window, decibels
 from litho_design.reports.parts import (
@@ -33,6 +34,7 @@ _TITLES = {
     "hoe": "Holographic element",
     "lens-direct": "Multi-level diffractive lens",
     "lens-computational": "Multi-level diffractive lens with deconvolution",
+    "relief": "Corrected relief",
 }
 
 
@@ -120,6 +122,12 @@ def _pictures(
     ]
     if isinstance(task, LensTask):
         panels.append(("PSF", decibels(seen), "inferno", (-40, 0), "dB", window))
+    elif isinstance(task, ReliefTask):
+        error = 1000 * (height_um - task.inputs["relief_um"])
+        rest = 1000 * np.load(folder / UNPRINTABLE_FILE)
+        limit = 2 * float(np.std(error)) + 1e-9
+        for title, off in (("error, offset free", error - error.mean()), ("no layout prints", rest)):
+            panels.append((title, off, "RdBu_r", (-limit, limit), "nm", side))
     elif isinstance(task, HologramTask):
         target = np.load(folder / TARGET_FILE)
         panels.append(("wanted image", target, "inferno", (0, 1), "intensity", window))

@@ -16,6 +16,9 @@ from litho_design.lenses.task import lens_task
 from litho_design.optimisation.settings import DesignSettings
 from litho_design.printers.printer import Printer
 from litho_design.printers.source import Device, load_printer, load_printers
+from litho_design.reliefs.settings import ReliefSettings, relief_settings
+from litho_design.reliefs.targets import load_relief
+from litho_design.reliefs.task import ReliefTask
 from litho_design.reports.design import write_design_report
 from litho_design.tasks.design import Design
 from litho_design.tasks.run import run_design
@@ -96,6 +99,42 @@ def design_lens(
     others = load_printers(ensemble, settings.layout, device=device, extrapolate=extrapolate)
     settings, pictures = with_objects(settings, objects, held_out_objects)
     task = lens_task(settings, printer, list(others.values()), pictures)
+    return run_design(task, out, write_design_report, announce=announce)
+
+
+def correct(
+    relief: str | Path | np.ndarray,
+    model: str | Path | Printer,
+    out: str | Path,
+    *,
+    settings: ReliefSettings | None = None,
+    ensemble: Iterable[str | Printer] = (),
+    device: Device = "cpu",
+    extrapolate: bool = False,
+    announce: bool = True,
+) -> Design:
+    """Optimise the layout whose print comes closest to a wanted height map.
+
+    Args:
+        relief: lens, blaze or staircase, a grey picture, a float TIFF in µm, or an array (size_px, size_px)
+            of heights in µm (see ``load_relief``).
+        model, out: as for ``design_hologram``.
+        settings: layout, height, search and process window; ``relief_settings()`` by default.
+        ensemble, device, extrapolate, announce: as for ``design_hologram``.
+
+    Returns:
+        The record written to ``out/design.json``; what no layout prints is in ``unprintable_um.npy``.
+
+    Raises:
+        InputError: what ``load_relief`` refuses, or ``design_hologram`` of models and folders.
+    """
+    settings = settings or relief_settings()
+    printer = load_printer(model, settings.layout, device=device, extrapolate=extrapolate)
+    others = load_printers(ensemble, settings.layout, device=device, extrapolate=extrapolate)
+    heights, record = load_relief(relief, settings.layout, settings.height_um)
+    task = ReliefTask(
+        settings, printer, inputs={"relief_um": heights}, ensemble=list(others.values()), record=record
+    )
     return run_design(task, out, write_design_report, announce=announce)
 
 

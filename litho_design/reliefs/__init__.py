@@ -1,0 +1,1 @@
+"""Reliefs: layouts whose print is a wanted height map."""

@@ -1,0 +1,35 @@
+"""All settings of a relief."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from litho_data.foundation.settings import changed, setting
+from litho_design.optimisation.settings import DesignSettings, SearchSettings
+from litho_design.printers.layout import LayoutSettings
+
+
+class ReliefSettings(DesignSettings):
+    """All settings of one relief; wavelength and distance only serve the report of the stroke."""
+
+    layout: LayoutSettings = setting(LayoutSettings(size_px=256, cell_um=0.1), "Layout")
+    search: SearchSettings = setting(
+        SearchSettings(start="inverse", iterations=150, learning_rate=0.3), "Search"
+    )
+    height_um: float = setting(
+        0.6,
+        "Height of a drawing, or of the brightest value of a picture",
+        unit="µm",
+        option="--height-um",
+        gt=0,
+    )
+
+
+def relief_settings(changes: Mapping[str, Any] | None = None) -> ReliefSettings:
+    """Settings of a relief with changes by path, such as ``{"layout.size_px": 512}``.
+
+    Raises:
+        InputError: a change of a setting that does not exist, or to a value that it does not accept.
+    """
+    return changed(ReliefSettings(), dict(changes or {}))

@@ -1,0 +1,85 @@
+"""Wanted height maps: drawn by code, or read from a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.hashes import array_sha256, file_sha256
+from litho_design.images.targets import TargetRecord, read_image
+from litho_design.printers.layout import LayoutSettings
+
+DrawnRelief = Literal["lens", "blaze", "staircase"]
+_PERIODS, _STEPS = 4, 6
+
+
+def load_relief(
+    source: str | Path | np.ndarray, layout: LayoutSettings, height_um: float
+) -> tuple[np.ndarray, TargetRecord]:
+    """A wanted height map, float32 (size, size), µm, and its record.
+
+    Args:
+        source: lens (a spherical cap), blaze (four periods of a sawtooth along x) or staircase (six steps
+            along x), ``height_um`` high; a grey picture, whose brightest value stands for ``height_um``; or
+            heights in µm: a float TIFF, or an array.
+
+    Raises:
+        InputError: not a drawing, not a readable file, or heights of another shape or that are not numbers.
+    """
+    size = layout.size_px
+    if isinstance(source, np.ndarray):
+        return _checked(source, size), _record("array", _checked(source, size))
+    name, path = str(source), Path(source)
+    if name in get_args(DrawnRelief):
+        drawn = (height_um * _draw(name, size)).astype(np.float32)
+        return drawn, _record(name, drawn)
+    if not path.is_file():
+        known = ", ".join(get_args(DrawnRelief))
+        raise InputError("relief", got=repr(name), wanted=f"a picture, a float TIFF in µm, or one of {known}")
+    notes: list[str] = []
+    heights = _float_tiff(path)
+    if heights is None:
+        grey, notes = read_image(path, size, "relief")
+        heights = height_um * grey
+        notes.append(f"its brightest value is {height_um:g} µm")
+    record = TargetRecord(name=path.name, sha256=file_sha256(path), adaptation="; ".join(notes))
+    return _checked(heights, size), record
+
+
+def _float_tiff(path: Path) -> np.ndarray | None:
+    """Heights in µm of a TIFF of floating-point numbers; None for anything else."""
+    if path.suffix.lower() not in (".tif", ".tiff"):
+        return None
+    import tifffile
+
+    heights = tifffile.imread(path)
+    return heights if np.issubdtype(heights.dtype, np.floating) else None
+
+
+def _draw(name: str, size_px: int) -> np.ndarray:
+    """A relief in [0, 1] on (size, size) pixels."""
+    x = (np.arange(size_px) + 0.5) / size_px
+    if name == "blaze":
+        return np.tile(_PERIODS * x % 1, (size_px, 1))
+    if name == "staircase":
+        return np.tile(np.floor(_STEPS * x) / (_STEPS - 1), (size_px, 1))
+    radius = np.hypot(x[:, None] - 0.5, x[None, :] - 0.5) / 0.45
+    return np.clip(1 - radius**2, 0, None)
+
+
+def _checked(heights: np.ndarray, size_px: int) -> np.ndarray:
+    found = np.ascontiguousarray(heights, np.float32)
+    if found.shape != (size_px, size_px):
+        raise InputError(
+            "relief", got=f"{found.shape} px", wanted=f"({size_px}, {size_px}) px, the element's"
+        )
+    if not np.isfinite(found).all() or np.ptp(found) == 0:
+        raise InputError("relief", got="heights that are all equal or not numbers", wanted="a relief in µm")
+    return found
+
+
+def _record(name: str, heights: np.ndarray) -> TargetRecord:
+    return TargetRecord(name=name, sha256=array_sha256(heights, "um", ("y", "x")))

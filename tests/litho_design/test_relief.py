@@ -1,0 +1,77 @@
+"""The layout whose print is a wanted relief."""
+
+from __future__ import annotations
+
+import sys
+
+import cv2
+import numpy as np
+import pytest
+import tifffile
+import torch
+
+from litho_data.foundation.errors import InputError
+from litho_design import correct, load_design, relief_settings
+from litho_design.cli.app import main
+from litho_design.reliefs.targets import load_relief
+
+TINY = {
+    "layout.size_px": 48,
+    "layout.cell_um": 0.2,
+    "search.iterations": 60,
+    "search.polish_rounds": 20,
+}
+
+
+def test_a_relief_that_a_layout_prints_is_printed(tmp_path, make_printer):
+    settings = relief_settings(TINY)
+    printer = make_printer(settings.layout, sigma_um=0.15)
+    cells = torch.from_numpy(np.random.default_rng(0).integers(2, 11, (24, 24))).float()
+    with torch.no_grad():
+        printed = printer(cells.repeat_interleave(2, 0).repeat_interleave(2, 1)[None, None])[0, 0].numpy()
+    # The zero of a relief is free.
+    made = correct(printed - 0.4, printer, tmp_path, settings=settings, announce=False)
+    assert made.predicted["offset_nm"] == pytest.approx(400, abs=62)
+    # Each cell that is a level off costs 62 nm x its share: a tenth of the cells would give 6 nm as blurred.
+    assert made.predicted["rms_nm"] < 6
+    assert made.baselines["free levels"]["rms_nm"] < 6
+    assert made.baselines["best affine"]["rms_nm"] > 3 * made.predicted["rms_nm"]
+    assert made.baselines["uncorrected"]["rms_nm"] > made.baselines["best affine"]["rms_nm"]
+    # Scored again from its folder, as any other design.
+    loaded = load_design(tmp_path)
+    assert loaded.score(loaded.expected_um).rms_nm == pytest.approx(made.predicted["rms_nm"], rel=1e-4)
+    assert np.abs(np.load(tmp_path / "unprintable_um.npy")).mean() < 0.006
+
+
+def test_what_no_layout_prints_is_shown_beside_it(tmp_path, monkeypatch, capsys):
+    """A step of one pixel cannot be printed, and neither can more than the levels reach."""
+    words = ["correct", "staircase", "--model", "zoo:physics", "--size-px", "48", "--iterations", "10"]
+    words += ["--set", "search.polish_rounds=0", "--height-um", "1.5", "--out", str(tmp_path / "out")]
+    monkeypatch.setattr(sys, "argv", ["litho-design", *words])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 0
+    said = capsys.readouterr()
+    assert "take --height-um 1.2 or less" in said.err
+    assert "free levels" in said.out
+    assert "nm rms from the relief" in said.out
+    rest = np.load(tmp_path / "out" / "unprintable_um.npy")
+    assert rest.std() > 0.02
+    assert rest.mean() == pytest.approx(0, abs=1e-5)
+
+
+def test_reliefs_are_read_in_micrometres(tmp_path):
+    layout = relief_settings(TINY).layout
+    heights = np.random.default_rng(0).random((48, 48)).astype(np.float32)
+    tifffile.imwrite(tmp_path / "a.tif", heights)
+    assert np.array_equal(load_relief(tmp_path / "a.tif", layout, 0.5)[0], heights)
+    cv2.imwrite(str(tmp_path / "a.png"), np.round(60000 * heights / heights.max()).astype(np.uint16))
+    grey, record = load_relief(tmp_path / "a.png", layout, 0.5)
+    assert grey == pytest.approx(0.5 * heights / heights.max(), abs=1e-5)
+    assert "0.5 µm" in record.adaptation
+    with pytest.raises(InputError, match="48"):
+        load_relief(heights[:40], layout, 0.5)
+    with pytest.raises(InputError, match="staircase"):
+        load_relief("hill", layout, 0.5)
+    with pytest.raises(InputError, match="equal"):
+        load_relief(np.zeros((48, 48)), layout, 0.5)
