@@ -22,7 +22,7 @@ TRAINING_S = {"pbl": 0.45, "fno": 0.6}
 _SMALL_MODELS_S = 300.0
 _TRIALS = 2
 # As ``run_design`` does it: draws of the yield curve; figures and page.
-_WINDOW_DRAWS, _REPORT_S = 16, 10.0
+_REPORT_S = 10.0
 
 
 def trial_job(out: Path, task: Task, arm: str) -> Job:
@@ -76,7 +76,7 @@ def _beside_s(design: Any, parameters: Any, height: torch.Tensor) -> float:
 
     seconds = _cpu_s(lambda: design.start(parameters, design.printer.level_heights_um()))
     seconds += _cpu_s(lambda: design.reference_efficiency(height)) + _cpu_s(design.baselines)
-    seconds += _WINDOW_DRAWS * _cpu_s(lambda: design.window_scores(height, 1))
+    seconds += design.settings.window.yield_draws * _cpu_s(lambda: design.window_scores(height, 1))
     if isinstance(design.bench, LensBench):
         seconds += _cpu_s(lambda: focus_window(design.bench, height))
     return seconds + _REPORT_S

@@ -11,6 +11,7 @@ from litho_data.foundation.results import Record
 from litho_data.foundation.settings import changed, setting
 from litho_design.images.targets import DrawnTarget, ImagedObject, object_name
 from litho_design.optics import Optics
+from litho_design.optimisation.process_window import ProcessWindow
 from litho_design.optimisation.settings import (
     PAPER_SEARCH,
     DesignSettings,
@@ -83,6 +84,8 @@ class LensSettings(DesignSettings):
     search: SearchSettings = setting(
         SearchSettings(start="fresnel", start_jitter_levels=0.3, iterations=200, learning_rate=0.3), "Search"
     )
+    # A draw of a lens costs a whole plane, as much as ten steps of its search along a radius.
+    window: ProcessWindow = setting(ProcessWindow(yield_draws=40), "Process window")
     view: LensView = setting(LensView(path="radial"), "View")
     imaging: ImagingSettings = setting(ImagingSettings(), "Computational imaging")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -148,8 +149,7 @@ class LensTask(Task):
 
     def window_figures(self, seen: Tensor) -> dict[str, float]:
         """Strehl ratio and centre-to-background ratio."""
-        peak = float(self.bench(self.bench.ideal_height_um()).max())
-        return {"strehl": float(seen.max()) / peak, "cbr": float(self._ratio(seen))}
+        return {"strehl": float(seen.max()) / self._ideal_peak, "cbr": float(self._ratio(seen))}
 
     def display(self, seen: np.ndarray) -> np.ndarray:
         """The root of the PSF over its peak."""
@@ -164,6 +164,10 @@ class LensTask(Task):
         press = self.printers[printer]
         strip = rings[self.strips[printer]][None, None]
         return press.print_patch(strip, press.strip_halo_px)[0, 0].mean(0)
+
+    @cached_property
+    def _ideal_peak(self) -> float:
+        return float(self.bench(self.bench.ideal_height_um()).max())
 
     def _ratio(self, psf: Tensor) -> Tensor:
         layout = self.settings.layout

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -19,7 +20,8 @@ if TYPE_CHECKING:
 
 _NARROWEST_BLUR_PX = 0.2
 _UNSEEN_STREAM = 1
-YIELD_DRAWS = 16
+# Figures that are better when lower.
+_ERRORS = ("loss", "mae_", "rms_", "rmse_", "p95_", "speckle_", "fwhm_")
 
 
 class ProcessWindow(Record):
@@ -56,6 +58,13 @@ class ProcessWindow(Record):
     weight: float = setting(1.0, "Weight of the standard deviation for mean-sd", option="--risk-weight", ge=0)
     tail: float = setting(0.25, "Worst share of the draws for cvar", option="--risk-tail", gt=0, le=1)
     seed: int = setting(0, "Seed of the draws")
+    yield_draws: int = setting(100, "Random prints of the yield", option="--yield-draws", ge=2)
+    pass_drop_db: float = setting(
+        1.0, "A print passes if no figure in dB is further below the print as modelled", unit="dB", ge=0
+    )
+    pass_share: float = setting(
+        0.9, "and if every other figure keeps this share of it (errors: its inverse)", gt=0, le=1
+    )
 
 
 def spreads(window: ProcessWindow) -> list[str]:
@@ -116,7 +125,7 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
         InputError: a draw below the sampling limit of the propagator between ``source`` and ``target``,
             or without a positive wavelength.
     """
-    drawn = draws(window, optics, window.samples) + draws(window, optics, YIELD_DRAWS, unseen=True)
+    drawn = draws(window, optics, window.samples) + draws(window, optics, window.yield_draws, unseen=True)
     nearest_um = min(draw.optics.distance_um for draw in drawn)
     shortest_um = min(draw.optics.wavelength_um for draw in drawn)
     if shortest_um <= 0:
@@ -137,6 +146,38 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
             wanted=f"at least {limit_um:.4g} µm",
             hint="lower --defocus-sd-um",
         )
+
+
+class Yield(Record):
+    """Share of random prints that pass, with its 95 % interval (Wilson), by which figures."""
+
+    draws: int
+    passed: int
+    share: float
+    ci95: tuple[float, float]
+    figures: list[str]
+
+
+def measure_yield(
+    drawn: Sequence[Mapping[str, float]], modelled: Mapping[str, float], window: ProcessWindow
+) -> Yield:
+    """How many drawn prints pass: all figures that they share with the print as modelled stay close to it."""
+    figures = [name for name in drawn[0] if name in modelled]
+    passed = sum(all(_passes(name, one[name], modelled[name], window) for name in figures) for one in drawn)
+    count, z = len(drawn), 1.96
+    share = passed / count
+    middle = (share + z**2 / (2 * count)) / (1 + z**2 / count)
+    half = z / (1 + z**2 / count) * math.sqrt(share * (1 - share) / count + z**2 / (4 * count**2))
+    interval = (max(0.0, middle - half), min(1.0, middle + half))
+    return Yield(draws=count, passed=passed, share=share, ci95=interval, figures=figures)
+
+
+def _passes(name: str, value: float, modelled: float, window: ProcessWindow) -> bool:
+    if name.startswith(_ERRORS):
+        return value <= modelled / window.pass_share
+    if name.endswith("_db"):
+        return value >= modelled - window.pass_drop_db
+    return value >= modelled * window.pass_share
 
 
 def risk(losses: Tensor, window: ProcessWindow) -> Tensor:

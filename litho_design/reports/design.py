@@ -10,7 +10,7 @@ import numpy as np
 from litho_data.foundation.report import Page, new_figure
 from litho_design.holograms.task import HologramTask
 from litho_design.lenses.task import LensTask
-from litho_design.optimisation.process_window import YIELD_DRAWS
+from litho_design.optimisation.process_window import measure_yield
 from litho_design.reliefs.task import UNPRINTABLE_FILE, ReliefTask
 from litho_design.reports.advice import stroke_advice
 from litho_design.reports.lens import add_lens_curves, add_lens_window, decibels
@@ -71,11 +71,12 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
     import torch
 
     print_um = torch.from_numpy(height_um).to(task.printer.device)
-    draws = task.window_scores(print_um, YIELD_DRAWS)
+    window = task.settings.window
+    draws = task.window_scores(print_um, window.yield_draws)
     shown = [name for name in draws[0] if name in design.predicted]
     chosen = [name for name in task.headline if name in shown][:2] or shown[:2]
     figures = {name: (design.predicted[name], labels.get(name, name)) for name in chosen}
-    add_yield(page, draws, task.settings.window, figures)
+    add_yield(page, draws, window, figures, measure_yield(draws, design.predicted, window))
     if isinstance(task, LensTask):
         add_lens_window(page, task.bench, print_um)
     page.heading("Printed height of the levels")

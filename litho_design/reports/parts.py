@@ -9,7 +9,7 @@ import numpy as np
 
 from litho_data.foundation.report import Page, new_figure
 from litho_data.foundation.results import Record
-from litho_design.optimisation.process_window import ProcessWindow, spreads
+from litho_design.optimisation.process_window import ProcessWindow, Yield, spreads
 from litho_design.reports.advice import distribution_warning
 from litho_design.tasks.design import Design
 
@@ -46,7 +46,11 @@ def progress_figure(history: list[dict[str, float]], design: Design):
 
 
 def add_yield(
-    page: Page, draws: list[dict[str, float]], window: ProcessWindow, figures: dict[str, tuple[float, str]]
+    page: Page,
+    draws: list[dict[str, float]],
+    window: ProcessWindow,
+    figures: dict[str, tuple[float, str]],
+    passed: Yield,
 ) -> None:
     """Yield curves of a design.
 
@@ -54,6 +58,7 @@ def add_yield(
         draws: figures of single prints on single benches.
         window: the spreads that were drawn from.
         figures: name to value of the print as modelled, and label.
+        passed: how many draws pass.
     """
     import pandas as pd
 
@@ -63,6 +68,12 @@ def add_yield(
         f"The curves give the share of {len(draws)} random prints that are at least as good as the value on "
         f"the axis. The search did not use these prints; the process window was {designed}. Standard "
         f"deviations: {'; '.join(spreads(window))}."
+    )
+    low, high = (round(100 * edge) for edge in passed.ci95)
+    page.paragraph(
+        f"{passed.passed} of {passed.draws} prints pass ({low} to {high} %, 95 % interval): no figure in dB "
+        f"is more than {window.pass_drop_db:g} dB below the print as modelled, every other one keeps "
+        f"{100 * window.pass_share:g} % of it. Judged by {', '.join(passed.figures)}."
     )
     figure = new_figure(8, 3)
     (axes,) = figure.subplots(1, len(figures), sharey=True, squeeze=False)

@@ -12,7 +12,13 @@ from litho_design.lenses.bench import LensBench
 from litho_design.lenses.focus_window import focus_window, range_above
 from litho_design.lenses.settings import LensView
 from litho_design.optics import Optics
-from litho_design.optimisation.process_window import Draw, ProcessWindow, draws, measured_window
+from litho_design.optimisation.process_window import (
+    Draw,
+    ProcessWindow,
+    draws,
+    measure_yield,
+    measured_window,
+)
 from litho_design.printers.layout import LayoutSettings
 
 
@@ -107,6 +113,17 @@ def test_a_draw_of_another_wavelength_has_the_index_of_its_resin():
         assert change == pytest.approx(-0.0616 * shift_um, abs=0.2 * shift_um**2 + 1e-6)
     constant = Optics(dispersion="constant")
     assert {draw.optics.index_step for draw in draws(window, constant, 3)} == {0.548}
+
+
+def test_a_yield_counts_prints_and_has_the_interval_of_a_share():
+    modelled = {"si_psnr_db": 20.0, "eff_signal": 0.5, "rms_nm": 10.0, "ssim": 0.4}
+    good = {"si_psnr_db": 19.1, "eff_signal": 0.46, "rms_nm": 11.0}
+    bad = [good | {"si_psnr_db": 18.9}, good | {"eff_signal": 0.44}, good | {"rms_nm": 11.2}]
+    found = measure_yield([good] * 90 + bad * 3 + bad[:1], modelled, ProcessWindow())
+    assert (found.draws, found.passed, found.share) == (100, 90, 0.9)
+    # Wilson's interval of 90 in 100, as in tables.
+    assert found.ci95 == pytest.approx((0.8256, 0.9448), abs=1e-4)
+    assert found.figures == ["si_psnr_db", "eff_signal", "rms_nm"]
 
 
 def test_gain_and_offset_are_drawn_together():
