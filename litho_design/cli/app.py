@@ -65,6 +65,12 @@ def score(
             "efficiencies."
         ),
     ] = None,
+    element: Annotated[
+        Literal["thin", "thick"] | None,
+        typer.Option(
+            help="Optics of the judges: thin, or thick (wave propagation method). As designed by default."
+        ),
+    ] = None,
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
@@ -93,6 +99,7 @@ def score(
         else PhotoSource(
             camera, camera_pitch_um or 0.0, camera_dark_level, camera_object, camera_orientation, camera_power
         ),
+        element=element,
         device=device,
         extrapolate=extrapolate,
     )

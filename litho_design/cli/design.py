@@ -232,10 +232,10 @@ def _print_design(design: Design, out: Path) -> None:
         distribution_warning,
         headline,
         stroke_advice,
+        thickness_warning,
     )
 
-    warning = distribution_warning(design)
-    if warning:
+    for warning in filter(None, (distribution_warning(design), thickness_warning(design))):
         print(warning, file=sys.stderr)
     print(stroke_advice(design))
     if design.baselines:

@@ -11,6 +11,7 @@ from torch import Tensor
 from litho_data.foundation.results import Record
 from litho_design.holograms.task import HologramTask
 from litho_design.lenses.task import LensTask
+from litho_design.optics.thin_element import ElementKind
 from litho_design.printers.printer import Printer
 from litho_design.printers.source import check_device
 from litho_design.reliefs.task import UNPRINTABLE_FILE
@@ -33,15 +34,22 @@ class LoadedDesign:
     Args:
         folder: a design folder; its arrays are checked against the hashes in the record.
         device: where prints and waves are computed.
+        element: ``thin`` or ``thick`` instead of the design's own (see ``Optics``).
 
     Raises:
         InputError: an incomplete or altered folder, a task that is not registered here, or a device that
             this machine does not have.
     """
 
-    def __init__(self, folder: str | Path, *, device: str | torch.device = "cpu"):
+    def __init__(
+        self, folder: str | Path, *, device: str | torch.device = "cpu", element: ElementKind | None = None
+    ):
         check_device(device)
         self.folder, self.record = Path(folder), Design.read(folder)
+        if element is not None:
+            optics = self.record.optics.model_copy(update={"element": element})
+            settings = self.record.settings | {"optics": optics.model_dump()}
+            self.record = self.record.model_copy(update={"optics": optics, "settings": settings})
         self.device = torch.device(device)
         self.level, self.expected_um = (self._tensor(name) for name in (LEVELS_FILE, HEIGHT_FILE))
         own = {LEVELS_FILE, HEIGHT_FILE, IMAGE_FILE, UNPRINTABLE_FILE}

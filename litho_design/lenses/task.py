@@ -116,6 +116,9 @@ class LensTask(Task):
         """Along a radius where layout and printers allow it, else the whole plane."""
         if not self.radial:
             return self.make_bench(optics)
+        if optics.element == "thick":
+            hint = "--set view.path=plane"
+            raise InputError("search path 'radial'", got="a thick element", wanted="a thin one", hint=hint)
         return RadialLensBench(self.settings.layout, optics, self.settings.view).to(self.printer.device)
 
     def search_print(self, level: Tensor, printer: int) -> Tensor:

@@ -9,6 +9,11 @@ from litho_data.foundation.results import Record
 from litho_data.foundation.settings import setting
 from litho_design.optics.materials import Resin, refractive_index
 
+ElementKind = Literal["thin", "thick"]
+
+# Beyond the element as far as light spreads within the height of a relief.
+_BORDER_UM = 2.0
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -37,6 +42,11 @@ class Optics(Record):
         "Propagator: the Rayleigh-Sommerfeld sum, the angular spectrum, or whichever is valid",
         option="--propagation",
     )
+    element: ElementKind = setting(
+        "thin",
+        "Element: one phase per place (thin), or the wave propagation method through the relief (thick)",
+        option="--element",
+    )
     dispersion: Resin = setting(
         "ip-dip", "Resin whose index against wavelength is used where the wavelength varies"
     )
@@ -56,11 +66,11 @@ class Optics(Record):
 def element_field(
     height_um: Tensor, grid: PixelGrid, optics: Optics, aperture: Tensor | None = None
 ) -> Tensor:
-    """The wave just behind a thin phase element lit by a plane wave of unit power.
+    """The wave just behind a phase element lit by a plane wave of unit power.
 
     u = exp(j 2 pi (index_step height + incidence . position) / wavelength) on the aperture and 0
     elsewhere, scaled so that sum |u|^2 dy dx = 1: intensities summed over any window times its pixel area
-    are shares of the incident power.
+    are shares of the incident power. A thick element is what ``wave_through_relief`` makes of it, in air.
 
     Args:
         height_um: real (..., ny, nx), µm.
@@ -83,7 +93,17 @@ def element_field(
     else:
         power = float(aperture.double().square().sum()) * area
         amplitude = (aperture / math.sqrt(power)).to(phase).expand_as(phase)
-    return torch.polar(amplitude, phase)
+    if optics.element == "thin":
+        return torch.polar(amplitude, phase)
+    from litho_design.optics.thick_element import wave_through_relief
+
+    tilted = torch.polar(amplitude, phase - height_um * (2 * math.pi / optics.wave_height_um))
+    # Dark beyond the borders, so that what leaves on one side does not come in on the other.
+    border = (math.ceil(_BORDER_UM / grid.pitch_um[0]),) * 4
+    dark = torch.nn.functional.pad(tilted, border)
+    relief = torch.nn.functional.pad(height_um - height_um.amin(), border)
+    wave = wave_through_relief(dark, relief, grid.pitch_um[0], optics.wavelength_um, 1 + optics.index_step)
+    return torch.nn.functional.pad(wave, [-one for one in border])
 
 
 def intensity_share(field: Tensor, grid: PixelGrid) -> Tensor:

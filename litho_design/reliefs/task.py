@@ -128,6 +128,10 @@ class ReliefTask(Task):
             "free levels": self.figures(self._free_print),
         }
 
+    def thick_score(self, height_um: Tensor) -> None:
+        """A height is a height, whatever the light."""
+        return
+
     def arrays(self, height_um: Tensor) -> dict[str, np.ndarray]:
         """Also what is left of the target with levels of any height: no layout of this range prints it."""
         left = self.target - self._free_print

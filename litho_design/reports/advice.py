@@ -6,6 +6,9 @@ from collections.abc import Mapping
 
 from litho_design.tasks.design import Design
 
+_EFFICIENCIES = ("eff_signal", "focusing_efficiency")
+# Reflection alone takes 4.6 %.
+_THICK_SHARE = 0.1
 # Below this share of the training pixels, a model has hardly seen the lowest and the highest level.
 _SEEN_SHARE = 0.02
 
@@ -25,6 +28,21 @@ def distribution_warning(design: Design) -> str:
     return (
         f"out of distribution: {100 * gauge.level_distance:.0f} % of the pixels would have to change level "
         "to match the training layouts of the model; its prediction is an extrapolation"
+    )
+
+
+def thickness_warning(design: Design) -> str:
+    """A warning where the same print does clearly worse as a thick element; else empty."""
+    name = next((one for one in _EFFICIENCIES if one in design.predicted), None)
+    if design.thick is None or name is None:
+        return ""
+    thin, thick = design.predicted[name], design.thick[name]
+    if thick >= (1 - _THICK_SHARE) * thin:
+        return ""
+    return (
+        f"as a thick element (wave propagation method, one reflection included) the same print sends "
+        f"{100 * thick:.1f} % where the thin element of these scores sends {100 * thin:.1f} %: its detail is "
+        "too fine for its height, and the figures are too good"
     )
 
 

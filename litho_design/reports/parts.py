@@ -10,7 +10,7 @@ import numpy as np
 from litho_data.foundation.report import Page, new_figure
 from litho_data.foundation.results import Record
 from litho_design.optimisation.process_window import ProcessWindow, Yield, spreads
-from litho_design.reports.advice import distribution_warning
+from litho_design.reports.advice import distribution_warning, thickness_warning
 from litho_design.tasks.design import Design
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ def add_notes(page: Page, design: Design) -> None:
         "These scores are predictions of the model that the layout was designed with. Before printing, score "
         "the layout with another model (litho-design score, litho-design compare)."
     )
-    for note in design.notes:
+    for note in filter(None, (thickness_warning(design), *design.notes)):
         page.note(note[0].upper() + note[1:] + ".")
 
 
@@ -110,7 +110,8 @@ def score_table(columns: Mapping[str, Mapping[str, float]], labels: Mapping[str,
 
 def add_scores(page: Page, design: Design, labels: Mapping[str, str]) -> None:
     """The scores of a design beside those of its baselines on the same grid."""
-    columns = {"print": design.predicted} | (design.baselines or {})
+    thick = {} if design.thick is None else {"print, thick element": design.thick}
+    columns = {"print": design.predicted} | thick | (design.baselines or {})
     page.table(
         score_table(columns, labels),
         "Scores of the argmax layout as printed, and of what it is to be compared with on the same grid",

@@ -66,8 +66,9 @@ class Design(Result):
     polished_loss: float
     reference_efficiency: float | None = None
     predicted: dict[str, float]
-    # Absent in older designs.
+    # Both are absent in older designs; the second is the same print as a thick element.
     baselines: dict[str, dict[str, float]] | None = None
+    thick: dict[str, float] | None = None
     files: dict[str, str]
 
 

@@ -113,6 +113,7 @@ def run_design(
     layout_array = layout_level.cpu().numpy().astype(np.uint8)
     arrays = {LEVELS_FILE: layout_array, HEIGHT_FILE: height.cpu().numpy(), **task.arrays(height)}
     files = write_arrays(folder, arrays) | write_level_image(folder, layout_array)
+    thick = task.thick_score(height)
     design = Design(
         task=task.name,
         variant=settings.variant,
@@ -147,6 +148,7 @@ def run_design(
         reference_efficiency=task.reference_efficiency(height),
         predicted=task.score(height).model_dump(),
         baselines=task.baselines(),
+        thick=None if thick is None else thick.model_dump(),
         files=files,
     )
     report(folder, design, task, outcome.state.history)

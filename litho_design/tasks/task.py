@@ -136,6 +136,15 @@ class Task:
         with torch.no_grad():
             return self.score_type(**self.figures(self.bench(height_um)))
 
+    def thick_score(self, height_um: Tensor) -> Record | None:
+        """Score of a print as a thick element; None where the settings have one, or no light is involved."""
+        if self.settings.optics.element == "thick":
+            return None
+        optics = self.settings.optics.model_copy(update={"element": "thick"})
+        nominal = Printer(None, self.settings.layout, source="none").to(self.printer.device)
+        settings = self.settings.model_copy(update={"optics": optics}).model_dump()
+        return self.reopened(settings, self.inputs, nominal).score(height_um)
+
     def window_figures(self, seen: Tensor) -> Mapping[str, float]:
         """Figures of one draw of the process window."""
         return self.figures(seen)

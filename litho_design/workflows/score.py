@@ -9,8 +9,9 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.outputs import require_own_folder
 from litho_data.foundation.run_facts import run_facts
-from litho_design.judging.loaded import LoadedDesign, load_design
+from litho_design.judging.loaded import LoadedDesign
 from litho_design.judging.score import MeasuredSource, PhotoSource, ScoreResult, judge_design
+from litho_design.optics.thin_element import ElementKind
 from litho_design.printers.printer import Printer
 from litho_design.printers.source import Device, load_printers
 from litho_design.reports.score import write_score_report
@@ -24,6 +25,7 @@ def score(
     judges: Iterable[str | Printer] = (),
     scan: MeasuredSource | None = None,
     camera: PhotoSource | None = None,
+    element: ElementKind | None = None,
     device: Device = "cpu",
     extrapolate: bool = False,
 ) -> ScoreResult:
@@ -37,6 +39,8 @@ def score(
         scan: a measured height map of the printed part.
         camera: a photograph of the printed hologram's image, or of an object through the printed lens;
             with ``scan`` it is deconvolved with the PSF of the measured print too.
+        element: ``thick`` judges every print by the wave propagation method; ignored for a design that is
+            loaded.
         device: where prints and waves are computed; ignored for a design that is loaded.
         extrapolate: accept heights beyond a judge's calibration; recorded in the result.
 
@@ -45,7 +49,9 @@ def score(
             does not match it, or an ``out`` that holds another kind of result.
     """
     require_own_folder(out, ScoreResult.FILE_NAME)
-    loaded = design if isinstance(design, LoadedDesign) else load_design(design, device=device)
+    loaded = (
+        design if isinstance(design, LoadedDesign) else LoadedDesign(design, device=device, element=element)
+    )
     record = loaded.record
     printers = load_printers(judges, record.layout, device=loaded.device, extrapolate=extrapolate)
     if not printers and scan is None and camera is None:

@@ -18,11 +18,15 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.settings import Leaf, changed, leaves
 from litho_design.cli.app import app
 from litho_design.holograms.settings import HologramSettings, hologram_settings
+from litho_design.holograms.task import HologramTask
 from litho_design.lenses.settings import LensSettings, lens_settings
-from litho_design.optimisation.starts import _MADE_FOR, _STARTS, StartName
+from litho_design.lenses.task import LensTask
+from litho_design.optimisation.starts import _STARTS, StartName
+from litho_design.reliefs.settings import ReliefSettings
+from litho_design.reliefs.task import ReliefTask
 
 ROOT = Path(__file__).parents[2]
-PRESETS = {"hoe": HologramSettings(), "lens": LensSettings()}
+PRESETS = {"hoe": HologramSettings(), "lens": LensSettings(), "relief": ReliefSettings()}
 EVERY = [(task, leaf) for task, preset in PRESETS.items() for leaf in leaves(preset)]
 # Choosing another preset or kind of lens changes more than the one value.
 CHOOSE = ("variant", "task")
@@ -97,7 +101,7 @@ def test_help_shows_default_and_unit_of_every_option(command, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setenv("TERMINAL_WIDTH", "200")
     shown = CliRunner().invoke(app, [command, "--help"]).stdout
-    presets = PRESETS.values() if command == "compare" else [PRESETS[command]]
+    presets = [PRESETS["hoe"], PRESETS["lens"]] if command == "compare" else [PRESETS[command]]
     offered = options_of(command)
     for leaf in (leaf for preset in presets for leaf in leaves(preset) if offered & set(leaf.options)):
         assert leaf.options[0] in shown
@@ -195,8 +199,10 @@ def test_bad_settings_are_one_line_and_exit_code_2(tmp_path, monkeypatch, refuse
 
 
 def test_every_start_that_can_be_named_can_be_made():
-    assert {"random", *_STARTS} == set(get_args(StartName))
-    assert set(_MADE_FOR) <= set(_STARTS)
+    named = {start for task in (HologramTask, LensTask, ReliefTask) for start in task.starts}
+    assert named == set(get_args(StartName))
+    # A relief makes its own.
+    assert named - set(_STARTS) == {"random", "inverse"}
 
 
 def test_help_needs_no_torch():

@@ -1,0 +1,50 @@
+"""The wave propagation method: light through a relief of finite height, slice by slice."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+# Slices a twentieth of a wave high: halving them changes a blaze of 1.6 µm period by less than 0.002.
+_SLICES_PER_WAVELENGTH = 20
+
+
+def wave_through_relief(
+    field: Tensor, height_um: Tensor, pitch_um: float, wavelength_um: float, index: float
+) -> Tensor:
+    """The wave above a relief, of the wave at its foot, with the phase of a thin element kept out of it.
+
+    In every slice the wave is carried on by the angular spectrum twice, in the resist and in air, and each
+    place takes the wave of the medium that is there (Brenner and Singer 1993, doi:10.1364/AO.32.004984); a
+    pixel that the surface cuts takes both by their share, so that gradients flow. Reflection is that of
+    normal incidence, once: (n - 1)^2 / (n + 1)^2 is lost. The result is carried back through air to the
+    foot, where a thin element stands. Periodic beyond the borders.
+
+    Args:
+        field: complex (..., ny, nx) at the foot of the relief, inside the resist.
+        height_um: real (..., ny, nx), not below 0, µm.
+        index: of the resist; above the relief is air.
+    """
+    highest_um = float(height_um.detach().max())
+    count = max(1, math.ceil(highest_um * _SLICES_PER_WAVELENGTH / wavelength_um))
+    thick_um = highest_um / count
+    ny, nx = field.shape[-2:]
+    fy, fx = (torch.fft.fftfreq(n, pitch_um, dtype=torch.float64, device=field.device) for n in (ny, nx))
+    squared = fy[:, None] ** 2 + fx[None, :] ** 2
+
+    def carried(n: float, distance_um: float) -> Tensor:
+        axial = torch.complex((n / wavelength_um) ** 2 - squared, torch.zeros_like(squared)).sqrt()
+        # Evanescent waves decay forwards, and are dropped on the way back.
+        kept = torch.ones_like(squared) if distance_um > 0 else (axial.imag == 0).double()
+        return (torch.exp(2j * math.pi * distance_um * axial) * kept).to(field.dtype)
+
+    in_resist, in_air = carried(index, thick_um), carried(1.0, thick_um)
+    for number in range(count):
+        share = ((height_um - number * thick_um) / thick_um).clamp(0, 1)
+        spectrum = torch.fft.fft2(field)
+        resist, air = (torch.fft.ifft2(spectrum * transfer) for transfer in (in_resist, in_air))
+        field = share * resist + (1 - share) * air
+    back = torch.fft.ifft2(torch.fft.fft2(field) * carried(1.0, -highest_um))
+    return back * math.sqrt(1 - ((index - 1) / (index + 1)) ** 2)
