@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from litho_design.lenses.settings import lens_settings as lens_settings
     from litho_design.optimisation.settings import design_settings as design_settings
     from litho_design.printers.source import load_printer as load_printer
-    from litho_design.reliefs.settings import relief_settings as relief_settings
     from litho_design.tasks.task import Task as Task
     from litho_design.tasks.task import register_task as register_task
     from litho_design.workflows.compare import compare as compare
@@ -49,7 +48,6 @@ else:
             "load_printer": "litho_design.printers.source",
             "load_target": "litho_design.images.targets",
             "register_task": "litho_design.tasks.task",
-            "relief_settings": "litho_design.reliefs.settings",
             "score": "litho_design.workflows.score",
         },
     )
@@ -74,6 +72,5 @@ __all__ = [
     "load_printer",
     "load_target",
     "register_task",
-    "relief_settings",
     "score",
 ]

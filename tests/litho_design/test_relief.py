@@ -11,8 +11,9 @@ import tifffile
 import torch
 
 from litho_data.foundation.errors import InputError
-from litho_design import correct, load_design, relief_settings
+from litho_design import correct, load_design
 from litho_design.cli.app import main
+from litho_design.reliefs.settings import relief_settings
 from litho_design.reliefs.targets import load_relief
 
 TINY = {
