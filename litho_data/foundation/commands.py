@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator
@@ -12,6 +13,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import running_command
 
 T = TypeVar("T")
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 
 def new_app(help_text: str):
@@ -38,12 +40,19 @@ def new_app(help_text: str):
 
 
 def run_app(app, name: str) -> None:
-    """Run a typer application; bad input becomes one line on stderr and exit code 2."""
+    """Run a typer application; bad input and a full disk become one line on stderr and exit code 2."""
     try:
         with running_command(command_line(name)):
             app(prog_name=name)
     except InputError as error:
         print(f"{name}: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    except OSError as error:
+        if error.errno not in _NO_ROOM:
+            raise
+        where = f" {error.filename}" if error.filename else ""
+        hint = "a build goes on from here once there is room"
+        print(f"{name}: cannot write{where}, got {error.strerror}; {hint}", file=sys.stderr)
         raise SystemExit(2) from None
 
 

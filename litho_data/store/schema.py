@@ -69,6 +69,8 @@ SCAN_VARIABLES = (
              "shows something else than the print, layout grid; not valid there; only where there is any"),
     Variable("vendor_mask", ("y", "x"), "bool", "1", "mask kept in the raw file; only where there is one"),
 )  # fmt: skip
+# No unit for the whole of it; in hashes it counts as 1.
+MIXED_UNITS = {"scan_to_layout": "units of its rows: 1, 1, um; 1, 1, um; um-1, um-1, 1"}
 VARIABLES = {variable.name: variable for variable in (*SAMPLE_VARIABLES, *SCAN_VARIABLES)}
 OPTIONAL_COLUMNS = ("field_x_um", "field_y_um", "dose")
 """Numbers per scan from the card's table; coordinates where the card has them, NaN where a row has not."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from litho_data.store.schema import OPTIONAL_COLUMNS, SAMPLE_VARIABLES, SCAN_VARIABLES, VARIABLES
+from litho_data.store.schema import MIXED_UNITS, OPTIONAL_COLUMNS, SAMPLE_VARIABLES, SCAN_VARIABLES, VARIABLES
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -16,6 +16,12 @@ if TYPE_CHECKING:
 
 _SHARD_BYTES = 16 << 20
 _MAX_SCANS_PER_SHARD = 16
+_OWN_FRAME = {"y": "scan_y", "x": "scan_x"}
+# Attributes of the CF conventions beyond unit and name.
+_CF: dict[str, dict[str, Any]] = {
+    "height_um": {"ancillary_variables": "valid"},
+    "valid": {"flag_values": [0, 1], "flag_meanings": "not_measured measured"},
+}
 
 
 def write_scan_group(
@@ -58,13 +64,17 @@ def write_samples(
 
     write_strings(root, "scan", [scan["id"] for scan in scans], "scan")
     write_strings(root, "print", [scan["print"] for scan in scans], "scan")
-    write_numbers(root, "order", np.array([scan["order"] for scan in scans], dtype=np.int64), "scan")
+    orders = np.array([scan["order"] for scan in scans], dtype=np.int64)
+    write_numbers(root, "order", orders, "scan", attributes={"long_name": "place in the order of writing"})
     for name in OPTIONAL_COLUMNS:
         if any(name in scan["columns"] for scan in scans):
             values = [scan["columns"].get(name, np.nan) for scan in scans]
-            write_numbers(root, name, np.array(values), "scan", "1" if name == "dose" else "um")
-    write_numbers(root, "y_um", pixel_centres_um(ny, pitch_um), "y", "um")
-    write_numbers(root, "x_um", pixel_centres_um(nx, pitch_um), "x", "um")
+            unit = {"units": "1" if name == "dose" else "um"}
+            write_numbers(root, name, np.array(values), "scan", attributes=unit)
+    for axis, count in (("y", ny), ("x", nx)):
+        described = {"long_name": f"{axis} of the pixel centres, layout frame", "axis": axis.upper()}
+        centres = pixel_centres_um(count, pitch_um)
+        write_numbers(root, f"{axis}_um", centres, axis, attributes={"units": "um", **described})
 
 
 def pixel_centres_um(count: int, pitch_um: float) -> np.ndarray:
@@ -100,7 +110,11 @@ def write_strings(group: zarr.Group, name: str, values: Sequence[str], dim: str)
 
 
 def write_numbers(
-    group: zarr.Group, name: str, values: np.ndarray, dim: str, unit: str | None = None
+    group: zarr.Group,
+    name: str,
+    values: np.ndarray,
+    dim: str,
+    attributes: Mapping[str, Any] | None = None,
 ) -> None:
     """A one-dimensional array of numbers."""
     array = group.create_array(
@@ -110,7 +124,7 @@ def write_numbers(
         dtype=values.dtype,
         compressors=_compressors(),
         dimension_names=(dim,),
-        attributes={"units": unit} if unit else {},
+        attributes=dict(attributes or {}),
     )
     array[...] = values
 
@@ -127,15 +141,21 @@ def consolidate(root: zarr.Group) -> None:
 
 def _create(group: zarr.Group, name: str, shape: tuple[int, ...], **layout: Any) -> zarr.Array:
     variable = VARIABLES[name]
-    coordinates = {"coordinates": "print order y_um x_um"} if variable.dims[:2] == ("scan", "y") else {}
+    unit = {"comment": MIXED_UNITS[name]} if name in MIXED_UNITS else {"units": variable.unit}
+    attributes = {**unit, "long_name": variable.long_name, **_CF.get(name, {})}
+    if variable.dims[:2] == ("scan", "y"):
+        attributes["coordinates"] = "print order y_um x_um"
+    # A scan's own frame has other sizes than the layouts: in one tree its axes need other names.
+    frame = {} if variable.dims[0] == "scan" else _OWN_FRAME
+    names = tuple(frame.get(dim, dim) for dim in variable.dims)
     return group.create_array(
         name,
         shape=shape,
         dtype=variable.dtype,
         fill_value=np.nan if variable.dtype.startswith("float") else 0,
         compressors=_compressors(),
-        dimension_names=variable.dims,
-        attributes={"units": variable.unit, "long_name": variable.long_name, **coordinates},
+        dimension_names=names,
+        attributes=attributes,
         **layout,
     )
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 
 import numpy as np
@@ -160,6 +161,21 @@ def test_bad_input_is_one_line_and_exit_code_2(
     assert message in error
     assert len(error.splitlines()) == 1
     assert sorted(scan_file.parent.iterdir()) == before
+
+
+def test_a_full_disk_is_one_line_and_exit_code_2(app, scan_file: Path, monkeypatch, capsys) -> None:
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", "somewhere")
+
+    monkeypatch.setattr("litho_data.level.scan.write_levelled", full)
+    recipe = scan_file.with_name("recipe.toml")
+    command = ["level", scan_file, "--unit", "m", "--recipe", recipe, "--out", "o.gsf"]
+    monkeypatch.setattr("sys.argv", ["litho-data", *map(str, command)])
+    with pytest.raises(SystemExit) as stopped:
+        run_app(app, "litho-data")
+    assert stopped.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "cannot write somewhere, got No space left on device" in line
 
 
 def test_a_step_that_fails_writes_nothing(tmp_path: Path) -> None:

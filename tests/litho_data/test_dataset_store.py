@@ -68,8 +68,20 @@ def test_opens_with_xarray_without_a_warning(campaign: Path, recwarn: pytest.War
     assert dataset["height_um"].attrs["units"] == "um"
     assert dataset["y_um"].values[:2] == pytest.approx([0.05, 0.15])
     assert [str(value) for value in dataset["print"].values] == ["1", "1", "2"]
+    assert [dataset[name].attrs["axis"] for name in ("y_um", "x_um")] == ["Y", "X"]
+    assert dataset["height_um"].attrs["ancillary_variables"] == "valid"
+    assert "units" not in dataset["scan_to_layout"].attrs
     quality = xarray.open_zarr(campaign / "prints.zarr", group="quality")
     assert float(quality["ncc_after"].min()) > 0.9
+
+
+def test_the_whole_store_opens_as_one_tree(campaign: Path) -> None:
+    import xarray
+
+    tree = xarray.open_datatree(campaign / "prints.zarr", engine="zarr")
+    assert tree["scans/P11/raw_height_um"].dims == ("scan_y", "scan_x")
+    assert tree["scans/P11/raw_height_um"].shape != tree["height_um"].shape[1:]
+    assert float(tree["quality/ncc_after"].min()) > 0.9
 
 
 def test_one_chunk_is_one_scan(campaign: Path) -> None:

@@ -41,6 +41,20 @@ def test_an_id_of_another_form_is_refused_with_a_reason(tmp_path: Path) -> None:
     assert "does not match" in refused.reason
 
 
+def test_a_link_that_leads_out_of_the_folder_is_not_followed(tmp_path: Path) -> None:
+    card = folder_with(tmp_path / "data", PAIRS)
+    (tmp_path / "secret.txt").write_text("1 2")
+    scan = tmp_path / "data" / "scans" / "P12.txt"
+    scan.unlink()
+    scan.symlink_to(tmp_path / "secret.txt")
+    (tmp_path / "data" / "layouts" / "P13.tif").symlink_to(tmp_path / "data" / "layouts" / "P11.tif")
+    (tmp_path / "data" / "scans" / "P13.txt").touch()
+    listing = list_fields(card)
+    assert [one.id for one in listing.fields] == ["P11", "P13"]
+    assert [(one.id, one.unpaired) for one in listing.left_aside] == [("P12", False)]
+    assert listing.left_aside[0].reason == "P12.txt is a link that leads out of the data folder"
+
+
 def test_the_table_gives_order_position_dose_and_use(tmp_path: Path) -> None:
     card = folder_with(tmp_path, [*PAIRS, "scans/bare.txt"], more='table = "scans.csv"')
     table = "id,order,field_x_um,dose,use\nP11,7,-20.5,1.1,\nP12,3,,,dataset\nbare,9,,,substrate\n"
