@@ -124,15 +124,14 @@ def register_scan(
     straight, blocks = case.registration(coarse, fine)
     if model not in BENDABLE or not features:
         return straight
+    found = [straight] if straight.quality.passed else []
     slow = slow_axis(coarse.orientation, fast_axis)
     if blocks.bends_along(slow) and (crept := refine_with_creep(oriented, layout, fine, slow)):
-        found, _ = case.registration(coarse, crept)
-        if found.quality.passed:
-            return found
-    if straight.quality.passed:
-        return straight
-    bent, _ = case.registration(coarse, refine_bent(oriented, layout, fine))
-    return bent if _explains(bent.quality, straight.quality) else straight
+        found = [one for one in (case.registration(coarse, crept)[0],) if one.quality.passed] or found
+    if not straight.quality.passed:
+        bent, _ = case.registration(coarse, refine_bent(oriented, layout, fine))
+        found += [bent] if _explains(bent.quality, straight.quality) else []
+    return min(found, key=lambda one: one.quality.tre_median_px, default=straight)
 
 
 def _explains(bent: RegistrationQuality, straight: RegistrationQuality) -> bool:
