@@ -57,6 +57,12 @@ class BlockShifts:
                 return True
         return False
 
+    def by_line(self, slow: int, pitch_um: float) -> str:
+        """Mean shift (x, y) of the blocks at each place along the slow axis, as ``µm: px px; …``."""
+        places = self.middle_px[:, slow]
+        rows = [(place, *self.shift_px[places == place].mean(axis=0)) for place in np.unique(places)]
+        return "; ".join(f"{(at + 0.5) * pitch_um:.1f}: {x:+.2f} {y:+.2f}" for at, x, y in rows)
+
     def _by_place(self, axis: int, along: int) -> list[np.ndarray]:
         places = self.middle_px[:, along]
         return [self.shift_px[places == place, axis] for place in np.unique(places)]

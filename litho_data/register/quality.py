@@ -46,6 +46,7 @@ class RegistrationQuality:
     curve_y_px: float
     curve_x_by_y_px: float
     curve_y_by_x_px: float
+    shift_by_line_px: str  # mean shift (x, y) of the blocks by place along the slow axis, "µm: px px; …"
     corner_sd_px: float
     corner_sd_nm: float
     singular_max: float

@@ -118,14 +118,14 @@ def register_scan(
         oriented = without_defects(oriented, defects, fine.refinement.layout_to_scan)
     if model == "ladder":
         fine = climb(fine)
+    slow = slow_axis(coarse.orientation, fast_axis)
     case = _Case(
-        height, layout, scan_pitch_um, layout_pitch_um, centred, layout_repeats, limits, seed, defects
+        height, layout, scan_pitch_um, layout_pitch_um, centred, layout_repeats, limits, seed, defects, slow
     )
     straight, blocks = case.registration(coarse, fine)
     if model not in BENDABLE or not features:
         return straight
     found = [straight] if straight.quality.passed else []
-    slow = slow_axis(coarse.orientation, fast_axis)
     if blocks.bends_along(slow) and (crept := refine_with_creep(oriented, layout, fine, slow)):
         found = [one for one in (case.registration(coarse, crept)[0],) if one.quality.passed] or found
     if not straight.quality.passed:
@@ -152,6 +152,7 @@ class _Case:
     limits: Thresholds
     seed: int
     defects: np.ndarray | None
+    slow: int
 
     def registration(self, coarse: CoarseFit, fine: FineFit) -> tuple[Registration, BlockShifts]:
         """The fit in µm of both frames, with its figures and the verdict; and the shifts of its blocks."""
@@ -168,6 +169,7 @@ class _Case:
             **figures_of_fit(coarse, fine, pitch_um),
             **figures_of_warp(layout_to_scan, _shape(layout), pitch_um),
             **evidence,
+            "shift_by_line_px": blocks.by_line(self.slow, pitch_um),
             "layout_repeats": self.layout_repeats,
             "overlap": float(np.isfinite(after).mean()),
             "defect_share": 0.0 if self.defects is None else float(self.defects.mean()),

@@ -146,6 +146,9 @@ def test_creep_along_the_slow_axis_is_put_back(creep_um: float, slow: int) -> No
     # The target; the straight warp leaves 0.8 px per µm of creep.
     assert rms_error_px(found, warp, seen) < 0.15
     assert found.quality.tre_median_px < 0.1
+    lines = [line.split(": ") for line in found.quality.shift_by_line_px.split("; ")]
+    assert len(lines) >= 3
+    assert max(abs(float(px)) for _, pair in lines for px in pair.split()) < 0.15
 
 
 def test_a_curve_along_the_fast_axis_is_reported_and_left() -> None:
