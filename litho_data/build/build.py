@@ -29,6 +29,7 @@ from litho_data.store.schema import DatasetId
 
 # A larger difference from the pixel aspect of other scans comes from missing rows or columns.
 _ASPECT_TOLERANCE = 1e-3
+_MOST_SEARCHES = 2000
 
 
 def build_dataset(
@@ -187,7 +188,8 @@ def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> None:
     fields = {job.id: job for job in jobs if isinstance(job, FieldJob)}
     lost = [key for key in skipped if key in fields and UNREGISTERED in skipped[key]]
     layouts = {key: layout for key, job in fields.items() if lost and (layout := job.layout()) is not None}
-    for key in lost:
+    # A search takes a twentieth of a second.
+    for key in lost[: max(1, _MOST_SEARCHES // max(1, len(layouts)))]:
         read = fields[key].read()
         others = {name: layout for name, layout in layouts.items() if name != key}
         height_um, pitch_y_x = read.arrays["raw_height_um"], read.facts["pitch_um"]

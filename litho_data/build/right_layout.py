@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -38,7 +39,7 @@ class _Print:
     id: str
     topography: np.ndarray
     height: np.ndarray
-    layout: bytes
+    layout: str
     dihedral: str
     group: float | str
     gain: float = float("nan")
@@ -100,7 +101,7 @@ def _print(record: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> _Prin
         id=record["id"],
         topography=predicted_topography(level, _BLUR_PX)[sparse],
         height=height[sparse].astype(np.float64),
-        layout=level.tobytes(),
+        layout=sha256(level.tobytes()).hexdigest(),
         dihedral=str(record["quality"]["dihedral"]),
         group=float(dose) if dose is not None and np.isfinite(dose) else str(record["print"]),
     )
@@ -149,7 +150,7 @@ def _gains(prints: Sequence[_Print]) -> list[tuple[str, str]]:
     same_layout = Counter(one.layout for one in prints)
     repeated = len(prints) > 0 and min(same_layout.values()) > 1
     scatter = _SCATTER_SAME if repeated else _SCATTER_OTHER
-    logs = np.array([np.log(max(_gain(one), 1e-12)) for one in prints])
+    logs = np.array([np.log(max(abs(_gain(one)), 1e-12)) for one in prints])
     if repeated:
         logs -= [
             np.median([logs[k] for k, other in enumerate(prints) if other.layout == one.layout])

@@ -112,7 +112,7 @@ class _Child:
         """Why there is no answer."""
         assert self._process is not None
         if isinstance(error, TimeoutError):
-            self.stop()
+            self._process.kill()
         code = self._process.wait()
         if code == -signal.SIGPROF or isinstance(error, TimeoutError):
             return f"no result after {computing_s:.0f} s of computing"

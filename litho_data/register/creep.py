@@ -88,7 +88,8 @@ def _is_confirmed(
         sums: np.ndarray = np.bincount(block[held_out], better[held_out], minlength=int(block.max()) + 1)
         gains.append(sums[np.unique(block[~fold])])
     # Ranks, because creep fades along the scan: a few blocks gain most, which says nothing against it.
-    return bool(wilcoxon(np.concatenate(gains), alternative="greater").pvalue < _CHANCE)
+    gain = np.concatenate(gains)
+    return bool(gain.any() and wilcoxon(gain, alternative="greater").pvalue < _CHANCE)
 
 
 class _Images:
@@ -128,10 +129,12 @@ class _Images:
             if not np.abs(step_px).max() < 0.2 * min(self._measured.shape):
                 return None
             layout = apply_transform(np.linalg.inv(matrix), bend.straighten(points))
-            to_layout, bend = fit_bent_affine(
-                points, layout + step_px.T, bend.middle, bend.half, 2 if slow is None else CREEP_DEGREE
-            )
-            matrix = np.linalg.inv(to_layout)
+            degree = 2 if slow is None else CREEP_DEGREE
+            try:
+                moved = fit_bent_affine(points, layout + step_px.T, bend.middle, bend.half, degree)
+            except np.linalg.LinAlgError:
+                return None
+            matrix, bend = np.linalg.inv(moved[0]), moved[1]
             if np.abs(step_px).max() < _SETTLED_PX:
                 return matrix, bend
         return None

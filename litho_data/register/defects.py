@@ -26,6 +26,9 @@ MARGIN_PX, POCKET_PX = 4, 12
 LARGEST_SHARE = 0.45
 _KNOTS = 8
 _EVERY = 3
+_FEWEST_PX = 60
+# Of the standard deviation of the scan.
+_LEAST_SIGMA = 1 / 32
 _ROUNDS = 6
 _SETTLED_PX = 0.02
 # Pixels that leave and enter at the edge of a mask keep the steps above a thousandth of a pixel.
@@ -52,9 +55,9 @@ def refine_around_defects(
         scan, layout_level, start, model: as there.
     """
     fine, defects = plain, None
-    for round in range(_ROUNDS):
+    for attempt in range(_ROUNDS):
         found, largest_sigma = find_defects(plain.scan, fine)
-        if not found.any() and round == 0 and plain.refinement.correlation < _SUSPICIOUS:
+        if not found.any() and attempt == 0 and plain.refinement.correlation < _SUSPICIOUS:
             # A large defect may have pulled the plain fit so far that all of the print misfits.
             fine = replace(plain, refinement=replace(plain.refinement, layout_to_scan=start))
             found, largest_sigma = find_defects(plain.scan, fine)
@@ -89,15 +92,20 @@ def find_defects(scan: np.ndarray, fine: FineFit) -> tuple[np.ndarray, float]:
     """
     from scipy.ndimage import binary_dilation, binary_erosion, binary_fill_holes, label, sum_labels
 
+    nowhere = np.zeros(fine.topography.shape, bool), 0.0
     misfit = _misfit(scan, fine)
-    size = np.nan_to_num(np.abs(misfit) * (_MAD_PER_SIGMA / np.nanmedian(np.abs(misfit))))
+    if misfit is None:
+        return nowhere
+    # Without noise the misfit may be all edges: what is small beside the print is no defect.
+    sigma = max(np.nanmedian(np.abs(misfit)) / _MAD_PER_SIGMA, _LEAST_SIGMA * np.nanstd(scan))
+    size = np.nan_to_num(np.abs(misfit) / sigma)
     regions, count = label(size > EDGE_SIGMA)
     index = np.arange(1, count + 1)
     suspect = sum_labels(size > SUSPECT_SIGMA, regions, index) > 0
     large = sum_labels(regions > 0, regions, index) >= SMALLEST_AREA_PX
     found = np.isin(regions, index[suspect & large])
     if not found.any() or found.mean() > LARGEST_SHARE:
-        return np.zeros(found.shape, bool), 0.0
+        return nowhere
     # Where a missing part happens to have the right height, it is missing all the same.
     whole = binary_fill_holes(binary_dilation(found, iterations=MARGIN_PX + POCKET_PX))
     return binary_erosion(whole, iterations=POCKET_PX, border_value=1), float(size[found].max())
@@ -112,8 +120,11 @@ def without_defects(scan: np.ndarray, defects: np.ndarray, layout_to_scan: np.nd
     return np.where(inside & defects[tuple(nearest)], np.nan, scan)
 
 
-def _misfit(scan: np.ndarray, fine: FineFit) -> np.ndarray:
-    """Scan minus what the layout explains, (ny, nx), NaN at the border and where the scan shows nothing."""
+def _misfit(scan: np.ndarray, fine: FineFit) -> np.ndarray | None:
+    """Scan minus what the layout explains, (ny, nx), NaN at the border and where the scan shows nothing.
+
+    None if it shows next to nothing of the layout.
+    """
     from scipy.ndimage import map_coordinates
 
     topography, found = fine.topography, fine.refinement
@@ -126,6 +137,8 @@ def _misfit(scan: np.ndarray, fine: FineFit) -> np.ndarray:
     design += list(quadratic_basis(shape)[1:])
     sparse = (slice(None, None, _EVERY),) * 2
     seen = np.isfinite(warped[sparse])
+    if seen.sum() < _FEWEST_PX:
+        return None
     columns_of = np.stack([one[sparse][seen] for one in design], axis=1)
     coefficients = _robust(columns_of, warped[sparse][seen])
     misfit = warped - np.einsum("k,kyx->yx", coefficients, np.stack(design))

@@ -173,6 +173,11 @@ def _greedy(path: Path) -> list[Channel]:
     raise InputError(f"got {len(bytearray(1 << 31))} bytes")
 
 
+def _asleep(path: Path) -> list[Channel]:
+    time.sleep(60)
+    return []
+
+
 def _crash(path: Path) -> list[Channel]:
     os.abort()
 
@@ -186,9 +191,18 @@ def test_a_parser_that_goes_wild_costs_one_line(tmp_path: Path, monkeypatch: pyt
     path = tmp_path / "scan"
     path.write_bytes(b"1")
     start = time.process_time()
-    for parser, message in ((_endless, "after 0 s of computing"), (_crash, "crashed"), (_greedy, "memory")):
+    for parser, message in (
+        (_endless, "after 0 s of computing"),
+        (_asleep, "after 0 s of computing"),
+        (_crash, "crashed"),
+        (_greedy, "memory"),
+    ):
+        # Seconds to start on a busy machine; only the parser that sleeps has to be waited for.
+        waiting = 10 if parser is _asleep else 500
+        monkeypatch.setattr("litho_data.readers.confined._WAITING_PER_COMPUTING", waiting)
         with pytest.raises(InputError, match=message):
             confined(parser, ())(path)
+        monkeypatch.setattr("litho_data.readers.confined._WAITING_PER_COMPUTING", 500)
         # The next file finds a parser at work again.
         assert confined(_whole, ())(path)[0].load()[0, 0, 0] == 7
     assert time.process_time() - start < 2

@@ -105,9 +105,10 @@ def test_a_defect_does_not_pull_the_warp_and_is_mapped(name: str) -> None:
     assert found.defects.mean() < changed.mean() + 0.12
 
 
-def test_a_clean_print_has_no_defects_and_keeps_its_warp() -> None:
+@pytest.mark.parametrize("snr", [5, np.inf])
+def test_a_clean_print_has_no_defects_and_keeps_its_warp(snr: float) -> None:
     layout, warp = print_of(seed=1)
-    found = register(scan_of(layout, warp, SCAN_SHAPE, snr=5, seed=1), layout)
+    found = register(scan_of(layout, warp, SCAN_SHAPE, snr=snr, seed=1), layout)
     assert (found.defects, found.bend_um, found.quality.defect_share) == (None, None, 0)
     assert rms_error_px(found, warp) < 0.02
 
