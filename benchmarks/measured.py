@@ -9,7 +9,6 @@ What the pages quote is written here from the result files, and a test holds the
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import shutil
 from pathlib import Path
@@ -24,12 +23,13 @@ from benchmarks.measured_models import (
     extrapolation_table,
     further_table,
     headline_table,
+    in_one,
     noise_table,
     paired_table,
     paper_table,
 )
 from benchmarks.record import publish
-from examples.demo import PAPER_SEEDS
+from examples.demo import PAPER_SEEDS, SMALL_BASES
 from litho_data.foundation.commands import run_script
 from litho_models.evaluation.zoo_making import ZOO_MODELS
 from litho_models.frozen import zoo
@@ -39,11 +39,12 @@ ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "results" / "neural-lithography"
 RESULTS = {
     "benchmark.json": "benchmark/benchmark.json",
+    "benchmark_least_squares.json": "benchmark-small/benchmark.json",
     **{f"benchmark_paper_{seed}.json": f"benchmark-paper-{seed}/benchmark.json" for seed in PAPER_SEEDS},
     "benchmark_prints.json": "leave-one-print-out/benchmark.json",
     "noise.json": "noise/noise.json",
     "close_loop.json": "close-loop/close_loop.json",
-    "close_loop_pbl.json": "close-loop-pbl/close_loop.json",
+    **{f"close_loop_{base}.json": f"close-loop-{base}/close_loop.json" for base in (*SMALL_BASES, "pbl")},
     "close_loop_candidates.csv": "close-loop/candidates.csv",
     "close_loop_errors.csv": "close-loop/errors.csv",
     "gap.json": "compare/gap.json",
@@ -63,22 +64,19 @@ def texts(folder: Path) -> dict[str, str]:
     def found(file: str) -> dict[str, Any]:
         return json.loads((folder / file).read_text(encoding="utf-8"))
 
-    with open(folder / "close_loop_errors.csv", encoding="utf-8", newline="") as file:
-        errors = list(csv.DictReader(file))
+    benchmark = in_one(found("benchmark.json"), found("benchmark_least_squares.json"))
     return {
-        "headline": headline_table(found("benchmark.json"), found("noise.json")),
+        "headline": headline_table(benchmark, found("noise.json")),
         "equal freedom": equal_freedom_table(
-            [found("close_loop.json"), found("close_loop_pbl.json")], errors
+            [found(f"close_loop{suffix}.json") for suffix in ("", *(f"_{b}" for b in SMALL_BASES))]
         ),
-        "benchmark": benchmark_table(found("benchmark.json"), found("noise.json")),
+        "benchmark": benchmark_table(benchmark, found("noise.json")),
         "paper split": paper_table(
-            [found(f"benchmark_paper_{seed}.json") for seed in PAPER_SEEDS], found("benchmark.json")
+            [found(f"benchmark_paper_{seed}.json") for seed in PAPER_SEEDS], benchmark
         ),
-        "whole prints": extrapolation_table(
-            found("benchmark_prints.json"), found("benchmark.json"), found("noise.json")
-        ),
-        "paired differences": paired_table(found("benchmark.json")),
-        "further figures": further_table(found("benchmark.json")),
+        "whole prints": extrapolation_table(found("benchmark_prints.json"), benchmark, found("noise.json")),
+        "paired differences": paired_table(benchmark),
+        "further figures": further_table(benchmark),
         "noise": noise_table(found("noise.json")),
         "coverage": coverage_table(found("noise.json")),
         "loop": loop_table(found("close_loop.json")),

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from benchmarks.markdown_table import markdown_table, with_interval
+from litho_models.effects import CATALOGUE
 from litho_models.evaluation.zoo_making import HELD_OUT
 from litho_models.frozen.card import ModelCard
 
@@ -16,15 +17,8 @@ OLDER_PIXELS = (
 )
 
 
-def equal_freedom_table(loops: Sequence[dict[str, Any]], errors: Sequence[dict[str, str]]) -> str:
-    """Errors before and after with the same terms per scan.
-
-    Args:
-        loops: results of the loop, the one on Physics first; ``errors``: the rows of its errors.csv, which
-            stand for results of schema 1.
-    """
-    if any(loop.get("equal_terms") is None for loop in loops):
-        return _equal_freedom_of_schema_1(errors)
+def equal_freedom_table(loops: Sequence[dict[str, Any]]) -> str:
+    """Errors before and after with the same terms per scan, of loops on several base models."""
     rows = []
     for loop in loops:
         nested = loop.get("nested")
@@ -49,7 +43,25 @@ def equal_freedom_table(loops: Sequence[dict[str, Any]], errors: Sequence[dict[s
         "whole scans, or whole prints; p is of sign flips of these." + best,
         *(_split_text(loop) for loop in loops if loop.get("gain_split")),
         *(_chosen_text(loop) for loop in loops if loop.get("nested")),
+        _names_text(loops),
     )
+
+
+def _names_text(loops: Sequence[dict[str, Any]]) -> str:
+    """What is found on each base, and what on every one."""
+    found = {
+        loop["base_model"]: [f"`{e['name']}` ({e['verdict']})" for e in loop["effects"] if not _of_scans(e)]
+        for loop in loops
+    }
+    every = set.intersection(*(set(names) for names in found.values()))
+    each = "; ".join(f"on {base} {', '.join(names) or 'nothing'}" for base, names in found.items())
+    alike = ", ".join(sorted(every)) or "none"
+    return f"Found beside terms of single scans: {each}. With the same verdict on every base: {alike}."
+
+
+def _of_scans(effect: dict[str, Any]) -> bool:
+    known = CATALOGUE.get(effect["name"])
+    return known is not None and known.per_scan
 
 
 def _equal_rows(name: str, equal_terms: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
@@ -108,25 +120,6 @@ def _background(loops: Sequence[dict[str, Any]]) -> str:
     }.get(tuple(sorted(used)), "in part with the shared background")
 
 
-def _equal_freedom_of_schema_1(errors: Sequence[dict[str, str]]) -> str:
-    found = {row["model"]: row for row in errors}
-    rows = []
-    for name in ("datum", "+ z-gain", "+ tilt-bow"):
-        before, after = found[f"base: {name}"], found[f"corrected: {name}"]
-        assert before["terms per scan"] == after["terms per scan"]
-        cells = [
-            with_interval(float(row["MAE (nm)"]), [float(row["low"]), float(row["high"])])
-            for row in (before, after)
-        ]
-        rows.append((f"k = {float(before['terms per scan']):.0f}", *cells))
-    return markdown_table(
-        ("terms per scan", "before", "after"),
-        rows,
-        "Mean absolute error on held-out scans, a border of 8 px left out, without the shared background of "
-        "the benchmark; 95 % intervals over scans.",
-    )
-
-
 # Slope terms were seen in the first look at all 24 scans, the locked ones among them.
 SEEN_BEFORE = {"slope-thinning", "axis-slope-table"}
 
@@ -153,7 +146,7 @@ def loop_table(loop: dict[str, Any], on_physics: dict[str, Any] | None = None) -
                 f"{better} of {count}",
             )
         )
-    equal = loop.get("equal_terms") is not None
+    equal, signature = loop.get("equal_terms") is not None, loop["residual"]["signature"]
     return markdown_table(
         ("step", "what it is", "held-out error before", "after", "terms per scan", "scans better"),
         rows,
@@ -167,7 +160,7 @@ def loop_table(loop: dict[str, Any], on_physics: dict[str, Any] | None = None) -
         + ("the same. " if equal else "all accepted terms free: not the same freedom. ")
         + f"{_background([loop]).capitalize()}. "
         f"What is left: {loop['residual']['state']}"
-        + (f"; it {loop['residual']['signature']}." if loop["residual"]["signature"] else "."),
+        + (f"; {'' if equal else 'it '}{signature}." if signature else "."),
         *_older_pixels([loop]),
     )
 
@@ -227,11 +220,11 @@ def locked_table(loops: Sequence[dict[str, Any]], cards: Sequence[ModelCard]) ->
     return markdown_table(
         ("", "zero of each scan free", "tilt, bow, gain and lines free too", "absolute error"),
         rows,
-        f"The {len(locked)} locked scans ({', '.join(locked)}), scored once, when model, recipe and loop "
-        f"had been settled; all was fitted to the other {others}. Models: those of the package, with the "
-        "background of their training scans. Loops: with one term per scan in the first column, and in the "
-        "second with all that they accepted, fitted on pixels that are not scored, the loop on Physics the "
-        f"registration too; {_background(loops)}. Intervals resample scans.",
+        f"The {len(locked)} locked scans ({', '.join(locked)}), a check of optimism: models, recipes and "
+        f"loops are chosen without them; all was fitted to the other {others}. Models: those of the package, "
+        "with the background of their training scans. Loops: with one term per scan in the first column, and "
+        "in the second with all that they accepted, fitted on pixels that are not scored, the loop on "
+        f"Physics the registration too; {_background(loops)}. Intervals resample scans.",
         *_older_pixels(loops),
     )
 

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from itertools import combinations
 from typing import Any
 
 from benchmarks.markdown_table import markdown_table, with_interval
+from litho_models.scoring.pairs import paired_scores
+from litho_models.scoring.records import ModelScores
 
 PAPER_MODELS = {"physics", "pbl", "fno"}
 _FREE = {
@@ -16,6 +19,32 @@ _FREE = {
     "full": "offset, gain, tilt, bow",
     "full+rows": "offset, gain, tilt, bow, lines",
 }
+
+
+def in_one(networks: dict[str, Any], closed_form: dict[str, Any]) -> dict[str, Any]:
+    """One benchmark of two runs on the same scans: the models of the second, and what only the first has.
+
+    Networks take hours, so that models in closed form are made anew without them.
+
+    Raises:
+        ValueError: other data, other scans, folds or terms.
+    """
+    for key, parts in (
+        ("dataset", ("sha256",)),
+        ("split", ("kind", "folds", "seed", "scored_ids_sha256")),
+        ("nuisance", ("policy", "k", "block_px", "buffer_px", "background")),
+    ):
+        for part in parts:
+            if networks[key][part] != closed_form[key][part]:
+                raise ValueError(f"{key}.{part}: {networks[key][part]}, {closed_form[key][part]}")
+    new = {score["model"] for score in closed_form["scores"]}
+    rows = {
+        key: closed_form[key] + [row for row in networks[key] if row["model"] not in new]
+        for key in ("scores", "fits")
+    }
+    scores = [ModelScores.model_validate(score) for score in rows["scores"]]
+    paired = [paired_scores(*pair).model_dump(mode="json") for pair in combinations(scores, 2)]
+    return networks | rows | {"paired": paired}
 
 
 def benchmark_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
@@ -58,7 +87,7 @@ def headline_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
     parameters = {fit["model"]: fit["parameters"] for fit in benchmark["fits"]}
     scores = {score["model"]: score for score in benchmark["scores"]}
     rows = []
-    for name in ("affine", "physics", "linear", "pbl", "fno"):
+    for name in ("affine", "physics", "linear", "pbl", "fno", "features", "random-features"):
         score = scores[name]
         full = next(entry["mae_nm"] for entry in score["by_policy"] if entry["policy"] == "full")
         free = with_interval(score["mae_datum_free_nm"], score["mae_datum_free_ci95_nm"])
@@ -90,7 +119,7 @@ def paired_table(benchmark: dict[str, Any]) -> str:
             _over_prints(pair.get("over_prints")),
         )
         for pair in benchmark["paired"]
-        if {pair["first"], pair["second"]} <= {"linear", *PAPER_MODELS}
+        if {pair["first"], pair["second"]} <= {"linear", "features", "random-features", *PAPER_MODELS}
     ]
     return markdown_table(
         ("difference", "datum-free error, k = 1, over scans", "p", "over prints"),

@@ -83,7 +83,6 @@ def _error_section(page: Page, findings: LoopFindings, result: CloseLoop) -> Non
         f"scored. {_BACKGROUND[result.nuisance.background]} Intervals (95 %) resample whole scans, or whole "
         "prints; p by flipping their signs, and what so many can show at best.",
         "equal_terms.csv",
-        digits=3,
     )
     if result.nested is not None:
         page.heading("The same where the choice itself has not seen the scans")
@@ -92,7 +91,6 @@ def _error_section(page: Page, findings: LoopFindings, result: CloseLoop) -> Non
             f"Named effects, generic terms and terms of single scans were chosen anew without each of the "
             f"{result.nested.selections} {result.nested.held_out}, and judged there.",
             "nested.csv",
-            digits=3,
         )
         page.table(
             pd.DataFrame([one.model_dump() for one in result.nested.chosen]),
@@ -158,10 +156,9 @@ def _error_section(page: Page, findings: LoopFindings, result: CloseLoop) -> Non
 
 
 def _equal_row(row: EqualTerms, floor: NoiseFloor) -> dict[str, object]:
+    before, after = round(row.before.k), round(row.after.k)
     cells: dict[str, object] = {
-        "terms": row.terms,
-        "terms per scan before": row.before.k,
-        "terms per scan after": row.after.k,
+        "terms per scan": f"k = {before}" if before == after else f"k = {before} → {after}",
         "before (nm)": row.before.mae_nm,
         "after (nm)": row.after.mae_nm,
         "gain (nm)": row.gain_nm,
@@ -169,10 +166,8 @@ def _equal_row(row: EqualTerms, floor: NoiseFloor) -> dict[str, object]:
     }
     for unit, over in (("scans", row.over_scans), ("prints", row.over_prints)):
         if over is not None:
-            cells[f"gain over {over.count} {unit}"] = interval_text(over.ci95_nm)
-            cells[f"better {unit}"] = f"{over.positive} of {over.count}"
-            cells[f"p over {unit}"] = over.p
-            cells[f"smallest p of {over.count} {unit}"] = over.smallest_p
+            cells[f"gain over {over.count} {unit} (nm)"] = interval_text(over.ci95_nm)
+            cells[f"better {unit}; p"] = f"{over.positive}; {over.p:.2g} (at best {over.smallest_p:.2g})"
     return cells
 
 
