@@ -33,12 +33,12 @@ gap: $(STAMP)      ## the design-to-manufacturing gap at full size, hours: make 
 	$(BIN)/python -m benchmarks.gap --out $(OUT)/gap --workers $(WORKERS) $(if $(CORRECTED),--corrected $(CORRECTED)) \
 		$(if $(PROOF),--proof) $(if $(PUBLISH),--publish)
 
-test: $(STAMP)     ## pass all tests; the report is runs/tests/report.xml
-	$(PYTEST) --durations 15 --junitxml $(OUT)/tests/report.xml
+test: $(STAMP)     ## pass all tests but the longest; the report is runs/tests/report.xml
+	$(PYTEST) -m "not long" --durations 15 --junitxml $(OUT)/tests/report.xml
 	@echo "test report: $(OUT)/tests/report.xml"
 
 test-fast: $(STAMP) ## pass the tests that take seconds
-	$(PYTEST) -m "not slow"
+	$(PYTEST) -m "not slow and not long"
 
 test-cpus: $(STAMP) ## pass the tests of numerics as older processors too: make test-cpus, or make test-cpus CPUS="avx2"
 	$(ONE_THREAD) $(BIN)/python tests/processors.py $(CPUS)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import torch
 
 ROOT = Path(__file__).parents[1]
-_QUICK = ["-m", "numerics and not slow"]
+_QUICK = ["-m", "numerics and not slow and not long"]
 
 
 class Processor(NamedTuple):

@@ -139,6 +139,9 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
     # The angular spectrum has no limit, but an image plane behind the element stays behind it.
     if optics.propagation != "rayleigh-sommerfeld":
         limit_um = min(draw.optics.wavelength_um for draw in drawn)
+    if optics.distance_um < limit_um:
+        got, wanted = f"{optics.distance_um:g} µm", f"at least {limit_um:.4g} µm"
+        raise InputError("propagation distance", got=got, wanted=wanted)
     if nearest_um < limit_um:
         raise InputError(
             f"distance {optics.distance_um:g} µm with a defocus spread of {window.defocus_sd_um:g} µm",

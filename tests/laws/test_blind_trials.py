@@ -189,7 +189,14 @@ def test_a_form_does_nothing_at_strength_zero_and_the_same_twice(name):
 
 
 @pytest.mark.parametrize(
-    "name", ["alternate-slices", "cubic-slope-loss", "fringes", "seam-in-height", "periodic-lines"]
+    "name",
+    [
+        "periodic-lines",
+        *(
+            pytest.param(name, marks=pytest.mark.long)
+            for name in ("alternate-slices", "cubic-slope-loss", "fringes", "seam-in-height")
+        ),
+    ],
 )
 def test_a_planted_form_has_the_size_that_it_claims(name):
     """It counts, and it is no more than what the plain fab and the scans' own terms leave."""
@@ -210,6 +217,7 @@ def test_a_planted_form_has_the_size_that_it_claims(name):
     assert 8.0 < planted.rms_nm < 1.05e3 * np.sqrt(np.mean(squares))
 
 
+@pytest.mark.long
 def test_what_the_base_can_imitate_does_not_count():
     """The plain fab at other parameters is the Physics model: nothing is left, wherever a fit starts."""
     draw = drawn({}, "empty")
@@ -221,6 +229,7 @@ def test_what_the_base_can_imitate_does_not_count():
     assert refitted_rms_nm(heights, jobs, other) < 0.01
 
 
+@pytest.mark.long
 def test_an_alias_is_planted_at_the_drawn_size_and_hardly_any_of_it_counts():
     draw = drawn({"dose-exponent": 12.0}, "alias")
     (planted,) = plant(draw, trial_jobs(draw, 4, 96))
@@ -541,6 +550,7 @@ def test_fields_that_cannot_be_printed_are_refused_before_the_first_trial():
         campaign.make_draws(count=4, seed=0, n_scans=12, size_px=8)
 
 
+@pytest.mark.long
 def test_a_plan_says_what_counts_and_runs_nothing():
     draws = campaign.make_draws(count=None, seed=1, n_scans=2, size_px=64)
     few = {draw.kind: draw.number for draw in draws.trials if draw.kind in ("empty", "other-form")}
@@ -576,7 +586,7 @@ def run_small(kind: Kind, out: Path) -> Trial:
     return run_trial(development_draw(kind), out, n_scans=12, size_px=192)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_one_effect_is_found_or_in_the_set(tmp_path):
     trial = run_small("single", tmp_path)
     assert not trial.failure

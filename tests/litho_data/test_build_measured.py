@@ -18,12 +18,15 @@ from litho_data.store.schema import SAMPLE_VARIABLES
 
 _BUILD = """
 import json, resource, sys
+from pathlib import Path
 from litho_data.build.build import build_dataset
 if __name__ == "__main__":
     result = build_dataset(sys.argv[1], sys.argv[2], workers=int(sys.argv[3]))
-    whose = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-    peaks = [resource.getrusage(one).ru_maxrss / 1024 for one in whose]
-    print(json.dumps([result.dataset.sha256, result.n_scans, result.seconds, *peaks]))
+    child = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024
+    # Of the process itself getrusage also counts what started it, here the tests with all that they hold.
+    status = Path("/proc/self/status").read_text()
+    own = int(status.split("VmHWM:")[1].split()[0]) / 1024
+    print(json.dumps([result.dataset.sha256, result.n_scans, result.seconds, own, child]))
 """
 
 
@@ -43,7 +46,8 @@ def test_all_measured_scans_build_in_bounded_memory(measured_prints: Path, tmp_p
     sha256, scans, seconds, peak_mib = _built(tmp_path / "prints.zarr", workers=2)
     print(f"{scans} scans, 2 workers: {seconds:.1f} s, peak at most {peak_mib:.0f} MiB")
     assert scans == 24
-    assert peak_mib < 1536
+    # 309 + 2 x 250 MiB were measured.
+    assert peak_mib < 1024
     store = open_store(tmp_path / "prints.zarr")
     assert store.sha256 == sha256
     assert store.quality["passed"].all()

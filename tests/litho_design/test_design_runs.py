@@ -131,7 +131,7 @@ def test_a_model_that_changes_while_it_prints_leaves_no_design(
     assert not (tmp_path / "design.json").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_killed_command_resumes_to_the_same_layout(tmp_path):
     def command(out):
         return [

@@ -58,7 +58,7 @@ def test_tasks_are_chosen_by_name(tmp_path):
         chosen(every, "lens")
 
 
-@pytest.mark.parametrize("kind", ["hoe", "lens-computational"])
+@pytest.mark.parametrize("kind", ["hoe", pytest.param("lens-computational", marks=pytest.mark.long)])
 def test_compare_judges_the_designs_that_single_commands_made(tmp_path, kind):
     torch.manual_seed(0)
     folder = save_frozen(build_model("affine"), tmp_path / "affine")

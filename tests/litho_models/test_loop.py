@@ -203,7 +203,7 @@ def test_terminal_and_pages_name_the_terms_and_what_was_resampled(planted, tmp_p
     assert f"over {len(scans)} scans" in said
     assert f"the smallest that {prints} prints can have" in said
     assert "chosen in so many of 1 selections: vignetting 1, datum-offset 1" in said
-    table = equal_freedom_table([result.model_dump(mode="json")], [])
+    table = equal_freedom_table([result.model_dump(mode="json")])
     assert "| physics, chosen anew (prints) | k = 7 |" in table
     assert f"what {prints} prints can show at best is p = {2 / 2**prints:.3f}" in table
     write_report(findings, result, tmp_path)
@@ -260,7 +260,7 @@ def test_only_printer_effects_are_exported(planted) -> None:
     assert list(exported_effects(findings.final.fits.chain, alike)["undetermined"]) == ["vignetting"]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_tip_that_narrows_is_contradicted() -> None:
     # Twice the height that a tip of this radius would add is missing on slopes of both axes.
     scans = printed_scans({"slope-thinning": {"along_x_um": 0.1, "along_y_um": 0.1}}, count=12, seed=2)

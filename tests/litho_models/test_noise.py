@@ -581,6 +581,7 @@ def test_a_locked_print_is_in_the_dose_matrix_and_in_nothing_else(tmp_path):
     assert locked in (tmp_path / "out" / "report.html").read_text()
 
 
+@pytest.mark.long
 def test_residuals_of_a_benchmark_are_out_of_fold_and_locked_scans_stay_out(store, tmp_path):
     from litho_models.evaluation.benchmark import benchmark
     from litho_models.noise import analyse_noise

@@ -75,7 +75,7 @@ def test_relative_differences_are_of_root_mean_squares():
     assert relative_percent(np.array([0.3, -0.3]), np.array([3.0, 3.0])) == pytest.approx(10)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("benchmark", "size_px"), [(train_step, 64), (predict, 160), (hoe_iteration, 160)])
 def test_each_benchmark_measures_all_its_sides(benchmark, size_px, tmp_path, monkeypatch):
     model = save_frozen(make_pbl(), tmp_path / "pbl")

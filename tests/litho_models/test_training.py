@@ -92,6 +92,7 @@ def test_physics_recovers_a_printer_of_its_own_kind():
     assert model.at_bounds == {}
 
 
+@pytest.mark.long
 def test_a_fit_stops_at_a_bound_and_names_it():
     printer = build_model("physics", sigma_diffusion_init_um=0.6, kappa_min_init=0.5)
     narrow = {"sigma_diffusion_max_um": 0.2, "sigma_diffusion_init_um": 0.1}
@@ -397,7 +398,9 @@ class OneOfMany:
         return torch.ones(2)
 
 
-@pytest.mark.parametrize("world", [2, 3, 5])
+@pytest.mark.parametrize(
+    "world", [2, pytest.param(3, marks=pytest.mark.long), pytest.param(5, marks=pytest.mark.long)]
+)
 def test_any_number_of_processes_has_the_mean_gradient_of_one(world, monkeypatch):
     monkeypatch.setattr("litho_models.fitting.crops._PASS_PX", 1)
     scans = make_scans(3, size_px=64)
