@@ -84,15 +84,11 @@ class FieldJob:
 
     def layout(self) -> np.ndarray | None:
         """Levels of its layout; None if there is none that can be read."""
-        if self.field.layout is None or self.layout_name is None:
-            return None
         try:
-            done = OPERATIONS["read-layout"].run(
-                {"levels": self.card.layout.levels}, {self.layout_name: self.field.layout}, {}
-            )
+            done = self._read_layout()
         except InputError:
             return None
-        return done.arrays["mask_level"]
+        return None if done is None else done.arrays["mask_level"]
 
     def read(self) -> Done:
         """The scan as it was read; InputError if that fails."""
@@ -124,9 +120,7 @@ class FieldJob:
     def _steps(self) -> Iterator[Done]:
         """The operations in order; each sees the arrays of those before it."""
         layout: dict[str, np.ndarray] = {}
-        if self.field.layout is not None and self.layout_name is not None:
-            file = {self.layout_name: self.field.layout}
-            done = OPERATIONS["read-layout"].run({"levels": self.card.layout.levels}, file, {})
+        if (done := self._read_layout()) is not None:
             layout = done.arrays
             yield done
         read = self.read()
@@ -154,6 +148,13 @@ class FieldJob:
         yield registered
         shape = {"layout_shape": list(layout["mask_level"].shape)}
         yield OPERATIONS["resample"].run({**pitches, **shape}, {}, {**height, **registered.arrays})
+
+    def _read_layout(self) -> Done | None:
+        """The layout as it was read, None if the field has none; InputError if that fails."""
+        if self.field.layout is None or self.layout_name is None:
+            return None
+        file = {self.layout_name: self.field.layout}
+        return OPERATIONS["read-layout"].run({"levels": self.card.layout.levels}, file, {})
 
     @property
     def _read_params(self) -> dict[str, Any]:

@@ -14,7 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.register.topography import pearson, predicted_topography
+from litho_data.register.geometry import ORIENTATIONS
+from litho_data.register.orientation import search_orientation
+from litho_data.register.scan import at_layout_pitch
+from litho_data.register.topography import pearson, predicted_topography, remove_bow
 
 _BLUR_PX = 3.0
 _SIDE_PX = 128
@@ -32,8 +35,7 @@ _CLEAR_SIGMA = 4.0
 class _Print:
     """One registered scan: its heights on its layout, and where it belongs.
 
-    ``group`` is what should share a gain: the dose, if the card gives it, or the printed block. ``gain`` is
-    the height per level, relative to other prints of the same layout if there are any.
+    ``group`` is what should share a gain: the dose, if the card gives it, or the printed block.
     """
 
     id: str
@@ -42,7 +44,6 @@ class _Print:
     layout: str
     dihedral: str
     group: float | str
-    gain: float = float("nan")
 
 
 def doubts(
@@ -75,11 +76,6 @@ def fitting_layout(
         layouts: levels (ny, nx) by id.
         pitch_um: of the layouts.
     """
-    from litho_data.register.geometry import ORIENTATIONS
-    from litho_data.register.orientation import search_orientation
-    from litho_data.register.scan import at_layout_pitch
-    from litho_data.register.topography import remove_bow
-
     flat = remove_bow(at_layout_pitch(height_um, scan_pitch_um, pitch_um))
     scores = {}
     for name, level in layouts.items():

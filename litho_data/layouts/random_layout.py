@@ -51,7 +51,7 @@ def random_layout(
     if not 2 <= levels <= 256:
         raise InputError("levels of a layout", got=levels, wanted="2 to 256")
     whole = shape if field_px is None else (field_px, field_px)
-    if min(whole) < max(shape) and field_px is not None:
+    if field_px is not None and field_px < max(shape):
         raise InputError("field_px of a random layout", got=field_px, wanted=f"at least {max(shape)}")
     field = low_pass(
         np.random.default_rng(seed).random(whole),

@@ -10,7 +10,7 @@ import numpy as np
 # From this trim on, only the median is left.
 MEDIAN_TRIM = 0.5
 _FEW_FOR_MODUS = 9
-_METRE_PER_UM = 1e-6
+METRE_PER_UM = 1e-6
 # Of heights in metres: more than files state, fewer than rounding between units disturbs.
 _DECIMAL_DIGITS = 12
 # Powers of ten up to here are exact in a double.
@@ -114,7 +114,7 @@ def _modus(ordered: np.ndarray, metres: np.ndarray) -> float:
 
 def _decimal_metres(height_um: np.ndarray) -> np.ndarray:
     """The doubles that a file in metres with up to 12 digits would have been read as."""
-    metres = height_um * _METRE_PER_UM
+    metres = height_um * METRE_PER_UM
     with np.errstate(divide="ignore", invalid="ignore"):
         exponent = np.nan_to_num(np.floor(np.log10(np.abs(metres))), posinf=0.0, neginf=0.0)
         power = np.clip(_DECIMAL_DIGITS - 1 - exponent, 0, _LARGEST_EXACT_POWER)

@@ -9,6 +9,7 @@ import numpy as np
 from litho_data.foundation.errors import InputError
 from litho_data.level.row_statistics import (
     MEDIAN_TRIM,
+    METRE_PER_UM,
     fewest_for_row,
     row_counts,
     row_facet_tilt,
@@ -29,7 +30,6 @@ RowMethod = Literal[
 ]
 Direction = Literal["horizontal", "vertical"]
 MAX_ROW_DEGREE = 5
-_METRE_PER_UM = 1e-6
 
 
 def align_rows(
@@ -161,7 +161,7 @@ def _matching_shifts(z: np.ndarray, chosen: np.ndarray | None, last_column_count
     Args:
         last_column_counts: whatever the mask says there, as in Gwyddion's include mode.
     """
-    steps_m = np.nan_to_num(np.diff(z, axis=0) * _METRE_PER_UM, nan=0.0)
+    steps_m = np.nan_to_num(np.diff(z, axis=0) * METRE_PER_UM, nan=0.0)
     usable = np.ones(steps_m.shape, dtype=bool) if chosen is None else chosen[1:] & chosen[:-1]
     bends_m = np.diff(steps_m, axis=1)
     scale_m = (np.abs(bends_m) * usable[:, :-1]).sum(axis=1) / bends_m.shape[1]
@@ -175,7 +175,7 @@ def _matching_shifts(z: np.ndarray, chosen: np.ndarray | None, last_column_count
     pixel_weights[~usable] = 0.0
     total = 2 * weights.sum(axis=1)
     step_m = (pixel_weights * steps_m).sum(axis=1) / np.where(total > 0, total, 1.0)
-    shifts = np.concatenate([[0.0], np.cumsum(step_m)]) / _METRE_PER_UM
+    shifts = np.concatenate([[0.0], np.cumsum(step_m)]) / METRE_PER_UM
     return shifts - shifts.mean()
 
 

@@ -10,12 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from litho_data.foundation.errors import InputError
-from litho_data.readers.reader import Channel, Loaded, Reader, foreign_parser
+from litho_data.readers.reader import MOST_BYTES_PER_PACKED_BYTE, Channel, Loaded, Reader, foreign_parser
 
 _ZIP_MAGIC = b"PK\x03\x04"
 _NAME_AT = 30
-# The most that deflate packs.
-_MOST_BYTES_PER_BYTE = 1032
 _READ_HEADER = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
@@ -46,7 +44,7 @@ def read_archive(path: Path) -> list[Channel]:
             with archive.open(member) as stream:
                 shape, _, dtype = _READ_HEADER[np.lib.format.read_magic(stream)](stream)
                 whole = stream.tell() + np.prod(shape, dtype=float) * dtype.itemsize == member.file_size
-            if not whole or member.file_size > _MOST_BYTES_PER_BYTE * member.compress_size:
+            if not whole or member.file_size > MOST_BYTES_PER_PACKED_BYTE * member.compress_size:
                 raise InputError(f"{path}: {member.filename}", got=f"{member.file_size} bytes", wanted=shape)
             if len(shape) == 2 and min(shape) > 1 and dtype.kind in "uif":
                 name = member.filename.removesuffix(".npy")

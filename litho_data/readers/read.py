@@ -11,12 +11,10 @@ import numpy as np
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import um_per
 from litho_data.readers.gzipped import unpacked
-from litho_data.readers.reader import Channel, Loaded, Reader
+from litho_data.readers.reader import MOST_BYTES_PER_PACKED_BYTE, Channel, Loaded, Reader
 from litho_data.readers.registry import PICTURE, detect_format, reader_of, require_file
 from litho_data.scan import Axis, Scan
 
-# Deflate, the strongest compression in use, packs at most 1032 bytes into one byte.
-_MOST_PIXELS_PER_BYTE = 1032
 # Files state sizes rounded to a few digits.
 _SIZE_TOLERANCE = 1e-4
 
@@ -92,7 +90,7 @@ def _read_channels(reader: Reader, file: Path) -> list[Channel]:
     channels = reader.read_channels(file)
     size = file.stat().st_size
     for channel in channels:
-        if channel.shape[0] * channel.shape[1] > _MOST_PIXELS_PER_BYTE * size:
+        if channel.shape[0] * channel.shape[1] > MOST_BYTES_PER_PACKED_BYTE * size:
             got = f"{size} bytes for {channel.shape[0]} x {channel.shape[1]} pixels"
             raise InputError(
                 f"{file} ({reader.name})", got=got, wanted="more", hint="the file may be damaged"

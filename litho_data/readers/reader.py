@@ -17,6 +17,8 @@ from litho_data.scan import Axis
 
 # 2 GiB as float64: beyond it, a damaged header is far more likely than a scan.
 _MAX_PIXELS = 2**28
+# Deflate, the strongest compression in use.
+MOST_BYTES_PER_PACKED_BYTE = 1032
 _LOGGERS = ("tifffile", "igor2", "SurfaceTopography")
 _LONGEST_MESSAGE = 160
 

@@ -62,7 +62,7 @@ class Bend:
 
     def shift(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distance (along x, along y) of points of the scan from their nominal position."""
-        terms = _terms(*self.unit(x, y), self._degree)
+        terms = _terms(*self.unit(x, y), self.degree)
         along_x, along_y = (sum(a * term for a, term in zip(row, terms, strict=True)) for row in self.amount)
         return along_x, along_y
 
@@ -103,7 +103,7 @@ class Bend:
     def slope(self) -> float:
         """The largest local stretch or rotation of the bend, as a fraction; from 1 on it may fold."""
         # Linear in u and v the gradient of a quadratic bend is largest in a corner; that of creep at an end.
-        gradient = np.array(self._gradient(*self._grid(2 if self._degree == 2 else 33)))
+        gradient = np.array(self._gradient(*self._grid(2 if self.degree == 2 else 33)))
         return float(np.linalg.norm(np.moveaxis(gradient, (0, 1), (-2, -1)), ord=2, axis=(-2, -1)).max())
 
     def _grid(self, count: int) -> np.ndarray:
@@ -114,10 +114,11 @@ class Bend:
     @property
     def kind(self) -> str:
         """``quadratic`` or ``creep``."""
-        return "quadratic" if self._degree == 2 else "creep"
+        return "quadratic" if self.degree == 2 else "creep"
 
     @property
-    def _degree(self) -> int:
+    def degree(self) -> int:
+        """Of the polynomial: 2, or 6 for creep."""
         return 2 if self.amount.shape[1] == _QUADRATIC_TERMS else CREEP_DEGREE
 
     def unit(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -129,7 +130,7 @@ class Bend:
         u, v = self.unit(x, y)
         by_u = [2 * u, v, np.zeros_like(v)]
         by_v = [np.zeros_like(u), u, 2 * v]
-        for k in range(3, self._degree + 1):
+        for k in range(3, self.degree + 1):
             slope = np.polynomial.legendre.Legendre.basis(k).deriv()
             by_u += [slope(u), np.zeros_like(v)]
             by_v += [np.zeros_like(u), slope(v)]

@@ -12,11 +12,10 @@ import numpy as np
 
 from litho_data.register.bend import CREEP_DEGREE, Bend, fit_bent_affine
 from litho_data.register.geometry import apply_transform, warped_grid
-from litho_data.register.pyramid import SMALLEST_LEVEL_PX, FineFit, smoothed
+from litho_data.register.pyramid import FineFit, reduced_levels
 from litho_data.register.refine import BORDER_PX, refine
-from litho_data.register.topography import fill_gaps, predicted_topography, quadratic_basis
+from litho_data.register.topography import fill_gaps, quadratic_basis
 
-_LEVELS = (4, 2)
 # Every second pixel of the layout in both directions places the print as well as all of them.
 _EVERY = 2
 _ITERATIONS = 12
@@ -44,13 +43,8 @@ def refine_with_creep(
     """
     straight_line = straight.refinement.layout_to_scan, Bend.none_yet((scan.shape[0], scan.shape[1]))
     crept = straight_line
-    for factor in _LEVELS:
-        if min(*layout_level.shape, *scan.shape) < factor * SMALLEST_LEVEL_PX:
-            continue
-        small = _Images(
-            smoothed(scan, factor)[::factor, ::factor],
-            predicted_topography(layout_level, 1.5 * factor)[::factor, ::factor],
-        )
+    for factor, small_scan, small_topography in reduced_levels(scan, layout_level):
+        small = _Images(small_scan, small_topography)
         scale = np.diag([1.0 / factor, 1.0 / factor, 1.0])
         shrunk = scale @ crept[0] @ np.linalg.inv(scale), crept[1].scaled(1 / factor)
         found = small.fit(*shrunk, slow, small.everywhere)

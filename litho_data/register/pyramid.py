@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,7 +57,7 @@ def refine_pyramid(
     low_model: Model = "affine" if model == "homography" else model
     coarse = project_to_model(start, low_model, (layout_level.shape[0], layout_level.shape[1]))
     matrix, _ = _from_coarse_to_fine(scan, layout_level, coarse, low_model, None)
-    smooth_scan = smoothed(scan, SCAN_BLUR_PX)
+    smooth_scan = _smooth(scan, SCAN_BLUR_PX)
     blur_px = match_blur(smooth_scan, layout_level, matrix)
     topography = predicted_topography(layout_level, blur_px)
     refinement = refine(smooth_scan, topography, matrix, model, tolerance_px=tolerance_px)
@@ -107,12 +108,7 @@ def _from_coarse_to_fine(
     scan: np.ndarray, layout_level: np.ndarray, matrix: np.ndarray, model: Model, bend: Bend | None
 ) -> tuple[np.ndarray, Bend | None]:
     """Warp and bend, refined at a quarter and at half resolution."""
-    for factor in LEVELS:
-        if min(*layout_level.shape, *scan.shape) < factor * SMALLEST_LEVEL_PX:
-            continue
-        # The extra blur widens the basin of convergence to the few pixels by which a coarse fit may be off.
-        small_scan = smoothed(scan, factor)[::factor, ::factor]
-        small_topography = predicted_topography(layout_level, 1.5 * factor)[::factor, ::factor]
+    for factor, small_scan, small_topography in reduced_levels(scan, layout_level):
         scale = np.diag([1.0 / factor, 1.0 / factor, 1.0])
         found = refine(
             small_scan,
@@ -126,6 +122,18 @@ def _from_coarse_to_fine(
             matrix = np.linalg.inv(scale) @ found.layout_to_scan @ scale
             bend = None if found.bend is None else found.bend.scaled(factor)
     return matrix, bend
+
+
+def reduced_levels(
+    scan: np.ndarray, layout_level: np.ndarray
+) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    """Factor, scan and predicted topography at a quarter and at half resolution, where enough is left."""
+    for factor in LEVELS:
+        if min(*layout_level.shape, *scan.shape) < factor * SMALLEST_LEVEL_PX:
+            continue
+        # The extra blur widens the basin of convergence to the few pixels by which a coarse fit may be off.
+        small_scan = _smooth(scan, factor)[::factor, ::factor]
+        yield factor, small_scan, predicted_topography(layout_level, 1.5 * factor)[::factor, ::factor]
 
 
 def match_blur(
@@ -178,6 +186,6 @@ def _about(linear: np.ndarray, point: np.ndarray, image: np.ndarray) -> np.ndarr
     return matrix
 
 
-def smoothed(scan: np.ndarray, sigma_px: float) -> np.ndarray:
+def _smooth(scan: np.ndarray, sigma_px: float) -> np.ndarray:
     """Smoothed where measured: what fills a gap comes from its surroundings and is no evidence."""
     return np.where(np.isfinite(scan), smooth_measured(scan, sigma_px), np.nan)

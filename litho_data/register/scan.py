@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from litho_data.foundation.errors import InputError
-from litho_data.register.bend import CREEP_DEGREE, Bend, fit_bent_affine
+from litho_data.register.bend import Bend, fit_bent_affine
 from litho_data.register.coarse import SEARCH_BLUR_PX, CoarseFit, find_coarse
 from litho_data.register.creep import refine_with_creep
 from litho_data.register.defects import refine_around_defects, without_defects
@@ -127,7 +127,9 @@ def register_scan(
         return straight
     found = [straight] if straight.quality.passed else []
     if blocks.bends_along(slow) and (crept := refine_with_creep(oriented, layout, fine, slow)):
-        found = [one for one in (case.registration(coarse, crept)[0],) if one.quality.passed] or found
+        with_creep, _ = case.registration(coarse, crept)
+        if with_creep.quality.passed:
+            found = [with_creep]
     if not straight.quality.passed:
         bent, _ = case.registration(coarse, refine_bent(oriented, layout, fine))
         found += [bent] if _explains(bent.quality, straight.quality) else []
@@ -199,8 +201,9 @@ class _Case:
         oriented = apply_transform(to_oriented @ np.linalg.inv(frame), points_um)
         to_layout = frame @ np.linalg.inv(found.layout_to_scan)
         images_um = apply_transform(to_layout, found.bend.straighten(oriented))
-        degree = 2 if found.bend.kind == "quadratic" else CREEP_DEGREE
-        scan_to_layout, bend_um = fit_bent_affine(points_um, images_um, size_um / 2, size_um / 2, degree)
+        scan_to_layout, bend_um = fit_bent_affine(
+            points_um, images_um, size_um / 2, size_um / 2, found.bend.degree
+        )
         # Rounded like the matrix: no digits below physical meaning.
         bend_um = replace(bend_um, amount=np.round(bend_um.amount, 6) + 0.0)
         return np.linalg.inv(scan_to_layout), bend_um

@@ -72,11 +72,16 @@ def _level(entry: dict[str, Any], height_um: np.ndarray, mask: np.ndarray, pitch
 
 
 def _inputs(oracles: Path, entry: dict[str, Any]) -> tuple[np.ndarray, np.ndarray, tuple, np.ndarray]:
-    field = np.load(oracles / "gwyddion" / entry["input"])
+    result_um = np.load(oracles / "gwyddion" / entry["file"])["result"] * 1e6
+    return *_field(oracles, entry["input"]), result_um
+
+
+def _field(oracles: Path, name: str) -> tuple[np.ndarray, np.ndarray, tuple]:
+    """Heights in µm, mask and pitch (y, x) in µm."""
+    field = np.load(oracles / "gwyddion" / name)
     ny, nx = field["z"].shape
     pitch_um = (float(field["yreal"]) * 1e6 / ny, float(field["xreal"]) * 1e6 / nx)
-    result_um = np.load(oracles / "gwyddion" / entry["file"])["result"] * 1e6
-    return field["z"] * 1e6, field["mask"] > 0, pitch_um, result_um
+    return field["z"] * 1e6, field["mask"] > 0, pitch_um
 
 
 @pytest.mark.parametrize("entry", _vectors(), ids=lambda entry: Path(entry["file"]).stem)
@@ -101,11 +106,7 @@ def test_vector(oracles: Path, entry: dict[str, Any]) -> None:
 @pytest.mark.parametrize("masking", ["ignore", "exclude", "include"])
 @pytest.mark.parametrize("name", SAMPLED)
 def test_sampled_rows_of_a_phantom(oracles: Path, name: str, masking: str) -> None:
-    field = {"input": "synA__input.npz", "file": "synA__input.npz"}
-    with np.load(oracles / "gwyddion" / field["input"]) as stored:
-        height_um, mask = stored["z"] * 1e6, stored["mask"] > 0
-        ny, nx = height_um.shape
-        pitch_um = (float(stored["yreal"]) * 1e6 / ny, float(stored["xreal"]) * 1e6 / nx)
+    height_um, mask, pitch_um = _field(oracles, "synA__input.npz")
     if (name, masking) == ("tmeandiff20", "include"):
         pytest.skip("Gwyddion's difference methods find no pixel of an inclusion mask: see test_vector")
     _compare_samples(oracles, f"synA__rows_{name}_{masking}", name, height_um, pitch_um, mask, masking)
