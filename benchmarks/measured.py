@@ -100,9 +100,10 @@ def main() -> None:
         shutil.copyfile(runs / source, FOLDER / name)
     draw_steps(FOLDER / "close_loop_errors.csv", FOLDER / "loop_steps.png")
     draw_prediction(runs / "store.zarr", runs / "benchmark", FOLDER / "prediction.jpg")
+    written = texts(FOLDER)
     for page, names in PAGES.items():
         for name in names:
-            publish(page, name, texts(FOLDER)[name])
+            publish(page, name, written[name])
 
 
 if __name__ == "__main__":

@@ -17,8 +17,9 @@ from litho_models.noise.result import NoiseAnalysis
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.parent.name)
 def test_the_page_quotes_the_committed_results(page):
+    written = texts(FOLDER)
     for name in PAGES[page]:
-        assert published(page, name) == texts(FOLDER)[name]
+        assert published(page, name) == written[name]
 
 
 def test_the_page_on_training_quotes_the_committed_runs():

@@ -18,7 +18,7 @@ from litho_models.loop.probes import Probed, probe_residual, with_intervals
 from litho_models.loop.probes.defects import find_defects
 from litho_models.loop.probes.kernel import off_centre_peak, resampled
 from litho_models.loop.probes.places import drawn, drawn_profile
-from litho_models.loop.probes.selection import _anchor, _corrected
+from litho_models.loop.probes.selection import GENERIC, _anchor, _corrected, generic_terms
 from litho_models.loop.probes.tables import SPOT_UM
 from litho_models.loop.probes.trend import order_trends
 from litho_models.loop.report.plots import probe_figure
@@ -86,6 +86,14 @@ def test_a_correction_moves_no_offset_gain_tilt_or_bow_that_all_scans_share() ->
 
 
 @pytest.mark.slow
+def test_every_probe_is_found_under_its_name() -> None:
+    scans, predictions = scene()
+    defects = find_defects(scans, predictions)
+    assert [probe.name for probe in generic_terms(scans, predictions, defects)] == list(GENERIC)
+    for name in ("missing-kernel", "row-gain-profile"):
+        assert [probe.name for probe in generic_terms(scans, predictions, defects, [name])] == [name]
+
+
 def test_nothing_is_taken_where_nothing_is_missing() -> None:
     found = probed(*scene())
     assert found.added == []

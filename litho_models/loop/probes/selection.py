@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -87,9 +88,8 @@ def probe_residual(state: State, study: Study, terms: Terms) -> Probed:
     tests: dict[str, ProbeTest] = {}
     while True:
         taken = {entry.probe.name for entry in added}
-        candidates = [
-            p for p in generic_terms(study.scans, state.predictions, defects) if p.name not in taken
-        ]
+        open_names = [name for name in GENERIC if name not in taken]
+        candidates = list(generic_terms(study.scans, state.predictions, defects, open_names))
         found = _best(candidates, state, study, terms, tests)
         if found is None:
             break
@@ -99,21 +99,53 @@ def probe_residual(state: State, study: Study, terms: Terms) -> Probed:
 
 
 def generic_terms(
-    scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray], defects: Defects
-) -> list[Probe]:
-    """All probes, measured on the residual of these held-out predictions."""
-    kept = [~mask.reshape(-1)[scan.sample] for mask, scan in zip(defects.masks, scans, strict=True)]
-    others = [make(scans, predictions, kept) for make in (level_table, order_shapes)]
-    places: list[Probe] = []
-    for times in (False, True):
-        places.append(position_map(scans, predictions, kept, times_height=times))
-        places += [
-            profile(scans, predictions, kept, along=along, times_height=times) for along in ("row", "column")
-        ]
-    kernel = missing_kernel(scans, predictions, defects.masks)
-    shapes = [make(scans, predictions, kept) for make in (slope_table, axis_slope_table, shape_powers)]
-    far = displaced_copy(scans, predictions, defects.masks)
-    return [*shapes, *places, kernel, *(probe for probe in (*others, far) if probe is not None)]
+    scans: Sequence[PreparedScan],
+    predictions: Sequence[np.ndarray],
+    defects: Defects,
+    names: Iterable[str] | None = None,
+) -> Iterator[Probe]:
+    """Probes, one by one, measured on the residual of these held-out predictions.
+
+    Args:
+        names: those wanted, of ``GENERIC``; all by default. One that these scans do not allow is left out.
+    """
+    for name in GENERIC if names is None else names:
+        probe = GENERIC[name](scans, predictions, defects.masks)
+        if probe is not None:
+            yield probe
+
+
+# Scans, predictions (y, x) µm and masks of defects (y, x) to a probe, or None if they do not allow one.
+Maker = Callable[[Sequence[PreparedScan], Sequence[np.ndarray], Sequence[np.ndarray]], Probe | None]
+
+
+def _on_samples(make: Callable[..., Probe | None], **settings: Any) -> Maker:
+    """A maker that is told which of the sampled pixels lie in no defect."""
+
+    def made(
+        scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray], masks: Sequence[np.ndarray]
+    ) -> Probe | None:
+        kept = [~mask.reshape(-1)[scan.sample] for mask, scan in zip(masks, scans, strict=True)]
+        return make(scans, predictions, kept, **settings)
+
+    return made
+
+
+GENERIC: dict[str, Maker] = {
+    "slope-table": _on_samples(slope_table),
+    "axis-slope-table": _on_samples(axis_slope_table),
+    "shape-powers": _on_samples(shape_powers),
+    "position-map": _on_samples(position_map, times_height=False),
+    "row-profile": _on_samples(profile, along="row", times_height=False),
+    "column-profile": _on_samples(profile, along="column", times_height=False),
+    "position-gain-map": _on_samples(position_map, times_height=True),
+    "row-gain-profile": _on_samples(profile, along="row", times_height=True),
+    "column-gain-profile": _on_samples(profile, along="column", times_height=True),
+    "missing-kernel": missing_kernel,
+    "level-table": _on_samples(level_table),
+    "order-shapes": _on_samples(order_shapes),
+    "displaced-copy": displaced_copy,
+}
 
 
 def _best(
@@ -162,9 +194,8 @@ def with_generic_terms(state: State, study: Study, names: Sequence[str]) -> Stat
     """The state with generic terms of these names, estimated one after another on what is left, unjudged."""
     defects = find_defects(study.scans, state.predictions)
     for name in names:
-        for probe in generic_terms(study.scans, state.predictions, defects):
-            if probe.name == name:
-                state = _with_probe(state, study, probe, probe.held_out(study.fold_of))
+        for probe in generic_terms(study.scans, state.predictions, defects, [name]):
+            state = _with_probe(state, study, probe, probe.held_out(study.fold_of))
     return state
 
 

@@ -83,18 +83,8 @@ def shape_powers(
     scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray], kept: Sequence[np.ndarray]
 ) -> LinearProbe:
     """Powers and products of height and slopes of the predicted print; no table over one follows them."""
-    return linear_probe(
-        "shape-powers",
-        _power_columns,
-        np.eye(len(_POWERS)),
-        lambda random, count: random.permutation(count),
-        lambda heights: {
-            name: (float(height) * NM_PER_UM, "nm") for name, height in zip(_POWERS, heights, strict=True)
-        },
-        scans,
-        predictions,
-        kept,
-    )
+    penalty = np.eye(len(_POWERS))
+    return _heights("shape-powers", _POWERS, _power_columns, penalty, scans, predictions, kept)
 
 
 def order_shapes(
@@ -107,18 +97,8 @@ def order_shapes(
     if len({scan.context.order for scan in scans}) < FEWEST_ORDERS:
         return None
     names = [f"{shape} {over}" for over in _OVER_ORDER for shape in _DRIFTING]
-    return linear_probe(
-        "order-shapes",
-        _order_columns,
-        np.eye(len(names)),
-        lambda random, count: random.permutation(count),
-        lambda heights: {
-            name: (float(height) * NM_PER_UM, "nm") for name, height in zip(names, heights, strict=True)
-        },
-        scans,
-        predictions,
-        kept,
-    )
+    penalty = np.eye(len(names))
+    return _heights("order-shapes", names, _order_columns, penalty, scans, predictions, kept)
 
 
 def _table(
@@ -132,10 +112,24 @@ def _table(
 ) -> LinearProbe:
     """One height per entry along an ordered covariate, or several of as many entries; bends kept small."""
     bends = np.kron(np.eye(blocks), second_differences(len(entries) // blocks))
+    penalty = bends + 1e-3 * np.eye(len(entries))
+    return _heights(name, entries, columns_of, penalty, scans, predictions, kept)
+
+
+def _heights(
+    name: str,
+    entries: Sequence[str],
+    columns_of: ColumnsOf,
+    penalty: np.ndarray,
+    scans: Sequence[PreparedScan],
+    predictions: Sequence[np.ndarray],
+    kept: Sequence[np.ndarray],
+) -> LinearProbe:
+    """One height per entry, in nm for people; the control permutes the entries of each scan."""
     return linear_probe(
         name,
         columns_of,
-        bends + 1e-3 * np.eye(len(entries)),
+        penalty,
         lambda random, count: random.permutation(count),
         lambda heights: {
             entry: (float(height) * NM_PER_UM, "nm") for entry, height in zip(entries, heights, strict=True)

@@ -16,6 +16,7 @@ from scipy.ndimage import gaussian_filter
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.linear import ALL_FREE, without_scan_terms
 from litho_models.loop.probes.defects import find_defects
+from litho_models.loop.probes.probe import Estimate, Probe
 from litho_models.loop.probes.selection import generic_terms
 from litho_models.loop.study import State, Study
 from litho_models.scan_terms import Terms
@@ -39,12 +40,7 @@ def generic_rival(before: State, after: State, study: Study) -> str | None:
     own = freed_changes(before, changes, study)
     defects = find_defects(study.scans, before.predictions)
     for probe in generic_terms(study.scans, before.predictions, defects):
-        estimate = probe.held_out(study.fold_of)
-        corrections = [
-            probe.correction(estimate.per_fold[fold], scan, prediction)
-            for scan, prediction, fold in zip(study.scans, before.predictions, study.fold_of, strict=True)
-        ]
-        generic = freed_changes(before, corrections, study)
+        generic = freed_corrections(probe, probe.held_out(study.fold_of), before, study)
         if gains_nm2(generic).mean() > _BETTER * gains_nm2(own).mean() and _is_contained(own, generic):
             return probe.name
     return None
@@ -104,6 +100,15 @@ def gains_nm2(freed: Sequence[np.ndarray]) -> np.ndarray:
         (2 * change @ residual - change @ change) / len(change) for change, residual in (c.T for c in freed)
     ]
     return np.array(gains) * NM_PER_UM**2
+
+
+def freed_corrections(probe: Probe, estimate: Estimate, state: State, study: Study) -> list[np.ndarray]:
+    """What a generic term adds to each scan by the fit that has not seen it, as ``freed_changes``."""
+    corrections = [
+        probe.correction(estimate.per_fold[fold], scan, prediction)
+        for scan, prediction, fold in zip(study.scans, state.predictions, study.fold_of, strict=True)
+    ]
+    return freed_changes(state, corrections, study)
 
 
 def freed_changes(

@@ -13,7 +13,7 @@ from litho_models.loop.explainable import Learner
 from litho_models.loop.probes.defects import find_defects
 from litho_models.loop.probes.selection import generic_terms
 from litho_models.loop.screening.directions import PROJECTIONS
-from litho_models.loop.selection.rivals import freed_changes, gains_nm2
+from litho_models.loop.selection.rivals import freed_changes, freed_corrections, gains_nm2
 from litho_models.loop.selection.search import EffectSets, Search
 from litho_models.loop.study import State, Study
 from litho_models.scan_terms import Terms
@@ -81,14 +81,10 @@ def weigh(without: State, final: State, study: Study, learner: Learner, terms: T
         for probe in generic_terms(study.scans, without.predictions, defects)
     ]
     probe, estimate = max(estimates, key=lambda one: one[1].mean_gain_nm2)
-    in_its_place = [
-        probe.correction(estimate.per_fold[fold], scan, prediction)
-        for scan, prediction, fold in zip(study.scans, without.predictions, study.fold_of, strict=True)
-    ]
     added = [new - old for old, new in zip(without.predictions, final.predictions, strict=True)]
     own = gains_nm2(freed_changes(without, added, study, terms))
     # Probes are estimated free of every scan's gain and bow: what they carry of these means nothing.
-    other = gains_nm2(freed_changes(without, in_its_place, study))
+    other = gains_nm2(freed_corrections(probe, estimate, without, study))
     return Weight(
         gain_nm2=float(own.mean()),
         probe=probe.name,
