@@ -24,10 +24,13 @@ from litho_data.roughness.levelling_bias import (
 from litho_data.roughness.noise import NoiseSplit, PrintRoughness, print_roughness, split_noise
 from litho_data.roughness.spectrum import Spectrum, psd_along, psd_radial
 from litho_data.roughness.step_height import StepHeight, groove_depth, stair_steps
+from litho_data.roughness.texture import LineDirection, LinePeriod, line_direction, line_period
 
 __all__ = [
     "AmplitudeParameters",
     "ArealParameters",
+    "LineDirection",
+    "LinePeriod",
     "NoiseSplit",
     "PrintRoughness",
     "Spectrum",
@@ -42,6 +45,8 @@ __all__ = [
     "gaussian_correlation",
     "groove_depth",
     "high_pass",
+    "line_direction",
+    "line_period",
     "low_pass",
     "print_roughness",
     "psd_along",

@@ -6,11 +6,15 @@ rough the places are where the layout is flat, so that a model has little to get
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
+from litho_data.roughness.texture import FEWEST_LINES
 from litho_models.noise.residuals import Residuals
+from litho_models.noise.texture import Texture, texture
 from litho_models.noise.variance import layout_slope
 from litho_models.scan_terms import POLICIES, cross_fit
 from litho_models.scoring.noise_floor import NoiseFloor, estimated_floor
@@ -37,12 +41,14 @@ class NoiseBudget(Record):
     """What the prints say about their own noise; both parts are upper estimates.
 
     ``flat_levels`` are of the pixels whose layout slope is at most ``flat_slope``, the flattest quarter.
+    ``flat_texture`` is of the same pixels of all scans, freed of policy ``full``: lines are left in.
     """
 
     model: str
     floor: NoiseFloor
     flat_slope: float
     flat_levels: list[FlatLevel]
+    flat_texture: Texture | None = None
 
 
 def noise_budget(found: Residuals, seed: int = 0) -> NoiseBudget:
@@ -78,7 +84,19 @@ def noise_budget(found: Residuals, seed: int = 0) -> NoiseBudget:
         )
     return NoiseBudget(
         model=found.model,
+        flat_texture=_flat_texture(found, slopes, limit),
         floor=estimated_floor(found.model, found.scans, found.maps_um, blocks, seed),
         flat_slope=limit,
         flat_levels=rows,
     )
+
+
+def _flat_texture(found: Residuals, slopes: Sequence[np.ndarray], limit: float) -> Texture | None:
+    """Texture of the residuals where the layout is flat, in its frame; None for small fields."""
+    flats = []
+    for scan, expected, slope in zip(found.scans, found.maps_um, slopes, strict=True):
+        if min(scan.shape) < FEWEST_LINES:
+            return None
+        fit = cross_fit(scan.height_um, expected, scan.valid, POLICIES["full"], found.protocol.blocks)
+        flats.append(np.where(slope <= limit, fit.residual_um, np.nan))
+    return texture(f"residuals of {found.model}", flats, found.scans[0].pitch_um)

@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from litho_data.foundation.results import Record
+from litho_data.roughness.texture import FEWEST_LINES
 from litho_data.store import Store
 from litho_models.noise.staircase import StepPrint, step_print
 from litho_models.noise.surface import (
@@ -19,7 +20,11 @@ from litho_models.noise.surface import (
     pooled,
     print_noise,
     surface_noise,
+    without_background,
 )
+from litho_models.noise.texture import Texture, texture
+
+_SQUARE_WITHIN = 0.01
 
 
 @dataclass(frozen=True)
@@ -33,12 +38,16 @@ class Reference:
 
 
 class ReferencePrints(Record):
-    """What the reference scans say: roughness of each surface, of the print alone, and the steps."""
+    """What the reference scans say: roughness of each surface, of the print alone, and the steps.
+
+    ``textures`` are of substrates and flat prints on square pixels, freed of a polynomial of second degree.
+    """
 
     substrates: list[SurfaceNoise] = Field(default_factory=list)
     flats: list[SurfaceNoise] = Field(default_factory=list)
     print_noise: list[PrintNoise] = Field(default_factory=list)
     steps: list[StepPrint] = Field(default_factory=list)
+    textures: list[Texture] = Field(default_factory=list)
 
 
 def store_references(store: Store) -> list[Reference]:
@@ -77,7 +86,20 @@ def reference_prints(references: Sequence[Reference], level_height_um: float) ->
         for one in references
         if one.use == "steps"
     ]
-    return ReferencePrints(substrates=substrates, flats=flats, print_noise=alone, steps=steps)
+    textures = [
+        texture(one.id, [without_background(one.height_um, "quadratic")], one.pitch_um[1])
+        for one in references
+        if one.use in ("substrate", "flat") and _has_texture(one)
+    ]
+    return ReferencePrints(
+        substrates=substrates, flats=flats, print_noise=alone, steps=steps, textures=textures
+    )
+
+
+def _has_texture(one: Reference) -> bool:
+    """Enough lines, on square pixels."""
+    pitch_y_um, pitch_x_um = one.pitch_um
+    return min(one.height_um.shape) >= FEWEST_LINES and abs(pitch_y_um / pitch_x_um - 1) < _SQUARE_WITHIN
 
 
 def _recorded_pitches(store: Store) -> dict[str, tuple[float, float]]:

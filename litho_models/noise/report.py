@@ -13,6 +13,7 @@ from litho_models.noise.budget import NoiseBudget
 from litho_models.noise.calibration import SpreadAnalysis
 from litho_models.noise.dose import DoseMatrix
 from litho_models.noise.staircase import StepPrint
+from litho_models.noise.texture import Texture
 
 if TYPE_CHECKING:
     from litho_models.noise.references import Reference
@@ -70,8 +71,33 @@ def _references(page: Page, result: NoiseAnalysis, references: Sequence[Referenc
             "What the print adds to substrate and microscope, in quadrature.",
             "print_noise.csv",
         )
+    for one in found.textures:
+        _texture(page, one)
     for step in found.steps:
         _steps(page, step)
+
+
+def _texture(page: Page, found: Texture) -> None:
+    import pandas as pd
+
+    page.paragraph(f"Texture of {found.id}: {found.verdict}.")
+    rows = [
+        {
+            "lines_along": one.along,
+            "share_of_variance": one.share,
+            **(one.period.model_dump() if one.period else {}),
+        }
+        for one in found.lines
+    ]
+    page.table(
+        pd.DataFrame(rows),
+        f"Strength of the direction {found.strength:.2f}: 0 where all directions are alike (chance of as "
+        f"much: {found.isotropic_p:.1g}), 1 for lines of one direction. Share: of the variance, in the means "
+        "of the lines along each axis; of their squares, in the strongest period. p: chance of such a peak "
+        "in a smooth spectrum. Coherence: 1 if the surfaces have one phase.",
+        f"texture_{found.id.replace(' ', '_')}.csv",
+        digits=3,
+    )
 
 
 def _steps(page: Page, found: StepPrint) -> None:
@@ -227,6 +253,8 @@ def _budget(page: Page, found: NoiseBudget) -> None:
         "bow, gain and line offsets of each scan are free.",
         "flat_levels.csv",
     )
+    if found.flat_texture is not None:
+        _texture(page, found.flat_texture)
 
 
 def _shape(freedom: float | None) -> str:

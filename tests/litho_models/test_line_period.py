@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from litho_models.loop.prepared import PreparedScan, prepare_scans
-from litho_models.loop.single_scans.line_period import line_period
+from litho_models.loop.single_scans.line_period import period_of_lines
 from tests.litho_models.loop_scans import printed_scans
 
 SIZE_PX = 160
@@ -30,7 +30,7 @@ def striped(
 
 def test_a_hum_is_found_with_its_period() -> None:
     scans, clean = striped(1, hum_um=0.004)
-    found = line_period(scans, clean, [scan.line for scan in scans])
+    found = period_of_lines(scans, clean, [scan.line for scan in scans])
     assert found is not None
     # A bin of the spectrum is 1.3 µm · 1.3 / 16 = 0.1 µm wide; its centre of mass is known better.
     assert found.period_um == pytest.approx(1.3, abs=0.05)
@@ -41,4 +41,4 @@ def test_a_hum_is_found_with_its_period() -> None:
 @pytest.mark.parametrize("seed", range(4))
 def test_random_lines_have_no_period(seed: int) -> None:
     scans, clean = striped(seed, hum_um=0.0)
-    assert line_period(scans, clean, [scan.line for scan in scans]) is None
+    assert period_of_lines(scans, clean, [scan.line for scan in scans]) is None

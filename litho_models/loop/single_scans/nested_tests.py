@@ -12,11 +12,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from litho_data.foundation.units import NM_PER_UM
+from litho_data.roughness import LinePeriod
 from litho_models.effects import Effect, get_effect
 from litho_models.effects.effect import Role
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.selection.confirming import BINOMIAL_P, Confirmation, confirm_variance
-from litho_models.loop.single_scans.line_period import LinePeriod, line_period
+from litho_models.loop.single_scans.line_period import period_of_lines
 from litho_models.loop.study import Score, Study
 from litho_models.scan_terms import (
     SCAN_TERMS,
@@ -168,7 +169,7 @@ def _test_lines(
         interval = bootstrap_interval(variance.tolist(), seed=study.seed)
         low, high = (float(np.sqrt(end)) for end in interval)
         term = line_terms(terms_of_effect(name))[0]
-        period = line_period(study.scans, predictions, [_lines(term, scan) for scan in study.scans])
+        period = period_of_lines(study.scans, predictions, [_lines(term, scan) for scan in study.scans])
         tests.append(
             MeasurementTest(
                 effect=get_effect(name),

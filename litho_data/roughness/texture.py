@@ -1,0 +1,160 @@
+"""Whether a surface has lines: in which direction, and whether they repeat."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import digamma, polygamma
+from scipy.stats import gamma, norm
+
+from litho_data.foundation.errors import InputError
+
+FEWEST_LINES = 64
+# A peak is compared with the frequencies around it, beyond its own width under a Hann window.
+_AROUND = 16
+_OWN = 3
+# Powers k = 0, 1, 2 frequencies apart are correlated by 1, 4/9, 1/36 under a Hann window: share that is free.
+_INDEPENDENT = 1 / (1 + 2 * 4 / 9 + 2 / 36)
+_QUANTILES = norm.ppf((np.arange(200) + 0.5) / 200)
+# The slowest frequencies are what levelling leaves of a bow.
+_FIRST = 3
+
+
+@dataclass(frozen=True)
+class LineDirection:
+    """Direction of the lines of a surface.
+
+    Args:
+        angle_deg: of the lines against the rows, from -90 (excluded) to 90; 0: along x, positive from x to y.
+        strength: length of the mean double-angle vector of the power spectrum; 0 for a surface alike in
+            all directions, 1 for lines of one direction.
+        p: chance of this strength in a surface alike in all directions (Rayleigh's test).
+    """
+
+    angle_deg: float
+    strength: float
+    p: float
+
+
+@dataclass(frozen=True)
+class LinePeriod:
+    """The strongest period of lines.
+
+    Args:
+        period_um: centre of the strongest peak over its surroundings.
+        share: of the squared means of the lines that is in the peak.
+        p: chance of such a peak anywhere in a spectrum that is smooth.
+        amplitude_um: root mean square over the surfaces of the amplitude at this period.
+        coherence: length of the mean of the surfaces' unit phasors at this period; 1 if all have one phase,
+            about 1 / √F if F surfaces have phases of their own.
+    """
+
+    period_um: float
+    share: float
+    p: float
+    amplitude_um: float
+    coherence: float
+
+
+def line_direction(heights_um: Sequence[np.ndarray]) -> LineDirection:
+    """Direction in which surfaces of one kind change least, from their power spectra.
+
+    Each frequency (fx, fy) counts with its power at twice its angle, each surface by its own variance. Random
+    surfaces have independent exponential powers, so the mean vector of one that is alike in all directions
+    is normal with variance 1 / n, where n = (Σ P)² / Σ P² counts the free frequencies.
+
+    Args:
+        heights_um: (ny, nx) µm on square pixels, levelled; NaN counts as the mean.
+
+    Raises:
+        InputError: fewer than 64 rows or columns.
+    """
+    vectors, variances = zip(*(_mean_vector(height) for height in heights_um), strict=True)
+    vector, variance = np.mean(vectors), np.mean(variances) / len(heights_um)
+    # The power lies across the lines.
+    across = 0.5 * float(np.degrees(np.angle(vector)))
+    return LineDirection(
+        angle_deg=across - 90 if across > 0 else across + 90,
+        strength=float(np.abs(vector)),
+        p=float(np.exp(-(np.abs(vector) ** 2) / variance)),
+    )
+
+
+def _mean_vector(height_um: np.ndarray) -> tuple[complex, float]:
+    """Mean double-angle vector of the power of a surface, and its variance if all directions are alike."""
+    height = np.asarray(height_um, np.float64)
+    if height.ndim != 2 or min(height.shape) < FEWEST_LINES:
+        raise InputError("surface", got=height.shape, wanted=f"at least {FEWEST_LINES} rows and columns")
+    finite = np.isfinite(height)
+    height = np.where(finite, height - height[finite].mean(), 0.0)
+    ny, nx = height.shape
+    weight = np.outer(np.hanning(ny + 2)[1:-1], np.hanning(nx + 2)[1:-1])
+    power = np.abs(np.fft.fft2((height - (height * weight).sum() / weight.sum()) * weight)) ** 2
+    fy, fx = np.meshgrid(np.fft.fftfreq(ny), np.fft.fftfreq(nx), indexing="ij")
+    radius = np.hypot(fx, fy)
+    # Beyond the Nyquist frequency of an axis the square has corners only, in four directions.
+    used = (radius >= _FIRST / min(ny, nx)) & (radius < 0.5)
+    power, angle = power[used], np.arctan2(fy, fx)[used]
+    total = power.sum()
+    if total == 0:
+        return 0j, 1.0
+    variance = (power**2).sum() / total**2 / _INDEPENDENT**2
+    return complex((power * np.exp(2j * angle)).sum() / total), float(variance)
+
+
+def line_period(means_um: Sequence[np.ndarray], pitch_um: float) -> LinePeriod | None:
+    """The strongest period that the means of lines have in common, over all scans; None below 64 lines.
+
+    The mean periodogram of F scans over its level is distributed as Gamma(F) / F where lines are random. The
+    level is a parabola through the logarithms of the frequencies around, whose uncertainty is integrated
+    over; the largest of all frequencies counts by Bonferroni.
+
+    Args:
+        means_um: mean height of each line, one array for each scan; the shortest decides on the length.
+        pitch_um: distance of lines.
+    """
+    count, scans = min(len(own) for own in means_um), len(means_um)
+    if count < FEWEST_LINES:
+        return None
+    taper = np.hanning(count)
+    spectra = np.stack(
+        [np.abs(np.fft.rfft(taper * (own[:count] - own[:count].mean()))) ** 2 for own in means_um]
+    )
+    # Scans differ in roughness: each counts by its own level.
+    floor = np.finfo(float).tiny
+    spectra = (spectra / np.maximum(np.median(spectra, axis=1, keepdims=True), floor))[:, _FIRST:]
+    power = np.maximum(spectra.mean(axis=0), floor)
+    level, chance = _against_surroundings(power, scans)
+    peak = int(np.argmin(chance))
+    near = slice(max(0, peak - 2), peak + 3)
+    centre = float(np.average(np.arange(len(power))[near] + _FIRST, weights=power[near]))
+    share = np.maximum(power[near] - level[near], 0).sum() / power.sum()
+    waves = taper * np.exp(-2j * np.pi * centre * np.arange(count) / count) * 2 / taper.sum()
+    amplitudes = np.array([waves @ (own[:count] - own[:count].mean()) for own in means_um])
+    sizes = np.maximum(np.abs(amplitudes), floor)
+    return LinePeriod(
+        period_um=count * pitch_um / centre,
+        share=float(share),
+        p=min(1.0, len(power) * float(chance[peak])),
+        amplitude_um=float(np.sqrt(np.mean(sizes**2))),
+        coherence=float(np.abs((amplitudes / sizes).mean())),
+    )
+
+
+def _against_surroundings(power: np.ndarray, scans: int) -> tuple[np.ndarray, np.ndarray]:
+    """Level of each frequency from those around it, and the chance that it lies so far above."""
+    position = np.arange(len(power))
+    logarithm = np.log(power) - digamma(scans) + np.log(scans)
+    level, chance = np.empty(len(power)), np.empty(len(power))
+    for at in position:
+        apart = position - at
+        around = (np.abs(apart) <= _AROUND) & (np.abs(apart) > _OWN)
+        basis = np.vander(apart[around] / _AROUND, 3, increasing=True)
+        inverse = np.linalg.pinv(basis)
+        fitted = inverse[0] @ logarithm[around]
+        variance = polygamma(1, scans) * (inverse[0] @ inverse[0]) / _INDEPENDENT
+        ratio = power[at] / np.exp(fitted - np.sqrt(variance) * _QUANTILES)
+        level[at], chance[at] = np.exp(fitted), gamma.sf(scans * ratio, scans).mean()
+    return level, chance

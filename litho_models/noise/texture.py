@@ -1,0 +1,130 @@
+"""What the roughness of flat surfaces looks like: lines or not, in which direction, periodic or not.
+
+The paper calls the roughness of its flat print line-shaped and not periodic (arXiv:2309.17343).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from litho_data.foundation.results import Record
+from litho_data.foundation.units import NM_PER_UM
+from litho_data.roughness import LinePeriod, line_direction, line_period
+
+RARE = 1e-3
+
+
+class Period(Record):
+    """A period of lines.
+
+    Args:
+        period_um: distance at which lines repeat.
+        share: of the squares of the lines' means.
+        p: chance of such a peak anywhere in a smooth spectrum.
+        amplitude_nm: root mean square over the surfaces.
+        coherence: 1 if the surfaces have one phase, in the frame that they are given in.
+        coherence_p: chance of as much for surfaces with phases of their own (Rayleigh's test); None for one.
+    """
+
+    period_um: float
+    share: float
+    p: float
+    amplitude_nm: float
+    coherence: float
+    coherence_p: float | None
+
+
+class Lines(Record):
+    """Lines along one axis.
+
+    Args:
+        along: ``x`` (rows) or ``y`` (columns).
+        share: of the variance of the surface that is in the means of the lines. A surface without lines has
+            a share too: compare the two axes.
+        period: the strongest of these means; None below 64 lines.
+    """
+
+    along: str
+    share: float
+    period: Period | None
+
+
+class Texture(Record):
+    """Texture of surfaces of one kind.
+
+    Args:
+        angle_deg: direction of the lines, 0 along x, positive from x to y.
+        strength: 0 where all directions are alike, 1 for lines of one direction; ``isotropic_p`` the chance
+            of this strength in a surface alike in all directions.
+        lines: along x and along y.
+    """
+
+    id: str
+    surfaces: int
+    angle_deg: float
+    strength: float
+    isotropic_p: float
+    lines: list[Lines]
+
+    @property
+    def verdict(self) -> str:
+        """In words: directed or not, periodic or not, at a chance of 1 in 1,000."""
+        directed = (
+            f"line-shaped, along {self.angle_deg:.0f}° from x" if self.isotropic_p < RARE else "no direction"
+        )
+        periods = [
+            f"period of {one.period.period_um:.3g} µm across lines along {one.along} "
+            f"(amplitude {one.period.amplitude_nm:.1f} nm, {100 * one.period.share:.0f} % of their squares)"
+            for one in self.lines
+            if one.period is not None and one.period.p < RARE
+        ]
+        return f"{directed}; {', '.join(periods) or 'not periodic'}"
+
+
+def texture(name: str, heights_um: Sequence[np.ndarray], pitch_um: float) -> Texture:
+    """Texture of levelled surfaces, (ny, nx) µm each on square pixels; NaN is left out.
+
+    Raises:
+        InputError: a surface of fewer than 64 rows or columns.
+    """
+    direction = line_direction(heights_um)
+    return Texture(
+        id=name,
+        surfaces=len(heights_um),
+        angle_deg=direction.angle_deg,
+        strength=direction.strength,
+        isotropic_p=direction.p,
+        lines=[_lines(heights_um, pitch_um, along) for along in ("x", "y")],
+    )
+
+
+def _lines(heights_um: Sequence[np.ndarray], pitch_um: float, along: str) -> Lines:
+    axis = 1 if along == "x" else 0
+    means = [_line_means(np.asarray(height, np.float64) - np.nanmean(height), axis) for height in heights_um]
+    variances = [float(np.nanvar(height)) for height in heights_um]
+    shares = [own.var() / all_of_it for own, all_of_it in zip(means, variances, strict=True) if all_of_it > 0]
+    found = line_period(means, pitch_um)
+    return Lines(
+        along=along,
+        share=float(np.mean(shares)) if shares else 0.0,
+        period=None if found is None else _period(found, len(means)),
+    )
+
+
+def _period(found: LinePeriod, surfaces: int) -> Period:
+    return Period(
+        period_um=found.period_um,
+        share=found.share,
+        p=found.p,
+        amplitude_nm=NM_PER_UM * found.amplitude_um,
+        coherence=found.coherence,
+        coherence_p=float(np.exp(-surfaces * found.coherence**2)) if surfaces > 1 else None,
+    )
+
+
+def _line_means(height_um: np.ndarray, axis: int) -> np.ndarray:
+    """Mean of each line; one without a measured pixel counts as the mean of all."""
+    measured = np.isfinite(height_um)
+    return np.where(measured, height_um, 0).sum(axis=axis) / np.maximum(measured.sum(axis=axis), 1)
