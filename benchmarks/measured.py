@@ -27,6 +27,7 @@ from benchmarks.measured_models import (
     noise_table,
     paired_table,
     paper_table,
+    texture_table,
 )
 from benchmarks.record import publish
 from examples.demo import PAPER_SEEDS, SMALL_BASES
@@ -54,7 +55,7 @@ NAMES = ("benchmark", "paper split", "loop", "loop with PBL", "locked scans", "d
 PAGES = {
     ROOT / "README.md": ("headline",),
     FOLDER / "README.md": (*NAMES, "equal freedom", "whole prints", "paired differences", "further figures"),
-    ROOT / "docs" / "noise.md": ("noise", "coverage"),
+    ROOT / "docs" / "noise.md": ("noise", "texture", "coverage"),
 }
 
 
@@ -78,6 +79,10 @@ def texts(folder: Path) -> dict[str, str]:
         "paired differences": paired_table(benchmark),
         "further figures": further_table(benchmark),
         "noise": noise_table(found("noise.json")),
+        "texture": texture_table(
+            [found("noise.json")["budget"]["flat_texture"]],
+            "Residuals where the layout is flattest, of 20 scans, each freed of offset, gain, tilt and bow.",
+        ),
         "coverage": coverage_table(found("noise.json")),
         "loop": loop_table(found("close_loop.json")),
         "loop with PBL": loop_table(found("close_loop_pbl.json"), found("close_loop.json")),

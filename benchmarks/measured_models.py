@@ -261,6 +261,39 @@ def noise_table(noise: dict[str, Any]) -> str:
     return f"{by_terms}\n\n{by_level}"
 
 
+def texture_table(textures: Sequence[dict[str, Any]], *notes: str) -> str:
+    """Direction and strongest period of the roughness, one row an axis."""
+    rows = []
+    for one in textures:
+        for lines in one["lines"]:
+            period = lines["period"]
+            rows.append(
+                (
+                    one["id"],
+                    str(one["surfaces"]),
+                    f"{one['angle_deg']:.1f}°, strength {one['strength']:.2f} (p = {one['isotropic_p']:.0e})",
+                    f"along {lines['along']}: {100 * lines['share']:.0f} %",
+                    f"{period['period_um']:.3g} µm, {period['amplitude_nm']:.1f} nm, "
+                    f"{100 * period['share']:.0f} %",
+                    f"{period['p']:.2g}",
+                    "" if period["coherence_p"] is None else f"{period['coherence']:.2f}",
+                )
+            )
+    return markdown_table(
+        (
+            "surface",
+            "maps",
+            "lines lie at",
+            "variance in means of lines",
+            "strongest period, amplitude, share of the means' squares",
+            "its p",
+            "one phase",
+        ),
+        rows,
+        *notes,
+    )
+
+
 def coverage_table(noise: dict[str, Any]) -> str:
     """How many pixels lie within the stated intervals, over all and by level and slope."""
     spread = noise["spread"]
