@@ -4,8 +4,7 @@
     python -m benchmarks.paper_pairs pairs.zarr --publish
 
 The datum of a scan is not in its layout. After one affine map for all quadrants, the mean of a quadrant's
-residual is its datum, and |mean r| ≤ mean |r|: a model whose quadrants have these datums has at least the mean
-of their sizes as absolute error.
+residual is its datum, and |mean r| ≤ mean |r|: the mean size of the datums is the least absolute error.
 """
 
 from __future__ import annotations
@@ -81,7 +80,13 @@ def text(record: dict[str, Any]) -> str:
         for row in record["bounds"]
     ]
     return markdown_table(
-        ("quadrants", "datum, standard deviation", "mean size of the datum", "error of the map", "datum freed"),
+        (
+            "quadrants",
+            "datum, standard deviation",
+            "mean size of the datum",
+            "error of the map",
+            "datum freed",
+        ),
         rows,
         f"The published 8-bit pairs after one affine map of the layout, 95 % intervals over prints. "
         f"The paper states {PAPER_MAE_NM} nm.",
@@ -97,7 +102,9 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("store", type=Path, help="store of litho-data import-pairs")
-    parser.add_argument("--publish", action="store_true", help="write result and table into the documentation")
+    parser.add_argument(
+        "--publish", action="store_true", help="write result and table into the documentation"
+    )
     given = parser.parse_args()
     store = open_store(given.store)
     record = {"run": origin(), "bounds": [bound(store), bound(store, (WRONG_SCALE,))]}

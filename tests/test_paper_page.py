@@ -1,0 +1,85 @@
+"""The page on the paper: a row for everything that is numbered, and the bound that its command prints."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import paper_pairs
+from benchmarks.record import published
+from litho_data.store import PrintedScan
+
+PAGE = Path(__file__).parents[1] / "docs" / "paper.md"
+# Display equations of the text and of its appendix; figures and tables are told by a word of each.
+EQUATIONS = ["1, 2", "3", "4, 5, 6a–c", "7a, b", "8", "9a, b", "10", "A1, A2", "A3a, b", "A4", "A5", "A6"]
+FIGURES = """teaser, chained simulators, bilevel, design pipelines, anatomy, example of the data set, forward
+    prediction, hologram: measured, lens: PSF, micrographs, ΔSSIM, PSF profiles, aleatoric, laser power,
+    setup, approaches, parameters of PBL, profilometer"""
+
+
+class Fields:
+    """As much of a store as the bound reads."""
+
+    def __init__(self, scans: list[PrintedScan]):
+        self._scans = scans
+
+    def scans(self) -> list[PrintedScan]:
+        return self._scans
+
+
+def test_every_equation_figure_and_table_has_a_row() -> None:
+    rows = [line for line in PAGE.read_text(encoding="utf-8").splitlines() if line.startswith("| ")]
+    assert [name for name in EQUATIONS if not any(row.startswith(f"| {name} |") for row in rows)] == []
+    wanted = [" ".join(name.split()) for name in FIGURES.split(",")]
+    assert [name for name in wanted if not any(name in row.split("|")[1] for row in rows)] == []
+
+
+def test_tests_and_files_that_the_page_names_exist() -> None:
+    root = PAGE.parents[1]
+    text = PAGE.read_text(encoding="utf-8")
+    tests = "\n".join(path.read_text(encoding="utf-8") for path in (root / "tests").rglob("test_*.py"))
+    for name in re.findall(r"`(test_\w+)`", text):
+        assert f"def {name}(" in tests, name
+    for name in re.findall(r"`([\w/]+\.py)`", text):
+        assert (root / name).exists() or name in tests or list((root / "tests").rglob(Path(name).name)), name
+
+
+def test_the_page_quotes_the_committed_bound() -> None:
+    record = json.loads(paper_pairs.RESULT.read_text(encoding="utf-8"))
+    assert published(PAGE, paper_pairs.MARK) == paper_pairs.text(record)
+
+
+def test_the_bound_is_the_mean_size_of_the_planted_datums() -> None:
+    random = np.random.default_rng(0)
+    datums = 0.03 * random.choice([-1.0, 1.0], size=24)
+    # The map has an offset of its own: the datums have to be free of one.
+    datums -= datums.mean()
+    scans = []
+    for number, datum in enumerate(datums):
+        level = random.integers(0, 13, (32, 32), dtype=np.uint8)
+        height = 0.8 * 0.1 * level + 0.02 + datum + 0.01 * random.normal(size=level.shape)
+        scans.append(
+            PrintedScan(
+                id=f"FOV{number}",
+                print_id=str(number // 4),
+                order=number,
+                mask_level=level,
+                height_um=height.astype(np.float32),
+                valid=np.ones(level.shape, dtype=bool),
+                pitch_um=0.1,
+                level_height_um=0.1,
+                levels=13,
+                scan_to_layout=np.eye(3),
+            )
+        )
+    found = paper_pairs.bound(Fields(scans))  # type: ignore[arg-type]
+    # Mean of 256 pixels of 10 nm: 0.6 nm, far below the datums; a mean size of 96 of them to 0.2 nm.
+    assert found["datum_size"]["mean_nm"] == pytest.approx(1000 * np.abs(datums).mean(), abs=0.3)
+    assert found["gain"] == pytest.approx(0.8, abs=0.005)
+    assert found["affine_mae"]["mean_nm"] >= found["datum_size"]["mean_nm"]
+    # Gaussian of 10 nm: 0.798 of it.
+    assert found["affine_mae_datum_freed"]["mean_nm"] == pytest.approx(7.98, abs=0.2)
