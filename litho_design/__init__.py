@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING
 from litho_data.foundation.faces import lazy_face
 
 if TYPE_CHECKING:
+    from litho_design.elements.element import Element as Element
     from litho_design.exports.files import export as export
     from litho_design.exports.files import import_levels as import_levels
     from litho_design.holograms.settings import hologram_settings as hologram_settings
-    from litho_design.images.targets import load_target as load_target
     from litho_design.judging.loaded import load_design as load_design
     from litho_design.judging.measured import MeasuredSource as MeasuredSource
     from litho_design.judging.photographs import PhotoSource as PhotoSource
@@ -30,6 +30,7 @@ else:
     __getattr__, __dir__ = lazy_face(
         __name__,
         {
+            "Element": "litho_design.elements.element",
             "MeasuredSource": "litho_design.judging.measured",
             "PhotoSource": "litho_design.judging.photographs",
             "Task": "litho_design.tasks.task",
@@ -46,13 +47,13 @@ else:
             "lens_settings": "litho_design.lenses.settings",
             "load_design": "litho_design.judging.loaded",
             "load_printer": "litho_design.printers.source",
-            "load_target": "litho_design.images.targets",
             "register_task": "litho_design.tasks.task",
             "score": "litho_design.workflows.score",
         },
     )
 
 __all__ = [
+    "Element",
     "MeasuredSource",
     "PhotoSource",
     "Task",
@@ -70,7 +71,6 @@ __all__ = [
     "lens_settings",
     "load_design",
     "load_printer",
-    "load_target",
     "register_task",
     "score",
 ]

@@ -31,8 +31,8 @@ ROOMS = {
         "frozen", "scoring", "fitting", "evaluation", "noise", "loop", "cli",
     ),
     "litho_design": (
-        "optics", "images", "printers", "optimisation", "tasks", "holograms", "lenses", "reliefs", "judging",
-        "exports", "reports", "workflows", "cli",
+        "optics", "images", "printers", "optimisation", "elements", "tasks", "holograms", "lenses", "reliefs",
+        "judging", "exports", "reports", "workflows", "cli",
     ),
 }  # fmt: skip
 HEAVY = ("torch", "cv2", "xarray", "zarr", "matplotlib", "pandas", "skimage", "SurfaceTopography")

@@ -95,14 +95,21 @@ def element_field(
         amplitude = (aperture / math.sqrt(power)).to(phase).expand_as(phase)
     if optics.element == "thin":
         return torch.polar(amplitude, phase)
+    tilted = torch.polar(amplitude, phase - height_um * (2 * math.pi / optics.wave_height_um))
+    return through_relief(tilted, height_um, grid.pitch_um[0], optics)
+
+
+def through_relief(field: Tensor, height_um: Tensor, pitch_um: float, optics: Optics) -> Tensor:
+    """The wave behind a thick element in air lit by ``field`` (..., ny, nx), dark around it."""
+    import torch
+
     from litho_design.optics.thick_element import wave_through_relief
 
-    tilted = torch.polar(amplitude, phase - height_um * (2 * math.pi / optics.wave_height_um))
     # Dark beyond the borders, so that what leaves on one side does not come in on the other.
-    border = (math.ceil(_BORDER_UM / grid.pitch_um[0]),) * 4
-    dark = torch.nn.functional.pad(tilted, border)
+    border = (math.ceil(_BORDER_UM / pitch_um),) * 4
+    dark = torch.nn.functional.pad(field, border)
     relief = torch.nn.functional.pad(height_um - height_um.amin(), border)
-    wave = wave_through_relief(dark, relief, grid.pitch_um[0], optics.wavelength_um, 1 + optics.index_step)
+    wave = wave_through_relief(dark, relief, pitch_um, optics.wavelength_um, 1 + optics.index_step)
     return torch.nn.functional.pad(wave, [-one for one in border])
 
 

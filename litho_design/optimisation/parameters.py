@@ -101,9 +101,8 @@ class DirectLevels(nn.Module):
 
     def sample(self, temperature: float, hard: bool, seed: int) -> Tensor:
         """Levels on the pixels, float (1, 1, size, size); nothing here is random."""
-        level: Tensor = self.height
-        if hard:
-            level = level + (level.round() - level).detach()
+        kept = self._kept()
+        level = self.height + ((kept.round() if hard else kept) - self.height).detach()
         return self.cells(level)[None, None]
 
     @torch.no_grad()
@@ -113,7 +112,7 @@ class DirectLevels(nn.Module):
 
     def best_levels(self) -> Tensor:
         """The nearest level of each cell, int64 (*cells)."""
-        return self.height.detach().round().long()
+        return self._kept().detach().round().long()
 
     @torch.no_grad()
     def start_from(self, levels: Tensor, *, jitter_levels: float = 0.0, seed: int = 0) -> None:
@@ -125,6 +124,10 @@ class DirectLevels(nn.Module):
         """Uniform over the whole range."""
         generator = torch.Generator().manual_seed(seed)
         self.height.copy_(torch.rand(self.height.shape, generator=generator) * (self.levels - 1))
+
+    def _kept(self) -> Tensor:
+        """Heights within the range, which an optimiser that does not project may have left."""
+        return self.height.clamp(0, self.levels - 1)
 
 
 Parametrisation = GumbelLevels | DirectLevels

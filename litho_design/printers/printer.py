@@ -11,6 +11,7 @@ from typing import Any, Literal, cast
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
 
 from litho_data.foundation.results import Record
 from litho_design.printers.fab import FabSimulator
@@ -119,6 +120,25 @@ class Printer(nn.Module):
         """
         height_um = level * self.layout.level_height_um
         return self._inside(height_um, self.halo_px if halo_px is None else halo_px)
+
+    def print_in_tiles(self, level: Tensor, tile_px: int) -> Tensor:
+        """Printed height as by ``forward``, in tiles with their halo that are computed again for gradients.
+
+        Memory grows with ``tile_px`` instead of the element. The same as ``forward`` up to rounding for
+        models of finite reach; ``tiling_check`` measures the difference for others.
+        """
+        halo = self.halo_px
+        around = F.pad(level, (halo,) * 4)
+
+        def tile(top: int, left: int) -> Tensor:
+            bottom, right = (min(start + tile_px, self.layout.size_px) + 2 * halo for start in (top, left))
+            part = around[..., top:bottom, left:right]
+            if torch.is_grad_enabled():
+                return checkpoint(self.print_patch, part, use_reentrant=False)
+            return self.print_patch(part)
+
+        starts = range(0, self.layout.size_px, tile_px)
+        return torch.cat([torch.cat([tile(top, left) for left in starts], -1) for top in starts], -2)
 
     @torch.no_grad()
     def tiling_check(self, level: Tensor, tile_px: int = 256) -> TilingCheck | None:

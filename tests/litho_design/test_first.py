@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from litho_data.foundation.errors import InputError
-from litho_design import design_hologram, first, hologram_settings, load_target
-from litho_design.images.targets import stroke_width_px
+from litho_design import design_hologram, first, hologram_settings
+from litho_design.images.targets import load_target, stroke_width_px
 from litho_design.workflows.first import _SMALL
 
 TINY = {"layout.size_px": 64, "optics.distance_um": 12, "search.iterations": 2, "search.polish_rounds": 0}

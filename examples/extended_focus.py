@@ -1,0 +1,77 @@
+"""A lens with an extended depth of focus: its spot has to stay bright over a range of distances.
+
+    python examples/extended_focus.py zoo:pbl
+
+Rings as free cells; the loss is the brightness of the axis, worst plane first. A plain lens is the start.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import torch
+
+import litho_design
+from litho_data.foundation.commands import run_script
+from litho_design.optics import centred_grid, make_propagator
+
+WAVELENGTH_UM, PLANES = 0.6328, 9
+
+
+class Axis:
+    """Brightness of the central 0.5 µm in several planes, over that of a perfect lens at its focus."""
+
+    def __init__(self, element: litho_design.Element, focal_um: float, range_um: float):
+        size, pitch = element.layout.size_px, element.layout.pitch_um
+        grid, spot = centred_grid((size, size), pitch), centred_grid((6, 6), pitch)
+        optics = element.optics(WAVELENGTH_UM)
+        planes = (focal_um + range_um * torch.linspace(-0.5, 0.5, PLANES)).tolist()
+        self.propagators = [
+            make_propagator(grid, spot, optics.model_copy(update={"distance_um": z})) for z in planes
+        ]
+        y, x = torch.from_numpy(grid.y_um)[:, None], torch.from_numpy(grid.x_um)[None, :]
+        self.wave = (torch.hypot(y, x) < size * pitch / 2).to(torch.complex64)
+        path = focal_um - (y**2 + x**2 + focal_um**2).sqrt()
+        self.lens_phase = (2 * torch.pi / WAVELENGTH_UM * path).float()
+        focused = torch.polar(self.wave.abs(), self.lens_phase)
+        self.peak = self._light(self.propagators[PLANES // 2], focused)
+
+    def brightness(self, element: litho_design.Element) -> torch.Tensor:
+        """One number per plane (planes,)."""
+        behind = element(self.wave, WAVELENGTH_UM)
+        return torch.stack([self._light(go, behind) for go in self.propagators]) / self.peak
+
+    def _light(self, propagator: torch.nn.Module, wave: torch.Tensor) -> torch.Tensor:
+        return propagator(wave).abs().square().sum()
+
+
+def main() -> None:
+    """A plain lens, and lenses trained for a perfect printer and through a model, all as printed."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("model", help="folder of a frozen model, or zoo:NAME")
+    parser.add_argument("--size-px", type=int, default=320)
+    parser.add_argument("--focal-um", type=float, default=60)
+    parser.add_argument("--range-um", type=float, default=30)
+    parser.add_argument("--iterations", type=int, default=100)
+    words = parser.parse_args()
+    layout = {"size_px": words.size_px, "cell_um": 0.2, "symmetry": "radial"}
+    judge = litho_design.Element(words.model, layout)
+    axis = Axis(judge, words.focal_um, words.range_um)
+    for name, iterations in ((words.model, 0), ("none", words.iterations), (words.model, words.iterations)):
+        element = litho_design.Element(name, layout)
+        element.start_from_phase(axis.lens_phase, WAVELENGTH_UM)
+        optimiser = torch.optim.Adam(element.free.parameters(), lr=0.2)
+        for _ in range(iterations):
+            optimiser.zero_grad()
+            # A soft minimum: the dimmest planes weigh most.
+            torch.logsumexp(-3 * axis.brightness(element).log(), 0).backward()
+            optimiser.step()
+        judge.start_from_levels(element.levels())
+        with torch.no_grad():
+            seen = axis.brightness(judge)
+        what = f"designed with {name}" if iterations else "a plain lens"
+        print(f"{what}: brightness {float(seen.min()):.3f} to {float(seen.max()):.3f} as printed")
+
+
+if __name__ == "__main__":
+    run_script(main)

@@ -1,0 +1,160 @@
+"""A printed element as a differentiable module: levels through the printer, its height through a resin."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.settings import changed
+from litho_design.optics import Optics
+from litho_design.optics.materials import Resin, refractive_index
+from litho_design.optics.thin_element import ElementKind, through_relief
+from litho_design.optimisation.parameters import DirectLevels
+from litho_design.optimisation.phases import focusing_levels, printed_phase
+from litho_design.printers.layout import LayoutSettings
+from litho_design.printers.printer import Printer
+from litho_design.printers.source import Device, load_printer
+
+Index = Callable[[float], float]
+
+
+class Element(nn.Module):
+    """A printed element in a program of your own: ``element(field, wavelength_um)`` is the wave behind it.
+
+    Its only trainable parameters are the free levels, one per cell or ring. They are rounded and kept within
+    the layout's levels with a straight-through gradient, printed by a frozen model with its guard ring, and
+    their height becomes the phase 2 pi (n(wavelength) - surroundings) h / wavelength. So the wave is always
+    that of a layout that can be printed; ``whole = False`` leaves the levels real, for the first steps.
+
+    Args:
+        model: folder of a frozen model, ``zoo:NAME``, ``none`` for nominal heights, or a loaded printer.
+        layout: geometry and levels, or changes of the default ones, such as ``{"size_px": 256}``.
+        resin: name of a resin, or a function from the wavelength in µm to its refractive index.
+        surroundings: refractive index above the relief.
+        absorption_per_um: absorption of the resin, of the intensity, 1/µm.
+        kind: ``thin``, or ``thick`` for the wave propagation method through the relief, in air.
+        tile_px: elements larger than this are printed in tiles with their halo, which are computed again for
+            the gradient, so that memory grows with the tile and not with the element; None for one piece.
+        seed: of the random levels that it starts with.
+        device, extrapolate: as for ``load_printer``.
+
+    Raises:
+        InputError: what ``load_printer`` refuses, a printer without gradients, a resin of no higher index
+            than what surrounds it, tiles of a model that depends on the position, or a thick element that is
+            not in air.
+    """
+
+    def __init__(
+        self,
+        model: str | Path | Printer,
+        layout: LayoutSettings | Mapping[str, Any] | None = None,
+        *,
+        resin: Resin | Index = "ip-dip",
+        surroundings: float = 1.0,
+        absorption_per_um: float = 0.0,
+        kind: ElementKind = "thin",
+        tile_px: int | None = 1024,
+        seed: int = 0,
+        device: Device = "cpu",
+        extrapolate: bool = False,
+    ):
+        super().__init__()
+        if not isinstance(layout, LayoutSettings):
+            layout = changed(LayoutSettings(), dict(layout or {}))
+        self.layout, self.kind, self.tile_px = layout, kind, tile_px
+        self.printer = load_printer(model, layout, device=device, extrapolate=extrapolate)
+        self.surroundings, self.absorption_per_um = surroundings, absorption_per_um
+        self._index: Index = resin if callable(resin) else partial(refractive_index, resin)
+        self._check()
+        self.free = DirectLevels(layout).to(device)
+        self.free.start_random(seed)
+        self.whole = True
+
+    def forward(self, field: Tensor, wavelength_um: float, height_um: Tensor | None = None) -> Tensor:
+        """The wave behind the element lit by ``field``, complex (..., size, size).
+
+        Args:
+            field: the wave on the pixels of the layout, complex (..., size, size).
+            wavelength_um: in vacuum.
+            height_um: a known print (size, size) instead of that of the levels, such as a measured one.
+        """
+        height = self.height_um() if height_um is None else height_um
+        if self.kind == "thin":
+            return field * self.transmission(wavelength_um, height)
+        kept = (-0.5 * self.absorption_per_um * height).exp()
+        return through_relief(field * kept, height, self.layout.pitch_um, self.optics(wavelength_um))
+
+    def transmission(self, wavelength_um: float, height_um: Tensor | None = None) -> Tensor:
+        """Complex factor (size, size) of the thin element: exp(2 pi j (n - n0) h / wavelength - a h / 2)."""
+        height = self.height_um() if height_um is None else height_um
+        phase = height * (2 * math.pi / self.optics(wavelength_um).wave_height_um)
+        return torch.polar((-0.5 * self.absorption_per_um * height).exp(), phase)
+
+    def height_um(self) -> Tensor:
+        """Printed height (size, size), µm, with a gradient to the free levels."""
+        level = self.free.sample(1.0, self.whole, 0)
+        size, tile = self.layout.size_px, self.tile_px
+        if tile is None or size <= tile:
+            return self.printer(level)[0, 0]
+        return self.printer.print_in_tiles(level, tile)[0, 0]
+
+    def levels(self) -> np.ndarray:
+        """The layout to be printed, uint8 (size, size)."""
+        return self.free.cells(self.free.best_levels()).cpu().numpy().astype(np.uint8)
+
+    def optics(self, wavelength_um: float) -> Optics:
+        """Wavelength, index step and kind of the element there."""
+        index, around = self._index(wavelength_um), self.surroundings
+        if not index > around:
+            raise InputError("resin", got=f"an index of {index:g}", wanted=f"more than around it, {around:g}")
+        return Optics(wavelength_um=wavelength_um, index_step=index - around, element=self.kind)
+
+    def start_from_levels(self, levels: np.ndarray) -> None:
+        """Start from a layout (size, size), whole or real levels."""
+        pixels = torch.as_tensor(levels, dtype=torch.float32, device=self.free.height.device)
+        self.free.start_from(self.free.cells.average(pixels))
+
+    def start_from_phase(self, phase: Tensor, wavelength_um: float) -> None:
+        """Start from the levels that print a wanted phase (size, size), radian, up to a constant."""
+        printed = printed_phase(self.printer.level_heights_um(), self.optics(wavelength_um))
+        wave = self.free.cells.average(torch.polar(torch.ones_like(phase), phase).to(self.free.height.device))
+        self.free.start_from(focusing_levels(wave.angle().float(), printed.to(wave.device)).float())
+
+    def as_torchoptics(self, *, z: float = 0.0, offset: Any = None, unit_um: float = 1.0) -> Any:
+        """The same element for ``torchoptics`` (extra ``torchoptics``): a ``PolychromaticModulationElement``.
+
+        Args:
+            z, offset: place of the element, in the lengths of your program.
+            unit_um: one such length in µm: 1e6 where it counts in metres.
+
+        Raises:
+            InputError: torchoptics is not installed, or a thick element, which no factor describes.
+        """
+        try:
+            from litho_design.elements.in_torchoptics import PrintedElement
+        except ImportError:
+            raise InputError(
+                "element for torchoptics", got="no torchoptics", hint="install litholoop[torchoptics]"
+            ) from None
+        if self.kind != "thin":
+            raise InputError("element for torchoptics", got="a thick element", wanted="a thin one")
+        return PrintedElement(self, z=z, offset=offset, unit_um=unit_um)
+
+    def _check(self) -> None:
+        if self.printer.only_judges:
+            raise InputError("printer of an element", got="a virtual fab", wanted="a frozen model, or none")
+        if self.kind == "thick" and self.surroundings != 1:
+            raise InputError("thick element", got=f"surroundings of {self.surroundings:g}", wanted="air")
+        large = self.tile_px is not None and self.layout.size_px > self.tile_px
+        if large and self.printer.depends_on_position:
+            raise InputError(
+                "tile_px", got="a model whose print depends on the position", wanted="None: in one piece"
+            )

@@ -1,0 +1,29 @@
+"""A printed element among the elements of torchoptics; imported only where torchoptics is installed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor
+from torchoptics.elements import PolychromaticModulationElement
+from torchoptics.utils import wavelength_or_default
+
+
+class PrintedElement(PolychromaticModulationElement):
+    """An ``Element`` on a plane of torchoptics: fields of its shape and spacing are modulated by it.
+
+    Args:
+        element: the printed element, whose parameters become those of this module.
+        z, offset: as in torchoptics.
+        unit_um: the unit of length of torchoptics, µm.
+    """
+
+    def __init__(self, element: Any, *, z: float = 0.0, offset: Any = None, unit_um: float = 1.0):
+        size, pitch = element.layout.size_px, element.layout.pitch_um
+        # Fields fit where their spacing is equal to the last bit: 0.1 / 1e6 is not 1e-7.
+        super().__init__((size, size), z, float(f"{pitch / unit_um:.12g}"), offset)
+        self.element, self.unit_um = element, unit_um
+
+    def modulation_profile(self, wavelength: Any = None) -> Tensor:
+        """Complex transmission (size, size) at a wavelength, in the unit of torchoptics."""
+        return self.element.transmission(float(wavelength_or_default(wavelength)) * self.unit_um)

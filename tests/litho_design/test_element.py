@@ -1,0 +1,169 @@
+"""The printer as an optical element: its wave, its gradient, tiles, torchoptics, the examples."""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from litho_data.foundation.errors import InputError
+from litho_design import Element
+from litho_design.optics import centred_grid, element_field
+from litho_design.optics.materials import refractive_index
+from litho_design.printers.layout import LayoutSettings
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+LAYOUT = LayoutSettings(size_px=40, cell_um=0.2)
+
+
+@pytest.fixture
+def element(make_printer):
+    return Element(make_printer(LAYOUT), LAYOUT, seed=1)
+
+
+def test_the_wave_is_that_of_the_printed_levels(element, make_printer):
+    """Phase and amplitude by the closed form, of the layout that would be printed."""
+    levels = torch.from_numpy(element.levels())[None, None].float()
+    height = make_printer(LAYOUT)(levels)[0, 0]
+    assert torch.equal(element.height_um(), height)
+    wave = torch.randn(3, 40, 40, dtype=torch.complex64)
+    for um in (0.473, 0.6328):
+        expected = wave * torch.exp(2j * math.pi * (refractive_index("ip-dip", um) - 1) * height / um)
+        # A few waves of phase in float32.
+        assert (element(wave, um) - expected).abs().max() < 1e-5 * wave.abs().max()
+    dark = Element(
+        element.printer, LAYOUT, seed=1, absorption_per_um=0.3, resin=lambda um: 1.5, surroundings=1.33
+    )
+    kept = wave.abs().square() * (-0.3 * height).exp()
+    assert torch.allclose(dark(wave, 0.5).abs().square(), kept, rtol=1e-5)
+    assert dark.optics(0.5).index_step == pytest.approx(0.17)
+    known = torch.full((40, 40), 0.5 / 0.17)
+    # One wave.
+    assert dark.transmission(0.5, known).angle().abs().max() < 1e-5
+
+
+def test_a_thick_element_is_that_of_the_designs(make_printer):
+    thick = Element(make_printer(LAYOUT), LAYOUT, kind="thick", resin=lambda um: 1.548)
+    wave = torch.full((40, 40), 1 / math.sqrt(16), dtype=torch.complex64)
+    expected = element_field(thick.height_um(), centred_grid((40, 40), 0.1), thick.optics(0.6328))
+    assert (thick(wave, 0.6328) - expected).abs().max() < 1e-5
+
+
+def test_the_gradient_passes_straight_through_rounding_and_limits(element):
+    """Whole levels have the gradient that real ones have at the same place, and none leave the range."""
+
+    def slope():
+        (found,) = torch.autograd.grad(element.height_um().square().sum(), element.free.height)
+        return found
+
+    whole = slope()
+    with torch.no_grad():
+        element.free.height.round_()
+    element.whole = False
+    assert torch.allclose(whole, slope(), rtol=1e-5)
+    with torch.no_grad():
+        step, place = 0.25, (3, 5)
+        element.free.height[place] = 6
+    middle = slope()[place]
+    with torch.no_grad():
+        element.free.height[place] += step
+        above = element.height_um().square().sum()
+        element.free.height[place] -= 2 * step
+        below = element.height_um().square().sum()
+    # A square is its own central difference.
+    assert float((above - below) / (2 * step)) == pytest.approx(float(middle), rel=1e-3)
+    with torch.no_grad():
+        element.free.height[0, 0], element.free.height[0, 1] = 99.0, -7.0
+    element.whole = True
+    assert element.levels()[0, [0, 2]].tolist() == [12, 0]
+    assert slope()[0, 0] != 0
+
+
+def test_tiles_print_the_same_with_the_same_gradient(element):
+    def found(tile):
+        element.tile_px = tile
+        height = element.height_um()
+        (slope,) = torch.autograd.grad(height.square().sum(), element.free.height)
+        return height.detach(), slope
+
+    # 40 px in tiles of 16: the last ones are smaller. The blur reaches 8 px.
+    for one, other in zip(found(16), found(None), strict=True):
+        assert torch.allclose(one, other, rtol=1e-5, atol=1e-6)
+
+
+def test_it_starts_from_a_layout_or_a_phase(element):
+    levels = np.random.default_rng(0).integers(0, 13, (20, 20)).repeat(2, 0).repeat(2, 1)
+    element.start_from_levels(levels)
+    assert np.array_equal(element.levels(), levels)
+    # The wide printed level whose phase is nearest; printed levels are 0.62 x 0.1 µm apart.
+    element.start_from_phase(torch.full((40, 40), 1.0), 0.6328)
+    assert len(np.unique(element.levels())) == 1
+
+
+def test_two_sources_of_a_resin_agree():
+    """Cauchy of 2017 and Sellmeier of 2019 are 0.004 apart all over the visible: the same dispersion."""
+    um = np.linspace(0.45, 1.0, 24)
+    older, newer = (
+        np.array([refractive_index(name, one) for one in um]) for name in ("ip-dip", "ip-dip-2019")
+    )
+    assert np.abs(newer - older - 0.004).max() < 5e-4
+    assert refractive_index("ip-dip-2019", 0.6328) == pytest.approx(1.5494, abs=1e-4)
+
+
+def test_torchoptics_takes_it_as_its_own(element):
+    torchoptics = pytest.importorskip("torchoptics")
+    data = torch.randn(40, 40, dtype=torch.complex128)
+    field = torchoptics.Field(data, 532e-9, z=3e-6, spacing=0.1e-6)
+    placed = element.as_torchoptics(z=3e-6, unit_um=1e6)
+    assert (placed(field).data - element(data, 0.532)).abs().max() < 1e-5
+    system = torchoptics.System(placed)
+    seen = system.measure_at_z(field, 20e-6)
+    seen.intensity().sum().backward()
+    assert element.free.height.grad.abs().sum() > 0
+
+
+def test_what_cannot_be_an_element_is_refused(element, make_printer, monkeypatch):
+    printer = make_printer(LAYOUT)
+    with pytest.raises(InputError, match="wanted air"):
+        Element(printer, LAYOUT, kind="thick", surroundings=1.33)
+    with pytest.raises(InputError, match="resin"):
+        Element(printer, LAYOUT, resin="constant").optics(0.5)
+    with pytest.raises(InputError, match="thin one"):
+        Element(printer, LAYOUT, kind="thick").as_torchoptics()
+    printer.simulator.card = {"process_effects": {"edge-bead": {}}}
+    with pytest.raises(InputError, match="one piece"):
+        Element(printer, LAYOUT, tile_px=20)
+    monkeypatch.setitem(sys.modules, "torchoptics.elements", None)
+    monkeypatch.delitem(sys.modules, "litho_design.elements.in_torchoptics", raising=False)
+    with pytest.raises(InputError, match=r"litholoop\[torchoptics\]"):
+        element.as_torchoptics()
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "better"),
+    [
+        ("rgb_hologram", ["--distance-um", "6", "--iterations", "12"], min),
+        ("structured_light_4f", ["--focal-um", "20", "--waist-um", "1.5", "--iterations", "12"], max),
+        ("extended_focus", ["--focal-um", "10", "--range-um", "6", "--iterations", "8"], max),
+        ("microscope_phase_mask", ["--iterations", "6"], min),
+    ],
+)
+def test_examples_train_through_the_printer(monkeypatch, capsys, name, options, better):
+    """Judged by the printer, the element designed through it beats the one for a perfect printer."""
+    if name == "structured_light_4f":
+        pytest.importorskip("torchoptics")
+    spec = importlib.util.spec_from_file_location(name, EXAMPLES / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    monkeypatch.setattr(sys, "argv", [name, "zoo:physics", "--size-px", "48", *options])
+    module.main()
+    said = capsys.readouterr().out.splitlines()
+    figures = {line.split(":")[0]: float(re.search(r"[\d.]+", line.split(": ")[-1])[0]) for line in said}
+    perfect, through = (next(v for k, v in figures.items() if w in k) for w in ("none", "zoo"))
+    assert through == better(perfect, through) != perfect
