@@ -71,6 +71,10 @@ def score(
             help="Optics of the judges: thin, or thick (wave propagation method). As designed by default."
         ),
     ] = None,
+    task_file: Annotated[
+        Path | None,
+        typer.Option(help="Python file that registers the task of the design, one of your own; it is run."),
+    ] = None,
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
@@ -78,6 +82,7 @@ def score(
     from litho_design.judging.measured import MeasuredSource
     from litho_design.judging.photographs import PhotoSource
     from litho_design.reports.advice import baseline_line, headline
+    from litho_design.tasks.task import register_tasks_of
     from litho_design.workflows.score import score as score_design
 
     if not judge and scan is None and camera is None:
@@ -88,6 +93,8 @@ def score(
         )
     if camera is None and camera_object is not None:
         raise InputError("--camera-object", got="no --camera", wanted="the photograph of it")
+    if task_file is not None:
+        register_tasks_of(task_file)
     size = None if scan_size_um is None else (scan_size_um, scan_size_um)
     result = score_design(
         design,

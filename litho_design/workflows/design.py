@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from litho_design.lenses.objects import with_objects
 from litho_design.lenses.settings import LensSettings, lens_settings
 from litho_design.lenses.task import lens_task
 from litho_design.optimisation.settings import DesignSettings
+from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 from litho_design.printers.source import Device, load_printer, load_printers
 from litho_design.reliefs.settings import ReliefSettings, relief_settings
@@ -56,13 +57,12 @@ def design_hologram(
         InputError: a target of another size or without dark and bright pixels, a model that does not
             fit the layout, or a folder that holds another result.
     """
-    settings = settings or hologram_settings()
-    printer = load_printer(model, settings.layout, device=device, extrapolate=extrapolate)
-    others = load_printers(ensemble, settings.layout, device=device, extrapolate=extrapolate)
-    wanted = load_target(target, settings.layout.size_px)
-    task = HologramTask(settings, printer, wanted, list(others.values()))
+    made = settings or hologram_settings()
 
-    return run_design(task, out, write_design_report, announce=announce)
+    def task(printer: Printer, others: list[Printer]) -> Task:
+        return HologramTask(made, printer, load_target(target, made.layout.size_px), others)
+
+    return _designed(task, made.layout, out, announce, model, ensemble, device, extrapolate)
 
 
 def design_lens(
@@ -94,12 +94,13 @@ def design_lens(
         InputError: as for ``design_hologram``; a radial search of a layout without rings or with a
             square aperture; or objects that are not pictures.
     """
-    settings = settings or lens_settings()
-    printer = load_printer(model, settings.layout, device=device, extrapolate=extrapolate)
-    others = load_printers(ensemble, settings.layout, device=device, extrapolate=extrapolate)
-    settings, pictures = with_objects(settings, objects, held_out_objects)
-    task = lens_task(settings, printer, list(others.values()), pictures)
-    return run_design(task, out, write_design_report, announce=announce)
+    made = settings or lens_settings()
+
+    def task(printer: Printer, others: list[Printer]) -> Task:
+        imaging, pictures = with_objects(made, objects, held_out_objects)
+        return lens_task(imaging, printer, others, pictures)
+
+    return _designed(task, made.layout, out, announce, model, ensemble, device, extrapolate)
 
 
 def correct(
@@ -128,14 +129,13 @@ def correct(
     Raises:
         InputError: what ``load_relief`` refuses, or ``design_hologram`` of models and folders.
     """
-    settings = settings or relief_settings()
-    printer = load_printer(model, settings.layout, device=device, extrapolate=extrapolate)
-    others = load_printers(ensemble, settings.layout, device=device, extrapolate=extrapolate)
-    heights, record = load_relief(relief, settings.layout, settings.height_um)
-    task = ReliefTask(
-        settings, printer, inputs={"relief_um": heights}, ensemble=list(others.values()), record=record
-    )
-    return run_design(task, out, write_design_report, announce=announce)
+    made = settings or relief_settings()
+
+    def task(printer: Printer, others: list[Printer]) -> Task:
+        heights, record = load_relief(relief, made.layout, made.height_um)
+        return ReliefTask(made, printer, inputs={"relief_um": heights}, ensemble=others, record=record)
+
+    return _designed(task, made.layout, out, announce, model, ensemble, device, extrapolate)
 
 
 def design(
@@ -167,8 +167,25 @@ def design(
         InputError: a task that is not registered, or what ``design_hologram`` refuses of models and folders.
     """
     registered_task(task.name)
-    settings = settings or DesignSettings()
-    printer = load_printer(model, settings.layout, device=device, extrapolate=extrapolate)
-    others = load_printers(ensemble, settings.layout, device=device, extrapolate=extrapolate)
-    made = task(settings, printer, inputs=inputs, ensemble=list(others.values()))
-    return run_design(made, out, write_design_report, announce=announce)
+    made = settings or DesignSettings()
+
+    def of_kind(printer: Printer, others: list[Printer]) -> Task:
+        return task(made, printer, inputs=inputs, ensemble=others)
+
+    return _designed(of_kind, made.layout, out, announce, model, ensemble, device, extrapolate)
+
+
+def _designed(
+    make: Callable[[Printer, list[Printer]], Task],
+    layout: LayoutSettings,
+    out: str | Path,
+    announce: bool,
+    model: str | Path | Printer,
+    ensemble: Iterable[str | Printer],
+    device: Device,
+    extrapolate: bool,
+) -> Design:
+    """The design of a task, made when its printers are there: they are refused before a target is read."""
+    printer = load_printer(model, layout, device=device, extrapolate=extrapolate)
+    others = load_printers(ensemble, layout, device=device, extrapolate=extrapolate)
+    return run_design(make(printer, list(others.values())), out, write_design_report, announce=announce)

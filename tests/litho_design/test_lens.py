@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 from pydantic import ValidationError
+from scipy.signal import fftconvolve
 
 from litho_data.foundation.errors import InputError
+from litho_design.images.targets import draw_target
 from litho_design.judging.loaded import LoadedDesign
-from litho_design.lenses.bench import LensBench, RadialLensBench, centre_to_background
-from litho_design.lenses.score import half_maximum_width_um, lens_score
+from litho_design.lenses.bench import LensBench, RadialLensBench, centre_to_background, sensor_psf
+from litho_design.lenses.score import half_maximum_width_um, lens_score, score_lens
 from litho_design.lenses.settings import ImagingSettings, LensView, lens_settings
 from litho_design.lenses.task import lens_task
 from litho_design.optics import Optics, blaze_efficiency
@@ -124,6 +127,55 @@ def test_a_printer_that_knows_the_position_is_asked_for_the_whole_plane(settings
     ratio = centre_to_background(task.bench(printer(level)[0, 0]), centre_px, 300)
     assert float(task.objective(level)[0]) == pytest.approx(-math.log(float(ratio)), rel=1e-6)
     assert printer.tiling_check(level, tile_px=64) is None
+
+
+def test_errors_of_a_computational_lens_by_independent_code(settings):
+    """Print, PSF, sensor image and Richardson-Lucy once more, in NumPy and SciPy and float64."""
+    computational = settings.model_copy(update={"task": "computational"})
+    imaging, n, window, z, wavelength = computational.imaging, 300, 128, 100.0, 0.6328
+    bench = LensBench(LAYOUT, OPTICS, settings.view)
+    rough = torch.randn(n, n, generator=torch.Generator().manual_seed(0)) * 0.1
+    heights = [bench.ideal_height_um() + part * rough for part in (1.0, 0.5)]
+    found = score_lens(computational, bench, heights[0], heights[1])
+
+    # First Rayleigh-Sommerfeld integral, summed directly over the aperture.
+    x = (np.arange(n) - (n - 1) / 2) * 0.1
+    inside = np.hypot(x[:, None], x[None, :]) < 15
+    apart = (np.arange(n + window - 1) - (n + window - 2) / 2) * 0.1
+    r = np.sqrt(apart[:, None] ** 2 + apart[None, :] ** 2 + z**2)
+    k = 2 * np.pi / wavelength
+    kernel = z / (2 * np.pi * r**2) * (1 / r - 1j * k) * np.exp(1j * k * r) * 0.01
+    psfs = []
+    for height in heights:
+        wave = inside * np.exp(1j * k * 0.548 * height.double().numpy())
+        seen = np.abs(fftconvolve(wave, kernel, "full")[n - 1 : n - 1 + window, n - 1 : n - 1 + window]) ** 2
+        # Sensor pixels of two pixels, an odd number of them around the axis.
+        part = (seen / inside.sum())[1:-1, 1:-1]
+        psfs.append(part.reshape(63, 2, 63, 2).sum((1, 3)))
+    ours = sensor_psf(bench(heights[0]), imaging.pixel_px)
+    assert np.abs(ours.numpy() - psfs[0]).max() < 1e-5 * psfs[0].max()
+
+    errors: dict[str, list[float]] = {"direct": [], "design": [], "calibrated": []}
+    objects = [np.pad(draw_target(name, 36).astype(float), 6) for name in imaging.test_objects]
+    for seed in (1000, 1001, 1002):
+        noise = torch.randn(2, 48, 48, generator=torch.Generator().manual_seed(seed)).double().numpy()
+        for truth, grain in zip(objects, noise, strict=True):
+            image = fftconvolve(truth, psfs[0], "same") + imaging.read_noise * grain
+            scale = (image * truth).sum() / (image**2).sum()
+            errors["direct"].append(np.abs(scale * image - truth).mean())
+            for name, psf in (("design", psfs[1]), ("calibrated", psfs[0])):
+                seen, mirrored = image.clip(1e-8), psf[::-1, ::-1]
+                weight = fftconvolve(np.ones_like(image), mirrored, "same")
+                estimate = np.full_like(image, seen.sum() / weight.sum())
+                for _ in range(imaging.iterations):
+                    ratio = seen / fftconvolve(estimate, psf, "same").clip(1e-8)
+                    estimate *= fftconvolve(ratio, mirrored, "same").clip(0) / weight
+                errors[name].append(np.abs(estimate - truth).mean())
+    for name, values in errors.items():
+        # float32 in ours, through ten divisions by dark images.
+        assert getattr(found, f"mae_{name}") == pytest.approx(np.mean(values), rel=1e-4), name
+    # Another PSF leaves another error, by far more than the tolerance.
+    assert found.mae_design != pytest.approx(found.mae_calibrated, rel=0.01)
 
 
 def test_light_thrown_out_of_the_window_counts_as_background():

@@ -12,10 +12,13 @@ import torch
 
 from litho_data.foundation.errors import InputError
 from litho_design import Task, compare, design, design_settings, load_design, register_task, score
+from litho_design.cli.app import main
 from litho_design.judging.gap import GapResult
 from litho_design.optics import Optics, RSPropagator, centred_grid
 from litho_design.printers.printer import Printer
+from litho_design.tasks import task as task_module
 from litho_design.tasks.bench import ElementBench
+from litho_design.tasks.task import register_tasks_of
 
 ROOT = Path(__file__).parents[2]
 TINY = {
@@ -63,6 +66,38 @@ def test_the_example_designs_compares_exports_and_scores(tmp_path):
     assert np.load(place / "image_share.npy").shape == (9, 64, 64)
     with pytest.raises(InputError, match=r"colours-in-planes.*register_task"):
         load_design(place)
+
+
+def test_the_command_scores_a_design_of_an_own_task(tmp_path, monkeypatch, capsys, refused):
+    """``--task-file`` runs the file with its task; without it, and with another file, the command says so."""
+    file, out = tmp_path / "far_corner.py", tmp_path / "design"
+    file.write_text(
+        "import litho_design\n@litho_design.register_task\nclass FarCorner(litho_design.Task):\n"
+        "    name = 'far-corner'\n"
+        "    def loss(self, seen): return 1 - seen[0, 16:, 16:].sum()\n"
+        "    def figures(self, seen): return {'corner': float(seen[0, 16:, 16:].sum())}\n"
+    )
+    known = dict(task_module._TASKS)
+    monkeypatch.setattr(task_module, "_TASKS", known)
+    register_tasks_of(file)
+    settings = design_settings(
+        TINY
+        | {"layout.size_px": 32, "search.iterations": 1, "search.polish_rounds": 0, "window.yield_draws": 2}
+    )
+    made = design(known["far-corner"], "none", out, settings=settings, announce=False)
+    del known["far-corner"]
+    words = ["score", out, "--judge", "none", "--out", tmp_path / "score"]
+    assert "--task-file" in refused(*words)
+    empty = tmp_path / "empty.py"
+    empty.write_text("")
+    assert "no task" in refused(*words, "--task-file", empty)
+    empty.write_text("1 / 0")
+    assert "ZeroDivisionError" in refused(*words, "--task-file", empty)
+    monkeypatch.setattr(sys, "argv", ["litho-design", *map(str, words), "--task-file", str(file)])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 0
+    assert f"corner {made.predicted['corner']:.4f}" in capsys.readouterr().out
 
 
 def test_search_improves_an_own_loss_and_resumes_only_the_same_task(tmp_path):
