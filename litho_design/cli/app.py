@@ -132,6 +132,9 @@ def export(
     gds_layers: Annotated[
         Literal["cumulative", "exclusive"], typer.Option(help="Layer k is level >= k, or level == k.")
     ] = "cumulative",
+    marks: Annotated[
+        bool, typer.Option("--marks", help="Also print an F (orientation) and a flat witness beside it.")
+    ] = False,
 ) -> None:
     """Write the layout for the printer, with the sidecar that gives it heights and size."""
     from litho_design.exports.files import export as export_design
@@ -145,6 +148,7 @@ def export(
         slicing_um=slicing_um,
         hatching_um=hatching_um,
         gds_layers=gds_layers,
+        marks=marks,
     )
     print(file)
     print(sidecar_path(file))

@@ -13,6 +13,7 @@ from litho_data.foundation.files import writable
 from litho_data.foundation.outputs import require_replaceable_folder
 from litho_design.exports.gds import GdsLayers, read_gds_levels, write_gds
 from litho_design.exports.image import read_image_levels, write_bmp, write_png16, write_tiff
+from litho_design.exports.marks import Marks, with_marks
 from litho_design.exports.sidecar import Format, Sidecar, make_sidecar, read_sidecar, sidecar_path
 from litho_design.exports.stl import read_stl_levels, write_stl
 from litho_design.judging.loaded import LoadedDesign
@@ -30,6 +31,7 @@ def export(
     slicing_um: float = 0.1,
     hatching_um: float = 0.1,
     gds_layers: GdsLayers = "cumulative",
+    marks: bool = False,
 ) -> Path:
     """Write the layout of a design for the printer, and ``<file>.json`` beside it.
 
@@ -41,13 +43,14 @@ def export(
         out: folder of the export; exports of the same layout in other formats stay in it.
         pedestal_um: base under level 0; part of the solid in STL, a note to the operator in other formats.
         slicing_um, hatching_um: settings of the print job, recorded in the sidecar.
+        marks: also a mark of orientation and a flat witness beside the element (see ``with_marks``).
 
     Returns:
         Path of the exported file.
 
     Raises:
-        InputError: an incomplete design, a format that cannot hold it, job settings below zero, or a
-            folder that holds something else.
+        InputError: an incomplete design, a format that cannot hold it, job settings below zero, an element
+            too small for marks, or a folder that holds something else.
     """
     if format not in _SUFFIX:
         raise InputError("format", got=repr(format), wanted=", ".join(_SUFFIX))
@@ -59,7 +62,11 @@ def export(
             raise InputError(setting, got=f"{value:g} µm", wanted="a positive length")
     folder = design.folder if isinstance(design, LoadedDesign) else Path(design)
     record = Design.read(folder)
-    levels = read_array(folder, LEVELS_FILE)
+    levels = written = read_array(folder, LEVELS_FILE)
+    found: Marks | None = None
+    if marks:
+        guard_um, heights = record.printer.guard_um, record.stroke.printed_height_um
+        written, found = with_marks(levels, record.layout, guard_um, heights)
     name = f"layout{_SUFFIX[format]}"
     require_replaceable_folder(out, "layout*")
     place = Path(out)
@@ -68,10 +75,11 @@ def export(
         place.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix="layout.", suffix=".partial", dir=place) as temporary:
         file = Path(temporary) / name
-        step = _write(file, format, levels, record, pedestal_um, gds_layers)
+        step = _write(file, format, written, record, pedestal_um, gds_layers, found)
         sidecar = make_sidecar(
             folder, record, file, format, pedestal_um=pedestal_um, slicing_um=slicing_um,
             hatching_um=hatching_um, grey_per_level=step, gds_layers=gds_layers if format == "gds" else None,
+            shape_px=written.shape, marks=found,
         )  # fmt: skip
         sidecar.write(temporary).rename(sidecar_path(file))
         back, _ = import_levels(file)
@@ -84,25 +92,34 @@ def export(
 
 
 def import_levels(file: str | Path) -> tuple[np.ndarray, Sidecar]:
-    """The level map of an exported file, uint8 (ny, nx), row 0 on top, and its sidecar.
+    """The level map of an element from its exported file, uint8 (ny, nx), row 0 on top, and its sidecar.
 
     Raises:
         InputError: no sidecar, or a file that was changed.
     """
     path = Path(file)
     sidecar = read_sidecar(path)
+    levels = _read(path, sidecar)
+    if sidecar.marks is not None:
+        top, bottom, left, right = sidecar.marks.element_px
+        levels = levels[top:bottom, left:right].copy()
+    return levels, sidecar
+
+
+def _read(path: Path, sidecar: Sidecar) -> np.ndarray:
+    """The whole map of a file, marks included."""
     if sidecar.format == "stl":
         cell_px = _cell_px(sidecar)
         shape = (sidecar.shape_px[0] // cell_px, sidecar.shape_px[1] // cell_px)
         cells = read_stl_levels(
             path, shape, cell_px * sidecar.pitch_um, sidecar.level_height_um, sidecar.pedestal_um
         )
-        return cells.repeat(cell_px, 0).repeat(cell_px, 1), sidecar
+        return cells.repeat(cell_px, 0).repeat(cell_px, 1)
     if sidecar.format == "gds":
         assert sidecar.gds_layers is not None
-        return read_gds_levels(path, sidecar.shape_px, sidecar.pitch_um, sidecar.gds_layers), sidecar
+        return read_gds_levels(path, sidecar.shape_px, sidecar.pitch_um, sidecar.gds_layers)
     assert sidecar.grey_per_level is not None
-    return read_image_levels(path, sidecar.grey_per_level), sidecar
+    return read_image_levels(path, sidecar.grey_per_level)
 
 
 def _require_same_layout(place: Path, name: str, layout_sha256: str) -> None:
@@ -114,7 +131,13 @@ def _require_same_layout(place: Path, name: str, layout_sha256: str) -> None:
 
 
 def _write(
-    file: Path, kind: Format, levels: np.ndarray, design: Design, pedestal_um: float, gds_layers: GdsLayers
+    file: Path,
+    kind: Format,
+    levels: np.ndarray,
+    design: Design,
+    pedestal_um: float,
+    gds_layers: GdsLayers,
+    marks: Marks | None,
 ) -> int | None:
     layout = design.layout
     if kind == "stl":
@@ -123,7 +146,8 @@ def _write(
         write_stl(file, cells, cell_px * layout.pitch_um, layout.level_height_um, pedestal_um)
         return None
     if kind == "gds":
-        write_gds(file, levels, layout.pitch_um, gds_layers)
+        parts = None if marks is None else marks.parts()
+        write_gds(file, levels, layout.pitch_um, gds_layers, parts)
         return None
     return {"png16": write_png16, "bmp": write_bmp, "tiff": write_tiff}[kind](file, levels, layout)
 

@@ -10,6 +10,7 @@ from pydantic import Field
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Result
+from litho_design.exports.marks import Marks
 from litho_design.printers.layout import OutOfDistribution, Printability
 from litho_design.tasks.design import Design
 
@@ -31,6 +32,7 @@ class Sidecar(Result):
     model_name: str
     model_sha256: str
     extrapolated: bool
+    # Of the whole file, marks included.
     shape_px: tuple[int, int]
     pitch_um: float
     size_um: tuple[float, float]
@@ -50,6 +52,8 @@ class Sidecar(Result):
     x_direction: Literal["right"] = "right"
     y_direction: Literal["down in the layout, up in stl and gds"] = "down in the layout, up in stl and gds"
     origin: Literal["lower left corner of the element"] = "lower left corner of the element"
+    # Absent in older files, and where only the element is exported.
+    marks: Marks | None = None
     polarity: Literal["higher level is higher resist"] = "higher level is higher resist"
     wavelength_um: float
     index_step: float
@@ -73,8 +77,10 @@ def make_sidecar(
     hatching_um: float,
     grey_per_level: int | None = None,
     gds_layers: Literal["cumulative", "exclusive"] | None = None,
+    shape_px: tuple[int, int],
+    marks: Marks | None = None,
 ) -> Sidecar:
-    """The sidecar of ``file``."""
+    """The sidecar of ``file``, a map of ``shape_px``."""
     layout, optics, stroke = design.layout, design.optics, design.stroke
     return Sidecar(
         file=file.name,
@@ -85,9 +91,10 @@ def make_sidecar(
         model_name=design.printer.name,
         model_sha256=design.printer.sha256,
         extrapolated=design.printer.extrapolated,
-        shape_px=(layout.size_px, layout.size_px),
+        shape_px=shape_px,
         pitch_um=layout.pitch_um,
-        size_um=(layout.size_um, layout.size_um),
+        size_um=(shape_px[0] * layout.pitch_um, shape_px[1] * layout.pitch_um),
+        marks=marks,
         levels=layout.levels,
         level_height_um=layout.level_height_um,
         nominal_height_um=[level * layout.level_height_um for level in range(layout.levels)],

@@ -11,6 +11,7 @@ import pytest
 import tifffile
 
 from litho_data.foundation.errors import InputError
+from litho_design.exports import marks
 from litho_design.exports.files import export as export_design
 from litho_design.exports.files import import_levels
 from litho_design.exports.gds import rectangles, write_gds
@@ -86,12 +87,12 @@ def test_gds_is_upright_and_has_its_size_for_another_reader(tmp_path, layers):
     gdstk = pytest.importorskip("gdstk")
     write_gds(tmp_path / "f.gds", LETTER * 2, 0.13, layers)
     library = gdstk.read_gds(tmp_path / "f.gds")
-    (cell,) = library.cells
+    (cell,) = library.top_level()
     # The F reaches all four sides; in ``exclusive`` level 0 fills the rest.
     corners = np.array(cell.bounding_box()) * library.unit
     assert corners == pytest.approx(np.array([[0, 0], [4 * 0.13e-6, 5 * 0.13e-6]]), abs=1e-9)
     centres = [((x + 0.5) * 0.13, (4.5 - y) * 0.13) for y in range(5) for x in range(4)]
-    highest = [polygon for polygon in cell.polygons if polygon.layer == 2]
+    highest = [polygon for polygon in cell.get_polygons() if polygon.layer == 2]
     assert np.array_equal(np.reshape(gdstk.inside(centres, highest), (5, 4)), LETTER > 0)
 
 
@@ -207,15 +208,107 @@ def test_gds_layers_have_the_area_of_their_levels(tmp_path, design, layers):
     gdstk = pytest.importorskip("gdstk")
     file = export_design(design, "gds", tmp_path / "gds", gds_layers=layers)
     levels = np.load(design / "layout_level.npy")
-    cell = gdstk.read_gds(file).cells[0]
+    (cell,) = gdstk.read_gds(file).top_level()
     area = {}
-    for polygon in cell.polygons:
+    for polygon in cell.get_polygons():
         area[polygon.layer] = area.get(polygon.layer, 0) + polygon.area()
         assert len(polygon.points) == 4
     for layer, covered in area.items():
         mask = levels >= layer if layers == "cumulative" else levels == layer
         assert covered == pytest.approx(mask.sum() * 0.01, rel=1e-9)
     assert np.array_equal(import_levels(file)[0], levels)
+
+
+def test_gds_blocks_that_are_equal_are_stored_once_and_read_by_another_parser(tmp_path):
+    """Records by struct, references followed by hand: no code of gdstk or of the writer."""
+    pytest.importorskip("gdstk")
+    tile = np.random.default_rng(0).integers(0, 4, (128, 128)).astype(np.uint8)
+    levels = np.tile(tile, (3, 2))
+    levels[300, 200] = 5
+    assert write_gds(tmp_path / "f.gds", levels, 0.1, "exclusive") > 0
+    cells = _gds_cells(tmp_path / "f.gds")
+    # Six blocks, of which five are equal.
+    assert [len(cells[name]["references"]) for name in ("LAYOUT", "ELEMENT")] == [1, 6]
+    assert len({name for name, _ in cells["ELEMENT"]["references"]}) == 2
+    seen = np.full(levels.shape, -1)
+
+    def draw(name, x0, y0):
+        for layer, corners in cells[name]["boundaries"]:
+            (left, low), (right, high) = np.array(corners).min(0), np.array(corners).max(0)
+            place = [round(edge / 100) for edge in (x0 + left, y0 + low, x0 + right, y0 + high)]
+            block = seen[384 - place[3] : 384 - place[1], place[0] : place[2]]
+            assert (block == -1).all(), "nothing is drawn twice"
+            block[...] = layer
+        for other, (x, y) in cells[name]["references"]:
+            draw(other, x0 + x, y0 + y)
+
+    draw("LAYOUT", 0, 0)
+    assert np.array_equal(seen, levels)
+
+
+def _gds_cells(file) -> dict[str, dict[str, list]]:
+    """Boundaries (layer, corners) and references (name, place) per cell of a GDSII stream, database units."""
+    data, at, cells = file.read_bytes(), 0, {}
+    while at < len(data):
+        length, kind = struct.unpack_from(">HB", data, at)
+        body, at = data[at + 4 : at + length], at + length
+        if kind == 0x06:
+            cell = cells.setdefault(body.rstrip(b"\0").decode(), {"boundaries": [], "references": []})
+        elif kind == 0x0D:
+            (layer,) = struct.unpack(">h", body)
+        elif kind == 0x12:
+            name = body.rstrip(b"\0").decode()
+        elif kind in (0x08, 0x0A):
+            what = "boundaries" if kind == 0x08 else "references"
+        elif kind == 0x10:
+            points = np.frombuffer(body, ">i4").reshape(-1, 2).tolist()
+            cell[what].append((layer, points) if what == "boundaries" else (name, points[0]))
+        elif kind == 0x04:
+            break
+    return cells
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_a_mark_and_a_witness_stand_beside_the_element(tmp_path, design, kind, monkeypatch):
+    if kind == "gds":
+        pytest.importorskip("gdstk")
+    # No printer, no reach: 6.4 µm hold an F of 0.8 µm strokes and a witness of 1.2 µm.
+    monkeypatch.setattr(marks, "_STROKE_UM", 0.8)
+    monkeypatch.setattr(marks, "_FLAT_UM", 1.2)
+    file = export_design(design, kind, tmp_path, marks=True)
+    levels, sidecar = import_levels(file)
+    assert np.array_equal(levels, np.load(design / "layout_level.npy"))
+    found = sidecar.marks
+    assert sidecar.shape_px == (64, 64 + 8 + 4 * 8)
+    assert found.witness_height_um == pytest.approx(1.2)
+    if kind == "gds":
+        assert {"ELEMENT", "ORIENTATION", "WITNESS"} <= _gds_cells(file).keys()
+    if kind == "png16":
+        whole = cv2.imread(str(file), cv2.IMREAD_UNCHANGED) // (65535 // 12)
+        parts = [whole[top:bottom, left:right] for top, bottom, left, right in found.parts().values()]
+        assert np.array_equal(parts[0], levels)
+        assert (parts[2] == 12).all()
+        # Nothing else is printed, and the F looks like itself in one of eight orientations only.
+        assert (whole > 0).sum() == sum((part > 0).sum() for part in parts)
+        letter = np.pad(parts[1], ((0, 0), (0, 8)))
+        turned = [np.rot90(side, turn) for side in (letter, letter.T) for turn in range(4)]
+        assert sum(np.array_equal(letter, other) for other in turned) == 1
+
+
+def test_marks_keep_the_reach_of_the_printer():
+    layout = LayoutSettings(size_px=512)
+    levels = np.zeros((512, 512), np.uint8)
+    canvas, found = marks.with_marks(levels, layout, 5.9, [0.1, 0.8])
+    box = {name: np.array(part) for name, part in found.parts().items()}
+    # 5.9 µm are 59 px, 60 on whole cells: to the element, and from the F to the witness below it.
+    assert box["ORIENTATION"][2] - 512 == box["WITNESS"][2] - 512 == 60
+    assert box["WITNESS"][0] - box["ORIENTATION"][1] >= 60
+    # The middle 4 µm are further than the reach from every edge.
+    assert box["WITNESS"][1] - box["WITNESS"][0] >= 2 * 59 + 40
+    assert all((edge % 4 == 0).all() for edge in box.values())
+    assert canvas.shape[1] == box["WITNESS"][3]
+    with pytest.raises(InputError, match="at least 28"):
+        marks.with_marks(levels[:100, :100], layout, 5.9, [0.1, 0.8])
 
 
 def test_rectangles_cover_once():

@@ -1,0 +1,83 @@
+"""What is printed beside an element: a mark that tells its orientation, and a flat witness of its height."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import Record
+from litho_design.printers.layout import LayoutSettings
+
+Box = tuple[int, int, int, int]
+
+# An F looks different in all eight orientations.
+_LETTER = np.array([[1, 1, 1, 1], [1, 0, 0, 0], [1, 1, 1, 0], [1, 0, 0, 0], [1, 0, 0, 0]], np.uint8)
+_STROKE_UM = 1.0
+# The middle of the witness is as wide as this, beyond the reach of its edges.
+_FLAT_UM = 4.0
+
+
+class Marks(Record):
+    """Where element, mark and witness lie in an exported map: rows from, to, columns from, to, in pixels.
+
+    ``witness_height_um`` is what the design model prints in its middle, above the ground around it.
+    """
+
+    element_px: Box
+    orientation_px: Box
+    witness_px: Box
+    witness_level: int
+    witness_height_um: float
+
+    def parts(self) -> dict[str, Box]:
+        """The three by name."""
+        return {"ELEMENT": self.element_px, "ORIENTATION": self.orientation_px, "WITNESS": self.witness_px}
+
+
+def with_marks(
+    levels: np.ndarray, layout: LayoutSettings, guard_um: float, level_heights_um: list[float]
+) -> tuple[np.ndarray, Marks]:
+    """The level map (size, size) with an F and a square of the highest level to the right of it.
+
+    Both keep the reach of the printer from the element and from each other, so that none changes the print of
+    another. Everything lies on whole cells.
+
+    Args:
+        guard_um: reach of the printer, µm.
+        level_heights_um: printed height of wide fields of each level.
+
+    Returns:
+        Levels uint8 (size, wider), and where what lies.
+
+    Raises:
+        InputError: an element that is lower than mark and witness together.
+    """
+    cell = 1 if layout.symmetry == "radial" else layout.cell_px
+
+    def cells(length_um: float) -> int:
+        return math.ceil(length_um / layout.pitch_um / cell - 1e-6) * cell
+
+    gap, stroke, side = cells(guard_um), cells(_STROKE_UM), cells(2 * guard_um + _FLAT_UM)
+    gap = max(gap, stroke)
+    letter = _LETTER.repeat(stroke, 0).repeat(stroke, 1)
+    size, high = len(levels), len(letter) + gap + side
+    if size < high:
+        raise InputError(
+            "marks",
+            got=f"an element of {size * layout.pitch_um:g} µm",
+            wanted=f"at least {high * layout.pitch_um:g} µm, the height of mark and witness",
+        )
+    left, top_level = size + gap, layout.levels - 1
+    canvas = np.zeros((size, left + max(side, letter.shape[1])), np.uint8)
+    canvas[:, :size] = levels
+    canvas[: len(letter), left : left + letter.shape[1]] = top_level * letter
+    canvas[size - side :, left : left + side] = top_level
+    return canvas, Marks(
+        element_px=(0, size, 0, size),
+        orientation_px=(0, len(letter), left, left + letter.shape[1]),
+        witness_px=(size - side, size, left, left + side),
+        witness_level=top_level,
+        witness_height_um=level_heights_um[-1] - level_heights_um[0],
+    )
