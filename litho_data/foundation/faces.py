@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import importlib.util
 import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
 _DISTRIBUTION = "litholoop"
+# litho_data does without it; it stands for all that the extras `models` and `design` bring.
+_OF_EXTRAS = "torch"
 
 
 def lazy_face(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
@@ -33,7 +36,14 @@ def lazy_face(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], A
             value: Any = _version()
         elif name in homes:
             module, _, inner = homes[name].partition(":")
-            value = getattr(__import__(module, fromlist=[inner or name]), inner or name)
+            try:
+                home = __import__(module, fromlist=[inner or name])
+            except ModuleNotFoundError as error:
+                if error.name != _OF_EXTRAS:
+                    raise
+                extra = package.removeprefix("litho_")
+                raise ModuleNotFoundError(f"{package}.{name} {_missing(extra)}", name=error.name) from None
+            value = getattr(home, inner or name)
         else:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         setattr(sys.modules[package], name, value)
@@ -43,6 +53,17 @@ def lazy_face(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], A
         return sorted([*homes, "__version__"])
 
     return load, names
+
+
+def require_extra(command: str, extra: str) -> None:
+    """End a command with one line on stderr and exit code 2 where what its extra brings is not installed."""
+    if importlib.util.find_spec(_OF_EXTRAS) is None:
+        print(f"{command}: {_missing(extra)}", file=sys.stderr)
+        raise SystemExit(2)
+
+
+def _missing(extra: str) -> str:
+    return f"needs {_OF_EXTRAS}, got none; install it with pip install '{_DISTRIBUTION}[{extra}]'"
 
 
 def _version() -> str:

@@ -1,0 +1,94 @@
+"""What is installed: litho_data without torch, the wheel in an empty folder; the project's own files."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import litho_data
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+EXTRA_MODULES = ("torch", "numba", "llvmlite", "skimage", "safetensors", "lightning")
+
+WITHOUT_EXTRAS = f"""
+import importlib.abc, sys
+class Absent(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {EXTRA_MODULES!r}:
+            raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
+sys.meta_path.insert(0, Absent())
+"""
+
+
+def run(code: str, folder: Path, **variables: str) -> subprocess.CompletedProcess[str]:
+    """A Python of its own in an empty folder."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "HOME": str(folder), **variables}
+    return subprocess.run(
+        [sys.executable, "-c", code], cwd=folder, env=environment, capture_output=True, text=True, timeout=300
+    )
+
+
+def test_litho_data_makes_and_builds_prints_without_the_extras(tmp_path: Path) -> None:
+    path = """
+import litho_data, pkgutil, importlib
+for module in pkgutil.walk_packages(litho_data.__path__, "litho_data."):
+    importlib.import_module(module.name)
+card = litho_data.simulate("prints", count=2, size_px=128)
+litho_data.build_dataset(card, "prints.zarr")
+print(len(litho_data.open_store("prints.zarr").ids))
+"""
+    done = run(WITHOUT_EXTRAS + path, tmp_path)
+    assert (done.returncode, done.stdout.split()[-1:]) == (0, ["2"]), done.stderr[-2000:]
+
+
+@pytest.mark.parametrize("name", ["models", "design"])
+def test_the_others_say_in_one_line_which_extra_they_need(tmp_path: Path, name: str) -> None:
+    hint = f"pip install 'litholoop[{name}]'"
+    # A blocked find_spec raises, a missing package returns None: what an environment without torch does.
+    hidden = "import importlib.util; importlib.util.find_spec = lambda name: None\n"
+    done = run(f"{hidden}from litho_{name}.cli import main; main()", tmp_path)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1
+    assert hint in done.stderr
+    face = {"models": "train", "design": "design_hologram"}[name]
+    done = run(f"{WITHOUT_EXTRAS}import litho_{name}; litho_{name}.{face}", tmp_path)
+    assert hint in done.stderr.strip().splitlines()[-1]
+
+
+@pytest.mark.long
+def test_the_wheel_designs_a_hologram_from_an_empty_folder(tmp_path: Path) -> None:
+    """Built as pip does it; its zoo, templates and cards are in it."""
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check"]
+    wheels, target, home = tmp_path / "wheels", tmp_path / "site", tmp_path / "home"
+    home.mkdir()
+    # Of a copy: setuptools leaves its own folders beside the sources.
+    source = tmp_path / "source"
+    source.mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE", "NOTICE"):
+        shutil.copy(ROOT / name, source)
+    for package in ("litho_data", "litho_models", "litho_design"):
+        shutil.copytree(ROOT / package, source / package, ignore=shutil.ignore_patterns("__pycache__"))
+    subprocess.run([*pip, "wheel", "--no-deps", "--wheel-dir", wheels, source], check=True, timeout=300)
+    (wheel,) = wheels.glob("litholoop-*.whl")
+    subprocess.run([*pip, "install", "--no-deps", "--target", target, wheel], check=True, timeout=300)
+    code = "import litho_design.cli as cli, sys; sys.argv[1:] = ['first', '--out', 'first']; cli.main()"
+    done = run(code, home, PYTHONPATH=str(target))
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert (home / "first" / "report.html").exists()
+    assert str(ROOT) not in done.stdout
+
+
+def test_versions_and_names_agree() -> None:
+    citation = (ROOT / "CITATION.cff").read_text("utf-8")
+    assert f"version: {PROJECT['version']}\n" in citation
+    assert f"## {PROJECT['version']}" in (ROOT / "CHANGELOG.md").read_text("utf-8")
+    assert litho_data.__version__ == PROJECT["version"]
+    core = " ".join(PROJECT["dependencies"])
+    assert not [name for name in ("torch", "numba", "lightning", "safetensors") if f"{name}>" in core]
