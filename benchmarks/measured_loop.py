@@ -9,6 +9,8 @@ from benchmarks.markdown_table import markdown_table, with_interval
 from litho_models.effects import CATALOGUE
 from litho_models.evaluation.zoo_making import HELD_OUT
 from litho_models.frozen.card import ModelCard
+from litho_models.loop.report.wording import chosen_text, over_text, terms_text
+from litho_models.loop.result.record import EqualTerms, NestedResult
 
 # Of results that do not record where the offsets of lines came from.
 OLDER_PIXELS = (
@@ -42,7 +44,7 @@ def equal_freedom_table(loops: Sequence[dict[str, Any]]) -> str:
         f"{_background(loops)}; terms are fitted on pixels that are not scored. Intervals of 95 % resample "
         "whole scans, or whole prints; p is of sign flips of these." + best,
         *(_split_text(loop) for loop in loops if loop.get("gain_split")),
-        *(_chosen_text(loop) for loop in loops if loop.get("nested")),
+        *(_nested_text(loop) for loop in loops if loop.get("nested")),
         _names_text(loops),
     )
 
@@ -68,12 +70,13 @@ def _equal_rows(name: str, equal_terms: Sequence[dict[str, Any]]) -> list[tuple[
     return [
         (
             name,
-            _terms_per_scan(row["terms"], row["before"]["k"], row["after"]["k"]),
-            *(with_interval(row[side]["mae_nm"], row[side]["mae_ci95_nm"]) for side in ("before", "after")),
-            f"{row['gain_nm']:.2f} nm",
-            *(_over(row[unit]) for unit in ("over_scans", "over_prints")),
+            terms_text(row),
+            *(with_interval(side.mae_nm, side.mae_ci95_nm) for side in (row.before, row.after)),
+            f"{row.gain_nm:.2f} nm",
+            over_text(row.over_scans, "scans"),
+            "–" if row.over_prints is None else over_text(row.over_prints, "prints"),
         )
-        for row in equal_terms
+        for row in map(EqualTerms.model_validate, equal_terms)
     ]
 
 
@@ -90,26 +93,12 @@ def _split_text(loop: dict[str, Any]) -> str:
     )
 
 
-def _chosen_text(loop: dict[str, Any]) -> str:
-    nested = loop["nested"]
-    times = ", ".join(f"{one['name']} {one['times']}" for one in nested["chosen"])
+def _nested_text(loop: dict[str, Any]) -> str:
+    nested = NestedResult.model_validate(loop["nested"])
     return (
         f"Chosen anew on {loop['base_model']}: named effects, generic terms, terms of single scans, without "
-        f"the {nested['held_out']} that they are judged on, {nested['selections']} times. How often each was "
-        f"chosen: {times or 'nothing'}."
+        f"the {nested.held_out} that they are judged on: {chosen_text(nested)}."
     )
-
-
-def _terms_per_scan(terms: str, before: float, after: float) -> str:
-    number = f"k = {before:.0f}" if round(before) == round(after) else f"k = {before:.0f} and {after:.0f}"
-    return f"{number} (accepted by the loop)" if terms == "accepted" else number
-
-
-def _over(units: dict[str, Any] | None) -> str:
-    if units is None:
-        return "–"
-    interval = "" if units["ci95_nm"] is None else "{:.2f} … {:.2f} nm, ".format(*units["ci95_nm"])
-    return f"{interval}better in {units['positive']} of {units['count']}, p = {units['p']:.2g}"
 
 
 def _background(loops: Sequence[dict[str, Any]]) -> str:

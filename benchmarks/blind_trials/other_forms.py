@@ -126,8 +126,8 @@ def _oriented_proximity(rng: np.random.Generator) -> Law:
     reach_um, direction = rng.uniform(4, 8), rng.uniform(0, np.pi)
 
     def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
-        spread = np.exp(-2 * (np.pi * reach_um * _frequency_along(canvas, direction)) ** 2)
-        return apply_transfer(dose, (1 + strength * spread) / (1 + strength))
+        along = _frequency_along(canvas, direction)
+        return _spread(dose, strength, np.exp(-2 * (np.pi * reach_um * along) ** 2))
 
     return law
 
@@ -139,8 +139,8 @@ def _halo_ring(rng: np.random.Generator) -> Law:
 
     def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
         frequency_y, frequency_x = frequencies_per_um(dose.shape, canvas.pitch_um)
-        ring = scipy.special.j0(2 * np.pi * radius_um * np.hypot(frequency_y, frequency_x))
-        return apply_transfer(dose, (1 + strength * ring) / (1 + strength))
+        frequency = np.hypot(frequency_y, frequency_x)
+        return _spread(dose, strength, scipy.special.j0(2 * np.pi * radius_um * frequency))
 
     return law
 
@@ -350,6 +350,11 @@ def _periodic_lines(rng: np.random.Generator) -> Law:
         return height + 1e-3 * strength * np.sin(2 * np.pi * line / period + phases[job.index % _MOST_SCANS])
 
     return law
+
+
+def _spread(dose: np.ndarray, strength: float, transfer: np.ndarray) -> np.ndarray:
+    """The dose beside ``strength`` times itself spread, by a transfer function that is 1 at rest."""
+    return apply_transfer(dose, (1 + strength * transfer) / (1 + strength))
 
 
 def _frequency_along(canvas: Canvas, direction: float) -> np.ndarray:

@@ -82,7 +82,7 @@ def refitted_rms_nm(heights_um: Sequence[np.ndarray], jobs: Sequence[Job], print
         printer: whose parameters the fit starts from.
     """
     scans = [_as_scan(job, height, printer) for job, height in zip(jobs, heights_um, strict=True)]
-    model = _plain_model(printer)
+    model = plain_model(printer)
     start = np.concatenate([p.detach().numpy().ravel() for p in model.parameters()])
     fitted = fit_least_squares(_Refit(model, scans, _SCAN_TERMS), start, _RULES)
     left = [
@@ -98,7 +98,7 @@ class _Refit(ModelProblem):
         return [replace(part, basis=orthonormal(part.basis.T).T) for part in super().linearise(vector)]
 
 
-def _plain_model(printer: Printer) -> Simulator:
+def plain_model(printer: Printer) -> Simulator:
     """The Physics model at the values at which it is the plain fab."""
     return build_model(
         "physics",

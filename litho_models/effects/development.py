@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import torch
 from torch import Tensor
 from torch.nn import functional
 
@@ -38,24 +37,21 @@ def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> 
 
 
 def feature_collapse(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H - c softplus((H / w - a) / t) t: narrow tall features lose height; w is the local width."""
-    sharpness = 0.25
-    width_um = 1.0
-    standing = torch.sigmoid((context.layout_um / context.full_height_um - 0.5) / 0.05)
-    variance = torch.as_tensor(width_um**2, dtype=height.dtype, device=height.device)
-    share = add_blur(standing, variance, context.pitch_um, 3 * width_um)
-    aspect = height / (width_um * torch.clamp(share, min=0.05))
-    excess = functional.softplus((aspect - values["aspect_ratio"]) / sharpness) * sharpness
-    return height - values["loss_um"] * excess
+    """H - φ (H - open_w(H)): what is narrower than w loses a share of its height above its surroundings."""
+    return height - values["fraction"] * (height + _closing(-height, values["width_um"], context))
 
 
 def trench_residue(height: Tensor, values: Values, context: FieldContext) -> Tensor:
     """H + ρ (close_w(H) - H): resist stays in pits narrower than w; tops are unchanged."""
-    half = max(1, math.floor(float(values["width_um"].detach()) / context.pitch_um / 2 + 0.5))
+    return height + values["fraction"] * (_closing(height, values["width_um"], context) - height)
+
+
+def _closing(height: Tensor, width_um: Tensor, context: FieldContext) -> Tensor:
+    """Closing by a square: whatever is narrower and lower than its surroundings is filled."""
+    half = max(1, math.floor(float(width_um.detach()) / context.pitch_um / 2 + 0.5))
     size = 2 * half + 1
     dilated = functional.max_pool2d(functional.pad(height, (half,) * 4, mode="replicate"), size, stride=1)
-    closed = -functional.max_pool2d(functional.pad(-dilated, (half,) * 4, mode="replicate"), size, stride=1)
-    return height + values["fraction"] * (closed - height)
+    return -functional.max_pool2d(functional.pad(-dilated, (half,) * 4, mode="replicate"), size, stride=1)
 
 
 def slope_thinning(height: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -63,6 +59,8 @@ def slope_thinning(height: Tensor, values: Values, context: FieldContext) -> Ten
     along_y, along_x = gradient(height, context.pitch_um)
     return height - values["along_x_um"] * along_x**2 - values["along_y_um"] * along_y**2
 
+
+_NARROW = tuple({"fraction": 0.1, "width_um": width} for width in (0.4, 0.8, 1.4))
 
 EFFECTS = (
     Effect(
@@ -112,12 +110,12 @@ EFFECTS = (
         role="process",
         acts_on="height",
         parameters={
-            "loss_um": Parameter("µm", 0.0, 1.0, 0.05),
-            "aspect_ratio": Parameter("1", 0.4, 4.0, 0.8, kind="shape"),
+            "fraction": Parameter("1", 0.0, 0.9, 0.1),
+            "width_um": Parameter("µm", 0.2, 3.0, 0.6, kind="choice"),
         },
         apply=feature_collapse,
-        trials=tuple({"loss_um": 0.05, "aspect_ratio": ratio} for ratio in (0.8, 1.5, 2.5)),
-        source="capillary force while drying, above a critical aspect ratio",
+        trials=_NARROW,
+        source="capillary force while drying; opening of the surface by a square of width w",
         separating="pillars of one height and five widths, dried in air and supercritically",
     ),
     Effect(
@@ -131,7 +129,7 @@ EFFECTS = (
             "width_um": Parameter("µm", 0.2, 3.0, 0.6, kind="choice"),
         },
         apply=trench_residue,
-        trials=tuple({"fraction": 0.1, "width_um": width} for width in (0.4, 0.8, 1.4)),
+        trials=_NARROW,
         source="closing of the surface by a square of width w",
         separating="trenches of five widths, developed for two times",
     ),

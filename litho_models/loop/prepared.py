@@ -147,8 +147,13 @@ def _half(size: int, second: int) -> tuple[slice, int]:
     return (slice(middle - MARGIN_PX, size), middle) if second else (slice(0, middle + MARGIN_PX), 0)
 
 
+def sample_border_px(size: int) -> int:
+    """Pixels at either end of an axis of this shortest length that are not sampled."""
+    return min(SAMPLE_BORDER_PX, size // 8)
+
+
 def _inner(shape: tuple[int, int]) -> np.ndarray:
-    border = min(SAMPLE_BORDER_PX, min(shape) // 8)
+    border = sample_border_px(min(shape))
     inner = np.zeros(shape, bool)
     inner[border : shape[0] - border, border : shape[1] - border] = True
     return inner

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.blind_trials.planting import plain_model
 from litho_data.virtual_fab import Fab, Microscope, Noise, Printer, scan_job
 from litho_data.virtual_fab.jobs import Plan, random_jobs
 from litho_data.virtual_fab.knobs import KnobBoard
-from litho_models.models.physics import Physics, PhysicsConfig
 
 
 @pytest.fixture(scope="module")
@@ -26,18 +26,7 @@ def prints() -> list[tuple[torch.Tensor, np.ndarray, np.ndarray]]:
 
 
 def test_physics_at_the_fabs_own_values_is_the_clean_print(prints):
-    printer = Printer()
-    model = Physics(
-        PhysicsConfig(
-            sigma_optical_um=printer.spot_sigma_um / 2**0.5,
-            # A normalised logistic of steepness s is a normalised tanh of steepness s/2.
-            alpha_init=printer.threshold_steepness / 2,
-            eta_init=printer.threshold_dose,
-            kappa_min_init=printer.loose_retention,
-            sigma_diffusion_init_um=printer.network_reach_um,
-            bias_init_um=printer.base_um,
-        )
-    )
+    model = plain_model(Printer())
     for layout_um, clean_um, noise_um in prints:
         with torch.no_grad():
             difference_nm = 1e3 * (model(layout_um)[0, 0].numpy() - clean_um)

@@ -279,15 +279,17 @@ def test_a_tip_on_a_hump_rests_as_the_closed_form_says() -> None:
     assert float((dilated[0, 0, 4] - expected)[inner].abs().max()) <= (PITCH_UM / 2) ** 2 / (8 * q) + 1e-12
 
 
-def test_trench_residue_fills_narrow_pits_only() -> None:
-    height = torch.ones(1, 1, 60, 60, dtype=torch.float64)
-    height[..., 10:50, 10:13] = 0
-    height[..., 10:50, 30:45] = 0
-    context = FieldContext(height, PITCH_UM, 1.2)
-    changed = get_effect("trench-residue")(height, {"fraction": 0.25, "width_um": 0.6}, context)
+@pytest.mark.parametrize(("name", "sign"), [("trench-residue", 1.0), ("feature-collapse", -1.0)])
+def test_only_what_is_narrow_is_filled_or_lost(name: str, sign: float) -> None:
+    """Pits in a plateau; upside down, ridges."""
+    pits = torch.ones(1, 1, 60, 60, dtype=torch.float64)
+    pits[..., 10:50, 10:13] = 0
+    pits[..., 10:50, 30:45] = 0
+    values = {"fraction": 0.25, "width_um": 0.6}
+    changed = sign * get_effect(name)(sign * pits, values, FieldContext(pits, PITCH_UM, 1.2))
     assert float(changed[0, 0, 30, 11]) == pytest.approx(0.25)
     assert float(changed[0, 0, 30, 37]) == 0.0
-    assert torch.equal(changed[height == 1], height[height == 1])
+    assert torch.equal(changed[pits == 1], pits[pits == 1])
 
 
 def test_stripes_follow_the_scan_lines_with_the_stated_spread() -> None:

@@ -13,6 +13,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 from litho_models.loop.fold_fits import FoldFits
+from litho_models.loop.linear import ALL_FREE
 from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.loop.probes import Probed, probe_residual, with_intervals
 from litho_models.loop.probes.defects import find_defects
@@ -23,6 +24,7 @@ from litho_models.loop.probes.tables import SPOT_UM
 from litho_models.loop.probes.trend import order_trends
 from litho_models.loop.report.plots import probe_figure
 from litho_models.loop.study import State, Study
+from litho_models.scan_terms import POLICIES, TermPixels, Terms, term_maps
 from tests.litho_models.loop_scans import printed_scans, true_model
 
 COUNT, SIZE_PX, NOISE_UM = 10, 128, 0.006
@@ -56,19 +58,20 @@ def probed(scans: list[PreparedScan], predictions: list[np.ndarray]) -> Probed:
     )  # fmt: skip
 
 
-def test_a_correction_moves_no_offset_gain_tilt_or_bow_that_all_scans_share() -> None:
+@pytest.mark.parametrize("free", [POLICIES["full"], ALL_FREE], ids=["full", "with warp"])
+def test_a_correction_moves_nothing_that_the_probe_was_estimated_free_of(free: Terms) -> None:
     scans = prepare_scans(printed_scans(count=3, size_px=64, seed=3))
     random = np.random.default_rng(0)
-    y, x = np.meshgrid(*2 * [np.linspace(-1, 1, 64)], indexing="ij")
     predictions = [gaussian_filter(random.random((64, 64)), 3).astype(np.float32) for _ in scans]
-    shared = [np.stack([np.ones_like(p), p, x, y, x * x, x * y, y * y]).reshape(7, -1) for p in predictions]
-    amounts = np.array([0.3, -0.2, 0.1, 0.4, -0.3, 0.2, 0.1])
+    shared = [term_maps(TermPixels(p), free) for p in predictions]
+    amounts = random.normal(size=len(shared[0])) / 4
     own = {f.id: random.normal(size=(64, 64)) for f in scans}
     of = {f.id: (amounts @ s).reshape(64, 64) for f, s in zip(scans, shared, strict=True)}
     changes: list[list[np.ndarray]] = []
     for scale in (0.0, 1.0):
         probe: Any = SimpleNamespace(
-            correction=lambda parameters, scan, prediction: parameters * own[scan.id] + of[scan.id]
+            correction=lambda parameters, scan, prediction: parameters * own[scan.id] + of[scan.id],
+            free=free,
         )
         parameters = np.array(scale)
         anchor = _anchor(probe, parameters, scans, predictions)

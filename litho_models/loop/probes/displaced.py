@@ -18,7 +18,7 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.probes.kernel import reach_um
 from litho_models.loop.probes.probe import Estimate
-from litho_models.scan_terms import POLICIES, fitted_terms
+from litho_models.scan_terms import POLICIES, Terms, fitted_terms
 
 FARTHEST_UM = 20.0
 # What is printed is no finer, and a quarter of the pixels is enough to find it.
@@ -46,6 +46,10 @@ class DisplacedCopy:
     @property
     def name(self) -> str:
         return "displaced-copy"
+
+    @property
+    def free(self) -> Terms:
+        return POLICIES["full"]
 
     def held_out(self, fold_of: np.ndarray) -> Estimate:
         """(y, x, amount) without each fold and the gain of each scan by those that have not seen it."""

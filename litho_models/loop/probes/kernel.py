@@ -17,11 +17,11 @@ from scipy.signal import fftconvolve
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.probes.probe import Estimate
-from litho_models.scan_terms import POLICIES, TermPixels, least_squares, term_maps
+from litho_models.scan_terms import POLICIES, TermPixels, Terms, least_squares, term_maps
 
 SUPPORT_UM = 5.0
 # The regularisation, relative to the median power of the layouts.
-REGULARISATIONS = tuple(10.0**exponent for exponent in (-4, -3, -2, -1, 0, 1))
+REGULARISATIONS = tuple(10.0**exponent for exponent in range(-3, 3))
 # Printed features end here; beyond there is no layout to respond to, and half the band costs a quarter.
 _BAND_CYCLES_PER_UM = 2.5
 _FITTED_PX = 20_000
@@ -52,11 +52,15 @@ class MissingKernel:
     def name(self) -> str:
         return "missing-kernel"
 
+    @property
+    def free(self) -> Terms:
+        return POLICIES["full"]
+
     def held_out(self, fold_of: np.ndarray) -> Estimate:
         """Kernels (flattened, support cut) without each fold and their gain on each held-out scan."""
         cross, power = np.conj(self.layouts) * self.residuals, np.abs(self.layouts) ** 2
         sums = _by_fold(cross, fold_of), _by_fold(power, fold_of)
-        choice = max(REGULARISATIONS, key=lambda c: self._pooled_gain(*sums, c))
+        choice = self._regularisation(*sums)
         kernels = self._without_each(*sums, choice)
         gains = np.zeros(len(cross))
         for fold, kernel in enumerate(kernels):
@@ -79,11 +83,11 @@ class MissingKernel:
         """Correlation over all layouts of the responses that two halves of the scans ask for."""
         cross = np.conj(self.layouts) * self.residuals
         power = np.abs(self.layouts) ** 2
-        transfers = []
-        for start in (0, 1):
-            kernel = self._kernel(cross[start::2].sum(axis=0), power[start::2].sum(axis=0), 0.1)
-            transfers.append(rfft2(kernel))
-        first, second = transfers
+        choice = self._regularisation(cross, power)
+        first, second = (
+            rfft2(self._kernel(cross[start::2].sum(axis=0), power[start::2].sum(axis=0), choice))
+            for start in (0, 1)
+        )
         weight = _weights(power.sum(axis=0).shape, self.size) * power.sum(axis=0)
         sizes = np.sqrt((weight * np.abs(first) ** 2).sum() * (weight * np.abs(second) ** 2).sum())
         return float((weight * first * np.conj(second)).real.sum() / max(sizes, np.finfo(float).tiny))
@@ -113,6 +117,10 @@ class MissingKernel:
     def kernel_map(self, parameters: np.ndarray) -> np.ndarray:
         """The kernel with its origin in the middle, (y, x), per pixel of the band."""
         return np.fft.fftshift(parameters.reshape(self.size))
+
+    def _regularisation(self, cross: np.ndarray, power: np.ndarray) -> float:
+        """The one whose kernels do best where they have not seen; ``cross``, ``power``: (folds, fy, fx)."""
+        return max(REGULARISATIONS, key=lambda c: self._pooled_gain(cross, power, c))
 
     def _without_each(self, cross: np.ndarray, power: np.ndarray, regularisation: float) -> list[np.ndarray]:
         """Kernels from the sums of all folds but one; ``cross``, ``power``: (folds, fy, fx)."""

@@ -12,6 +12,7 @@ from litho_models.fitting.least_squares import orthonormal
 from litho_models.loop.linear import ALL_FREE
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.probes.probe import Estimate
+from litho_models.scan_terms import Terms
 
 # Relative to the mean information per column; the grid is wide, its choice is made on training scans.
 RIDGES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
@@ -44,6 +45,10 @@ class LinearProbe:
     grams: np.ndarray
     rights: np.ndarray
     pixels: np.ndarray
+
+    @property
+    def free(self) -> Terms:
+        return ALL_FREE
 
     def held_out(self, fold_of: np.ndarray) -> Estimate:
         """Coefficients without each fold, and the gain of each scan by those that have not seen it."""

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 
 from litho_data.foundation.units import NM_PER_UM
-from litho_models.loop.prepared import PreparedScan
+from litho_models.loop.prepared import PreparedScan, sample_border_px
 from litho_models.loop.probes.linear import LinearProbe, linear_probe, second_differences
 
 SPLINES = 5
@@ -118,10 +118,14 @@ def _profile_columns(
 
 
 def _splines(size: int, count: int = SPLINES) -> np.ndarray:
-    """Cubic splines (count, size) from one end of an axis to the other; they add up to 1."""
+    """Cubic splines (count, size) over the sampled part of an axis, constant beyond it; they add up to 1.
+
+    A spline that only pixels beyond it hold would be drawn there without having been measured.
+    """
     inner = np.linspace(-1, 1, count - 2)
     knots = np.concatenate([[-1.0] * 3, inner, [1.0] * 3])
-    position = np.linspace(-1, 1, size)
+    first = sample_border_px(size)
+    position = np.interp(np.arange(size), [first, size - 1 - first], [-1.0, 1.0])
     return BSpline.design_matrix(position, knots, 3).toarray().T
 
 

@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from litho_models.loop.prepared import PreparedScan
+from litho_models.scan_terms import Terms
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,10 @@ class Probe(Protocol):
     @property
     def name(self) -> str:
         """Identifier in the result."""
+
+    @property
+    def free(self) -> Terms:
+        """What every scan may add by itself in the estimate: of these the probe knows nothing."""
 
     def held_out(self, fold_of: np.ndarray) -> Estimate:
         """Fit without each fold; ``fold_of``: (scans,)."""

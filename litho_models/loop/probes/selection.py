@@ -24,8 +24,7 @@ from litho_models.loop.probes.tables import (
 from litho_models.loop.probes.trend import OrderTrend, order_trends
 from litho_models.loop.selection.confirming import SMALLEST_SHARE, Confirmation
 from litho_models.loop.study import Score, State, Study
-from litho_models.scan_terms import Terms
-from litho_models.scan_terms.term import smooth_shapes
+from litho_models.scan_terms import TermPixels, Terms, term_maps
 
 CONTROLS = 199
 CONTROL_QUANTILE = 0.95
@@ -47,7 +46,7 @@ class ProbeTest:
 class AddedProbe:
     """A probe taken into the prediction, with its estimate and held-out errors before and after.
 
-    ``anchor``: (7,) offset µm, relative gain, plane and bow µm that go with the correction.
+    ``anchor``: (k,) amounts of the maps of the probe's ``free`` terms that go with the correction.
     """
 
     probe: Probe
@@ -213,28 +212,22 @@ def _with_probe(state: State, study: Study, probe: Probe, estimate: Estimate) ->
 def _corrected(
     probe: Probe, parameters: np.ndarray, anchor: np.ndarray, scan: PreparedScan, prediction: np.ndarray
 ) -> np.ndarray:
-    shared = np.tensordot(anchor, _shared_maps(prediction), axes=1).astype(np.float32)
-    return prediction + probe.correction(parameters, scan, prediction) + shared
-
-
-def _shared_maps(prediction: np.ndarray) -> np.ndarray:
-    """1, the prediction, and plane and bow over the scan: (7, y, x)."""
-    return np.stack([np.ones_like(prediction), prediction, *smooth_shapes(prediction.shape)])
+    shared = (anchor @ term_maps(TermPixels(prediction), probe.free)).reshape(prediction.shape)
+    return prediction + probe.correction(parameters, scan, prediction) + shared.astype(np.float32)
 
 
 def _anchor(
     probe: Probe, parameters: np.ndarray, scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray]
 ) -> np.ndarray:
-    """Minus the offset, gain, plane and bow that the correction has in the mean over scans.
+    """Minus what the correction has of the probe's free terms in the mean over scans, (k,).
 
     A probe is estimated free of what every scan may have of these, so it says nothing about what all
-    scans share of them; without this it would move the absolute height at random.
+    scans share of them; without this it would move height and place at random.
     """
-    count = len(_shared_maps(predictions[0]))
-    normal, right = np.zeros((count, count)), np.zeros(count)
+    normal, right = 0.0, 0.0
     for scan, prediction in zip(scans, predictions, strict=True):
         correction = scan.at_sample(probe.correction(parameters, scan, prediction))
-        columns = np.stack([scan.at_sample(shared) for shared in _shared_maps(prediction)])
-        normal += columns @ columns.T / len(correction)
-        right -= columns @ correction / len(correction)
+        columns = term_maps(TermPixels(prediction, at=scan.sample), probe.free)
+        normal = normal + columns @ columns.T / len(correction)
+        right = right - columns @ correction / len(correction)
     return np.linalg.lstsq(normal, right, rcond=1e-10)[0]

@@ -69,9 +69,9 @@ def slope_table(
 def axis_slope_table(
     scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray], kept: Sequence[np.ndarray]
 ) -> LinearProbe:
-    """One height correction per steepness along y and one per steepness along x, added.
+    """One height correction per steepness along y, x and both diagonals, added.
 
-    What a slope does along one axis and not along the other no table over the steepness can follow.
+    What a slope does along one direction and not along another no table over the steepness can follow.
     """
     knots = {axis: _slope_knots(of, scans, predictions) for axis, of in _ALONG.items()}
     entries = [f"along_{axis}_{knot:.2f}" for axis, places in knots.items() for knot in places]
@@ -158,7 +158,7 @@ def _order_columns(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
     """``_DRIFTING`` times order, and beyond each step of it, (m, y, x)."""
     order = scan.context.order
     squared = (prediction.astype(np.float64) / scan.context.full_height_um) ** 2
-    drifting = np.stack([squared, *(steepness(scan, prediction) for steepness in _ALONG.values())])
+    drifting = np.stack([squared, *(steepness(scan, prediction) for steepness in _AXES)])
     return np.concatenate([order * drifting, *((order > step) * drifting for step in ORDER_STEPS)])
 
 
@@ -176,12 +176,19 @@ def _steepness(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
     return np.hypot(*np.gradient(prediction.astype(np.float64), scan.stored.pitch_um))
 
 
-def _along(scan: PreparedScan, prediction: np.ndarray, axis: int) -> np.ndarray:
-    """|dH/dy| or |dH/dx| (y, x), µm/µm."""
-    return np.abs(np.gradient(prediction.astype(np.float64), scan.stored.pitch_um, axis=axis))
+def _along(scan: PreparedScan, prediction: np.ndarray, direction: float) -> np.ndarray:
+    """|slope| (y, x) along a direction, radians from x to y; µm/µm."""
+    y, x = np.gradient(prediction.astype(np.float64), scan.stored.pitch_um)
+    return np.abs(np.cos(direction) * x + np.sin(direction) * y)
 
 
-_ALONG: Mapping[str, Steepness] = {"y": partial(_along, axis=0), "x": partial(_along, axis=1)}
+_ALONG: Mapping[str, Steepness] = {
+    "y": partial(_along, direction=np.pi / 2),
+    "x": partial(_along, direction=0.0),
+    "diagonal": partial(_along, direction=np.pi / 4),
+    "other_diagonal": partial(_along, direction=3 * np.pi / 4),
+}
+_AXES = tuple(_ALONG[axis] for axis in "yx")
 
 
 def _slope_knots(

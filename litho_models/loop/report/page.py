@@ -15,7 +15,7 @@ from litho_models.loop.equal_terms import TermSet
 from litho_models.loop.findings import LoopFindings
 from litho_models.loop.report.plots import curve_figure, map_figure, probe_figure, staircase_figure
 from litho_models.loop.report.power import identifiability_section, power_section
-from litho_models.loop.report.wording import parts_text, plain_words, warnings_for
+from litho_models.loop.report.wording import parts_text, plain_words, terms_text, warnings_for
 from litho_models.loop.result.record import CloseLoop, EqualTerms
 from litho_models.loop.single_scans.nested_tests import scan_parameters
 from litho_models.loop.structure import PLACE
@@ -156,9 +156,8 @@ def _error_section(page: Page, findings: LoopFindings, result: CloseLoop) -> Non
 
 
 def _equal_row(row: EqualTerms, floor: NoiseFloor) -> dict[str, object]:
-    before, after = round(row.before.k), round(row.after.k)
     cells: dict[str, object] = {
-        "terms per scan": f"k = {before}" if before == after else f"k = {before} → {after}",
+        "terms per scan": terms_text(row),
         "before (nm)": row.before.mae_nm,
         "after (nm)": row.after.mae_nm,
         "gain (nm)": row.gain_nm,

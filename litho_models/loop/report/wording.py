@@ -80,7 +80,7 @@ def over_text(over: OverUnits, unit: str) -> str:
     """Interval and p of a gain over scans or prints, and what so many can show at best."""
     interval = "no interval" if over.ci95_nm is None else "{:.2f} … {:.2f}".format(*over.ci95_nm)
     best = f", the smallest that {over.count} {unit} can have" if over.p <= over.smallest_p else ""
-    return f"{interval} over {over.count} {unit} (p = {over.p:.2g}{best})"
+    return f"{interval} over {over.count} {unit} (better in {over.positive}, p = {over.p:.2g}{best})"
 
 
 def plain_words(findings: LoopFindings, result: CloseLoop) -> str:
