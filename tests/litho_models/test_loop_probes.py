@@ -254,9 +254,9 @@ def test_a_map_that_all_scans_share_is_found_and_drawn() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("along", ["row", "column"])
 def test_a_profile_of_the_dose_over_one_axis_is_found_and_drawn(along: str) -> None:
-    def wave(count: int) -> np.ndarray:
+    def wave(count: int, first: float = 0.0) -> np.ndarray:
         # Three periods: finer than a map of 5 splines, coarser than the profile's 24.
-        return 0.04 * np.sin(6 * np.pi * np.linspace(0, 1, count) + 0.5)
+        return 0.04 * np.sin(6 * np.pi * np.linspace(first, 1 - first, count) + 0.5)
 
     _, predictions = scene()
     by_scan = {f.id: p for f, p in zip(scene()[0], predictions, strict=True)}
@@ -269,7 +269,7 @@ def test_a_profile_of_the_dose_over_one_axis_is_found_and_drawn(along: str) -> N
     found = probed(*scene(uneven))
     entry = found.added[0]
     assert entry.probe.name == f"{along}-gain-profile"
-    estimate, planted = drawn_profile(entry.estimate.common), wave(201)
+    estimate, planted = drawn_profile(entry.estimate.common), wave(201, first=8 / (SIZE_PX - 1))
     # The cubic splines alone leave (π/8)⁴/384 of a wave of 8 knots per period: nothing.
     assert np.corrcoef(estimate, planted)[0, 1] > 0.95
     assert estimate.std() == pytest.approx(planted.std(), rel=0.15)

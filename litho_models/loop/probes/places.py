@@ -68,13 +68,13 @@ def profile(
 
 
 def drawn_profile(coefficients: np.ndarray, size: int = 201) -> np.ndarray:
-    """The profile (size,) that the splines' coefficients stand for, from one end to the other."""
-    return coefficients @ _splines(size, PROFILE_SPLINES)
+    """The profile (size,) that the splines' coefficients stand for, over the sampled part."""
+    return coefficients @ _splines(np.linspace(-1, 1, size), PROFILE_SPLINES)
 
 
 def drawn(coefficients: np.ndarray, size: int = 101) -> np.ndarray:
-    """The map (size, size) that the splines' coefficients stand for; first axis y."""
-    splines = _splines(size)
+    """The map (size, size) that the splines' coefficients stand for, over the sampled part; first axis y."""
+    splines = _splines(np.linspace(-1, 1, size), SPLINES)
     return splines.T @ coefficients.reshape(SPLINES, SPLINES) @ splines
 
 
@@ -96,7 +96,7 @@ def _spread(values: np.ndarray, times_height: bool) -> dict[str, tuple[float, st
 
 def _map_columns(scan: PreparedScan, prediction: np.ndarray, times_height: bool) -> np.ndarray:
     """Products of splines along y and x over the scan (25, y, x)."""
-    along_y, along_x = (_splines(n) for n in scan.stored.shape)
+    along_y, along_x = (_over(n) for n in scan.stored.shape)
     maps = np.einsum("iy,jx->ijyx", along_y, along_x).reshape(-1, *scan.stored.shape)
     return maps * prediction if times_height else maps
 
@@ -104,7 +104,7 @@ def _map_columns(scan: PreparedScan, prediction: np.ndarray, times_height: bool)
 def map_columns_at(scan: PreparedScan, at: np.ndarray) -> np.ndarray:
     """The splines of ``position_map`` at flat indices of a scan, (25, n)."""
     (ny, nx), (y, x) = scan.stored.shape, np.divmod(at, scan.stored.shape[1])
-    return (_splines(ny)[:, None, y] * _splines(nx)[None, :, x]).reshape(-1, len(at))
+    return (_over(ny)[:, None, y] * _over(nx)[None, :, x]).reshape(-1, len(at))
 
 
 def _profile_columns(
@@ -112,20 +112,24 @@ def _profile_columns(
 ) -> np.ndarray:
     """Splines over the rows or the columns (24, y, x)."""
     ny, nx = scan.stored.shape
-    splines = _splines(ny if along == "row" else nx, PROFILE_SPLINES)
+    splines = _over(ny if along == "row" else nx, PROFILE_SPLINES)
     maps = splines[:, :, None] if along == "row" else splines[:, None, :]
     return np.broadcast_to(maps, (PROFILE_SPLINES, ny, nx)) * (prediction if times_height else 1.0)
 
 
-def _splines(size: int, count: int = SPLINES) -> np.ndarray:
-    """Cubic splines (count, size) over the sampled part of an axis, constant beyond it; they add up to 1.
+def _over(size: int, count: int = SPLINES) -> np.ndarray:
+    """Cubic splines (count, size) over the sampled part of an axis, constant beyond it.
 
     A spline that only pixels beyond it hold would be drawn there without having been measured.
     """
+    first = sample_border_px(size)
+    return _splines(np.interp(np.arange(size), [first, size - 1 - first], [-1.0, 1.0]), count)
+
+
+def _splines(position: np.ndarray, count: int) -> np.ndarray:
+    """Cubic splines (count, n) at positions from -1 to 1; they add up to 1."""
     inner = np.linspace(-1, 1, count - 2)
     knots = np.concatenate([[-1.0] * 3, inner, [1.0] * 3])
-    first = sample_border_px(size)
-    position = np.interp(np.arange(size), [first, size - 1 - first], [-1.0, 1.0])
     return BSpline.design_matrix(position, knots, 3).toarray().T
 
 

@@ -15,7 +15,7 @@ from litho_models.loop.probes.kernel import missing_kernel
 from litho_models.loop.probes.places import position_map, profile
 from litho_models.loop.probes.probe import Estimate, Probe
 from litho_models.loop.probes.tables import (
-    axis_slope_table,
+    directed_slope_table,
     level_table,
     order_shapes,
     shape_powers,
@@ -132,7 +132,10 @@ def _on_samples(make: Callable[..., Probe | None], **settings: Any) -> Maker:
 
 GENERIC: dict[str, Maker] = {
     "slope-table": _on_samples(slope_table),
-    "axis-slope-table": _on_samples(axis_slope_table),
+    "axis-slope-table": _on_samples(directed_slope_table, name="axis-slope-table", along=("y", "x")),
+    "diagonal-slope-table": _on_samples(
+        directed_slope_table, name="diagonal-slope-table", along=("diagonal", "antidiagonal")
+    ),
     "shape-powers": _on_samples(shape_powers),
     "position-map": _on_samples(position_map, times_height=False),
     "row-profile": _on_samples(profile, along="row", times_height=False),
@@ -224,10 +227,10 @@ def _anchor(
     A probe is estimated free of what every scan may have of these, so it says nothing about what all
     scans share of them; without this it would move height and place at random.
     """
-    normal, right = 0.0, 0.0
+    products: list[tuple[np.ndarray, np.ndarray]] = []
     for scan, prediction in zip(scans, predictions, strict=True):
         correction = scan.at_sample(probe.correction(parameters, scan, prediction))
         columns = term_maps(TermPixels(prediction, at=scan.sample), probe.free)
-        normal = normal + columns @ columns.T / len(correction)
-        right = right - columns @ correction / len(correction)
-    return np.linalg.lstsq(normal, right, rcond=1e-10)[0]
+        products.append((columns @ columns.T / len(correction), columns @ correction / len(correction)))
+    normal, right = (sum(part) for part in zip(*products, strict=True))
+    return -np.linalg.lstsq(normal, right, rcond=1e-10)[0]

@@ -66,17 +66,22 @@ def slope_table(
     return _table("slope-table", entries, columns_of, scans, predictions, kept)
 
 
-def axis_slope_table(
-    scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray], kept: Sequence[np.ndarray]
+def directed_slope_table(
+    scans: Sequence[PreparedScan],
+    predictions: Sequence[np.ndarray],
+    kept: Sequence[np.ndarray],
+    *,
+    name: str,
+    along: Sequence[str],
 ) -> LinearProbe:
-    """One height correction per steepness along y, x and both diagonals, added.
+    """One height correction per steepness along each of these directions, added.
 
     What a slope does along one direction and not along another no table over the steepness can follow.
     """
-    knots = {axis: _slope_knots(of, scans, predictions) for axis, of in _ALONG.items()}
-    entries = [f"along_{axis}_{knot:.2f}" for axis, places in knots.items() for knot in places]
-    columns_of = partial(_axis_slope_columns, knots=knots)
-    return _table("axis-slope-table", entries, columns_of, scans, predictions, kept, blocks=len(knots))
+    knots = {one: _slope_knots(_ALONG[one], scans, predictions) for one in along}
+    entries = [f"along_{one}_{knot:.2f}" for one, places in knots.items() for knot in places]
+    columns_of = partial(_directed_slope_columns, knots=knots)
+    return _table(name, entries, columns_of, scans, predictions, kept, blocks=len(knots))
 
 
 def shape_powers(
@@ -158,7 +163,7 @@ def _order_columns(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
     """``_DRIFTING`` times order, and beyond each step of it, (m, y, x)."""
     order = scan.context.order
     squared = (prediction.astype(np.float64) / scan.context.full_height_um) ** 2
-    drifting = np.stack([squared, *(steepness(scan, prediction) for steepness in _AXES)])
+    drifting = np.stack([squared, *(_ALONG[axis](scan, prediction) for axis in "yx")])
     return np.concatenate([order * drifting, *((order > step) * drifting for step in ORDER_STEPS)])
 
 
@@ -182,13 +187,13 @@ def _along(scan: PreparedScan, prediction: np.ndarray, direction: float) -> np.n
     return np.abs(np.cos(direction) * x + np.sin(direction) * y)
 
 
+# Directions of a slope, by name.
 _ALONG: Mapping[str, Steepness] = {
     "y": partial(_along, direction=np.pi / 2),
     "x": partial(_along, direction=0.0),
     "diagonal": partial(_along, direction=np.pi / 4),
-    "other_diagonal": partial(_along, direction=3 * np.pi / 4),
+    "antidiagonal": partial(_along, direction=3 * np.pi / 4),
 }
-_AXES = tuple(_ALONG[axis] for axis in "yx")
 
 
 def _slope_knots(
@@ -208,7 +213,7 @@ def _slope_columns(
     return np.maximum(0.0, 1.0 - np.abs(place - np.arange(len(knots))[:, None, None]))
 
 
-def _axis_slope_columns(
+def _directed_slope_columns(
     scan: PreparedScan, prediction: np.ndarray, knots: Mapping[str, np.ndarray]
 ) -> np.ndarray:
-    return np.concatenate([_slope_columns(scan, prediction, of, knots[axis]) for axis, of in _ALONG.items()])
+    return np.concatenate([_slope_columns(scan, prediction, _ALONG[one], at) for one, at in knots.items()])

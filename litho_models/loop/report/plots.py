@@ -28,6 +28,7 @@ _TABLES = {
     "level-table": "printed level",
     "slope-table": "steepness of the print (µm/µm)",
     "axis-slope-table": "steepness along the axis (µm/µm)",
+    "diagonal-slope-table": "steepness along the diagonal (µm/µm)",
 }
 _BEFORE, _AFTER = "#9aa5b1", "#0b6aa2"
 
