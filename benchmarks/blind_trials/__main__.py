@@ -81,8 +81,8 @@ def _campaign(arguments: argparse.Namespace) -> None:
         results_of(seed).mkdir(parents=True, exist_ok=True)
         scoreboard.write(results_of(seed))
         (results_of(seed) / CSV_NAME).write_bytes((out / CSV_NAME).read_bytes())
-    for what, value in figures_of(scoreboard):
-        print(f"{value:>16}  {what}")
+    for what, value, wanted in figures_of(scoreboard):
+        print(f"{value:>16}  {what}" + (f" (wanted: {wanted})" if wanted else ""))
     print(f"report: {page}")
 
 

@@ -49,8 +49,12 @@ def write_report(scoreboard: Scoreboard, folder: Path) -> Path:
     )
     if scoreboard.pending:
         page.note(f"Not run yet: trials {', '.join(map(str, scoreboard.pending))}.")
-    figures = figures_of(scoreboard)
-    page.tiles([(value, what) for what, value in figures])
+    page.tiles(
+        [
+            (one.value, f"{one.what} (wanted: {one.wanted})" if one.wanted else one.what)
+            for one in figures_of(scoreboard)
+        ]
+    )
     page.code(scoreboard.command)
     if scoreboard.trials:
         page.heading("Outcome against size")

@@ -474,8 +474,9 @@ def test_the_scoreboard_survives_its_file_and_its_page_says_what_it_says(tmp_pat
     assert page.read_text(encoding="utf-8").startswith("top\n")
     assert page.read_text(encoding="utf-8").endswith("\nbottom\n")
     table = [line for line in published(page, scoreboard.seed).splitlines() if line.startswith("|")]
-    # 11 figures and 8 planted causes, with two lines of head each.
-    assert len(table) == 11 + 2 + 8 + 2
+    # 12 figures and 8 planted causes, with two lines of head each.
+    assert len(table) == 12 + 2 + 8 + 2
+    assert "| … both together | 4 of 7 (57 %) | at least 90 % |" in table
     report = write_report(scoreboard, tmp_path).read_text(encoding="utf-8")
     assert report.count("data:image/png;base64,") == 2
     assert (tmp_path / "scoreboard.csv").read_text(encoding="utf-8").count("\n") >= 9
