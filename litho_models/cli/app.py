@@ -201,6 +201,26 @@ def predict(
     typer.echo(f"{height.shape[0]} x {height.shape[1]} px, {lowest:.3f} to {highest:.3f} µm high: {out}")
 
 
+@app.command()
+def export(
+    model: Annotated[str, typer.Argument(help="folder of a frozen model, or zoo:NAME")],
+    out: Annotated[Path, typer.Option(help="file to write: .pt2 (torch.export) or .onnx (extra onnx)")],
+    size_px: Annotated[int, typer.Option(min=1, help="side of the layouts that the program takes")] = 512,
+) -> None:
+    """Write a frozen model as a program for layouts of one size, which runs without this package.
+
+    Example: litho-models export zoo:pbl --size-px 512 --out pbl.onnx
+    """
+    from litho_models.frozen.exporting import export_model
+
+    frozen = litho_models.load_frozen(litho_models.zoo.model_folder(model))
+    difference_um = export_model(frozen, out, size_px)
+    typer.echo(
+        f"{out}: layouts of {size_px} x {size_px} px, (1, 1, y, x) float32 µm; differs by "
+        f"{1000 * difference_um:.2g} nm at most"
+    )
+
+
 @app.command("zoo")
 def show_zoo(
     name: Annotated[str | None, typer.Argument(help="show the page of this model; list all without")] = None,

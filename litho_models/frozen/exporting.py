@@ -1,0 +1,201 @@
+"""A frozen model as a program of its own, for one size of layout: ``torch.export`` or ONNX."""
+
+from __future__ import annotations
+
+import copy
+import json
+import logging
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import atomic_file
+from litho_models.frozen.simulator import FrozenSimulator
+
+if TYPE_CHECKING:
+    from torch.export import ExportedProgram
+
+SUFFIXES = (".pt2", ".onnx")
+# An exported model prints what the model prints, to 0.01 nm.
+LARGEST_DIFFERENCE_UM = 1e-5
+_ITEM = torch.ops.aten._local_scalar_dense.default
+_FACTS = ("name", "pitch_um", "level_height_um", "levels", "calibrated_range_um")
+
+
+def export_model(model: FrozenSimulator, out: str | Path, size_px: int | tuple[int, int] = 512) -> float:
+    """Write a frozen model as a program for layouts of one size; returns the largest difference, µm.
+
+    The program maps a layout (1, 1, y, x) float32 µm to the printed height of the same shape. It checks
+    neither pitch nor range; its metadata has both (``card.json`` of a ``.pt2``, ``metadata_props`` of ONNX).
+
+    Args:
+        out: ``.pt2`` (``torch.export.load``) or ``.onnx`` (extra ``onnx``).
+        size_px: of the layout, one number or (y, x).
+
+    Raises:
+        InputError: another suffix; no ``onnx``; a model whose operations the format does not have; one that
+            would print something else.
+    """
+    target = Path(out)
+    if target.suffix not in SUFFIXES:
+        raise InputError(f"export to {out}", got=repr(target.suffix), wanted=" or ".join(SUFFIXES))
+    shape = (size_px, size_px) if isinstance(size_px, int) else size_px
+    if min(shape) < 1:
+        raise InputError("size_px", got=shape, wanted="positive numbers")
+    generator = torch.Generator().manual_seed(0)
+    lowest, highest = model.card["calibrated_range_um"]
+    layouts = lowest + (highest - lowest) * torch.rand((2, 1, 1, *shape), generator=generator)
+    simulator = _in_plain_operations(model.simulator)
+    with torch.no_grad():
+        wanted = simulator(layouts[1])
+        program = _program(simulator, layouts)
+        facts = {key: model.card[key] for key in _FACTS} | {"sha256": model.sha256}
+        with atomic_file(target) as temporary:
+            # The formats are told by the suffix.
+            file = temporary.with_suffix(target.suffix)
+            try:
+                write = _write_pt2 if target.suffix == ".pt2" else _write_onnx
+                printed = write(program, file, layouts[1], facts, model.name)
+                file.replace(temporary)
+            finally:
+                file.unlink(missing_ok=True)
+            difference = float((printed - wanted).abs().max())
+            if not difference <= LARGEST_DIFFERENCE_UM:
+                got = f"a print that differs by {difference:g} µm"
+                raise InputError(f"export of {model.name}", got=got, wanted=f"{LARGEST_DIFFERENCE_UM:g} µm")
+    return difference
+
+
+def _in_plain_operations(simulator: nn.Module) -> nn.Module:
+    """A copy whose networks run layer by layer: a program has no place for the compiled stack."""
+    plain = copy.deepcopy(simulator).float().cpu().eval().requires_grad_(False)
+    for module in plain.modules():
+        activation = getattr(module, "activation", None)
+        if isinstance(activation, nn.LeakyReLU):
+            cast(Any, module).activation = _LeakySteps(activation.negative_slope)
+    return plain
+
+
+class _LeakySteps(nn.Module):
+    """A leaky ReLU that no fast path knows."""
+
+    def __init__(self, slope: float):
+        super().__init__()
+        self.slope = slope
+
+    def forward(self, values: Tensor) -> Tensor:
+        return functional.leaky_relu(values, self.slope)
+
+
+class _Numbers(TorchDispatchMode):
+    """What a model takes out of tensors as Python numbers: noted in one run, or told in another.
+
+    Kernels have radii that follow from widths, and tables have ends. They follow from the weights alone, so a
+    program may hold them as constants.
+    """
+
+    def __init__(self, told: list[Any] | None = None):
+        super().__init__()
+        self.noted: list[Any] = []
+        self._told = None if told is None else iter(told)
+
+    def __torch_dispatch__(
+        self, operation: Any, types: Any, args: Any = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        if operation is _ITEM and self._told is not None:
+            return next(self._told)
+        result = operation(*args, **(kwargs or {}))
+        if operation is _ITEM:
+            self.noted.append(result)
+        return result
+
+
+def _program(simulator: nn.Module, layouts: Tensor) -> ExportedProgram:
+    from torch.fx.experimental.proxy_tensor import make_fx
+
+    noted = []
+    for layout in layouts:
+        with _Numbers() as numbers:
+            simulator(layout)
+        noted.append(numbers.noted)
+    if noted[0] != noted[1]:
+        raise InputError("model to export", got="steps that depend on the layout", wanted="the same for all")
+
+    def run(layout_um: Tensor) -> Tensor:
+        with _Numbers(noted[0]):
+            return simulator(layout_um)
+
+    traced = make_fx(run, tracing_mode="real")(layouts[0])
+    return torch.export.export(_Program(traced), (layouts[0],), strict=False)
+
+
+class _Program(nn.Module):
+    """Names the input of a program."""
+
+    def __init__(self, traced: Callable[[Tensor], Tensor]):
+        super().__init__()
+        self.traced = traced
+
+    def forward(self, layout_um: Tensor) -> Tensor:
+        return self.traced(layout_um)
+
+
+def _write_pt2(
+    program: ExportedProgram, file: Path, layout_um: Tensor, facts: dict[str, Any], name: str
+) -> Tensor:
+    torch.export.save(program, file, extra_files={"card.json": json.dumps(facts)})
+    return torch.export.load(file).module()(layout_um)
+
+
+def _write_onnx(
+    program: ExportedProgram, file: Path, layout_um: Tensor, facts: dict[str, Any], name: str
+) -> Tensor:
+    try:
+        import onnxruntime
+        import onnxscript  # noqa: F401
+    except ModuleNotFoundError as error:
+        raise InputError(
+            "export to ONNX", got=f"no {error.name}", hint="pip install 'litholoop[onnx]'"
+        ) from None
+    with _quiet():
+        try:
+            written = torch.onnx.export(program, (layout_um,), dynamo=True, verbose=False)
+        except torch.onnx.errors.OnnxExporterError as error:
+            complex_numbers = "complex" in str(error)
+            raise InputError(
+                f"model {name} to export to ONNX",
+                got="complex numbers, which its operators do not have"
+                if complex_numbers
+                else type(error).__name__,
+                hint="a .pt2 holds every model",
+            ) from None
+    assert written is not None
+    written.model.metadata_props.update({key: json.dumps(value) for key, value in facts.items()})
+    written.save(str(file))
+    session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
+    (given,) = session.get_inputs()
+    return torch.from_numpy(session.run(None, {given.name: layout_um.numpy()})[0])
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """The exporter warns of packages that no model here needs."""
+    loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
+    levels = [logger.level for logger in loggers]
+    try:
+        for logger in loggers:
+            logger.setLevel(logging.ERROR)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)

@@ -1,0 +1,77 @@
+"""A model that leaves prints what it printed here, or says why it cannot leave."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from litho_data.foundation.errors import InputError
+from litho_models import build_model, load_frozen, save_frozen, zoo
+from litho_models.cli.app import app
+from litho_models.frozen.exporting import LARGEST_DIFFERENCE_UM, export_model
+from litho_models.frozen.simulator import FrozenSimulator
+
+SIZE_PX = 96
+CLOSED_FORM = ("identity", "affine", "affine-mtf", "blur-table", "linear", "features")
+
+
+def layout(seed: int, size_px: int = SIZE_PX) -> torch.Tensor:
+    levels = torch.randint(0, 13, (1, 1, size_px, size_px), generator=torch.Generator().manual_seed(seed))
+    return 0.1 * levels.float()
+
+
+def frozen(name: str, folder: Path) -> FrozenSimulator:
+    """One of the zoo, or a baseline whose weights are drawn."""
+    if name in zoo.list():
+        return zoo.load(name)
+    torch.manual_seed(0)
+    model = build_model(name)
+    for weights in model.parameters():
+        weights.data += 0.01 * torch.rand(weights.shape)
+    return load_frozen(save_frozen(model, folder / name))
+
+
+@pytest.mark.parametrize("name", ["physics", "pbl", "fno", *CLOSED_FORM])
+def test_a_program_prints_what_the_model_prints(name: str, tmp_path: Path) -> None:
+    model = frozen(name, tmp_path)
+    assert export_model(model, tmp_path / "model.pt2", SIZE_PX) <= LARGEST_DIFFERENCE_UM
+    facts = {"card.json": ""}
+    program = torch.export.load(tmp_path / "model.pt2", extra_files=facts).module()
+    # A layout that the export has not seen, and the model by its usual way, compiled stack included.
+    torch.testing.assert_close(program(layout(5)), model(layout(5)), atol=LARGEST_DIFFERENCE_UM, rtol=0)
+    assert json.loads(facts["card.json"])["pitch_um"] == model.pitch_um
+
+
+@pytest.mark.parametrize("name", ["physics", "pbl", "affine-mtf"])
+def test_onnxruntime_prints_the_same(name: str, tmp_path: Path) -> None:
+    onnxruntime = pytest.importorskip("onnxruntime")
+    model = frozen(name, tmp_path)
+    export_model(model, tmp_path / "model.onnx", SIZE_PX)
+    session = onnxruntime.InferenceSession(tmp_path / "model.onnx", providers=["CPUExecutionProvider"])
+    assert [one.name for one in session.get_inputs()] == ["layout_um"]
+    (printed,) = session.run(None, {"layout_um": layout(5).numpy()})
+    np.testing.assert_allclose(printed, model(layout(5)).numpy(), atol=LARGEST_DIFFERENCE_UM, rtol=0)
+    stored = session.get_modelmeta().custom_metadata_map
+    assert json.loads(stored["calibrated_range_um"]) == model.card["calibrated_range_um"]
+
+
+def test_what_cannot_leave_says_why_and_leaves_no_file(tmp_path: Path) -> None:
+    pytest.importorskip("onnxruntime")
+    with pytest.raises(InputError, match="complex numbers"):
+        export_model(zoo.load("fno"), tmp_path / "fno.onnx", SIZE_PX)
+    with pytest.raises(InputError, match=r"wanted \.pt2 or \.onnx"):
+        export_model(zoo.load("physics"), tmp_path / "physics.pth", SIZE_PX)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_command_says_size_and_difference(tmp_path: Path) -> None:
+    out = tmp_path / "physics.pt2"
+    done = CliRunner().invoke(app, ["export", "zoo:physics", "--size-px", "64", "--out", str(out)])
+    assert done.exit_code == 0, done.output
+    assert "64 x 64 px" in done.output
+    assert out.exists()
