@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from litho_models.evaluation.benchmark import benchmark as benchmark
     from litho_models.evaluation.compare import compare as compare
     from litho_models.evaluation.evaluate import evaluate as evaluate
+    from litho_models.fitting.patches import PatchDataset as PatchDataset
     from litho_models.fitting.runs import train as train
     from litho_models.frozen import zoo as zoo
     from litho_models.frozen.files import load_frozen as load_frozen
@@ -31,6 +32,7 @@ else:
         {
             "FrozenSimulator": "litho_models.frozen.simulator",
             "LoopConfig": "litho_models.loop",
+            "PatchDataset": "litho_models.fitting.patches",
             "Simulator": "litho_models.simulator",
             "analyse_noise": "litho_models.noise",
             "benchmark": "litho_models.evaluation.benchmark",
@@ -53,6 +55,7 @@ else:
 __all__ = [
     "FrozenSimulator",
     "LoopConfig",
+    "PatchDataset",
     "Simulator",
     "__version__",
     "analyse_noise",
