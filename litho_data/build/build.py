@@ -191,7 +191,13 @@ def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> None:
     # A search takes a twentieth of a second.
     for key in lost[: max(1, _MOST_SEARCHES // max(1, len(layouts)))]:
         read = fields[key].read()
-        others = {name: layout for name, layout in layouts.items() if name != key}
+        # One layout may be printed, and one print scanned, more than once.
+        own = layouts.get(key)
+        others = {
+            name: layout
+            for name, layout in layouts.items()
+            if name != key and (own is None or layout.tobytes() != own.tobytes())
+        }
         height_um, pitch_y_x = read.arrays["raw_height_um"], read.facts["pitch_um"]
         pitch_um = fields[key].card.layout.pitch_um
         if fits := fitting_layout(height_um, (pitch_y_x[0], pitch_y_x[1]), others, pitch_um):

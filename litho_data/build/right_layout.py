@@ -35,7 +35,8 @@ _CLEAR_SIGMA = 4.0
 class _Print:
     """One registered scan: its heights on its layout, and where it belongs.
 
-    ``group`` is what should share a gain: the dose, if the card gives it, or the printed block.
+    ``turned``: whether the card says that it lay turned. ``group`` is what should share a gain: the dose, if
+    the card gives it, or the printed block.
     """
 
     id: str
@@ -43,6 +44,7 @@ class _Print:
     height: np.ndarray
     layout: str
     dihedral: str
+    turned: bool
     group: float | str
 
 
@@ -99,6 +101,7 @@ def _print(record: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> _Prin
         height=height[sparse].astype(np.float64),
         layout=sha256(level.tobytes()).hexdigest(),
         dihedral=str(record["quality"]["dihedral"]),
+        turned=bool(record["columns"].get("turned_deg")),
         group=float(dose) if dose is not None and np.isfinite(dose) else str(record["print"]),
     )
 
@@ -132,6 +135,9 @@ def _orientations(prints: Sequence[_Print]) -> list[tuple[str, str]]:
     usual, count = Counter(one.dihedral for one in prints).most_common(1)[0]
     said = []
     for one in prints:
+        if one.turned:
+            # As its card says.
+            continue
         if one.dihedral != usual and 2 * count > len(prints):
             mirrored = (one.dihedral in MIRRORED) != (usual in MIRRORED)
             what = "a mirror image of its layout" if mirrored else f"turned ({one.dihedral})"

@@ -149,6 +149,12 @@ class Write(Record):
     field_um: Length | None = None
 
 
+class Planned(Record):
+    """Prints that were planned: the hash of the dataset whose open questions they are to decide."""
+
+    dataset_sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+
+
 class Source(Record):
     """Where to get the files: a base URL, and a registry of SHA-256 sums beside the card."""
 
@@ -168,6 +174,7 @@ class Card(Record):
     process: Process = Process()
     ids: Ids = Ids()
     write: Write | None = None
+    plan: Planned | None = None
     source: Source | None = None
 
 

@@ -16,6 +16,7 @@ from litho_data.store.schema import OPTIONAL_COLUMNS
 
 SAFE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._+-]*")
 COLUMNS = ("id", "order", *OPTIONAL_COLUMNS, "use")
+_ALLOWED = {"turned_deg": (0.0, 90.0, 180.0, 270.0), "direction": (1.0, -1.0)}
 
 
 def read_table(path: Path) -> dict[str, dict[str, str]]:
@@ -59,6 +60,9 @@ def _check_row(row: Mapping[str, str], what: str, overfull: bool, needs_order: b
     for name in OPTIONAL_COLUMNS:
         if name in row and not _is_finite(row[name]):
             raise InputError(f"{what}: {name}", got=repr(row[name]), wanted="a number")
+        if name in row and float(row[name]) not in _ALLOWED.get(name, (float(row[name]),)):
+            wanted = " | ".join(f"{value:g}" for value in _ALLOWED[name])
+            raise InputError(f"{what}: {name}", got=repr(row[name]), wanted=wanted)
 
 
 def _is_finite(text: str) -> bool:

@@ -80,6 +80,14 @@ def simulate(
     layouts: Annotated[
         Path | None, typer.Option(help="print the layouts of this card instead of random ones")
     ] = None,
+    plan: Annotated[
+        Path | None,
+        typer.Option(help="print and scan the plan in this folder (litho-models next-print), beside --fab"),
+    ] = None,
+    fab: Annotated[
+        Path | None,
+        typer.Option(help="earlier run (raw/ and truth/) whose machine prints the plan; give a new --seed"),
+    ] = None,
     count: Annotated[int | None, typer.Option(min=1, help="number of scans; by default the preset's")] = None,
     size: Annotated[
         int | None, typer.Option(min=32, help="side of a layout, pixels; by default the preset's")
@@ -107,9 +115,18 @@ def simulate(
 ) -> None:
     """The virtual fab: print layouts, scan the prints, and write the files a laboratory would deliver."""
     from litho_data.foundation.errors import InputError
-    from litho_data.virtual_fab import jobs_of_card, simulate
+    from litho_data.virtual_fab import jobs_of_card, simulate, simulate_plan
     from litho_data.virtual_fab.settings import preset as named_preset
 
+    if (plan is None) != (fab is None):
+        raise InputError("--plan and --fab", got="one of them", wanted="both: what is printed, and where")
+    if plan is not None and fab is not None:
+        if layouts is not None or knob or any(value is not None for value in (count, size, write_field_um)):
+            wanted = "only --out and --seed: plan and fab have the rest"
+            raise InputError("options beside --plan", wanted=wanted)
+        card = simulate_plan(plan, fab, out, seed=seed)
+        typer.echo(f"card   {card}\ntruth  {card.parent.parent / 'truth' / 'truth.json'}")
+        return
     if layouts is not None and any(value is not None for value in (count, size, write_field_um)):
         wanted = "no --count, --size or --write-field-um: the card's layouts have them"
         raise InputError("options beside --layouts", wanted=wanted)

@@ -32,6 +32,7 @@ class CardText:
         table: whether a table lies beside the card.
         slow_axis: axis across the hatch lines, or empty if it is not stated.
         write_field_um: side of the write field, µm, or None if it is not stated.
+        plan_of: hash of the dataset that the layouts were planned from, or empty.
     """
 
     name: str
@@ -44,6 +45,7 @@ class CardText:
     table: bool = True
     slow_axis: str = ""
     write_field_um: float | None = None
+    plan_of: str = ""
 
     def toml(self) -> str:
         """The card's text."""
@@ -73,6 +75,8 @@ class CardText:
             lines += [f'slow_axis = "{self.slow_axis}"'] * bool(self.slow_axis)
             if self.write_field_um is not None:
                 lines.append(f"field_um = {float(self.write_field_um)}")
+        if self.plan_of:
+            lines += ["", "[plan]", f"dataset_sha256 = {json.dumps(self.plan_of)}"]
         return "\n".join(lines) + "\n"
 
     def write(self, folder: Path) -> Path:

@@ -55,6 +55,8 @@ class PrintedScan:
         write: the card's ``[write]`` table; None if it has none.
         field_x_um, field_y_um: position of the scan in its write field, µm; ``dose``: relative dose;
             None if the card does not state it.
+        turned_deg: by how much the scan is turned against the others, ``direction``: 1 trace, -1 retrace,
+            ``tip``: number of the tip; None as above.
         bend_um: of a bent scan; ``scan_to_layout`` then acts on the straightened positions.
     """
 
@@ -72,7 +74,16 @@ class PrintedScan:
     field_x_um: float | None = None
     field_y_um: float | None = None
     dose: float | None = None
+    turned_deg: float | None = None
+    direction: float | None = None
+    tip: float | None = None
     bend_um: Bend | None = None
+
+    @property
+    def quarter_turns(self) -> int:
+        """How often ``rot90`` turns the layout's grid into the scan's, 0 to 3, by its registration."""
+        along = self.scan_to_layout[:2, 0]
+        return round(math.atan2(along[1], along[0]) / (math.pi / 2)) % 4
 
     @property
     def layout_um(self) -> np.ndarray:
@@ -147,7 +158,7 @@ class Store:
             write=self.write,
             field_x_um=self._column("field_x_um", row),
             field_y_um=self._column("field_y_um", row),
-            dose=self._column("dose", row),
+            **{name: self._column(name, row) for name in ("dose", "turned_deg", "direction", "tip")},
             bend_um=self._bend_um(row),
         )
 

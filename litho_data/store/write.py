@@ -69,7 +69,7 @@ def write_samples(
     for name in OPTIONAL_COLUMNS:
         if any(name in scan["columns"] for scan in scans):
             values = [scan["columns"].get(name, np.nan) for scan in scans]
-            unit = {"units": "1" if name == "dose" else "um"}
+            unit = {"units": "um" if name.endswith("_um") else "degree" if name.endswith("_deg") else "1"}
             write_numbers(root, name, np.array(values), "scan", attributes=unit)
     for axis, count in (("y", ny), ("x", nx)):
         described = {"long_name": f"{axis} of the pixel centres, layout frame", "axis": axis.upper()}

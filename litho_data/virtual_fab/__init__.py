@@ -3,6 +3,7 @@
 from litho_data.virtual_fab.fab import Fab, FabScan, scan_job
 from litho_data.virtual_fab.jobs import jobs_of_card
 from litho_data.virtual_fab.knobs import KNOBS, Knob, KnobSetting
+from litho_data.virtual_fab.plans import simulate_plan
 from litho_data.virtual_fab.printer import Cause, Job
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 from litho_data.virtual_fab.simulate import simulate
@@ -26,5 +27,6 @@ __all__ = [
     "knob_rms_nm",
     "scan_job",
     "simulate",
+    "simulate_plan",
     "strength_for_rms",
 ]

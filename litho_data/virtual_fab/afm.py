@@ -7,6 +7,7 @@ import scipy.ndimage
 
 from litho_data.virtual_fab.geometry import ScanFrame
 from litho_data.virtual_fab.knobs import KnobBoard
+from litho_data.virtual_fab.printer import Job
 from litho_data.virtual_fab.settings import Noise
 
 _TIP_OVERSAMPLING = 10
@@ -18,22 +19,25 @@ def scan_surface(
     frame: ScanFrame,
     noise: Noise,
     knobs: KnobBoard,
-    scan_index: int,
+    job: Job,
     rng: np.random.Generator,
 ) -> np.ndarray:
     """Height that the microscope reports for a surface given at its pixels, µm.
 
-    Lines are scanned from left to right (fast axis x), the first line on top.
+    Lines are scanned from left to right (fast axis x; on the way back from right to left), the first line
+    on top.
 
     Args:
         surface_um: true height at the pixels of the scan, µm.
+        job: what is scanned, in which direction and with which tip.
         rng: draws of the default noise of this scan.
     """
-    height = surface_um
-    if strength := knobs["tip-dilation"]:
+    height, scan_index = surface_um, job.index
+    if strength := (job.tip == 1) * knobs["tip-dilation"]:
         height = _dilate_by_tip(height, frame.pitch_um, strength)
     if strength := knobs["feedback-lag"]:
-        height = _follow_surface(height, frame.pitch_um, strength)
+        onwards = slice(None, None, int(job.direction))
+        height = _follow_surface(height[:, onwards], frame.pitch_um, strength)[:, onwards]
     if strength := knobs["z-gain"]:
         height = height * (1 + strength * knobs.scan_rng("z-gain", scan_index).standard_normal())
     height = height + 1e-3 * _additive_nm(frame, noise, knobs, scan_index, rng)

@@ -47,21 +47,24 @@ class FabScan:
 
 def scan_job(fab: Fab, job: Job) -> FabScan:
     """Print and scan one field; depends on the fab and the job only, not on other fields."""
-    geometry_seed, roughness_seed, instrument_seed = np.random.SeedSequence(
-        fab.seed, spawn_key=(job.index, 1)
-    ).spawn(3)
+    geometry_seed, _, instrument_seed = _seeds(fab, job.index)
+    roughness_seed = _seeds(fab, job.printed)[1]
     frame = place_scan(
-        job.level.shape, fab.printer.pitch_um, fab.microscope, np.random.default_rng(geometry_seed)
+        job.level.shape,
+        fab.printer.pitch_um,
+        fab.microscope,
+        np.random.default_rng(geometry_seed),
+        job.turned_deg,
     )
     surface = print_clean(job, fab.printer, fab.knobs, fab.cause)
     rough = surface_noise(job, fab.printer, fab.noise, fab.knobs, np.random.default_rng(roughness_seed))
 
     def scan(true_surface: np.ndarray, noise: Noise) -> np.ndarray:
-        sampled = sample_surface(true_surface, frame, fab.knobs, job.index)
+        sampled = sample_surface(true_surface, frame, fab.knobs, job.index, job.direction)
         if fab.cause is not None:
             sampled = fab.cause.on_scan(sampled, frame, job)
         instrument = np.random.default_rng(instrument_seed)
-        return scan_surface(sampled, frame, noise, fab.knobs, job.index, instrument)
+        return scan_surface(sampled, frame, noise, fab.knobs, job, instrument)
 
     return FabScan(
         job=job,
@@ -70,3 +73,8 @@ def scan_job(fab: Fab, job: Job) -> FabScan:
         noiseless_um=scan(surface, Noise.off()),
         clean_um=cut_layout(surface),
     )
+
+
+def _seeds(fab: Fab, index: int) -> list[np.random.SeedSequence]:
+    """Of where a scan lies, of the surface's roughness, of the microscope's noise."""
+    return np.random.SeedSequence(fab.seed, spawn_key=(index, 1)).spawn(3)

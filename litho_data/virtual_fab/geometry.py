@@ -40,13 +40,22 @@ class ScanFrame:
 
 
 def place_scan(
-    layout_shape: tuple[int, int], pitch_um: float, microscope: Microscope, rng: np.random.Generator
+    layout_shape: tuple[int, int],
+    pitch_um: float,
+    microscope: Microscope,
+    rng: np.random.Generator,
+    turned_deg: float = 0.0,
 ) -> ScanFrame:
-    """A scan centred on the layout up to a small random shift, rotation, shear and anisotropic scale."""
+    """A scan centred on the layout up to a small random shift, rotation, shear and anisotropic scale.
+
+    ``turned_deg``: by how much the print lies turned under the microscope, on top of the small rotation.
+    """
     margins_px = [round(microscope.margin_px * size / _REFERENCE_PX) for size in layout_shape]
     shape = (layout_shape[0] + 2 * margins_px[0], layout_shape[1] + 2 * margins_px[1])
     draws = rng.uniform(-1, 1, 6)
-    angle = np.deg2rad(microscope.rotation_deg) * draws[0]
+    if turned_deg % 180:
+        shape = shape[::-1]
+    angle = np.deg2rad(microscope.rotation_deg) * draws[0] + np.deg2rad(turned_deg)
     scale_x, scale_y = 1 + microscope.scale * draws[1], 1 + microscope.scale * draws[2]
     rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
     linear = rotation @ np.array([[scale_x, microscope.shear * draws[3]], [0.0, scale_y]])
@@ -58,7 +67,9 @@ def place_scan(
     return ScanFrame(shape, pitch_um, transform)
 
 
-def sample_surface(surface: np.ndarray, frame: ScanFrame, knobs: KnobBoard, scan_index: int) -> np.ndarray:
+def sample_surface(
+    surface: np.ndarray, frame: ScanFrame, knobs: KnobBoard, scan_index: int, direction: float = 1.0
+) -> np.ndarray:
     """The surface (on the canvas) at the pixels of the scan, shape ``frame.shape``."""
     y_um = (np.arange(frame.shape[0]) + 0.5)[:, None] * frame.pitch_um
     x_um = (np.arange(frame.shape[1]) + 0.5)[None, :] * frame.pitch_um
@@ -66,7 +77,8 @@ def sample_surface(surface: np.ndarray, frame: ScanFrame, knobs: KnobBoard, scan
     if not warped and (corner := _whole_pixel_corner(frame)) is not None:
         top, left = corner
         return surface[top : top + frame.shape[0], left : left + frame.shape[1]].copy()
-    if strength := knobs["piezo-nonlinearity"]:
+    # On the way back a piezo bulges the other way.
+    if strength := direction * knobs["piezo-nonlinearity"]:
         x_um = x_um + strength * x_um * (1 - x_um / frame.size_um[1])
     (xx, xy, x0), (yx, yy, y0) = frame.scan_to_layout[:2]
     layout_x_um = xx * x_um + xy * y_um + x0

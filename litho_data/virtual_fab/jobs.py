@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,8 @@ from litho_data.readers import read_layout
 from litho_data.virtual_fab.printer import Job, Use
 from litho_data.virtual_fab.settings import Printer
 
+# Columns of a card's table that say how a scan was made.
+SCANNING = ("turned_deg", "direction", "tip")
 PRINT_PATTERN = r"P(?P<print>\d+)F\d+"
 _STEPS = 5
 
@@ -110,8 +113,15 @@ def _reference_jobs(plan: Plan, printer: Printer) -> Iterator[Job]:
     yield Job(id="P0F3", level=np.ascontiguousarray(steps), index=plan.count + 2, use="steps")
 
 
-def jobs_of_card(path: str | Path) -> list[Job]:
-    """The layouts of a dataset card, with order, dose, position and use from its table.
+def jobs_of_card(path: str | Path, *, first: int = 0) -> list[Job]:
+    """The layouts of a dataset card, with what its table says about printing and scanning them.
+
+    Rows of one print with the same layout are scans of one printed field if the table says how a scan was
+    made (``turned_deg``, ``direction``, ``tip``).
+
+    Args:
+        path: the card.
+        first: number of the first scan: what is drawn for a scan or print goes by its number.
 
     Raises:
         InputError: a bad card, no layout files, or layouts of a pitch or level height that the default
@@ -135,15 +145,23 @@ def jobs_of_card(path: str | Path) -> list[Job]:
     ids = [file.relative_to(folder).as_posix().removeprefix(before).removesuffix(after) for file in files]
     rank = {scan_id: int(table.get(scan_id, {}).get("order", place)) for place, scan_id in enumerate(ids)}
     spread = max(1, len(ids) - 1)
-    jobs = []
+    jobs: list[Job] = []
+    printed: dict[tuple[str, bytes], tuple[int, float]] = {}
     for index, scan_id in enumerate(sorted(ids, key=rank.__getitem__)):
         row = table.get(scan_id, {})
+        level = read_layout(folder / f"{before}{scan_id}{after}")
+        match = re.fullmatch(card.ids.print, scan_id) if card.ids.print else None
+        block = match["print"] if match and any(name in row for name in SCANNING) else scan_id
+        place = index / spread - 0.5 if len(ids) > 1 else 0.0
+        print_index, order = printed.setdefault((block, level.tobytes()), (first + index, place))
         jobs.append(
             Job(
                 id=scan_id,
-                level=read_layout(folder / f"{before}{scan_id}{after}"),
-                index=index,
-                order=index / spread - 0.5 if len(ids) > 1 else 0.0,
+                level=level,
+                index=first + index,
+                print_index=print_index,
+                order=order,
+                **{name: float(row[name]) for name in SCANNING if name in row},
                 dose=float(row.get("dose", 1.0)),
                 field_um=(float(row.get("field_y_um", 0.0)), float(row.get("field_x_um", 0.0))),
                 write_field_um=card.write.field_um if card.write else None,

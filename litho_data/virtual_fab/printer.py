@@ -33,6 +33,10 @@ class Job:
         field_um: (y, x) centre of the layout in its write field, µm.
         write_field_um: side of the write field, µm; None for a field as large as the layout.
         use: what the scan is for; nothing is printed for ``substrate``.
+        print_index: number of the print in its set where one is scanned more than once; ``index`` if None.
+        turned_deg: by how much the print lies turned under the microscope, whole quarters.
+        direction: 1 for lines recorded on the way there, -1 on the way back.
+        tip: number of the tip; every one after the first is new and sharp.
     """
 
     id: str
@@ -43,6 +47,15 @@ class Job:
     field_um: tuple[float, float] = (0.0, 0.0)
     write_field_um: float | None = None
     use: Use = "dataset"
+    print_index: int | None = None
+    turned_deg: float = 0.0
+    direction: float = 1.0
+    tip: float = 1.0
+
+    @property
+    def printed(self) -> int:
+        """Number of the print, which decides what is drawn for it; the scan's own draws go by ``index``."""
+        return self.index if self.print_index is None else self.print_index
 
     def canvas(self, pitch_um: float) -> Canvas:
         """The framed layout in its write field."""
@@ -77,7 +90,7 @@ def print_clean(job: Job, printer: Printer, knobs: KnobBoard, cause: Cause | Non
     if job.use == "substrate":
         return np.zeros(canvas.level.shape)
     dose = accumulate_dose(
-        canvas, printer, knobs, relative_dose=job.dose, order=job.order, scan_index=job.index
+        canvas, printer, knobs, relative_dose=job.dose, order=job.order, scan_index=job.printed
     )
     height = develop(cause.on_dose(dose, canvas, job), canvas, printer, knobs)
     if strength := knobs["hatch-ripple"]:
@@ -99,6 +112,6 @@ def surface_noise(
         return 1e-3 * noise.substrate_nm * gaussian_field(grain_psd, rng, shape)
     rough_nm = noise.roughness_nm * line_roughness(shape, printer.pitch_um, rng)
     if strength := knobs["line-roughness"]:
-        more = line_roughness(shape, printer.pitch_um, knobs.scan_rng("line-roughness", job.index))
+        more = line_roughness(shape, printer.pitch_um, knobs.scan_rng("line-roughness", job.printed))
         rough_nm = rough_nm + strength * more
     return 1e-3 * rough_nm

@@ -17,7 +17,7 @@ from litho_data.foundation.outputs import require_replaceable_folder
 from litho_data.layouts.card_text import CardText, write_layout, write_table
 from litho_data.readers.text_matrix import write_text_matrix
 from litho_data.virtual_fab.fab import Fab, FabScan, scan_job
-from litho_data.virtual_fab.jobs import PRINT_PATTERN, Plan, random_jobs
+from litho_data.virtual_fab.jobs import PRINT_PATTERN, SCANNING, Plan, random_jobs
 from litho_data.virtual_fab.knobs import KnobBoard, KnobSetting
 from litho_data.virtual_fab.printer import Cause, Job
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
@@ -44,6 +44,8 @@ def simulate(
     jobs: Sequence[Job] | None = None,
     metadata: str = "full",
     name: str = "virtual-fab",
+    plan_of: str = "",
+    print_pattern: str = PRINT_PATTERN,
 ) -> Path:
     """Print and scan a set of fields; returns the path of the card, ``out/raw/card.toml``.
 
@@ -64,6 +66,8 @@ def simulate(
         write_field_um: side of a write field that a print's fields share, µm; None: each has its own.
         references: add scans of a bare substrate, a flat print and a five-step print.
         jobs: your own layouts instead of random ones; the arguments about random layouts are then unused.
+        plan_of: hash of the dataset that the layouts were planned from, ``print_pattern``: which print an id
+            belongs to, for the card.
         metadata: ``files-only`` leaves print groups, order, positions and write axis out of the card.
 
     Raises:
@@ -112,11 +116,20 @@ def simulate(
             np.save(hidden / "prints" / f"{job.id}.npy", scan.clean_um.astype(np.float32))
             size_um = scan.frame.size_um
             write_field_um = job.write_field_um
-            rows.append((job.id, len(rows), job.field_um[1], job.field_um[0], job.dose, job.use))
+            rows.append(_row(job, len(rows)))
             scans.append(_scan_truth(scan))
-        _write_card(raw, fab, name, size_um, rows, metadata, write_field_um)
+        _write_card(raw, fab, name, size_um, rows, metadata, write_field_um, plan_of, print_pattern)
         _truth(fab, scans).write(hidden)
     return Path(out) / "raw" / "card.toml"
+
+
+# Not turned, on the way there, with the first tip.
+AS_EVER = (0.0, 1.0, 1.0)
+
+
+def _row(job: Job, number: int) -> tuple[object, ...]:
+    place = (job.field_um[1], job.field_um[0])
+    return (job.id, number, *place, job.dose, job.use, job.turned_deg, job.direction, job.tip)
 
 
 def _named(value: T | str, what: str, known: dict[str, T]) -> T:
@@ -152,11 +165,15 @@ def _write_card(
     rows: list[tuple[object, ...]],
     metadata: str,
     write_field_um: float | None,
+    plan_of: str,
+    print_pattern: str,
 ) -> None:
     full = metadata == "full"
-    in_prints = all(re.fullmatch(PRINT_PATTERN, str(row[0])) for row in rows)
+    in_prints = all(re.fullmatch(print_pattern, str(row[0])) for row in rows)
     if full:
-        write_table(raw, ("id", "order", "field_x_um", "field_y_um", "dose", "use"), rows)
+        ways = SCANNING if any(row[-len(SCANNING) :] != AS_EVER for row in rows) else ()
+        columns = ("id", "order", "field_x_um", "field_y_um", "dose", "use", *ways)
+        write_table(raw, columns, [row[: len(columns)] for row in rows])
     CardText(
         name=name,
         title="Simulated two-photon prints with simulated AFM scans",
@@ -164,8 +181,9 @@ def _write_card(
         level_height_um=fab.printer.level_height_um,
         levels=fab.printer.levels,
         scan_size_um=size_um,
-        print_pattern=PRINT_PATTERN if full and in_prints else "",
+        print_pattern=print_pattern if full and in_prints else "",
         table=full,
+        plan_of=plan_of,
         slow_axis="y" if full else "",
         write_field_um=write_field_um if full else None,
     ).write(raw)

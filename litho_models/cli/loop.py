@@ -11,7 +11,13 @@ import litho_models
 
 
 def close_loop(
-    store: Annotated[Path, typer.Argument(help="dataset store made by litho-data build")],
+    stores: Annotated[
+        list[Path],
+        typer.Argument(
+            help="dataset store made by litho-data build; further stores of the same printer, later prints, "
+            "decide what the first leaves open"
+        ),
+    ],
     out: Annotated[
         Path, typer.Option("--out", help="folder for result, report, tables and the corrected model")
     ],
@@ -76,8 +82,9 @@ def close_loop(
         inject=tuple(inject or ()),
     )
     result = litho_models.close_loop(
-        store,
+        stores[0],
         out,
+        new_prints=stores[1:],
         base=base,
         config=config,
         steps=steps,
@@ -91,4 +98,7 @@ def close_loop(
         typer.echo(
             f"  {effect.name}{alike}: {effect.verdict}, {effect.before_nm:.2f} -> {effect.after_nm:.2f} nm"
         )
+    for one in result.decisions or []:
+        left = ", ".join(one.left) or "none"
+        typer.echo(f"  new prints on {one.question}: {one.verdict}: {left}; {one.evidence}")
     typer.echo(f"report: {out / 'report.html'}")

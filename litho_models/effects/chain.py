@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import torch
 from torch import Tensor, nn
@@ -20,6 +20,8 @@ class EffectChain(nn.Module):
         effects: effect name to parameter values; parameters not named are off.
         full_height_um: nominal height of the highest level, µm.
         pitch_um: lateral sampling, µm.
+        scan_frame: height effects that act as the microscope's do, whatever the catalogue says: turned with
+            the scan. Those of the stage ``measurement`` always do.
     """
 
     def __init__(
@@ -29,11 +31,13 @@ class EffectChain(nn.Module):
         *,
         full_height_um: float,
         pitch_um: float,
+        scan_frame: Collection[str] = (),
     ):
         super().__init__()
         self.base = base
         self.full_height_um = full_height_um
         self.pitch_um = pitch_um
+        self.scan_frame = frozenset(scan_frame)
         self.names = tuple(in_forward_order(list(effects)))
         self.fitted: list[tuple[str, str]] = []
         for name in self.names:
@@ -76,7 +80,8 @@ class EffectChain(nn.Module):
 
     def with_effects(self, effects: Mapping[str, Mapping[str, float]]) -> EffectChain:
         """The same base (shared, not copied) with other effects."""
-        return EffectChain(self.base, effects, full_height_um=self.full_height_um, pitch_um=self.pitch_um)
+        geometry = {"full_height_um": self.full_height_um, "pitch_um": self.pitch_um}
+        return EffectChain(self.base, effects, **geometry, scan_frame=self.scan_frame)
 
     def process_model(self, undetermined: bool = False) -> EffectChain:
         """Only the effects that belong to the printer; those of unknown role on request."""
@@ -88,7 +93,9 @@ class EffectChain(nn.Module):
         for name in self.names:
             effect = get_effect(name)
             if effect.acts_on == acts_on:
-                field = effect.apply(field, self._tensors(effect), context)
+                scanned = effect.stage == "measurement" or name in self.scan_frame
+                apply = effect.as_scanned if scanned else effect.apply
+                field = apply(field, self._tensors(effect), context)
         return field
 
     def _tensors(self, effect: Effect) -> dict[str, Tensor]:

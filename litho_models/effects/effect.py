@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
@@ -65,6 +65,9 @@ class FieldContext:
         scan_shape: (rows, columns) of the whole scan where this field is a part of it.
         origin_px: (row, column) of this field's first pixel in the whole scan.
         scan_line: index of the scan line under each pixel (y, x), None for the rows of the array.
+        quarter_turns: the microscope saw the array turned by so many quarters, as ``rot90`` turns it.
+        backward: the scan lines were recorded on the way back.
+        new_tip: scanned with another tip than the rest, a sharp one.
         seed: decides the draws of random effects where one is planted.
     """
 
@@ -80,6 +83,27 @@ class FieldContext:
     origin_px: tuple[int, int] = (0, 0)
     scan_line: Tensor | None = None
     seed: int = 0
+    quarter_turns: int = 0
+    backward: bool = False
+    new_tip: bool = False
+
+    def in_scan_frame(self) -> FieldContext:
+        """The same field as the microscope saw it, its fast axis along x."""
+        if not self.quarter_turns % 4:
+            return self
+        shape, (top, left) = self.layout_um.shape[-2:], self.origin_px
+        below = self.whole_shape()[0] - top - shape[0]
+        right = self.whole_shape()[1] - left - shape[1]
+        corners = [(top, left), (right, top), (below, right), (left, below)]
+        turn = self.quarter_turns % 4
+        return replace(
+            self,
+            layout_um=torch.rot90(self.layout_um, turn, (-2, -1)),
+            scan_shape=self.whole_shape()[::-1] if turn % 2 else self.whole_shape(),
+            origin_px=corners[turn],
+            scan_line=None if self.scan_line is None else torch.rot90(self.scan_line, turn),
+            quarter_turns=0,
+        )
 
     def centred_um(self) -> tuple[Tensor, Tensor]:
         """(y, x) of each pixel from the centre of the write field: shapes (y, 1) and (1, x), µm."""
@@ -144,6 +168,8 @@ class Effect:
         per_scan: its parameters belong to one scan and have no value shared by all.
         linear: a filter of layout or height, so that what it fails to explain is a filter too.
         along_lines: it depends on the line alone, so offsets of single lines would hide it.
+        reverses: parameters whose sign is the other way round on lines recorded on the way back.
+        of_tip: it belongs to the tip, and a new one does not have it.
     """
 
     name: str
@@ -160,6 +186,8 @@ class Effect:
     per_scan: bool = False
     linear: bool = False
     along_lines: bool = False
+    reverses: tuple[str, ...] = ()
+    of_tip: bool = False
     amplitudes: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -206,3 +234,13 @@ class Effect:
             for name, value in values.items()
         }
         return self.apply(array, tensors, context)
+
+    def as_scanned(self, height: Tensor, values: Values, context: FieldContext) -> Tensor:
+        """Apply an effect of the microscope: in the frame, the direction and with the tip of the scan."""
+        if self.of_tip and context.new_tip:
+            return height
+        if context.backward:
+            values = {name: -v if name in self.reverses else v for name, v in values.items()}
+        turn = context.quarter_turns % 4
+        seen = self.apply(torch.rot90(height, turn, (-2, -1)), values, context.in_scan_frame())
+        return torch.rot90(seen, -turn, (-2, -1))

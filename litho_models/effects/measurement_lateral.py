@@ -80,6 +80,7 @@ EFFECTS = (
         source="first-order feedback loop; a probe that parachutes loses the surface on the way down",
         separating="compare trace and retrace; scan at 0 and 90 degrees",
         linear=True,
+        reverses=("direction",),
     ),
     Effect(
         name="registration-residual",
@@ -110,6 +111,7 @@ EFFECTS = (
         trials=({"strength": 0.005},),
         source="hysteresis of a piezo scanner, quadratic along the line",
         separating="scan a calibration grating; scan at 0 and 180 degrees",
+        reverses=("strength",),
     ),
     Effect(
         name="resampling-blur",

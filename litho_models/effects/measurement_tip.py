@@ -82,5 +82,6 @@ EFFECTS = (
         trials=({"radius_um": 0.04}, {"radius_um": 0.4}),
         source="dilation by a paraboloid; a worn tip is far blunter than a new one",
         separating="scan again with a new tip; scan a tip characteriser",
+        of_tip=True,
     ),
 )

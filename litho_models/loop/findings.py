@@ -107,6 +107,5 @@ def corrected_chain(findings: LoopFindings) -> EffectChain:
     chain = copy.deepcopy(findings.final.fits.chain)
     if isinstance(chain.base, FoldedBase):
         effects, common = chain.values(), chain.base.common
-        geometry = {"full_height_um": chain.full_height_um, "pitch_um": chain.pitch_um}
-        return EffectChain(common, effects, **geometry)
+        return EffectChain(common, effects, full_height_um=chain.full_height_um, pitch_um=chain.pitch_um)
     return chain

@@ -25,8 +25,9 @@ def carry_over(
 ) -> tuple[State, Search]:
     """Try the effects found on the small model on the network; returns its bare state and the search."""
     guide = found.state.fits.chain
-    geometry = {"full_height_um": guide.full_height_um, "pitch_um": guide.pitch_um}
-    bare = fit_state(EffectChain(base, {}, **geometry), study)
+    bare = fit_state(
+        EffectChain(base, {}, full_height_um=guide.full_height_um, pitch_um=guide.pitch_um), study
+    )
     carried = Search(
         bare, first=found.first, last=found.last, failures=dict(found.failures), dropped=dict(found.dropped)
     )

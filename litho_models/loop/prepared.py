@@ -102,6 +102,9 @@ def _prepare(scan: PrintedScan, order: float) -> PreparedScan:
         slow_axis=write.get("slow_axis", "y"),
         order=order,
         scan_line=torch.from_numpy(line),
+        quarter_turns=scan.quarter_turns,
+        backward=scan.direction == -1,
+        new_tip=scan.tip not in (None, 1),
     )
     usable = np.asarray(scan.valid, bool) & np.isfinite(scan.height_um)
     return _thinned(scan, context, usable, usable & _inner(scan.shape), line)

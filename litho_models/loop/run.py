@@ -18,10 +18,13 @@ from litho_models.frozen.files import save_frozen
 from litho_models.loop.close import close_loop
 from litho_models.loop.findings import LoopConfig, LoopFindings, corrected_chain
 from litho_models.loop.folded_base import Trainer
+from litho_models.loop.open_questions import OpenQuestions, open_questions
+from litho_models.loop.prepared import prepare_scans
 from litho_models.loop.report.page import write_report
 from litho_models.loop.result.exporting import exported_effects, write_measurement_model
 from litho_models.loop.result.record import CloseLoop
 from litho_models.loop.result.summary import summarise
+from litho_models.loop.second_round import decide
 from litho_models.loop.single_scans.observed import rounding_step_um
 from litho_models.models import MODELS, build_model
 from litho_models.simulator import Simulator, is_small
@@ -33,6 +36,7 @@ def close_loop_on_store(
     store: str | Path,
     out: str | Path,
     *,
+    new_prints: Sequence[str | Path] = (),
     base: str = "physics",
     config: LoopConfig | None = None,
     steps: int | None = None,
@@ -43,6 +47,8 @@ def close_loop_on_store(
 
     Args:
         store: a store made by ``litho-data build``.
+        new_prints: further stores of the same printer. Names and sets are found on the first store and
+            declared; the new prints then decide between them, see ``second_round``.
         base: name of a model, or a frozen one (its folder, ``zoo:NAME``).
         config: settings; ``report`` is told what happens, a sentence at a time.
         steps: optimiser steps of a base that is trained per fold; the recipe's by default.
@@ -50,12 +56,20 @@ def close_loop_on_store(
             default beside ``out``; that of a benchmark with the same folds and settings spares its trainings.
 
     Raises:
-        InputError: no store, no such base, a base of another pitch, or too few usable scans.
+        InputError: no store, no such base, a base of another pitch, too few usable scans, or further
+            stores of another printer or with a turned scan whose card does not say so.
     """
     require_replaceable_folder(
-        out, CloseLoop.FILE_NAME, "report.html", "*.csv", MODEL_FOLDER, MEASUREMENT_FILE
+        out,
+        CloseLoop.FILE_NAME,
+        OpenQuestions.FILE_NAME,
+        "report.html",
+        "*.csv",
+        MODEL_FOLDER,
+        MEASUREMENT_FILE,
     )
     opened = open_store(store)
+    new = [scan for path in new_prints for scan in _new_scans(opened, open_store(path))]
     simulator, name = _base_model(base, opened)
     scans = opened.scans()
     usable = [scan for scan in scans if np.count_nonzero(scan.valid & np.isfinite(scan.height_um)) >= 1024]
@@ -75,12 +89,49 @@ def close_loop_on_store(
         report=report,
     )
     result = summarise(findings, dataset=opened.dataset_id, base_name=name, dropped=dropped)
+    shares = level_share([scan.stored for scan in findings.development])
+    questions = open_questions(findings, result, shares, report)
+    if new:
+        decisions = decide(findings, questions, prepare_scans(new), report)
+        result = result.model_copy(update={"decisions": decisions})
     with atomic_folder(out) as folder:
         result.write(folder)
+        questions.write(folder)
         write_report(findings, result, folder)
         _save_process_model(findings, result, opened, folder / MODEL_FOLDER)
         write_measurement_model(findings, result, folder / MEASUREMENT_FILE)
     return result
+
+
+def _new_scans(first: Store, store: Store) -> list[PrintedScan]:
+    """The scans of a further store, checked to be of the same printer and turned as their card says."""
+    for name in ("pitch_um", "level_height_um", "levels"):
+        if getattr(store, name) != getattr(first, name):
+            raise InputError(
+                f"{name} of {store.path}",
+                got=getattr(store, name),
+                wanted=f"{getattr(first, name)}, as before",
+            )
+    planned = store.manifest.get("card", {}).get("plan", {}).get("dataset_sha256")
+    if planned is not None and planned != first.sha256:
+        raise InputError(
+            f"prints of {store.path}",
+            got=f"a plan for dataset {planned[:12]}…",
+            wanted=f"a plan for {first.path}, {first.sha256[:12]}…",
+            hint="they were printed for another printer's questions",
+        )
+    scans = store.scans()
+    for scan in scans:
+        stated = round((scan.turned_deg or 0.0) / 90)
+        # From which side a print was turned is a convention; that it was turned shows in its registration.
+        if (stated - scan.quarter_turns) % 2:
+            raise InputError(
+                f"scan {scan.id} of {store.path}",
+                got=f"turned by {90 * scan.quarter_turns}° on its layout, {90 * stated}° in its card",
+                wanted="what the scan shows",
+                hint="add the column turned_deg to the table of the card, and build again",
+            )
+    return scans
 
 
 def parse_priors(text: str | None) -> tuple[str, ...]:

@@ -57,6 +57,7 @@ def write_report(findings: LoopFindings, result: CloseLoop, folder: Path) -> Pat
     for warning in warnings_for(findings, result):
         page.note(warning)
     _error_section(page, findings, result)
+    _decision_section(page, result)
     _effect_section(page, result)
     _candidate_section(page, result)
     page.heading("Residual maps")
@@ -73,6 +74,29 @@ def write_report(findings: LoopFindings, result: CloseLoop, folder: Path) -> Pat
     page.heading("How it was run")
     page.code(result.run.command or "litho_models.loop.close_loop")
     return page.write(folder)
+
+
+def _decision_section(page: Page, result: CloseLoop) -> None:
+    if not result.decisions:
+        return
+    page.heading("What the new prints decided")
+    page.paragraph(
+        "Names and sets were found on the first store and declared before the new prints were looked at. "
+        "Each rival was fitted to all prints and judged on the new ones alone."
+    )
+    rows = [
+        {
+            "question": one.question,
+            "declared": ", ".join(one.declared),
+            "left": ", ".join(one.left),
+            "verdict": one.verdict,
+            "evidence": one.evidence,
+            "prints": one.prints,
+            "scans": one.scans,
+        }
+        for one in result.decisions
+    ]
+    page.table(pd.DataFrame(rows), "Declared questions on the new prints.", "decisions.csv")
 
 
 def _error_section(page: Page, findings: LoopFindings, result: CloseLoop) -> None:

@@ -18,6 +18,7 @@ ChosenKind = Literal["named", "generic", "per-scan"]
 Part = Literal["process", "undetermined", "measurement", "per-scan"]
 EffectVerdict = Literal["explained", "confusable", "partial", "traced-to-covariate"]
 Verdict = Literal["traced", "nothing-missing", "unexplained", "too-few-scans"]
+Decided = Literal["decided", "still open", "none of them", "not shown by these prints"]
 CandidateVerdict = Literal[
     "explained",
     "confusable",
@@ -183,10 +184,36 @@ class Residual(Record):
     signature: str
 
 
+class Comparison(Record):
+    """Of two rivals on new scans: how much smaller the squared error of the first is, mean over pixels;
+    ``z``: in standard deviations.
+    """
+
+    better: str
+    worse: str
+    gain_nm2: float
+    z: float
+
+
+class Decision(Record):
+    """A question declared by the first round, and what the new prints say."""
+
+    question: str
+    kind: str
+    declared: list[str]
+    left: list[str]
+    verdict: Decided
+    evidence: str
+    prints: int
+    scans: int
+    comparisons: list[Comparison] = Field(default_factory=list)
+
+
 class CloseLoop(Result):
     """What the loop found.
 
     ``fewest_scans``: with fewer to work on the verdict is ``too-few-scans`` unless something is found.
+    ``decisions``: what further stores decided about names and sets declared on the first, if there were any.
     ``gain_split``: what each step gains, in the order added; ``nested``: if asked for. ``equal_terms``,
     ``gain_split``, ``explainable``, ``fewest_scans`` and, where the lock box was opened,
     ``locked_equal_terms`` are None in results of schema 1.
@@ -218,6 +245,7 @@ class CloseLoop(Result):
     explainable: list[Explainable] | None = None
     residual: Residual
     verdict: Verdict
+    decisions: list[Decision] | None = None
     fewest_scans: int | None = None
 
     @property
@@ -234,4 +262,8 @@ class CloseLoop(Result):
 
     @model_serializer(mode="wrap")
     def _without_unopened_lock_box(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {k: v for k, v in handler(self).items() if v is not None or not k.startswith("locked_")}
+        return {
+            k: v
+            for k, v in handler(self).items()
+            if v is not None or not k.startswith(("locked_", "decisions"))
+        }

@@ -164,12 +164,12 @@ def _fitted(state: State, entering: Sequence[Screened], study: Study) -> list[En
     entrants, chain = [], state.fits.chain
     for s in entering:
         study.report(f"fitting {s.effect.name}")
-        extended = chain.with_effects({**chain.values(), s.effect.name: _start(s)})
+        extended = chain.with_effects({**chain.values(), s.effect.name: fitting_start(s)})
         entrants.append(Entrant(s, fit_state(extended, study)))
     return entrants
 
 
-def _start(s: Screened) -> dict[str, float]:
+def fitting_start(s: Screened) -> dict[str, float]:
     """The screened values, no amplitude farther from its null than its largest trial: the line ends there.
 
     A fit that starts beyond may end on the far side of a kink.

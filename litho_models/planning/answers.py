@@ -1,0 +1,137 @@
+"""What the plan makes of every open question: difference, power, reason, and what each outcome means."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from litho_models.loop.open_questions import OpenQuestions, Question
+from litho_models.planning import power
+from litho_models.planning.record import PlannedPair, PlannedQuestion, Status
+from litho_models.planning.rivalry import Contrast, PlannedPrint, Rivalry
+
+_COUNTS = range(1, power.MOST_PRINTS + 1)
+
+
+def of_rivals(
+    rivalry: Rivalry,
+    planned: Sequence[PlannedPrint],
+    random: Sequence[PlannedPrint],
+    tried: Mapping[str, float],
+    prints: int,
+) -> PlannedQuestion:
+    """A question whose rivals are models: judged on the planned prints, and on as many random layouts."""
+    question, spread = rivalry.question, rivalry.question.spread
+    pairs = _pairs(rivalry, rivalry.contrasts(planned))
+    control = _pairs(rivalry, rivalry.contrasts(random))
+    hardest = min(pairs, key=lambda pair: pair.power[prints - 1])
+    names = [rival.name for rival in question.rivals]
+    ways = "; ".join(f"{what}: {z:.1f}" for what, z in tried.items())
+    return PlannedQuestion(
+        name=question.name,
+        kind=question.kind,
+        text=question.text,
+        status=_status(hardest.power, prints),
+        why=f"the nearest two rivals differ by so many standard deviations on one random print with {ways}"
+        + (f"; prints so far differ in the size of the effect by {100 * spread:.0f} %" if spread else ""),
+        rivals=names,
+        pairs=pairs,
+        difference_nm=hardest.difference_nm,
+        noise_nm=hardest.noise_nm,
+        power=hardest.power,
+        random_power=np.min([pair.power for pair in control], axis=0).tolist(),
+        prints_needed=power.prints_needed(hardest.power),
+        outcomes=[
+            *(f"the scans are nearer to {name} than to each other rival: it is {name}" for name in names),
+            "two are as near: these two stay a set, the others are excluded",
+            "all leave more than the noise: none of them is the cause",
+        ],
+    )
+
+
+def _pairs(rivalry: Rivalry, contrasts: Sequence[Contrast]) -> list[PlannedPair]:
+    """Unordered pairs, each in the direction in which the refitted rival comes nearer."""
+    names = [rival.name for rival in rivalry.question.rivals]
+    directed = {
+        pair: (contrast, [power.of_contrast(contrast, rivalry.question.spread, n) for n in _COUNTS])
+        for pair, contrast in zip(rivalry.pairs, contrasts, strict=True)
+    }
+    found = []
+    for first, second in (pair for pair in directed if pair[0] < pair[1]):
+        contrast, powers = min(
+            (directed[first, second], directed[second, first]), key=lambda one: tuple(one[1])
+        )
+        found.append(
+            PlannedPair(
+                rivals=(names[first], names[second]),
+                difference_nm=contrast.rms_nm,
+                noise_nm=contrast.noise_nm,
+                power=powers,
+            )
+        )
+    return found
+
+
+def of_others(
+    question: Question, open_: OpenQuestions, prints: int, scans: int, size_px: int
+) -> PlannedQuestion:
+    """A question whose answer lies in how prints are scanned, not in what is printed."""
+    difference = noise = None
+    if question.kind == "generic" and question.turning is not None:
+        turning = question.turning
+        difference, noise = turning.rms_nm, turning.noise_nm
+        powers = [power.of_generic(question, n) for n in _COUNTS]
+        why = f"{turning.by}: as the printer's and as the microscope's it differs by {difference:.1f} nm rms"
+        if difference < 0.1:
+            why += "; turning a print does not show it: a second tip and a step standard do"
+        outcomes = [
+            "the term stays where it was on the print: the printer's, or the resist's",
+            "it goes with the scan: the microscope's, and no design may use it",
+        ]
+    elif question.kind == "lines":
+        sd_um = next(iter(question.sizes.values()), 0.0)
+        difference = 1e3 * sd_um
+        powers = [power.of_lines(sd_um, open_.noise, size_px, n) for n in _COUNTS]
+        why = "lines of a turned scan run along the other axis of the layout than written ones"
+        outcomes = [
+            "offsets follow the layout's rows in turned scans, too: written",
+            "they follow the scan lines: scanned",
+        ]
+    elif question.kind == "per-scan":
+        powers = [power.of_repeats(n, scans) for n in _COUNTS]
+        why = "every print is taken out and scanned again: what belongs to it comes back"
+        outcomes = [
+            "scans of one print agree: the printer's, different in every print",
+            "they agree no better than scans of different prints: the microscope's",
+        ]
+    else:
+        powers, outcomes = (
+            [0.0 for _ in _COUNTS],
+            [f"once the fact is in the card, {question.name} is tested"],
+        )
+        why = question.experiment
+    status: Status = "needs a fact" if question.kind == "fact" else _status(powers, prints)
+    return PlannedQuestion(
+        name=question.name,
+        kind=question.kind,
+        text=question.text,
+        status=status,
+        why=why,
+        rivals=[],
+        pairs=[],
+        difference_nm=difference,
+        noise_nm=noise,
+        power=powers,
+        random_power=powers,
+        prints_needed=power.prints_needed(powers),
+        outcomes=outcomes,
+    )
+
+
+def _status(powers: Sequence[float], prints: int) -> Status:
+    reached = powers[prints - 1]
+    if reached >= power.ENOUGH:
+        return "decides"
+    hopeful = reached > power.HOPELESS or power.prints_needed(powers) is not None
+    return "may decide" if hopeful else "no experiment separates"

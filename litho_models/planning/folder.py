@@ -1,0 +1,126 @@
+"""The plan as a folder: a dataset in waiting, with a sheet for the printer and one for the microscope."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from litho_data.foundation.files import atomic_file
+from litho_data.layouts.card_text import CardText, write_layout, write_table
+from litho_models.planning.record import NextPrint, PlannedScan
+
+PRINT_PATTERN = r"N(?P<print>\d+)F\d+"
+PRINTER_SHEET, MICROSCOPE_SHEET = "printer.md", "microscope.md"
+HOLDS = (
+    "card.toml",
+    "scans.csv",
+    "layouts",
+    NextPrint.FILE_NAME,
+    "report.html",
+    "*.csv",
+    PRINTER_SHEET,
+    MICROSCOPE_SHEET,
+)
+_COLUMNS = ("id", "order", "field_x_um", "field_y_um", "dose", "use", "turned_deg", "direction", "tip")
+_USES = {
+    "substrate": "bare substrate, nothing printed: zero, tilt and bow of the microscope",
+    "flat": "one level everywhere: the noise floor",
+    "steps": "a stair: height against level",
+}
+
+
+def write_plan(
+    folder: Path,
+    plan: NextPrint,
+    layouts: Sequence[np.ndarray],
+    *,
+    pitch_um: float,
+    level_height_um: float,
+    levels: int,
+    write_field_um: float | None,
+) -> None:
+    """Write card, table, layouts and sheets; ``layouts``: the level map of each scan."""
+    for scan, level in zip(plan.scans, layouts, strict=True):
+        write_layout(folder, scan.id, level)
+    rows = [
+        (s.id, s.order, s.field_x_um, s.field_y_um, 1.0, s.use, s.turned_deg, s.direction, s.tip)
+        for s in plan.scans
+    ]
+    write_table(folder, _COLUMNS, rows)
+    CardText(
+        name=f"{plan.dataset.name}-next",
+        title=f"Planned prints that decide what is open on {plan.dataset.name}",
+        pitch_um=pitch_um,
+        level_height_um=level_height_um,
+        levels=levels,
+        scan_size_um=(plan.field_um, plan.field_um),
+        print_pattern=PRINT_PATTERN,
+        slow_axis="y",
+        write_field_um=write_field_um,
+        plan_of=plan.dataset.sha256,
+    ).write(folder)
+    plan.write(folder)
+    for name, text in ((PRINTER_SHEET, _printer_sheet(plan)), (MICROSCOPE_SHEET, _microscope_sheet(plan))):
+        with atomic_file(folder / name) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+
+
+def _first_scans(plan: NextPrint) -> list[PlannedScan]:
+    seen: dict[tuple[str, str], PlannedScan] = {}
+    for scan in plan.scans:
+        # References share one print number and are fields of their own.
+        seen.setdefault((scan.print, scan.id if scan.use != "dataset" else ""), scan)
+    return list(seen.values())
+
+
+def _printer_sheet(plan: NextPrint) -> str:
+    lines = [
+        f"# Printing for {plan.dataset.name}",
+        "",
+        f"{plan.prints} prints of {plan.field_um:g} µm, in this order, with the dose, resist and recipe of "
+        "the prints so far, none turned. Write along x, one line below the other. Print the references once.",
+        "",
+        "| order | layout | centre in the write field (x, y), µm | what it is |",
+        "|---|---|---|---|",
+    ]
+    for scan in _first_scans(plan):
+        what = "print" if scan.use == "dataset" else _USES[scan.use]
+        place = f"{scan.field_x_um:g}, {scan.field_y_um:g}"
+        lines.append(f"| {scan.order} | layouts/{scan.id}.tif | {place} | {what} |")
+    lines += [
+        "",
+        "Note the laser power before each print, and anything that went otherwise than written here.",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _microscope_sheet(plan: NextPrint) -> str:
+    lines = [
+        f"# Scanning for {plan.dataset.name}",
+        "",
+        f"{len(plan.scans)} scans in this order. Save raw heights, not levelled, one file per scan: "
+        "`scans/ID.txt`, heights in metres (or change `[scan]` of `card.toml` to your format and size). A "
+        "margin of 1 to 2 µm around the print helps. Take the print out and put it back between two scans of "
+        "it. Leave the file as the microscope shows it: do not turn it back.",
+        "",
+        "| order | scan | print | turned | direction | tip | why |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for scan in plan.scans:
+        direction = "there" if scan.direction > 0 else "back"
+        tip = "as before" if scan.tip == 1 else "new"
+        lines.append(
+            f"| {scan.order} | {scan.id} | {scan.print} | {scan.turned_deg}° | {direction} | {tip} | "
+            f"{scan.why} |"
+        )
+    lines += [
+        "",
+        "If a scan had to be made otherwise, say so in `scans.csv` (`turned_deg`, `direction`, `tip`): a "
+        "turned scan without its column is refused. Then",
+        "",
+        "    litho-data build card.toml --out next.zarr",
+        "    litho-models close-loop prints.zarr next.zarr --out decided",
+    ]
+    return "\n".join(lines) + "\n"

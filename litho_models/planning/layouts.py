@@ -1,0 +1,178 @@
+"""Layouts that the rivals print most differently: starts, gradient ascent, and what can be printed at all.
+
+A layout is built from tiles. Each tile starts as a calibration pattern or a random layout and climbs along
+the gradient of the rivals' separation, through their effects. It is low-passed and clipped all the way, so
+that it stays among what the printer has printed and the models know.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from litho_data.layouts.patterns import checkerboard, isolated_features, line_space_sweep
+from litho_data.layouts.random_layout import quantise, random_layout
+from litho_models.loop.open_questions import OpenQuestions
+from litho_models.planning.rivalry import Place, PlannedPrint, Rivalry, Way
+
+TILE_PX = 256
+STEPS = 40
+_REFIT_EVERY = 10
+_STEP_LEVELS = 0.3
+# Levels rarer than this in the prints so far are not known to the models.
+_RARE = 1e-3
+_POWER_KNOWN = 0.95
+# Mean distance of sorted levels from those of the prints so far, in levels, that costs nothing.
+_FREE_LEVELS = 1.5
+_PRICE = 2.0
+_FEWEST_TREADS = 3
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What may be printed: levels, cut-off (cycles/µm), and the levels of the prints so far, sorted."""
+
+    lowest: int
+    highest: int
+    cutoff_per_um: float
+    pitch_um: float
+    known: np.ndarray
+
+    @classmethod
+    def of(cls, open_: OpenQuestions, pitch_um: float) -> Limits:
+        """Levels with a share of a thousandth, and frequencies up to where 95 % of the power lies."""
+        share = np.array(open_.level_share)
+        levels = np.flatnonzero(share >= _RARE)
+        cumulative = np.cumsum(open_.power_share) / max(sum(open_.power_share), 1e-12)
+        cutoff = float(np.array(open_.frequency_per_um)[np.searchsorted(cumulative, _POWER_KNOWN)])
+        quantiles = (np.arange(4096) + 0.5) / 4096
+        known = np.searchsorted(np.cumsum(share) / share.sum(), quantiles).astype(np.float32)
+        return cls(int(levels[0]), int(levels[-1]), cutoff, pitch_um, known)
+
+    def soft(self, free: Tensor) -> Tensor:
+        """Printable soft levels (y, x) nearest to free ones."""
+        frequencies = [torch.fft.fftfreq(n, self.pitch_um).abs() for n in free.shape]
+        passed = (frequencies[0][:, None] <= self.cutoff_per_um) & (
+            frequencies[1][None, :] <= self.cutoff_per_um
+        )
+        smooth = torch.fft.ifft2(torch.fft.fft2(free) * passed).real
+        return smooth.clamp(self.lowest, self.highest)
+
+    def whole(self, soft: np.ndarray) -> np.ndarray:
+        """The whole levels to send to the printer, uint8."""
+        span = self.highest - self.lowest
+        return quantise((soft - self.lowest) / span, span + 1) + np.uint8(self.lowest)
+
+    def price(self, soft: Tensor) -> Tensor:
+        """What levels far from those of the prints so far cost."""
+        quantiles = torch.quantile(
+            soft.reshape(-1)[:: max(1, soft.numel() // 16384)],
+            (torch.arange(256) + 0.5) / 256,
+        )
+        known = torch.from_numpy(self.known[8::16].copy())
+        return _PRICE * torch.relu((quantiles - known).abs().mean() - _FREE_LEVELS) ** 2
+
+
+def starts(size_px: int, limits: Limits, seed: int) -> Iterator[tuple[str, np.ndarray]]:
+    """Named layouts to start from, (size, size) levels.
+
+    Patterns lie in a frame of random structure, a fifth of the side wide: a scan of what repeats itself
+    cannot be registered.
+    """
+    shape, high, low = (size_px, size_px), limits.highest, limits.lowest
+    feature = max(3, round(0.5 / limits.cutoff_per_um / limits.pitch_um))
+    levels = limits.highest + 1
+    for number in range(3):
+        cutoff = limits.cutoff_per_um * (1.0, 0.5, 0.8)[number]
+        level = random_layout(
+            shape, levels=levels, cutoff_per_um=cutoff, pitch_um=limits.pitch_um, seed=seed + number
+        )
+        yield f"random-{number + 1}", np.maximum(level, low)
+    frame = random_layout(
+        shape, levels=levels, cutoff_per_um=limits.cutoff_per_um, pitch_um=limits.pitch_um, seed=seed + 7
+    )
+    frame = np.maximum(frame, np.uint8(low))
+    inset = size_px // 5
+    room, inner = (slice(inset, size_px - inset),) * 2, size_px - 2 * inset
+    patterns = {
+        "checkerboard": checkerboard((inner, inner), cell_px=2 * feature, high=high, low=low),
+        "lines": line_space_sweep((inner, inner), high=high, low=low, narrowest_px=feature),
+        "lines-along-x": line_space_sweep(
+            (inner, inner), high=high, low=low, narrowest_px=feature, along="x"
+        ),
+    }
+    if inner >= _FEWEST_TREADS * 2 * feature:
+        steps = min(levels - low, inner // (2 * feature))
+        stairs = np.rint(np.linspace(low, high, steps)).astype(np.uint8)
+        patterns["stairs"] = np.broadcast_to(stairs[np.arange(inner) * steps // inner], (inner, inner))
+    widths = [feature + 2 * i for i in range(9) if 3 * (feature + 2 * i) <= inner // 3]
+    if widths:
+        middle = (high + low) // 2
+        for name, top in (("pillars", high), ("pits", low)):
+            patterns[name] = isolated_features((inner, inner), widths_px=widths, feature=top, ground=middle)
+    for name, pattern in patterns.items():
+        whole = frame.copy()
+        whole[room] = pattern
+        yield name, whole
+
+
+def score(
+    rivalry: Rivalry, level: np.ndarray, ways: tuple[Way, ...], place: Place = "centre", order: float = 0.0
+) -> float:
+    """Separation of the nearest pair by one print of this layout, standard deviations."""
+    printed = PlannedPrint(torch.from_numpy(level.astype(np.float32)), ways, place, order)
+    refitted = rivalry.refitted([printed])
+    with torch.no_grad():
+        return float(rivalry.separations([printed], refitted).min())
+
+
+def climb(
+    rivalry: Rivalry,
+    start: np.ndarray,
+    ways: tuple[Way, ...],
+    limits: Limits,
+    *,
+    place: Place = "centre",
+    order: float = 0.0,
+    steps: int = STEPS,
+    tick: Callable[[], None] = lambda: None,
+) -> np.ndarray:
+    """Soft levels (y, x) at the top of the way up from ``start``."""
+    free = torch.from_numpy(start.astype(np.float32)).requires_grad_()
+    climber = torch.optim.Adam([free], lr=_STEP_LEVELS)
+    best, highest = start.astype(np.float32), -np.inf
+    refitted = None
+    for step in range(steps + 1):
+        soft = limits.soft(free)
+        if step % _REFIT_EVERY == 0:
+            refitted = rivalry.refitted([PlannedPrint(soft.detach(), ways, place, order)])
+        assert refitted is not None
+        apart = rivalry.separations([PlannedPrint(soft, ways, place, order)], refitted)
+        # The nearest pair, softly: with the hard minimum two pairs would take turns.
+        height = -torch.logsumexp(-apart, 0)
+        if step % _REFIT_EVERY == 0 and height.item() > highest:
+            # Only where the partners are those of this very layout is the height true.
+            best, highest = soft.detach().numpy().copy(), height.item()
+        if step == steps:
+            break
+        climber.zero_grad()
+        (limits.price(soft) - height).backward()
+        climber.step()
+        tick()
+    return best
+
+
+def assemble(tiles: Sequence[np.ndarray], number: int, size_px: int, limits: Limits) -> np.ndarray:
+    """Whole levels (size, size) of one print: the tiles side by side, in another order for each print."""
+    side = -(-size_px // tiles[0].shape[0])
+    rows = []
+    for row in range(side):
+        places = [(row * side + column + number) % len(tiles) for column in range(side)]
+        rows.append(np.concatenate([tiles[place] for place in places], axis=1))
+    whole = np.concatenate(rows)[:size_px, :size_px]
+    smooth = limits.soft(torch.from_numpy(whole.astype(np.float32)))
+    return limits.whole(smooth.numpy())

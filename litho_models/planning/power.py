@@ -1,0 +1,79 @@
+"""How probably so many prints decide rightly: normal approximation, F test, variance of lines."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.stats import f as f_distribution
+from scipy.stats import norm
+
+from litho_models.loop.open_questions import Question
+from litho_models.loop.residual_spectrum import NoiseSpectrum
+from litho_models.loop.selection.confirming import BINOMIAL_P
+from litho_models.planning.rivalry import Contrast
+
+# A wrong name is given with this probability at most.
+Z_DECIDED = float(norm.isf(BINOMIAL_P))
+ENOUGH = 0.95
+# Beside this power no allowed experiment separates the rivals.
+HOPELESS = 0.2
+MOST_PRINTS = 12
+
+
+def of_contrast(contrast: Contrast, spread: float, prints: int) -> float:
+    """Power with so many prints like those of the contrast.
+
+    The difference of two squared errors has the mean of the squared distance; its variance is that of the
+    noise along the distance, and that of the distance itself, which varies between prints by ``spread``.
+    """
+    squares = float(contrast.squares_um2.mean())
+    variance = float((contrast.sd_um2**2).mean()) + (spread * squares) ** 2
+    return float(norm.cdf(math.sqrt(prints) * squares / math.sqrt(variance) - Z_DECIDED))
+
+
+def of_generic(question: Question, prints: int) -> float:
+    """Power to tell a term that goes with the print from one that goes with the scan."""
+    turning = question.turning
+    assert turning is not None
+    squares = turning.pixels * turning.rms_nm**2
+    noise = 2 * math.sqrt(turning.pixels) * turning.rms_nm * turning.noise_nm
+    variance = noise**2 + (question.spread * squares) ** 2
+    return float(norm.cdf(math.sqrt(prints) * squares / math.sqrt(variance) - Z_DECIDED)) if squares else 0.0
+
+
+def of_repeats(prints: int, scans: int, share: float = 0.9) -> float:
+    """Power of prints that are taken out and scanned again, to say whose a term of single scans is.
+
+    With the F of an analysis of variance: the printer's if scans of one print agree as they never would by
+    chance (p <= 0.005), the microscope's if they agree as little as they never would (p <= 0.005) were it the
+    printer's. The power is the smaller one of both answers.
+
+    Args:
+        prints: each with as many ``scans``.
+        share: of the variance that belongs to the print, if the printer is the cause.
+    """
+    if prints < 2 or scans < 2:
+        return 0.0
+    between, within = prints - 1, prints * (scans - 1)
+    ratio = 1 + scans * share / (1 - share)
+    printer = f_distribution.sf(f_distribution.isf(BINOMIAL_P, between, within) / ratio, between, within)
+    scanned = f_distribution.cdf(ratio * f_distribution.ppf(BINOMIAL_P, between, within), between, within)
+    return float(min(printer, scanned))
+
+
+def of_lines(sd_um: float, noise: NoiseSpectrum, size_px: int, prints: int) -> float:
+    """Power to tell written from scanned lines where the scan is turned: one of the two axes has them."""
+    grid = noise.on_grid((size_px, size_px))
+    # The mean over a line has the power at frequency 0 along it.
+    own_um2 = float(grid[1:, 0].mean()) / size_px * 1e-6
+    variance = sd_um**2
+    z = variance / ((variance + own_um2) * math.sqrt(2 / (size_px * prints)))
+    return float(norm.cdf(z - Z_DECIDED))
+
+
+def prints_needed(powers: Sequence[float]) -> int | None:
+    """Fewest prints with enough power; None where none of the numbers looked at has it."""
+    found = np.flatnonzero(np.array(powers) >= ENOUGH)
+    return int(found[0]) + 1 if len(found) else None

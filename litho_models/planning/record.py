@@ -1,0 +1,77 @@
+"""``plan.json``, schema ``litho-models/next-print/1``."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from litho_data.cards.card import Use
+from litho_data.foundation.results import Record, Result
+from litho_data.foundation.run_facts import RunInfo
+from litho_data.store.schema import DatasetId
+
+Status = Literal["decides", "may decide", "no experiment separates", "needs a fact"]
+
+
+class PlannedScan(Record):
+    """One scan of the plan; ``place``: in the write field."""
+
+    id: str
+    print: str
+    order: int
+    use: Use
+    turned_deg: int
+    direction: int
+    tip: int
+    field_x_um: float
+    field_y_um: float
+    why: str
+
+
+class PlannedPair(Record):
+    """Two rivals: the difference that the refitted ones have on the planned prints, and its noise, nm rms."""
+
+    rivals: tuple[str, str]
+    difference_nm: float
+    noise_nm: float
+    power: list[float]
+
+
+class PlannedQuestion(Record):
+    """An open question and what the plan makes of it.
+
+    ``power``: probability of a right decision with 1, 2, 3, … prints; ``random_power``: with random layouts
+    and the same scans. ``prints_needed``: for a power of 0.95.
+    """
+
+    name: str
+    kind: str
+    text: str
+    status: Status
+    why: str
+    rivals: list[str]
+    pairs: list[PlannedPair]
+    difference_nm: float | None
+    noise_nm: float | None
+    power: list[float]
+    random_power: list[float]
+    prints_needed: int | None
+    outcomes: list[str]
+
+
+class NextPrint(Result):
+    """A plan: what to print and scan, and what it will decide."""
+
+    SCHEMA: ClassVar[str] = "litho-models/next-print/1"
+    FILE_NAME: ClassVar[str] = "plan.json"
+
+    run: RunInfo
+    dataset: DatasetId
+    prints: int
+    field_um: float
+    levels: tuple[int, int]
+    cutoff_per_um: float
+    smallest_feature_um: float
+    level_distance: float
+    starts: list[str]
+    scans: list[PlannedScan]
+    questions: list[PlannedQuestion]

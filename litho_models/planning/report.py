@@ -1,0 +1,131 @@
+"""The plan for people: what is open, what is printed for it, how the rivals differ there, and the power."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+import torch
+
+from litho_data.foundation.report import Page, new_figure
+from litho_data.foundation.units import NM_PER_UM
+from litho_models.planning.power import ENOUGH
+from litho_models.planning.record import NextPrint, PlannedQuestion
+from litho_models.planning.rivalry import PlannedPrint, Rivalry
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+_SHOWN_LAYOUTS = 4
+
+
+def write_report(
+    folder: Path,
+    plan: NextPrint,
+    levels: Sequence[np.ndarray],
+    rivalries: Sequence[Rivalry],
+    shown: PlannedPrint,
+) -> Path:
+    """Write ``report.html`` and ``questions.csv``; ``shown``: the print on which rivals are pictured."""
+    page = Page(
+        f"What to print next: {plan.dataset.name}",
+        f"{plan.prints} prints of {plan.field_um:g} µm in {len(plan.scans)} scans, three of them references.",
+    )
+    decided = [q for q in plan.questions if q.status == "decides"]
+    page.tiles(
+        [
+            (f"{len(plan.questions)}", "open questions"),
+            (f"{len(decided)}", f"decided with a power of {ENOUGH} or more"),
+            (f"{plan.levels[0]} to {plan.levels[1]}", "levels used"),
+            (f"{plan.smallest_feature_um:.2g} µm", "half a period of the finest structure"),
+        ]
+    )
+    page.table(_table(plan), "Open questions, and what the plan makes of them.", "questions.csv")
+    page.heading("Layouts")
+    page.figure(
+        _layouts_figure(levels, plan), "Levels of the first prints; tiles come in another order in each."
+    )
+    for question in plan.questions:
+        page.heading(f"{question.name}: {question.status}")
+        page.paragraph(f"{question.text}. {question.why}.")
+        for outcome in question.outcomes:
+            page.paragraph(f"– {outcome}.")
+        rivalry = next((r for r in rivalries if r.question.name == question.name), None)
+        if rivalry is not None:
+            page.figure(
+                _prints_figure(rivalry, shown),
+                "What each rival predicts of the first print as the last of its scans shows it, and what it "
+                "has more than the first rival, nm.",
+            )
+        if question.kind != "fact":
+            page.figure(
+                _power_figure(question), "Probability of a right decision; grey: with random layouts."
+            )
+    page.heading("Scans")
+    page.table(
+        pd.DataFrame([scan.model_dump() for scan in plan.scans]), "In the order of scanning.", "order.csv"
+    )
+    page.heading("How it was planned")
+    page.code(plan.run.command or "litho_models.next_print")
+    return page.write(folder)
+
+
+def _table(plan: NextPrint) -> pd.DataFrame:
+    return pd.DataFrame(
+        [
+            {
+                "question": q.name,
+                "rivals": ", ".join(q.rivals),
+                "difference, nm rms": np.nan if q.difference_nm is None else q.difference_nm,
+                "noise along it, nm": np.nan if q.noise_nm is None else q.noise_nm,
+                f"power with {plan.prints} prints": q.power[plan.prints - 1],
+                "power of random layouts": q.random_power[plan.prints - 1],
+                "prints needed": "more" if q.prints_needed is None else str(q.prints_needed),
+                "status": q.status,
+            }
+            for q in plan.questions
+        ]
+    )
+
+
+def _layouts_figure(levels: Sequence[np.ndarray], plan: NextPrint) -> Figure:
+    figure = new_figure(11, 3)
+    shown = levels[:_SHOWN_LAYOUTS]
+    for place, level in enumerate(shown, start=1):
+        axes = figure.add_subplot(1, len(shown), place)
+        axes.imshow(level, vmin=plan.levels[0], vmax=plan.levels[1], cmap="viridis")
+        axes.set_title(f"print {place}")
+        axes.set_axis_off()
+    return figure
+
+
+def _prints_figure(rivalry: Rivalry, shown: PlannedPrint) -> Figure:
+    with torch.no_grad():
+        maps = [rivalry.printing.predict(chain, shown, shown.ways[-1]).numpy() for chain in rivalry.chains]
+    figure = new_figure(11, 5.5)
+    changes = [NM_PER_UM * (own - maps[0]) for own in maps]
+    reach = max(float(np.percentile(np.abs(change - change.mean()), 99)) for change in changes[1:])
+    for place, (rival, own, change) in enumerate(zip(rivalry.question.rivals, maps, changes, strict=True)):
+        axes = figure.add_subplot(2, len(maps), place + 1)
+        axes.imshow(own, cmap="viridis")
+        axes.set_title(rival.name, fontsize=9)
+        axes.set_axis_off()
+        axes = figure.add_subplot(2, len(maps), len(maps) + place + 1)
+        picture = axes.imshow(change - change.mean(), cmap="RdBu_r", vmin=-reach, vmax=reach)
+        axes.set_axis_off()
+    figure.colorbar(picture, ax=figure.axes[1::2], label="nm", shrink=0.7)
+    return figure
+
+
+def _power_figure(question: PlannedQuestion) -> Figure:
+    figure = new_figure(6, 3)
+    axes = figure.add_subplot(1, 1, 1, xlabel="prints", ylabel="power")
+    counts = np.arange(1, len(question.power) + 1)
+    axes.plot(counts, question.random_power, color="0.7")
+    axes.plot(counts, question.power, marker="o")
+    axes.axhline(ENOUGH, color="0.5", linestyle=":")
+    axes.set_ylim(0, 1.02)
+    return figure

@@ -1,0 +1,363 @@
+"""The next print: what is open becomes an experiment, and the experiment decides."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter
+
+import litho_models
+from litho_data.cards.card import load_card
+from litho_data.foundation.errors import InputError
+from litho_data.store.schema import DatasetId
+from litho_data.virtual_fab import jobs_of_card
+from litho_data.virtual_fab.fab import Fab, scan_job
+from litho_data.virtual_fab.knobs import KnobBoard, KnobSetting
+from litho_data.virtual_fab.printer import Job
+from litho_data.virtual_fab.settings import Microscope, Noise, Printer
+from litho_models.effects import FieldContext, get_effect
+from litho_models.effects.chain import EffectChain
+from litho_models.frozen.files import save_frozen
+from litho_models.loop.open_questions import IN_SCAN, OpenQuestions, Question, Rival
+from litho_models.loop.parameters import get_vector
+from litho_models.loop.prepared import prepare_scans
+from litho_models.loop.residual_spectrum import NoiseSpectrum, residual_spectrum
+from litho_models.loop.run import _new_scans
+from litho_models.loop.second_round import decide
+from litho_models.planning import power
+from litho_models.planning.layouts import Limits, climb, score, starts
+from litho_models.planning.record import NextPrint
+from litho_models.planning.rivalry import PlannedPrint, Printing, Rivalry, Way
+from litho_models.scan_terms import Blocks
+from tests.litho_models.loop_scans import printed_scans, true_model
+from tests.litho_models.prints import write_store
+
+SLOPE = {"slope-thinning": {"along_x_um": 0.2, "along_y_um": 0.0}}
+NOISE_NM = 10.0
+TURNED = (Way(), Way(turned_deg=90))
+
+
+def rival(name: str, effects: dict, frame: list[str]) -> Rival:
+    chain = true_model(effects)
+    size = len(get_vector(chain))
+    return Rival(
+        name=name,
+        effects=chain.values(),
+        scan_frame=frame,
+        vector=get_vector(chain).tolist(),
+        information=np.zeros((size, size)).tolist(),
+    )
+
+
+def slope_question() -> Question:
+    name = "slope-thinning"
+    return Question(
+        name=name,
+        kind="role",
+        text="whose it is",
+        experiment="turn it",
+        rivals=[rival(name, SLOPE, []), rival(name + IN_SCAN, SLOPE, [name])],
+    )
+
+
+def white(tile_px: int = 16) -> NoiseSpectrum:
+    half = tile_px // 2 + 1
+    return NoiseSpectrum(tile_px=tile_px, power_nm2=np.full((half, half), NOISE_NM**2).tolist())
+
+
+def opened(questions: list[Question]) -> OpenQuestions:
+    return OpenQuestions(
+        schema=OpenQuestions.SCHEMA,
+        dataset=DatasetId(name="made", sha256="0" * 64),
+        n_scans=10,
+        field_px=(96, 96),
+        noise=white(),
+        level_share=[1 / 13] * 13,
+        power_share=[0.9, 0.1],
+        frequency_per_um=[0.25, 0.5],
+        write_field_um=None,
+        questions=questions,
+    )
+
+
+@pytest.fixture(scope="module")
+def rivalry() -> Rivalry:
+    return Rivalry(slope_question(), true_model({}).base, Printing(0.1, 0.1, 12), white())
+
+
+@pytest.fixture(scope="module")
+def limits() -> Limits:
+    return Limits.of(opened([]), 0.1)
+
+
+def closed_loop(folder: Path, questions: list[Question]) -> Path:
+    save_frozen(true_model({}).base, folder / "model", name="made")
+    opened(questions).write(folder)
+    return folder
+
+
+def first_layout(limits: Limits, size_px: int = 96) -> np.ndarray:
+    return next(starts(size_px, limits, 3))[1]
+
+
+# --- what a scan shows when it is turned, recorded backwards, or made with another tip
+
+
+@pytest.mark.parametrize("turned_deg", [90.0, 180.0, 270.0])
+def test_the_fab_and_the_models_agree_on_what_turning_does(turned_deg: float) -> None:
+    """A turned scan is ``rot90`` of the print by the quarters that its transform says; no noise, no warp."""
+    level = np.random.default_rng(1).integers(0, 13, (40, 40)).astype(np.uint8)
+    fab = Fab(Printer(), Microscope.aligned(), Noise.off(), KnobBoard([], 0), 0)
+    plain, turned = (scan_job(fab, Job("a", level, turned_deg=deg)) for deg in (0.0, turned_deg))
+    along = turned.frame.scan_to_layout[:2, 0]
+    quarters = round(math.atan2(along[1], along[0]) / (math.pi / 2)) % 4
+    # The same pixels by cubic interpolation at whole positions: rounding only.
+    assert np.abs(np.rot90(plain.height_um, quarters) - turned.height_um).max() < 1e-9
+    assert quarters == turned_deg // 90
+
+
+def test_effects_of_the_microscope_turn_with_the_scan_and_those_of_the_printer_do_not() -> None:
+    height = torch.rand(1, 1, 24, 30)
+    layout = torch.rand(1, 1, 24, 30)
+    plain = FieldContext(layout, 0.1, 1.2)
+    values = {"length_um": 0.3, "rising": 0.5, "direction": 1.0}
+    lag, thinning = get_effect("feedback-lag"), get_effect("slope-thinning")
+    chain = EffectChain(torch.nn.Identity(), {"feedback-lag": values}, full_height_um=1.2, pitch_um=0.1)
+    seen = chain.after_base(height, replace(plain, quarter_turns=1))
+    by_hand = torch.rot90(lag(torch.rot90(height, 1, (-2, -1)), values, plain), -1, (-2, -1))
+    assert torch.equal(seen, by_hand)
+    back = chain.after_base(height, replace(plain, backward=True))
+    assert torch.allclose(back, lag(height, {**values, "direction": -1.0}, plain))
+    amounts = thinning.with_values({"along_x_um": 0.2})
+    for frame, axis in (((), "along_x_um"), (("slope-thinning",), "along_y_um")):
+        chain = EffectChain(
+            torch.nn.Identity(),
+            {"slope-thinning": amounts},
+            full_height_um=1.2,
+            pitch_um=0.1,
+            scan_frame=frame,
+        )
+        expected = thinning(height, thinning.with_values({axis: 0.2}), plain)
+        assert torch.allclose(chain.after_base(height, replace(plain, quarter_turns=1)), expected, atol=1e-6)
+    tip = EffectChain(
+        torch.nn.Identity(), {"tip-dilation": {"radius_um": 0.4}}, full_height_um=1.2, pitch_um=0.1
+    )
+    assert torch.equal(tip.after_base(height, replace(plain, new_tip=True)), height)
+    assert not torch.equal(tip.after_base(height, plain), height)
+
+
+def test_the_position_of_a_window_turns_with_the_scan() -> None:
+    """Scan coordinates of a part of a field, taken from the turned whole."""
+    y, x = torch.meshgrid(torch.arange(20.0), torch.arange(14.0), indexing="ij")
+    part = FieldContext(torch.zeros(1, 1, 8, 6), 0.1, 1.2, scan_shape=(20, 14), origin_px=(5, 3))
+    for turns in range(4):
+        own = replace(part, quarter_turns=turns).in_scan_frame()
+        rows = torch.rot90(torch.stack([y, x])[:, 5:13, 3:9], turns, (-2, -1))
+        whole = torch.rot90(torch.stack([y, x]), turns, (-2, -1))
+        top, left = own.origin_px
+        ny, nx = own.layout_um.shape[-2:]
+        assert torch.equal(whole[:, top : top + ny, left : left + nx], rows)
+        assert own.whole_shape() == tuple(whole.shape[-2:])
+
+
+# --- the criterion
+
+
+def test_noise_along_a_change_is_what_draws_of_that_noise_show() -> None:
+    random = np.random.default_rng(2)
+    scans = prepare_scans(printed_scans(size_px=64, count=4))
+    flat = np.zeros((64, 64))
+    rough = [gaussian_filter(random.normal(size=(64, 64)), (0, 2), mode="wrap") for _ in scans]
+    scale = 0.01 / np.std(rough)
+    noisy = [
+        replace(one, stored=replace(one.stored, height_um=(flat + scale * r).astype(np.float32)))
+        for one, r in zip(scans, rough, strict=True)
+    ]
+    layout = [one.stored.layout_um for one in scans]
+    noisy = [replace(one, height=one.at_sample(one.stored.height_um)) for one in noisy]
+    moved = [
+        replace(one, stored=replace(one.stored, height_um=one.stored.height_um + own))
+        for one, own in zip(noisy, layout, strict=True)
+    ]
+    spectrum = residual_spectrum(moved, layout)
+    # What a scan may add by itself takes some of the slow noise; four scans are few tiles.
+    assert spectrum.rms_nm == pytest.approx(10.0, rel=0.1)
+    for sigma in ((0, 2), (2, 0)):
+        change = gaussian_filter(random.normal(size=(64, 64)), sigma, mode="wrap")
+        draws = [
+            1e3 * scale * np.sum(change * gaussian_filter(random.normal(size=(64, 64)), (0, 2), mode="wrap"))
+            for _ in range(400)
+        ]
+        # 400 draws know a standard deviation to 3.5 %, the spectrum to about 10 %.
+        assert spectrum.along(change) == pytest.approx(np.std(draws) / np.linalg.norm(change), rel=0.2)
+
+
+def test_only_a_turned_scan_separates_printer_from_microscope(rivalry: Rivalry, limits: Limits) -> None:
+    level = first_layout(limits)
+    # Unturned the two are the same model: what is left is the refit's rounding.
+    assert score(rivalry, level, (Way(),)) < 1e-3
+    assert score(rivalry, level, TURNED) > 5
+
+
+def test_the_linearised_refit_comes_near_the_full_one(rivalry: Rivalry, limits: Limits) -> None:
+    prints = [PlannedPrint(torch.from_numpy(first_layout(limits).astype(np.float32)), TURNED)]
+    one, full = (
+        rivalry.contrasts(prints, rivalry.refitted(prints, rounds=rounds))[0].rms_nm for rounds in (1, 6)
+    )
+    plain = rivalry.contrasts(prints, [rivalry.chains[b] for _, b in rivalry.pairs])[0].rms_nm
+    # The refit matters (it takes a good part of the difference), and one step finds nearly all of it.
+    assert full < 0.9 * plain
+    assert one == pytest.approx(full, rel=0.1)
+
+
+def test_layouts_climb_and_stay_printable(rivalry: Rivalry, limits: Limits) -> None:
+    start = first_layout(limits)
+    soft = climb(rivalry, start, TURNED, limits, steps=10)
+    level = limits.whole(soft)
+    assert score(rivalry, level, TURNED) > 1.05 * score(rivalry, start, TURNED)
+    assert limits.lowest <= level.min()
+    assert level.max() <= limits.highest
+    spectrum = np.abs(np.fft.fft2(soft - soft.mean())) ** 2
+    beyond = np.maximum(*np.meshgrid(*[np.abs(np.fft.fftfreq(96, 0.1))] * 2)) > limits.cutoff_per_um
+    # Clipping at the outer levels brings a little back.
+    assert spectrum[beyond].sum() < 0.1 * spectrum.sum()
+
+
+def test_the_power_of_repeats_is_that_of_draws() -> None:
+    random = np.random.default_rng(3)
+    from scipy.stats import f
+
+    prints, scans, count = 6, 2, 4000
+    bar = f.isf(0.005, prints - 1, prints)
+    low = 19 * f.ppf(0.005, prints - 1, prints)
+    found = []
+    for share in (0.9, 0.0):
+        data = math.sqrt(share) * random.normal(size=(count, prints, 1))
+        data = data + math.sqrt(1 - share) * random.normal(size=(count, prints, scans))
+        between = scans * data.mean(axis=2).var(axis=1, ddof=1)
+        ratio = between / data.var(axis=2, ddof=1).mean(axis=1)
+        found.append(np.mean(ratio > bar) if share else np.mean(ratio < low))
+    # 4000 draws: 0.8 % standard error at most.
+    assert power.of_repeats(prints, scans) == pytest.approx(min(found), abs=0.025)
+    assert power.of_repeats(1, 2) == power.of_repeats(4, 1) == 0.0
+
+
+# --- the plan
+
+
+def test_a_plan_is_a_dataset_in_waiting_and_resumes(tmp_path: Path) -> None:
+    loop = closed_loop(tmp_path / "loop", [slope_question()])
+    settings = {"prints": 2, "field_um": 9.6, "steps": 2}
+    told: list[str] = []
+
+    def killed(message: str) -> None:
+        told.append(message)
+        if message.startswith("tile 2"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        litho_models.next_print(loop, tmp_path / "plan", report=killed, **settings)
+    assert not (tmp_path / "plan").exists()
+    told.clear()
+    plan = litho_models.next_print(loop, tmp_path / "plan", report=told.append, **settings)
+    assert plan is not None
+    assert "1 of 2 tiles are kept" in told[0]
+    assert not any(text.startswith("tile 1") for text in told)
+    assert NextPrint.read(tmp_path / "plan") == plan
+    question = plan.questions[0]
+    assert question.status == "decides"
+    assert question.power[0] <= question.power[1]
+    assert load_card(tmp_path / "plan" / "card.toml").plan is not None
+    jobs = {job.id: job for job in jobs_of_card(tmp_path / "plan" / "card.toml", first=5)}
+    assert jobs["N1F2"].turned_deg == 90
+    assert jobs["N1F1"].printed == jobs["N1F2"].printed != jobs["N2F1"].printed
+    assert {jobs[name].use for name in ("N0F1", "N0F2", "N0F3")} == {"substrate", "flat", "steps"}
+    assert (tmp_path / "plan" / "microscope.md").read_text("utf-8").count("90°") >= 2
+    assert not (tmp_path / "plan-cache").exists()
+
+
+def test_nothing_open_and_no_questions_kept_are_said(tmp_path: Path) -> None:
+    loop = closed_loop(tmp_path / "loop", [])
+    assert litho_models.next_print(loop, tmp_path / "plan") is None
+    assert not (tmp_path / "plan").exists()
+    (loop / OpenQuestions.FILE_NAME).unlink()
+    with pytest.raises(InputError, match=r"open_questions\.json"):
+        litho_models.next_print(loop, tmp_path / "plan")
+
+
+# --- the second round
+
+
+def second_round(frame: tuple[str, ...], seed: int) -> list:
+    """Two prints, each scanned at 0 and 90 degrees, slope loss by the printer or by the microscope."""
+    random = np.random.default_rng(seed)
+    chain = EffectChain(true_model({}).base, SLOPE, full_height_um=1.2, pitch_um=0.1, scan_frame=frame)
+    turned = np.array([[0.0, -1.0, 6.4], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    scans = []
+    for number, plain in enumerate(printed_scans(size_px=64, count=2, noise_um=0, seed=seed)):
+        rough = gaussian_filter(random.normal(size=plain.shape), 1.0)
+        for at, placed in enumerate((np.eye(3), turned)):
+            scan = replace(
+                plain, id=f"N{number}F{at}", print_id=str(number), scan_to_layout=placed, turned_deg=90.0 * at
+            )
+            one = prepare_scans([scan])[0]
+            with torch.no_grad():
+                height = chain(one.layout, one.context)[0, 0].numpy()
+            scans.append(replace(scan, height_um=(height + 0.006 * rough / rough.std()).astype(np.float32)))
+    return scans
+
+
+@pytest.mark.parametrize("frame", [(), ("slope-thinning",)])
+def test_two_turned_prints_say_whose_a_loss_on_slopes_is(frame: tuple[str, ...]) -> None:
+    first = prepare_scans(printed_scans(SLOPE, size_px=64, count=4))
+    start = true_model(SLOPE)
+    findings = SimpleNamespace(
+        search=SimpleNamespace(state=SimpleNamespace(fits=SimpleNamespace(chain=start))),
+        development=first,
+        study=SimpleNamespace(blocks=Blocks()),
+    )
+    decision = decide(findings, opened([slope_question()]), prepare_scans(second_round(frame, 5)))[0]
+    assert decision.verdict == "decided"
+    assert decision.left == ["slope-thinning" + IN_SCAN * bool(frame)]
+
+
+def test_new_prints_have_to_be_of_this_printer_and_turned_as_they_say(tmp_path: Path) -> None:
+    from litho_data.store import open_store
+
+    first = open_store(write_store(tmp_path / "first.zarr", printed_scans(size_px=64, count=2)))
+    turned = [replace(scan, turned_deg=None) for scan in second_round((), 5)]
+    with pytest.raises(InputError, match=r"N0F1.*turned by 90° on its layout, 0° in its card"):
+        _new_scans(first, open_store(write_store(tmp_path / "second.zarr", turned)))
+    coarser = [replace(scan, pitch_um=0.2) for scan in printed_scans(size_px=64, count=2)]
+    with pytest.raises(InputError, match=r"pitch_um.*0\.2.*0\.1"):
+        _new_scans(first, open_store(write_store(tmp_path / "coarse.zarr", coarser)))
+    store = open_store(write_store(tmp_path / "foreign.zarr", printed_scans(size_px=64, count=2)))
+    store.__dict__["manifest"] = {"card": {"plan": {"dataset_sha256": "a" * 64}}}
+    with pytest.raises(InputError, match="plan for dataset aaaaaaaaaaaa"):
+        _new_scans(first, store)
+
+
+def test_a_plan_is_printed_by_the_same_machine_with_new_chance() -> None:
+    """Same knobs, other roughness; scans of one print share it."""
+    level = np.full((40, 40), 6, np.uint8)
+    fab = Fab(
+        Printer(), Microscope.aligned(), Noise(), KnobBoard([KnobSetting("tip-dilation", 0.5, 3)], 9), 9
+    )
+    first = scan_job(fab, Job("N1F1", level, index=12, print_index=12))
+    again = scan_job(fab, Job("N1F2", level, index=13, print_index=12))
+    other = scan_job(fab, Job("N2F1", level, index=14, print_index=14))
+
+    def agreement(a: np.ndarray, b: np.ndarray) -> float:
+        return float(np.corrcoef(a.ravel(), b.ravel())[0, 1])
+
+    # Roughness of 15.9 nm beside lines and pixels of 1 nm; two prints share nothing but chance.
+    assert agreement(first.height_um, again.height_um) > 0.98
+    assert abs(agreement(first.height_um, other.height_um)) < 0.6
+    sharp = scan_job(fab, Job("N1F3", level, index=13, print_index=12, tip=2.0))
+    assert not np.array_equal(again.height_um, sharp.height_um)
