@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -17,6 +17,10 @@ def next_print(
     ],
     prints: Annotated[int, typer.Option("--prints", min=1, help="prints to plan, references apart")] = 4,
     field_um: Annotated[float, typer.Option("--field-um", min=1.0, help="side of a print, µm")] = 51.2,
+    layouts: Annotated[
+        Literal["optimised", "random"],
+        typer.Option("--layouts", help="random: a control, the same scans of layouts with nothing optimised"),
+    ] = "optimised",
     seed: Annotated[int, typer.Option("--seed", min=0, help="of the random layouts to start from")] = 0,
     steps: Annotated[int, typer.Option("--steps", min=0, help="of the ascent of each tile")] = 40,
 ) -> None:
@@ -28,6 +32,7 @@ def next_print(
         field_um=field_um,
         seed=seed,
         steps=steps,
+        layouts=layouts,
         report=lambda message: typer.echo(message, err=True),
     )
     if plan is None:

@@ -33,7 +33,7 @@ def of_rivals(
         kind=question.kind,
         text=question.text,
         status=_status(hardest.power, prints),
-        why=f"the nearest two rivals differ by so many standard deviations on one random print with {ways}"
+        why=f"the nearest two rivals differ by so many standard deviations on one random print: {ways}"
         + (f"; prints so far differ in the size of the effect by {100 * spread:.0f} %" if spread else ""),
         rivals=names,
         pairs=pairs,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -48,6 +49,7 @@ def next_print(
     field_um: float = 51.2,
     seed: int = 0,
     steps: int = STEPS,
+    layouts: Literal["optimised", "random"] = "optimised",
     cache: str | Path | None = None,
     report: Callable[[str], None] = lambda message: None,
 ) -> NextPrint | None:
@@ -58,6 +60,7 @@ def next_print(
         out: folder of the plan, which appears when complete.
         prints: how many at most; ``field_um``: side of each.
         seed: of random layouts; ``steps``: of the ascent of each tile.
+        layouts: ``random`` for a control: the same scans of layouts that nothing was optimised in.
         cache: folder where finished tiles are kept until the plan is there; beside ``out`` by default.
         report: told what happens, a sentence at a time.
 
@@ -91,7 +94,7 @@ def next_print(
     designer = _Designer(rivalries, limits, size_px, seed, steps, Path(cache or f"{out}-cache"), report)
     can_move = open_.write_field_um is not None and open_.write_field_um > field_um
     designer.choose(ways_without_rivals(open_.questions), can_move)
-    tiles = designer.tiles(folder, prints)
+    tiles = designer.tiles(folder, prints) if layouts == "optimised" else designer.random_tiles(prints)
     levels = [assemble(tiles, number, size_px, limits) for number in range(prints)]
     orders = np.linspace(-0.5, 0.5, prints) if prints > 1 else np.zeros(1)
     planned = [
@@ -178,12 +181,9 @@ class _Designer:
 
     def tiles(self, loop: Path, prints: int) -> list[np.ndarray]:
         """The tiles of all prints, soft levels; those of an interrupted run are taken as they are."""
-        count = _TILES if self.size_px > self.tile_px else prints
+        count = self._count(prints)
         if not self.rivalries:
-            self.chosen = ["random"]
-            return [
-                _random(self.limits, self.tile_px, self.seed + i).astype(np.float32) for i in range(count)
-            ]
+            return self.random_tiles(prints)
         questions = (loop / OpenQuestions.FILE_NAME).read_text(encoding="utf-8")
         key = record_sha256(
             {
@@ -215,6 +215,17 @@ class _Designer:
             tiles.append(np.load(file))
             self.chosen.append(name)
         return tiles
+
+    def random_tiles(self, prints: int) -> list[np.ndarray]:
+        """As many tiles of random structure."""
+        self.chosen = ["random"]
+        return [
+            _random(self.limits, self.tile_px, self.seed + 31 + i).astype(np.float32)
+            for i in range(self._count(prints))
+        ]
+
+    def _count(self, prints: int) -> int:
+        return _TILES if self.size_px > self.tile_px else prints
 
     def forget(self) -> None:
         """Remove the kept tiles: the plan is there."""

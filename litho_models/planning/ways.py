@@ -39,7 +39,7 @@ def choose_ways(
         can_move: whether the write field is larger than a print and known.
 
     Returns:
-        ways, place, and what was tried: separation in standard deviations, by words.
+        ways, place, and the separation in standard deviations by one scan and by each way beside it.
     """
     ways: tuple[Way, ...] = (Way(),)
     reached = score(rivalry, level, ways)
@@ -49,9 +49,8 @@ def choose_ways(
         for extra in _EXTRAS:
             if extra not in ways:
                 scores[extra] = score(rivalry, level, (*ways, extra))
-                tried[WORDS[extra].split(":")[0]] = max(
-                    scores[extra], tried.get(WORDS[extra].split(":")[0], -np.inf)
-                )
+                # What each does beside one plain scan; later ones only add to it.
+                tried.setdefault(f"a scan {WORDS[extra].split(':')[0]}", scores[extra])
         best = max(scores, key=lambda way: scores[way])
         if scores[best] < max(_WORTH * reached, _NOTHING):
             break

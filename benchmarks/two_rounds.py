@@ -1,0 +1,210 @@
+"""Two rounds on the virtual fab: a loop, the prints that it asks for, and what they decide.
+
+    python -m benchmarks.two_rounds --out runs/two-rounds [--trials 24] [--seed 1] [--size 192] [--publish]
+
+Each trial plants one knob, of a size between 12 and 30 nm rms, in a fab of its own; what is planted is drawn
+from the seed before anything is run. The first round is a loop on 14 scans of random layouts. Its open
+questions are planned for and printed in the same fab, four prints, and as many prints with random layouts
+are scanned in the same ways as a control. An answer is right if only the planted cause is left, and as the
+one whose it is. A trial whose first round leaves no question that scans can decide is counted apart. An
+interrupted run resumes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+
+from benchmarks.record import origin, publish, write_record
+from litho_data.build.build import build_dataset
+from litho_data.foundation.commands import run_script
+from litho_data.store import open_store
+from litho_data.virtual_fab import KNOBS, simulate, simulate_plan, strength_for_rms
+from litho_models.fitting.runs import level_share
+from litho_models.frozen.files import save_frozen
+from litho_models.loop import LoopConfig, close_loop
+from litho_models.loop.findings import LoopFindings
+from litho_models.loop.open_questions import OpenQuestions, open_questions
+from litho_models.loop.prepared import prepare_scans
+from litho_models.loop.result.record import Decision
+from litho_models.loop.result.summary import summarise
+from litho_models.loop.run import MODEL_FOLDER
+from litho_models.loop.second_round import MICROSCOPE, PRINTER, decide
+from litho_models.models import build_model
+from litho_models.planning.record import PlannedQuestion
+from litho_models.planning.run import next_print
+
+PAGE = Path(__file__).parents[1] / "docs" / "next_print.md"
+RESULT = PAGE.parent / "results" / "two-rounds" / "two_rounds.json"
+DEALT = (
+    "slope-thinning-x",
+    "feedback-lag",
+    "galvo-lag",
+    "scan-line-stripes",
+    "elliptical-psf",
+    "tip-dilation",
+    "slope-thinning-y",
+    "line-roughness",
+    "diffusion-blur",
+    "slope-thinning",
+)
+SCANS, PRINTS = 14, 4
+RMS_NM = (12.0, 30.0)
+Arm = Literal["optimised", "random"]
+
+
+def main() -> None:
+    """Run what is missing, print, write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, required=True, help="folder of the trials")
+    parser.add_argument("--trials", type=int, default=24)
+    parser.add_argument("--seed", type=int, default=1, help="of everything that is drawn")
+    parser.add_argument("--size", type=int, default=192, help="side of a layout, pixels")
+    parser.add_argument("--publish", action="store_true", help="write the figures into the page")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    trials = []
+    for draw in draws(arguments.trials, arguments.seed):
+        folder = arguments.out / f"{draw['number']:02d}"
+        kept = folder / "trial.json"
+        if not kept.is_file():
+            write_record(kept, run_trial(draw, folder, arguments.size, print))
+        trials.append(json.loads(kept.read_text(encoding="utf-8")))
+        print(line_of(trials[-1]), flush=True)
+    record = {**origin(), "seed": arguments.seed, "size_px": arguments.size, "trials": trials}
+    write_record(arguments.out / "two_rounds.json", record)
+    print(summary(trials))
+    if arguments.publish:
+        RESULT.parent.mkdir(parents=True, exist_ok=True)
+        write_record(RESULT, record)
+        publish(PAGE, "two_rounds.json", summary(trials))
+
+
+def draws(count: int, seed: int) -> list[dict[str, Any]]:
+    """What is planted in each trial: knobs dealt in turn, sizes log-uniform, a seed of its own."""
+    random = np.random.default_rng([seed, 17])
+    return [
+        {
+            "number": number,
+            "knob": DEALT[number % len(DEALT)],
+            "rms_nm": float(np.exp(random.uniform(*np.log(RMS_NM)))),
+            "seed": int(random.integers(1, 2**20)),
+        }
+        for number in range(count)
+    ]
+
+
+def run_trial(
+    draw: dict[str, Any], folder: Path, size_px: int, report: Callable[[str], None]
+) -> dict[str, Any]:
+    """Both rounds of one trial, with optimised and with random layouts."""
+    report(f"trial {draw['number']}: {draw['knob']}")
+    found = strength_for_rms(draw["knob"], draw["rms_nm"], seed=draw["seed"])
+    card = simulate(folder / "fab", count=SCANS, size_px=size_px, seed=draw["seed"], knobs=[found.setting])
+    build_dataset(card, folder / "first.zarr")
+    findings, questions = first_round(folder)
+    answers: dict[str, Any] = {}
+    arms: tuple[Arm, ...] = ("optimised", "random")
+    for arm in arms:
+        plan = next_print(
+            folder / "loop",
+            folder / f"plan-{arm}",
+            prints=PRINTS,
+            field_um=size_px / 10,
+            layouts=arm,
+            report=report,
+        )
+        if plan is None or not any(q.kind != "fact" for q in plan.questions):
+            continue
+        printed = simulate_plan(
+            folder / f"plan-{arm}", folder / "fab", folder / f"fab-{arm}", seed=draw["seed"] + 1
+        )
+        build_dataset(printed, folder / f"{arm}.zarr")
+        new = prepare_scans(open_store(folder / f"{arm}.zarr").scans())
+        planned = {q.name: q for q in plan.questions}
+        answers[arm] = [
+            judged(one, planned[one.question], draw["knob"]) for one in decide(findings, questions, new)
+        ]
+    return {**draw, "strength": found.setting.strength, "reached_rms_nm": found.rms_nm, "answers": answers}
+
+
+def first_round(folder: Path) -> tuple[LoopFindings, OpenQuestions]:
+    """The loop on the first store; its questions and its base model go into ``loop``."""
+    store = open_store(folder / "first.zarr")
+    base = build_model(
+        "physics", pitch_um=store.pitch_um, level_height_um=store.level_height_um, levels=store.levels
+    )
+    findings = close_loop(store.scans(), base, LoopConfig.model_validate({}), lock_box=store.locked_ids)
+    result = summarise(findings, dataset=store.dataset_id, base_name="physics", dropped=[])
+    shares = level_share([scan.stored for scan in findings.development])
+    questions = open_questions(findings, result, shares)
+    (folder / "loop").mkdir(exist_ok=True)
+    questions.write(folder / "loop")
+    save_frozen(findings.search.state.fits.chain.base, folder / "loop" / MODEL_FOLDER, name="first round")
+    return findings, questions
+
+
+def judged(decision: Decision, planned: PlannedQuestion, knob: str) -> dict[str, Any]:
+    """One answer beside the truth and the predicted power."""
+    truth = KNOBS[knob]
+    owner = MICROSCOPE if truth.role == "measurement" else PRINTER
+    asked = {truth.effect, owner} & set(decision.declared)
+    return {
+        "question": decision.question,
+        "kind": decision.kind,
+        "declared": decision.declared,
+        "left": decision.left,
+        "verdict": decision.verdict,
+        "evidence": decision.evidence,
+        "power": planned.power[PRINTS - 1],
+        "status": planned.status,
+        # Terms of single scans are drawn by the fab's default noise, whatever is planted.
+        "counts": bool(asked) and decision.kind != "per-scan",
+        "right": decision.verdict == "decided" and set(decision.left) == asked,
+        "wrong": decision.verdict == "decided" and set(decision.left) != asked,
+    }
+
+
+def line_of(trial: dict[str, Any]) -> str:
+    """One trial in one line."""
+    told = [
+        f"{arm}: {one['question']} [{', '.join(one['declared'])}] -> {one['verdict']} {one['left']}, "
+        f"power {one['power']:.2f}"
+        for arm, answers in trial["answers"].items()
+        for one in answers
+        if one["counts"]
+    ]
+    return (
+        f"{trial['number']:2d} {trial['knob']} {trial['rms_nm']:.0f} nm: {'; '.join(told) or 'no question'}"
+    )
+
+
+def summary(trials: list[dict[str, Any]]) -> str:
+    """How many questions were decided rightly, by arm and by predicted power."""
+    arms: tuple[Arm, ...] = ("optimised", "random")
+    rows = [
+        "| layouts | questions | power ≥ 0.95 | of these right | wrong | no experiment | right of all |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for arm in arms:
+        asked = [one for trial in trials for one in trial["answers"].get(arm, []) if one["counts"]]
+        sure = [one for one in asked if one["power"] >= 0.95]
+        none = [one for one in asked if one["status"] == "no experiment separates"]
+        rows.append(
+            f"| {arm} | {len(asked)} | {len(sure)} | {sum(one['right'] for one in sure)} | "
+            f"{sum(one['wrong'] for one in asked)} | {len(none)} | {sum(one['right'] for one in asked)} |"
+        )
+    silent = sum(not any(one["counts"] for one in trial["answers"].get("optimised", [])) for trial in trials)
+    return "\n".join([*rows, "", f"{len(trials)} trials; {silent} left no question about what was planted."])
+
+
+if __name__ == "__main__":
+    run_script(main)
