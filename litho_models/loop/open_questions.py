@@ -8,14 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
 
-from litho_data.foundation.results import Record, Result
 from litho_data.foundation.units import NM_PER_UM
-from litho_data.store.schema import DatasetId
 from litho_models.effects import CATALOGUE, get_effect
 from litho_models.effects.chain import EffectChain
 from litho_models.fitting.least_squares import eliminated_sum, fit_least_squares
@@ -27,78 +23,15 @@ from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.probes import AddedProbe
 from litho_models.loop.probes.probe import Probe
 from litho_models.loop.residual_spectrum import NoiseSpectrum, residual_spectrum
+from litho_models.loop.result.questions import IN_SCAN, Doing, OpenQuestions, Question, Rival, Turning
 from litho_models.loop.result.record import AddedEffect, CloseLoop
 from litho_models.loop.screening.score_test import FAMILY_P, Screened
 from litho_models.loop.selection.contest import fitting_start
 from litho_models.loop.study import Score
 
-Kind = Literal["set", "suspects", "role", "generic", "per-scan", "lines", "fact"]
-Doing = Literal["turned scan", "early print scanned late"]
-IN_SCAN = " as the microscope's"
 # Suspects: how many, and the least gain that one promises, as a share of the squared error.
 _MOST_SUSPECTS = 3
 _LEAST_GAIN = 0.003
-
-
-class Rival(Record):
-    """One answer to a question: the base with these effects, as fitted to the prints so far.
-
-    ``vector``: all fitted numbers, ``loop.parameters.get_vector``; ``information``: (p, p), normal matrix of
-    the fit over all pixels that it stands for, µm². ``scan_frame``: effects that turn with the scan.
-    """
-
-    name: str
-    effects: dict[str, dict[str, float]]
-    scan_frame: list[str]
-    vector: list[float]
-    information: list[list[float]]
-
-
-class Turning(Record):
-    """A generic term as the printer's and as the microscope's, on layouts like those of the prints so far.
-
-    The two differ where ``by`` is done: by ``rms_nm`` once the scan's own terms are free, and ``noise_nm`` is
-    the standard deviation of the noise along that difference, both per scan of ``pixels`` pixels.
-    """
-
-    by: Doing
-    rms_nm: float
-    noise_nm: float
-    pixels: int
-
-
-class Question(Record):
-    """Something a loop left open.
-
-    ``spread``: how much the evidence that a print gives for the effect varies between the prints so far,
-    relative to its mean, beyond the noise. ``sizes``: figures of terms of single scans, by name and unit.
-    """
-
-    name: str
-    kind: Kind
-    text: str
-    experiment: str
-    rivals: list[Rival] = Field(default_factory=list)
-    turning: Turning | None = None
-    spread: float = 0.0
-    sizes: dict[str, float] = Field(default_factory=dict)
-
-
-class OpenQuestions(Result):
-    """``open_questions.json``: what is open, and the noise against which it is to be decided."""
-
-    SCHEMA: ClassVar[str] = "litho-models/open-questions/1"
-    FILE_NAME: ClassVar[str] = "open_questions.json"
-
-    dataset: DatasetId
-    n_scans: int
-    field_px: tuple[int, int]
-    noise: NoiseSpectrum
-    level_share: list[float]
-    power_share: list[float]
-    frequency_per_um: list[float]
-    write_field_um: float | None
-    questions: list[Question]
 
 
 def open_questions(

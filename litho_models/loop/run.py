@@ -18,10 +18,11 @@ from litho_models.frozen.files import save_frozen
 from litho_models.loop.close import close_loop
 from litho_models.loop.findings import LoopConfig, LoopFindings, corrected_chain
 from litho_models.loop.folded_base import Trainer
-from litho_models.loop.open_questions import OpenQuestions, open_questions
+from litho_models.loop.open_questions import open_questions
 from litho_models.loop.prepared import prepare_scans
 from litho_models.loop.report.page import write_report
 from litho_models.loop.result.exporting import exported_effects, write_measurement_model
+from litho_models.loop.result.questions import OpenQuestions
 from litho_models.loop.result.record import CloseLoop
 from litho_models.loop.result.summary import summarise
 from litho_models.loop.second_round import decide

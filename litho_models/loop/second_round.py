@@ -20,9 +20,10 @@ from litho_models.fitting.least_squares import fit_least_squares
 from litho_models.loop.findings import LoopFindings
 from litho_models.loop.fold_fits import RULES, ChainProblem, predict
 from litho_models.loop.linear import ALL_FREE
-from litho_models.loop.open_questions import IN_SCAN, OpenQuestions, Question, Rival, as_scanned
+from litho_models.loop.open_questions import as_scanned
 from litho_models.loop.parameters import chain_at, get_vector
 from litho_models.loop.prepared import PreparedScan
+from litho_models.loop.result.questions import IN_SCAN, OpenQuestions, Question, Rival
 from litho_models.loop.result.record import Comparison, Decided, Decision
 from litho_models.loop.selection.confirming import BINOMIAL_P
 from litho_models.loop.single_scans.nested_tests import scan_parameters

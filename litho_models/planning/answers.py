@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from litho_models.loop.open_questions import OpenQuestions, Question
+from litho_models.loop.result.questions import OpenQuestions, Question
 from litho_models.planning import power
 from litho_models.planning.record import PlannedPair, PlannedQuestion, Status
 from litho_models.planning.rivalry import Contrast, PlannedPrint, Rivalry

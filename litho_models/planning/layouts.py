@@ -16,7 +16,7 @@ from torch import Tensor
 
 from litho_data.layouts.patterns import checkerboard, isolated_features, line_space_sweep
 from litho_data.layouts.random_layout import quantise, random_layout
-from litho_models.loop.open_questions import OpenQuestions
+from litho_models.loop.result.questions import OpenQuestions
 from litho_models.planning.rivalry import Place, PlannedPrint, Rivalry, Way
 
 TILE_PX = 256

@@ -9,8 +9,8 @@ import numpy as np
 from scipy.stats import f as f_distribution
 from scipy.stats import norm
 
-from litho_models.loop.open_questions import Question
 from litho_models.loop.residual_spectrum import NoiseSpectrum
+from litho_models.loop.result.questions import Question
 from litho_models.loop.selection.confirming import BINOMIAL_P
 from litho_models.planning.rivalry import Contrast
 

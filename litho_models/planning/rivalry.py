@@ -23,9 +23,9 @@ from litho_models.effects.chain import EffectChain
 from litho_models.fitting.least_squares import gram, orthonormal, solve_damped
 from litho_models.loop.fold_fits import TERM_WEIGHT
 from litho_models.loop.linear import ALL_FREE
-from litho_models.loop.open_questions import Question, Rival
 from litho_models.loop.parameters import chain_at, difference_steps, get_vector, room
 from litho_models.loop.residual_spectrum import NoiseSpectrum
+from litho_models.loop.result.questions import Question, Rival
 from litho_models.scan_terms import TermPixels, term_maps
 from litho_models.simulator import Simulator
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from litho_models.loop.open_questions import Question
+from litho_models.loop.result.questions import Question
 from litho_models.planning.layouts import score
 from litho_models.planning.rivalry import Place, Rivalry, Way
 

@@ -24,10 +24,10 @@ from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 from litho_models.effects import FieldContext, get_effect
 from litho_models.effects.chain import EffectChain
 from litho_models.frozen.files import save_frozen
-from litho_models.loop.open_questions import IN_SCAN, OpenQuestions, Question, Rival
 from litho_models.loop.parameters import get_vector
 from litho_models.loop.prepared import prepare_scans
 from litho_models.loop.residual_spectrum import NoiseSpectrum, residual_spectrum
+from litho_models.loop.result.questions import IN_SCAN, OpenQuestions, Question, Rival
 from litho_models.loop.run import _new_scans
 from litho_models.loop.second_round import decide
 from litho_models.planning import power

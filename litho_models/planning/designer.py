@@ -1,0 +1,162 @@
+"""Which scans every print gets, and the tiles of its layout, kept one by one: a killed run goes on."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from litho_data.foundation.hashes import record_sha256
+from litho_data.layouts.random_layout import random_layout
+from litho_data.register.coarse import SEARCH_BLUR_PX
+from litho_data.register.orientation import rival_alignment
+from litho_data.register.topography import predicted_topography
+from litho_models.loop.result.questions import OpenQuestions
+from litho_models.planning.layouts import TILE_PX, Limits, climb, score, starts
+from litho_models.planning.rivalry import Place, PlannedPrint, Rivalry, Way
+from litho_models.planning.ways import choose_ways
+
+_TILES = 4
+# Registration refuses layouts that repeat themselves by more than 0.9; a print shows them less clearly.
+_MOST_REPEATING = 0.7
+
+
+class Designer:
+    """Ways to scan, and tiles that climbed, for the questions that have rivals."""
+
+    def __init__(
+        self,
+        rivalries: Sequence[Rivalry],
+        limits: Limits,
+        size_px: int,
+        seed: int,
+        steps: int,
+        cache: Path,
+        report: Callable[[str], None],
+    ):
+        self.rivalries, self.limits, self.seed, self.steps = rivalries, limits, seed, steps
+        self.size_px, self.tile_px = size_px, min(TILE_PX, size_px)
+        self.cache, self.report = cache, report
+        self.ways: tuple[Way, ...] = (Way(),)
+        self.tried: list[dict[str, float]] = []
+        self.chosen: list[str] = []
+        self._edge = False
+
+    def choose(self, asked: Sequence[Way], can_move: bool) -> None:
+        """Settle how every print is scanned: what any of the questions needs."""
+        ways = [Way(), *asked]
+        for rivalry in self.rivalries:
+            own, place, tried = choose_ways(
+                rivalry, random_level(self.limits, self.tile_px, self.seed), can_move
+            )
+            ways += own
+            self._edge |= place == "edge"
+            self.tried.append(tried)
+        self.ways = tuple(dict.fromkeys(ways))
+
+    def place(self, number: int) -> Place:
+        """Where a print lies in the write field: in turn at edge and centre, if that shows anything."""
+        return "edge" if self._edge and number % 2 == 0 else "centre"
+
+    def tiles(self, loop: Path, prints: int) -> list[np.ndarray]:
+        """The tiles of all prints, soft levels; those of an interrupted run are taken as they are."""
+        count = self._count(prints)
+        if not self.rivalries:
+            return self.random_tiles(prints)
+        questions = (loop / OpenQuestions.FILE_NAME).read_text(encoding="utf-8")
+        key = record_sha256(
+            {
+                "questions": questions,
+                "ways": [vars(way) for way in self.ways],
+                "settings": [self.tile_px, self.seed, self.steps, count],
+            }
+        )[:16]
+        kept = self.cache / key
+        kept.mkdir(parents=True, exist_ok=True)
+        self._announce(count, sum((kept / f"{n}.npy").is_file() for n in range(count)))
+        ranked = [self._ranked(rivalry) for rivalry in self.rivalries]
+        tiles = []
+        for number in range(count):
+            which, rank = number % len(self.rivalries), number // len(self.rivalries)
+            name, start = ranked[which][rank % len(ranked[which])]
+            file = kept / f"{number}.npy"
+            if not file.is_file():
+                self.report(
+                    f"tile {number + 1} of {count}: from {name}, for {self.rivalries[which].question.name}"
+                )
+                place: Place = "edge" if self._edge else "centre"
+                tile = climb(
+                    self.rivalries[which], start, self.ways, self.limits, place=place, steps=self.steps
+                )
+                with open(kept / f"{number}.part", "wb") as stream:
+                    np.save(stream, tile)
+                (kept / f"{number}.part").replace(file)
+            tiles.append(np.load(file))
+            self.chosen.append(name)
+        return tiles
+
+    def random_tiles(self, prints: int) -> list[np.ndarray]:
+        """As many tiles of random structure."""
+        self.chosen = ["random"]
+        return [
+            random_level(self.limits, self.tile_px, self.seed + 31 + i).astype(np.float32)
+            for i in range(self._count(prints))
+        ]
+
+    def _count(self, prints: int) -> int:
+        return _TILES if self.size_px > self.tile_px else prints
+
+    def forget(self) -> None:
+        """Remove the kept tiles: the plan is there."""
+        shutil.rmtree(self.cache, ignore_errors=True)
+
+    def _ranked(self, rivalry: Rivalry) -> list[tuple[str, np.ndarray]]:
+        found = [
+            (name, level)
+            for name, level in starts(self.tile_px, self.limits, self.seed)
+            if _repeats(level) <= _MOST_REPEATING
+        ]
+        scores = {name: score(rivalry, level, self.ways) for name, level in found}
+        return sorted(found, key=lambda one: -scores[one[0]])
+
+    def _announce(self, count: int, done: int) -> None:
+        """Say before the work begins how long it will take, from one step of it."""
+        rivalry = max(self.rivalries, key=lambda one: len(one.pairs))
+        level = random_level(self.limits, self.tile_px, self.seed)
+        clock = time.perf_counter()
+        refitted = rivalry.refitted([PlannedPrint(as_tensor(level), self.ways)])
+        refit_s, clock = time.perf_counter() - clock, time.perf_counter()
+        soft = as_tensor(level).requires_grad_()
+        rivalry.separations([PlannedPrint(soft, self.ways)], refitted).sum().backward()
+        step_s = time.perf_counter() - clock
+        tile_s = self.steps * step_s + (1 + self.steps / 10) * refit_s
+        area = (self.size_px / self.tile_px) ** 2
+        rest_s = len(self.rivalries) * (9 * refit_s + 8 * area * refit_s)
+        total_s = (count - done) * tile_s + rest_s
+        kept = f", {done} of {count} tiles are kept from an earlier run" if done else ""
+        self.report(f"this takes about {max(1, round(total_s / 60))} min on one core{kept}")
+
+
+def _repeats(level: np.ndarray) -> float:
+    """How well a layout repeats itself, as its registration will judge it: 1 where any shift does as well."""
+    topography = predicted_topography(level, SEARCH_BLUR_PX)
+    return rival_alignment(topography, topography)
+
+
+def random_level(limits: Limits, size_px: int, seed: int) -> np.ndarray:
+    level = random_layout(
+        (size_px, size_px),
+        levels=limits.highest + 1,
+        cutoff_per_um=limits.cutoff_per_um,
+        pitch_um=limits.pitch_um,
+        seed=seed,
+    )
+    return np.maximum(level, np.uint8(limits.lowest))
+
+
+def as_tensor(level: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(level.astype(np.float32))
