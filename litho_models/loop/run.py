@@ -25,7 +25,7 @@ from litho_models.loop.result.exporting import exported_effects, write_measureme
 from litho_models.loop.result.questions import OpenQuestions
 from litho_models.loop.result.record import CloseLoop
 from litho_models.loop.result.summary import summarise
-from litho_models.loop.second_round import decide
+from litho_models.loop.second_round import decide, with_decisions
 from litho_models.loop.single_scans.observed import rounding_step_um
 from litho_models.models import MODELS, build_model
 from litho_models.simulator import Simulator, is_small
@@ -94,7 +94,7 @@ def close_loop_on_store(
     questions = open_questions(findings, result, shares, report)
     if new:
         decisions = decide(findings, questions, prepare_scans(new), report)
-        result = result.model_copy(update={"decisions": decisions})
+        result = with_decisions(result, decisions)
     with atomic_folder(out) as folder:
         result.write(folder)
         questions.write(folder)
@@ -183,6 +183,16 @@ def _base_model(base: str, store: Store) -> tuple[Simulator, str]:
     return load_simulator(folder, card), card.name
 
 
+def _attributed(result: CloseLoop) -> dict[str, str]:
+    """Whose an effect is where the catalogue does not know it and new prints have decided."""
+    sides = {"process": "printer", "measurement": "microscope"}
+    return {
+        effect.name: sides[effect.role]
+        for effect in result.effects
+        if effect.role in sides and get_effect(effect.name).role == "undetermined"
+    }
+
+
 def _save_process_model(findings: LoopFindings, result: CloseLoop, store: Store, folder: Path) -> None:
     chain = corrected_chain(findings)
     groups = exported_effects(chain, result)
@@ -194,6 +204,7 @@ def _save_process_model(findings: LoopFindings, result: CloseLoop, store: Store,
         process_effects=groups["process"],
         measurement_effects=groups["measurement"],
         undetermined_effects=groups["undetermined"],
+        attributed=_attributed(result),
         dataset=result.dataset.model_dump(mode="json"),
         command=result.run.command,
         split={

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.stats import f as f_distribution
@@ -24,7 +25,7 @@ from litho_models.loop.open_questions import as_scanned
 from litho_models.loop.parameters import chain_at, get_vector
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.result.questions import IN_SCAN, OpenQuestions, Question, Rival
-from litho_models.loop.result.record import Comparison, Decided, Decision
+from litho_models.loop.result.record import AddedEffect, CloseLoop, Comparison, Decided, Decision
 from litho_models.loop.selection.confirming import BINOMIAL_P
 from litho_models.loop.single_scans.nested_tests import scan_parameters
 from litho_models.loop.study import Score, score
@@ -65,6 +66,24 @@ def decide(
         else:
             decisions.append(_of_single_scans(findings, question, new))
     return decisions
+
+
+def with_decisions(result: CloseLoop, decisions: list[Decision]) -> CloseLoop:
+    """The result with what was decided: an effect that is left alone is explained, and has an owner."""
+    named = {one.question: one.left[0] for one in decisions if one.verdict == "decided" and one.left}
+
+    def decided(effect: AddedEffect) -> AddedEffect:
+        left = named.get(effect.name, "")
+        if left.removesuffix(IN_SCAN) != effect.name:
+            return effect
+        changes: dict[str, Any] = {"verdict": "explained", "confusable_with": []}
+        if effect.role == "undetermined":
+            changes["role"] = "measurement" if left.endswith(IN_SCAN) else "process"
+        return effect.model_copy(update=changes)
+
+    return result.model_copy(
+        update={"decisions": decisions, "effects": [decided(effect) for effect in result.effects]}
+    )
 
 
 def fitted_rival(

@@ -27,9 +27,11 @@ from litho_models.frozen.files import save_frozen
 from litho_models.loop.parameters import get_vector
 from litho_models.loop.prepared import prepare_scans
 from litho_models.loop.residual_spectrum import NoiseSpectrum, residual_spectrum
+from litho_models.loop.result.exporting import part_of
 from litho_models.loop.result.questions import IN_SCAN, OpenQuestions, Question, Rival
-from litho_models.loop.run import _new_scans
-from litho_models.loop.second_round import decide
+from litho_models.loop.result.record import AddedEffect, CloseLoop, Decision
+from litho_models.loop.run import _attributed, _new_scans
+from litho_models.loop.second_round import decide, with_decisions
 from litho_models.planning import power
 from litho_models.planning.layouts import Limits, climb, score, starts
 from litho_models.planning.record import NextPrint
@@ -325,6 +327,28 @@ def test_two_turned_prints_say_whose_a_loss_on_slopes_is(frame: tuple[str, ...])
     decision = decide(findings, opened([slope_question()]), prepare_scans(second_round(frame, 5)))[0]
     assert decision.verdict == "decided"
     assert decision.left == ["slope-thinning" + IN_SCAN * bool(frame)]
+
+
+def test_what_is_decided_gets_its_owner_in_the_result_and_in_the_model() -> None:
+    decision = {
+        "question": "slope-thinning",
+        "kind": "role",
+        "declared": ["slope-thinning", "slope-thinning" + IN_SCAN],
+        "verdict": "decided",
+        "evidence": "",
+        "prints": 2,
+        "scans": 4,
+    }
+    effect = AddedEffect.model_construct(
+        name="slope-thinning", role="undetermined", verdict="explained", confusable_with=[]
+    )
+    result = CloseLoop.model_construct(effects=[effect])
+    assert part_of(effect) == "undetermined"
+    for left, part in (("slope-thinning", "process"), ("slope-thinning" + IN_SCAN, "measurement")):
+        decided = with_decisions(result, [Decision.model_validate({**decision, "left": [left]})])
+        assert part_of(decided.effects[0]) == part
+        side = {"process": "printer", "measurement": "microscope"}[part]
+        assert _attributed(decided) == {"slope-thinning": side}
 
 
 def test_new_prints_have_to_be_of_this_printer_and_turned_as_they_say(tmp_path: Path) -> None:

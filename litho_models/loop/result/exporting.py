@@ -38,7 +38,8 @@ def part_of(effect: AddedEffect) -> Part:
         return "undetermined"
     if get_effect(effect.name).per_scan:
         return "per-scan"
-    roles = {get_effect(name).role for name in (effect.name, *effect.confusable_with)}
+    # Its own as the result has it: new prints may have decided it.
+    roles = {effect.role, *(get_effect(name).role for name in effect.confusable_with)}
     if roles == {"process"}:
         return "process"
     return "measurement" if roles == {"measurement"} else "undetermined"
