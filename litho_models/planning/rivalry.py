@@ -133,6 +133,7 @@ class Rivalry:
         self.printing = printing
         self.noise = noise
         self.chains = [self._chain(rival, base) for rival in question.rivals]
+        self._power: dict[tuple[int, int], Tensor] = {}
         self.prior = [np.array(rival.information) for rival in question.rivals]
 
     @property
@@ -150,15 +151,18 @@ class Rivalry:
         """
         with torch.no_grad():
             predicted = [self._predict(chain, prints) for chain in self.chains]
+            # The first step of a model is taken from the same place whatever it is fitted to.
+            first = [self._linearise(chain, prints) for chain in self.chains]
             found = []
             for true, other in self.pairs:
-                chain, prior = self.chains[other], self.prior[other]
-                start = get_vector(chain)
-                vector = start
-                for _ in range(rounds):
-                    moved = chain_at(chain, vector)
-                    step = self._step(moved, predicted[true], prints, prior, vector - start)
-                    vector = vector + step
+                chain = self.chains[other]
+                start = vector = get_vector(chain)
+                for number in range(rounds):
+                    here = chain_at(chain, vector)
+                    linear = first[other] if number == 0 else self._linearise(here, prints)
+                    vector = vector + self._step(
+                        here, linear, predicted[true], self.prior[other], vector - start
+                    )
                 found.append(chain_at(chain, vector))
             return found
 
@@ -168,62 +172,65 @@ class Rivalry:
         """Every directed pair on these prints, each print by itself."""
         partners = refitted or self.refitted(prints, rounds=2)
         with torch.no_grad():
-            directed = zip(self.pairs, partners, strict=True)
-            parts = [self._of_pair(pair, partner, prints) for pair, partner in directed]
+            parts = self._of_pairs(prints, partners)
         return [Contrast(*np.array([[float(x) for x in one] for one in part]).T) for part in parts]
 
     def separations(self, prints: Sequence[PlannedPrint], refitted: Sequence[EffectChain]) -> Tensor:
         """Distance of each directed pair in standard deviations, (pairs,); differentiable in the levels."""
         spread = self.question.spread
         scores = []
-        for pair, partner in zip(self.pairs, refitted, strict=True):
-            squares, sd, _ = zip(*self._of_pair(pair, partner, prints), strict=True)
+        for part in self._of_pairs(prints, refitted):
+            squares, sd, _ = zip(*part, strict=True)
             total = torch.stack(squares).sum()
             variance = (torch.stack(sd) ** 2 + (spread * torch.stack(squares)) ** 2).sum()
             scores.append(total / torch.sqrt(variance + _SMALLEST**2))
         return torch.stack(scores)
 
-    def _of_pair(
-        self, pair: tuple[int, int], partner: EffectChain, prints: Sequence[PlannedPrint]
-    ) -> list[tuple[Tensor, Tensor, int]]:
-        """Per print: squared distance, deviation by noise, pixels.
+    def _of_pairs(
+        self, prints: Sequence[PlannedPrint], partners: Sequence[EffectChain]
+    ) -> list[list[tuple[Tensor, Tensor, int]]]:
+        """Per directed pair and print: squared distance, deviation by noise, pixels."""
+        true = [self._predict(chain, prints) for chain in self.chains]
+        return [
+            self._of_pair(true[pair[0]], self._predict(partner, prints), prints)
+            for pair, partner in zip(self.pairs, partners, strict=True)
+        ]
 
-        Scans of one print show the same roughness, so their differences add up before the noise meets them.
-        """
-        found = []
+    def _of_pair(
+        self, true: Sequence[Tensor], other: Sequence[Tensor], prints: Sequence[PlannedPrint]
+    ) -> list[tuple[Tensor, Tensor, int]]:
+        """Scans of one print share its roughness: their differences add up before the noise meets them."""
+        found, scans = [], iter(zip(true, other, strict=True))
         for printed in prints:
-            squares, together, pixels = torch.zeros(()), None, 0
-            for way in printed.ways:
-                true = self.printing.predict(self.chains[pair[0]], printed, way)
-                other = self.printing.predict(partner, printed, way)
+            squares, together, pixels = torch.zeros(()), torch.zeros(()), 0
+            for _ in printed.ways:
+                right, refitted = next(scans)
                 # The refitted model's own maps: a gain of the true one would let the other fade to nothing.
-                basis = torch.from_numpy(_free_basis(other.detach().numpy())).to(true)
-                inner = _inner(true - other)
+                basis = torch.from_numpy(_free_basis(refitted.detach().numpy())).to(right)
+                inner = _inner(right - refitted)
                 flat = inner.reshape(-1)
-                freed = flat - basis @ (basis.T @ flat)
-                squares = squares + (freed**2).sum()
-                together = freed if together is None else together + freed
+                freed = (flat - basis @ (basis.T @ flat)).reshape(inner.shape)
+                squares, together = squares + (freed**2).sum(), together + freed
                 pixels += flat.numel()
-            assert together is not None
-            shape = inner.shape[0], inner.shape[1]
-            power = torch.from_numpy(self.noise.on_grid(shape)).to(together) / NM_PER_UM**2
-            spectrum = torch.fft.fft2(together.reshape(shape)).abs() ** 2
-            variance = 4 * (spectrum * power).sum() / flat.numel()
+            spectrum = torch.fft.fft2(together).abs() ** 2
+            variance = 4 * (spectrum * self._power_um2(together)).sum() / together.numel()
             found.append((squares, torch.sqrt(variance + _SMALLEST**2), pixels))
         return found
+
+    def _power_um2(self, like: Tensor) -> Tensor:
+        """The noise at the frequencies of this map."""
+        shape = like.shape[0], like.shape[1]
+        if shape not in self._power:
+            self._power[shape] = torch.from_numpy(self.noise.on_grid(shape)).to(like) / NM_PER_UM**2
+        return self._power[shape]
 
     def _predict(self, chain: EffectChain, prints: Sequence[PlannedPrint]) -> list[Tensor]:
         return [self.printing.predict(chain, one, way) for one in prints for way in one.ways]
 
-    def _step(
-        self,
-        chain: EffectChain,
-        target: Sequence[Tensor],
-        prints: Sequence[PlannedPrint],
-        prior: np.ndarray,
-        moved: np.ndarray,
-    ) -> np.ndarray:
-        """One Gauss-Newton step of the chain towards the target, within its room."""
+    def _linearise(
+        self, chain: EffectChain, prints: Sequence[PlannedPrint]
+    ) -> list[tuple[Tensor, np.ndarray, np.ndarray]]:
+        """Of each scan: prediction (y, x), derivatives (n, p) on the inner pixels, free basis (n, k)."""
         vector = get_vector(chain)
         steps = difference_steps(chain, vector)
         here = self._predict(chain, prints)
@@ -231,16 +238,33 @@ class Rivalry:
             self._predict(chain_at(chain, vector + step * (np.arange(len(vector)) == i)), prints)
             for i, step in enumerate(steps)
         ]
+        return [
+            (
+                height,
+                np.column_stack(
+                    [_flat(own[at] - height) / step for own, step in zip(aside, steps, strict=True)]
+                ),
+                _free_basis(height.numpy()),
+            )
+            for at, height in enumerate(here)
+        ]
+
+    def _step(
+        self,
+        chain: EffectChain,
+        linear: Sequence[tuple[Tensor, np.ndarray, np.ndarray]],
+        target: Sequence[Tensor],
+        prior: np.ndarray,
+        moved: np.ndarray,
+    ) -> np.ndarray:
+        """One Gauss-Newton step of the chain towards the target, within its room."""
         normal, right = prior.copy(), -prior @ moved
-        for at, own_height in enumerate(here):
-            basis = _free_basis(own_height.numpy())
-            columns = [_flat(target[at] - here[at])]
-            columns += [_flat(own[at] - here[at]) / step for own, step in zip(aside, steps, strict=True)]
-            stacked = np.column_stack(columns)
+        for (height, jacobian, basis), wanted in zip(linear, target, strict=True):
+            stacked = np.column_stack([_flat(wanted - height), jacobian])
             # As in a fit of the loop: a little weight fixes what only the scans' own terms carry.
             products = gram(stacked, basis, TERM_WEIGHT)
             normal, right = normal + products[1:, 1:], right + products[1:, 0]
-        return solve_damped(normal, right, _DAMPING, room(chain, vector))
+        return solve_damped(normal, right, _DAMPING, room(chain, get_vector(chain)))
 
     def _chain(self, rival: Rival, base: Simulator) -> EffectChain:
         full = self.printing.highest * self.printing.level_height_um
