@@ -27,14 +27,16 @@ def of_rivals(
     control = _pairs(rivalry, rivalry.contrasts(random))
     hardest = min(pairs, key=lambda pair: pair.power[prints - 1])
     names = [rival.name for rival in question.rivals]
+    status = _status(hardest.power, prints)
     ways = "; ".join(f"{what}: {z:.1f}" for what, z in tried.items())
     return PlannedQuestion(
         name=question.name,
         kind=question.kind,
         text=question.text,
-        status=_status(hardest.power, prints),
+        status=status,
         why=f"the nearest two rivals differ by so many standard deviations on one random print: {ways}"
-        + (f"; prints so far differ in the size of the effect by {100 * spread:.0f} %" if spread else ""),
+        + (f"; what a print says varies by {100 * spread:.0f} %, beyond noise" if spread else "")
+        + (f". Not in this plan: {question.experiment}" if status == "no experiment separates" else ""),
         rivals=names,
         pairs=pairs,
         difference_nm=hardest.difference_nm,

@@ -14,9 +14,10 @@ from scipy.ndimage import gaussian_filter
 
 import litho_models
 from litho_data.cards.card import load_card
+from litho_data.cards.tables import read_table
 from litho_data.foundation.errors import InputError
 from litho_data.store.schema import DatasetId
-from litho_data.virtual_fab import jobs_of_card
+from litho_data.virtual_fab import Truth, jobs_of_card, simulate, simulate_plan
 from litho_data.virtual_fab.fab import Fab, scan_job
 from litho_data.virtual_fab.knobs import KnobBoard, KnobSetting
 from litho_data.virtual_fab.printer import Job
@@ -282,6 +283,22 @@ def test_a_plan_is_a_dataset_in_waiting_and_resumes(tmp_path: Path) -> None:
     assert {jobs[name].use for name in ("N0F1", "N0F2", "N0F3")} == {"substrate", "flat", "steps"}
     assert (tmp_path / "plan" / "microscope.md").read_text("utf-8").count("90°") >= 2
     assert not (tmp_path / "plan-cache").exists()
+
+    simulate(tmp_path / "fab", count=1, size_px=64, seed=4, knobs=["galvo-lag=0.2@9"])
+    with pytest.raises(InputError, match="seed"):
+        simulate_plan(tmp_path / "plan", tmp_path / "fab", tmp_path / "fab-2", seed=4)
+    card = simulate_plan(tmp_path / "plan", tmp_path / "fab", tmp_path / "fab-2", seed=5)
+    printed = load_card(card)
+    assert printed.plan is not None
+    assert printed.plan.dataset_sha256 == plan.dataset.sha256
+    truths = [Truth.read(tmp_path / name / "truth") for name in ("fab", "fab-2")]
+    assert truths[0].knobs == truths[1].knobs
+    turned = np.array(next(s.scan_to_layout for s in truths[1].scans if s.id == "N1F2"))
+    # The microscope turns a scan by up to 0.6 degrees on its own.
+    assert abs(math.degrees(math.atan2(turned[1, 0], turned[0, 0])) - 90) < 1
+    rows = read_table(card.parent / "scans.csv")
+    assert rows["N1F2"]["turned_deg"] == "90.0"
+    assert rows["N0F1"]["use"] == "substrate"
 
 
 def test_nothing_open_and_no_questions_kept_are_said(tmp_path: Path) -> None:
