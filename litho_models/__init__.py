@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from litho_models.models import build_model as build_model
     from litho_models.models.authors import model_of_authors as model_of_authors
     from litho_models.noise import analyse_noise as analyse_noise
-    from litho_models.planning.run import next_print as next_print
     from litho_models.scan_terms import register_scan_term as register_scan_term
     from litho_models.scoring.metric_registry import register_metric as register_metric
     from litho_models.simulator import Simulator as Simulator
@@ -44,7 +43,6 @@ else:
             "freeze": "litho_models.frozen.freezing",
             "load_frozen": "litho_models.frozen.files",
             "model_of_authors": "litho_models.models.authors",
-            "next_print": "litho_models.planning.run",
             "register_effect": "litho_models.effects",
             "register_metric": "litho_models.scoring.metric_registry",
             "register_scan_term": "litho_models.scan_terms",
@@ -69,7 +67,6 @@ __all__ = [
     "freeze",
     "load_frozen",
     "model_of_authors",
-    "next_print",
     "register_effect",
     "register_metric",
     "register_scan_term",

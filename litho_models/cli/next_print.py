@@ -7,8 +7,6 @@ from typing import Annotated, Literal
 
 import typer
 
-import litho_models
-
 
 def next_print(
     loop: Annotated[Path, typer.Argument(help="folder of litho-models close-loop")],
@@ -25,7 +23,9 @@ def next_print(
     steps: Annotated[int, typer.Option("--steps", min=0, help="of the ascent of each tile")] = 40,
 ) -> None:
     """Plan the prints and scans that decide what a closed loop left open; resumes after a kill."""
-    plan = litho_models.next_print(
+    from litho_models.planning.run import next_print as plan_next_print
+
+    plan = plan_next_print(
         loop,
         out,
         prints=prints,

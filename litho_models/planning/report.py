@@ -69,7 +69,7 @@ def write_report(
         pd.DataFrame([scan.model_dump() for scan in plan.scans]), "In the order of scanning.", "order.csv"
     )
     page.heading("How it was planned")
-    page.code(plan.run.command or "litho_models.next_print")
+    page.code(plan.run.command or "litho_models.planning.run.next_print")
     return page.write(folder)
 
 

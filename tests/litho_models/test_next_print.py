@@ -12,7 +12,6 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
-import litho_models
 from litho_data.cards.card import load_card
 from litho_data.cards.tables import read_table
 from litho_data.foundation.errors import InputError
@@ -37,6 +36,7 @@ from litho_models.planning import power
 from litho_models.planning.layouts import Limits, climb, score, starts
 from litho_models.planning.record import NextPrint
 from litho_models.planning.rivalry import PlannedPrint, Printing, Rivalry, Way
+from litho_models.planning.run import next_print
 from litho_models.scan_terms import Blocks
 from tests.litho_models.loop_scans import printed_scans, true_model
 from tests.litho_models.prints import write_store
@@ -265,10 +265,10 @@ def test_a_plan_is_a_dataset_in_waiting_and_resumes(tmp_path: Path) -> None:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        litho_models.next_print(loop, tmp_path / "plan", report=killed, **settings)
+        next_print(loop, tmp_path / "plan", report=killed, **settings)
     assert not (tmp_path / "plan").exists()
     told.clear()
-    plan = litho_models.next_print(loop, tmp_path / "plan", report=told.append, **settings)
+    plan = next_print(loop, tmp_path / "plan", report=told.append, **settings)
     assert plan is not None
     assert "1 of 2 tiles are kept" in told[0]
     assert not any(text.startswith("tile 1") for text in told)
@@ -303,11 +303,11 @@ def test_a_plan_is_a_dataset_in_waiting_and_resumes(tmp_path: Path) -> None:
 
 def test_nothing_open_and_no_questions_kept_are_said(tmp_path: Path) -> None:
     loop = closed_loop(tmp_path / "loop", [])
-    assert litho_models.next_print(loop, tmp_path / "plan") is None
+    assert next_print(loop, tmp_path / "plan") is None
     assert not (tmp_path / "plan").exists()
     (loop / OpenQuestions.FILE_NAME).unlink()
     with pytest.raises(InputError, match=r"open_questions\.json"):
-        litho_models.next_print(loop, tmp_path / "plan")
+        next_print(loop, tmp_path / "plan")
 
 
 # --- the second round
