@@ -23,7 +23,7 @@ FROZEN_ONLY = {"load_frozen", "zoo"}
 # Rooms from the ground up: a room imports from those before it only. `simulator` is a module.
 ROOMS = {
     "litho_data": (
-        "foundation", "scan", "readers", "register", "level", "roughness", "store", "cards", "layouts",
+        "foundation", "scan", "readers", "register", "level", "roughness", "tip", "store", "cards", "layouts",
         "virtual_fab", "build", "provenance", "exchange", "cli",
     ),
     "litho_models": (

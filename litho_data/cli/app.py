@@ -11,6 +11,7 @@ import typer
 
 from litho_data.cli.layouts import masks, simulate
 from litho_data.cli.scan import inspect, level
+from litho_data.cli.tip import tip
 from litho_data.foundation.commands import new_app, run_app
 
 app = new_app(
@@ -20,6 +21,7 @@ app.command()(masks)
 app.command()(simulate)
 app.command()(inspect)
 app.command()(level)
+app.command()(tip)
 
 StorePath = Annotated[Path, typer.Argument(help="dataset store, a .zarr folder or .zarr.zip file")]
 DataDir = Annotated[

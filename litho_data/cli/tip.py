@@ -1,0 +1,85 @@
+"""``litho-data tip``: the tip of the microscope from its own scans."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from litho_data.cli.scan import ChannelName, Format, FullScale, Size, Unit
+from litho_data.foundation.errors import InputError
+
+if TYPE_CHECKING:
+    from litho_data.tip import TipEstimate
+
+
+def tip(
+    scans: Annotated[list[Path], typer.Argument(help="one scan, or all scans of one tip, of the same pitch")],
+    format: Format = "auto",
+    unit: Unit = None,
+    size_um: Size = None,
+    channel: ChannelName = None,
+    full_scale_um: FullScale = None,
+    json: Annotated[bool, typer.Option("--json", help="print the whole result as JSON")] = False,
+    maps: Annotated[
+        Path | None,
+        typer.Option(help="folder for NAME.certain.npy (true where the tip touched) and NAME.surface.gsf"),
+    ] = None,
+) -> None:
+    """Estimate the radius of the tip, or the most that it can be, and where it did not touch.
+
+    The surface in --maps is the highest that explains the image.
+    """
+    from litho_data.readers import read_scan
+    from litho_data.tip import estimate_tip
+
+    read = [
+        read_scan(
+            file, format=format, unit=unit, size_um=size_um, channel=channel, full_scale_um=full_scale_um
+        )
+        for file in scans
+    ]
+    found = estimate_tip(read)
+    typer.echo(found.model_dump_json(by_alias=True, indent=1) if json else _text(found))
+    if maps is None:
+        return
+    if found.radius_um is None:
+        raise InputError("maps of the tip", got=found.reason, wanted="scans that set a bound on the tip")
+    import numpy as np
+
+    from litho_data.foundation.files import atomic_file
+    from litho_data.level.scan import write_heights
+    from litho_data.tip import reconstructed, tip_certain
+
+    maps.mkdir(parents=True, exist_ok=True)
+    for scan in read:
+        height, pitch = scan.height_um, scan.require_pitch()
+        with atomic_file(maps / f"{scan.name}.certain.npy") as temporary, open(temporary, "wb") as stream:
+            np.save(stream, tip_certain(height, pitch, found.radius_um))
+        surface = reconstructed(height, pitch, found.radius_um)
+        write_heights(
+            maps / f"{scan.name}.surface.gsf", surface, pitch_um=pitch, title=f"{scan.name} surface"
+        )
+    typer.echo(f"maps of {len(read)} scans in {maps}", err=json)
+
+
+def _text(found: TipEstimate) -> str:
+    if found.radius_um is None:
+        return f"radius: no bound, {found.reason}"
+    value = f"{found.radius_um:.3g}"
+    if found.kind == "estimate":
+        lines = [f"radius {value} ± {found.radius_sd_um:.2g} µm (standard uncertainty)"]
+    else:
+        lines = [f"radius at most {value} µm: {found.reason}"]
+    lines += [
+        f"flanks at most {found.full_angle_deg:.0f}° apart",
+        f"heights over {found.depth_um:.3g} µm, noise {found.pixel_noise_nm:.2g} nm per pixel and "
+        f"{found.line_noise_nm:.2g} nm per line",
+    ]
+    for scan in found.scans:
+        limit = f"{scan.resolution_um:.3g} µm" if scan.resolution_um else "no length"
+        lines.append(
+            f"{scan.name}: {scan.certain_fraction:.1%} touched for certain; may show the tip below {limit}"
+        )
+    return "\n".join(lines)

@@ -1,0 +1,84 @@
+"""Which pixels of a surface the tip did touch, and the surface under the image.
+
+An image is set by the place where the tip touches. Where the surface turns up more sharply than the tip, the
+contact jumps from one side of a valley to the other; what lies between was not touched, and all that the
+image says of it is one pixel: a valley with a curvature beyond that of the tip. The untouched pixels are
+those whose highest possible height is set by such a valley (Villarrubia 1997, section 5).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError
+from litho_data.register.topography import smooth_measured
+from litho_data.tip.curvature import (
+    DISC_RADII_PX,
+    QUIET,
+    curvature_noise,
+    disc,
+    highest_curvature,
+    noise_of,
+)
+from litho_data.tip.morphology import paraboloid_erosion
+
+# Curvature of a valley in units of the tip's: from the first on it may be a jump, from the second it is. The
+# image of a valley of curvature k has k / (1 − kR): 0.75 of the tip's means 0.43 in the surface.
+_MAY_JUMP, _JUMPS = 0.35, 0.75
+# A disc sees a jump from a radius away, weaker; the jump is where it is more than this share of its peak.
+_CORE = 0.55
+_SMOOTHING = 0.25
+
+
+def tip_certain(height_um: np.ndarray, pitch_um: tuple[float, float], radius_um: float) -> np.ndarray:
+    """Pixels of the surface that the tip touched, bool (ny, nx), with one pixel to spare.
+
+    With an upper bound for the radius, more pixels than necessary are uncertain. False where nothing was
+    measured.
+
+    Args:
+        height_um: image (ny, nx), µm, NaN where not measured.
+        pitch_um: (y, x).
+        radius_um: of the end of the tip, taken for a paraboloid.
+
+    Raises:
+        InputError: a radius that is not a positive number.
+    """
+    from scipy.ndimage import binary_dilation, label, maximum_filter
+
+    height = _checked(height_um, radius_um)
+    noise = noise_of(height)
+    quiet = (r for r in DISC_RADII_PX if curvature_noise(noise, pitch_um, r) * radius_um <= QUIET)
+    size = next(quiet, DISC_RADII_PX[-1])
+    sharpness = np.nan_to_num(highest_curvature(height, pitch_um, size) * radius_um, nan=0.0)
+    regions, count = label(sharpness > _MAY_JUMP, structure=np.ones((3, 3)))
+    jumps = np.zeros(count + 1, bool)
+    jumps[np.unique(regions[sharpness > _JUMPS])] = True
+    jumps[0] = False
+    valley = jumps[regions] & (sharpness >= _CORE * maximum_filter(sharpness, footprint=disc(size)))
+
+    measured = np.isfinite(height)
+    smooth = np.where(measured, smooth_measured(height, _SMOOTHING * size), np.nan)
+    found = paraboloid_erosion(smooth, pitch_um, radius_um)
+    return measured & ~binary_dilation(valley[found.row, found.column])
+
+
+def reconstructed(height_um: np.ndarray, pitch_um: tuple[float, float], radius_um: float) -> np.ndarray:
+    """The highest surface that gives this image, (ny, nx) µm: the image eroded by the tip.
+
+    It is the surface itself where the tip touched and lies above it elsewhere. Noise is taken for surface:
+    its valleys grow to the width of the tip, which lowers the result by up to the noise.
+
+    Args:
+        height_um, pitch_um, radius_um: as for ``tip_certain``.
+
+    Raises:
+        InputError: a radius that is not a positive number.
+    """
+    return paraboloid_erosion(_checked(height_um, radius_um), pitch_um, radius_um).surface
+
+
+def _checked(height_um: np.ndarray, radius_um: float) -> np.ndarray:
+    if not (np.isfinite(radius_um) and radius_um > 0):
+        raise InputError("radius of the tip", got=radius_um, wanted="a positive number in µm")
+    return np.asarray(height_um, dtype=np.float64)

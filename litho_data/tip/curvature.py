@@ -1,0 +1,99 @@
+"""Noise of a scan, and curvatures over small discs with their noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+_MAD_PER_SIGMA = 0.6744897501960817
+_FOURTH = (1.0, -4.0, 6.0, -4.0, 1.0)
+# Pixels: each size adds some to the disc before it.
+DISC_RADII_PX = (2.0, 2.25, 2.5, 2.85, 3.2, 3.65, 4.0, 4.5, 5.0, 6.0, 7.0, 8.0, 10.0, 12.0, 15.0, 20.0)
+# Noise of a curvature that is quiet enough, as a share of the curvature of the tip.
+QUIET = 0.17
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviation of white noise, and of one offset per row or per column, µm."""
+
+    pixel_um: float
+    line_um: float
+    lines_are_rows: bool
+
+
+def noise_of(height_um: np.ndarray) -> Noise:
+    """Noise of a scan (ny, nx), µm, from fourth differences, which are 0 on a parabola: the print of a tip.
+
+    What varies more down the columns than along the rows is an offset of whole rows, and the other way round.
+    """
+    rows, columns = (_fourth_difference(height_um, axis) for axis in (0, 1))
+    pixel, other = min(rows, columns), max(rows, columns)
+    return Noise(pixel, float(np.sqrt(other**2 - pixel**2)), rows > columns)
+
+
+def highest_curvature(height_um: np.ndarray, pitch_um: tuple[float, float], radius_px: float) -> np.ndarray:
+    """Highest principal curvature (ny, nx), 1/µm, of the best quadratic surface of each disc.
+
+    Exact for a quadratic surface, with the least noise of all linear estimates on the disc. NaN where the
+    disc leaves the scan or holds a pixel that was not measured.
+
+    Args:
+        height_um: (ny, nx), NaN where not measured.
+        pitch_um: (y, x).
+        radius_px: of the disc, pixels.
+    """
+    from scipy.ndimage import binary_dilation
+    from scipy.signal import oaconvolve
+
+    kernels, edge = disc_kernels(radius_px, pitch_um), int(radius_px)
+    measured = np.isfinite(height_um)
+    filled = np.where(measured, height_um, 0.0)
+    xx, xy, yy = (oaconvolve(filled, kernel[::-1, ::-1], mode="valid") for kernel in kernels)
+    highest = np.full(height_um.shape, np.nan)
+    inner = slice(edge, height_um.shape[0] - edge), slice(edge, height_um.shape[1] - edge)
+    highest[inner] = (xx + yy) / 2 + np.hypot((xx - yy) / 2, xy)
+    if not measured.all():
+        highest[binary_dilation(~measured, structure=disc(radius_px))] = np.nan
+    return highest
+
+
+def curvature_noise(noise: Noise, pitch_um: tuple[float, float], radius_px: float) -> float:
+    """Standard deviation of a curvature of a flat scan with this noise, 1/µm; the larger of both axes."""
+    largest = 0.0
+    for kernel in disc_kernels(radius_px, pitch_um)[[0, 2]]:
+        lines = kernel.sum(axis=1 if noise.lines_are_rows else 0)
+        variance = noise.pixel_um**2 * (kernel**2).sum() + noise.line_um**2 * (lines**2).sum()
+        largest = max(largest, float(np.sqrt(variance)))
+    return largest
+
+
+@lru_cache(maxsize=64)
+def disc_kernels(radius_px: float, pitch_um: tuple[float, float]) -> np.ndarray:
+    """Weights (3, n, n) of the second derivatives xx, xy, yy, 1/µm², of a quadratic fit on a disc."""
+    inside = disc(radius_px)
+    y_px, x_px = (places - int(radius_px) for places in np.nonzero(inside))
+    y, x = y_px * pitch_um[0], x_px * pitch_um[1]
+    design = np.stack([np.ones(x.size), x, y, x**2 / 2, x * y, y**2 / 2], axis=1)
+    kernels = np.zeros((3, *inside.shape))
+    kernels[:, inside] = np.linalg.pinv(design)[3:]
+    kernels.setflags(write=False)
+    return kernels
+
+
+def disc(radius_px: float) -> np.ndarray:
+    """Pixels (n, n) of a disc, bool, n odd."""
+    half = int(radius_px)
+    y, x = np.mgrid[-half : half + 1, -half : half + 1]
+    return x**2 + y**2 <= radius_px**2 + 1e-9
+
+
+def _fourth_difference(height_um: np.ndarray, axis: int) -> float:
+    lines = np.moveaxis(height_um, axis, -1)
+    difference = np.diff(lines, len(_FOURTH) - 1)
+    values = np.abs(difference[np.isfinite(difference)])
+    if values.size == 0:
+        return 0.0
+    return float(np.median(values) / _MAD_PER_SIGMA / np.sqrt(sum(weight**2 for weight in _FOURTH)))

@@ -1,0 +1,156 @@
+"""The tip of one or more scans: its radius, or the most that it can be, and where it did not touch."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import Record, Result
+from litho_data.foundation.run_facts import RunFacts, run_facts
+from litho_data.scan import Scan
+from litho_data.tip.blind import blind_tip, full_angle_bound_deg
+from litho_data.tip.certainty import tip_certain
+from litho_data.tip.curvature import noise_of
+from litho_data.tip.radius import PeakRadius, of_one_tip, peak_radius
+from litho_data.tip.resolution import lateral_resolution_um
+
+_THRESHOLD_SIGMA = 6.0
+_LEAST_THRESHOLD = 1e-3
+_SMALLEST_HALF_PX, _LARGEST_HALF_PX = 3, 12
+_SAME_PITCH = 1e-3
+
+
+class ScanUnderTip(Record):
+    """One scan: share of its pixels that the tip touched, and below which wavelength it may show the tip.
+
+    None where the image sets no bound on the tip; ``resolution_um`` also where the tip does not limit it.
+    """
+
+    name: str
+    certain_fraction: float | None
+    resolution_um: float | None
+
+
+class TipEstimate(RunFacts, Result):
+    """What scans say about the tip that made them.
+
+    Args:
+        kind: ``estimate`` where many places show the same end of the tip, else ``upper bound``.
+        radius_um: radius of the end of the tip, or the most that it can be; None if the scans set no bound.
+        radius_sd_um: standard uncertainty of an estimate; None for a bound.
+        reason: why it is no more than a bound; empty for an estimate.
+        full_angle_deg: most that the angle between opposite flanks can be.
+        depth_um: range of heights, without tilt and bow, of the scan behind the radius.
+        reach_px: √(2 R depth) in pixels: how far the image of a spike reaches.
+        pixel_noise_nm, line_noise_nm: noise of the scans, root of the mean square.
+        window_px: side of the windows in which curvatures were measured; None without a bound.
+        share: of the sharp places that are as sharp as the sharpest; high where the tip makes them so.
+        pitch_um: (y, x) of the scans.
+        scans: one by one.
+    """
+
+    SCHEMA: ClassVar[str] = "litho-data/tip/1"
+    FILE_NAME: ClassVar[str] = "tip.json"
+
+    kind: Literal["estimate", "upper bound"]
+    radius_um: float | None
+    radius_sd_um: float | None
+    reason: str
+    full_angle_deg: float
+    depth_um: float
+    reach_px: float | None
+    pixel_noise_nm: float
+    line_noise_nm: float
+    window_px: int | None
+    share: float | None
+    pitch_um: tuple[float, float]
+    scans: tuple[ScanUnderTip, ...]
+
+
+def estimate_tip(scans: Sequence[Scan]) -> TipEstimate:
+    """The tip that made one or more scans, such as those of one day.
+
+    The radius comes from the sharpest tops: an image is nowhere more sharply curved than the end of its tip.
+    It is an estimate only where many tops have the same, largest curvature and the valleys have more;
+    otherwise the tip may be sharper than anything it met. The flanks are bounded by blind tip estimation.
+
+    Args:
+        scans: with a pitch, all the same. Levelling is of little influence.
+
+    Raises:
+        InputError: no scan, no pitch or another one, or a scan of fewer than 64 × 64 pixels.
+    """
+    pitch_um = _common_pitch(scans)
+    heights = [scan.height_um for scan in scans]
+    found = of_one_tip([peak_radius(height, pitch_um) for height in heights])
+    noises = [noise_of(height) for height in heights]
+    threshold_um = max(
+        _THRESHOLD_SIGMA * max(math.hypot(one.pixel_um, one.line_um) for one in noises),
+        max(pitch_um) ** 2 / (2 * found.radius_um) if found.radius_um else 0.0,
+        _LEAST_THRESHOLD * found.depth_um,
+    )
+    reach_px = _reach_px(found, pitch_um)
+    half_px = int(np.clip(math.ceil(reach_px or 0) + 1, _SMALLEST_HALF_PX, _LARGEST_HALF_PX))
+    blind = blind_tip(heights, half_px, threshold_um)
+    return TipEstimate(
+        schema=TipEstimate.SCHEMA,
+        **run_facts(),
+        kind="upper bound" if found.reason else "estimate",
+        radius_um=found.radius_um,
+        radius_sd_um=None if found.reason else found.sd_um,
+        reason=found.reason,
+        full_angle_deg=full_angle_bound_deg(blind, pitch_um),
+        depth_um=found.depth_um,
+        reach_px=reach_px,
+        pixel_noise_nm=1e3 * _rms([one.pixel_um for one in noises]),
+        line_noise_nm=1e3 * _rms([one.line_um for one in noises]),
+        window_px=found.window_px,
+        share=found.share,
+        pitch_um=pitch_um,
+        scans=tuple(
+            _under_tip(scan.name, height, pitch_um, found.radius_um)
+            for scan, height in zip(scans, heights, strict=True)
+        ),
+    )
+
+
+def _under_tip(
+    name: str, height: np.ndarray, pitch_um: tuple[float, float], radius_um: float | None
+) -> ScanUnderTip:
+    if radius_um is None:
+        return ScanUnderTip(name=name, certain_fraction=None, resolution_um=None)
+    certain = tip_certain(height, pitch_um, radius_um)
+    return ScanUnderTip(
+        name=name,
+        certain_fraction=float(certain.sum() / np.isfinite(height).sum()),
+        resolution_um=lateral_resolution_um(height, pitch_um, radius_um),
+    )
+
+
+def _common_pitch(scans: Sequence[Scan]) -> tuple[float, float]:
+    if not scans:
+        raise InputError("scans of a tip", got="none", wanted="at least one")
+    pitches = [scan.require_pitch() for scan in scans]
+    for scan, pitch in zip(scans, pitches, strict=True):
+        if min(scan.shape) < 64:
+            raise InputError(
+                f"scan {scan.source or scan.name}", got=scan.shape, wanted="64 x 64 pixels or more"
+            )
+        if not np.allclose(pitch, pitches[0], rtol=_SAME_PITCH):
+            what = f"pitch of {scan.source or scan.name}"
+            raise InputError(what, got=f"{pitch} µm", wanted=f"{pitches[0]} µm, as the first scan has")
+    return pitches[0]
+
+
+def _reach_px(found: PeakRadius, pitch_um: tuple[float, float]) -> float | None:
+    if found.radius_um is None:
+        return None
+    return math.sqrt(2 * found.radius_um * found.depth_um) / max(pitch_um)
+
+
+def _rms(values: Sequence[float]) -> float:
+    return math.sqrt(sum(value**2 for value in values) / len(values))

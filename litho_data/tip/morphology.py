@@ -1,0 +1,93 @@
+"""Grey-scale morphology of a scan: the image is the surface dilated by the tip.
+
+A tip is an array of heights (2k + 1, 2k + 1) with 0 at its end and ≤ 0 elsewhere. ``dilate`` takes the
+highest surface pixel plus tip, ``erode`` the lowest image pixel minus tip; dilating what was eroded gives the
+*opening*, eroding what was dilated the *closing*. A pixel that was not measured (NaN) takes no part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Eroded(NamedTuple):
+    """A surface (ny, nx), and row and column of the image pixel that sets it, int32; NaN sets nothing."""
+
+    surface: np.ndarray
+    row: np.ndarray
+    column: np.ndarray
+
+
+def dilate(surface: np.ndarray, tip: np.ndarray) -> np.ndarray:
+    """``max over u of surface(x − u) + tip(u)``, same shape; −inf where nothing was measured in reach."""
+    return -_erode(-surface, tip[::-1, ::-1])
+
+
+def erode(image: np.ndarray, tip: np.ndarray) -> np.ndarray:
+    """``min over u of image(x + u) − tip(u)``, same shape; +inf where nothing was measured in reach."""
+    return _erode(image, tip)
+
+
+def paraboloid_dilation(surface: np.ndarray, pitch_um: tuple[float, float], radius_um: float) -> np.ndarray:
+    """The image of a surface (ny, nx), µm, under a paraboloid tip −u²/2R; NaN stays NaN."""
+    return -paraboloid_erosion(-surface, pitch_um, radius_um).surface
+
+
+def paraboloid_erosion(image: np.ndarray, pitch_um: tuple[float, float], radius_um: float) -> Eroded:
+    """The highest surface that explains an image (ny, nx), µm, under a paraboloid tip of radius R, µm.
+
+    A paraboloid is the sum of two parabolas, so that the minimum is taken along one axis after the other.
+    NaN stays NaN.
+    """
+    rows = np.broadcast_to(np.arange(image.shape[0], dtype=np.int32)[:, None], image.shape)
+    measured = np.isfinite(image)
+    heights = np.where(measured, image, np.inf)
+    steepest_um = float(np.ptp(image[measured])) if measured.any() else 0.0
+    along_y, row = _erode_rows(heights.T, rows.T, steepest_um, pitch_um[0], radius_um)
+    columns = np.broadcast_to(np.arange(image.shape[1], dtype=np.int32), image.shape)
+    surface, column = _erode_rows(along_y.T, columns, steepest_um, pitch_um[1], radius_um)
+    row = np.take_along_axis(row.T, column, axis=1)
+    return Eroded(np.where(measured, surface, np.nan), row, column)
+
+
+def _erode_rows(
+    heights: np.ndarray, places: np.ndarray, range_um: float, pitch_um: float, radius_um: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest of height + distance²/2R along rows, and the place of the pixel that it belongs to."""
+    lowest, owner = heights.copy(), places.copy()
+    # Farther away the tip is higher than all of the image.
+    reach = min(int(np.sqrt(2 * radius_um * range_um) / pitch_um) + 1, heights.shape[1] - 1)
+    for step in range(1, reach + 1):
+        rise = (step * pitch_um) ** 2 / (2 * radius_um)
+        for to, start in ((slice(None, -step), slice(step, None)), (slice(step, None), slice(None, -step))):
+            candidate = heights[:, start] + rise
+            better = candidate < lowest[:, to]
+            np.copyto(lowest[:, to], candidate, where=better)
+            np.copyto(owner[:, to], places[:, start], where=better)
+    return lowest, owner
+
+
+def _erode(image: np.ndarray, tip: np.ndarray) -> np.ndarray:
+    heights = np.where(np.isfinite(image), image, np.asarray(np.inf, image.dtype))
+    lowest = np.full_like(heights, np.inf)
+    for (dy, dx), height in _parts(tip):
+        to_y, from_y = _overlap(dy, image.shape[0])
+        to_x, from_x = _overlap(dx, image.shape[1])
+        place = lowest[to_y, to_x]
+        np.minimum(place, heights[from_y, from_x] - height, out=place)
+    return lowest
+
+
+def _parts(tip: np.ndarray) -> Iterator[tuple[tuple[int, int], float]]:
+    half_y, half_x = tip.shape[0] // 2, tip.shape[1] // 2
+    for (row, column), height in np.ndenumerate(tip):
+        if np.isfinite(height):
+            yield (row - half_y, column - half_x), float(height)
+
+
+def _overlap(step: int, size: int) -> tuple[slice, slice]:
+    """Slices so that ``out[to]`` meets ``image[from]`` at ``to + step``."""
+    return slice(max(-step, 0), size - max(step, 0)), slice(max(step, 0), size - max(-step, 0))

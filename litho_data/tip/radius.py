@@ -1,0 +1,183 @@
+"""The radius of the end of a tip, from the sharpest tops of its images.
+
+Under a paraboloid tip the image plus x²/2R is convex along every line: no top is more sharply curved than
+1/R, and every corner and spike that is sharper than the tip is exactly as sharp. So the curvatures of an
+image end in an edge, which is clear where the tip sets it and a thin tail where the surface does. Curvatures
+are taken along the lines of the scan, where offsets of lines have no say.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from litho_data.register.topography import remove_bow
+from litho_data.tip.curvature import QUIET, noise_of
+
+# Half sides of the square windows of a parabola, pixels.
+_HALVES_PX = (2, 3, 4, 5, 6, 7, 8, 10, 12, 15, 20)
+# Half sides of a third of the reach average most and still fit on the image of an edge; not beyond 0.45.
+_HALF_OF_REACH, _LARGEST_OF_REACH = 1 / 3, 0.45
+# The edge: 98 % of the curvatures beyond half of it lie below, noise adds 1.4 of its standard deviations
+# there.
+_EDGE_QUANTILE, _EDGE_SIGMA = 0.98, 1.4
+_FEWEST_TOPS = 50
+# Where the scanner turns round, a line says little.
+_TURN = 0.02
+_SMALLEST_REACH_PX = 5.0
+# Share of the tops beyond 0.4 of the edge that are within 0.8 of it. Surfaces that no tip limits: up to 0.16.
+_TIP_SHARE = 0.25
+# Valleys under a tip are sharper than its tops; those of other surfaces, and of most noise, are not.
+_SHARPER_VALLEYS = 1.2
+# Scatter of estimates of known tips beyond that of the parts of a scan.
+_METHOD_SD, _BOUND_SIGMA = 0.05, 2.0
+_SPAN = (0.5, 99.5)
+
+
+@dataclass(frozen=True)
+class PeakRadius:
+    """A radius, µm, None without any bound; ``reason``: why it is only a bound, empty if it is more.
+
+    ``sd_um``: standard uncertainty; a bound lies twice that above what was found. ``depth_um``: range of
+    heights; ``window_px``, ``share``: see ``TipEstimate``.
+    """
+
+    radius_um: float | None
+    sd_um: float
+    reason: str
+    depth_um: float
+    window_px: int | None
+    share: float | None
+
+
+def peak_radius(height_um: np.ndarray, pitch_um: tuple[float, float]) -> PeakRadius:
+    """The radius of the tip from one scan, or an upper bound, and what speaks against more.
+
+    Args:
+        height_um: (ny, nx), µm, NaN where not measured. Tilt and bow count as depth only.
+        pitch_um: (y, x).
+    """
+    depth_um = float(np.subtract(*np.nanpercentile(remove_bow(height_um), _SPAN[::-1])))
+    noise = noise_of(height_um)
+    lines, pitch = (height_um, pitch_um[1]) if noise.lines_are_rows else (height_um.T, pitch_um[0])
+    turn = int(np.ceil(_TURN * lines.shape[1]))
+    lines = lines[:, turn : lines.shape[1] - turn]
+    chosen: _Tops | None = None
+    for half in _HALVES_PX:
+        if min(lines.shape) <= 4 * half:
+            break
+        tops = _tops(lines, pitch, half, noise.pixel_um)
+        if tops.edge <= 0 or tops.noise > QUIET * tops.edge:
+            continue
+        chosen = tops
+        if half >= _HALF_OF_REACH * tops.reach_px(depth_um, pitch_um):
+            break
+    if chosen is None:
+        return PeakRadius(None, 0.0, "no top stands out of the noise", depth_um, None, None)
+    parts = [edge for part in chosen.quarters if (edge := _edge(part, chosen.noise)) > 0]
+    spread = float(np.std(parts, ddof=1) / np.mean(parts) / np.sqrt(len(parts))) if len(parts) > 1 else 0.0
+    radius_um, doubt = 1 / chosen.edge, chosen.doubt(depth_um, pitch_um)
+    sd_um = radius_um * float(np.hypot(spread, _METHOD_SD))
+    if doubt:
+        radius_um += _BOUND_SIGMA * sd_um
+    return PeakRadius(radius_um, sd_um, doubt, depth_um, 2 * chosen.half_px + 1, chosen.share)
+
+
+def of_one_tip(found: Sequence[PeakRadius]) -> PeakRadius:
+    """What several scans say about the one tip that made them: the mean of estimates, or the lowest bound.
+
+    Estimates well above the lowest come from rounded surfaces, and an estimate well above a bound of another
+    scan is refuted by it.
+    """
+    known = sorted((one for one in found if one.radius_um is not None), key=lambda one: one.radius_um or 0.0)
+    estimates, bounds = ([one for one in known if bool(one.reason) is bound] for bound in (False, True))
+    if not known:
+        return found[0]
+    if not estimates:
+        return bounds[0]
+    radii = np.array([one.radius_um for one in estimates], dtype=np.float64)
+    radii = radii[radii <= radii[0] + 2 * _BOUND_SIGMA * estimates[0].sd_um]
+    mean_um = float(radii.mean())
+    sd_um = float(np.hypot(radii.std() / np.sqrt(len(radii)), estimates[0].sd_um))
+    if bounds and (bounds[0].radius_um or 0.0) < mean_um - _BOUND_SIGMA * sd_um:
+        return bounds[0]
+    return replace(estimates[0], radius_um=mean_um, sd_um=sd_um)
+
+
+@dataclass(frozen=True)
+class _Tops:
+    """Curvatures (n,), 1/µm, of windows of one size, positive at tops; by quarter of the scan."""
+
+    half_px: int
+    noise: float
+    quarters: Sequence[np.ndarray]
+    edge: float
+
+    @property
+    def share(self) -> float:
+        near = sum(int((part > 0.8 * self.edge).sum()) for part in self.quarters)
+        return near / max(sum(int((part > 0.4 * self.edge).sum()) for part in self.quarters), 1)
+
+    def reach_px(self, depth_um: float, pitch_um: tuple[float, float]) -> float:
+        return float(np.sqrt(2 * depth_um / self.edge) / max(pitch_um))
+
+    def doubt(self, depth_um: float, pitch_um: tuple[float, float]) -> str:
+        """Why the edge may not be the tip's; empty if nothing speaks against it."""
+        reach = self.reach_px(depth_um, pitch_um)
+        if reach < _SMALLEST_REACH_PX:
+            return f"such a tip reaches over {reach:.1f} pixels, fewer than {_SMALLEST_REACH_PX:.0f}"
+        if self.half_px > _LARGEST_OF_REACH * reach:
+            size = 2 * self.half_px + 1
+            return f"the noise asks for windows of {size} pixels, and the tip reaches over {reach:.1f}"
+        if self.share < _TIP_SHARE:
+            return (
+                f"{self.share:.0%} of the sharp tops are as sharp as the sharpest: the surface makes them so"
+            )
+        valleys = _edge(-np.concatenate(self.quarters), self.noise)
+        if valleys < _SHARPER_VALLEYS * self.edge:
+            return "valleys are no sharper than tops, as on a surface that no tip limits"
+        return ""
+
+
+def _tops(lines: np.ndarray, pitch_um: float, half_px: int, pixel_um: float) -> _Tops:
+    weights = _parabola(half_px) / pitch_um**2
+    noise = pixel_um * float(np.sqrt((weights**2).sum() / (2 * half_px + 1)))
+    curvature = -_along_lines(lines, weights)
+    quarters = [
+        piece[np.isfinite(piece)]
+        for part in np.array_split(curvature, 2, axis=0)
+        for piece in np.array_split(part, 2, axis=1)
+    ]
+    return _Tops(half_px, noise, quarters, _edge(np.concatenate(quarters), noise))
+
+
+def _along_lines(lines: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Second derivative along the lines, mean of as many lines; only whole windows, NaN around gaps."""
+    from scipy.ndimage import correlate1d, uniform_filter1d
+
+    size, half = len(weights), len(weights) // 2
+    measured = np.isfinite(lines)
+    bent = correlate1d(np.where(measured, lines, 0.0), weights, axis=1)
+    bent = uniform_filter1d(bent, size, axis=0)
+    if not measured.all():
+        from scipy.ndimage import minimum_filter
+
+        bent[~minimum_filter(measured, size)] = np.nan
+    return bent[half:-half, half:-half]
+
+
+def _parabola(half_px: int) -> np.ndarray:
+    """Weights of the second derivative of the best parabola through 2 half_px + 1 pixels, 1/px²."""
+    x = np.arange(-half_px, half_px + 1.0)
+    return np.linalg.pinv(np.stack([np.ones_like(x), x, x**2 / 2], axis=1))[2]
+
+
+def _edge(curvatures: np.ndarray, noise: float) -> float:
+    """Where the curvatures end, without what noise adds; 0 or less where noise is all there is."""
+    if len(curvatures) <= _FEWEST_TOPS:
+        return 0.0
+    top = np.partition(curvatures, -_FEWEST_TOPS)[-_FEWEST_TOPS]
+    sharp = curvatures[curvatures > 0.5 * top] if top > 0 else curvatures
+    return float(np.quantile(sharp, _EDGE_QUANTILE) - _EDGE_SIGMA * noise)

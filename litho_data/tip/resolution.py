@@ -1,0 +1,52 @@
+"""The lateral resolution that a tip leaves to a scan."""
+
+from __future__ import annotations
+
+import numpy as np
+
+# Sanner et al. 2022: artefacts set in where peaks reach half of the tip's curvature.
+_SHARE = 0.5
+
+
+def lateral_resolution_um(
+    height_um: np.ndarray, pitch_um: tuple[float, float], radius_um: float
+) -> float | None:
+    """Wavelength below which the scan may show the tip instead of the surface, µm.
+
+    Peaks of an image are at most as sharp as the tip. The curvature of the sharpest peak is taken at distance
+    λ/2, ``(h(x − λ/2) − 2 h(x) + h(x + λ/2)) / (λ/2)²``, along both axes; the result is the largest λ at
+    which it reaches half of 1/R: Sanner et al., Scale-dependent roughness parameters for topography analysis,
+    arXiv:2106.16103. Noise counts as peaks: the result is an upper bound.
+
+    Args:
+        height_um: (ny, nx), µm, NaN where not measured.
+        pitch_um: (y, x).
+        radius_um: of the tip.
+
+    Returns:
+        None if no peak is that sharp at any distance: the tip does not limit the scan.
+    """
+    found = [
+        _along(np.moveaxis(height_um, axis, 0), pitch, _SHARE / radius_um)
+        for axis, pitch in enumerate(pitch_um)
+    ]
+    return max((value for value in found if value is not None), default=None)
+
+
+def _along(lines: np.ndarray, pitch_um: float, limit: float) -> float | None:
+    steps = np.arange(1, (len(lines) - 1) // 2 + 1)
+    sharpest = np.array([_sharpest(lines, int(step)) / (step * pitch_um) ** 2 for step in steps])
+    reached = np.flatnonzero(sharpest >= limit)
+    if reached.size == 0:
+        return None
+    last = reached[-1]
+    step = float(steps[last])
+    if last + 1 < len(steps):
+        step += (sharpest[last] - limit) / (sharpest[last] - sharpest[last + 1])
+    return 2 * step * pitch_um
+
+
+def _sharpest(lines: np.ndarray, step: int) -> float:
+    bend = 2 * lines[step:-step] - lines[: -2 * step] - lines[2 * step :]
+    finite = bend[np.isfinite(bend)]
+    return float(finite.max()) if finite.size else 0.0

@@ -1,0 +1,262 @@
+"""The tip of the microscope: laws of morphology, known tips, and where a tip did not touch."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+
+import numpy as np
+import pytest
+import scipy.ndimage
+from typer.testing import CliRunner
+
+from benchmarks.tip import OVER, PITCH_UM, fine_surface, noise_of_snr, print_under_tip
+from litho_data.cli.app import app
+from litho_data.foundation.errors import InputError
+from litho_data.level.scan import write_heights
+from litho_data.scan import Scan
+from litho_data.tip import (
+    blind_tip,
+    dilate,
+    erode,
+    estimate_tip,
+    full_angle_bound_deg,
+    lateral_resolution_um,
+    paraboloid_dilation,
+    paraboloid_erosion,
+    reconstructed,
+    tip_certain,
+)
+from litho_data.tip.radius import PeakRadius, of_one_tip
+
+PITCH = PITCH_UM
+_image = cache(lambda kind, radius_um: print_under_tip(kind, radius_um, 1.0))
+
+
+def _scan(kind: str, radius_um: float, snr: float) -> Scan:
+    image, _ = _image(kind, radius_um)
+    return Scan(image + noise_of_snr(image.shape, 1.0, snr, seed=11), PITCH, name=kind)
+
+
+# Morphology
+
+
+def test_erosion_is_dual_to_dilation_and_opening_and_closing_are_idempotent() -> None:
+    rng = np.random.default_rng(0)
+    field, tip = rng.standard_normal((24, 31)), -rng.uniform(0, 2, (5, 5))
+    tip[2, 2] = 0.0
+    assert np.array_equal(erode(field, tip), -dilate(-field, tip[::-1, ::-1]))
+    opened, closed = dilate(erode(field, tip), tip), erode(dilate(field, tip), tip)
+    # Sums are taken in another order the second time: a few units in the last place of 4.
+    assert np.allclose(dilate(erode(opened, tip), tip), opened, atol=1e-14)
+    assert np.allclose(erode(dilate(closed, tip), tip), closed, atol=1e-14)
+    assert (opened <= field + 1e-14).all()
+    assert (closed >= field - 1e-14).all()
+    assert opened.mean() < field.mean() - 0.1 < closed.mean()
+
+
+def test_a_paraboloid_axis_by_axis_is_the_paraboloid_at_once() -> None:
+    rng, pitch = np.random.default_rng(1), (0.1, 0.07)
+    field = rng.standard_normal((20, 26)) * 0.1
+    field[3, 4] = np.nan
+    radius = 0.2
+    half = int(np.sqrt(2 * radius * np.ptp(field[np.isfinite(field)])) / min(pitch)) + 2
+    step = np.arange(-half, half + 1)
+    tip = -((step[:, None] * pitch[0]) ** 2 + (step * pitch[1]) ** 2) / (2 * radius)
+    measured = np.isfinite(field)
+    found = paraboloid_erosion(field, pitch, radius)
+    assert np.allclose(found.surface[measured], erode(field, tip)[measured], atol=1e-14)
+    assert np.allclose(
+        paraboloid_dilation(field, pitch, radius)[measured], dilate(field, tip)[measured], atol=1e-14
+    )
+    # The owner of a pixel is where its height comes from.
+    rows, columns = np.indices(field.shape)
+    away = ((found.row - rows) * pitch[0]) ** 2 + ((found.column - columns) * pitch[1]) ** 2
+    explained = field[found.row, found.column] + away / (2 * radius)
+    assert np.allclose(explained[measured], found.surface[measured], atol=1e-14)
+    assert np.isnan(found.surface[3, 4])
+
+
+def test_a_surface_that_the_tip_follows_comes_back_and_an_image_stays_an_image() -> None:
+    rows, columns = np.indices((60, 60)) * 0.1
+    surface = 0.05 * np.sin(1.3 * rows) * np.cos(0.9 * columns)  # curvature below 0.13 / µm
+    image = paraboloid_dilation(surface, PITCH, 2.0)
+    found = reconstructed(image, PITCH, 2.0)
+    # Contacts between pixels: at most (pitch/2)² (1/2R) per axis is lost, twice.
+    assert np.abs(found - surface)[10:-10, 10:-10].max() < 2 * 0.05**2 / (2 * 2.0) * 2
+    assert np.allclose(paraboloid_dilation(found, PITCH, 2.0), image, atol=1e-14)
+
+
+# Known tips
+
+
+@pytest.mark.parametrize("snr", [20, 100])
+@pytest.mark.parametrize(("kind", "radius_um"), [("pillars", 0.5), ("spikes", 0.5), ("bumps", 1.0)])
+def test_the_radius_of_a_known_tip_is_found(kind: str, radius_um: float, snr: float) -> None:
+    found = estimate_tip([_scan(kind, radius_um, snr)])
+    assert found.kind == "estimate", found.reason
+    assert found.radius_um == pytest.approx(radius_um, rel=0.1)
+    assert found.radius_sd_um is not None
+    assert abs(found.radius_um - radius_um) < 3 * found.radius_sd_um
+
+
+@pytest.mark.parametrize("snr", [20, 100])
+@pytest.mark.parametrize("kind", ["pillars", "spikes", "bumps"])
+def test_a_tip_of_few_pixels_gets_an_upper_bound(kind: str, snr: float) -> None:
+    found = estimate_tip([_scan(kind, 0.06, snr)])  # √(2 R h) = 3.5 pixels
+    assert found.kind == "upper bound"
+    assert found.radius_um is not None
+    assert found.radius_um > 0.06
+
+
+def test_the_end_of_a_sphere_is_found_as_well() -> None:
+    radius_um, fine_um = 2.0, PITCH[0] / OVER
+    surface = fine_surface("pillars", 0.3, seed=11, size_px=64)
+    reach = int(np.sqrt(2 * radius_um * 0.35) / fine_um)
+    step = np.arange(-reach, reach + 1) * fine_um
+    inside = radius_um**2 - step[:, None] ** 2 - step**2
+    sphere = np.where(inside > (radius_um - 0.35) ** 2, np.sqrt(np.maximum(inside, 0)) - radius_um, -np.inf)
+    image = dilate(surface.astype(np.float32), sphere.astype(np.float32))[
+        OVER // 2 :: OVER, OVER // 2 :: OVER
+    ]
+    found = estimate_tip([Scan(image, PITCH)])
+    # Along a line up the flank the curvature of a sphere is 1/R (1 + slope²)^1.5; the flanks end at 0.3 µm,
+    # where the slope is 0.62: up to 1.63 times as sharp. On the way there it is 1.23 times as sharp.
+    assert found.radius_um is not None
+    assert radius_um / 1.63 < found.radius_um < 1.1 * radius_um
+
+
+def test_a_flat_scan_sets_no_bound_and_a_rounded_surface_no_more_than_one() -> None:
+    rng = np.random.default_rng(3)
+    flat = estimate_tip([Scan(0.003 * rng.standard_normal((128, 128)), PITCH)])
+    assert (flat.kind, flat.radius_um, flat.radius_sd_um) == ("upper bound", None, None)
+    assert flat.full_angle_deg == 180
+    assert flat.scans[0].certain_fraction is None
+    rough = scipy.ndimage.gaussian_filter(rng.standard_normal((200, 200)), 5)
+    rounded = estimate_tip([Scan(0.3 * rough / rough.std(), PITCH)])
+    assert rounded.kind == "upper bound"
+    assert "surface" in rounded.reason
+    ridges = np.broadcast_to(0.3 * np.sin(np.arange(200) / 4), (200, 200))
+    assert estimate_tip([Scan(ridges, PITCH)]).kind == "upper bound"
+
+
+def test_scans_of_one_day_bound_one_tip_by_the_sharpest_of_them() -> None:
+    rough = scipy.ndimage.gaussian_filter(np.random.default_rng(4).standard_normal((160, 160)), 9)
+    dull, sharp = Scan(0.2 * rough / rough.std(), PITCH), _scan("pillars", 0.5, 100)
+    alone, both = estimate_tip([dull]), estimate_tip([dull, sharp])
+    assert alone.radius_um is not None
+    assert both.radius_um is not None
+    assert alone.radius_um > 1.5 * both.radius_um
+    with pytest.raises(InputError, match="pitch of"):
+        estimate_tip([sharp, Scan(rough, (0.2, 0.2))])
+
+
+def test_an_estimate_is_refuted_by_a_sharper_scan() -> None:
+    def said(radius_um: float | None, reason: str = "") -> PeakRadius:
+        return PeakRadius(radius_um, 0.05 * (radius_um or 0.0), reason, 1.0, 5, 0.5)
+
+    none, wide, tight = said(None, "flat"), said(2.0, "rounded"), said(0.2, "rounded")
+    assert of_one_tip([none, none]).radius_um is None
+    assert of_one_tip([none, wide, tight]) == tight
+    both = of_one_tip([said(0.5), wide, said(0.52)])
+    assert both.radius_um == pytest.approx(0.51)
+    assert not both.reason
+    # The third is 8 standard deviations blunter: not this tip but its surface.
+    assert of_one_tip([said(0.5), said(0.52), said(0.7)]).radius_um == pytest.approx(0.51)
+    assert of_one_tip([said(0.5), tight]) == tight
+
+
+def test_offsets_of_lines_and_turning_points_do_not_sharpen_the_bound() -> None:
+    scan = _scan("pillars", 0.5, 100)
+    rng = np.random.default_rng(6)
+    worse = scan.height_um + 0.03 * rng.standard_normal((scan.shape[0], 1))
+    worse[:, :2] += 0.3
+    found = estimate_tip([Scan(worse, PITCH)])
+    assert found.radius_um == pytest.approx(0.5, rel=0.1)
+    turned = estimate_tip([Scan(worse.T, PITCH)])
+    assert turned.radius_um == pytest.approx(found.radius_um, rel=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["pillars", "spikes"])
+def test_the_blind_bound_is_nowhere_sharper_than_the_tip(kind: str) -> None:
+    image, _ = _image(kind, 0.5)
+    step = np.arange(-11, 12) * PITCH[0]
+    tip = -(step[:, None] ** 2 + step**2) / (2 * 0.5)
+    bound = blind_tip([image], 11, threshold_um=PITCH[0] ** 2 / (2 * 0.5))
+    seen = tip > -0.9
+    assert (bound - tip)[seen].min() >= 0
+    # 1 µm up, 10 pixels away, the flanks of this tip are 90° apart as seen from its end; a bound of no use:
+    # 180°.
+    assert 90 < full_angle_bound_deg(bound, PITCH) < 150
+    assert full_angle_bound_deg(np.zeros((9, 9)), PITCH) == 180
+
+
+def test_gaps_say_nothing_about_the_tip() -> None:
+    scan = _scan("pillars", 0.5, 100)
+    gaps = scan.height_um.copy()
+    gaps[40:60, 70:100] = np.nan
+    found = estimate_tip([Scan(gaps, PITCH)])
+    assert found.radius_um == pytest.approx(0.5, rel=0.1)
+    assert not tip_certain(gaps, PITCH, 0.5)[np.isnan(gaps)].any()
+
+
+# Where the tip did not touch
+
+
+@pytest.mark.parametrize("snr", [np.inf, 20])
+@pytest.mark.parametrize(
+    ("kind", "radius_um"), [("pillars", 0.15), ("pillars", 0.5), ("spikes", 0.5), ("bumps", 1.0)]
+)
+def test_untouched_pixels_are_uncertain_and_most_of_the_touched_certain(
+    kind: str, radius_um: float, snr: float
+) -> None:
+    inner = (slice(15, -15),) * 2
+    certain = tip_certain(_scan(kind, radius_um, snr).height_um, PITCH, radius_um)[inner]
+    untouched = _image(kind, radius_um)[1][inner] < 0.5
+    assert untouched.sum() > 100
+    assert (~certain[untouched]).mean() >= 0.95
+    assert certain[~untouched].mean() >= 0.8
+
+
+def test_a_blunter_tip_leaves_fewer_pixels_certain_and_a_flat_scan_all() -> None:
+    image, _ = _image("pillars", 0.5)
+    shares = [tip_certain(image, PITCH, radius).mean() for radius in (0.1, 0.25, 0.5)]
+    assert shares[0] > shares[1] > shares[2]
+    noise = 0.003 * np.random.default_rng(7).standard_normal((80, 80))
+    assert tip_certain(noise, PITCH, 0.05).all()
+    with pytest.raises(InputError, match="radius of the tip"):
+        tip_certain(noise, PITCH, float("nan"))
+
+
+def test_the_lateral_resolution_follows_its_closed_form_and_surface_topography() -> None:
+    from SurfaceTopography import Topography
+
+    rows, columns = np.indices((80, 120)) * 0.1
+    base_um, bump_um, radius_um = 1.0, 0.5, 1.0
+    away = (rows - 4.0) ** 2 + (columns - 5.0) ** 2
+    image = np.maximum(base_um**2 - away, 0) / (2 * bump_um)
+    # At distances d beyond its base the top of this cap has the curvature 2h/d², h = b²/2ρ: half of 1/R at
+    # d = b √(2R/ρ). λ is twice that; between pixels the curvature is taken for straight.
+    found = lateral_resolution_um(image, PITCH, radius_um)
+    assert found == pytest.approx(2 * base_um * np.sqrt(2 * radius_um / bump_um), rel=0.01)
+    theirs = Topography(image, (8.0, 12.0), unit="um", periodic=False)
+    assert found == pytest.approx(theirs.scanning_probe_reliability_cutoff(radius_um), rel=0.01)
+    assert lateral_resolution_um(0.001 * image, PITCH, 0.01) is None
+
+
+# The command
+
+
+def test_the_command_prints_the_tip_and_writes_its_maps(tmp_path) -> None:
+    scan = _scan("pillars", 0.5, 100)
+    file = write_heights(tmp_path / "print.gsf", scan.height_um, pitch_um=PITCH)
+    done = CliRunner().invoke(app, ["tip", str(file), "--maps", str(tmp_path / "maps")])
+    assert done.exit_code == 0, done.output
+    assert "radius 0.5" in done.output or "radius 0.4" in done.output
+    certain = np.load(tmp_path / "maps" / "print.certain.npy")
+    assert certain.dtype == bool
+    assert certain.shape == scan.shape
+    assert (tmp_path / "maps" / "print.surface.gsf").exists()
+    said = json.loads(CliRunner().invoke(app, ["tip", str(file), "--json"]).stdout)
+    assert said["kind"] == "estimate"
+    assert said["scans"][0]["certain_fraction"] == pytest.approx(certain.mean(), abs=0.01)
