@@ -7,18 +7,19 @@ import shutil
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from litho_data.build.assemble import Campaign, assemble, files_table, records_of_use
+from litho_data.build.day_tip import with_tip_found
 from litho_data.build.jobs import FieldJob, Job, Skipped, attempt, field_jobs
 from litho_data.build.operations import UNREGISTERED, load_recipe
 from litho_data.build.report import write_report
 from litho_data.build.result import BuildResult, LeftOut, report_folder
 from litho_data.build.right_layout import doubts, fitting_layout
-from litho_data.cards.card import Card
+from litho_data.cards.card import Card, with_tip
 from litho_data.cards.listing import Listing, list_fields
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError
@@ -41,6 +42,7 @@ def build_dataset(
     dask: str | None = None,
     strict: bool = False,
     seed: int = 0,
+    tip: float | str | None = None,
 ) -> BuildResult:
     """Build a dataset store from a card.
 
@@ -57,14 +59,20 @@ def build_dataset(
         workers: local processes; ``dask``: address of a Dask scheduler instead. Both give the same result.
         strict: refuse to build if any scan has to be skipped, or a scan or layout has no partner.
         seed: of the robust registration.
+        tip: radius of the microscope's tip in µm, or ``blind`` to find it in the scans, in place of the
+            card's: pixels that it may not have touched are not valid.
 
     Raises:
-        InputError: a bad card, no usable scan, a skipped or unpaired one under ``strict``, or ``out`` that
-            is no store.
+        InputError: a bad card, no usable scan, a skipped or unpaired one under ``strict``, a tip that is no
+            radius, or ``out`` that is no store.
     """
     listing = list_fields(card_path, data_dir)
+    if tip is not None:
+        listing = replace(listing, card=with_tip(listing.card, tip))
     recipe = load_recipe(_recipe_path(listing))
-    return make_store(_source(listing, recipe, seed), Path(out), workers=workers, dask=dask, strict=strict)
+    jobs = with_tip_found(field_jobs(listing, recipe, seed), workers, dask)
+    source = _source(listing, recipe, seed, jobs)
+    return make_store(source, Path(out), workers=workers, dask=dask, strict=strict)
 
 
 def _recipe_path(listing: Listing) -> Path | None:
@@ -72,12 +80,12 @@ def _recipe_path(listing: Listing) -> Path | None:
     return None if level is None else listing.card_path.parent / level
 
 
-def _source(listing: Listing, recipe: Mapping[str, Any], seed: int) -> Source:
+def _source(listing: Listing, recipe: Mapping[str, Any], seed: int, jobs: Sequence[Job]) -> Source:
     found = {one.id: [one.layout, one.scan] for one in listing.fields}
     found |= {one.id: [*one.files] for one in listing.left_aside}
     return Source(
         card=listing.card,
-        jobs=field_jobs(listing, recipe, seed),
+        jobs=jobs,
         data_dir=listing.data_dir,
         files={key: {listing.relative(path): path for path in paths if path} for key, paths in found.items()},
         recipe=recipe,

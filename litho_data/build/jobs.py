@@ -99,7 +99,7 @@ class FieldJob:
         steps = list(self._steps())
         arrays = {name: array for done in steps for name, array in done.arrays.items()}
         facts = {done.step.op: done.facts for done in steps}
-        quality: dict[str, Any] = {**facts.get("register", {})}
+        quality: dict[str, Any] = {**facts.get("register", {}), **facts.get("tip", {})}
         quality |= noise_figures(arrays["raw_height_um"]) | levelling_figures(arrays["removed_um"])
         if "height_um" in arrays:
             quality["valid_fraction"] = float(arrays["valid"].mean())
@@ -146,8 +146,13 @@ class FieldJob:
         height = {"levelled_height_um": levelled.arrays["levelled_height_um"]}
         registered = OPERATIONS["register"].run(register_params, {}, {**layout, **height})
         yield registered
+        found = dict(registered.arrays)
+        if self.card.process.tip is not None:
+            touched = OPERATIONS["tip"].run({**pitch, "radius_um": self.card.process.tip}, {}, height)
+            found |= touched.arrays
+            yield touched
         shape = {"layout_shape": list(layout["mask_level"].shape)}
-        yield OPERATIONS["resample"].run({**pitches, **shape}, {}, {**height, **registered.arrays})
+        yield OPERATIONS["resample"].run({**pitches, **shape}, {}, {**height, **found})
 
     def _read_layout(self) -> Done | None:
         """The layout as it was read, None if the field has none; InputError if that fails."""

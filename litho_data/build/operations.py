@@ -127,25 +127,46 @@ def _registration(height_um: np.ndarray, layout_level: np.ndarray, params: Mappi
     )
 
 
+def _tip(
+    params: Mapping[str, Any], _: Sequence[Path], arrays: Mapping[str, np.ndarray]
+) -> tuple[Arrays, Facts]:
+    from litho_data.tip import lateral_resolution_um, tip_certain
+
+    height, pitch_um = arrays["levelled_height_um"].astype(np.float64), tuple(params["scan_pitch_um"])
+    radius_um = params["radius_um"]
+    certain = tip_certain(height, pitch_um, radius_um)
+    facts = {
+        "tip_radius_um": radius_um,
+        "tip_certain_fraction": float(certain.mean()),
+        "tip_resolution_um": lateral_resolution_um(height, pitch_um, radius_um) or 0.0,
+    }
+    return {"tip_certain": certain}, facts
+
+
 def _resample(
     params: Mapping[str, Any], _: Sequence[Path], arrays: Mapping[str, np.ndarray]
 ) -> tuple[Arrays, Facts]:
     from litho_data.register import Bend, resample_to_layout
 
     levelled, pitch_um = arrays["levelled_height_um"], tuple(params["scan_pitch_um"])
-    bent = "bend_um" in arrays
-    height, valid = resample_to_layout(
-        levelled.astype(np.float64),
-        arrays["scan_to_layout"],
-        tuple(params["layout_shape"]),
-        scan_pitch_um=pitch_um,
-        layout_pitch_um=params["layout_pitch_um"],
-        bend_um=Bend.of_scan(arrays["bend_um"], levelled.shape, pitch_um) if bent else None,
-    )
+    bend = Bend.of_scan(arrays["bend_um"], levelled.shape, pitch_um) if "bend_um" in arrays else None
+
+    def on_layout(scan_map: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return resample_to_layout(
+            scan_map.astype(np.float64),
+            arrays["scan_to_layout"],
+            tuple(params["layout_shape"]),
+            scan_pitch_um=pitch_um,
+            layout_pitch_um=params["layout_pitch_um"],
+            bend_um=bend,
+        )
+
+    height, valid = on_layout(levelled)
     if "defect" in arrays:
         valid &= ~arrays["defect"]
-        height = np.where(valid, height, np.float32(np.nan))
-    return {"height_um": height, "valid": valid}, {}
+    if "tip_certain" in arrays:
+        valid &= on_layout(arrays["tip_certain"])[0] > 0.5
+    return {"height_um": np.where(valid, height, np.float32(np.nan)), "valid": valid}, {}
 
 
 def _stitch_pairs(
@@ -166,6 +187,7 @@ OPERATIONS = {
         Operation("locate", "1", _locate, ("register", "level", "build/operations.py")),
         Operation("level", "1", _level, ("level", "build/operations.py")),
         Operation("register", "1", _register, ("register", "build/operations.py")),
+        Operation("tip", "1", _tip, ("tip", "register/topography.py", "build/operations.py")),
         Operation("resample", "1", _resample, ("register", "build/operations.py")),
         Operation("stitch-pairs", "1", _stitch_pairs, ("readers", "build/operations.py")),
     )

@@ -45,6 +45,20 @@ def check_card(content: dict[str, Any], what: str) -> Card:
         raise _readable(error, what) from error
 
 
+def with_tip(card: Card, tip: float | str) -> Card:
+    """The card with another ``process.tip``.
+
+    Raises:
+        InputError: neither a positive number nor ``blind``.
+    """
+    try:
+        value = tip if tip == "blind" else float(tip)
+        process = Process.model_validate({**card.process.model_dump(), "tip": value})
+    except ValueError as error:  # pydantic's is one
+        raise InputError("tip", got=repr(tip), wanted="a radius in µm, or blind") from error
+    return card.model_copy(update={"process": process})
+
+
 def _positive(value: float) -> float:
     # pydantic accepts inf as a positive number.
     if not 0 < value < float("inf"):
@@ -129,10 +143,14 @@ class ScanFiles(Record):
 
 
 class Process(Record):
-    """How raw scans become heights on the layout grid: a levelling recipe file, a registration model."""
+    """How raw scans become heights on the layout grid: a levelling recipe file, a registration model, a tip.
+
+    ``tip`` is the radius of the microscope's tip in µm, or ``blind`` to find it in the scans.
+    """
 
     level: InsidePath | None = None
     registration: Registration = "affine"
+    tip: Literal["blind"] | Length | None = None
 
 
 class Ids(Record):

@@ -68,12 +68,21 @@ def build(
     ] = None,
     strict: Strict = False,
     seed: Annotated[int, typer.Option(min=0, help="seed of the robust registration")] = 0,
+    tip: Annotated[
+        str | None,
+        typer.Option(
+            metavar="UM|blind",
+            help="radius of the tip, or blind to find it; pixels that it may not have touched are not valid",
+        ),
+    ] = None,
 ) -> None:
     """Read, level, register and store all scans of a card; writes the store and a report beside it."""
     from litho_data.build.build import build_dataset
     from litho_data.build.result import report_folder
 
-    result = build_dataset(card, out, data_dir=data_dir, workers=workers, dask=dask, strict=strict, seed=seed)
+    result = build_dataset(
+        card, out, data_dir=data_dir, workers=workers, dask=dask, strict=strict, seed=seed, tip=tip
+    )
     unpaired = f"{len(result.unpaired)} without layout or scan, " if result.unpaired else ""
     typer.echo(
         f"{out}: {result.n_scans} scans, {len(result.skipped)} skipped, {unpaired}{result.seconds:.1f} s"

@@ -58,6 +58,7 @@ class PrintedScan:
         turned_deg: by how much the scan is turned against the others, ``direction``: 1 trace, -1 retrace,
             ``tip``: number of the tip; None as above.
         bend_um: of a bent scan; ``scan_to_layout`` then acts on the straightened positions.
+        tip_radius_um: of the microscope's tip, or the most that it can be; None if the store does not say.
     """
 
     id: str
@@ -78,6 +79,7 @@ class PrintedScan:
     direction: float | None = None
     tip: float | None = None
     bend_um: Bend | None = None
+    tip_radius_um: float | None = None
 
     @property
     def quarter_turns(self) -> int:
@@ -160,6 +162,7 @@ class Store:
             field_y_um=self._column("field_y_um", row),
             **{name: self._column(name, row) for name in ("dose", "turned_deg", "direction", "tip")},
             bend_um=self._bend_um(row),
+            tip_radius_um=self._tip_radius_um(row),
         )
 
     def scans(self) -> list[PrintedScan]:
@@ -269,6 +272,12 @@ class Store:
         shape = int(one["scan_ny"]), int(one["scan_nx"])
         pitch_um = float(one["scan_pitch_y_um"]), float(one["scan_pitch_x_um"])
         return Bend.of_scan(self.scan_frame(scan_id, "bend_um"), shape, pitch_um)
+
+    def _tip_radius_um(self, row: int) -> float | None:
+        if "tip_radius_um" not in self.quality:
+            return None
+        value = float(self.quality["tip_radius_um"].iloc[row])
+        return None if math.isnan(value) else value
 
     def _column(self, name: str, row: int) -> float | None:
         value = float(self._columns[name][row]) if name in self._columns else math.nan

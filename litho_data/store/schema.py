@@ -67,6 +67,8 @@ SCAN_VARIABLES = (
              "of the scan frame; only of a bent scan"),
     Variable("defect", ("layout_y", "layout_x"), "bool", "1",
              "shows something else than the print, layout grid; not valid there; only where there is any"),
+    Variable("tip_certain", ("y", "x"), "bool", "1",
+             "touched by the tip for certain, scan frame; only where a tip is given; elsewhere not valid"),
     Variable("vendor_mask", ("y", "x"), "bool", "1", "mask kept in the raw file; only where there is one"),
 )  # fmt: skip
 # No unit for the whole of it; in hashes it counts as 1.

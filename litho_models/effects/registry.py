@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from litho_data.foundation.errors import InputError
 from litho_models.effects import (
@@ -71,6 +72,7 @@ UNTESTABLE = {
     "scars-and-spikes": "a mask, not a term: looked for among the outliers",
 }
 
+TIP = "tip-dilation"
 
 CATALOGUE: dict[str, Effect] = {}
 
@@ -118,9 +120,27 @@ def in_forward_order(names: Sequence[str]) -> list[str]:
     return [name for name in CATALOGUE if name in given]
 
 
-def screened_effects() -> list[Effect]:
-    """Effects with parameters common to all scans, tested by the score test."""
-    return [effect for effect in CATALOGUE.values() if not effect.per_scan]
+def screened_effects(tip_radius_um: float | None = None) -> list[Effect]:
+    """Effects with parameters common to all scans, tested by the score test.
+
+    Args:
+        tip_radius_um: of the microscope's tip, or the most that it can be, if the store knows it: the tip is
+            tried at that size too.
+    """
+    effects = [effect for effect in CATALOGUE.values() if not effect.per_scan]
+    if tip_radius_um is None:
+        return effects
+    return [_tried_at(effect, tip_radius_um) if effect.name == TIP else effect for effect in effects]
+
+
+def _tried_at(tip: Effect, radius_um: float) -> Effect:
+    limits = tip.parameters["radius_um"]
+    radius_um = min(radius_um, limits.upper)
+    known = [trial["radius_um"] for trial in tip.trials]
+    # A trial of nearly the same size would say the same twice.
+    if any(abs(radius_um - one) < 0.2 * one for one in known):
+        return tip
+    return replace(tip, trials=(*tip.trials, {"radius_um": radius_um}))
 
 
 def _fill() -> None:

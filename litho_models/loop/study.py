@@ -82,6 +82,12 @@ class Study:
         return [scan.window for scan in self.scans]
 
     @property
+    def tip_radius_um(self) -> float | None:
+        """Radius of the tip, or the most that it can be, if the store knows: that of the first scan."""
+        known = (scan.stored.tip_radius_um for scan in self.scans)
+        return next((radius for radius in known if radius is not None), None)
+
+    @property
     def blocks(self) -> Blocks:
         """Pixels that terms are fitted on and pixels that are scored: those of the benchmark."""
         return Blocks(seed=self.seed)

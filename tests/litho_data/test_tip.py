@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,10 +12,14 @@ import scipy.ndimage
 from typer.testing import CliRunner
 
 from benchmarks.tip import OVER, PITCH_UM, fine_surface, noise_of_snr, print_under_tip
+from litho_data.build.build import build_dataset
 from litho_data.cli.app import app
 from litho_data.foundation.errors import InputError
 from litho_data.level.scan import write_heights
+from litho_data.provenance.replay import replay
+from litho_data.provenance.verify import verify
 from litho_data.scan import Scan
+from litho_data.store import open_store
 from litho_data.tip import (
     blind_tip,
     dilate,
@@ -28,6 +33,7 @@ from litho_data.tip import (
     tip_certain,
 )
 from litho_data.tip.radius import PeakRadius, of_one_tip
+from tests.litho_data.campaigns import write_campaign
 
 PITCH = PITCH_UM
 _image = cache(lambda kind, radius_um: print_under_tip(kind, radius_um, 1.0))
@@ -260,3 +266,56 @@ def test_the_command_prints_the_tip_and_writes_its_maps(tmp_path) -> None:
     said = json.loads(CliRunner().invoke(app, ["tip", str(file), "--json"]).stdout)
     assert said["kind"] == "estimate"
     assert said["scans"][0]["certain_fraction"] == pytest.approx(certain.mean(), abs=0.01)
+
+
+# In a build
+
+
+def test_a_build_with_a_tip_leaves_out_what_it_may_not_have_touched(tmp_path) -> None:
+    card = write_campaign(tmp_path / "raw", count=1)
+    plain = open_store(_built(card, tmp_path / "plain.zarr"))
+    store = open_store(_built(card, tmp_path / "blunt.zarr", tip=0.1))
+    scan, before = store.scan("P11"), plain.scan("P11")
+    certain = store.scan_frame("P11", "tip_certain")
+    assert certain.dtype == bool
+    assert 0.3 < certain.mean() < 0.97
+    row = store.quality.iloc[0]
+    assert row["tip_radius_um"] == scan.tip_radius_um == 0.1
+    assert before.tip_radius_um is None
+    assert row["tip_certain_fraction"] == pytest.approx(certain.mean())
+    # The scan lies 8 pixels around its layout, turned and scaled by next to nothing.
+    on_layout = certain[8:-8, 8:-8]
+    inner = (slice(3, -3),) * 2
+    clear = scipy.ndimage.uniform_filter(on_layout.astype(float), 3)
+    assert not scan.valid[inner][clear[inner] < 0.01].any()
+    assert scan.valid[inner][clear[inner] > 0.99].all()
+    assert np.isnan(scan.height_um[~scan.valid]).all()
+    assert np.array_equal(scan.height_um[scan.valid], before.height_um[scan.valid])
+    assert verify(tmp_path / "blunt.zarr").findings == ()
+    assert replay(tmp_path / "blunt.zarr")["same_hash"].all()
+    assert store.sha256 != plain.sha256
+    assert store.computed_sha256() == store.sha256
+
+
+def test_a_blind_tip_is_the_same_for_all_scans(tmp_path, capsys) -> None:
+    card = write_campaign(tmp_path / "raw", count=2, more='[process]\ntip = "blind"')
+    store = open_store(_built(card, tmp_path / "prints.zarr"))
+    assert "tip: radius at most" in capsys.readouterr().err
+    assert store.quality["tip_radius_um"].nunique() == 1
+    assert store.manifest["card"]["process"]["tip"] == "blind"
+    assert 0.3 < store.quality["valid_fraction"].min() < 1
+
+
+@pytest.mark.parametrize("tip", ["-1", "0", "sharp", "nan"])
+def test_a_tip_that_is_no_radius_is_one_line(tmp_path, tip) -> None:
+    card = write_campaign(tmp_path / "raw", count=1)
+    with pytest.raises(InputError, match="wanted a radius in µm, or blind"):
+        build_dataset(card, tmp_path / "out.zarr", tip=tip)
+    card.write_text(card.read_text() + '[process]\ntip = "sharp"\n')
+    with pytest.raises(InputError, match=r"process\.tip"):
+        build_dataset(card, tmp_path / "out.zarr")
+
+
+def _built(card: Path, out: Path, **options) -> Path:
+    build_dataset(card, out, **options)
+    return out

@@ -142,6 +142,17 @@ def test_screened_effects_and_forward_order() -> None:
     assert in_forward_order(["tilt-bow", "vignetting"]) == ["vignetting", "tilt-bow"]
 
 
+def test_the_tip_is_tried_at_the_radius_that_the_store_knows() -> None:
+    def radii(known_um: float | None) -> list[float]:
+        tip = next(one for one in screened_effects(known_um) if one.name == "tip-dilation")
+        return [trial["radius_um"] for trial in tip.trials]
+
+    assert radii(0.13) == [0.04, 0.4, 0.13]
+    assert radii(None) == radii(0.39) == [0.04, 0.4]
+    # No further than the effect goes.
+    assert radii(9.0) == [0.04, 0.4, get_effect("tip-dilation").parameters["radius_um"].upper]
+
+
 def test_unknown_names_are_refused() -> None:
     with pytest.raises(InputError, match="vignetting"):
         get_effect("vigneting")

@@ -67,9 +67,8 @@ def search_effects(start: State, study: Study, terms: Terms, *, exclude: Mapping
     found = Search(start)
 
     def contest(state: State, holder: tuple[str, State] | None = None) -> Contest:
-        candidates = [
-            effect for effect in screened_effects() if effect.name not in {*exclude, *state.fits.chain.names}
-        ]
+        effects = screened_effects(study.tip_radius_um)
+        candidates = [one for one in effects if one.name not in {*exclude, *state.fits.chain.names}]
         return hold_contest(state, candidates, study, terms, holder=holder)
 
     def select() -> bool:

@@ -1,0 +1,47 @@
+"""The tip behind all scans of a card, found before they are built."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from litho_data.build.jobs import FieldJob
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.workers import run_jobs
+from litho_data.tip.radius import PeakRadius, of_one_tip, peak_radius
+
+
+def with_tip_found(jobs: Sequence[FieldJob], workers: int, dask: str | None) -> list[FieldJob]:
+    """The jobs with the radius in the place of ``blind``, or without a tip where the scans set no bound.
+
+    Says on stderr what was found. Scans that cannot be read say nothing here; their jobs tell why.
+    """
+    if not jobs or jobs[0].card.process.tip != "blind":
+        return list(jobs)
+    found = [one for one in run_jobs(tip_of, jobs, workers, dask) if one is not None]
+    tip = of_one_tip(found) if found else None
+    radius_um = None if tip is None else tip.radius_um
+    if tip is None or radius_um is None:
+        print("tip: no scan sets a bound on its radius, so no pixel is left out", file=sys.stderr)
+    elif tip.reason:
+        print(f"tip: radius at most {radius_um:.3g} µm; {tip.reason}", file=sys.stderr)
+    else:
+        print(f"tip: radius {radius_um:.3g} ± {tip.sd_um:.2g} µm", file=sys.stderr)
+    # Rounded far below its uncertainty: the order in which scans are finished must not show.
+    rounded = None if radius_um is None else float(f"{radius_um:.9g}")
+    card = jobs[0].card
+    process = card.process.model_copy(update={"tip": rounded})
+    return [replace(job, card=card.model_copy(update={"process": process})) for job in jobs]
+
+
+def tip_of(job: FieldJob) -> PeakRadius | None:
+    """What one scan says about the tip; None if it cannot be read."""
+    try:
+        read = job.read()
+    except InputError:
+        return None
+    pitch_y_um, pitch_x_um = read.facts["pitch_um"]
+    return peak_radius(read.arrays["raw_height_um"].astype(np.float64), (pitch_y_um, pitch_x_um))
