@@ -14,13 +14,14 @@ import pytest
 
 from benchmarks import build as build_benchmark
 from benchmarks import levelling as levelling_benchmark
+from benchmarks import readers as readers_benchmark
 from benchmarks import tip as tip_benchmark
 from benchmarks.record import NOT_MEASURED, publish, published
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import run_facts
 
 
-@pytest.mark.parametrize("benchmark", [build_benchmark, levelling_benchmark, tip_benchmark])
+@pytest.mark.parametrize("benchmark", [build_benchmark, levelling_benchmark, readers_benchmark, tip_benchmark])
 def test_the_page_quotes_the_committed_measurement(benchmark):
     text = published(benchmark.PAGE, benchmark.NAME)
     if not benchmark.RESULT.exists():

@@ -13,31 +13,11 @@ import tifffile
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
+from benchmarks.readers import SIGNATURES
 from litho_data.foundation.errors import InputError
 from litho_data.readers import formats, list_channels, read_layout, read_scan
 from tests.litho_data import afm_files
 
-SIGNATURES = [
-    b"Gwyddion Simple Field 1.0\n",
-    b"GWYPGwyContainer\0",
-    b"\x93NUMPY\x01\x00",
-    b"II*\0\x08\0\0\0",
-    b"MM\0*",
-    b"II+\0",
-    b"\x89PNG\r\n\x1a\n",
-    b"BM",
-    b"\x05\x00",
-    b"\x00\x05",
-    b"DIGITAL SURF\0",
-    b"\\*File list\r\n",
-    b"PK\x03\x04",
-    b"\x89HDF\r\n\x1a\n",
-    b"CDF\x01",
-    b"MATLAB 5.0 MAT-file",
-    b"WSxM file copyright",
-    b"1 2 3\n",
-    b"# Width: 1 um\n",
-]
 LONGEST_S = 20
 
 
