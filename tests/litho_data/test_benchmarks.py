@@ -21,7 +21,9 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import run_facts
 
 
-@pytest.mark.parametrize("benchmark", [build_benchmark, levelling_benchmark, readers_benchmark, tip_benchmark])
+@pytest.mark.parametrize(
+    "benchmark", [build_benchmark, levelling_benchmark, readers_benchmark, tip_benchmark]
+)
 def test_the_page_quotes_the_committed_measurement(benchmark):
     text = published(benchmark.PAGE, benchmark.NAME)
     if not benchmark.RESULT.exists():
