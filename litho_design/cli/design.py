@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
 
+from litho_data.foundation.errors import InputError
 from litho_data.foundation.settings import changed
 from litho_design.cli.options import (
     Device,
@@ -81,6 +82,13 @@ def hoe(
     out: Out,
     given: Given,
     target: Target = "text",
+    front: Annotated[
+        str | None,
+        typer.Option(
+            help="Efficiency weights, comma-separated, such as 0,0.03,0.1,0.3,1: one design each, and the "
+            "front of efficiency against likeness."
+        ),
+    ] = None,
     spread_of: SpreadOf = None,
     ensemble: Ensemble = None,
     device: Device = "cpu",
@@ -88,6 +96,9 @@ def hoe(
 ) -> None:
     """Design a holographic element; an interrupted run in OUT is continued."""
     settings = _settings(given, _hologram, "hoe", spread_of)
+    if front is not None:
+        _front(front, target, model, out, settings, ensemble or (), device, extrapolate)
+        return
     from litho_design.workflows.design import design_hologram
 
     design = design_hologram(
@@ -224,6 +235,37 @@ def _settings(
 
     measured = made.model_copy(update={"window": measured_window(open_store(spread_of), made.window)})
     return changed(measured, given.options)
+
+
+def _front(
+    front: str,
+    target: str,
+    model: str,
+    out: Path,
+    settings: HologramSettings,
+    ensemble: Sequence[str],
+    device: str,
+    extrapolate: bool,
+) -> None:
+    from litho_design.reports.advice import baseline_line
+    from litho_design.workflows.front import efficiency_front
+
+    try:
+        weights = [float(word) for word in front.split(",")]
+    except ValueError:
+        raise InputError("--front", got=repr(front), wanted="numbers, separated by commas") from None
+    result = efficiency_front(
+        target, model, out, weights=weights, settings=settings, ensemble=ensemble, device=device,
+        extrapolate=extrapolate,
+    )  # fmt: skip
+    for point in result.points:
+        print(
+            f"efficiency weight {point.efficiency_weight:g}: {100 * point.eff_signal:.1f} % on the signal, "
+            f"{point.si_psnr_db:.2f} dB{'' if point.on_front else ', not on the front'}"
+        )
+    if result.baselines:
+        print(baseline_line(result.baselines))
+    print(out / "report.html")
 
 
 def _print_design(design: Design, out: Path) -> None:

@@ -11,7 +11,8 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Result
 from litho_design.exports.marks import Marks
-from litho_design.printers.layout import OutOfDistribution, Printability
+from litho_design.printers.layout import Printability
+from litho_design.printers.training import OutOfDistribution
 from litho_design.tasks.design import Design
 
 Format = Literal["png16", "bmp", "tiff", "stl", "gds"]

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from litho_design.holograms.bench import HologramBench, camera_ssim, hologram_score
-from litho_design.holograms.loss import hologram_loss
+from litho_design.holograms.loss import counted_pixels, hologram_loss
 from litho_design.holograms.settings import HologramSettings
-from litho_design.images.similarity import likeness
+from litho_design.images.similarity import likeness, si_psnr_db
 from litho_design.optics import element_field, intensity_share
 from litho_design.optimisation.parameters import CellMap
 from litho_design.optimisation.phases import gerchberg_saxton
@@ -33,6 +33,7 @@ def hologram_baselines(
     forty weighted Gerchberg-Saxton steps on the same phases.
     """
     wave_um = settings.optics.wave_height_um
+    counted = counted_pixels(target, settings.loss, settings.layout.pitch_um)
     found = {"black image": _of_black(bench, target, settings)}
     limited = _free_amplitude(bench, target)
     score = hologram_score(
@@ -46,6 +47,9 @@ def hologram_baselines(
     ):
         height_um = cells(phase) * (wave_um / (2 * math.pi))
         found[name] = bench.score(height_um, target, settings.camera).model_dump()
+        if counted is not None:
+            seen = bench(height_um)[counted].double()
+            found[name]["si_psnr_window_db"] = si_psnr_db(seen, target[counted].double())
     found["continuous phase"]["loss"] = loss
     return found
 
@@ -92,14 +96,17 @@ def _continuous_phase(
 ) -> tuple[Tensor, float]:
     """The phase per cell with the lowest loss, radian, and that loss."""
     wave_um = settings.optics.wave_height_um
+    counted = counted_pixels(target, settings.loss, settings.layout.pitch_um)
     phase, _ = gerchberg_saxton(
-        bench.propagator, target, cells, iterations=_ITERATIONS, weighted=False, seed=settings.search.seed
-    )
+        bench.propagator, target, cells, iterations=_ITERATIONS, weighted=False, seed=settings.search.seed,
+        counted=counted,
+    )  # fmt: skip
     free = phase.clone().requires_grad_()
     optimiser = torch.optim.Adam([free], lr=_PHASE_RATE)
     best, lowest = phase, math.inf
     for _ in range(_PHASE_ITERATIONS):
-        loss, _ = hologram_loss(bench(cells(free) * (wave_um / (2 * math.pi))), target, settings.loss)
+        seen = bench(cells(free) * (wave_um / (2 * math.pi)))
+        loss, _ = hologram_loss(seen, target, settings.loss, counted)
         value = float(loss.detach())
         if value < lowest:
             best, lowest = free.detach().clone(), value

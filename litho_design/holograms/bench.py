@@ -52,6 +52,12 @@ class HologramScore(Record):
     background_ratio: float = Field(description="mean signal over mean background")
 
 
+class WindowedHologramScore(HologramScore):
+    """With a signal window, beyond which light is free: the figures above count that light as an error."""
+
+    si_psnr_window_db: float = Field(description="scale-invariant PSNR inside the signal window, dB")
+
+
 def hologram_score(
     field: Tensor, element: Tensor, target: Tensor, grid: PixelGrid, optics: Optics, camera: CameraView
 ) -> HologramScore:

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 class HologramLoss(Record):
     """RMSE(target, image) + efficiency_weight * (1 - efficiency).
 
+    With ``signal_window_um`` only pixels that close to the wanted light count in the error; beyond them light
+    is free (mixed-region amplitude freedom: Pasienski and DeMarco 2008, doi:10.1364/OE.16.002176).
     ``scale`` matches the image to the target: ``paper`` divides by the mean over the wanted light,
     ``least-squares`` uses the factor of least error. The efficiency is
     the share of the incident power on pixels whose target is above zero.
@@ -28,21 +30,41 @@ class HologramLoss(Record):
     efficiency_weight: float = setting(
         0.1, "Weight of the light that misses the target", option="--efficiency-weight", ge=0
     )
+    signal_window_um: float = setting(
+        0.0, "Light further from the wanted light than this is free; 0 for none", unit="µm",
+        option="--signal-window-um", ge=0,
+    )  # fmt: skip
 
 
-def hologram_loss(share: Tensor, target: Tensor, settings: HologramLoss) -> tuple[Tensor, dict[str, float]]:
+def counted_pixels(target: Tensor, settings: HologramLoss, pitch_um: float) -> Tensor | None:
+    """Pixels (size, size) that count in the error: those near the wanted light; None for all."""
+    if not settings.signal_window_um:
+        return None
+    import torch
+    from scipy.ndimage import distance_transform_edt
+
+    away_um = distance_transform_edt((target <= 0).cpu().numpy()) * pitch_um
+    return torch.from_numpy(away_um <= settings.signal_window_um).to(target.device)
+
+
+def hologram_loss(
+    share: Tensor, target: Tensor, settings: HologramLoss, counted: Tensor | None = None
+) -> tuple[Tensor, dict[str, float]]:
     """Loss of an image and its parts by name.
 
     Args:
         share: share of the incident power on each pixel (size, size).
         target: wanted intensity in [0, 1], (size, size).
+        counted: pixels that count in the error, bool (size, size); None for all.
     """
     # Not at the top: the command line reads the weights without torch.
     from litho_design.images.similarity import matched_scale
 
+    efficiency = share[target > 0].sum()
+    if counted is not None:
+        share, target = share[counted], target[counted]
     lit = (share * target).sum()
     factor = target.sum() / lit if settings.scale == "paper" else matched_scale(share, target)
     rmse = (factor * share - target).square().mean().sqrt()
-    efficiency = share[target > 0].sum()
     loss = rmse + settings.efficiency_weight * (1 - efficiency)
     return loss, {"rmse": float(rmse.detach()), "efficiency": float(efficiency.detach())}

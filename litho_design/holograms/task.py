@@ -12,8 +12,8 @@ from torch import Tensor
 
 from litho_data.foundation.errors import InputError
 from litho_design.holograms.baselines import best_signal_efficiency, hologram_baselines
-from litho_design.holograms.bench import HologramBench, HologramScore
-from litho_design.holograms.loss import hologram_loss
+from litho_design.holograms.bench import HologramBench, HologramScore, WindowedHologramScore
+from litho_design.holograms.loss import counted_pixels, hologram_loss
 from litho_design.holograms.settings import HologramSettings
 from litho_design.images.similarity import SSIM_WINDOW_PX, si_psnr_db
 from litho_design.images.targets import Target, load_target, stroke_width_px
@@ -42,7 +42,7 @@ class HologramTask(Task):
     name = "hoe"
     starts = ("random", "gs", "wgs")
     headline = ("si_psnr_db", "ssim", "ssim_camera", "eff_signal", "speckle_contrast")
-    score_type = HologramScore
+    score_type = WindowedHologramScore
     settings_type = HologramSettings
     settings: HologramSettings
     bench: HologramBench
@@ -56,10 +56,13 @@ class HologramTask(Task):
     ):
         _check_target(target.pixels, settings.layout)
         super().__init__(settings, printer, inputs={"target": target.pixels}, ensemble=ensemble)
+        if settings.loss.signal_window_um:
+            self.headline = ("si_psnr_window_db", *self.headline[1:])  # type: ignore[misc]
         self.target_record = target.record
         self.notes += [f"target {target.record.adaptation}"] if target.record.adaptation else []
         self.notes += _too_fine(target.pixels, settings)
         self.target = torch.from_numpy(target.pixels).to(printer.device)
+        self.counted = counted_pixels(self.target, settings.loss, settings.layout.pitch_um)
 
     @classmethod
     def reopened(
@@ -75,23 +78,35 @@ class HologramTask(Task):
 
     def loss(self, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
         """See ``hologram_loss``."""
-        return hologram_loss(seen, self.target, self.settings.loss)
+        return hologram_loss(seen, self.target, self.settings.loss, self.counted)
 
     def window_figures(self, seen: Tensor) -> dict[str, float]:
         """Loss, SI-PSNR and signal efficiency."""
-        return {
+        figures = {
             "loss": float(self.loss(seen)[0]),
             "si_psnr_db": si_psnr_db(seen.double(), self.target.double()),
             "eff_signal": float(seen[self.target > 0.5].sum()),
         }
+        return figures | self._inside_window(seen)
 
     def scene(self, level_phase: Tensor) -> Scene:
         """With the image that a start approaches."""
-        return replace(super().scene(level_phase), target=self.target, propagator=self.bench.propagator)
+        scene = super().scene(level_phase)
+        return replace(scene, target=self.target, counted=self.counted, propagator=self.bench.propagator)
 
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> HologramScore:
         """Score of the image behind a print (size, size), µm."""
-        return self.bench.score(height_um, self.target, self.settings.camera)
+        score = self.bench.score(height_um, self.target, self.settings.camera)
+        if self.counted is None:
+            return score
+        with torch.no_grad():
+            return WindowedHologramScore(**score.model_dump(), **self._inside_window(self.bench(height_um)))
+
+    def _inside_window(self, seen: Tensor) -> dict[str, float]:
+        if self.counted is None:
+            return {}
+        found = si_psnr_db(seen[self.counted].double(), self.target[self.counted].double())
+        return {"si_psnr_window_db": found}
 
     def reference_efficiency(self, height_um: Tensor) -> float:
         """Signal efficiency of the best continuous phase found from the print, power alone counting."""

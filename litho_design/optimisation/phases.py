@@ -22,6 +22,7 @@ def gerchberg_saxton(
     weighted: bool,
     seed: int,
     level_phase: Tensor | None = None,
+    counted: Tensor | None = None,
 ) -> tuple[Tensor, list[float]]:
     """A phase per cell whose propagated amplitude approaches sqrt(target).
 
@@ -36,6 +37,8 @@ def gerchberg_saxton(
         propagator: RSPropagator or ASMPropagator on square grids of the element's pixel pitch.
         target: wanted intensity (size, size) in [0, 1].
         cells: the element's free cells.
+        counted: pixels whose amplitude is wanted, bool (size, size); elsewhere the wave is kept as it is. The
+            wanted amplitude then follows the light that is there.
         level_phase: printed phase of each level, radian (levels,); if given, the second half of the
             iterations projects on these phases instead of on the whole circle.
 
@@ -61,7 +64,9 @@ def gerchberg_saxton(
             )
             wanted[lit] *= shortfall.clamp(0.5, 2).sqrt()
             wanted *= amplitude.norm() / wanted.norm()
-        missing = seen * (wanted / size.clamp(min=1e-12 * float(size.max())) - 1)
+        aim = wanted if counted is None else wanted * (size[counted].norm() / wanted.norm())
+        missing = seen * (aim / size.clamp(min=1e-12 * float(size.max())) - 1)
+        missing = missing if counted is None else missing * counted
         mean_wave = cells.average(wave + propagator.adjoint(missing))
         phase = mean_wave.angle()
         if level_phase is not None and step >= iterations // 2:

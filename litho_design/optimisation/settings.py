@@ -10,6 +10,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_data.foundation.settings import changed, setting
 from litho_design.optics import Optics
+from litho_design.optimisation.fabrication import Fabrication
 from litho_design.optimisation.process_window import ProcessWindow
 from litho_design.optimisation.starts import StartName
 from litho_design.printers.layout import LayoutSettings
@@ -101,6 +102,7 @@ class DesignSettings(Record):
     search: SearchSettings = setting(SearchSettings(), "Search")
     window: ProcessWindow = setting(ProcessWindow(), "Process window")
     ensemble: EnsemblePenalty = setting(EnsemblePenalty(), "Several models")
+    fabrication: Fabrication = setting(Fabrication(), "What the printer can make")
 
 
 def design_settings(changes: Mapping[str, Any] | None = None) -> DesignSettings:

@@ -35,6 +35,7 @@ class Scene:
         iterations: of an iterative start.
         seed: of a start that draws numbers.
         target: wanted image (size, size) in [0, 1]; None for a lens.
+        counted: pixels of the image where light is not free, bool (size, size); None for all.
         propagator: from the element to the image; None for a lens.
     """
 
@@ -45,6 +46,7 @@ class Scene:
     iterations: int
     seed: int
     target: Tensor | None = None
+    counted: Tensor | None = None
     propagator: Any = None
 
 
@@ -80,6 +82,7 @@ def _gerchberg_saxton(scene: Scene, *, weighted: bool = False) -> Tensor:
         weighted=weighted,
         seed=scene.seed,
         level_phase=scene.level_phase,
+        counted=scene.counted,
     )
     return nearest_levels(phase, scene.level_phase)
 

@@ -1,9 +1,8 @@
-"""Layouts: geometry and levels, rules of fabrication, and distance from the training layouts of a model."""
+"""Layouts: geometry and levels, and what a printer must resolve to print them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -11,8 +10,6 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_data.foundation.settings import setting
 
-# Half of the pixels at levels that the training layouts hardly have: mostly extrapolation.
-_FLAG_DISTANCE = 0.5
 _LARGE_JUMP_LEVELS = 8
 
 
@@ -70,15 +67,6 @@ class Printability(Record):
     smallest_ring_um: float | None = None
 
 
-class OutOfDistribution(Record):
-    """Total-variation distance between the level histogram and that of the model's training layouts."""
-
-    level_distance: float
-    flagged: bool
-    extreme_level_share: float
-    training_extreme_level_share: float
-
-
 def printability(levels: np.ndarray, layout: LayoutSettings) -> Printability:
     """What a printer must resolve to print a layout.
 
@@ -103,26 +91,6 @@ def printability(levels: np.ndarray, layout: LayoutSettings) -> Printability:
         large_jump_share=float((steps >= _LARGE_JUMP_LEVELS).mean()) if steps.size else 0.0,
         used_levels=len(np.unique(levels)),
         smallest_ring_um=_smallest_ring_um(levels, layout),
-    )
-
-
-def out_of_distribution(
-    levels: np.ndarray, layout: LayoutSettings, card: Mapping[str, Any]
-) -> OutOfDistribution | None:
-    """Compare the level histogram with the one in a model's card; None where the card has none."""
-    trained = np.asarray(card.get("training_level_share") or [], dtype=float)
-    if trained.size == 0:
-        return None
-    count = max(layout.levels, trained.size)
-    share = np.bincount(levels.ravel(), minlength=count) / levels.size
-    trained = np.pad(trained / trained.sum(), (0, count - trained.size))
-    distance = float(np.abs(share - trained).sum()) / 2
-    top = layout.levels - 1
-    return OutOfDistribution(
-        level_distance=distance,
-        flagged=distance > _FLAG_DISTANCE,
-        extreme_level_share=float(share[0] + share[top]),
-        training_extreme_level_share=float(trained[0] + trained[top]),
     )
 
 

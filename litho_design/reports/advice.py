@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 from litho_design.tasks.design import Design
 
+# Figures whose loss is told in dB: already in dB (0), shares of power (10), lengths (20).
+_IN_DB = {"si_psnr_db": 0, "eff_signal": 10, "focusing_efficiency": 10, "rms_nm": -20}
 _EFFICIENCIES = ("eff_signal", "focusing_efficiency")
 # Reflection alone takes 4.6 %.
 _THICK_SHARE = 0.1
@@ -25,9 +28,31 @@ def distribution_warning(design: Design) -> str:
         )
     if not gauge.flagged:
         return ""
-    return (
+    text = (
         f"out of distribution: {100 * gauge.level_distance:.0f} % of the pixels would have to change level "
         "to match the training layouts of the model; its prediction is an extrapolation"
+    )
+    text += f": {'; '.join(gauge.unusual)}" if gauge.unusual else ""
+    return text + _cost_of_staying_inside(design)
+
+
+def _cost_of_staying_inside(design: Design) -> str:
+    """What a layout closer to the training layouts scores, in dB where that makes sense; or nothing."""
+    gauge = design.out_of_distribution
+    if gauge is None or gauge.inside is None or gauge.inside_distance is None:
+        return ""
+    told = []
+    for name, scale in _IN_DB.items():
+        now, then = design.predicted.get(name, 0.0), gauge.inside.get(name, 0.0)
+        if min(now, then) > 0:
+            told.append(f"{now - then if scale == 0 else scale * math.log10(now / then):.2f} dB of {name}")
+    if not told:
+        told = [f"{name} {now:.4g}, not {design.predicted[name]:.4g}" for name, now in gauge.inside.items()][
+            :2
+        ]
+    return (
+        f". A short search that stays closer ({100 * gauge.inside_distance:.0f} % of the pixels) ends at a "
+        f"cost of {', '.join(told)}, as the model prints both (--inside-weight searches so from the start)"
     )
 
 
@@ -83,6 +108,8 @@ def headline(score: Mapping[str, float], uncertainty: Mapping[str, float] | None
         return text + (f", MAE {told('mae_calibrated', 4)}" if "mae_calibrated" in score else "")
     if "si_psnr_db" in score:
         text = f"{told('si_psnr_db', 2)} dB, SSIM {told('ssim', 3)}"
+        if "si_psnr_window_db" in score:
+            text += f", {told('si_psnr_window_db', 2)} dB inside the signal window"
         return (f"{told('eff_signal', 1, 100)} % on the signal, " if "eff_signal" in score else "") + text
     if "rms_nm" in score:
         return f"{told('rms_nm', 1)} nm rms from the relief"

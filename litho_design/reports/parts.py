@@ -119,7 +119,9 @@ def add_scores(page: Page, design: Design, labels: Mapping[str, str]) -> None:
         digits=4,
     )
     ceiling = (design.baselines or {}).get("continuous phase", {}).get("loss")
-    if ceiling is not None and not design.settings["window"]["samples"]:
+    made = design.settings.get("fabrication", {})
+    penalised = any(made.get(name) for name in ("max_step_levels", "min_feature_um", "inside_weight"))
+    if ceiling is not None and not penalised and not design.settings["window"]["samples"]:
         page.paragraph(
             f"The loss of the printed layout is {design.polished_loss:.4f}; a continuous phase on the same "
             f"cells reaches {ceiling:.4f} ({100 * (design.polished_loss / ceiling - 1):+.1f} % against it)."
@@ -164,7 +166,7 @@ def add_gauge(page: Page, design: Design) -> None:
             f"{ensemble.disagreement_nm:.1f} nm ({ensemble.disagreement_waves:.3f} waves) rms."
         )
     figures = design.printability.model_dump() | (gauge.model_dump() if gauge else {})
-    given = {name: float(value) for name, value in figures.items() if value is not None}
+    given = {name: float(value) for name, value in figures.items() if isinstance(value, (int, float))}
     frame = pd.DataFrame({"name": list(given), "value": list(given.values())})
     page.table(frame, "Lengths in µm; shares of pixel pairs or runs", "printability.csv", digits=3)
 

@@ -17,8 +17,9 @@ from litho_design.images.targets import TargetRecord
 from litho_design.optics import Optics
 from litho_design.optics.stroke import Stroke
 from litho_design.optimisation.robust import EnsembleRecord
-from litho_design.printers.layout import LayoutSettings, OutOfDistribution, Printability
+from litho_design.printers.layout import LayoutSettings, Printability
 from litho_design.printers.printer import PrinterRecord, TilingCheck
+from litho_design.printers.training import OutOfDistribution
 
 LEVELS_FILE = "layout_level.npy"
 HEIGHT_FILE = "predicted_height_um.npy"

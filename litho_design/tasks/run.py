@@ -21,6 +21,7 @@ from litho_data.foundation.outputs import require_own_folder
 from litho_data.foundation.run_facts import run_facts
 from litho_design.optics.stroke import measure_stroke
 from litho_design.optimisation.budget import Budget, measure_budget, peak_memory_gib
+from litho_design.optimisation.fabrication import outside
 from litho_design.optimisation.polish import polish_levels
 from litho_design.optimisation.robust import measure_disagreement
 from litho_design.optimisation.search import (
@@ -31,8 +32,9 @@ from litho_design.optimisation.search import (
     search_layout,
 )
 from litho_design.optimisation.settings import DesignSettings
-from litho_design.printers.layout import out_of_distribution, printability
+from litho_design.printers.layout import printability
 from litho_design.printers.printer import Printer
+from litho_design.printers.training import OutOfDistribution, out_of_distribution
 from litho_design.tasks.design import (
     HEIGHT_FILE,
     LEVELS_FILE,
@@ -45,6 +47,10 @@ from litho_design.tasks.task import Task
 
 # Writes the report into the folder of a design, from the record and the history of the search.
 Report = Callable[[Path, Design, Task, list[dict[str, float]]], object]
+
+
+# Brings a hologram from 0.67 to 0.2 of the level distance in twenty iterations.
+_INSIDE_WEIGHT = 0.5
 
 
 @dataclass(frozen=True)
@@ -138,7 +144,7 @@ def run_design(
             heights, settings.optics.wave_height_um, level_height_um=settings.layout.level_height_um
         ),
         printability=printability(layout_array, settings.layout),
-        out_of_distribution=out_of_distribution(layout_array, settings.layout, task.printer.card),
+        out_of_distribution=_gauge(task, outcome.levels, layout_array),
         notes=list(task.notes),
         iterations=outcome.state.iteration,
         start_loss=outcome.start_loss,
@@ -155,6 +161,40 @@ def run_design(
     design.write(folder)
     remove_checkpoint(folder)
     return design
+
+
+def _gauge(task: Task, levels: Tensor, layout_array: np.ndarray) -> OutOfDistribution | None:
+    """Distance from the training layouts; where that is large, also what a layout closer to them scores."""
+    settings = task.settings
+    gauge = out_of_distribution(layout_array, settings.layout, task.printer.card)
+    trial = settings.fabrication.trial_iterations
+    if gauge is None or not gauge.flagged or not trial:
+        return gauge
+    search = settings.search.model_copy(
+        update={"parametrisation": "direct", "optimiser": "adam", "learning_rate": 1.0, "iterations": trial,
+                "hard_from": 0.0, "evaluate_every": 5, "keep": "best"}
+    )  # fmt: skip
+    parameters = make_parametrisation(settings.layout, search).to(levels.device)
+    parameters.start_from(levels.float())
+
+    def inside(level: Tensor) -> tuple[Tensor, dict[str, float]]:
+        loss, parts = task.objective(level)
+        return loss + _INSIDE_WEIGHT * outside(level, settings.layout.levels, task.printer.card), parts
+
+    state = search_layout(parameters, inside, search, what="staying inside")
+    assert state.best_levels is not None
+    layout_level = parameters.cells(state.best_levels)
+    with torch.no_grad():
+        score = task.score(task.printer(layout_level[None, None].float())[0, 0]).model_dump()
+    kept = out_of_distribution(layout_level.cpu().numpy(), settings.layout, task.printer.card)
+    assert kept is not None
+    return gauge.model_copy(
+        update={
+            "inside": score,
+            "inside_distance": kept.level_distance,
+            "inside_step_distance": kept.step_distance,
+        }
+    )
 
 
 def _check_printers(printers: Sequence[Printer]) -> None:

@@ -20,6 +20,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_design.images.targets import TargetRecord
 from litho_design.optics import Optics
+from litho_design.optimisation.fabrication import fabrication_penalty
 from litho_design.optimisation.parameters import CellMap, Parametrisation
 from litho_design.optimisation.phases import printed_phase
 from litho_design.optimisation.process_window import Draw, check_draws, draws
@@ -200,7 +201,7 @@ class Task:
         """Loss of levels on the pixels (1, 1, size, size), and its parts.
 
         With process-window samples: the risk of the loss over them; with an ensemble: its mean over
-        the models, and their disagreement.
+        the models, and their disagreement; then the penalties on what the printer can make.
         """
         settings = self.settings
         prints = [self.search_print(level, number) for number in range(len(self.printers))]
@@ -208,7 +209,9 @@ class Task:
             prints, self.scenes, self._loss_of_print, settings.window, settings.layout.pitch_um
         )
         wave_um = settings.optics.wave_height_um
-        return penalised(loss, prints, settings.ensemble.weight, wave_um, self.search_area()), parts
+        loss = penalised(loss, prints, settings.ensemble.weight, wave_um, self.search_area())
+        extra = fabrication_penalty(level, settings.fabrication, settings.layout, self.printer.card)
+        return loss if extra is None else loss + extra, parts
 
     def start(self, parameters: Parametrisation, level_heights_um: list[float]) -> None:
         """Set the start of the search, from the phases of the levels as printed."""

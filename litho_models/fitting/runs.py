@@ -107,6 +107,7 @@ def train(
             "seconds": round(fitted.seconds, 1),
         },
         training_level_share=level_share(used),
+        training_step_share=step_share(used),
         background=learn_background(used, [predict_scan(fitted.model, scan) for scan in used]),
         command=record.run.command,
         split={
@@ -157,6 +158,16 @@ def level_share(scans: Sequence[PrintedScan]) -> list[float]:
 
     levels = np.concatenate([scan.mask_level.ravel() for scan in scans])
     return (np.bincount(levels, minlength=scans[0].levels) / levels.size).tolist()
+
+
+def step_share(scans: Sequence[PrintedScan]) -> list[float]:
+    """Share of neighbouring pixels, along rows and columns, whose levels differ by 0, 1, …"""
+    import numpy as np
+
+    steps = np.concatenate(
+        [np.abs(np.diff(scan.mask_level.astype(int), axis=axis)).ravel() for scan in scans for axis in (0, 1)]
+    )
+    return (np.bincount(steps, minlength=scans[0].levels) / steps.size).tolist()
 
 
 def _write_history(record: TrainingRun, folder: Path) -> None:

@@ -61,6 +61,7 @@ class ModelCard(RunFacts, Result):
     levels: int
     calibrated_range_um: tuple[float, float]
     training_level_share: list[float] = Field(default_factory=list)
+    training_step_share: list[float] = Field(default_factory=list)
     receptive_radius_um: float | None
     at_bounds: dict[str, float] = Field(default_factory=dict)
     dataset: DatasetId | None = None

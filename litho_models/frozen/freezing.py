@@ -15,6 +15,7 @@ from litho_models.frozen.files import load_simulator, save_frozen
 MODEL_FOLDER = "model"
 _CARRIED_FIELDS = {
     "training_level_share",
+    "training_step_share",
     "dataset",
     "training",
     "command",

@@ -12,7 +12,7 @@ from litho_data.foundation.files import atomic_folder
 from litho_data.foundation.outputs import require_replaceable_folder
 from litho_data.store import PrintedScan, Store, open_store
 from litho_models.effects import get_effect
-from litho_models.fitting.runs import level_share
+from litho_models.fitting.runs import level_share, step_share
 from litho_models.frozen import zoo
 from litho_models.frozen.files import save_frozen
 from litho_models.loop.close import close_loop
@@ -214,6 +214,7 @@ def _save_process_model(findings: LoopFindings, result: CloseLoop, store: Store,
         nuisance=result.nuisance.model_dump(mode="json"),
         noise_floor=result.noise_floor.model_dump(mode="json"),
         training_level_share=level_share([scan.stored for scan in findings.development]),
+        training_step_share=step_share([scan.stored for scan in findings.development]),
         confusable_sets=[[e.name, *e.confusable_with] for e in result.effects if e.confusable_with],
         unexplained_fraction=result.shares.unexplained_structured,
         metrics=[

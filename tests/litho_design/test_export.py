@@ -19,7 +19,8 @@ from litho_design.exports.image import read_published_bmp, write_bmp, write_png1
 from litho_design.exports.sidecar import sidecar_path
 from litho_design.exports.stl import read_stl_levels, read_stl_triangles, write_stl
 from litho_design.images.targets import load_target
-from litho_design.printers.layout import LayoutSettings, out_of_distribution, printability
+from litho_design.printers.layout import LayoutSettings, printability
+from litho_design.printers.training import out_of_distribution
 from litho_design.tasks.design import Design
 from litho_design.workflows.design import design_hologram
 

@@ -17,8 +17,9 @@ import torch
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import run_facts
 from litho_design.cli.app import app, main
-from litho_design.printers.layout import LayoutSettings, OutOfDistribution
+from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.source import load_printer
+from litho_design.printers.training import OutOfDistribution
 from litho_design.reports.advice import distribution_warning, stroke_advice
 from litho_design.tasks.design import Design
 from litho_models import save_frozen

@@ -380,6 +380,10 @@ def test_the_loop_locks_what_training_locks_whatever_its_seed_and_what_was_dropp
         used = np.concatenate([s.mask_level.ravel() for s in scans if s.id not in locked])
         shares = ModelCard.read(tmp_path / f"loop{number}" / "model").training_level_share
         assert shares == pytest.approx(np.bincount(used, minlength=len(shares)) / used.size, abs=1e-12)
+        levels = [s.mask_level.astype(int) for s in scans if s.id not in locked]
+        steps = np.abs(np.concatenate([np.diff(m, axis=a).ravel() for m in levels for a in (0, 1)]))
+        shares = ModelCard.read(tmp_path / f"run{number}" / "model").training_step_share
+        assert shares == pytest.approx(np.bincount(steps, minlength=len(shares)) / steps.size, abs=1e-12)
 
 
 def test_one_scan_is_refused() -> None:

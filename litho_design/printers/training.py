@@ -1,0 +1,89 @@
+"""How a layout compares with the layouts that a model was trained on: its levels, and its steps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from pydantic import Field
+
+from litho_data.foundation.results import Record
+from litho_design.printers.layout import LayoutSettings
+
+# Half of the pixels at levels that the training layouts hardly have: mostly extrapolation.
+_FLAG_DISTANCE = 0.5
+# A tenth of all neighbours: a few borders do not make a layout unusual.
+_FLAG_STEPS = 0.1
+# What a layout may have more often than the training layouts; half a per cent of anything is no news.
+ALLOWED_TIMES = 2.0
+_ALLOWED_SHARE = 0.005
+
+
+class OutOfDistribution(Record):
+    """Distance of a layout from the model's training layouts.
+
+    Two total-variation distances: between the histograms of levels, and between those of the steps of
+    neighbouring pixels. ``unusual`` says what the layout has and they have not; ``inside`` holds the scores
+    of a layout that was kept closer to them, as printed, and the next two how close it came. All but the
+    levels is absent in older designs; steps also where the card of the model has none.
+    """
+
+    level_distance: float
+    flagged: bool
+    extreme_level_share: float
+    training_extreme_level_share: float
+    step_distance: float | None = None
+    unusual: list[str] = Field(default_factory=list)
+    inside: dict[str, float] | None = None
+    inside_distance: float | None = None
+    inside_step_distance: float | None = None
+
+
+def out_of_distribution(
+    levels: np.ndarray, layout: LayoutSettings, card: Mapping[str, Any]
+) -> OutOfDistribution | None:
+    """Compare a layout (ny, nx) with the histograms in a model's card; None where the card has none."""
+    trained = training_share(card, "training_level_share", layout.levels)
+    if trained is None:
+        return None
+    share = np.bincount(levels.ravel(), minlength=len(trained)) / levels.size
+    steps = np.concatenate([np.abs(np.diff(levels.astype(int), axis=axis)).ravel() for axis in (0, 1)])
+    step_share = np.bincount(steps, minlength=len(trained)) / max(steps.size, 1)
+    trained_steps = training_share(card, "training_step_share", layout.levels)
+    apart = None if trained_steps is None else _distance(step_share, trained_steps)
+    distance, top = _distance(share, trained), layout.levels - 1
+    unusual = _excess(share, trained, "levels {}", "of the pixels")
+    if trained_steps is not None:
+        unusual += _excess(step_share, trained_steps, "steps of {} levels", "of the neighbouring pixels")
+    return OutOfDistribution(
+        level_distance=distance,
+        flagged=distance > _FLAG_DISTANCE or (apart or 0) > _FLAG_STEPS,
+        extreme_level_share=float(share[0] + share[top]),
+        training_extreme_level_share=float(trained[0] + trained[top]),
+        step_distance=apart,
+        unusual=unusual,
+    )
+
+
+def training_share(card: Mapping[str, Any], name: str, levels: int) -> np.ndarray | None:
+    """A histogram of a model's card over at least ``levels`` values, its sum 1; None where it has none."""
+    trained = np.asarray(card.get(name) or [], dtype=float)
+    if trained.size == 0:
+        return None
+    return np.pad(trained / trained.sum(), (0, max(0, levels - trained.size)))
+
+
+def _distance(share: np.ndarray, trained: np.ndarray) -> float:
+    return float(np.abs(share - trained).sum()) / 2
+
+
+def _excess(share: np.ndarray, trained: np.ndarray, what: str, of: str) -> list[str]:
+    """In words, what ``share`` has much more of than ``trained``; nothing where that is little."""
+    many = np.flatnonzero((share > ALLOWED_TIMES * trained) & (share > trained + _ALLOWED_SHARE))
+    if many.size == 0:
+        return []
+    runs = np.split(many, np.flatnonzero(np.diff(many) > 1) + 1)
+    names = ", ".join(f"{run[0]}" if run.size == 1 else f"{run[0]} to {run[-1]}" for run in runs)
+    here, there = (100 * float(one[many].sum()) for one in (share, trained))
+    return [f"{what.format(names)}: {here:.2g} % {of}, {there:.2g} % in the training layouts"]

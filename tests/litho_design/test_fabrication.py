@@ -1,0 +1,115 @@
+"""What a printer can make as a penalty, and what staying inside the training layouts costs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from litho_data.foundation.errors import InputError
+from litho_design import design_hologram, hologram_settings
+from litho_design.optimisation.fabrication import Fabrication, fabrication_penalty, outside
+from litho_design.printers.layout import LayoutSettings
+from litho_design.printers.training import out_of_distribution
+from litho_design.reports.advice import distribution_warning
+
+LAYOUT = LayoutSettings(size_px=16, levels=13)
+
+
+def _penalty(rows: np.ndarray, layout: LayoutSettings = LAYOUT, card=None, **settings) -> float:
+    level = torch.as_tensor(np.asarray(rows, np.float32))[None, None]
+    return float(fabrication_penalty(level, Fabrication(weight=1.0, **settings), layout, card or {}))
+
+
+def test_steps_above_the_cap_count_by_their_excess():
+    rows = np.tile(np.repeat([2, 9], 8), (16, 1))
+    # One step of 7 in each of 16 rows: 16 of 240 pairs along x, none along y.
+    assert _penalty(rows, max_step_levels=3) == pytest.approx((4 / 12) ** 2 / 15, rel=1e-5)
+    assert _penalty(rows, max_step_levels=7) == 0
+    level = torch.zeros(1, 1, 16, 16)
+    assert fabrication_penalty(level, Fabrication(), LAYOUT, {}) is None
+
+
+def test_ridges_and_grooves_narrower_than_the_smallest_feature_count_by_their_height():
+    row = np.zeros(16)
+    row[5:8] = 6
+    for sign in (1, -1):
+        rows = np.tile(6 + sign * row, (16, 1))
+        # 3 of 16 pixels, half of the range high; along y nothing changes.
+        assert _penalty(rows, min_feature_um=0.4) == pytest.approx(3 / 16 * 6 / 12, rel=1e-5)
+        assert _penalty(rows, min_feature_um=0.3) == 0
+    # A staircase has neither, however narrow its steps; nor has a feature at the border.
+    assert _penalty(np.tile(np.arange(16).clip(max=12), (16, 1)), min_feature_um=0.4) == 0
+    assert _penalty(np.tile(6.0 * (np.arange(16) < 2), (16, 1)), min_feature_um=0.4) == 0
+    # Rings are as wide as along a radius, whatever a row cuts elsewhere.
+    y, x = np.mgrid[:16, :16] - 7.5
+    rings = 6.0 * (np.hypot(y, x) < 4.6)
+    radial = LAYOUT.model_copy(update={"symmetry": "radial", "cell_um": 0.1})
+    assert _penalty(rings, radial, min_feature_um=0.4) == 0
+    assert _penalty(rings, min_feature_um=0.4) > 0
+
+
+def test_tails_beyond_the_training_layouts_pull_inwards():
+    card = {"training_level_share": np.eye(13)[5].tolist(), "training_step_share": [0.9, 0.1]}
+    level = torch.full((1, 1, 16, 16), 11.0, requires_grad=True)
+    found = outside(level, 13, card)
+    # All pixels six levels above the only one of training; no steps.
+    assert float(found.detach()) == pytest.approx(6, rel=1e-5)
+    found.backward()
+    assert (level.grad > 0).all()
+    level = torch.full((1, 1, 16, 16), 2.0, requires_grad=True)
+    found = outside(level, 13, card)
+    assert float(found.detach()) == pytest.approx(3, rel=1e-5)
+    found.backward()
+    assert (level.grad < 0).all()
+    # Steps of two between all columns: half of the pairs, 0.5 - 0.2 at one level and 0.5 at two.
+    stripes = torch.tensor([5.0, 7.0]).repeat(8).expand(1, 1, 16, 16)
+    only_steps = {"training_step_share": [0.9, 0.1]}
+    assert float(outside(stripes, 13, only_steps)) == pytest.approx(0.8, rel=1e-5)
+    assert float(outside(torch.full((1, 1, 16, 16), 5.0), 13, card)) == 0
+    assert float(outside(stripes, 13, {})) == 0
+
+
+def test_what_is_unusual_is_said():
+    card = {"training_level_share": np.eye(13)[4:7].mean(0).tolist(), "training_step_share": [0.9, 0.1]}
+    levels = np.tile(np.repeat([0, 5], 8), (16, 1)).astype(np.uint8)
+    found = out_of_distribution(levels, LAYOUT, card)
+    # Half of the pixels are at 5, a third in training: not twice as many. One step of 5 in 15 along x.
+    assert found.unusual == [
+        "levels 0: 50 % of the pixels, 0 % in the training layouts",
+        "steps of 5 levels: 3.3 % of the neighbouring pixels, 0 % in the training layouts",
+    ]
+    found = out_of_distribution(np.tile(np.array([5, 9], np.uint8), (16, 8)), LAYOUT, card)
+    assert found.step_distance == pytest.approx(0.5)
+    assert found.flagged
+
+
+def test_a_flagged_design_says_what_staying_inside_costs(tmp_path):
+    """And a search that stays inside from the start is closer, at a cost."""
+    changes = {
+        "layout.size_px": 64,
+        "optics.distance_um": 8,
+        "search.iterations": 20,
+        "search.polish_rounds": 2,
+        "window.yield_draws": 2,
+        "window.defocus_sd_um": 0.5,
+    }
+
+    def designed(name, **more):
+        settings = hologram_settings(changes=changes | more)
+        return design_hologram("ring", "zoo:physics", tmp_path / name, settings=settings, announce=False)
+
+    free = designed("free")
+    gauge = free.out_of_distribution
+    assert gauge.flagged
+    assert gauge.inside_distance < gauge.level_distance - 0.2
+    assert gauge.inside["si_psnr_db"] < free.predicted["si_psnr_db"]
+    said = distribution_warning(free)
+    cost = free.predicted["si_psnr_db"] - gauge.inside["si_psnr_db"]
+    assert "steps of" in said
+    assert f"{cost:.2f} dB of si_psnr_db" in said
+    kept = designed("kept", **{"fabrication.inside_weight": 0.5, "fabrication.trial_iterations": 0})
+    assert kept.out_of_distribution.level_distance < gauge.level_distance - 0.2
+    assert kept.out_of_distribution.inside is None
+    with pytest.raises(InputError, match="other settings"):
+        designed("free", **{"fabrication.min_feature_um": 0.8})
