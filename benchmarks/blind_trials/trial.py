@@ -84,7 +84,8 @@ def run_trial(
         # Results are published: where they were made must not show.
         trial = failed(draw, planted, f"{type(error).__name__}: {error}".replace(str(out), "OUT"))
     if not keep_data:
-        for data in (folder / "fab", folder / "store.zarr", folder / "store-report", hidden / "prints"):
+        made = (folder / "fab", folder / "store.zarr", folder / "store-report")
+        for data in (*made, hidden / "prints", hidden / "surfaces"):
             shutil.rmtree(data, ignore_errors=True)
     trial.write(folder)
     return trial

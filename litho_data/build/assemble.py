@@ -123,7 +123,7 @@ def quality_table(records: Sequence[Record]) -> pd.DataFrame:
     for record in records_of_use(records):
         ny, nx = _shape_of(record, "mask_level")
         scan_ny, scan_nx = _shape_of(record, "raw_height_um")
-        pitch_y_um, pitch_x_um = record["read"]["pitch_um"]
+        pitch_y_um, pitch_x_um = record.get("pitch_um", record["read"]["pitch_um"])
         shape = {"layout_ny": ny, "layout_nx": nx, "scan_ny": scan_ny, "scan_nx": scan_nx}
         pitch = {"scan_pitch_y_um": pitch_y_um, "scan_pitch_x_um": pitch_x_um}
         rows.append({"scan": record["id"], **shape, **pitch, **record["quality"]})
@@ -162,7 +162,8 @@ def table_sha256(table: pd.DataFrame) -> str:
 
 def _row(record: Record) -> dict[str, Any]:
     keys = ("id", "print", "order", "columns")
-    return {**{key: record[key] for key in keys}, "shape": _shape_of(record, "mask_level")}
+    made = [output["name"] for step in record["steps"] for output in step["outputs"]]
+    return {**{key: record[key] for key in keys}, "shape": _shape_of(record, "mask_level"), "arrays": made}
 
 
 def _identity(record: Record) -> dict[str, Any]:
@@ -180,6 +181,7 @@ def _shape_of(record: Record, name: str) -> tuple[int, int]:
 
 def files_table(
     files: Mapping[str, Mapping[str, Path]],
+    standards: Mapping[str, Path],
     records: Mapping[str, Mapping[str, Any]],
     skipped: Mapping[str, str],
     unpaired: Mapping[str, str],
@@ -187,7 +189,7 @@ def files_table(
     """One row per raw file, sorted by id.
 
     Args:
-        files: per id, the files by their recorded name.
+        files: per id, the files by their recorded name; ``standards``: those of the calibration.
         records: of the finished scans.
         skipped: per id, why it is not in the store; ``unpaired``: per id, which file is missing.
 
@@ -211,6 +213,10 @@ def files_table(
             rows.append(
                 {**row, "size_bytes": size, "read": json.dumps(_facts(record, name), ensure_ascii=False)}
             )
+    for name, path in standards.items():
+        sha256, size = _file_identity(path)
+        row = {"path": name, "scan": "", "status": "ok", "reason": "", "use": "calibration"}
+        rows.append({**row, "sha256": sha256, "size_bytes": size, "read": "{}"})
     return pd.DataFrame(rows)
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from litho_data.build.assemble import Campaign, assemble, files_table, records_of_use
+from litho_data.build.calibration import measure_scales, standards_of
 from litho_data.build.day_tip import with_tip_found
 from litho_data.build.jobs import FieldJob, Job, Skipped, attempt, field_jobs
 from litho_data.build.operations import UNREGISTERED, load_recipe
@@ -81,12 +82,17 @@ def _recipe_path(listing: Listing) -> Path | None:
 
 
 def _source(listing: Listing, recipe: Mapping[str, Any], seed: int, jobs: Sequence[Job]) -> Source:
+    standards = standards_of(listing)
+    if standards.described:
+        # A bad standard spoils every scan: said once, before any is made.
+        measure_scales(standards.described, list(standards.files.values()))
     found = {one.id: [one.layout, one.scan] for one in listing.fields}
     found |= {one.id: [*one.files] for one in listing.left_aside}
     return Source(
         card=listing.card,
         jobs=jobs,
         data_dir=listing.data_dir,
+        standards=standards.files,
         files={key: {listing.relative(path): path for path in paths if path} for key, paths in found.items()},
         recipe=recipe,
         seed=seed,
@@ -100,7 +106,8 @@ def _source(listing: Listing, recipe: Mapping[str, Any], seed: int, jobs: Sequen
 class Source:
     """Everything that a store is made from, with the raw files by id for the manifest.
 
-    ``files`` maps each id to its raw files by recorded name; ``unpaired`` and ``refused`` map ids to reasons.
+    ``files`` maps each id to its raw files by recorded name, ``standards`` holds those of the calibration;
+    ``unpaired`` and ``refused`` map ids to reasons.
     """
 
     card: Card
@@ -109,6 +116,7 @@ class Source:
     files: Mapping[str, Mapping[str, Path]]
     recipe: Mapping[str, Any] = field(default_factory=lambda: load_recipe(None))
     seed: int = 0
+    standards: Mapping[str, Path] = field(default_factory=dict)
     assumptions: Sequence[str] = ()
     unpaired: Mapping[str, str] = field(default_factory=dict)
     refused: Mapping[str, str] = field(default_factory=dict)
@@ -158,7 +166,7 @@ def make_store(
             recipe=source.recipe,
             seed=source.seed,
             assumptions=source.assumptions,
-            files=files_table(source.files, records, skipped, source.unpaired),
+            files=files_table(source.files, source.standards, records, skipped, source.unpaired),
             build={
                 "started": started.isoformat(),
                 "data_dir": _relative(source.data_dir, out.parent),

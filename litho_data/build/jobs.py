@@ -6,12 +6,13 @@ Jobs travel to other processes and machines, so they hold paths and plain parame
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 
+from litho_data.build.calibration import NO_STANDARDS, Standards, standards_of
 from litho_data.build.operations import OPERATIONS
 from litho_data.build.quality import levelling_figures, noise_figures
 from litho_data.build.step import Done
@@ -66,6 +67,7 @@ class FieldJob:
     scan_name: str
     layout_name: str | None
     seed: int = 0
+    standards: Standards = NO_STANDARDS
 
     @property
     def id(self) -> str:
@@ -78,7 +80,8 @@ class FieldJob:
         described = [one.id, one.print_id, one.order, one.use, one.full_scale_um, dict(one.columns)]
         plan = [described, self.scan_name, self.layout_name, self.recipe, self.seed]
         plan.append(self.card.model_dump(mode="json"))
-        files = [file_sha256(path) for path in (self.field.scan, self.field.layout) if path is not None]
+        own = (self.field.scan, self.field.layout, *self.standards.files.values())
+        files = [file_sha256(path) for path in own if path is not None]
         code = {name: [operation.version, operation.code_sha256] for name, operation in OPERATIONS.items()}
         return record_sha256([*plan, files, code])
 
@@ -99,7 +102,9 @@ class FieldJob:
         steps = list(self._steps())
         arrays = {name: array for done in steps for name, array in done.arrays.items()}
         facts = {done.step.op: done.facts for done in steps}
-        quality: dict[str, Any] = {**facts.get("register", {}), **facts.get("tip", {})}
+        quality: dict[str, Any] = {}
+        for op in ("register", "uncertainty", "tip", "calibrate"):
+            quality |= facts.get(op, {})
         quality |= noise_figures(arrays["raw_height_um"]) | levelling_figures(arrays["removed_um"])
         if "height_um" in arrays:
             quality["valid_fraction"] = float(arrays["valid"].mean())
@@ -113,6 +118,7 @@ class FieldJob:
             "steps": [done.step.to_record() for done in steps],
             "quality": quality,
             "read": facts["read-scan"],
+            "pitch_um": scaled_pitch_um(facts["read-scan"]["pitch_um"], facts.get("calibrate", {})),
             "software": software_record(),
         }
         return Piece(json.loads(json.dumps(record)), arrays)
@@ -125,13 +131,21 @@ class FieldJob:
             yield done
         read = self.read()
         yield read
-        pitch = {"scan_pitch_um": read.facts["pitch_um"]}
+        calibration: dict[str, np.ndarray] = {}
+        pitch_um = read.facts["pitch_um"]
+        if self.standards.described:
+            described = {"standards": [dict(one) for one in self.standards.described]}
+            done = OPERATIONS["calibrate"].run(described, self.standards.files, {})
+            yield done
+            calibration = done.arrays
+            pitch_um = scaled_pitch_um(pitch_um, done.facts)
+        pitch = {"scan_pitch_um": pitch_um}
         pitches = {**pitch, "layout_pitch_um": self.card.layout.pitch_um}
         register_params = {**pitches, "model": self.card.process.registration, "seed": self.seed}
         if read.facts["fast_axis"] == "y":
             register_params["fast_axis"] = "y"  # otherwise the lines are rows
 
-        level_inputs = dict(read.arrays)
+        level_inputs = {**read.arrays, **calibration}
         if any(step["op"] == "layout-aware" for step in self.recipe["step"]):
             if not layout:
                 raise InputError("layout-aware levelling", got="a scan without layout", wanted="a layout")
@@ -152,7 +166,12 @@ class FieldJob:
             found |= touched.arrays
             yield touched
         shape = {"layout_shape": list(layout["mask_level"].shape)}
-        yield OPERATIONS["resample"].run({**pitches, **shape}, {}, {**height, **found})
+        resampled = OPERATIONS["resample"].run({**pitches, **shape}, {}, {**height, **found})
+        yield resampled
+        fit = {name: registered.facts[name] for name in ("blur_um", "model")}
+        at = {**height, "height_um": resampled.arrays["height_um"], **layout, **calibration}
+        lines = {"fast_axis": read.facts["fast_axis"] or "x", "levelled": bool(self.recipe["step"])}
+        yield OPERATIONS["uncertainty"].run({**pitches, **fit, **lines}, {}, at)
 
     def _read_layout(self) -> Done | None:
         """The layout as it was read, None if the field has none; InputError if that fails."""
@@ -174,8 +193,14 @@ class FieldJob:
         }
 
 
+def scaled_pitch_um(pitch_um: Sequence[float], scales: Mapping[str, float]) -> list[float]:
+    """A stated (y, x) pitch times the scales of its axes, if they are known."""
+    return [one * scales.get(f"scale_{axis}", 1.0) for axis, one in zip("yx", pitch_um, strict=True)]
+
+
 def field_jobs(listing: Listing, recipe: Mapping[str, Any], seed: int = 0) -> list[FieldJob]:
     """The jobs of a card, in the order of its ids."""
+    standards = standards_of(listing)
     return [
         FieldJob(
             field=field,
@@ -184,6 +209,7 @@ def field_jobs(listing: Listing, recipe: Mapping[str, Any], seed: int = 0) -> li
             scan_name=listing.relative(field.scan),
             layout_name=listing.relative(field.layout) if field.layout else None,
             seed=seed,
+            standards=standards,
         )
         for field in listing.fields
     ]

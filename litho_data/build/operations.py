@@ -63,6 +63,27 @@ def _read_scan(
     return arrays, facts
 
 
+def _calibrate(
+    params: Mapping[str, Any], files: Sequence[Path], _: Mapping[str, np.ndarray]
+) -> tuple[Arrays, Facts]:
+    """Scales of the microscope, from scans of what has a known size."""
+    from litho_data.build.calibration import SCALES, measure_scales
+
+    found = measure_scales(params["standards"], files)
+    facts: Facts = {}
+    for scale, (factor, uncertainty) in zip(SCALES, found.tolist(), strict=True):
+        facts |= {f"scale_{scale}": factor, f"scale_{scale}_uncertainty": uncertainty}
+    return {"calibration": found}, facts
+
+
+def _z_scale(arrays: Mapping[str, np.ndarray]) -> tuple[float, float]:
+    """Factor of the heights and its relative uncertainty; 1 and 0 without a calibration."""
+    if "calibration" not in arrays:
+        return 1.0, 0.0
+    factor, uncertainty = arrays["calibration"][2].tolist()
+    return factor, uncertainty / factor
+
+
 def _locate(
     params: Mapping[str, Any], _: Sequence[Path], arrays: Mapping[str, np.ndarray]
 ) -> tuple[Arrays, Facts]:
@@ -86,7 +107,7 @@ def _level(
     from litho_data.level import Recipe
 
     levelled = Recipe.from_dict(params["recipe"]).apply(
-        arrays["raw_height_um"].astype(np.float64),
+        arrays["raw_height_um"].astype(np.float64) * _z_scale(arrays)[0],
         pitch_um=tuple(params["scan_pitch_um"]),
         mask=arrays.get("vendor_mask"),
         layout_level=arrays.get("layout_in_scan"),
@@ -169,6 +190,26 @@ def _resample(
     return {"height_um": np.where(valid, height, np.float32(np.nan)), "valid": valid}, {}
 
 
+def _uncertainty(
+    params: Mapping[str, Any], _: Sequence[Path], arrays: Mapping[str, np.ndarray]
+) -> tuple[Arrays, Facts]:
+    from litho_data.build.height_sigma import height_sigma
+
+    sigma_um, budget = height_sigma(
+        arrays["levelled_height_um"],
+        arrays["height_um"],
+        arrays["mask_level"],
+        scan_pitch_um=tuple(params["scan_pitch_um"]),
+        layout_pitch_um=params["layout_pitch_um"],
+        blur_px=params["blur_um"] / params["layout_pitch_um"],
+        model=params["model"],
+        levelled=params["levelled"],
+        fast_axis=params["fast_axis"],
+        z_uncertainty=_z_scale(arrays)[1],
+    )
+    return {"height_sigma_um": sigma_um}, dict(budget)
+
+
 def _stitch_pairs(
     params: Mapping[str, Any], files: Sequence[Path], _: Mapping[str, np.ndarray]
 ) -> tuple[Arrays, Facts]:
@@ -184,11 +225,23 @@ OPERATIONS = {
         Operation(
             "read-scan", "1", _read_scan, ("readers", "scan.py", "foundation/units.py", "build/operations.py")
         ),
+        Operation(
+            "calibrate",
+            "1",
+            _calibrate,
+            ("readers", "roughness", "build/calibration.py", "build/operations.py"),
+        ),
         Operation("locate", "1", _locate, ("register", "level", "build/operations.py")),
         Operation("level", "1", _level, ("level", "build/operations.py")),
         Operation("register", "1", _register, ("register", "build/operations.py")),
         Operation("tip", "1", _tip, ("tip", "register/topography.py", "build/operations.py")),
         Operation("resample", "1", _resample, ("register", "build/operations.py")),
+        Operation(
+            "uncertainty",
+            "1",
+            _uncertainty,
+            ("register", "roughness", "build/height_sigma.py", "build/operations.py"),
+        ),
         Operation("stitch-pairs", "1", _stitch_pairs, ("readers", "build/operations.py")),
     )
 }

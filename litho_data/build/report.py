@@ -46,6 +46,16 @@ _TABLE = {
     "row_step_nm": "row steps [nm]",
     "removed_sd_nm": "removed by levelling, sd [nm]",
 }
+_BUDGET = {
+    "scan": "scan",
+    "sigma_nm": "all",
+    "sigma_pixel_nm": "pixel noise",
+    "sigma_line_nm": "line noise",
+    "sigma_resampling_nm": "resampling",
+    "sigma_registration_nm": "registration",
+    "sigma_levelling_nm": "levelling",
+    "sigma_calibration_nm": "z calibration",
+}
 
 
 def write_report(result: BuildResult, store_path: Path, folder: Path) -> Path:
@@ -106,6 +116,14 @@ def _quality(page: Page, quality: pd.DataFrame) -> None:
     page.table(
         shown, "Registration and noise of every scan; quality.csv has all figures", "summary.csv", digits=3
     )
+    if "sigma_nm" in quality:
+        page.table(
+            quality[list(_BUDGET)].rename(columns=_BUDGET),
+            "What the uncertainty of the heights is made of: root mean square over a scan [nm], its offset "
+            "aside. z calibration is 0 if the card has none: the error of the z scale is then not contained",
+            "uncertainty.csv",
+            digits=2,
+        )
 
 
 def _pictures(page: Page, store: Store) -> None:

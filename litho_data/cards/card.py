@@ -160,6 +160,44 @@ class Ids(Record):
     table: InsidePath | None = None
 
 
+class Standard(Record):
+    """A scan of something whose size is known; how to read it is that of the scans unless stated here."""
+
+    file: InsidePath
+    uncertainty_um: float = Field(ge=0, allow_inf_nan=False)
+    format: Annotated[str, AfterValidator(_known_format)] | None = None
+    unit: Annotated[str, AfterValidator(_known_unit)] | None = None
+    size_um: tuple[Length, Length] | None = None
+    channel: str | None = None
+
+
+class Grating(Standard):
+    """A grating along an axis; a square one serves both."""
+
+    period_um: Length
+
+
+class Step(Standard):
+    """A step, ridge or groove; ``axis`` is the one that its edges lie across."""
+
+    height_um: Length
+    axis: Literal["x", "y"] = "x"
+
+
+class Calibration(Record):
+    """What tells the scales of the microscope: gratings along x and y, a step."""
+
+    x: Grating | None = None
+    y: Grating | None = None
+    z: Step | None = None
+
+    @model_validator(mode="after")
+    def _any(self) -> Self:
+        if self.x is None and self.y is None and self.z is None:
+            raise ValueError("wanted at least one of x, y, z")
+        return self
+
+
 class Write(Record):
     """How the printer wrote a field; what is missing is assumed, and labelled as an assumption."""
 
@@ -193,6 +231,7 @@ class Card(Record):
     ids: Ids = Ids()
     write: Write | None = None
     plan: Planned | None = None
+    calibration: Calibration | None = None
     source: Source | None = None
 
 

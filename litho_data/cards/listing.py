@@ -91,7 +91,7 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
             continue
         print_id = _print_id(scan_id, card)
         scale = _full_scale(scales, scan_id, scans[scan_id])
-        reason = _refusal(scan_id, print_id, use, table, card) or _leads_out(files, folder)
+        reason = _refusal(scan_id, print_id, use, table, card) or leads_out(files, folder)
         if not reason and scales is not None and scale is None:
             reason = f"no full scale in {card.scan.full_scale_file}"
         if reason:
@@ -151,7 +151,7 @@ def _refusal(
     return ""
 
 
-def _leads_out(files: tuple[Path, ...], folder: Path) -> str:
+def leads_out(files: tuple[Path, ...], folder: Path) -> str:
     """Why files that are links cannot be used: what lies outside is not what the card is about."""
     outside = [path for path in files if not path.resolve().is_relative_to(folder)]
     return f"{outside[0].name} is a link that leads out of the data folder" if outside else ""

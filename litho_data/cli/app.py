@@ -94,6 +94,21 @@ def build(
 
 
 @app.command()
+def calibrate(
+    card: Annotated[Path, typer.Argument(help="dataset card (TOML) with a [calibration] table")],
+    data_dir: DataDir = None,
+) -> None:
+    """Measure the card's gratings and step, and show the scales that a build would apply."""
+    from litho_data.build.calibration import calibrate as scales_of
+
+    for axis, scale in scales_of(card, data_dir).items():
+        percent = 100 * (scale.factor - 1)
+        typer.echo(
+            f"{axis}: stated lengths times {scale.factor:.6g} ± {scale.uncertainty:.2g} ({percent:+.3g} %)"
+        )
+
+
+@app.command()
 def verify(store: StorePath, data_dir: DataDir = None) -> None:
     """Hash a store and its raw files again and name everything that has changed since the build."""
     from litho_data.provenance.verify import verify as verify_store

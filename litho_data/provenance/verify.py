@@ -18,10 +18,10 @@ from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256, record_sha256
 from litho_data.provenance.history import raw_folder, read_steps, require_folder, stored_array
-from litho_data.store.access import array_of, decoded, group_of, open_root, read_table, values_of
+from litho_data.store.access import array_of, decoded, group_of, has_child, open_root, read_table, values_of
 from litho_data.store.read import Store, open_store
-from litho_data.store.schema import MIXED_UNITS, SAMPLE_VARIABLES, STORE_SCHEMA, VARIABLES
-from litho_data.store.write import pixel_centres_um
+from litho_data.store.schema import LAYOUT_VARIABLES, MIXED_UNITS, STORE_SCHEMA, VARIABLES
+from litho_data.store.write import PADDING, pixel_centres_um
 
 
 @dataclass(frozen=True)
@@ -199,8 +199,9 @@ def _array(store: Store, scan_id: str, name: str, wanted: str) -> Finding | None
 
 
 def _padding(store: Store) -> Iterator[Finding]:
-    empty = {"mask_level": 0, "height_um": np.nan, "valid": False}
-    for name, fill in empty.items():
+    for name, fill in PADDING.items():
+        if not has_child(store.root, name):
+            continue
         array = array_of(store.root, name)
         for row, scan_id in enumerate(store.ids):
             ny, nx = store.shapes[row]
@@ -217,7 +218,9 @@ def _coordinates(store: Store) -> Iterator[Finding]:
     for name, count in (("y_um", shape[1]), ("x_um", shape[2])):
         if not np.array_equal(values_of(store.root, name), pixel_centres_um(count, store.pitch_um)):
             yield Finding(f"coordinate {name}", "is not at pixel centres")
-    for variable in SAMPLE_VARIABLES:
+    for variable in LAYOUT_VARIABLES:
+        if not has_child(store.root, variable.name):
+            continue
         attributes = array_of(store.root, variable.name).attrs
         if variable.name not in MIXED_UNITS and attributes.get("units") != variable.unit:
             problem = f"is {attributes.get('units')!r}, by the schema {variable.unit!r}"

@@ -12,6 +12,9 @@ from litho_data.register.geometry import index_to_um, warped_grid
 from litho_data.register.topography import fill_gaps
 
 SPLINE_ORDER = 3
+# Sub-pixel positions, and the pixels around one that a spline reaches, for figures of the resampling.
+_PHASES = (np.arange(64) + 0.5) / 64
+_LAGS = np.arange(-128, 129)
 
 
 def resample_to_layout(
@@ -86,24 +89,42 @@ class Resampler:
         return np.where(valid, values, np.nan).astype(np.float32), valid
 
 
-@lru_cache
 def noise_variance_factor(scan_pitch_um: tuple[float, float], layout_pitch_um: float) -> float:
-    """Share of the variance of white pixel noise left by resampling, averaged over sub-pixel positions.
+    """Share of the variance of white pixel noise left by resampling, averaged over sub-pixel positions."""
+    along_y, along_x = (line_variance_factor(pitch_um, layout_pitch_um) for pitch_um in scan_pitch_um)
+    return along_y * along_x
 
-    The squared weights that one output pixel gives to the scan's pixels along an axis, summed, averaged
-    over phases; the product of both axes.
+
+def line_variance_factor(pitch_um: float, layout_pitch_um: float) -> float:
+    """The same along one axis: what is left of offsets of lines that follow each other along it."""
+    return float((_weights(pitch_um, layout_pitch_um) ** 2).sum(axis=1).mean())
+
+
+@lru_cache
+def transfer_error(pitch_um: float, layout_pitch_um: float) -> tuple[np.ndarray, np.ndarray]:
+    """Frequencies (n,), cycles/µm, up to Nyquist's, and the squared error that resampling makes of a wave.
+
+    Relative to the square of its amplitude, averaged over sub-pixel positions; the average over the layout's
+    pixel of a finely sampled scan is no error.
     """
+    frequency = np.linspace(0, 0.5, 129)
+    lags = _LAGS[None, :] + _PHASES[:, None]
+    waves = np.exp(-2j * np.pi * frequency[:, None, None] * lags)
+    passed = (_weights(pitch_um, layout_pitch_um) * waves).sum(axis=-1)
+    averaged = np.exp(-2 * (np.pi * frequency * _average_px(pitch_um, layout_pitch_um)) ** 2)
+    return frequency / pitch_um, (np.abs(passed - averaged[:, None]) ** 2).mean(axis=1)
+
+
+@lru_cache
+def _weights(pitch_um: float, layout_pitch_um: float) -> np.ndarray:
+    """What scan pixels at a distance of lag + phase pixels weigh in one of the layout, (phases, lags)."""
     from scipy.ndimage import map_coordinates
 
     impulse = np.zeros((513, 1))
     impulse[256] = 1.0
-    places = 256 + np.arange(-128, 129)[None, :] + (np.arange(64)[:, None] + 0.5) / 64
-    factor = 1.0
-    for pitch_um in scan_pitch_um:
-        response = _average_over_layout_pixel(impulse, (pitch_um, layout_pitch_um), layout_pitch_um)[:, 0]
-        weights = map_coordinates(response, [places], order=SPLINE_ORDER)
-        factor *= float((weights**2).sum(axis=1).mean())
-    return factor
+    pitches = (pitch_um, layout_pitch_um)
+    response = _average_over_layout_pixel(impulse, pitches, layout_pitch_um)[:, 0]
+    return map_coordinates(response, [256 + _LAGS[None, :] + _PHASES[:, None]], order=SPLINE_ORDER)
 
 
 def _average_over_layout_pixel(
@@ -111,7 +132,12 @@ def _average_over_layout_pixel(
 ) -> np.ndarray:
     from scipy.ndimage import gaussian_filter
 
-    ratios = [layout_pitch_um / pitch for pitch in scan_pitch_um]
-    # A box of r pixels has variance (r² - 1) / 12; below 10 % of difference the pitches count as equal.
-    sigma_px = [np.sqrt((ratio**2 - 1) / 12) if ratio > 1.1 else 0.0 for ratio in ratios]
+    sigma_px = [_average_px(pitch_um, layout_pitch_um) for pitch_um in scan_pitch_um]
     return gaussian_filter(height, sigma_px, mode="nearest") if any(sigma_px) else height
+
+
+def _average_px(pitch_um: float, layout_pitch_um: float) -> float:
+    """Sigma of the Gaussian that averages a scan over the layout's pixel, scan pixels."""
+    # A box of r pixels has variance (r² - 1) / 12; below 10 % of difference the pitches count as equal.
+    ratio = layout_pitch_um / pitch_um
+    return ((ratio**2 - 1) / 12) ** 0.5 if ratio > 1.1 else 0.0

@@ -15,15 +15,16 @@ from litho_data.roughness.areal import (
     high_pass,
     low_pass,
 )
+from litho_data.roughness.grating import Scale, Wave, axis_scales, find_wave
 from litho_data.roughness.levelling_bias import (
     exponential_correlation,
     gaussian_correlation,
     retained_variance,
     retained_variance_by_rows,
 )
-from litho_data.roughness.noise import NoiseSplit, PrintRoughness, print_roughness, split_noise
+from litho_data.roughness.noise import NoiseSplit, PrintRoughness, print_roughness, split_noise, white_noise
 from litho_data.roughness.spectrum import Spectrum, psd_along, psd_radial
-from litho_data.roughness.step_height import StepHeight, groove_depth, stair_steps
+from litho_data.roughness.step_height import StepHeight, find_step, groove_depth, stair_steps
 from litho_data.roughness.texture import LineDirection, LinePeriod, line_direction, line_period
 
 __all__ = [
@@ -33,15 +34,20 @@ __all__ = [
     "LinePeriod",
     "NoiseSplit",
     "PrintRoughness",
+    "Scale",
     "Spectrum",
     "StepHeight",
+    "Wave",
     "amplitude_parameters",
     "areal_parameters",
     "autocorrelation",
+    "axis_scales",
     "correlation_length_um",
     "decay_lengths_um",
     "effective_samples",
     "exponential_correlation",
+    "find_step",
+    "find_wave",
     "gaussian_correlation",
     "groove_depth",
     "high_pass",
@@ -56,4 +62,5 @@ __all__ = [
     "split_noise",
     "sq_uncertainty_nm",
     "stair_steps",
+    "white_noise",
 ]

@@ -11,6 +11,8 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 
 Axis = Literal["x", "y"]
+# Of a rough surface without step the largest change is 4 to 5 times the usual one.
+_EDGE_SIGMA = 9.0
 
 
 class StepHeight(Record):
@@ -138,3 +140,41 @@ def _independent_lines(values: np.ndarray) -> float:
     negative = np.flatnonzero(correlation < 0)
     until = int(negative[0]) if negative.size else correlation.size
     return float(values.size / max(1.0, 1 + 2 * correlation[1:until].sum()))
+
+
+def find_step(height_um: np.ndarray, pitch_um: float, *, axis: Axis = "x") -> StepHeight:
+    """Height of the steps of a step, ridge, groove or row of grooves, wherever its edges are.
+
+    Edges are where the median profile changes by at least half of its largest change, the slope of the field
+    aside; their heights are those of ``stair_steps``, without sign, and averaged. The edges of one scan share
+    their treads, so the uncertainty of the mean is taken as that of one.
+
+    Raises:
+        InputError: no edge stands out of the profile, or edges closer than three pixels.
+    """
+    lines, _ = _profiles(height_um, pitch_um, axis)
+    profile = np.nanmedian(lines, axis=0)
+    width = max(2, profile.size // 50)
+    sums = np.cumsum(np.insert(np.nan_to_num(profile), 0, 0.0))
+    means = (sums[width:] - sums[:-width]) / width
+    change = means[width:] - means[:-width]
+    change = change - np.median(change)
+    largest, usual = np.abs(change).max(), np.median(np.abs(change))
+    if not largest > _EDGE_SIGMA * usual:
+        raise InputError(
+            f"step along {axis}",
+            got="no edge that stands out of the profile",
+            wanted="a scan of a step or groove whose edges lie across this axis",
+        )
+    steep = np.flatnonzero(np.abs(change) > largest / 2)
+    edges = [
+        float(np.average(group + width, weights=np.abs(change[group])) * pitch_um)
+        for group in np.split(steep, np.flatnonzero(np.diff(steep) > 1) + 1)
+    ]
+    steps = stair_steps(height_um, pitch_um, edges_um=edges, axis=axis)
+    return StepHeight(
+        height_nm=float(np.mean([abs(step.height_nm) for step in steps])),
+        line_sd_nm=float(np.mean([step.line_sd_nm for step in steps])),
+        uncertainty_nm=float(np.sqrt(np.mean([step.uncertainty_nm**2 for step in steps]))),
+        lines=min(step.lines for step in steps),
+    )

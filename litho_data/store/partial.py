@@ -21,7 +21,7 @@ import numpy as np
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file, replace_folder, writable
 from litho_data.store.access import group_of, open_root, values_of
-from litho_data.store.schema import SAMPLE_VARIABLES, SCAN_VARIABLES, STORE_SCHEMA, VARIABLES
+from litho_data.store.schema import LAYOUT_VARIABLES, SCAN_VARIABLES, STORE_SCHEMA, VARIABLES
 from litho_data.store.write import write_scan_group
 
 if TYPE_CHECKING:
@@ -96,7 +96,7 @@ class PartialStore:
         """Keep one finished scan; its record is written last."""
         scan_id = piece.record["id"]
         write_scan_group(root, scan_id, piece.arrays, {"use": piece.record["use"]})
-        samples = {v.name: piece.arrays[v.name] for v in SAMPLE_VARIABLES if v.name in piece.arrays}
+        samples = {v.name: piece.arrays[v.name] for v in LAYOUT_VARIABLES if v.name in piece.arrays}
         with atomic_file(self._pieces / f"{scan_id}.npz") as temporary, open(temporary, "wb") as stream:
             np.savez(stream, allow_pickle=False, **samples)
         with atomic_file(self._pieces / f"{scan_id}.json") as temporary:

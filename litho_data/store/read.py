@@ -27,6 +27,7 @@ from litho_data.store.lock_box import lock_box, lock_box_size
 from litho_data.store.schema import (
     OPTIONAL_COLUMNS,
     SAMPLE_VARIABLES,
+    SIGMA,
     VARIABLES,
     DatasetId,
     checked_arrays,
@@ -59,6 +60,8 @@ class PrintedScan:
             ``tip``: number of the tip; None as above.
         bend_um: of a bent scan; ``scan_to_layout`` then acts on the straightened positions.
         tip_radius_um: of the microscope's tip, or the most that it can be; None if the store does not say.
+        height_sigma_um: float32 (ny, nx), µm, standard uncertainty of ``height_um``, the scan's offset aside;
+            NaN where not valid, None if the store has none.
     """
 
     id: str
@@ -80,6 +83,7 @@ class PrintedScan:
     tip: float | None = None
     bend_um: Bend | None = None
     tip_radius_um: float | None = None
+    height_sigma_um: np.ndarray | None = None
 
     @property
     def quarter_turns(self) -> int:
@@ -163,6 +167,7 @@ class Store:
             **{name: self._column(name, row) for name in ("dose", "turned_deg", "direction", "tip")},
             bend_um=self._bend_um(row),
             tip_radius_um=self._tip_radius_um(row),
+            height_sigma_um=self.sample(SIGMA.name, row) if SIGMA.name in self._arrays else None,
         )
 
     def scans(self) -> list[PrintedScan]:

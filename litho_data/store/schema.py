@@ -55,6 +55,11 @@ SAMPLE_VARIABLES = (
     Variable("scan_to_layout", ("scan", "row", "column"), "float64", "1",
              "maps (x_um, y_um, 1) of the scan frame to the layout frame"),
 )  # fmt: skip
+SIGMA = Variable("height_sigma_um", ("scan", "y", "x"), "float32", "um",
+                 "standard uncertainty of height_um, its offset aside")  # fmt: skip
+"""Not in stores made before 0.1.0 or from 8-bit pairs, and no part of the dataset's hash."""
+LAYOUT_VARIABLES = (*SAMPLE_VARIABLES, SIGMA)
+"""The arrays over all scans on the layouts' grid."""
 SCAN_VARIABLES = (
     Variable("raw_height_um", ("y", "x"), "float32", "um", "height as read from the raw file, scan frame"),
     Variable("levelled_height_um", ("y", "x"), "float32", "um", "height after levelling, scan frame"),
@@ -69,11 +74,13 @@ SCAN_VARIABLES = (
              "shows something else than the print, layout grid; not valid there; only where there is any"),
     Variable("tip_certain", ("y", "x"), "bool", "1",
              "touched by the tip for certain, scan frame; only where a tip is given; elsewhere not valid"),
+    Variable("calibration", ("scale", "figure"), "float64", "1",
+             "scales along y, x and of heights: factor, its standard uncertainty; only if calibrated"),
     Variable("vendor_mask", ("y", "x"), "bool", "1", "mask kept in the raw file; only where there is one"),
 )  # fmt: skip
 # No unit for the whole of it; in hashes it counts as 1.
 MIXED_UNITS = {"scan_to_layout": "units of its rows: 1, 1, um; 1, 1, um; um-1, um-1, 1"}
-VARIABLES = {variable.name: variable for variable in (*SAMPLE_VARIABLES, *SCAN_VARIABLES)}
+VARIABLES = {variable.name: variable for variable in (*LAYOUT_VARIABLES, *SCAN_VARIABLES)}
 OPTIONAL_COLUMNS = ("field_x_um", "field_y_um", "dose", "turned_deg", "direction", "tip")
 """Numbers per scan from the card's table; coordinates where the card has them, NaN where a row has not."""
 
@@ -113,8 +120,12 @@ def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array]:
     """The arrays over all scans by name; InputError where one is missing or of another shape or type."""
     names = (*(variable.name for variable in SAMPLE_VARIABLES), "scan", "print", "order")
     arrays = {name: array_of(root, name) for name in names}
+    if has_child(root, SIGMA.name):
+        arrays[SIGMA.name] = array_of(root, SIGMA.name)
     count, field = arrays["scan"].shape[0], arrays["mask_level"].shape[1:]
-    for variable in SAMPLE_VARIABLES:
+    for variable in LAYOUT_VARIABLES:
+        if variable.name not in arrays:
+            continue
         array = arrays[variable.name]
         wanted = (count, 3, 3) if variable.name == "scan_to_layout" else (count, *field)
         if array.shape != wanted or array.dtype != np.dtype(variable.dtype):

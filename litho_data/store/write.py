@@ -8,7 +8,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from litho_data.store.schema import MIXED_UNITS, OPTIONAL_COLUMNS, SAMPLE_VARIABLES, SCAN_VARIABLES, VARIABLES
+from litho_data.store.schema import (
+    LAYOUT_VARIABLES,
+    MIXED_UNITS,
+    OPTIONAL_COLUMNS,
+    SAMPLE_VARIABLES,
+    SCAN_VARIABLES,
+    SIGMA,
+    VARIABLES,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -16,6 +24,8 @@ if TYPE_CHECKING:
 
 _SHARD_BYTES = 16 << 20
 _MAX_SCANS_PER_SHARD = 16
+PADDING = {"mask_level": 0, "height_um": np.nan, "valid": False, "height_sigma_um": np.nan}
+"""What fills the place beyond a layout that is smaller than the largest."""
 _OWN_FRAME = {"y": "scan_y", "x": "scan_x"}
 # Attributes of the CF conventions beyond unit and name.
 _CF: dict[str, dict[str, Any]] = {
@@ -45,21 +55,25 @@ def write_samples(
 
     Args:
         root: an open group.
-        scans: per scan ``id``, ``print``, ``order``, ``shape`` (ny, nx), ``columns`` (optional numbers).
+        scans: per scan ``id``, ``print``, ``order``, ``shape`` (ny, nx), ``columns`` (optional numbers) and
+            ``arrays`` (names of what was made of it).
         load: the sample arrays of an id.
         pitch_um: pitch of the layout grid, µm.
     """
     ny, nx = (max(scan["shape"][axis] for scan in scans) for axis in (0, 1))
     group_size = int(np.clip(_SHARD_BYTES // (ny * nx * 4), 1, _MAX_SCANS_PER_SHARD))
     field_shape = {"y": ny, "x": nx, "row": 3, "column": 3}
+    with_sigma = all(SIGMA.name in scan["arrays"] for scan in scans)
     arrays = {}
-    for variable in SAMPLE_VARIABLES:
+    for variable in LAYOUT_VARIABLES if with_sigma else SAMPLE_VARIABLES:
         sample = tuple(field_shape[dim] for dim in variable.sample_dims)
         shape, shards = (len(scans), *sample), (min(group_size, len(scans)), *sample)
         arrays[variable.name] = _create(root, variable.name, shape, chunks=(1, *sample), shards=shards)
+    if with_sigma:
+        arrays["height_um"].attrs["ancillary_variables"] = f"valid {SIGMA.name}"
     for start in range(0, len(scans), group_size):
         rows = scans[start : start + group_size]
-        for name, block in _padded_blocks(rows, load, ny, nx).items():
+        for name, block in _padded_blocks(list(arrays), rows, load, ny, nx).items():
             arrays[name][start : start + len(rows)] = block
 
     write_strings(root, "scan", [scan["id"] for scan in scans], "scan")
@@ -168,9 +182,13 @@ def _compressors() -> list[Any]:
 
 
 def _padded_blocks(
-    scans: Sequence[Mapping[str, Any]], load: Callable[[str], Mapping[str, np.ndarray]], ny: int, nx: int
+    names: Sequence[str],
+    scans: Sequence[Mapping[str, Any]],
+    load: Callable[[str], Mapping[str, np.ndarray]],
+    ny: int,
+    nx: int,
 ) -> dict[str, np.ndarray]:
-    padding = {"mask_level": 0, "height_um": np.nan, "valid": False}
+    padding = {name: PADDING[name] for name in names if name in PADDING}
     blocks = {
         name: np.full((len(scans), ny, nx), fill, dtype=VARIABLES[name].dtype)
         for name, fill in padding.items()

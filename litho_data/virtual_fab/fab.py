@@ -35,7 +35,7 @@ class FabScan:
         frame: where the scan lies on the layout.
         height_um: what the microscope reports, float64 (ny, nx) of the scan.
         noiseless_um: the same without default noise.
-        clean_um: the print without noise on the layout grid, µm.
+        clean_um: the print without noise on the layout grid, µm; ``surface_um``: with its roughness.
     """
 
     job: Job
@@ -43,6 +43,7 @@ class FabScan:
     height_um: np.ndarray
     noiseless_um: np.ndarray
     clean_um: np.ndarray
+    surface_um: np.ndarray
 
 
 def scan_job(fab: Fab, job: Job) -> FabScan:
@@ -72,6 +73,7 @@ def scan_job(fab: Fab, job: Job) -> FabScan:
         height_um=scan(surface + rough, fab.noise),
         noiseless_um=scan(surface, Noise.off()),
         clean_um=cut_layout(surface),
+        surface_um=cut_layout(surface + rough),
     )
 
 

@@ -50,8 +50,8 @@ def simulate(
     """Print and scan a set of fields; returns the path of the card, ``out/raw/card.toml``.
 
     ``out/raw`` is what a laboratory would deliver: card, table, layouts, scans. ``out/truth`` holds what
-    only a simulation knows: `truth.json` and the clean prints. Scans are made one at a time, so memory
-    does not grow with their number, and no scan depends on that number.
+    only a simulation knows: `truth.json`, the clean prints and the rough ones. Scans are made one at a
+    time, so memory does not grow with their number, and no scan depends on that number.
 
     Args:
         count: number of scans with random layouts.
@@ -104,7 +104,7 @@ def simulate(
     require_replaceable_folder(out, "raw", "truth")
     with atomic_folder(out) as folder:
         raw, hidden = folder / "raw", folder / "truth"
-        for part in (raw / "scans", hidden / "prints"):
+        for part in (raw / "scans", hidden / "prints", hidden / "surfaces"):
             part.mkdir(parents=True)
         rows: list[tuple[object, ...]] = []
         scans: list[ScanTruth] = []
@@ -114,6 +114,7 @@ def simulate(
             write_layout(raw, job.id, job.level)
             write_text_matrix(raw / "scans" / f"{job.id}.txt", scan.height_um)
             np.save(hidden / "prints" / f"{job.id}.npy", scan.clean_um.astype(np.float32))
+            np.save(hidden / "surfaces" / f"{job.id}.npy", scan.surface_um.astype(np.float32))
             size_um = scan.frame.size_um
             write_field_um = job.write_field_um
             rows.append(_row(job, len(rows)))

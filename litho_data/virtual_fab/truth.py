@@ -54,7 +54,10 @@ class ScanTruth(Record):
 
 
 class Truth(Result):
-    """`truth.json`; the clean print of each scan lies beside it as ``prints/<id>.npy`` (µm, layout grid)."""
+    """`truth.json`; each print lies beside it, clean as ``prints/<id>.npy``, rough as ``surfaces/<id>.npy``.
+
+    Both are heights in µm on the layout grid.
+    """
 
     SCHEMA: ClassVar[str] = "litho-data/virtual-fab/1"
     FILE_NAME: ClassVar[str] = "truth.json"

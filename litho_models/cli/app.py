@@ -52,6 +52,12 @@ PrecisionOption = Annotated[
     Literal["bf16-mixed", "32-true"] | None,
     typer.Option(help="of the products within networks in training; the recipe's by default"),
 ]
+WeightsOption = Annotated[
+    Literal["uniform", "sigma"],
+    typer.Option(
+        help="what pixels count for in fits: alike, or by 1 / σ of the height; errors count all alike"
+    ),
+]
 Seed = Annotated[int, typer.Option(min=0, help="seed of weights, crops and splits")]
 
 
@@ -70,6 +76,7 @@ def train(
     variant: VariantOption = "default",
     steps: Steps = None,
     precision: PrecisionOption = None,
+    weights: WeightsOption = "uniform",
     seed: Seed = 0,
     use_lock_box: Annotated[
         bool,
@@ -79,7 +86,7 @@ def train(
     """Train a model on all scans but the locked ones; resumable."""
     from litho_models.frozen.readme import bounds_text
 
-    settings = {"seed": seed, **_given(steps=steps, precision=precision)}
+    settings = {"seed": seed, "weights": weights, **_given(steps=steps, precision=precision)}
     run = litho_models.train(
         store, model, out, recipe=recipe, variant=variant, settings=settings, use_lock_box=use_lock_box
     )
@@ -141,6 +148,7 @@ def benchmark(
     variant: VariantOption = "default",
     steps: Steps = None,
     precision: PrecisionOption = None,
+    weights: WeightsOption = "uniform",
     folds: Annotated[int, typer.Option(min=2, help="folds of the grouped split")] = 5,
     policy: PolicyOption = "offset",
     background: BackgroundOption = "training",
@@ -159,7 +167,7 @@ def benchmark(
     from litho_models.evaluation.tables import headline_table
     from litho_models.scoring.statistics import FEWEST_FOR_INTERVAL
 
-    settings = {"recipe": recipe, "variant": variant}
+    settings = {"recipe": recipe, "variant": variant, "weights": weights}
     settings |= _given(steps=steps, precision=precision, seed=training_seed)
     result = litho_models.benchmark(
         store,

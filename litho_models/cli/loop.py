@@ -53,6 +53,12 @@ def close_loop(
         Literal["squares", "absolute"],
         typer.Option("--loss", help="what fits minimise: squares, or absolute errors as in a benchmark"),
     ] = "squares",
+    weights: Annotated[
+        Literal["uniform", "sigma"],
+        typer.Option(
+            "--weights", help="what pixels count for in fits: alike, or by 1 / σ; all else counts them alike"
+        ),
+    ] = "uniform",
     background: Annotated[
         Literal["none", "training"],
         typer.Option("--background", help="training: report errors with the background of a benchmark"),
@@ -75,6 +81,7 @@ def close_loop(
         folds=folds,
         seed=seed,
         loss=loss,
+        weights=weights,
         background=background,
         nested=nested,
         open_lock_box=open_lock_box,

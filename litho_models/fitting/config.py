@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from typing import Any, Literal, Self, get_args
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
 from litho_data.foundation.errors import InputError
+from litho_models.fitting.pixel_weights import Weights
 from litho_models.scan_terms import Policy
 from litho_models.simulator import Simulator, Variant, is_small
 
@@ -15,7 +16,7 @@ RECIPES: tuple[str, ...] = get_args(Recipe)
 PAPER_EPOCHS, PAPER_CROPS, PAPER_BATCH = 4000, 72, 4
 FAST_STEPS = {"pbl": 2000, "fno": 1000}
 # What a fit by least squares depends on.
-LEAST_SQUARES_FIELDS = {"recipe", "variant", "seed", "nuisance", "free_gain"}
+LEAST_SQUARES_FIELDS = {"recipe", "variant", "seed", "nuisance", "free_gain", "weights"}
 PAPER_LEARNING_RATE = {"pbl": 5e-4, "fno": 1e-4, "physics": 1e-2}
 
 
@@ -51,8 +52,17 @@ class TrainingConfig(BaseModel):
     free_gain: bool = Field(
         False, description="a gain per scan among the nuisances, where the policy has one"
     )
+    weights: Weights = Field("uniform", description="what pixels count for: alike, or by 1 / σ of the height")
     validation_scans: int = Field(2, ge=0, description="training scans that only choose the checkpoint")
     precision: Literal["bf16-mixed", "32-true"] = "32-true"
+
+    @model_serializer(mode="wrap")
+    def _record(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Uniform weights go unsaid: what was recorded and kept before there were others stays the same."""
+        record: dict[str, Any] = write(self)
+        if record.get("weights") == "uniform":
+            del record["weights"]
+        return record
 
     @classmethod
     def of_recipe(cls, recipe: Recipe, model_name: str, **settings: Any) -> Self:

@@ -18,6 +18,7 @@ from litho_data.foundation.hashes import array_sha256
 from litho_data.store import PrintedScan
 from litho_models.fitting.checkpoint import CheckpointFolder, RoundRecord
 from litho_models.fitting.config import TrainingConfig
+from litho_models.fitting.pixel_weights import pixel_weights
 from litho_models.fitting.ridge import fit_ridge
 from litho_models.fitting.small_models import fit_small_model
 from litho_models.fitting.stochastic import train_network
@@ -88,9 +89,9 @@ def fit_with_record(
             model, training, validation, config, lambda: _first_predictions(training, config), folder
         )
     elif isinstance(model, Features):
-        fit_ridge(model, scans, config.nuisance, config.free_gain)
+        fit_ridge(model, scans, config.nuisance, config.free_gain, config.weights)
     else:
-        fit_small_model(model, scans, config.nuisance, config.free_gain)
+        fit_small_model(model, scans, config.nuisance, config.free_gain, config.weights)
     return Fitted(
         model=model.eval(),
         training_ids=[scan_id for scan_id in ids if scan_id not in validation_ids],
@@ -117,7 +118,7 @@ def _first_predictions(scans: Sequence[PrintedScan], config: TrainingConfig) -> 
     """Heights of a small model fitted to the scans, from which a network's first scan terms come."""
     small = build_model(FIRST_MODEL, **common_geometry(scans))
     if config.nuisance != "none":
-        fit_small_model(small, scans, config.nuisance, config.free_gain)
+        fit_small_model(small, scans, config.nuisance, config.free_gain, config.weights)
     return [predict_scan(small, scan) for scan in scans]
 
 
@@ -132,6 +133,9 @@ def run_key(
         "training": config.model_dump(mode="json"),
         "scans": scans_sha256(scans),
     }
+    if config.weights == "sigma":
+        weights = {scan.id: pixel_weights(scan, "sigma") for scan in scans}
+        record["weights"] = {key: array_sha256(own, "1", ("y", "x")) for key, own in weights.items()}
     return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 

@@ -10,6 +10,7 @@ import torch
 from litho_data.foundation.commands import progress
 from litho_data.store import PrintedScan
 from litho_models.fitting.least_squares import ABSOLUTE_WIDTH_UM, Linearised, eliminated, orthonormal
+from litho_models.fitting.pixel_weights import Weights, pixel_weights
 from litho_models.layers.gaussian import pad_field
 from litho_models.models.features import Features, RandomFeatures
 from litho_models.scan_terms import FloatMap, Policy, TermPixels, Terms, least_squares, line_terms, term_maps
@@ -31,13 +32,18 @@ _TERM_WEIGHT = 1e-3
 
 
 def fit_ridge(
-    model: Features, scans: Sequence[PrintedScan], policy: Policy, free_gain: bool = False
+    model: Features,
+    scans: Sequence[PrintedScan],
+    policy: Policy,
+    free_gain: bool = False,
+    weights: Weights = "uniform",
 ) -> list[float]:
     """Fit the weights of ``model`` in place to the mean absolute error.
 
     Args:
         model: the model; ``scans``: what it is fitted to.
         policy: what each scan may add by itself; offsets of lines are left out, as they average out.
+        weights: what pixels count for.
 
     Returns:
         mean absolute residual before the last pass, µm, the terms of the scans taken out.
@@ -46,7 +52,7 @@ def fit_ridge(
     terms -= {term.name for term in line_terms(terms)}
     if isinstance(model, RandomFeatures):
         _standardise(model, scans)
-    weights: FloatMap | None = None
+    solved: FloatMap | None = None
     losses: list[float] = []
     kept: dict[int, tuple[FloatMap, FloatMap, FloatMap]] = {}
     keeps = 8 * FITTED_PX * model.parameter_count * len(scans) <= KEPT_BYTES
@@ -54,13 +60,13 @@ def fit_ridge(
         size = model.parameter_count
         matrix, right, errors = np.zeros((size, size)), np.zeros(size), []
         for number, scan in enumerate(progress(scans, f"fitting {model.name}")):
-            rows = kept.get(number) or _rows(model, scan, terms)
+            rows = kept.get(number) or _rows(model, scan, terms, weights)
             if keeps:
                 kept[number] = rows
             design, height, basis = rows
             certainty = np.ones_like(height)
-            if weights is not None:
-                rest = height - weights @ design
+            if solved is not None:
+                rest = height - solved @ design
                 rest -= least_squares(basis, rest) @ basis if len(basis) else 0.0
                 errors.append(np.abs(rest).mean())
                 certainty = 1 / np.sqrt(rest**2 + ABSOLUTE_WIDTH_UM**2)
@@ -68,10 +74,10 @@ def fit_ridge(
             own = Linearised(height * root, design * root, orthonormal((basis * root).T).T)
             normal, moment, _ = eliminated(own, _TERM_WEIGHT)
             matrix, right = matrix + normal, right + moment
-        weights = _ridge(matrix, right)
+        solved = _ridge(matrix, right)
         losses += [float(np.mean(errors))] if errors else []
     with torch.no_grad():
-        model.weights.copy_(torch.as_tensor(weights))
+        model.weights.copy_(torch.as_tensor(solved))
     return losses
 
 
@@ -80,11 +86,15 @@ def _ridge(matrix: FloatMap, right: FloatMap) -> FloatMap:
     return np.linalg.solve(matrix / np.outer(size, size) + RIDGE * np.eye(len(size)), right / size) / size
 
 
-def _rows(model: Features, scan: PrintedScan, terms: Terms) -> tuple[FloatMap, FloatMap, FloatMap]:
-    """Features (k, n), measured height (n,) µm and the scan's own terms (m, n) at the fitted pixels."""
+def _rows(
+    model: Features, scan: PrintedScan, terms: Terms, weights: Weights
+) -> tuple[FloatMap, FloatMap, FloatMap]:
+    """Features (k, n), measured height (n,) µm and the scan's own terms (m, n), fitted pixels, weighted."""
     at = _fitted_pixels(scan)
     height = scan.height_um.reshape(-1)[at].astype(np.float64)
-    return feature_rows(model, scan, at), height, term_maps(TermPixels(scan.layout_um, at=at), terms)
+    own = pixel_weights(scan, weights).reshape(-1)[at].astype(np.float64)
+    basis = term_maps(TermPixels(scan.layout_um, at=at), terms)
+    return own * feature_rows(model, scan, at), own * height, own * basis
 
 
 def feature_rows(model: Features, scan: PrintedScan, at: np.ndarray) -> FloatMap:

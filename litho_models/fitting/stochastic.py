@@ -24,6 +24,7 @@ from litho_data.store import PrintedScan
 from litho_models.fitting.checkpoint import CheckpointFolder, RoundRecord, TrainingState
 from litho_models.fitting.config import TrainingConfig
 from litho_models.fitting.crops import Window, in_passes, plan_batch, stack
+from litho_models.fitting.pixel_weights import Weights, pixel_weights
 from litho_models.layers.precision import Precision, network_precision, warn_where_slower
 from litho_models.prediction.tiles import blending_window, predict_scan
 from litho_models.scan_terms.training import estimate_scan_terms, training_terms
@@ -70,7 +71,7 @@ def train_network(
         predictions = [predict_scan(model, scan) for scan in training] if first else first_predictions_um()
         terms = training_terms(config.nuisance, config.free_gain)
         added = estimate_scan_terms(training, predictions, terms)
-        targets = _Targets(training, added, _overhang_px(model, training, config))
+        targets = _Targets(training, added, _overhang_px(model, training, config), config.weights)
         losses = []
         for step in progress(range(first, last), f"training {model.name} to step {config.steps}"):
             losses.append(_step(fabric, module, optimiser, targets, config, step))
@@ -95,11 +96,17 @@ class _Targets:
     Around each scan the outermost pixels of its layout continue for ``overhang_px``, without weight.
     """
 
-    def __init__(self, scans: Sequence[PrintedScan], added_um: Sequence[np.ndarray], overhang_px: int):
+    def __init__(
+        self,
+        scans: Sequence[PrintedScan],
+        added_um: Sequence[np.ndarray],
+        overhang_px: int,
+        weights: Weights,
+    ):
         self.layouts_um = [np.pad(scan.layout_um, overhang_px, mode="edge") for scan in scans]
         self.shapes = [layout.shape for layout in self.layouts_um]
         usable = [scan.valid & np.isfinite(scan.height_um) for scan in scans]
-        self.weights = [np.pad(mask.astype(np.float32), overhang_px) for mask in usable]
+        self.weights = [np.pad(pixel_weights(scan, weights), overhang_px) for scan in scans]
         heights = [
             np.where(mask, scan.height_um - added, 0).astype(np.float32)
             for scan, added, mask in zip(scans, added_um, usable, strict=True)

@@ -82,7 +82,7 @@ def close_loop(
             wanted="at least 2",
         )
     fold_of = deal(development, config.folds, config.seed)
-    study = Study(development, fold_of, config.seed, config.loss, report=report)
+    study = Study(development, fold_of, config.seed, config.loss, config.weights, report=report)
     choice = choose(study, base, trainer)
     final, search = choice.final, choice.search
     terms = DATUM_FREE | names_to_terms(passed(choice.first_tests))

@@ -11,6 +11,7 @@ from pydantic import Field as Setting
 
 from litho_models.effects.chain import EffectChain
 from litho_models.fitting.least_squares import Loss
+from litho_models.fitting.pixel_weights import Weights
 from litho_models.loop.choice import Choice
 from litho_models.loop.equal_terms import BeforeAfter, TermSet
 from litho_models.loop.explainable import Rest
@@ -35,6 +36,7 @@ class LoopConfig(BaseModel):
     folds: int = Setting(6, ge=2, description="outer folds by scan")
     seed: int = Setting(0, ge=0, description="folds, calibration blocks, bootstrap")
     loss: Loss = Setting("squares", description="what fits minimise; absolute, as in a benchmark")
+    weights: Weights = Setting("uniform", description="what pixels count for in fits")
     background: BackgroundUse = Setting(
         "none", description="training: reported errors with the background that a benchmark learns"
     )

@@ -19,6 +19,7 @@ from litho_models.effects.chain import EffectChain
 from litho_models.fitting.least_squares import (
     Linearised,
     Loss,
+    Problem,
     Room,
     Rules,
     eliminated,
@@ -28,6 +29,7 @@ from litho_models.fitting.least_squares import (
     solve_damped,
     weighted_squares,
 )
+from litho_models.fitting.pixel_weights import Weighted, Weights, pixel_weights
 from litho_models.fitting.small_models import RULES as ZOO_RULES
 from litho_models.fitting.small_models import fit_small_model
 from litho_models.loop.parameters import (
@@ -82,7 +84,11 @@ class FoldFits:
 
 
 def fit_folds(
-    chain: EffectChain, scans: Sequence[PreparedScan], fold_of: np.ndarray, loss: Loss = "squares"
+    chain: EffectChain,
+    scans: Sequence[PreparedScan],
+    fold_of: np.ndarray,
+    loss: Loss = "squares",
+    weights: Weights = "uniform",
 ) -> FoldFits:
     """Fit on all scans, then without each fold in turn.
 
@@ -93,13 +99,14 @@ def fit_folds(
     Args:
         chain: base and effects at their starting values.
         scans: development scans; ``fold_of``: (len(scans),) fold that holds each out.
+        weights: what pixels count for in the fits; what is derived from them later counts all alike.
     """
     windows = [scan.window for scan in scans]
     training = [np.flatnonzero(fold_of != fold).tolist() for fold in range(int(fold_of.max()) + 1)]
     if loss == "absolute":
-        common = _fit_absolute(chain, scans)
+        common = _fit_absolute(chain, scans, weights)
         linear = ChainProblem(chain, windows).linearise(common)
-        per_fold = np.stack([_fit_absolute(chain, [scans[i] for i in own]) for own in training])
+        per_fold = np.stack([_fit_absolute(chain, [scans[i] for i in own], weights) for own in training])
         errors = np.array(
             [
                 weighted_squares(
@@ -113,14 +120,18 @@ def fit_folds(
     else:
         start = get_vector(chain)
         if len(windows) > 2 * _START_EVERY:
-            start = fit_least_squares(ChainProblem(chain, windows[::_START_EVERY]), start, RULES[loss]).vector
-        fitted = fit_least_squares(ChainProblem(chain, windows), start, RULES[loss])
+            start = fit_least_squares(
+                _problem(chain, windows[::_START_EVERY], weights), start, RULES[loss]
+            ).vector
+        fitted = fit_least_squares(_problem(chain, windows, weights), start, RULES[loss])
         common, linear = fitted.vector, fitted.linear
         own_fits = [
-            _fit_without(chain, common, [linear[i] for i in own], [windows[i] for i in own])
+            _fit_without(chain, common, [linear[i] for i in own], [windows[i] for i in own], weights)
             for own in training
         ]
         per_fold, errors = np.stack([v for v, _ in own_fits]), np.array([error for _, error in own_fits])
+        if weights != "uniform":
+            linear = ChainProblem(chain, windows).linearise(common)
     free = within_bounds(chain, common)
     linear = [replace(part, jacobian=part.jacobian * free[:, None]) for part in linear]
     return FoldFits(chain_at(chain, common), common, per_fold, errors, _robust_covariance(linear), linear)
@@ -205,23 +216,37 @@ def _with_height_effects(chain: EffectChain, base_height: Tensor, scan: Prepared
         return chain.after_base(base_height, scan.context)[0, 0].numpy()
 
 
-def _fit_absolute(chain: EffectChain, scans: Sequence[PreparedScan]) -> np.ndarray:
+def _problem(
+    chain: EffectChain, windows: Sequence[PreparedScan], weights: Weights, loss: Loss = "squares"
+) -> Problem:
+    """A chain on windows of scans, their pixels weighted."""
+    problem = ChainProblem(chain, windows, loss)
+    if weights == "uniform":
+        return problem
+    return Weighted(problem, [one.at_sample(pixel_weights(one.stored, weights)) for one in windows], loss)
+
+
+def _fit_absolute(chain: EffectChain, scans: Sequence[PreparedScan], weights: Weights) -> np.ndarray:
     """A base without effects is fitted as any small model of the zoo."""
     if chain.names or not isinstance(chain.base, Simulator) or not is_small(chain.base):
-        problem = ChainProblem(chain, [scan.window for scan in scans], "absolute")
+        problem = _problem(chain, [scan.window for scan in scans], weights, "absolute")
         return fit_least_squares(problem, get_vector(chain), RULES["absolute"]).vector
     fitted = copy.deepcopy(chain)
     assert isinstance(fitted.base, Simulator)
-    fit_small_model(fitted.base, [scan.stored for scan in scans], "full+rows")
+    fit_small_model(fitted.base, [scan.stored for scan in scans], "full+rows", weights=weights)
     return get_vector(fitted)
 
 
 def _fit_without(
-    chain: EffectChain, common: np.ndarray, linear: Sequence[Linearised], scans: Sequence[PreparedScan]
+    chain: EffectChain,
+    common: np.ndarray,
+    linear: Sequence[Linearised],
+    scans: Sequence[PreparedScan],
+    weights: Weights,
 ) -> tuple[np.ndarray, float]:
     """Fit on some of the scans, and their weighted sum of squares; cheap steps with the common derivatives,
     full ones where those fail."""
-    problem = ChainProblem(chain, scans)
+    problem = _problem(chain, scans, weights)
     normal, right, start = eliminated_sum(linear, TERM_WEIGHT)
     if not len(common):
         return common, start

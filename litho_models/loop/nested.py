@@ -161,6 +161,8 @@ def _key(inner: Study, base: nn.Module, scans: Sequence[PreparedScan], study: St
         "held out": scans_sha256([scan.stored for scan in scans]),
         "settings": [inner.fold_of.tolist(), study.seed, study.loss, study.background],
     }
+    if study.weights != "uniform":
+        record["weights"] = study.weights
     return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 

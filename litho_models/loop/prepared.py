@@ -121,11 +121,13 @@ def _with_quadrant(scan: PreparedScan, number: int) -> PreparedScan:
     own = np.zeros_like(scan.usable)
     own[row_start : row_start + ny // 2, column_start : column_start + nx // 2] = True
     usable = (own & scan.usable & _inner((ny, nx)))[cut]
+    sigma_um = scan.stored.height_sigma_um
     part = replace(
         scan.stored,
         mask_level=scan.stored.mask_level[cut],
         height_um=scan.stored.height_um[cut],
         valid=usable,
+        height_sigma_um=None if sigma_um is None else sigma_um[cut],
     )
     pitch = scan.stored.pitch_um
     centre = tuple(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -162,8 +163,9 @@ def _rounding_um(store: Store, scans: Sequence[PrintedScan]) -> dict[str, float]
 def _trainer(base: str, config: LoopConfig | None, steps: int | None, cache: Path) -> Trainer:
     from litho_models.fitting import TrainingConfig, fit_in_cache
 
-    given = {} if steps is None else {"steps": steps}
-    settings = TrainingConfig.of_recipe("fast", base, seed=config.seed if config else 0, **given)
+    given: dict[str, Any] = {} if steps is None else {"steps": steps}
+    given |= {"seed": config.seed, "weights": config.weights} if config else {"seed": 0}
+    settings = TrainingConfig.of_recipe("fast", base, **given)
     return lambda scans: fit_in_cache(base, scans, settings, cache).model
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects.chain import EffectChain
 from litho_models.fitting.least_squares import Loss
+from litho_models.fitting.pixel_weights import Weights
 from litho_models.loop.fold_fits import FoldFits, fit_folds, predict
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.selection.confirming import Confirmation, confirm
@@ -57,7 +58,7 @@ class Study:
         scans: development scans.
         fold_of: (scans,) number of the fold that holds each out.
         seed: of blocks, bootstrap and permutations.
-        loss: what fits minimise.
+        loss: what fits minimise; ``weights``: what pixels count for there, and nowhere else.
         floor_nm2: squared noise floor or its lower bound, nm².
         background: ``training``: to each prediction is added what the training scans of its fold have in
             common beside their prints, as in a benchmark. The search goes without.
@@ -68,6 +69,7 @@ class Study:
     fold_of: np.ndarray
     seed: int = 0
     loss: Loss = "squares"
+    weights: Weights = "uniform"
     floor_nm2: float = 0.0
     background: BackgroundUse = "none"
     report: Callable[[str], None] = _silent
@@ -160,7 +162,7 @@ class State:
 
 def fit_state(chain: EffectChain, study: Study) -> State:
     """Fit the chain per fold and predict every scan with the fit that has not seen it."""
-    fits = fit_folds(chain, study.scans, study.fold_of, study.loss)
+    fits = fit_folds(chain, study.scans, study.fold_of, study.loss, study.weights)
     held_out = zip(study.scans, study.fold_of, strict=True)
     return State(fits, [predict(fits.chain, fits.per_fold[fold], scan) for scan, fold in held_out])
 

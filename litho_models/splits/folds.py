@@ -172,4 +172,5 @@ def _quadrant(scan: PrintedScan, crop: Crop) -> PrintedScan:
         mask_level=scan.mask_level[area],
         height_um=scan.height_um[area],
         valid=scan.valid[area],
+        height_sigma_um=None if scan.height_sigma_um is None else scan.height_sigma_um[area],
     )

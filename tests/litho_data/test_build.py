@@ -242,7 +242,7 @@ def test_layout_aware_levelling_knows_where_the_layout_lies(tmp_path: Path) -> N
     # The margin has no layout and the response is piecewise linear: 5 % of the tilt is left to them.
     np.testing.assert_allclose(np.polyfit(np.arange(128), removed.mean(axis=0), 1)[0] * 128, 0.3, rtol=0.05)
     steps = [step.op for _, step in read_steps(open_store(tmp_path / "prints.zarr"))["P11"]]
-    assert steps == ["read-layout", "read-scan", "locate", "level", "register", "resample"]
+    assert steps == ["read-layout", "read-scan", "locate", "level", "register", "resample", "uncertainty"]
     assert replay(tmp_path / "prints.zarr")["same_hash"].all()
 
 

@@ -69,7 +69,7 @@ def test_opens_with_xarray_without_a_warning(campaign: Path, recwarn: pytest.War
     assert dataset["y_um"].values[:2] == pytest.approx([0.05, 0.15])
     assert [str(value) for value in dataset["print"].values] == ["1", "1", "2"]
     assert [dataset[name].attrs["axis"] for name in ("y_um", "x_um")] == ["Y", "X"]
-    assert dataset["height_um"].attrs["ancillary_variables"] == "valid"
+    assert dataset["height_um"].attrs["ancillary_variables"] == "valid height_sigma_um"
     assert "units" not in dataset["scan_to_layout"].attrs
     quality = xarray.open_zarr(campaign / "prints.zarr", group="quality")
     assert float(quality["ncc_after"].min()) > 0.9

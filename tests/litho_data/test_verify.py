@@ -31,8 +31,8 @@ def test_an_untouched_store_has_no_findings(campaign: Path) -> None:
     result = verify(campaign / "prints.zarr")
     assert result.findings == ()
     assert result.notes == ()
-    # Per scan: layout, raw, levelled, removed, transform, height, valid; five steps; two files.
-    assert (result.n_arrays, result.n_steps, result.n_raw_files) == (21, 15, 6)
+    # Per scan: layout, raw, levelled, removed, transform, height, valid, sigma; six steps; two files.
+    assert (result.n_arrays, result.n_steps, result.n_raw_files) == (24, 18, 6)
 
 
 @pytest.mark.parametrize("name", ["scans/P12.txt", "layouts/P21.tif"])
@@ -148,7 +148,7 @@ def test_values_that_decode_but_differ_are_named(own_campaign: Path) -> None:
 
 def test_replay_gives_every_array_again(campaign: Path) -> None:
     table = replay(campaign / "prints.zarr", ["P12"])
-    assert len(table) == 7
+    assert len(table) == 8
     assert (table["max_abs_difference"] == 0).all()
     assert table["same_hash"].all()
     one = replay(campaign / "prints.zarr", ["P11"], arrays=["height_um"])

@@ -1,0 +1,153 @@
+"""The scales of a microscope from the card's scans of gratings and of a step."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from litho_data.cards.card import Grating
+from litho_data.cards.listing import Listing, leads_out, list_fields
+from litho_data.foundation.errors import InputError
+from litho_data.readers import read_scan
+from litho_data.roughness import Scale, axis_scales, find_step, find_wave
+
+SCALES = ("y", "x", "z")
+# A measured height further from the known one says that a unit or a file is wrong.
+_MOST_Z = 1.5
+
+
+def calibrate(card_path: str | Path, data_dir: str | Path | None = None) -> dict[str, Scale]:
+    """The scales that a build of a card would apply: of ``y``, ``x`` and ``z`` those that it calibrates.
+
+    Raises:
+        InputError: a card without ``[calibration]``, a missing file, or a scan that shows no grating or step.
+    """
+    listing = list_fields(card_path, data_dir)
+    standards = standards_of(listing)
+    if not standards.described:
+        raise InputError(f"card {card_path}", got="no [calibration]", wanted="x, y or z in that table")
+    found = measure_scales(standards.described, list(standards.files.values()))
+    named = {axis: Scale(factor=row[0], uncertainty=row[1]) for axis, row in zip(SCALES, found, strict=True)}
+    return {axis: scale for axis, scale in named.items() if axis in standards.scales}
+
+
+@dataclass(frozen=True)
+class Standards:
+    """What a card calibrates by; empty without ``[calibration]``.
+
+    Attributes:
+        described: per standard ``scale`` (x, y or z), ``file`` (a number, in the order of the files),
+            ``known_um``, ``uncertainty_um``, ``across`` (axis of the profiles) and ``read``, the options of
+            ``read_scan``.
+        files: by recorded name.
+    """
+
+    described: tuple[Mapping[str, Any], ...] = ()
+    files: Mapping[str, Path] = field(default_factory=dict)
+
+    @property
+    def scales(self) -> set[str]:
+        """Which scales have a standard."""
+        return {one["scale"] for one in self.described}
+
+
+NO_STANDARDS = Standards()
+
+
+def standards_of(listing: Listing) -> Standards:
+    """The standards of a card.
+
+    Raises:
+        InputError: a file that is missing, or a link that leads out of the data folder.
+    """
+    card = listing.card
+    standards: list[dict[str, Any]] = []
+    files: dict[str, Path] = {}
+    for scale in SCALES if card.calibration else ():
+        one = getattr(card.calibration, scale)
+        if one is None:
+            continue
+        path = listing.data_dir / one.file
+        outside = leads_out((path,), listing.data_dir)
+        if outside or not path.is_file():
+            got = outside or f"no file {one.file}"
+            raise InputError(f"card {listing.card_path}: calibration.{scale}.file", got=got, wanted="a scan")
+        files.setdefault(listing.relative(path), path)
+        size = one.size_um or card.scan.size_um
+        standards.append(
+            {
+                "scale": scale,
+                "file": list(files).index(listing.relative(path)),
+                "known_um": one.period_um if isinstance(one, Grating) else one.height_um,
+                "uncertainty_um": one.uncertainty_um,
+                "across": scale if isinstance(one, Grating) else one.axis,
+                "read": {
+                    "format": one.format or card.scan.format,
+                    "unit": one.unit or card.scan.unit,
+                    "size_um": list(size) if size else None,
+                    "channel": one.channel or card.scan.channel,
+                },
+            }
+        )
+    return Standards(tuple(standards), files)
+
+
+def measure_scales(standards: Sequence[Mapping[str, Any]], files: Sequence[Path]) -> np.ndarray:
+    """Factors and standard uncertainties, (3, 2) in the order of ``SCALES``; 1 and 0 of what has no standard.
+
+    Raises:
+        InputError: a scan that shows no grating or step of about the known size.
+    """
+    # Every scan of a build asks for them.
+    times = tuple(file.stat().st_mtime_ns for file in files)
+    return _measured(json.dumps(list(standards)), tuple(files), times).copy()
+
+
+@lru_cache(maxsize=4)
+def _measured(standards: str, files: tuple[Path, ...], times: tuple[int, ...]) -> np.ndarray:
+    found = np.array([[1.0, 0.0]] * len(SCALES))
+    waves, axes = [], []
+    z = None
+    for one in json.loads(standards):
+        file, size = files[one["file"]], one["read"]["size_um"]
+        scan = read_scan(file, **{**one["read"], "size_um": tuple(size) if size else None})
+        try:
+            if one["scale"] == "z":
+                z = one, scan
+            else:
+                wave = find_wave(scan.height_um, scan.require_pitch(), one["known_um"], one["scale"])
+                waves.append((wave, one["known_um"], one["uncertainty_um"]))
+                axes.append(one["scale"])
+        except InputError as error:
+            raise InputError(f"calibration scan {file.name}: {error}") from error
+    for axis, scale in (axis_scales(waves, axes) if waves else {}).items():
+        found[SCALES.index(axis)] = scale.factor, scale.uncertainty
+    if z is not None:
+        found[SCALES.index("z")] = _z_scale(*z, files[z[0]["file"]].name)
+    return np.round(found, 10)
+
+
+def _z_scale(one: Mapping[str, Any], scan: Any, name: str) -> tuple[float, float]:
+    pitch_y_um, pitch_x_um = scan.require_pitch()
+    try:
+        step = find_step(
+            scan.height_um, pitch_x_um if one["across"] == "x" else pitch_y_um, axis=one["across"]
+        )
+    except InputError as error:
+        raise InputError(f"calibration scan {name}: {error}") from error
+    factor = 1e3 * one["known_um"] / step.height_nm
+    if not 1 / _MOST_Z < factor < _MOST_Z:
+        raise InputError(
+            f"calibration scan {name}: height of the step",
+            got=f"{step.height_nm / 1e3:.4g} µm",
+            wanted=f"about {one['known_um']:g} µm",
+            hint="is the unit right, and the file?",
+        )
+    relative = np.hypot(one["uncertainty_um"] / one["known_um"], step.uncertainty_nm / step.height_nm)
+    return factor, factor * float(relative)

@@ -1,0 +1,92 @@
+"""The standard uncertainty of every registered height, and what it is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from litho_data.register.resample import line_variance_factor, noise_variance_factor, transfer_error
+from litho_data.register.topography import fill_gaps
+from litho_data.register.warp_error import warp_error
+from litho_data.roughness import psd_along, white_noise
+from litho_data.scan import Axis
+
+
+def height_sigma(
+    levelled_um: np.ndarray,
+    height_um: np.ndarray,
+    layout_level: np.ndarray,
+    *,
+    scan_pitch_um: tuple[float, float],
+    layout_pitch_um: float,
+    blur_px: float,
+    model: str,
+    levelled: bool,
+    fast_axis: Axis = "x",
+    z_uncertainty: float = 0.0,
+) -> tuple[np.ndarray, Mapping[str, float]]:
+    """The standard uncertainty of registered heights, the offset of the scan aside.
+
+    The variance is a sum of six parts: white noise of pixels and of lines as far as the resampling leaves
+    it, the error of the resampling itself, the slope times the uncertainty of the warp, the surface that
+    levelling left or took, and the calibration of the z scale times the height over the scan's mean.
+
+    Args:
+        levelled_um: (ny, nx) in the scan's own frame, NaN where not measured.
+        height_um: the same on the layout's grid, NaN where not valid.
+        layout_level: levels on that grid.
+        blur_px, model: of the registration, see ``warp_error``.
+        levelled: whether a recipe was applied. What it took of the print then counts as it is found; without
+            one a surface beside the print counts only if it is clear.
+        fast_axis: along which the tip moved.
+        z_uncertainty: relative, of the z scale; 0 if it was not calibrated.
+
+    Returns:
+        float32 µm on the layout's grid, NaN where not valid; and per part the root mean square, as
+        ``sigma_<part>_nm``, and that of all as ``sigma_nm``.
+    """
+    own, height = levelled_um.astype(np.float64), height_um.astype(np.float64)
+    valid, shape = np.isfinite(height), (height.shape[0], height.shape[1])
+    pixel_nm, line_nm = white_noise(own, fast_axis=fast_axis)
+    slow_pitch_um = scan_pitch_um[0 if fast_axis == "x" else 1]
+    fit = warp_error(height, layout_level, blur_px, model)
+    variance_um2 = {
+        "pixel": 1e-6 * pixel_nm**2 * noise_variance_factor(scan_pitch_um, layout_pitch_um),
+        "line": 1e-6 * line_nm**2 * line_variance_factor(slow_pitch_um, layout_pitch_um),
+        "resampling": 1e-6
+        * _resampling_nm2(own, scan_pitch_um, layout_pitch_um, pixel_nm, line_nm, fast_axis),
+        "registration": fit.warp_variance(fill_gaps(height)),
+        "levelling": fit.surface_rms**2 if levelled or fit.is_clear else 0.0,
+        "calibration": (z_uncertainty * (height - height[valid].mean())) ** 2,
+    }
+    total = np.zeros(shape)
+    budget = {}
+    for name, part in variance_um2.items():
+        total += part
+        budget[f"sigma_{name}_nm"] = 1e3 * float(np.broadcast_to(part, shape)[valid].mean()) ** 0.5
+    sigma_um = np.where(valid, np.sqrt(total), np.nan).astype(np.float32)
+    return sigma_um, {**budget, "sigma_nm": 1e3 * float(total[valid].mean()) ** 0.5}
+
+
+def _resampling_nm2(
+    levelled_um: np.ndarray,
+    scan_pitch_um: tuple[float, float],
+    layout_pitch_um: float,
+    pixel_nm: float,
+    line_nm: float,
+    fast_axis: Axis,
+) -> float:
+    """What interpolation loses of the print's fine structure: its spectrum without noise times the loss."""
+    filled = fill_gaps(levelled_um)
+    lost = 0.0
+    axes: tuple[Axis, Axis] = ("y", "x")
+    for axis, pitch_um in zip(axes, scan_pitch_um, strict=True):
+        spectrum = psd_along(filled, pitch_um, axis)
+        white_nm2 = pixel_nm**2 + (line_nm**2 if axis != fast_axis else 0.0)
+        error = np.interp(spectrum.frequency_per_um, *transfer_error(pitch_um, layout_pitch_um))
+        # A density is one-sided: white noise of variance s² has 2 s² times the pitch.
+        lost += float(((spectrum.density - 2 * pitch_um * white_nm2) * error).sum()) * float(
+            spectrum.frequency_per_um[0]
+        )
+    return max(lost, 0.0)

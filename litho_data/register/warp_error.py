@@ -1,0 +1,87 @@
+"""How far a registered scan may lie off its layout, pixel by pixel, and its surface beside the print.
+
+Gain, quadratic surface and warp are fitted again without each block of the field in turn (jackknife). The
+spread of the fits contains whatever the topography does not explain, at its own correlation length.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from litho_data.register.bend import Bend
+from litho_data.register.flows import LADDER, flows, normalisation
+from litho_data.register.pyramid import SCAN_BLUR_PX
+from litho_data.register.refine import NUISANCES, refine, solve_gram
+from litho_data.register.topography import predicted_topography, quadratic_basis, smooth_measured
+
+# A surface is real if its terms exceed their standard errors by this factor, in root mean square. What a
+# printer does to broad features reaches 2.1 on virtual prints without tilt and bow.
+_CLEAR = 6.0**0.5
+
+
+@dataclass(frozen=True)
+class WarpError:
+    """Errors of the fit that put a scan on its layout.
+
+    Attributes:
+        covariance: (k, k) of the amounts of the flows of ``register.flows``, normalised layout frame.
+        surface_rms: of the quadratic surface that the scan has beside the print, its offset aside, over the
+            field, unit of the heights.
+        is_clear: whether there is such a surface.
+    """
+
+    covariance: np.ndarray
+    surface_rms: float
+    is_clear: bool
+
+    def warp_variance(self, height: np.ndarray) -> np.ndarray:
+        """Variance of registered heights (ny, nx) by the error of the warp: steep places move most."""
+        shape = (height.shape[0], height.shape[1])
+        normalise = normalisation(shape)
+        gradient_y, gradient_x = (gradient / normalise[0, 0] for gradient in np.gradient(height))
+        x = normalise[0, 0] * np.arange(shape[1])[None, :] + normalise[0, 2]
+        y = normalise[1, 1] * np.arange(shape[0])[:, None] + normalise[1, 2]
+        moved = [
+            along_x * gradient_x + along_y * gradient_y
+            for along_x, along_y in flows(len(self.covariance), x, y)
+        ]
+        sizes, directions = np.linalg.eigh(self.covariance)
+        total = np.zeros(shape)
+        for size, direction in zip(sizes, directions.T, strict=True):
+            combined = sum(part * one for part, one in zip(direction, moved, strict=True))
+            total += max(size, 0.0) * combined**2
+        return total
+
+
+def warp_error(height: np.ndarray, layout_level: np.ndarray, blur_px: float, model: str) -> WarpError:
+    """The errors of a registration.
+
+    Args:
+        height: (ny, nx) registered heights, NaN where not valid.
+        layout_level: (ny, nx) integer levels.
+        blur_px: Gaussian sigma of the topography, layout pixels.
+        model: as in the quality record: a rung of the ladder, ``quadratic`` or ``creep``.
+    """
+    shape = (height.shape[0], height.shape[1])
+    rung = next((name for name in LADDER if name == model), None)
+    at_the_fit = refine(
+        np.where(np.isfinite(height), smooth_measured(height, SCAN_BLUR_PX), np.nan),
+        predicted_topography(layout_level, blur_px),
+        np.eye(3),
+        rung or "affine",
+        bend=None if rung else Bend.none_yet(shape),
+        max_iterations=0,
+    )
+    blocks = at_the_fit.blocks()
+    blocks = blocks.reshape(-1, *blocks.shape[2:])
+    without = solve_gram(blocks.sum(axis=0) - blocks)
+    without[:, NUISANCES:] /= without[:, :1]
+    middle = without.mean(axis=0)
+    covariance = (len(blocks) - 1) / len(blocks) * (without - middle).T @ (without - middle)
+    terms = slice(2, NUISANCES)
+    surface, variance = middle[terms], np.diag(covariance)[terms]
+    is_clear = bool(np.mean(surface**2 / np.maximum(variance, 1e-300)) > _CLEAR**2)
+    shown = np.einsum("k,kyx->yx", surface, quadratic_basis(shape)[1:])
+    return WarpError(covariance[NUISANCES:, NUISANCES:], float(shown.std()), is_clear)

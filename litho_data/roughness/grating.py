@@ -1,0 +1,151 @@
+"""The period of a grating: where the spectrum peaks, then how its phase advances over the field."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import Record
+from litho_data.roughness.noise import Axis
+
+# The period of a scanner that is not calibrated is within this factor of the true one.
+SEARCHED = 1.25
+# A window of two periods is blind to the mean and to all harmonics; phases need a few of them side by side.
+_WINDOW_PERIODS, _FEWEST_PERIODS = 2.0, 8.0
+# Phases of noise scatter by 1.8 rad.
+_MOST_SCATTER_RAD = 0.5
+# Neighbouring windows overlap by half: their noise is correlated by 1/6, on both sides.
+_OVERLAP_VARIANCE = 1 + 2 / 6
+
+
+@dataclass(frozen=True)
+class Wave:
+    """Fundamental of a grating: cycles/µm along x and y, and their standard uncertainty."""
+
+    x_per_um: float
+    y_per_um: float
+    uncertainty_per_um: float
+
+
+class Scale(Record):
+    """What a stated length has to be multiplied by to be true, and the standard uncertainty of that."""
+
+    factor: float
+    uncertainty: float
+
+
+def find_wave(height_um: np.ndarray, pitch_um: tuple[float, float], period_um: float, axis: Axis) -> Wave:
+    """The fundamental of a grating whose period lies along an axis, to a few degrees.
+
+    The phase is measured in windows of two periods (Hann along the axis, all of the other axis). Its slope
+    along the axis corrects the frequency, the scatter of the phases about it gives the uncertainty: noise,
+    drift and a bent scanner axis alike.
+
+    Args:
+        height_um: (ny, nx), NaN where not measured.
+        pitch_um: stated (y, x) pitch.
+        period_um: known period; the one that is searched for lies within a factor of ``SEARCHED``.
+        axis: of the period that is wanted.
+
+    Raises:
+        InputError: fewer than eight periods, or nothing that is periodic.
+    """
+    lines = height_um if axis == "x" else height_um.T
+    along_um, across_um = pitch_um[::-1] if axis == "x" else pitch_um
+    extent_um = lines.shape[1] * along_um
+    if extent_um < _FEWEST_PERIODS * period_um or period_um < 4 * along_um:
+        raise InputError(
+            f"grating along {axis}",
+            got=f"{extent_um / period_um:.1f} periods of {period_um / along_um:.1f} pixels",
+            wanted=f"at least {_FEWEST_PERIODS:g} periods of at least 4 pixels",
+        )
+    flat = np.nan_to_num(lines - np.nanmean(lines))
+    at = _peak(flat, (along_um, across_um), period_um)
+    for _ in range(3):
+        step, error, scatter = _advance(flat, (along_um, across_um), at)
+        if not scatter < _MOST_SCATTER_RAD:
+            raise InputError(
+                f"grating along {axis}",
+                got=f"nothing that repeats every {period_um:g} µm (its phase scatters by {scatter:.1f} rad)",
+                wanted="a scan of a grating of this period",
+            )
+        at = at + step
+    x, y = at if axis == "x" else at[::-1]
+    return Wave(float(x), float(y), error)
+
+
+def axis_scales(waves: Sequence[tuple[Wave, float, float]], axes: Sequence[Axis]) -> dict[Axis, Scale]:
+    """Scales of the axes whose gratings were measured, for a scanner without shear.
+
+    With stated lengths that are c times too short, a frequency is c times too high: (x / c_x)² + (y / c_y)²
+    is the square of the true one, whatever the angle at which a grating lies.
+
+    Args:
+        waves: measured wave, known period and its standard uncertainty (µm) of each grating.
+        axes: which axis each is for; an axis without grating keeps its stated scale.
+    """
+    design = np.array([[wave.x_per_um**2, wave.y_per_um**2] for wave, _, _ in waves])
+    known = np.array([1 / period_um**2 for _, period_um, _ in waves])
+    columns = [0 if axis == "x" else 1 for axis in axes]
+    others = [column for column in (0, 1) if column not in columns]
+    solved = np.linalg.solve(design[:, columns], known - design[:, others].sum(axis=1))
+    found: dict[Axis, Scale] = {}
+    for value, axis, (wave, period_um, period_sd_um) in zip(solved, axes, waves, strict=True):
+        factor = float(value**-0.5)
+        relative = np.hypot(wave.uncertainty_per_um * period_um / factor, period_sd_um / period_um)
+        found[axis] = Scale(factor=factor, uncertainty=factor * float(relative))
+    return found
+
+
+def _peak(flat: np.ndarray, pitch_um: tuple[float, float], period_um: float) -> np.ndarray:
+    """Strongest frequency (along, across) within the range, and within 15° of the axis."""
+    ny, nx = flat.shape
+    windowed = flat * np.outer(np.hanning(ny), np.hanning(nx))
+    power = np.abs(np.fft.fft2(windowed)[:, : nx // 2 + 1]) ** 2
+    along = np.fft.rfftfreq(nx, pitch_um[0])[None, :]
+    across = np.fft.fftfreq(ny, pitch_um[1])[:, None]
+    inside = (np.abs(np.log(np.hypot(along, across).clip(1e-12) * period_um)) < np.log(SEARCHED)) & (
+        np.abs(across) < np.tan(np.radians(15)) * along
+    )
+    row, column = np.unravel_index(np.argmax(np.where(inside, power, -1.0)), power.shape)
+    return np.array([along[0, column], across[row, 0]])
+
+
+def _advance(
+    flat: np.ndarray, pitch_um: tuple[float, float], at: np.ndarray
+) -> tuple[np.ndarray, float, float]:
+    """By how much the frequency (along, across) is off, the uncertainty of the first, scatter in rad."""
+    x, y = (np.arange(n) * step for n, step in zip(flat.shape[::-1], pitch_um, strict=True))
+    carried = flat * np.exp(-2j * np.pi * (at[0] * x[None, :] + at[1] * y[:, None]))
+    places, phases = _phases(carried.mean(axis=0), x, 1 / at[0])
+    slope, error, scatter = _line(places, phases)
+    # Across, four bands are enough for a small angle; in each the waves along the axis are averaged out.
+    window = np.hanning(len(x))
+    bands = [band @ window for band in np.array_split(carried, 4)]
+    centres = np.array([band.mean() for band in np.array_split(y, 4)])
+    sums = np.array([band.sum() for band in bands])
+    tilt, _, _ = _line(centres, np.unwrap(np.angle(sums)))
+    return np.array([slope, tilt]) / (2 * np.pi), error / (2 * np.pi), scatter
+
+
+def _phases(carried: np.ndarray, x_um: np.ndarray, period_um: float) -> tuple[np.ndarray, np.ndarray]:
+    width_um = _WINDOW_PERIODS * period_um
+    places = np.arange(x_um[0] + width_um / 2, x_um[-1] - width_um / 2, width_um / 2)
+    distance = (x_um[None, :] - places[:, None]) / width_um
+    windows = np.where(np.abs(distance) < 0.5, np.cos(np.pi * distance) ** 2, 0.0)
+    return places, np.unwrap(np.angle(windows @ carried))
+
+
+def _line(places: np.ndarray, phases: np.ndarray) -> tuple[float, float, float]:
+    """Slope, its standard uncertainty, and scatter of phases about a straight line."""
+    centred = places - places.mean()
+    slope = float(centred @ phases / (centred @ centred))
+    rest = phases - phases.mean() - slope * centred
+    freedom = max(len(places) - 2, 1)
+    scatter = float(np.sqrt(rest @ rest / freedom))
+    # The scatter of a few phases is uncertain itself: Student's t with this freedom is that much wider.
+    wider = (freedom / (freedom - 2)) ** 0.5 if freedom > 2 else 3.0
+    return slope, wider * scatter * float(np.sqrt(_OVERLAP_VARIANCE / (centred @ centred))), scatter

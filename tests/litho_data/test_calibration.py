@@ -1,0 +1,178 @@
+"""Scales come out of gratings and steps with an uncertainty that holds, and a build applies both."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+from typer.testing import CliRunner
+
+from litho_data import build_dataset, open_store, verify
+from litho_data.build.calibration import calibrate
+from litho_data.cli.app import app
+from litho_data.foundation.errors import InputError
+from litho_data.provenance.history import history
+from litho_data.provenance.replay import replay
+from litho_data.roughness import axis_scales, find_step, find_wave
+from tests.litho_data.campaigns import MARGIN_PX, NOISE_UM, height_of, layout_of, write_campaign, write_scan
+
+PITCH_UM, PERIOD_UM, STEP_UM = 0.1, 1.5, 0.2
+SCALE = {"x": 1.03, "y": 0.98, "z": 1.05}
+
+
+def _grating(
+    rng: np.random.Generator, axis: str, scale_x: float, scale_y: float, degrees: float, size: int = 192
+) -> np.ndarray:
+    """Ridges of 0.1 µm, with noise of pixels and lines; lengths of the scanner are off by the scales."""
+    y, x = (np.arange(size) * PITCH_UM * scale for scale in (scale_y, scale_x))
+    turn = np.radians(degrees)
+    along, across = (x[None, :], y[:, None]) if axis == "x" else (y[:, None], x[None, :])
+    phase = (along * np.cos(turn) + across * np.sin(turn)) / PERIOD_UM + rng.uniform()
+    ridges = 0.05 * np.tanh(4 * np.sin(2 * np.pi * phase))
+    return ridges + 0.02 * rng.standard_normal((size, size)) + 0.01 * rng.standard_normal((size, 1))
+
+
+def _step(rng: np.random.Generator, height_um: float, shape: tuple[int, int] = (96, 128)) -> np.ndarray:
+    """A step across x on a tilted field, with noise of pixels and of lines."""
+    profile = height_um * gaussian_filter((np.arange(shape[1]) >= 70).astype(float), 2.0)
+    tilt = np.linspace(0, 0.1, shape[1])[None, :] + np.linspace(0, 0.3, shape[0])[:, None]
+    return profile + tilt + 0.01 * rng.standard_normal(shape) + 0.05 * rng.standard_normal((shape[0], 1))
+
+
+def test_a_stretched_grating_gives_both_factors_within_their_uncertainty():
+    rng = np.random.default_rng(0)
+    ratios = []
+    for _ in range(40):
+        scales = 1 + 0.03 * rng.standard_normal(2)
+        waves = [
+            find_wave(_grating(rng, axis, *scales, rng.uniform(-3, 3)), (PITCH_UM,) * 2, PERIOD_UM, axis)
+            for axis in ("x", "y")
+        ]
+        found = axis_scales([(wave, PERIOD_UM, 0.0) for wave in waves], ["x", "y"])
+        ratios.append(
+            [(found[a].factor - s) / found[a].uncertainty for a, s in zip("xy", scales, strict=True)]
+        )
+        # Known to a part in a thousand: three per cent of stretch stand out thirtyfold.
+        assert max(found[a].uncertainty for a in "xy") < 2e-3
+    inside = [float((np.abs(ratios) < limit).mean()) for limit in (1, 2)]
+    # 80 draws: 0.68 ± 0.05 and 0.95 ± 0.024, and three times that.
+    assert 0.53 < inside[0] < 0.83
+    assert inside[1] > 0.88
+
+
+def test_a_grating_that_lies_at_an_angle_needs_both_axes_only_to_second_order():
+    """Known exactly: cycles per µm of a grating turned by 3°, the other axis 2 % off."""
+    rng = np.random.default_rng(3)
+    wave = find_wave(_grating(rng, "x", 1.03, 1.02, 3.0), (PITCH_UM,) * 2, PERIOD_UM, "x")
+    found = axis_scales([(wave, PERIOD_UM, 0.0)], ["x"])["x"]
+    # (sin 3°)² of the error of the axis that is not calibrated.
+    assert found.factor == pytest.approx(1.03, abs=3 * found.uncertainty + 0.02 * np.sin(np.radians(3)) ** 2)
+
+
+def test_the_period_known_for_a_standard_adds_its_uncertainty():
+    wave = find_wave(_grating(np.random.default_rng(1), "x", 1.0, 1.0, 0.0), (PITCH_UM,) * 2, PERIOD_UM, "x")
+    own = axis_scales([(wave, PERIOD_UM, 0.0)], ["x"])["x"].uncertainty
+    both = axis_scales([(wave, PERIOD_UM, 0.015)], ["x"])["x"]
+    assert both.uncertainty == pytest.approx(np.hypot(own, 0.01 * both.factor), rel=1e-6)
+
+
+def test_a_step_is_found_and_measured_within_its_uncertainty():
+    rng = np.random.default_rng(0)
+    found = [find_step(_step(rng, STEP_UM), PITCH_UM) for _ in range(60)]
+    ratios = np.array([(step.height_nm - 1e3 * STEP_UM) / step.uncertainty_nm for step in found])
+    # 60 draws: 0.68 ± 0.06, three times that.
+    assert 0.5 < (np.abs(ratios) < 1).mean() < 0.86
+    assert find_step(_step(rng, STEP_UM).T, PITCH_UM, axis="y").height_nm == pytest.approx(200, abs=5)
+    grooves = np.tile(np.repeat([0.0, -0.3], 16), 4)[None, :] + np.zeros((20, 1))
+    assert find_step(grooves, PITCH_UM).height_nm == pytest.approx(300, abs=1e-6)
+
+
+@pytest.fixture(scope="module")
+def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A campaign on a microscope that is off along all three axes, with its gratings and its step."""
+    folder = tmp_path_factory.mktemp("calibrated")
+    write_campaign(folder)
+    rng = np.random.default_rng(5)
+    for index, name in enumerate(("P11", "P12", "P21")):
+        write_scan(folder / "scans" / f"{name}.txt", height_of(layout_of(index), index) / SCALE["z"])
+    size = 192
+    for axis in "xy":
+        write_scan(folder / "standards" / f"{axis}.txt", _grating(rng, axis, SCALE["x"], SCALE["y"], 1.0))
+    write_scan(folder / "standards" / "step.txt", _step(rng, STEP_UM / SCALE["z"], (size, size)))
+    card = (folder / "card.toml").read_text()
+    stated = [12.8 / SCALE["y"], 12.8 / SCALE["x"]]
+    card = card.replace("size_um = [12.8, 12.8]", f"size_um = {stated}")
+    grating = f"size_um = [19.2, 19.2]\nperiod_um = {PERIOD_UM}\nuncertainty_um = 0.0015\n"
+    card += f'[calibration.x]\nfile = "standards/x.txt"\n{grating}'
+    card += f'[calibration.y]\nfile = "standards/y.txt"\n{grating}'
+    card += '[calibration.z]\nfile = "standards/step.txt"\nsize_um = [19.2, 19.2]\n'
+    card += f"height_um = {STEP_UM}\nuncertainty_um = 0.002\n"
+    (folder / "card.toml").write_text(card)
+    build_dataset(folder / "card.toml", folder / "prints.zarr")
+    return folder
+
+
+def test_a_build_applies_the_scales_and_carries_their_uncertainty(calibrated: Path) -> None:
+    store = open_store(calibrated / "prints.zarr")
+    quality = store.quality
+    for axis, true in SCALE.items():
+        error = np.abs(quality[f"scale_{axis}"] - true) / quality[f"scale_{axis}_uncertainty"]
+        assert error.max() < 3
+    # With true lengths the layouts are neither stretched nor compressed: noise leaves 0.02 px of 112.
+    assert quality["singular_max"].max() < 1.004
+    assert quality["singular_min"].min() > 0.996
+    for index, scan in enumerate(store.scans()):
+        truth = height_of(layout_of(index), index)[MARGIN_PX:-MARGIN_PX, MARGIN_PX:-MARGIN_PX]
+        difference = (scan.height_um - truth)[scan.valid]
+        # The z scale is known to 1 %, so heights with an sd of 0.35 µm to 3.5 nm; noise as without it.
+        assert difference.std() < np.hypot(2 * NOISE_UM, 3 * 0.0035)
+        spread = scan.height_um[scan.valid].std()
+        known = 1e3 * spread * quality["scale_z_uncertainty"][index] / quality["scale_z"][index]
+        assert quality["sigma_calibration_nm"][index] == pytest.approx(known, rel=1e-4)
+
+
+def test_the_standards_are_in_the_provenance(calibrated: Path) -> None:
+    path = calibrated / "prints.zarr"
+    assert not verify(path).findings
+    assert "standards/step.txt" in history(path, "P11")
+    assert replay(path, ["P12"])["same_hash"].all()
+    said = CliRunner().invoke(app, ["calibrate", str(calibrated / "card.toml")])
+    assert said.exit_code == 0
+    assert [line[0] for line in said.output.splitlines()] == ["y", "x", "z"]
+    step = calibrated / "standards" / "step.txt"
+    kept = step.read_text()
+    step.write_text(kept.replace("e-", "e-0", 1))
+    assert [str(one).split(":")[0] for one in verify(path).findings] == ["raw file standards/step.txt"]
+    step.write_text(kept)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("standards/x.txt", "standards/step.txt", "nothing that repeats every 1.5 µm"),
+        (
+            f"period_um = {PERIOD_UM}",
+            "period_um = 3.0",
+            r"6.4 periods of 30.0 pixels, wanted at least 8 periods",
+        ),
+        ("standards/step.txt", "standards/flat.txt", "no edge that stands out"),
+        ("standards/step.txt", "standards/none.txt", "no file standards/none.txt"),
+        (f"height_um = {STEP_UM}\nuncertainty", "height_um = 200.0\nuncertainty", "is the unit right"),
+        ("uncertainty_um = 0.002", "uncertainty_um = -1", "uncertainty_um"),
+    ],
+)
+def test_a_standard_that_shows_something_else_stops_the_build_in_one_line(calibrated, old, new, said):
+    flat = 0.01 * np.random.default_rng(9).standard_normal((192, 192))
+    write_scan(calibrated / "standards" / "flat.txt", gaussian_filter(flat, 2.0))
+    card = calibrated / "bad.toml"
+    text = (calibrated / "card.toml").read_text()
+    assert old in text
+    card.write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError, match=said) as caught:
+        build_dataset(card, calibrated / "bad.zarr")
+    assert "\n" not in str(caught.value)
+    assert not (calibrated / "bad.zarr").exists()
+    with pytest.raises(InputError, match=said):
+        calibrate(card)
