@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from benchmarks import build as build_benchmark
+from benchmarks import height_sigma as height_sigma_benchmark
 from benchmarks import levelling as levelling_benchmark
 from benchmarks import readers as readers_benchmark
 from benchmarks import tip as tip_benchmark
@@ -22,7 +23,8 @@ from litho_data.foundation.run_facts import run_facts
 
 
 @pytest.mark.parametrize(
-    "benchmark", [build_benchmark, levelling_benchmark, readers_benchmark, tip_benchmark]
+    "benchmark",
+    [build_benchmark, levelling_benchmark, height_sigma_benchmark, readers_benchmark, tip_benchmark],
 )
 def test_the_page_quotes_the_committed_measurement(benchmark):
     text = published(benchmark.PAGE, benchmark.NAME)
