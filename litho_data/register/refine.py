@@ -46,12 +46,8 @@ class Refinement:
     bend: Bend | None = None
 
     def blocks(self) -> np.ndarray:
-        """``gram`` summed over blocks of two by two cells, (blocks_y, blocks_x, k, k).
-
-        Errors of the topography extend over a feature or two; a block is the smallest independent piece.
-        """
-        starts = [np.linspace(0, n, max(1, n // 2) + 1).astype(int)[:-1] for n in self.gram.shape[:2]]
-        return np.add.reduceat(np.add.reduceat(self.gram, starts[0], axis=0), starts[1], axis=1)
+        """``gram`` summed over blocks, see ``in_blocks``."""
+        return in_blocks(self.gram)
 
     @property
     def background(self) -> np.ndarray:
@@ -97,8 +93,7 @@ def refine(
     normalise = normalisation(shape)
     denormalise = np.linalg.inv(normalise)
     regressors = _regressors(topography, LADDER[model] if bend is None else BENT_COUNT)
-    border = min(BORDER_PX, min(shape) // 16)
-    interior = np.pad(np.ones([n - 2 * border for n in shape], bool), border)
+    interior = _interior(shape)
     measured = np.isfinite(scan)
     complete = bool(measured.all())
     spline = spline_filter(fill_gaps(scan), 3, output=np.float32, mode="mirror")
@@ -140,6 +135,25 @@ def refine(
     return Refinement(model, matrix, warped, _cell_grams(regressors, warped, inside), converged, bend)
 
 
+def aligned_gram(aligned: np.ndarray, topography: np.ndarray, count: int) -> np.ndarray:
+    """``gram`` of a scan that lies on the topography (ny, nx) already, NaN where not measured.
+
+    ``count``: number of flows of a warp, see ``LADDER`` and ``BENT_COUNT``.
+    """
+    shape = (topography.shape[0], topography.shape[1])
+    inside = _interior(shape) & np.isfinite(aligned)
+    return _cell_grams(_regressors(topography, count), np.where(inside, aligned, 0.0), inside)
+
+
+def in_blocks(gram: np.ndarray) -> np.ndarray:
+    """Inner products per cell summed over blocks of two by two cells, (blocks_y, blocks_x, k, k).
+
+    Errors of the topography extend over a feature or two; a block is the smallest independent piece.
+    """
+    starts = [np.linspace(0, n, max(1, n // 2) + 1).astype(int)[:-1] for n in gram.shape[:2]]
+    return np.add.reduceat(np.add.reduceat(gram, starts[0], axis=0), starts[1], axis=1)
+
+
 def solve_gram(gram: np.ndarray) -> np.ndarray:
     """Least-squares coefficients of the regressors for the scan, for (…, k, k) inner products."""
     normal, right = gram[..., :-1, :-1], gram[..., :-1, -1]
@@ -166,6 +180,11 @@ def corner_motion_px(coefficients: np.ndarray, shape: tuple[int, int], points: n
     unit = apply_transform(normalise, points)
     flow = np.array([np.broadcast_arrays(*one) for one in flows(warp.shape[-1], *unit.T)])
     return np.einsum("...k,kdn->...nd", warp, flow) / normalise[0, 0]
+
+
+def _interior(shape: tuple[int, int]) -> np.ndarray:
+    border = min(BORDER_PX, min(shape) // 16)
+    return np.pad(np.ones([n - 2 * border for n in shape], bool), border)
 
 
 def _moved_on(

@@ -10,10 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from litho_data.register.bend import Bend
-from litho_data.register.flows import LADDER, flows, normalisation
+from litho_data.register.flows import BENT_COUNT, LADDER, flows, normalisation
 from litho_data.register.pyramid import SCAN_BLUR_PX
-from litho_data.register.refine import NUISANCES, refine, solve_gram
+from litho_data.register.refine import NUISANCES, aligned_gram, in_blocks, solve_gram
 from litho_data.register.topography import predicted_topography, quadratic_basis, smooth_measured
 
 # A surface is real if its terms exceed their standard errors by this factor, in root mean square. What a
@@ -65,16 +64,9 @@ def warp_error(height: np.ndarray, layout_level: np.ndarray, blur_px: float, mod
         model: as in the quality record: a rung of the ladder, ``quadratic`` or ``creep``.
     """
     shape = (height.shape[0], height.shape[1])
-    rung = next((name for name in LADDER if name == model), None)
-    at_the_fit = refine(
-        np.where(np.isfinite(height), smooth_measured(height, SCAN_BLUR_PX), np.nan),
-        predicted_topography(layout_level, blur_px),
-        np.eye(3),
-        rung or "affine",
-        bend=None if rung else Bend.none_yet(shape),
-        max_iterations=0,
-    )
-    blocks = at_the_fit.blocks()
+    smooth = np.where(np.isfinite(height), smooth_measured(height, SCAN_BLUR_PX), np.nan)
+    count = {str(name): number for name, number in LADDER.items()}.get(model, BENT_COUNT)
+    blocks = in_blocks(aligned_gram(smooth, predicted_topography(layout_level, blur_px), count))
     blocks = blocks.reshape(-1, *blocks.shape[2:])
     without = solve_gram(blocks.sum(axis=0) - blocks)
     without[:, NUISANCES:] /= without[:, :1]
