@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from litho_data.foundation.report import new_figure
+from litho_data.foundation.report_pictures import new_figure
 from litho_data.store import open_store
 
 _BASE, _CORRECTED = "#9aa5b1", "#0b6aa2"

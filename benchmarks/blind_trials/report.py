@@ -16,7 +16,8 @@ from benchmarks.blind_trials.scoreboard import (
     trial_table,
 )
 from benchmarks.blind_trials.trial import trial_folder
-from litho_data.foundation.report import Page, new_figure
+from litho_data.foundation.report import Page
+from litho_data.foundation.report_pictures import new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,6 +47,7 @@ def write_report(scoreboard: Scoreboard, folder: Path) -> Path:
         "Blind trials of the closed loop",
         "The virtual fab hides causes drawn from one seed; the loop sees scans and layouts only; "
         "a judge who knows the answer compares. All draws are shown, none was repeated.",
+        facts={"seed": scoreboard.seed, "command": scoreboard.command},
     )
     if scoreboard.pending:
         page.note(f"Not run yet: trials {', '.join(map(str, scoreboard.pending))}.")
@@ -55,7 +57,6 @@ def write_report(scoreboard: Scoreboard, folder: Path) -> Path:
             for one in figures_of(scoreboard)
         ]
     )
-    page.code(scoreboard.command)
     if scoreboard.trials:
         page.heading("Outcome against size")
         page.figure(
@@ -70,7 +71,7 @@ def write_report(scoreboard: Scoreboard, folder: Path) -> Path:
             "one (filled). Black: the true models on the same pixels; grey band: up to "
             f"{TOLERANCE_IN_FORM:g} times that, with a cause of another form {TOLERANCE_OTHER:g}.",
         )
-        page.heading("All trials")
+        page.heading("All trials", folded=True)
         page.table(trial_table(scoreboard), "One row per planted cause.", CSV_NAME)
         numbers = [trial.draw.number for trial in scoreboard.trials if not trial.failure]
         page.links(

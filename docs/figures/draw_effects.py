@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from litho_data.foundation.report import new_figure
+from litho_data.foundation.report_pictures import new_figure
 from litho_data.layouts import random_layout
 from litho_models.effects import CATALOGUE, Effect, FieldContext
 from litho_models.effects.chain import EffectChain

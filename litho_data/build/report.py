@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from litho_data.foundation.files import atomic_file
-from litho_data.foundation.report import Page, colour_bar_png, coloured_png
+from litho_data.foundation.report import Page
+from litho_data.foundation.report_pictures import colour_bar_png, coloured_png
 from litho_data.store.read import PrintedScan, Store, open_store
 
 if TYPE_CHECKING:
@@ -22,29 +23,29 @@ _THUMBNAIL_PX = 180
 # Blur of the layout in the residual: about the width of the printer's line. For pictures only, no model.
 _BLUR_PX = 3.0
 _STAGES = {
-    "layout [level]": "viridis",
-    "raw [nm]": "cividis",
-    "registered [nm]": "cividis",
-    "residual [nm]": "RdBu_r",
+    "layout (level)": "viridis",
+    "raw (nm)": "cividis",
+    "registered (nm)": "cividis",
+    "residual (nm)": "RdBu_r",
 }
 _TABLE = {
     "scan": "scan",
     "model": "model",
     "ncc_before": "correlation, centred",
     "ncc_after": "correlation, registered",
-    "reprojection_px": "reprojection [px]",
-    "tre_median_nm": "held-out error, median [nm]",
-    "tre_p95_nm": "held-out error, p95 [nm]",
-    "corner_sd_nm": "corner spread [nm]",
+    "reprojection_px": "reprojection (px)",
+    "tre_median_nm": "held-out error, median (nm)",
+    "tre_p95_nm": "held-out error, p95 (nm)",
+    "corner_sd_nm": "corner spread (nm)",
     "overlap": "overlap",
-    "bend_um": "bend [µm]",
-    "rotation_deg": "rotation [deg]",
+    "bend_um": "bend (µm)",
+    "rotation_deg": "rotation (deg)",
     "singular_min": "scale, smallest",
     "singular_max": "scale, largest",
-    "noise_x_nm": "noise along x [nm]",
-    "noise_y_nm": "noise along y [nm]",
-    "row_step_nm": "row steps [nm]",
-    "removed_sd_nm": "removed by levelling, sd [nm]",
+    "noise_x_nm": "noise along x (nm)",
+    "noise_y_nm": "noise along y (nm)",
+    "row_step_nm": "row steps (nm)",
+    "removed_sd_nm": "removed by levelling, sd (nm)",
 }
 _BUDGET = {
     "scan": "scan",
@@ -62,13 +63,15 @@ def write_report(result: BuildResult, store_path: Path, folder: Path) -> Path:
     """Write ``report.html``, ``build.json`` and CSV tables into ``folder``; returns the page's path."""
     store = open_store(store_path)
     page = Page(
-        f"Dataset {store.name}", "Raw scans read, levelled, registered onto their layouts and stored."
+        f"Dataset {store.name}",
+        "Raw scans read, levelled, registered onto their layouts and stored.",
+        facts={"dataset": store.sha256},
     )
     _summary(page, result, store)
     _left_out(page, result)
     _warnings(page, store.quality)
-    _quality(page, store.quality)
     _pictures(page, store)
+    _quality(page, store.quality)
     result.write(folder)
     with atomic_file(folder / "quality.csv") as temporary:
         store.quality.to_csv(temporary, index=False)
@@ -77,6 +80,7 @@ def write_report(result: BuildResult, store_path: Path, folder: Path) -> Path:
 
 def _summary(page: Page, result: BuildResult, store: Store) -> None:
     quality = store.quality
+    page.verdict(_verdict(result, quality))
     tiles = [(str(result.n_scans), "scans in the store")]
     if "ncc_after" in quality:
         tiles.append((f"{quality['ncc_after'].median():.3f}", "median correlation of height and layout"))
@@ -86,11 +90,19 @@ def _summary(page: Page, result: BuildResult, store: Store) -> None:
     page.tiles(tiles)
     page.paragraph(
         f"Pitch {store.pitch_um} µm, level height {store.level_height_um} µm, {store.levels} levels. "
-        f"Dataset hash {store.sha256}; it covers layouts, heights, validity and transforms of all scans, "
-        "and building again gives the same."
+        "The hash of the dataset, below, covers layouts, heights, validity and transforms of all scans; "
+        "building again gives the same."
     )
     for assumption in store.manifest["assumptions"]:
         page.note(f"Assumed, because the card does not say: {assumption}.")
+
+
+def _verdict(result: BuildResult, quality: pd.DataFrame) -> str:
+    left = len(result.skipped) + len(result.unpaired)
+    stored = f"All {result.n_scans} scans are" if not left else f"{result.n_scans} scans are"
+    text = f"{stored} in the store" + (f", {left} ids are not" if left else "")
+    warned = int(quality["warning"].astype(bool).sum()) if "warning" in quality else 0
+    return text + (f"; {warned} passed with a warning." if warned else ", and none has a warning.")
 
 
 def _left_out(page: Page, result: BuildResult) -> None:
@@ -111,7 +123,7 @@ def _warnings(page: Page, quality: pd.DataFrame) -> None:
 
 
 def _quality(page: Page, quality: pd.DataFrame) -> None:
-    page.heading("Quality of every scan")
+    page.heading("Quality of every scan, in numbers", folded=True)
     shown = quality[[name for name in _TABLE if name in quality]].rename(columns=_TABLE)
     page.table(
         shown, "Registration and noise of every scan; quality.csv has all figures", "summary.csv", digits=3
@@ -138,7 +150,7 @@ def _pictures(page: Page, store: Store) -> None:
         columns.append((f"{title}, {low:.4g} … {high:.4g}", colour_bar_png(colours)))
         pictures.append([coloured_png(image, colours, low, high) for image in images])
     caption = (
-        "Raw: the scan in its own frame. Registered: on the layout's grid, white where not measured. "
+        "Raw: the scan in its own frame. Registered: on the layout's grid, empty where not measured. "
         "Residual: registered height minus the blurred layout, with the best gain and offset. "
         "One colour scale per column."
     )

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from litho_data.foundation.files import atomic_file
-from litho_data.foundation.report import new_figure
+from litho_data.foundation.report_pictures import new_figure
 from litho_data.scan import Scan
 
 if TYPE_CHECKING:

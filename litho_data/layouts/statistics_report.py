@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.report import Page, new_figure
+from litho_data.foundation.report import Page
+from litho_data.foundation.report_pictures import new_figure
 from litho_data.layouts.statistics import LayoutStatistics
 
 _SHOWN = 4
@@ -24,6 +25,7 @@ def statistics_page(statistics: LayoutStatistics, files: Sequence[Path]) -> Page
     page = Page(
         f"{statistics.count} layouts", f"{statistics.levels} levels, pitch {statistics.pitch_um:g} µm"
     )
+    page.verdict(_verdict(statistics))
     pictures = new_figure(11, 3)
     shown = files[:_SHOWN]
     for place, file in enumerate(shown, start=1):
@@ -52,6 +54,7 @@ def statistics_page(statistics: LayoutStatistics, files: Sequence[Path]) -> Page
     axes.plot(statistics.lag_um, statistics.autocorrelation_y, label="along y")
     axes.legend()
     page.figure(graphs, "Pooled statistics of the set.")
+    page.heading("In numbers", folded=True)
     shares = {
         "level or jump": levels,
         "share of pixels": statistics.level_share,
@@ -59,3 +62,14 @@ def statistics_page(statistics: LayoutStatistics, files: Sequence[Path]) -> Page
     }
     page.table(pd.DataFrame(shares), "Level and jump shares.", "levels.csv", digits=4)
     return page
+
+
+def _verdict(statistics: LayoutStatistics) -> str:
+    used = int(np.count_nonzero(np.asarray(statistics.level_share)))
+    jump = int(np.flatnonzero(np.asarray(statistics.jump_share)).max())
+    flat = 100 * float(statistics.jump_share[0])
+    levels = "Every level is" if used == statistics.levels else f"{used} of {statistics.levels} levels are"
+    return (
+        f"{levels} used. Neighbouring pixels differ by {jump} level{'' if jump == 1 else 's'} at most; "
+        f"{flat:.0f} % of the pairs have the same level."
+    )

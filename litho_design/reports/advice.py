@@ -14,6 +14,13 @@ _EFFICIENCIES = ("eff_signal", "focusing_efficiency")
 _THICK_SHARE = 0.1
 # Below this share of the training pixels, a model has hardly seen the lowest and the highest level.
 _SEEN_SHARE = 0.02
+# Figures that are errors or widths, by how their names begin; of all others more is better.
+_LESS_IS_BETTER = ("mae", "rms", "p95", "fwhm", "speckle", "zero_order", "loss")
+
+
+def less_is_better(figure: str) -> bool:
+    """Whether a smaller value of a score's figure is the better one."""
+    return figure.startswith(_LESS_IS_BETTER)
 
 
 def distribution_warning(design: Design) -> str:

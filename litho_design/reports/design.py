@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from litho_data.foundation.report import Page, new_figure
+from litho_data.foundation.report import Page
+from litho_data.foundation.report_pictures import new_figure
 from litho_design.holograms.task import HologramTask
 from litho_design.lenses.task import LensTask
 from litho_design.optimisation.process_window import measure_yield
 from litho_design.reliefs.task import UNPRINTABLE_FILE, ReliefTask
-from litho_design.reports.advice import stroke_advice
+from litho_design.reports.advice import baseline_line, headline, stroke_advice
 from litho_design.reports.lens import add_lens_curves, add_lens_window, decibels
 from litho_design.reports.parts import (
     BRIGHTEST,
@@ -20,6 +21,7 @@ from litho_design.reports.parts import (
     add_notes,
     add_scores,
     add_yield,
+    identity,
     level_table,
     meanings,
     progress_figure,
@@ -45,26 +47,34 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
         _TITLES.get(design.task, design.task),
         f"Designed through the printer model “{design.printer.name}”; "
         "all scores are of the printable layout.",
+        run=design.run,
+        facts=identity(design),
     )
-    page.tiles([*_tiles(design, task), (f"{design.stroke.stroke_waves:.2f} waves", "printed stroke")])
+    page.verdict(
+        f"As {design.printer.name} prints it: {headline(design.predicted)}. This is what the model that the "
+        "layout was designed with expects, not a measurement: before printing, score it with another model "
+        "(litho-design score, litho-design compare)."
+    )
+    if design.baselines:
+        line = baseline_line(design.baselines)
+        page.paragraph(f"{line[0].upper()}{line[1:]}.")
     add_notes(page, design)
-    page.heading("Layout, print and light")
     page.figure(
         _pictures(folder, design, task, levels, height_um, seen),
         "Rows are y (down), columns x; lengths in µm. A PSF is in decibels below its peak.",
     )
+    page.tiles([*_tiles(design, task), (f"{design.stroke.stroke_waves:.2f} waves", "printed stroke")])
+    page.heading("All scores", folded=True)
     labels = meanings(task.score_type)
     if isinstance(task, LensTask):
         add_lens_curves(page, design, height_um, seen, task.bench)
     add_scores(page, design, labels)
     if design.reference_efficiency:
         _add_reference(page, design, task)
-    page.heading("Search")
-    page.figure(
-        progress_figure(history, design), "Loss of the sampled layout and of the printable (argmax) layout."
-    )
+    page.heading("Search", folded=True)
+    page.figure(progress_figure(history, design), "Loss of the sampled layout and of the printable layout.")
     page.paragraph(
-        f"Argmax loss {design.start_loss:.4f} at the start, {design.argmax_loss:.4f} after "
+        f"Loss of the printable layout: {design.start_loss:.4f} at the start, {design.argmax_loss:.4f} after "
         f"{design.iterations} iterations, {design.polished_loss:.4f} after the polish; the last sample had "
         f"{design.sample_loss:.4f} (soft-to-hard gap {design.argmax_loss - design.sample_loss:+.4f})."
     )
@@ -79,12 +89,12 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
     add_yield(page, draws, window, figures, measure_yield(draws, design.predicted, window))
     if isinstance(task, LensTask):
         add_lens_window(page, task.bench, print_um)
-    page.heading("Printed height of the levels")
+    page.heading("Printed height of the levels", folded=True)
     page.table(level_table(design), "Printed height of a uniform field of each level", "levels.csv", digits=3)
     page.paragraph(stroke_advice(design))
     add_gauge(page, design)
-    page.heading("Settings")
-    page.code(design.model_dump_json(indent=1, include={"settings", "printer", "target", "run", "notes"}))
+    page.heading("Settings", folded=True)
+    page.code(design.model_dump_json(indent=1, include={"settings", "printer", "target"}))
     return page.write(folder)
 
 

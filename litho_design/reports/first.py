@@ -6,7 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from litho_data.foundation.report import Page, new_figure
+from litho_data.foundation.report import Page
+from litho_data.foundation.report_pictures import new_figure
 from litho_design.judging.gap import GapResult, design_folder
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.printers.printer import Printer
@@ -33,12 +34,16 @@ def write_first_report(folder: Path, result: GapResult, printers: Mapping[str, P
         "The same hologram, designed without and with a model of the printer",
         "A printer blurs and shrinks what it prints. A layout made for a perfect printer suffers from "
         "that; a layout made through the model of the printer has already taken it into account.",
+        run=result,
+        facts={"seed": result.seeds[0]},
     )
-    page.tiles(
-        [
-            (f"{scores[arm, DESIGNER]:.1f} dB", f"{name}, as it would be printed")
-            for arm, name in _NAMES.items()
-        ]
+    gain, judged = (scores[DESIGNER, by] - scores[WITHOUT, by] for by in (DESIGNER, JUDGE))
+    better, doubt = (("better" if one >= 0 else "worse") for one in (gain, judged))
+    page.verdict(
+        f"Designed with the model, the printed hologram shows the image {abs(gain):.1f} dB {better}: "
+        f"{scores[DESIGNER, DESIGNER]:.1f} dB instead of {scores[WITHOUT, DESIGNER]:.1f} dB. That is what "
+        f"{DESIGNER} expects of its own design; {JUDGE}, a model that had no part in it, finds it "
+        f"{abs(judged):.1f} dB {doubt}. One hologram, so nothing is said about chance."
     )
     for note in designs[WITHOUT].record.notes:
         page.note(note[0].upper() + note[1:] + ".")
@@ -58,7 +63,7 @@ def write_first_report(folder: Path, result: GapResult, printers: Mapping[str, P
         _draw_prints(designs, printers[DESIGNER]),
         f"Layouts at their nominal heights, and what the model {DESIGNER} prints of them; all on one scale.",
     )
-    page.heading("In numbers")
+    page.heading("In numbers", folded=True)
     rows = [
         {"hologram": name} | {f"printed by {judge}, dB": scores[arm, judge] for judge in printers}
         for arm, name in _NAMES.items()
@@ -67,8 +72,8 @@ def write_first_report(folder: Path, result: GapResult, printers: Mapping[str, P
         pd.DataFrame(rows), "none: a perfect printer, which prints every level at its height", "scores.csv"
     )
     places = {arm: design_folder(Path(), arm, result.seeds[0]) / "report.html" for arm in _NAMES}
+    page.heading("Reports of the two holograms")
     page.links([(places[arm].as_posix(), f"Report of the hologram {name}") for arm, name in _NAMES.items()])
-    page.code(result.command)
     return page.write(folder)
 
 

@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from litho_data.foundation.report import Page, new_figure
+from litho_data.foundation.report import Page
+from litho_data.foundation.report_pictures import model_colour, new_figure
 from litho_design.holograms.bench import HologramScore
-from litho_design.judging.gap import GapResult, design_folder, headline
+from litho_design.judging.gap import GapResult, PairedDifference, design_folder, headline
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.lenses.score import ImagingLensScore
 from litho_design.printers.printer import Printer
-from litho_design.reports.advice import baseline_line
+from litho_design.reports.advice import baseline_line, less_is_better
 from litho_design.reports.parts import image_grid, meanings
 from litho_design.tasks.design import Design
 
@@ -24,37 +25,28 @@ if TYPE_CHECKING:
 
 # Side of the cut-out that shows layout against print; features of some pixels must stay visible.
 _DETAIL_PX = 160
+# With fewer, an interval over seeds is missing or says nothing.
+_FEWEST_SEEDS = 3
 _LABELS = meanings(HologramScore) | meanings(ImagingLensScore)
 
 
 def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Printer]) -> Path:
     """Write ``report.html`` and one CSV per table."""
     what = f"hologram of “{result.target}”" if result.task == "hoe" else result.task.replace("-", ", ")
+    shown = headline(result.task)
     page = Page(
         "The design-to-manufacturing gap",
         f"{what}: {len(result.arms)} arms, {len(result.seeds)} seed(s), {result.settings.search.iterations} "
         "iterations each; layouts are scored as they would be printed.",
+        run=result,
+        facts={"seeds": ", ".join(map(str, result.seeds))}
+        | {f"{name}, SHA-256": one.sha256 for name, one in result.judges.items() if one.sha256},
     )
-    if len(result.seeds) < 3:
-        page.note(
-            f"Only {len(result.seeds)} seed(s): intervals are missing or wide, so the arms cannot be ranked."
-        )
     own = Design.read(design_folder(folder, next(iter(result.arms)), result.seeds[0]))
+    shown = shown or tuple(own.predicted)
+    page.verdict(_verdict(result, shown[0]))
     for note in own.notes:
         page.note(note[0].upper() + note[1:] + ".")
-    page.paragraph(
-        "An arm is a model that layouts are designed with (rows); a judge is a model that prints them "
-        "(columns). On the diagonal a model judges its own design: that is its expectation, not an "
-        "independent result."
-    )
-    if own.baselines:
-        line = baseline_line(own.baselines)
-        page.paragraph(f"{line[0].upper()}{line[1:]}. No printer is involved in these.")
-    shown = headline(result.task) or tuple(own.predicted)
-    for figure in shown:
-        caption = f"{_LABELS.get(figure, figure)}: mean over seeds [95 % interval]"
-        page.table(_matrix(result, figure), caption, f"matrix_{figure}.csv", digits=3)
-    page.heading("In design and after printing")
     judged = _judged(folder, result, printers)
     page.figure(
         _pictures(result, judged),
@@ -63,6 +55,19 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
             "Square root of the PSF over its peak." if result.task.startswith("lens-") else "Scaled to match."
         ),
     )
+    page.paragraph(
+        "An arm is a model that layouts are designed with (rows); a judge is a model that prints them "
+        "(columns). On the diagonal a model judges its own design: that is its expectation, not an "
+        "independent result."
+    )
+    page.table(_matrix(result, shown[0]), _caption(shown[0]), f"matrix_{shown[0]}.csv", digits=3)
+    if own.baselines:
+        line = baseline_line(own.baselines)
+        page.paragraph(f"{line[0].upper()}{line[1:]}. No printer is involved in these.")
+    page.heading("Further figures", folded=True)
+    for figure in shown[1:]:
+        page.table(_matrix(result, figure), _caption(figure), f"matrix_{figure}.csv", digits=3)
+    page.heading("Layouts, prints and what they cost", folded=True)
     page.figure(
         _prints(result, judged, printers),
         f"Seed {result.seeds[0]}: layout and prints in the middle of the element, heights in µm, each in the "
@@ -79,13 +84,48 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
         "Left: expected in design (circles) and after each judge's print (bars), means over seeds. Right: "
         "design minus print, the gap.",
     )
-    page.heading("Arm against arm")
+    page.heading("Arm against arm", folded=True)
     page.paragraph(
         "Differences under the same judge, paired by seed. Where the interval includes 0, the order is open."
     )
     page.table(_paired_frame(result), "Paired differences", "paired.csv", digits=3)
     page.table(_long_frame(result), "All means", "summary.csv", digits=4)
     return page.write(folder)
+
+
+def _verdict(result: GapResult, figure: str) -> str:
+    """The best arm under each judge that is none of the arms, or else under every judge."""
+    judges = [name for name in result.judges if name not in result.arms] or list(result.judges)
+    sign = -1 if less_is_better(figure) else 1
+    told = []
+    for judge in judges:
+        found = {i.arm: i.judged_mean for i in result.summary if (i.judge, i.figure) == (judge, figure)}
+        ranking = sorted(found, key=lambda arm: -sign * found[arm])
+        text = f"Printed by {judge}, layouts designed with {ranking[0]} are best: {found[ranking[0]]:.3g}"
+        if len(ranking) > 1:
+            pair = next(
+                i
+                for i in result.paired
+                if (i.judge, i.figure) == (judge, figure) and {i.arm, i.against} == set(ranking[:2])
+            )
+            text += f", against {found[ranking[1]]:.3g} with {ranking[1]}; " + _chance(
+                pair, len(result.seeds)
+            )
+        told.append(f"{text}.")
+    return f"{' '.join(told)} The figure is the {_LABELS.get(figure, figure)}."
+
+
+def _chance(pair: PairedDifference, seeds: int) -> str:
+    if pair.ci95 is None or seeds < _FEWEST_SEEDS:
+        return f"{seeds} seed{'s' * (seeds > 1)} cannot tell that from chance"
+    low, high = pair.ci95
+    sure = "more than chance" if low > 0 or high < 0 else "which may be chance"
+    return f"{sure} (95 % interval of the difference over {seeds} seeds {low:.3g} … {high:.3g})"
+
+
+def _caption(figure: str) -> str:
+    better = "less" if less_is_better(figure) else "more"
+    return f"{_LABELS.get(figure, figure)}: mean over seeds [95 % interval]; {better} is better."
 
 
 def _matrix(result: GapResult, figure: str) -> pd.DataFrame:
@@ -122,7 +162,9 @@ def _pictures(result: GapResult, judged: dict[str, tuple[LoadedDesign, dict[str,
     images, titles, side_um = [], [], 0.0
     for arm, (loaded, by_judge) in judged.items():
         images.append([loaded.display(image) for image in by_judge.values()])
-        titles.append([f"{arm}: in design" if name == arm else f"printed by {name}" for name in by_judge])
+        titles.append(
+            [f"{arm}: in design" if name == arm else f"{arm}: printed by {name}" for name in by_judge]
+        )
         side_um = loaded.window_um
     return image_grid(images, titles, list(judged), side_um)
 
@@ -162,10 +204,10 @@ def _profiles(result: GapResult, judged: dict[str, tuple[LoadedDesign, dict[str,
             x = (np.arange(psf.shape[0]) - (psf.shape[0] - 1) / 2) * pitch
             width = 2.5 if name == arm else 1.0
             label = f"{name} (design)" if name == arm else name
-            left.plot(x, psf[psf.shape[0] // 2], linewidth=width, label=label)
+            left.plot(x, psf[psf.shape[0] // 2], linewidth=width, color=model_colour(name), label=label)
             spectrum = np.abs(np.fft.rfft(psf.sum(0)))
             frequency = np.fft.rfftfreq(psf.shape[0], pitch)
-            right.plot(frequency, spectrum, linewidth=width)
+            right.plot(frequency, spectrum, linewidth=width, color=model_colour(name))
         left.set_xlim(-6, 6)
         left.set_ylabel(f"designed with {arm}\nshare per pixel")
         left.legend(fontsize=7)
@@ -187,9 +229,10 @@ def _bars(result: GapResult, name: str):
         place = np.arange(len(judges)) + (index - (len(arms) - 1) / 2) * width
         half = [0.0 if i.judged_ci95 is None else i.judged_ci95[1] - i.judged_mean for i in items]
         error = {"yerr": half, "capsize": 2} if any(half) else {}
-        left.bar(place, [item.judged_mean for item in items], width, color=f"C{index}", label=arm, **error)
+        colour = model_colour(arm)
+        left.bar(place, [item.judged_mean for item in items], width, color=colour, label=arm, **error)
         left.plot(place, [item.designed_mean for item in items], "o", mfc="none", color="black", ms=4)
-        right.bar(place, [item.gap_mean for item in items], width, color=f"C{index}")
+        right.bar(place, [item.gap_mean for item in items], width, color=colour)
     left.set_ylabel(textwrap.fill(_LABELS.get(name, name), 32))
     right.set_ylabel(textwrap.fill(f"Δ {_LABELS.get(name, name)}", 32))
     right.axhline(0, color="black", linewidth=0.8)

@@ -6,7 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from litho_data.foundation.report import Page, new_figure
+from litho_data.foundation.report import Page
+from litho_data.foundation.report_pictures import new_figure
 from litho_design.lenses.bench import LensBench
 from litho_design.lenses.focus_window import focus_window
 from litho_design.lenses.score import mtf
@@ -36,23 +37,23 @@ def _curves(design: Design, height: np.ndarray, psf: np.ndarray, ideal: np.ndarr
     x = bench.grid.x_um[middle:]
     axes[0].plot(x, height[middle, middle:], label="print")
     wanted = bench.ideal_height_um().cpu().numpy()[middle, middle:]
-    axes[0].plot(x, wanted, color="0.7", linewidth=0.8, label="perfect lens", zorder=0)
+    axes[0].plot(x, wanted, color="#9aa7b5", linewidth=0.8, label="perfect lens", zorder=0)
     axes[0].set_xlim(0, min(30, x[-1]))
     axes[0].set_xlabel("distance from the centre, µm")
     axes[0].set_ylabel("height, µm")
     across = bench.window.x_um
     row = psf.shape[0] // 2
-    axes[1].plot(across, ideal[row] / ideal.max(), color="0.6", label="perfect lens")
+    axes[1].plot(across, ideal[row] / ideal.max(), color="#9aa7b5", label="perfect lens")
     axes[1].plot(across, psf[row] / ideal.max(), label="print")
     axes[1].set_xlim(-6, 6)
     axes[1].set_xlabel("x, µm")
     axes[1].set_ylabel("PSF over ideal peak")
     frequency = np.arange(psf.shape[0] // 2) / (psf.shape[0] * design.layout.pitch_um)
-    for image, label, colour in ((ideal, "perfect lens", "0.6"), (psf, "print", "C0")):
+    for image, label, colour in ((ideal, "perfect lens", "#9aa7b5"), (psf, "print", "C0")):
         curve = mtf(torch.from_numpy(image))[0, : len(frequency)].numpy()
         axes[2].plot(frequency, curve, label=label, color=colour)
     cutoff = 2 * bench.numerical_aperture / design.optics.wavelength_um
-    axes[2].axvline(cutoff, color="0.8", linewidth=0.8)
+    axes[2].axvline(cutoff, color="#9aa7b5", linewidth=0.8)
     axes[2].set_xlim(0, 1.15 * cutoff)
     axes[2].set_xlabel("cycles/µm")
     axes[2].set_ylabel("MTF")
@@ -66,6 +67,7 @@ def add_lens_window(page: Page, bench: LensBench, height_um: Tensor) -> None:
     import pandas as pd
 
     window = focus_window(bench, height_um)
+    page.heading("Focus and dose", folded=True)
     page.paragraph(
         "Focus and print gain (which represents the dose) are swept. The peak stays above 80 % of its best "
         f"value over {window.depth_of_focus_um:.1f} µm of defocus at the modelled gain and over a gain range "
@@ -82,7 +84,7 @@ def add_lens_window(page: Page, bench: LensBench, height_um: Tensor) -> None:
     axes[1].legend(fontsize=8)
     share = strehl / strehl.max()
     shown = axes[2].contourf(window.defocus_um, window.gain, share, levels=np.linspace(0, 1, 11))
-    axes[2].contour(window.defocus_um, window.gain, share, levels=[0.8], colors="white")
+    axes[2].contour(window.defocus_um, window.gain, share, levels=[0.8], colors="#fefefe")
     axes[2].set_ylabel("print gain over the modelled one")
     figure.colorbar(shown, ax=axes[2], label="peak over the best of the sweep")
     for axis in axes:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from litho_data.foundation.report import Page, new_figure
+from litho_data.foundation.report import Page, spelt_out
+from litho_data.foundation.report_pictures import new_figure
 from litho_data.foundation.results import Record
 from litho_design.optimisation.process_window import ProcessWindow, Yield, spreads
 from litho_design.reports.advice import distribution_warning, thickness_warning
@@ -22,13 +23,18 @@ BRIGHTEST = 1.5
 
 
 def add_notes(page: Page, design: Design) -> None:
-    """Whose prediction the report shows, and the remarks of the record."""
-    page.note(
-        "These scores are predictions of the model that the layout was designed with. Before printing, score "
-        "the layout with another model (litho-design score, litho-design compare)."
-    )
-    for note in filter(None, (thickness_warning(design), *design.notes)):
+    """The remarks of the record, and where layout or element lie beyond what the scores can tell."""
+    for note in filter(None, (distribution_warning(design), thickness_warning(design), *design.notes)):
         page.note(note[0].upper() + note[1:] + ".")
+
+
+def identity(design: Design) -> dict[str, object]:
+    """What identifies a design at the foot of its report: hashes of printer and target, seed."""
+    search = design.settings.get("search", {})
+    facts = {"printer": design.printer.name, "printer, SHA-256": design.printer.sha256}
+    return {
+        name: value for name, value in (facts | {"seed": search.get("seed")}).items() if value is not None
+    }
 
 
 def progress_figure(history: list[dict[str, float]], design: Design):
@@ -36,9 +42,9 @@ def progress_figure(history: list[dict[str, float]], design: Design):
     figure = new_figure(8, 3.4)
     axis = figure.subplots()
     steps = [entry["iteration"] for entry in history]
-    axis.plot(steps, [entry["sample_loss"] for entry in history], color="0.6", label="sampled layout")
-    axis.plot(steps, [entry["argmax_loss"] for entry in history], color="tab:blue", label="argmax layout")
-    axis.axhline(design.polished_loss, color="tab:green", linewidth=1, label="after polish")
+    axis.plot(steps, [entry["sample_loss"] for entry in history], color="#9aa7b5", label="sampled layout")
+    axis.plot(steps, [entry["argmax_loss"] for entry in history], color="#2f7fd0", label="printable layout")
+    axis.axhline(design.polished_loss, color="#3a9142", linewidth=1, label="after polish")
     axis.set_xlabel("iteration")
     axis.set_ylabel("loss")
     axis.legend()
@@ -62,7 +68,7 @@ def add_yield(
     """
     import pandas as pd
 
-    page.heading("Process window")
+    page.heading("Process window", folded=True)
     designed = "in the loss" if window.samples else "not in the loss"
     page.paragraph(
         f"The curves give the share of {len(draws)} random prints that are at least as good as the value on "
@@ -73,7 +79,7 @@ def add_yield(
     page.paragraph(
         f"{passed.passed} of {passed.draws} prints pass ({low} to {high} %, 95 % interval): no figure in dB "
         f"is more than {window.pass_drop_db:g} dB below the print as modelled, every other one keeps "
-        f"{100 * window.pass_share:g} % of it. Judged by {', '.join(passed.figures)}."
+        f"{100 * window.pass_share:g} % of it. Judged by {', '.join(map(spelt_out, passed.figures))}."
     )
     figure = new_figure(8, 3)
     (axes,) = figure.subplots(1, len(figures), sharey=True, squeeze=False)
@@ -114,7 +120,7 @@ def add_scores(page: Page, design: Design, labels: Mapping[str, str]) -> None:
     columns = {"print": design.predicted} | thick | (design.baselines or {})
     page.table(
         score_table(columns, labels),
-        "Scores of the argmax layout as printed, and of what it is to be compared with on the same grid",
+        "Scores of the printable layout as printed, and of what it is to be compared with on the same grid",
         "scores.csv",
         digits=4,
     )
@@ -148,10 +154,7 @@ def add_gauge(page: Page, design: Design) -> None:
     """What a printer must resolve, and the distance from the model's training layouts."""
     import pandas as pd
 
-    page.heading("What the printer must resolve")
-    warning = distribution_warning(design)
-    if warning:
-        page.note(warning[0].upper() + warning[1:] + ".")
+    page.heading("What the printer must resolve", folded=True)
     gauge = design.out_of_distribution
     tiling, ensemble = design.tiling, design.ensemble
     if tiling is not None:

@@ -10,6 +10,7 @@ from litho_data.foundation.report import Page
 from litho_design.judging.loaded import task_named
 from litho_design.judging.photographs import LensPhotoScore
 from litho_design.judging.score import ScoreResult
+from litho_design.reports.advice import headline
 from litho_design.reports.parts import image_grid, meanings, score_table
 
 
@@ -32,11 +33,24 @@ def write_score_report(
     page = Page(
         "Score of a printable layout",
         f"Designed through “{result.designed_with.name}”, printed by {len(result.scores)} judge(s).",
+        run=result,
+        facts={"layout, SHA-256": result.layout_sha256, "seeds": ", ".join(map(str, result.seeds))},
     )
-    if not any(score.independent for score in result.scores):
-        page.note(
-            "No judge is independent of the design: these scores only repeat the prediction of its own model."
+    page.verdict(_verdict(result))
+    page.figure(
+        image_grid([list(pictures.values())], [list(pictures)], [""], side_um),
+        "Behind each print: the image at matched scale, or the square root of the PSF.",
+    )
+    if photos:
+        page.figure(
+            image_grid([list(photos.values())], [list(photos)], [""], frame_um),
+            "Photograph through the printed lens, each image at the scale of least error. The scores are of "
+            "this one object.",
         )
+    for score in result.scores:
+        for remark in score.remarks():
+            page.paragraph(f"{score.judge.name}: {remark}.")
+    page.heading("All scores", folded=True)
     columns = {f"{result.designed_with.name} (design)": result.designed}
     for score in result.scores:
         name = score.judge.name + ("" if score.independent else " (not independent)")
@@ -48,19 +62,6 @@ def write_score_report(
     page.table(
         table, "Figures by judge, ± one standard deviation, and their baselines", "scores.csv", digits=3
     )
-    for score in result.scores:
-        for remark in score.remarks():
-            page.paragraph(f"{score.judge.name}: {remark}.")
-    page.figure(
-        image_grid([list(pictures.values())], [list(pictures)], [""], side_um),
-        "Behind each print: the image at matched scale, or the square root of the PSF.",
-    )
-    if photos:
-        page.figure(
-            image_grid([list(photos.values())], [list(photos)], [""], frame_um),
-            "Photograph through the printed lens, each image at the scale of least error. The scores are of "
-            "this one object.",
-        )
     heights = pd.DataFrame(
         [
             {
@@ -74,3 +75,17 @@ def write_score_report(
     )
     page.table(heights, "Heights against the print that the design expected", "heights.csv", digits=1)
     return page.write(folder)
+
+
+def _verdict(result: ScoreResult) -> str:
+    expected = f"The design expects {headline(result.designed)}. "
+    if not any(score.independent for score in result.scores):
+        return expected + (
+            "No judge is independent of the design: these scores only repeat the prediction of its own model."
+        )
+    told = [
+        f"{score.judge.name}: {headline(score.figures, score.uncertainty)}"
+        for score in result.scores
+        if score.independent
+    ]
+    return f"{expected}Judged independently, by {'; by '.join(told)}."

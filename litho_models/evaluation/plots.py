@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from litho_data.foundation.report import new_figure
+from litho_data.foundation.report_pictures import LIGHT, model_colour, new_figure
 from litho_data.store import PrintedScan
 from litho_models.scan_terms import NuisanceProtocol, cross_fit, policy_terms
 from litho_models.scoring.records import ModelScores
@@ -28,29 +28,31 @@ def error_bars(scores: Sequence[ModelScores], floor_nm: float | None, paper_line
     figure = new_figure(8.5, 0.55 * len(scores) + 2.0)
     axes = figure.subplots()
     position = np.arange(len(scores))
-    for shift, label, colour, values in (
-        (-0.17, "MAE, no fit at test time", "#9aa7b5", [(s.mae_abs_nm, s.mae_abs_ci95_nm) for s in scores]),
+    colours = [model_colour(s.model) for s in scores]
+    for shift, label, strength, values in (
+        (-0.17, "nothing fitted", 0.4, [(s.mae_abs_nm, s.mae_abs_ci95_nm) for s in scores]),
         (
             0.17,
-            "MAE, datum-free",
-            "#0b6aa2",
+            "own terms of each scan fitted",
+            1.0,
             [(s.mae_datum_free_nm, s.mae_datum_free_ci95_nm) for s in scores],
         ),
     ):
         means = np.array([mean for mean, _ in values])
-        axes.barh(position + shift, means, 0.32, color=colour, label=label)
+        axes.barh(position + shift, means, 0.32, color=colours, alpha=strength)
+        axes.fill_between([], [], color="#868d98", alpha=strength, label=label)
         ends = np.array([ci or (mean, mean) for mean, ci in values])
         axes.errorbar(
             means,
             position + shift,
             xerr=np.abs(ends.T - means),
             fmt="none",
-            ecolor="#1c2430",
+            ecolor=LIGHT["ink"],
             capsize=3,
             lw=1,
         )
     if floor_nm is not None:
-        axes.axvline(floor_nm, color="#2d8a4e", ls="--", label=f"noise floor, datum-free: {floor_nm:.1f} nm")
+        axes.axvline(floor_nm, color="#2d8a4e", ls="--", label=f"noise floor: {floor_nm:.1f} nm")
     if paper_line:
         axes.axvline(
             PAPER_MAE_NM, color="#c23b22", ls=":", label=f"paper, PBL: {PAPER_MAE_NM} nm (other protocol)"
@@ -99,10 +101,10 @@ def line_profiles(
     row = scan.shape[0] // 2
     x_um = (np.arange(scan.shape[1]) + 0.5) * scan.pitch_um
     axes.step(x_um, scan.layout_um[row], where="mid", color="#c9d1da", lw=1, label="layout")
-    axes.plot(x_um, scan.height_um[row], color="#1c2430", lw=1.4, label="measured")
+    axes.plot(x_um, scan.height_um[row], color=LIGHT["ink"], lw=1.4, label="measured")
     for name, prediction in predictions_um.items():
         matched = scan.height_um[row] - residual_um(scan, prediction, protocol)[row]
-        axes.plot(x_um, matched, lw=1, label=name)
+        axes.plot(x_um, matched, lw=1, color=model_colour(name), label=name)
     axes.set_xlabel("x, µm")
     axes.set_ylabel("height, µm")
     axes.set_xlim(0, min(x_um[-1], 30))
@@ -116,8 +118,9 @@ def level_bias(scores: Sequence[ModelScores]) -> Figure:
     left, right = figure.subplots(1, 2)
     for score in scores:
         levels = [entry.level for entry in score.by_level]
-        left.plot(levels, [entry.bias_nm for entry in score.by_level], "o-", ms=3, lw=1, label=score.model)
-        right.plot(levels, [entry.sd_nm for entry in score.by_level], "o-", ms=3, lw=1)
+        style: dict[str, Any] = {"marker": "o", "ms": 3, "lw": 1, "color": model_colour(score.model)}
+        left.plot(levels, [entry.bias_nm for entry in score.by_level], label=score.model, **style)
+        right.plot(levels, [entry.sd_nm for entry in score.by_level], **style)
     left.axhline(0, color="#9aa7b5", lw=0.8)
     left.set_ylabel("bias (measured - predicted), nm")
     right.set_ylabel("standard deviation, nm")
@@ -131,8 +134,8 @@ def transfer(scores: Sequence[ModelScores]) -> Figure:
     """Transfer, coherence and error density against spatial frequency, along x (solid) and y (dashed)."""
     figure = new_figure(12, 3.4)
     panels = figure.subplots(1, 3)
-    for number, score in enumerate(scores):
-        curves, colour = score.transfer, f"C{number % 10}"
+    for score in scores:
+        curves, colour = score.transfer, model_colour(score.model)
         for axes, name in zip(panels, ("gain", "coherence", "error_psd"), strict=True):
             along_x, along_y = getattr(curves, f"{name}_x"), getattr(curves, f"{name}_y")
             axes.plot(curves.frequency_per_um, along_x, color=colour, lw=1.2, label=score.model)
@@ -154,9 +157,11 @@ def loss_curves(fits: Sequence[FitRecord]) -> Figure:
     """Training error (solid) and inner-validation error (dashed) of every fit with rounds."""
     figure = new_figure(8.5, 3.4)
     axes = figure.subplots()
-    for number, fit in enumerate(fits):
-        colour = f"C{number % 10}"
-        label = f"{fit.model}, fold {fit.fold}"
+    named: set[str] = set()
+    for fit in fits:
+        colour = model_colour(fit.model)
+        label = None if fit.model in named else fit.model
+        named.add(fit.model)
         axes.plot(fit.steps, fit.training_mae_nm, color=colour, lw=1.2, label=label)
         validation = [np.nan if value is None else value for value in fit.validation_mae_datum_free_nm]
         axes.plot(fit.steps, validation, color=colour, lw=1, ls="--")

@@ -12,6 +12,7 @@ from litho_data.foundation.report import Page
 from litho_data.store import PrintedScan
 from litho_models.evaluation import plots, tables
 from litho_models.evaluation.results import Benchmark, Evaluation, ModelRecord
+from litho_models.evaluation.words import COLUMNS, benchmark_verdict, evaluation_verdict
 from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.noise_floor import NoiseFloor
 from litho_models.scoring.records import ModelScores, ScanRow
@@ -34,50 +35,35 @@ def write_evaluation_report(
 ) -> Path:
     """Render the result into ``out``; returns the page."""
     scores = result.scores
-    page = Page(
-        f"{result.model.name} on {result.dataset.name}",
-        f"{len(scores.scans)} scans, datum-free MAE {scores.mae_datum_free_nm:.2f} nm.",
-    )
-    page.tiles(
-        [
-            (f"{scores.mae_datum_free_nm:.2f} nm", "MAE, datum-free"),
-            (f"{scores.mae_abs_nm:.2f} nm", "MAE, no fit at test time"),
-            (f"{scores.bias_nm:.1f} nm", "bias"),
-        ]
-    )
+    page = Page(f"{result.model.name} on {result.dataset.name}", run=result.run, facts=_facts(result))
+    page.verdict(evaluation_verdict(result))
     if result.trained_on_scored_scans:
         count = len(result.trained_on_scored_scans)
         page.note(f"{count} of the scored scans were used in training: this is not a held-out error.")
-    page.note(lock_box_text(result.split))
     if result.model.extrapolated:
         page.note("Layouts beyond the calibrated range were accepted (extrapolate).")
-    page.paragraph(tables.protocol_text(result.nuisance))
     page.figure(
         plots.error_bars([scores], result.noise_floor.mae_at(result.nuisance.policy), False),
         "Error and noise floor.",
     )
-    page.table(
-        tables.headline_table([scores], result.nuisance, result.noise_floor),
-        "Error over scans.",
-        "headline.csv",
-    )
-    page.paragraph(tables.floor_text(result.noise_floor))
-    _policies(page, [scores], result.nuisance, result.noise_floor)
-    page.table(tables.metric_table([scores]), "Phase, similarity, edges.", "metrics.csv", digits=3)
-    page.paragraph(tables.metric_text())
-    page.table(
-        _model(result.model),
-        "The same pixels in another crop; what predicting a scan costs on the machine that made this.",
-        "model.csv",
-    )
+    page.paragraph(lock_box_text(result.split))
     worst = max(range(len(scans)), key=lambda i: scores.scans[i].mae_datum_free_nm)
     shown = {scores.model: predictions_um[worst]}
     page.heading("The worst scan")
     page.figure(plots.residual_maps(scans[worst], shown, result.nuisance), "Measured height and error.")
     page.figure(plots.line_profiles(scans[worst], shown, result.nuisance), "Middle row.")
+    page.heading("The errors in numbers", folded=True)
+    _headline(page, [scores], result, "Error over scans.", "headline.csv")
+    _policies(page, [scores], result.nuisance, result.noise_floor)
+    _metrics(page, [scores], "Phase, similarity, edges.")
+    page.table(
+        _model(result.model),
+        "The same pixels in another crop; what predicting a scan costs on the machine that made this.",
+        "model.csv",
+        words=COLUMNS,
+    )
     _by_level_and_frequency(page, [scores])
     _all_numbers(page, [scores], "By scan.", "By level.")
-    page.code(result.run.command)
     return page.write(out)
 
 
@@ -91,39 +77,35 @@ def write_benchmark_report(
     scores = sorted(result.scores, key=lambda s: -s.mae_datum_free_nm)
     best = scores[-1]
     on_paper_data = result.dataset.name == _PAPER_DATASET
-    page = Page(
-        f"Benchmark on {result.dataset.name}",
-        f"Best held-out model: {best.model}, {best.mae_datum_free_nm:.2f} nm datum-free MAE "
-        f"over {len(best.scans)} held-out {'quadrants' if result.split.kind == 'paper' else 'scans'}.",
-    )
-    page.paragraph(f"Split '{result.split.kind}': {_SPLIT_TEXT[result.split.kind]}.")
+    page = Page(f"Benchmark on {result.dataset.name}", run=result.run, facts=_facts(result))
+    page.verdict(benchmark_verdict(result))
+    if len(best.scans) < 8:
+        page.note(f"Only {len(best.scans)} scans: intervals over scans are rough.")
     page.figure(
         plots.error_bars(scores, result.noise_floor.mae_at(result.nuisance.policy), on_paper_data),
-        "Held-out error of every model.",
+        f"Held-out error of every model. Split '{result.split.kind}': {_SPLIT_TEXT[result.split.kind]}.",
     )
-    page.table(
-        tables.headline_table(scores, result.nuisance, result.noise_floor), "Held-out error.", "benchmark.csv"
-    )
-    page.paragraph(tables.protocol_text(result.nuisance))
+    _headline(page, scores, result, "Held-out error.", "benchmark.csv")
     if on_paper_data:
         page.note(paper_sentence(result.split.kind))
-    page.paragraph(tables.floor_text(result.noise_floor))
+    page.heading("Which differences are more than chance?", folded=True)
+    page.table(
+        _pairs(result),
+        "Error of one model minus that of another over the same scans, with the same terms fitted.",
+        "pairs.csv",
+        digits=3,
+        words=COLUMNS,
+    )
     if result.locked_scores:
-        page.heading("Lock box")
-        page.table(
-            tables.headline_table(result.locked_scores, result.nuisance, result.noise_floor),
+        page.heading("Lock box", folded=True)
+        _headline(
+            page,
+            result.locked_scores,
+            result,
             "Trained on all development scans, scored once on the locked scans.",
             "lock_box.csv",
         )
-    _policies(page, scores, result.nuisance, result.noise_floor)
-    page.heading("Pairs of models")
-    page.table(
-        _pairs(result), "Datum-free MAE, first minus second, over the same scans.", "pairs.csv", digits=3
-    )
-    page.heading("Phase, similarity, edges")
-    page.table(tables.metric_table(scores), "Means over held-out scans.", "metrics.csv", digits=3)
-    page.paragraph(tables.metric_text())
-    page.heading("One scan")
+    page.heading("One scan", folded=True)
     middle = _median_scan(best.scans)
     shown = {s.model: predictions_um[s.model][scans[middle].id] for s in scores}
     page.figure(
@@ -132,28 +114,53 @@ def write_benchmark_report(
     )
     profiles = {name: shown[name] for name in [s.model for s in scores[-2:]]}
     page.figure(plots.line_profiles(scans[middle], profiles, result.nuisance), "Its middle row.")
-    page.heading("Gain and offset of single prints")
+    page.heading("Phase, similarity, edges", folded=True)
+    _metrics(page, scores, "Means over held-out scans.")
+    page.heading("With other terms fitted", folded=True)
+    _policies(page, scores, result.nuisance, result.noise_floor)
+    page.heading("Gain and offset of single prints", folded=True)
     page.figure(
         plots.print_gains(best),
         f"Line through measured against predicted height ({best.model}, nothing fitted to the scan before); "
         "95 % ellipses from blocks of 32 px. Numbers in scans.csv.",
     )
     _by_level_and_frequency(page, scores)
-    page.heading("Training")
+    page.heading("Training", folded=True)
     page.table(
         _fits(result),
-        "Every fit: datum-free error on its training, inner-validation and held-out scans, all without a "
-        "background (policy offset), so that over-fitting shows; the largest and the RMS difference of the "
-        "same pixels in another crop; what training and predicting a scan cost on the machine at hand.",
+        "Every fit: error on its training, inner-validation and held-out scans, all without a background and "
+        "with the zero height of each scan fitted, so that over-fitting shows; the largest and the RMS "
+        "difference of the same pixels in another crop; what training and predicting cost here.",
         "fits.csv",
         digits=3,
+        words=COLUMNS,
     )
     curves = [fit for fit in result.fits if len(fit.steps) > 1]
     if curves:
         page.figure(plots.loss_curves(curves), "Error during training.")
     _all_numbers(page, scores, "By model and scan.", "By model and level.")
-    page.code(result.run.command)
     return page.write(out)
+
+
+def _facts(result: Evaluation | Benchmark) -> dict[str, object]:
+    facts: dict[str, object] = {
+        "dataset": result.dataset.sha256,
+        "seeds": ", ".join(map(str, result.run.seeds)),
+    }
+    return facts | ({"model": result.model.sha256} if isinstance(result, Evaluation) else {})
+
+
+def _headline(
+    page: Page, scores: Sequence[ModelScores], result: Evaluation | Benchmark, caption: str, csv_name: str
+) -> None:
+    page.table(
+        tables.headline_table(scores, result.nuisance, result.noise_floor), caption, csv_name, words=COLUMNS
+    )
+
+
+def _metrics(page: Page, scores: Sequence[ModelScores], caption: str) -> None:
+    page.table(tables.metric_table(scores), caption, "metrics.csv", digits=3, words=COLUMNS)
+    page.paragraph(tables.metric_text())
 
 
 def lock_box_text(split: ScoredSplit) -> str:
@@ -162,7 +169,7 @@ def lock_box_text(split: ScoredSplit) -> str:
         return "The dataset is too small for locked scans."
     scored = [scan_id for scan_id in split.lock_box if scan_id in split.scored_ids]
     if not scored:
-        return f"The {len(split.lock_box)} locked scans of the dataset were left out."
+        return f"Locked scans of the dataset, left out: {len(split.lock_box)}."
     return f"Locked scans of the dataset are among the scored ones: {', '.join(scored)}."
 
 
@@ -188,28 +195,32 @@ def _policies(
 ) -> None:
     page.table(
         tables.policy_table(scores, protocol, floor),
-        "MAE under every nuisance policy, with and without the background, nm.",
+        "Mean absolute error by what is fitted to each scan, with and without the background, nm.",
         "policies.csv",
+        words=COLUMNS,
     )
+    page.paragraph(tables.protocol_text(protocol))
+    page.paragraph(tables.floor_text(floor))
 
 
 def _by_level_and_frequency(page: Page, scores: Sequence[ModelScores]) -> None:
-    page.heading("By level and frequency")
+    page.heading("By level and frequency", folded=True)
     page.figure(plots.level_bias(scores), "Error by printed level.")
     page.figure(plots.transfer(scores), "Transfer, coherence and error by spatial frequency.")
     page.table(
         tables.band_table(scores),
         "How far up in frequency the prediction follows the measurement, cycles/µm.",
         "bands.csv",
+        words=COLUMNS,
     )
     page.paragraph(tables.band_text())
 
 
 def _all_numbers(page: Page, scores: Sequence[ModelScores], by_scan: str, by_level: str) -> None:
-    page.heading("Tables")
-    page.table(tables.scan_table(scores), by_scan, "scans.csv")
-    page.table(tables.level_table(scores), by_level, "levels.csv")
-    page.heading("Notes on these numbers")
+    page.heading("By scan and by level", folded=True)
+    page.table(tables.scan_table(scores), by_scan, "scans.csv", words=COLUMNS)
+    page.table(tables.level_table(scores), by_level, "levels.csv", words=COLUMNS)
+    page.heading("Notes on these numbers", folded=True)
     for note in tables.caveats(scores):
         page.paragraph(note)
 

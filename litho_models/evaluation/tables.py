@@ -109,7 +109,13 @@ def scan_table(scores: Sequence[ModelScores]) -> pd.DataFrame:
 
     return pd.DataFrame(
         [
-            {"model": s.model, **row.model_dump(exclude={"metrics"}), **row.metrics}
+            {
+                "model": s.model,
+                "scan": row.scan,
+                "print": row.print,
+                **row.model_dump(exclude={"metrics", "scan", "print"}),
+                **row.metrics,
+            }
             for s in scores
             for row in s.scans
         ]
@@ -142,7 +148,8 @@ def protocol_text(protocol: NuisanceProtocol) -> str:
     """How the datum-free error was obtained, in one paragraph."""
     lines = " and its line offsets" if protocol.policy == "full+rows" else ""
     return (
-        f"mae_abs has no fit at test time. mae_datum_free first frees each scan of the nuisances of policy "
+        "The error with nothing fitted (mae_abs) has no fit at test time. The other (mae_datum_free) first "
+        f"frees each scan of the terms of policy "
         f"'{protocol.policy}' (k = {protocol.k:g} per scan{lines}), fitted on one half of a checkerboard of "
         f"{protocol.block_px} px blocks shrunk by {protocol.buffer_px} px and scored on the other half, "
         "both halves swapped; 'full+rows' uses stripes of columns instead. Means are per scan first, then "
@@ -168,7 +175,7 @@ def floor_text(floor: NoiseFloor) -> str:
 def metric_text() -> str:
     """What the columns of ``metric_table`` are."""
     return (
-        f"phase_rms_waves is the RMS error seen by light of {WAVELENGTH_UM:g} µm that passes the print "
+        f"The phase error is the RMS error seen by light of {WAVELENGTH_UM:g} µm that passes the print "
         f"(index step {INDEX_STEP:g}). {metrics_text()}"
     )
 
@@ -176,8 +183,8 @@ def metric_text() -> str:
 def band_text() -> str:
     """What the columns of ``band_table`` are."""
     return (
-        "half_power is where predicted over measured falls to 1/√2 of that at the lowest frequencies, "
-        "noise_band the width of the ideal low pass that lets as much white noise through; along x and y."
+        "Half power is where predicted over measured falls to 1/√2 of that at the lowest frequencies, "
+        "the noise band the width of the ideal low pass that lets as much white noise through; along x and y."
     )
 
 
@@ -191,8 +198,6 @@ def caveats(scores: Sequence[ModelScores]) -> list[str]:
             notes.append(
                 f"{s.model}: {s.dropped_pixels} pixels were not measured or not valid and are not scored."
             )
-    if scores and len(scores[0].scans) < 8:
-        notes.append(f"Only {len(scores[0].scans)} scans: intervals over scans are rough.")
     if scores:
         s = min(scores, key=lambda entry: entry.mae_datum_free_nm)
         notes.append(

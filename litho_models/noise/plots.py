@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from litho_data.foundation.report import new_figure
+from litho_data.foundation.report_pictures import LIGHT, new_figure
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.noise.calibration import SpreadAnalysis
 from litho_models.noise.dose import DoseMatrix
@@ -117,7 +117,7 @@ def spread(found: SpreadAnalysis) -> Figure:
     for axes, name in zip(grid, names, strict=True):
         rows = [row for row in found.bins if row.covariate == name]
         centre = [(row.low + row.high) / 2 for row in rows]
-        axes.plot(centre, [row.rms_nm for row in rows], "o", color="#1c2430", ms=4, label="measured")
+        axes.plot(centre, [row.rms_nm for row in rows], "o", color=LIGHT["ink"], ms=4, label="measured")
         axes.plot(centre, [row.predicted_nm for row in rows], "-", color="#0b6aa2", label="predicted")
         axes.set_xlabel(name)
         axes.grid(alpha=0.3)

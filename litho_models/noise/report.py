@@ -14,6 +14,8 @@ from litho_models.noise.calibration import SpreadAnalysis
 from litho_models.noise.dose import DoseMatrix
 from litho_models.noise.staircase import StepPrint
 from litho_models.noise.texture import Texture
+from litho_models.noise.words import COLUMNS
+from litho_models.scoring.noise_floor import NoiseFloor
 
 if TYPE_CHECKING:
     from litho_models.noise.references import Reference
@@ -24,11 +26,9 @@ def write_noise_report(result: NoiseAnalysis, references: Sequence[Reference], o
     """Render the result into ``out``; returns the page."""
     floor = result.noise_floor
     title = f"Noise of {result.dataset.name}" if result.dataset else "Noise of single scans"
-    known = "nothing bounds it" if floor.mae_nm is None else f"MAE {floor.mae_nm:.2f} nm ({floor.kind})"
-    page = Page(title, f"Noise floor: {known}.")
-    page.paragraph(f"Source of the floor: {floor.source}.")
-    if floor.mae_nm is not None and floor.rmse_nm is not None:
-        page.tiles([(f"{floor.mae_nm:.2f} nm", "floor, MAE"), (f"{floor.rmse_nm:.2f} nm", "floor, σ")])
+    hashes = {"dataset": result.dataset.sha256} if result.dataset else {}
+    page = Page(title, run=result.run, facts=hashes | {"seeds": ", ".join(map(str, result.run.seeds))})
+    page.verdict(_verdict(floor))
     for note in result.notes:
         page.note(note)
     if references:
@@ -44,8 +44,20 @@ def write_noise_report(result: NoiseAnalysis, references: Sequence[Reference], o
         _budget(page, result.budget)
     if result.spread is not None:
         _spread(page, result.spread)
-    page.code(result.run.command)
     return page.write(out)
+
+
+def _verdict(floor: NoiseFloor) -> str:
+    if floor.mae_nm is None:
+        return f"These data do not bound the noise: {floor.source}."
+    known = f"{floor.mae_nm:.2f} nm" + (f" (σ {floor.rmse_nm:.2f} nm)" if floor.rmse_nm is not None else "")
+    if floor.kind == "upper-estimate":
+        return (
+            f"At most {known} of a model's mean error is noise that no model can predict; what it has above "
+            f"that can still be won. Source: {floor.source}."
+        )
+    kind = floor.kind.replace("-", " ")
+    return f"No model can have a mean error below {known} ({kind}). Source: {floor.source}."
 
 
 def _references(page: Page, result: NoiseAnalysis, references: Sequence[Reference]) -> None:
@@ -54,6 +66,7 @@ def _references(page: Page, result: NoiseAnalysis, references: Sequence[Referenc
     found = result.references
     page.heading("Reference prints")
     page.figure(plots.surfaces(references), "Heights about their mean; substrate and flat share a scale.")
+    page.heading("Reference prints in numbers", folded=True)
     rows = [
         {"use": use, **surface.model_dump()}
         for use, group in (("substrate", found.substrates), ("flat", found.flats))
@@ -64,12 +77,14 @@ def _references(page: Page, result: NoiseAnalysis, references: Sequence[Referenc
             pd.DataFrame(rows),
             "Roughness. MAE is measured about the median; 0.798 σ is what a Gaussian would have.",
             "surfaces.csv",
+            words=COLUMNS,
         )
     if found.print_noise:
         page.table(
             pd.DataFrame([one.model_dump() for one in found.print_noise]),
             "What the print adds to substrate and microscope, in quadrature.",
             "print_noise.csv",
+            words=COLUMNS,
         )
     for one in found.textures:
         _texture(page, one)
@@ -97,13 +112,14 @@ def _texture(page: Page, found: Texture) -> None:
         "in a smooth spectrum. Coherence: 1 if the surfaces have one phase.",
         f"texture_{found.id.replace(' ', '_')}.csv",
         digits=3,
+        words=COLUMNS,
     )
 
 
 def _steps(page: Page, found: StepPrint) -> None:
     import pandas as pd
 
-    page.heading(f"Steps of {found.id}")
+    page.heading(f"Steps of {found.id}", folded=True)
     page.figure(plots.steps(found), "Step heights and the smallest step that can be told from none.")
     page.table(
         pd.DataFrame([{"step": n + 1, **step.model_dump()} for n, step in enumerate(found.steps)]),
@@ -111,6 +127,7 @@ def _steps(page: Page, found: StepPrint) -> None:
         "misread pixels are nearer to the other tread.",
         f"steps_{found.id}.csv",
         digits=3,
+        words=COLUMNS,
     )
 
 
@@ -123,15 +140,17 @@ def _dose(page: Page, found: DoseMatrix) -> None:
         plots.dose(found),
         "Green: recommended. Shaded: steps are lost. Dashed: single pixels of two levels are told apart.",
     )
+    page.heading("The doses in numbers", folded=True)
     rows = [{**row.model_dump(exclude={"levels", "scans"}), "scans": len(row.scans)} for row in found.rows]
     page.table(
         pd.DataFrame(rows),
         f"Measured farther than {found.guard_um:g} µm from every edge. Gain is printed over nominal height.",
         "doses.csv",
         digits=3,
+        words=COLUMNS,
     )
     levels = [{"dose": row.dose, **level.model_dump()} for row in found.rows for level in row.levels]
-    page.table(pd.DataFrame(levels), "Height of every level.", "dose_levels.csv")
+    page.table(pd.DataFrame(levels), "Height of every level.", "dose_levels.csv", words=COLUMNS)
 
 
 def _spread(page: Page, found: SpreadAnalysis) -> None:
@@ -153,8 +172,9 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
             "member freed of its mean). The fitted σ already holds the error that this disagreement is "
             "part of; the row with it added shows whether it helps."
         )
-    page.figure(plots.spread(found), "Spread against level, slope, distance to the next edge, and radius.")
     page.figure(plots.calibration(found), "Calibration on scans left out.")
+    page.heading(f"What the uncertainty of {found.model} depends on", folded=True)
+    page.figure(plots.spread(found), "Spread against level, slope, distance to the next edge, and radius.")
     rows = [
         {
             "σ": one.name,
@@ -178,6 +198,7 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
         "Means over scans; NLL in nats of nm, ENCE and AUSE as shares (0 is best).",
         "calibration.csv",
         digits=3,
+        words=COLUMNS,
     )
     scans = [
         {
@@ -191,7 +212,7 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
         for one in found.calibrations
         for row in one.scans
     ]
-    page.table(pd.DataFrame(scans), "By scan.", "calibration_scans.csv", digits=3)
+    page.table(pd.DataFrame(scans), "By scan.", "calibration_scans.csv", digits=3, words=COLUMNS)
     page.table(
         pd.DataFrame(
             {"covariate": found.variance.covariates, "coefficient of ln s²": found.variance.coefficients}
@@ -199,6 +220,7 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
         "The scale fitted on all scans.",
         "variance.csv",
         digits=4,
+        words=COLUMNS,
     )
     bins = [
         {
@@ -213,13 +235,14 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
         "By level, and in ranges of equal count of what else σ depends on; intervals over prints.",
         "spread.csv",
         digits=3,
+        words=COLUMNS,
     )
 
 
 def _budget(page: Page, found: NoiseBudget) -> None:
     import pandas as pd
 
-    page.heading("Noise budget")
+    page.heading("Noise budget", folded=True)
     page.paragraph(
         f"From residuals of {found.model} on scans that it had not seen. Both estimates are upper ones: what "
         "the model lacks counts as noise unless like surroundings share it. What levelling took out of the "
@@ -242,6 +265,7 @@ def _budget(page: Page, found: NoiseBudget) -> None:
             "Noise by the scan terms that are set free (k per scan), from like layout surroundings in "
             "different scans; 95 % intervals over prints.",
             "budget.csv",
+            words=COLUMNS,
         )
     flat = [
         {**row.model_dump(exclude={"ci95_nm"}), "sigma_ci95_nm": interval_text(row.ci95_nm)}
@@ -252,6 +276,7 @@ def _budget(page: Page, found: NoiseBudget) -> None:
         f"Where the layout is flat (slope at most {found.flat_slope:.3f}, a quarter of the pixels); tilt, "
         "bow, gain and line offsets of each scan are free.",
         "flat_levels.csv",
+        words=COLUMNS,
     )
     if found.flat_texture is not None:
         _texture(page, found.flat_texture)

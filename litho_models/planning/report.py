@@ -10,7 +10,8 @@ import numpy as np
 import pandas as pd
 import torch
 
-from litho_data.foundation.report import Page, new_figure
+from litho_data.foundation.report import Page
+from litho_data.foundation.report_pictures import new_figure
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.planning.power import ENOUGH
 from litho_models.planning.record import NextPrint, PlannedQuestion

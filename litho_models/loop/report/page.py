@@ -15,7 +15,13 @@ from litho_models.loop.equal_terms import TermSet
 from litho_models.loop.findings import LoopFindings
 from litho_models.loop.report.plots import curve_figure, map_figure, probe_figure, staircase_figure
 from litho_models.loop.report.power import identifiability_section, power_section
-from litho_models.loop.report.wording import parts_text, plain_words, terms_text, warnings_for
+from litho_models.loop.report.wording import (
+    headline_words,
+    parts_text,
+    plain_words,
+    terms_text,
+    warnings_for,
+)
 from litho_models.loop.result.record import CloseLoop, EqualTerms
 from litho_models.loop.single_scans.nested_tests import scan_parameters
 from litho_models.loop.structure import PLACE
@@ -32,47 +38,48 @@ _BACKGROUND = {
 def write_report(findings: LoopFindings, result: CloseLoop, folder: Path) -> Path:
     """Write ``report.html`` and the CSV tables into ``folder``; returns the page's path."""
     page = Page(
-        f"Closing the loop: {result.dataset.name}, base model {result.base_model}",
+        f"What {result.base_model} lacks on {result.dataset.name}",
         "From the residual of the model on scans it was not fitted on, to causes, to a corrected model.",
+        run=result.run,
+        facts={"dataset": result.dataset.sha256, "seeds": ", ".join(map(str, result.run.seeds))},
     )
+    page.verdict(headline_words(result))
+    noise = f"{result.noise_floor.mae_nm:.2f} nm" if result.noise_floor.mae_nm else "–"
     page.tiles(
         [
-            (result.verdict, "verdict"),
-            (
-                f"{result.before.mae_datum_free_nm:.2f} nm",
-                "error before (MAE, held out, k = 1)",
-            ),
+            (f"{result.before.mae_datum_free_nm:.2f} nm", "error before, on scans held out"),
             (f"{result.after.mae_datum_free_nm:.2f} nm", "after, with the same one term per scan"),
             (
                 f"{result.after.mae_abs_nm:.1f} nm",
-                f"absolute error after (before {result.before.mae_abs_nm:.1f})",
+                f"error after with nothing fitted (before {result.before.mae_abs_nm:.1f})",
             ),
-            (
-                f"{result.noise_floor.mae_nm:.2f} nm" if result.noise_floor.mae_nm else "–",
-                f"noise (MAE, k = 1): {result.noise_floor.kind.replace('-', ' ')}",
-            ),
+            (noise, f"noise that no model predicts: {result.noise_floor.kind.replace('-', ' ')}"),
         ]
     )
-    page.paragraph(plain_words(findings, result))
     for warning in warnings_for(findings, result):
         page.note(warning)
-    _error_section(page, findings, result)
+    page.figure(
+        staircase_figure(_steps_frame(findings)),
+        "Held-out mean absolute error, step by step; bars are 95 % bootstrap intervals over scans. Pale: "
+        "terms of each scan on the base model. Full: with the effects added.",
+    )
     _decision_section(page, result)
-    _effect_section(page, result)
-    _candidate_section(page, result)
-    page.heading("Residual maps")
+    page.heading("In words", folded=True)
+    page.paragraph(plain_words(findings, result))
+    page.heading("Residual maps", folded=True)
     page.figure(
         map_figure(findings, *equal_terms.scores(findings)["accepted"]),
         "Measured minus predicted on held-out scans: the worst, the median and the best scan before; one "
         "colour scale for all. Above and below with the accepted terms per scan, fitted on other pixels.",
     )
+    _effect_section(page, result)
+    _error_section(page, findings, result)
+    _candidate_section(page, result)
     _probe_section(page, findings)
     _rest_section(page, findings, result)
     identifiability_section(page, findings)
     power_section(page, findings)
     _scan_section(page, findings)
-    page.heading("How it was run")
-    page.code(result.run.command or "litho_models.loop.close_loop")
     return page.write(folder)
 
 
@@ -100,7 +107,7 @@ def _decision_section(page: Page, result: CloseLoop) -> None:
 
 
 def _error_section(page: Page, findings: LoopFindings, result: CloseLoop) -> None:
-    page.heading("Error before and after, with the same terms per scan")
+    page.heading("Error before and after, with the same terms per scan", folded=True)
     page.table(
         pd.DataFrame([_equal_row(row, result.noise_floor) for row in result.equal_terms or []]),
         "Held-out mean absolute error on the benchmark's pixels; terms are fitted on pixels that are not "
@@ -109,7 +116,7 @@ def _error_section(page: Page, findings: LoopFindings, result: CloseLoop) -> Non
         "equal_terms.csv",
     )
     if result.nested is not None:
-        page.heading("The same where the choice itself has not seen the scans")
+        page.heading("The same where the choice itself has not seen the scans", folded=True)
         page.table(
             pd.DataFrame([_equal_row(row, result.noise_floor) for row in result.nested.equal_terms]),
             f"Named effects, generic terms and terms of single scans were chosen anew without each of the "
@@ -122,7 +129,7 @@ def _error_section(page: Page, findings: LoopFindings, result: CloseLoop) -> Non
             "nested_chosen.csv",
         )
     if result.gain_split:
-        page.heading("Whose the gain is")
+        page.heading("Whose the gain is", folded=True)
         page.paragraph(f"{parts_text(result).capitalize()}.")
         page.table(
             pd.DataFrame(
@@ -144,28 +151,9 @@ def _error_section(page: Page, findings: LoopFindings, result: CloseLoop) -> Non
             "accepted terms and with one. Only what is called process goes into the exported model.",
             "gain_split.csv",
         )
-    page.heading("Error, step by step")
-    rows = _staircase(findings)
-    frame = pd.DataFrame(
-        [
-            {
-                "model": label,
-                "terms per scan": s.degrees_of_freedom,
-                "MAE (nm)": s.mean_mae_nm,
-                "low": s.interval_nm(findings.config.seed)[0],
-                "high": s.interval_nm(findings.config.seed)[1],
-                "RMSE (nm)": s.rmse_nm,
-            }
-            for label, s in rows
-        ]
-    )
-    page.figure(
-        staircase_figure(frame),
-        "Held-out mean absolute error; bars are 95 % bootstrap intervals over scans. Grey: per-scan terms of "
-        "the microscope on the base model. Blue: with the effects added.",
-    )
+    page.heading("Error, step by step", folded=True)
     page.table(
-        frame,
+        _steps_frame(findings),
         "The same per-scan terms with and without the process effects, fitted on pixels not scored.",
         "errors.csv",
     )
@@ -176,6 +164,22 @@ def _error_section(page: Page, findings: LoopFindings, result: CloseLoop) -> Non
         "roughness; what lies above it is counted as unexplained, structured or not.",
         "shares.csv",
         digits=1,
+    )
+
+
+def _steps_frame(findings: LoopFindings) -> pd.DataFrame:
+    return pd.DataFrame(
+        [
+            {
+                "model": label,
+                "terms per scan": s.degrees_of_freedom,
+                "MAE (nm)": s.mean_mae_nm,
+                "low": s.interval_nm(findings.config.seed)[0],
+                "high": s.interval_nm(findings.config.seed)[1],
+                "RMSE (nm)": s.rmse_nm,
+            }
+            for label, s in _staircase(findings)
+        ]
     )
 
 
@@ -195,7 +199,7 @@ def _equal_row(row: EqualTerms, floor: NoiseFloor) -> dict[str, object]:
 
 
 def _staircase(findings: LoopFindings) -> list[tuple[str, Score]]:
-    steps: list[tuple[str, Terms]] = [("no fit", frozenset()), ("datum", DATUM_FREE)]
+    steps: list[tuple[str, Terms]] = [("nothing fitted", frozenset()), ("zero height fitted", DATUM_FREE)]
     names: list[str] = []
     for name in findings.accepted:
         names.append(name)
@@ -209,7 +213,7 @@ def _staircase(findings: LoopFindings) -> list[tuple[str, Score]]:
 
 
 def _effect_section(page: Page, result: CloseLoop) -> None:
-    page.heading("Effects added")
+    page.heading("Effects added", folded=True)
     if not result.effects:
         page.paragraph("None.")
         return
@@ -258,7 +262,7 @@ def _effect_section(page: Page, result: CloseLoop) -> None:
 
 
 def _candidate_section(page: Page, result: CloseLoop) -> None:
-    page.heading("Every candidate, and why")
+    page.heading("Every candidate, and why", folded=True)
     order = [
         "explained",
         "confusable",
@@ -292,7 +296,7 @@ def _candidate_section(page: Page, result: CloseLoop) -> None:
 
 def _probe_section(page: Page, findings: LoopFindings) -> None:
     probed = findings.probed
-    page.heading("What has no name")
+    page.heading("What has no name", folded=True)
     for entry in probed.added:
         page.figure(
             probe_figure(entry),
@@ -321,7 +325,7 @@ def _probe_section(page: Page, findings: LoopFindings) -> None:
 
 
 def _rest_section(page: Page, findings: LoopFindings, result: CloseLoop) -> None:
-    page.heading("What is left")
+    page.heading("What is left", folded=True)
     state = result.residual.state
     page.paragraph(
         f"State: {state}. {result.residual.signature or 'No covariate carries a shared structure.'} The "
@@ -368,7 +372,7 @@ def _rest_section(page: Page, findings: LoopFindings, result: CloseLoop) -> None
 
 
 def _scan_section(page: Page, findings: LoopFindings) -> None:
-    page.heading("Scan by scan")
+    page.heading("Scan by scan", folded=True)
     found = equal_terms.scores(findings)
     shown: dict[TermSet, str] = {"offset": "k = 1", "accepted": "accepted terms"}
     errors = {

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from litho_data.foundation.report import new_figure
+from litho_data.foundation.report_pictures import LIGHT, new_figure
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.findings import LoopFindings
 from litho_models.loop.identifiability import Profile
@@ -30,7 +30,7 @@ _TABLES = {
     "axis-slope-table": "steepness along the axis (µm/µm)",
     "diagonal-slope-table": "steepness along the diagonal (µm/µm)",
 }
-_BEFORE, _AFTER = "#9aa5b1", "#0b6aa2"
+_BEFORE, _AFTER = "#9aa5b1", "#2f7fd0"
 
 
 def staircase_figure(frame: pd.DataFrame) -> Figure:
@@ -88,7 +88,7 @@ def curve_figure(curves: list[CovariateTest]) -> Figure:
     figure = new_figure(10, 2.3 * rows)
     axes = figure.subplots(rows, columns, squeeze=False, sharey=True).ravel()
     for panel, test in zip(axes, curves, strict=False):
-        panel.axhline(0, color="k", lw=0.6)
+        panel.axhline(0, color=LIGHT["ink"], lw=0.6)
         panel.errorbar(
             test.centres, test.curve_nm, 2 * test.error_nm, fmt="o-", color=_AFTER, ms=3.5, capsize=2
         )
@@ -142,7 +142,7 @@ def _bars_figure(entry: AddedProbe) -> Figure:
     ends = np.array([interval for _, _, interval in found.values()])
     figure = new_figure(6, 0.3 * len(found) + 1)
     axes = figure.subplots()
-    axes.axvline(0, color="k", lw=0.6)
+    axes.axvline(0, color=LIGHT["ink"], lw=0.6)
     axes.errorbar(
         values, np.arange(len(found)), xerr=np.abs(ends.T - values), fmt="o", color=_AFTER, ms=4, capsize=2
     )
@@ -161,7 +161,7 @@ def _table_figure(entry: AddedProbe) -> Figure:
     )
     figure = new_figure(6, 3)
     axes = figure.subplots()
-    axes.axhline(0, color="k", lw=0.6)
+    axes.axhline(0, color=LIGHT["ink"], lw=0.6)
     for colour, (covariate, table) in zip(
         (_AFTER, "#c05621"), values.groupby("covariate", sort=False), strict=False
     ):
@@ -180,7 +180,7 @@ def _table_figure(entry: AddedProbe) -> Figure:
 def _profile_figure(values: np.ndarray, along: str, unit: str) -> Figure:
     figure = new_figure(6, 3)
     axes = figure.subplots()
-    axes.axhline(0, color="k", lw=0.6)
+    axes.axhline(0, color=LIGHT["ink"], lw=0.6)
     axes.plot(np.linspace(0, 1, len(values)), values, color=_AFTER)
     axes.set_xlabel(f"{along}s, from the first to the last")
     axes.set_ylabel(unit)

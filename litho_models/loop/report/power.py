@@ -14,7 +14,7 @@ def identifiability_section(page: Page, findings: LoopFindings) -> None:
     found = findings.identifiability
     if found is None:
         return
-    page.heading("How well these scans determine the fit")
+    page.heading("How well these scans determine the fit", folded=True)
     weakest = ", ".join(f"{part:+.2f} {name}" for name, part in found.weakest.items())
     idle = ", ".join(found.without_slope)
     bounds = f" At a bound, or without influence: {idle}." if idle else ""
@@ -59,7 +59,7 @@ def power_section(page: Page, findings: LoopFindings) -> None:
     """The smallest planted amounts that were found, and the power at every amount."""
     if not findings.planted:
         return
-    page.heading("How small an effect would have been found")
+    page.heading("How small an effect would have been found", folded=True)
     for name in dict.fromkeys(p.name for p in findings.planted):
         found = [p for p in findings.planted if p.name == name and p.found]
         smallest = min(found, key=lambda p: p.rms_nm, default=None)

@@ -11,6 +11,9 @@ from litho_models.loop.result.record import AddedEffect, CloseLoop, EqualTerms, 
 from litho_models.loop.selection.confirming import FEWEST_SCANS
 from litho_models.scoring.pairs import OverUnits
 
+# What counts as more than chance.
+_CHANCE = 0.05
+
 
 def verdict_text(result: CloseLoop) -> str:
     """The verdict, and with too few scans how many would do."""
@@ -83,6 +86,36 @@ def over_text(over: OverUnits, unit: str) -> str:
     return f"{interval} over {over.count} {unit} (better in {over.positive}, p = {over.p:.2g}{best})"
 
 
+def headline_words(result: CloseLoop) -> str:
+    """What was found missing, what it is worth, and whether that is more than chance."""
+    before, after = result.before.mae_datum_free_nm, result.after.mae_datum_free_nm
+    if result.verdict == "too-few-scans":
+        found = result.headline.over_scans.count if result.headline else "These"
+        return (
+            f"{found} scans are too few to say what is missing: {FEWEST_SCANS} are needed to confirm "
+            f"anything, {result.fewest_scans} to find that nothing is missing. The held-out error is "
+            f"{before:.2f} nm."
+        )
+    if not result.effects:
+        left = result.verdict == "unexplained"
+        missing = "although something with structure is left" if left else "or needed"
+        return f"Nothing was found to add, {missing}: the held-out error stays at {before:.2f} nm."
+    named = [e for e in result.effects if e.verdict != "traced-to-covariate"]
+    names = ", ".join(get_effect(e.name).title for e in named) or "no named effect, only generic terms"
+    text = f"{result.base_model} lacks: {names}. "
+    if len(named) < len(result.effects) and named:
+        text += f"Generic terms without a name were added as well ({len(result.effects) - len(named)}). "
+    text += f"With all of it the held-out error goes from {before:.2f} to {after:.2f} nm"
+    if result.headline is None:
+        return f"{text}."
+    over = result.headline.over_prints or result.headline.over_scans
+    unit = "scans" if result.headline.over_prints is None else "prints"
+    if over.smallest_p > _CHANCE:
+        return f"{text}; {over.count} {unit} are too few to tell that from chance."
+    sure = "more than chance" if over.p <= _CHANCE and after < before else "which may be chance"
+    return f"{text}, {sure} (p = {over.p:.2g} over {over.count} {unit})."
+
+
 def plain_words(findings: LoopFindings, result: CloseLoop) -> str:
     """One paragraph for a process engineer."""
     traced = [e for e in result.effects if e.verdict == "traced-to-covariate"]
@@ -142,8 +175,6 @@ def plain_words(findings: LoopFindings, result: CloseLoop) -> str:
 
 def warnings_for(findings: LoopFindings, result: CloseLoop) -> list[str]:
     warnings = []
-    if result.verdict == "too-few-scans":
-        warnings.append(f"{_sentence_case(verdict_text(result).partition(': ')[2])}. Errors are given.")
     if result.run.dropped:
         warnings.append(f"Scans left out: {'; '.join(result.run.dropped)}")
     if findings.development[0].stored.write is None:

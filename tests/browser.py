@@ -1,0 +1,141 @@
+"""Pages in a real browser: Chromium without a window, spoken to over a pipe (DevTools protocol)."""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+import select
+import shutil
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
+# Of everything that is asked of the browser; one answer takes milliseconds, the start seconds.
+TIMEOUT_S = 60.0
+OPTIONS = (
+    "--headless=new",
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-extensions",
+    "--no-first-run",
+    "--hide-scrollbars",
+    "--remote-debugging-pipe",
+)
+
+
+def browser_path() -> str | None:
+    """The browser of this machine, or None."""
+    return next((path for name in NAMES if (path := shutil.which(name))), None)
+
+
+class Browser:
+    """One Chromium with one page."""
+
+    def __enter__(self) -> Self:
+        path = browser_path()
+        assert path is not None
+        self._profile = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+        to_read, self._write = os.pipe()
+        self._read, to_write = os.pipe()
+        # The browser reads commands from descriptor 3 and writes its answers to 4.
+        wire = 'exec 3<&"$1" 4>&"$2"; shift 2; exec "$@"'
+        self._process = subprocess.Popen(
+            ["bash", "-c", wire, "wire", str(to_read), str(to_write), path, *OPTIONS,
+             f"--user-data-dir={self._profile.name}", "about:blank"],
+            pass_fds=(to_read, to_write), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        )  # fmt: skip
+        os.close(to_read)
+        os.close(to_write)
+        self._buffer, self._number, self._session = b"", 0, ""
+        self.errors: list[str] = []
+        (target,) = [one for one in self.ask("Target.getTargets")["targetInfos"] if one["type"] == "page"]
+        self._session = self.ask("Target.attachToTarget", targetId=target["targetId"], flatten=True)[
+            "sessionId"
+        ]
+        for domain in ("Page", "Runtime", "Log"):
+            self.ask(f"{domain}.enable")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._process.kill()
+        self._process.wait()
+        os.close(self._write)
+        os.close(self._read)
+        self._profile.cleanup()
+
+    def show(self, page: Path, width_px: int, dark: bool) -> None:
+        """Load a page and wait for it; what it complains about is in ``errors``."""
+        self.errors = []
+        self.screen(width_px, dark)
+        self._loaded = False
+        self.ask("Page.navigate", url=page.resolve().as_uri())
+        while not self._loaded:
+            self._take(self._receive())
+        # Pictures far down are decoded when they are needed: ask for all, and for the layout with them.
+        self.run("Promise.all([...document.images].map(i => i.decode().catch(() => 0))).then(() => 1)")
+
+    def screen(self, width_px: int, dark: bool) -> None:
+        """The size and the colours that the page is shown in."""
+        self.ask(
+            "Emulation.setDeviceMetricsOverride", width=width_px, height=844 if width_px < 600 else 800,
+            deviceScaleFactor=1, mobile=False,
+        )  # fmt: skip
+        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+        self.ask("Emulation.setEmulatedMedia", features=[scheme])
+
+    def run(self, script: str) -> Any:
+        """The value of a JavaScript expression in the page."""
+        answer = self.ask("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in answer, answer["exceptionDetails"]
+        return answer["result"].get("value")
+
+    def picture(self, file: Path) -> None:
+        """The whole page as PNG."""
+        height = self.run("document.documentElement.scrollHeight")
+        width = self.run("innerWidth")
+        clip = {"x": 0, "y": 0, "width": width, "height": min(height, 16000), "scale": 1}
+        answer = self.ask("Page.captureScreenshot", captureBeyondViewport=True, clip=clip)
+        file.write_bytes(base64.b64decode(answer["data"]))
+
+    def ask(self, method: str, **parameters: Any) -> dict[str, Any]:
+        """The answer to one command of the protocol."""
+        self._number += 1
+        message: dict[str, Any] = {"id": self._number, "method": method, "params": parameters}
+        if self._session:
+            message["sessionId"] = self._session
+        os.write(self._write, json.dumps(message).encode() + b"\0")
+        while True:
+            received = self._receive()
+            if received.get("id") == self._number:
+                assert "error" not in received, received["error"]
+                return received["result"]
+            self._take(received)
+
+    def _take(self, event: dict[str, Any]) -> None:
+        match event.get("method"):
+            case "Page.loadEventFired":
+                self._loaded = True
+            case "Runtime.exceptionThrown":
+                self.errors.append(str(event["params"]["exceptionDetails"].get("text")))
+            case "Runtime.consoleAPICalled" if event["params"]["type"] in ("error", "warning"):
+                self.errors.append(str(event["params"]["args"]))
+            case "Log.entryAdded" if event["params"]["entry"]["level"] == "error":
+                self.errors.append(event["params"]["entry"]["text"])
+
+    def _receive(self) -> dict[str, Any]:
+        until = time.monotonic() + TIMEOUT_S
+        while b"\0" not in self._buffer:
+            ready, _, _ = select.select([self._read], [], [], max(0.0, until - time.monotonic()))
+            assert ready, f"the browser said nothing for {TIMEOUT_S:g} s"
+            part = os.read(self._read, 1 << 16)
+            assert part, "the browser has ended"
+            self._buffer += part
+        line, _, self._buffer = self._buffer.partition(b"\0")
+        return json.loads(line)

@@ -1,0 +1,207 @@
+"""Reports in a real browser: no errors, nothing too wide for a telephone, pictures and words to be seen."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from litho_data.foundation.report import Page, spelt_out
+from litho_data.foundation.report_pictures import (
+    DARK,
+    LIGHT,
+    colour_bar_png,
+    coloured_png,
+    model_colour,
+    new_figure,
+)
+from litho_design import compare, hologram_settings
+from litho_models.evaluation.benchmark import benchmark
+from tests.browser import Browser, browser_path
+from tests.litho_models.prints import make_scans, write_store
+
+PHONE_PX, DESK_PX = 390, 1280
+# Screens of a telephone before the folded part.
+MOST_SCREENS = 6
+TINY = {
+    "layout.size_px": 64,
+    "optics.distance_um": 12,
+    "search.iterations": 2,
+    "search.polish_rounds": 0,
+    "window.yield_draws": 5,
+}
+# What is wrong with the page as it is shown: WCAG 2 contrast (AA: 4.5, large letters 3), and pictures without
+# content, which are drawn small and have their colours counted.
+FAULTS = """(async () => {
+  const found = [], channel = v => (v /= 255) <= .04045 ? v / 12.92 : ((v + .055) / 1.055) ** 2.4;
+  const light = ([r, g, b]) => .2126 * channel(r) + .7152 * channel(g) + .0722 * channel(b);
+  const rgb = text => text.match(/[\\d.]+/g).map(Number);
+  const paper = element => { for (let e = element; e; e = e.parentElement) {
+    const colour = rgb(getComputedStyle(e).backgroundColor); if (colour[3] !== 0) return colour; }
+    return matchMedia("(prefers-color-scheme: dark)").matches ? [18, 18, 18] : [255, 255, 255]; };
+  const walk = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+  for (let node; node = walk.nextNode();) {
+    const element = node.parentElement;
+    if (!node.textContent.trim() || !element.checkVisibility() || element.tagName === "SCRIPT") continue;
+    const style = getComputedStyle(element), size = parseFloat(style.fontSize);
+    const [a, b] = [light(rgb(style.color)), light(paper(element))].sort((x, y) => y - x);
+    const wanted = size >= 24 || (size >= 18.66 && style.fontWeight >= 700) ? 3 : 4.5;
+    if ((a + .05) / (b + .05) < wanted) found.push(`contrast of "${node.textContent.trim().slice(0, 40)}"`);
+  }
+  if (document.documentElement.scrollWidth > innerWidth) found.push("wider than the screen");
+  for (const image of document.images) {
+    if (!image.complete || !image.naturalWidth) { found.push("picture not decoded"); continue; }
+    if (!image.checkVisibility() || image.clientHeight < 4) { found.push("picture not shown"); continue; }
+    const canvas = document.createElement("canvas"); canvas.width = canvas.height = 64;
+    const context = canvas.getContext("2d"); context.drawImage(image, 0, 0, 64, 64);
+    const colours = new Set(new Uint32Array(context.getImageData(0, 0, 64, 64).data.buffer));
+    if (colours.size < 8) found.push("picture without content");
+  }
+  return found;
+})()"""
+
+
+@pytest.fixture(scope="module")
+def browser():
+    if browser_path() is None:
+        pytest.skip("no Chromium on this machine")
+    with Browser() as one:
+        yield one
+
+
+@pytest.fixture(scope="module")
+def reports(tmp_path_factory) -> dict[str, Path]:
+    folder = tmp_path_factory.mktemp("reports")
+    store = write_store(folder / "made.zarr", make_scans(6, size_px=64))
+    benchmark(store, folder / "benchmark", models=("identity", "affine"), folds=2)
+    settings = hologram_settings(changes=TINY)
+    compare(settings, {"none": "none", "physics": "zoo:physics"}, folder / "gap", target="ring", seeds=(0,))
+    every_part().write(folder)
+    return {
+        "every part": folder / "report.html",
+        "benchmark": folder / "benchmark" / "report.html",
+        "gap": folder / "gap" / "report.html",
+        "design": folder / "gap" / "designs" / "physics" / "seed0" / "report.html",
+    }
+
+
+def every_part() -> Page:
+    page = Page("Every part", "a lead", facts={"dataset": "0123456789abcdef" * 4})
+    page.verdict("pbl is best.")
+    page.tiles([("1 nm", "error"), ("2", "scans")])
+    page.note("Do not overlook this.")
+    page.heading("Folded", folded=True)
+    page.code("x" * 200)
+    values = [3.0, 20.0, float("nan"), 100.0]
+    frame = pd.DataFrame(
+        {"model": ["pbl", "fno", "linear", "own"], "mae_abs_nm": values}
+        | {f"a_column_of_many_{n}": ["some words"] * 4 for n in range(12)}
+    )
+    page.table(frame, "numbers", "table.csv", words={"mae_abs_nm": ("error (nm)", "how far off it is")})
+    image = np.add.outer(np.arange(20.0), np.arange(20.0))
+    picture = coloured_png(image, "viridis", 0, 38)
+    page.gallery([("height", colour_bar_png("viridis"))] * 5, [("P1", [picture] * 5)], "gallery")
+    figure = new_figure(11, 3)
+    for axes in figure.subplots(1, 3):
+        shown = axes.imshow(image)
+        figure.colorbar(shown, ax=axes, label="nm")
+    page.figure(figure, "maps")
+    page.links([("elsewhere.html", "a link")])
+    return page
+
+
+@pytest.mark.parametrize("name", ["every part", "benchmark", "gap", "design"])
+def test_a_report_is_sound_on_every_screen(browser, reports, name):
+    for width_px in (DESK_PX, PHONE_PX):
+        browser.show(reports[name], width_px, dark=False)
+        height = browser.run("document.documentElement.scrollHeight")
+        assert height <= MOST_SCREENS * browser.run("innerHeight")
+        browser.run("document.querySelectorAll('details').forEach(one => one.open = true)")
+        for dark in (False, True):
+            browser.screen(width_px, dark)
+            assert browser.run("getComputedStyle(document.body).backgroundColor") == shown_as(dark)
+            assert browser.run(FAULTS) == []
+        assert browser.errors == []
+
+
+def shown_as(dark: bool) -> str:
+    paper = (DARK if dark else LIGHT)["paper"]
+    return "rgb({}, {}, {})".format(*(int(paper[at : at + 2], 16) for at in (1, 3, 5)))
+
+
+def test_what_is_wrong_with_a_page_is_found(browser, tmp_path):
+    """One fault of each kind, so that the test above cannot pass by looking at nothing."""
+    blank = "data:image/svg+xml,<svg xmlns='http://www.w3.org/2000/svg' width='9' height='9'></svg>"
+    (tmp_path / "bad.html").write_text(
+        f'<p style="color:#999">pale</p><div style="width:2000px">wide</div><img src="none.png">'
+        f'<img src="{blank}"><script>console.error("oh"); nothing()</script>',
+        encoding="utf-8",
+    )
+    browser.show(tmp_path / "bad.html", PHONE_PX, dark=False)
+    assert sorted(browser.run(FAULTS)) == [
+        'contrast of "pale"', "picture not decoded", "picture without content", "wider than the screen",
+    ]  # fmt: skip
+    assert len(browser.errors) >= 3
+
+
+def test_a_click_sorts_by_number_with_gaps_last_and_a_second_turns_it(browser, reports):
+    browser.show(reports["every part"], DESK_PX, dark=False)
+    rows = "[...document.querySelectorAll('table.data tbody tr')]"
+    orders = []
+    for _ in range(2):
+        browser.run("document.querySelectorAll('table.data th button')[1].click()")
+        orders.append(browser.run(f"{rows}.map(row => row.cells[0].textContent.trim())"))
+    assert orders == [["pbl", "fno", "own", "linear"], ["own", "fno", "pbl", "linear"]]
+
+
+def test_the_narrow_figure_is_drawn_anew(browser, reports):
+    """On the telephone the panels lie below each other: the figure is higher than wide, not a strip."""
+    sizes = {}
+    for width_px in (DESK_PX, PHONE_PX):
+        browser.show(reports["every part"], width_px, dark=False)
+        browser.run("document.querySelector('details').open = true")
+        shape = "(i => i.clientHeight / i.clientWidth)(document.querySelector('picture img'))"
+        sizes[width_px] = browser.run(shape)
+    assert sizes[DESK_PX] < 0.5
+    assert sizes[PHONE_PX] > 2
+
+
+def test_tables_have_names_for_people_and_the_csv_keeps_the_keys(reports):
+    for report in reports.values():
+        heads = re.findall(r"<th[^>]*>(?:<button>)?([^<]*)", report.read_text("utf-8"))
+        assert len(heads) > 5
+        assert not [head for head in heads if "_" in head]
+    text = reports["every part"].read_text("utf-8")
+    assert "how far off it is" in text
+    assert "mae_abs_nm" in (reports["every part"].parent / "table.csv").read_text("utf-8")
+    assert spelt_out("a_rough_edge_um") == "a rough edge (µm)"
+
+
+def test_the_foot_says_how_the_page_was_made(reports):
+    text = reports["benchmark"].read_text("utf-8")
+    foot = text[text.index("<footer>") :]
+    assert re.search(r"<dt>dataset</dt><dd>[0-9a-f]{64}</dd>", foot)
+    assert all(f"<dt>{name}</dt>" in foot for name in ("seeds", "litholoop", "torch"))
+
+
+def test_colours_stand_out_from_both_papers():
+    """WCAG 2: 4.5 for words on paper and bands, 3 for lines and bars; figures have the same colours."""
+    for colours in (LIGHT, DARK):
+        for ink in ("ink", "soft", "accent"):
+            assert min(contrast(colours[ink], colours[ground]) for ground in ("paper", "band")) >= 4.5
+        models = ("identity", "affine", "blur-table", "linear", "physics", "pbl", "fno", "features", "my-own")
+        assert min(contrast(model_colour(name), colours["paper"]) for name in models) >= 3
+    assert model_colour("pbl") != model_colour("physics") != model_colour("fno")
+
+
+def contrast(first: str, second: str) -> float:
+    def light(colour: str) -> float:
+        channels = np.array([int(colour[at : at + 2], 16) for at in (1, 3, 5)]) / 255
+        linear = np.where(channels <= 0.04045, channels / 12.92, ((channels + 0.055) / 1.055) ** 2.4)
+        return float(linear @ (0.2126, 0.7152, 0.0722))
+
+    low, high = sorted((light(first), light(second)))
+    return (high + 0.05) / (low + 0.05)
