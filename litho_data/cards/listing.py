@@ -11,6 +11,7 @@ from typing import cast
 
 from litho_data.cards.card import Card, Use, load_card
 from litho_data.cards.fetch import known_folders
+from litho_data.cards.prints import prints_of
 from litho_data.cards.tables import SAFE_ID, read_full_scales, read_table
 from litho_data.foundation.errors import InputError
 from litho_data.store.schema import OPTIONAL_COLUMNS
@@ -81,7 +82,9 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
 
     fields: list[PrintedField] = []
     aside: list[LeftAside] = []
-    for scan_id in sorted({*layouts, *scans, *table}):
+    ids = sorted({*layouts, *scans, *table})
+    print_ids = dict(zip(ids, prints_of(ids, card.ids.print), strict=True))
+    for scan_id in ids:
         row = table.get(scan_id, {})
         use = cast(Use, row.get("use", "dataset"))
         files = tuple(found[scan_id] for found in (layouts, scans) if scan_id in found)
@@ -89,7 +92,7 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
             missing = card.scan.files if scan_id not in scans else card.layout.files
             aside.append(LeftAside(scan_id, files, True, f"no file {missing.replace('{id}', scan_id)}"))
             continue
-        print_id = _print_id(scan_id, card)
+        print_id = print_ids[scan_id]
         scale = _full_scale(scales, scan_id, scans[scan_id])
         reason = _refusal(scan_id, print_id, use, table, card) or leads_out(files, folder)
         if not reason and scales is not None and scale is None:
@@ -155,13 +158,6 @@ def leads_out(files: tuple[Path, ...], folder: Path) -> str:
     """Why files that are links cannot be used: what lies outside is not what the card is about."""
     outside = [path for path in files if not path.resolve().is_relative_to(folder)]
     return f"{outside[0].name} is a link that leads out of the data folder" if outside else ""
-
-
-def _print_id(scan_id: str, card: Card) -> str | None:
-    if card.ids.print is None:
-        return scan_id
-    match = re.fullmatch(card.ids.print, scan_id)
-    return match["print"] if match else None
 
 
 def _table(card: Card, *folders: Path) -> dict[str, dict[str, str]]:

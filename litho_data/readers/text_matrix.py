@@ -17,12 +17,15 @@ _TEXT_BYTES = bytes(range(0x20, 0x7F)) + b"\t\n\r\x0c"
 _EMPTY_CELL = re.compile(rb"[,;][ \t]*[,;]")
 _EXPONENT = re.compile(r"[eE][+-]?\d+$")
 _FORTRAN_EXPONENT = re.compile(rb"(?<=[\d.])[dD](?=[-+]?\d)")
-_LENGTH = re.compile(r"^\s*([-+\d.,eE]+)\s*(\S+)\s*$")
-_ENTRY = re.compile(r"([\w ()>-]+?)\s*[:=]\s*(.*)")
+# No two neighbouring repetitions of these expressions match the same characters: otherwise a long line of
+# blanks or digits takes hours.
+_LEADING_NUMBER = re.compile(r"[-+\d.,eE]+")
+_ASSIGNMENT = re.compile(r"[:=]")
+_KEY = re.compile(r"[\w ()>-]+")
 _COMMENT = (b"#", b"%", b";")
-_NUMBER = re.compile(rb"[-+]?(\d+[.,]?\d*|[.,]\d+)([eEdD][-+]?\d+)?|[-+]?nan|[-+]?inf", re.IGNORECASE)
-_AROUND_COMMA = re.compile(rb"[ \t]*,[ \t]*(?=[^\s,])|[ \t]*,[ \t]*(?=\r?\n|$)")
-_OTHER_SEPARATOR = re.compile(rb"[^\s,][ \t]*[;\t ]+[ \t]*[^\s;,]")
+_NUMBER = re.compile(rb"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eEdD][-+]?\d+)?|[-+]?nan|[-+]?inf", re.IGNORECASE)
+_AROUND_COMMA = re.compile(rb"(?<![ \t])[ \t]*,[ \t]*(?=[^\s,]|\r?\n|$)")
+_OTHER_SEPARATOR = re.compile(rb"[^\s;,][;\t ]+[^\s;,]")
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 _CELL_WIDTH = len("-1.2345e-007\t")
 _MOST_HEADER_LINES = 1000
@@ -110,9 +113,12 @@ def _header(lines: list[bytes]) -> dict[str, str]:
     header = {}
     for index, line in enumerate(lines):
         text = line.decode("utf-8", errors="replace").strip("#%; \t\r\n")
-        entry = _ENTRY.fullmatch(text)
-        if text:
-            header[entry[1].strip() if entry else f"comment {index + 1}"] = entry[2] if entry else text
+        sign = _ASSIGNMENT.search(text)
+        key = text[: sign.start()].strip() if sign else ""
+        if sign and _KEY.fullmatch(key):
+            header[key] = text[sign.end() :].lstrip()
+        elif text:
+            header[f"comment {index + 1}"] = text
     return header
 
 
@@ -129,11 +135,12 @@ def _size_um(header: dict[str, str], shape: tuple[int, ...]) -> tuple[float, flo
 
 
 def _length_um(text: str) -> float | None:
-    match = _LENGTH.match(text)
-    if match is None or not is_length(match[2]):
+    number = _LEADING_NUMBER.match(text := text.strip())
+    unit = text[number.end() :].strip() if number else ""
+    if number is None or not is_length(unit):
         return None
     try:
-        return float(match[1].replace(",", ".")) * um_per(match[2])
+        return float(number[0].replace(",", ".")) * um_per(unit)
     except ValueError:
         return None
 

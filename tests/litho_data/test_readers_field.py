@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import gzip
+import io
 import os
+import struct
 import time
+import zipfile
 from functools import partial
 from pathlib import Path
 
@@ -282,3 +285,30 @@ def test_real_files_agree_with_another_reader(oracles: Path) -> None:
         expected_um = reference[f"{key}_nm_every_8px"] * 1e-3
         np.testing.assert_allclose(height_um[::8, ::8], expected_um, rtol=1e-12, atol=1e-15)
         assert scan.require_pitch()[1] == pytest.approx(float(reference[f"{key}_nm_per_px"]) * 1e-3)
+
+
+@pytest.mark.parametrize("format", ["gsf", "npy", "npz", "gwy", "h5"])
+def test_a_size_that_is_only_declared_is_one_line(tmp_path: Path, format: str) -> None:
+    """16000 × 16000 pixels of nothing: 1 GB that the file does not hold."""
+    path, side = tmp_path / f"scan.{format}", 16_000
+    header = io.BytesIO()
+    shape = {"descr": "<f4", "fortran_order": False, "shape": (side, side)}
+    np.lib.format.write_array_header_1_0(header, shape)
+    if format == "gsf":
+        path.write_bytes(b"Gwyddion Simple Field 1.0\nXRes = 16000\nYRes = 16000\n\0\0\0\0" + bytes(400))
+    elif format == "npy":
+        path.write_bytes(header.getvalue() + bytes(800))
+    elif format == "npz":
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("height.npy", header.getvalue() + bytes(800))
+    elif format == "gwy":
+        numbers = [f"{key}\0i".encode() + struct.pack("<i", side) for key in ("xres", "yres")]
+        field = b"".join([*numbers, b"data\0D" + struct.pack("<I", 50) + bytes(400)])
+        entry = b"/0/data\0oGwyDataField\0" + struct.pack("<I", len(field)) + field
+        path.write_bytes(b"GWYPGwyContainer\0" + struct.pack("<I", len(entry)) + entry)
+    else:
+        with h5py.File(path, "w") as file:
+            file.create_dataset("height", shape=(side, side), chunks=(1000, 1000), dtype="f4")
+    with pytest.raises(InputError) as caught:
+        read_scan(path, unit="m", size_um=(1.0, 1.0))
+    assert "\n" not in str(caught.value)

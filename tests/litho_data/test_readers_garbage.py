@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -16,6 +17,7 @@ from hypothesis import strategies as st
 from benchmarks.readers import SIGNATURES
 from litho_data.foundation.errors import InputError
 from litho_data.readers import formats, list_channels, read_layout, read_scan
+from litho_data.readers.tiff import _ome_pitch_um as ome_pitch_um
 from tests.litho_data import afm_files
 
 LONGEST_S = 20
@@ -127,3 +129,42 @@ def test_every_cut_is_noticed(tmp_path: Path, name: str) -> None:
     content = whole_files(tmp_path)[name]
     for cut in np.linspace(1, len(content) - 1, 25).astype(int):
         refused(tmp_path / "cut", content[:cut], "auto")
+
+
+_LONG = 200_000
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a" + " " * _LONG + "b\n1 2\n3 4\n",
+        "# Width: " + "1" * _LONG + " x y\n1 2\n3 4\n",
+        "# Width: " + " " * _LONG + "\n1 2\n3 4\n",
+        "1" * _LONG + "x 2\n3 4\n",
+        "1" + " " * _LONG + "2,5\n3 4\n",
+        "1,5 2,5\n" + "\t" * _LONG + "x\n",
+        "1,5" + " " * _LONG + ",\n1 2\n",
+        "1 " + "e" * _LONG,
+        "1 1" + "e1" * _LONG,
+        "," * _LONG,
+        "1;" * _LONG,
+    ],
+)
+def test_no_line_keeps_an_expression_busy(tmp_path: Path, text: str) -> None:
+    """Where two neighbouring repetitions may match the same characters, each takes minutes or hours."""
+    path = tmp_path / "scan.txt"
+    path.write_text(text)
+    started = time.process_time()
+    with suppress(InputError):
+        read_scan(path, format="text-matrix", unit="m", size_um=(1.0, 1.0))
+    # Splitting 200 kB into cells takes a few hundredths; the square of it would take 40 s or more.
+    assert time.process_time() - started < 2
+
+
+@pytest.mark.parametrize(
+    "text", ["<" * _LONG, "<a" * _LONG, "<Pixels PhysicalSizeX" + " " * _LONG, '="' * _LONG]
+)
+def test_no_metadata_keeps_an_expression_busy(text: str) -> None:
+    started = time.process_time()
+    assert ome_pitch_um(text) is None
+    assert time.process_time() - started < 2

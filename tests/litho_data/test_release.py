@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -53,3 +54,15 @@ def test_the_crate_describes_its_files(campaign: Path, tmp_path: Path) -> None:
         assert raw["identifier"] == f"sha256:{file_sha256(campaign / raw['name'])}"
     # RO-Crate 1.1 asks every root dataset for these.
     assert {"name", "description", "datePublished"} <= set(root)
+
+
+def test_a_member_that_points_out_of_the_file_stays_in_it(campaign: Path, tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    packed = export_zip(campaign / "prints.zarr", tmp_path / "in" / "prints.zarr.zip")
+    with zipfile.ZipFile(packed, "a") as archive:
+        for name in ("../evil.txt", "../evil.zarr/zarr.json", f"{tmp_path}/evil.txt"):
+            archive.writestr(name, "{}")
+    store = open_store(packed)
+    assert store.computed_sha256() == open_store(campaign / "prints.zarr").sha256
+    verify(packed, data_dir=campaign)
+    assert [path.name for path in tmp_path.rglob("*")] == ["in", "prints.zarr.zip"]
