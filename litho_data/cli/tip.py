@@ -52,6 +52,8 @@ def tip(
     from litho_data.level.scan import write_heights
     from litho_data.tip import reconstructed, tip_certain
 
+    if len({scan.name for scan in read}) < len(read):
+        raise InputError("--maps", got="scans of one name", wanted="names that differ: they name the maps")
     maps.mkdir(parents=True, exist_ok=True)
     for scan in read:
         height, pitch = scan.height_um, scan.require_pitch()
