@@ -72,6 +72,8 @@ def main() -> None:
     if arguments.only_bodies:
         write_record(arguments.out, {"signatures": read_bodies(arguments.bodies)})
         return
+    if "LITHO_ORACLE_DIR" not in os.environ:
+        raise InputError("LITHO_ORACLE_DIR", got="nothing", wanted="the folder that holds vendor/")
     folder = Path(os.environ["LITHO_ORACLE_DIR"]) / "vendor"
     record = {
         "schema": "litho-data/benchmark-readers/1",
