@@ -94,6 +94,10 @@ class Simulator(nn.Module, ABC):
         reach = self.reach_px or 0
         return self.interior(pad_field(layout_um, reach, reach))
 
+    def printer(self) -> Simulator:
+        """The model without what it knows of the microscope; itself where it knows nothing of it."""
+        return self
+
     @property
     def ranges(self) -> dict[str, Range]:
         """Ranges of fitted values, each by the parameter (one raw number) behind it; any other is free."""

@@ -15,6 +15,9 @@ Recipe = Literal["fast", "paper"]
 RECIPES: tuple[str, ...] = get_args(Recipe)
 PAPER_EPOCHS, PAPER_CROPS, PAPER_BATCH = 4000, 72, 4
 FAST_STEPS = {"pbl": 2000, "fno": 1000}
+# The steps of a default PBL train its chain, on which the feature networks then build: no long training, and
+# no scan is spent on choosing between its rounds.
+FAST_CHAIN: dict[str, Any] = {"steps": 300, "rounds": 2, "validation_scans": 0}
 # What a fit by least squares depends on.
 LEAST_SQUARES_FIELDS = {"recipe", "variant", "seed", "nuisance", "free_gain", "weights"}
 PAPER_LEARNING_RATE = {"pbl": 5e-4, "fno": 1e-4, "physics": 1e-2}
@@ -70,7 +73,7 @@ class TrainingConfig(BaseModel):
 
         ``paper``: Adam, batch 4, L1, 4,000 epochs over 72 quadrants, the paper's learning rates, no
         nuisances. ``fast``: AdamW with a one-cycle schedule, random crops, nuisances fitted jointly, and
-        ``FAST_STEPS``.
+        ``FAST_STEPS``, or ``FAST_CHAIN`` for the default PBL.
 
         Raises:
             InputError: unknown recipe.
@@ -78,8 +81,10 @@ class TrainingConfig(BaseModel):
         if recipe not in RECIPES:
             raise InputError("recipe", got=repr(recipe), wanted=", ".join(RECIPES))
         if recipe == "fast":
-            steps = {"steps": FAST_STEPS[model_name]} if model_name in FAST_STEPS else {}
-            return cls(**{"recipe": recipe, **steps, **settings})
+            usual = {"steps": FAST_STEPS[model_name]} if model_name in FAST_STEPS else {}
+            if model_name == "pbl" and settings.get("variant", "default") == "default":
+                usual = FAST_CHAIN
+            return cls(**{"recipe": recipe, **usual, **settings})
         paper: dict[str, Any] = {
             "steps": PAPER_EPOCHS * PAPER_CROPS // PAPER_BATCH,
             "rounds": 100,

@@ -19,11 +19,13 @@ from litho_data.store import PrintedScan
 from litho_models.fitting.checkpoint import CheckpointFolder, RoundRecord
 from litho_models.fitting.config import TrainingConfig
 from litho_models.fitting.pixel_weights import pixel_weights
+from litho_models.fitting.pixels import fit_feature_networks
 from litho_models.fitting.ridge import fit_ridge
 from litho_models.fitting.small_models import fit_small_model
 from litho_models.fitting.stochastic import train_network
 from litho_models.models import build_model
 from litho_models.models.features import Features
+from litho_models.models.pbl import Pbl
 from litho_models.prediction.tiles import predict_scan
 from litho_models.simulator import Simulator
 from litho_models.splits.folds import inner_validation
@@ -85,9 +87,13 @@ def fit_with_record(
         validation_ids = inner_validation(ids, config.validation_scans, config.seed)
         training = [scan for scan in scans if scan.id not in validation_ids]
         validation = [scan for scan in scans if scan.id in validation_ids]
+        by_steps = model.chain() if isinstance(model, Pbl) else model
         history = train_network(
-            model, training, validation, config, lambda: _first_predictions(training, config), folder
+            by_steps, training, validation, config, lambda: _first_predictions(training, config), folder
         )
+        if isinstance(model, Pbl) and model.feature_networks:
+            model.take(by_steps)
+            history.append(fit_feature_networks(model, training, validation, config))
     elif isinstance(model, Features):
         fit_ridge(model, scans, config.nuisance, config.free_gain, config.weights)
     else:

@@ -79,7 +79,7 @@ def train_network(
             RoundRecord(
                 step=last,
                 training_mae_nm=1000 * float(np.mean(losses)),
-                validation_mae_datum_free_nm=_validation_error(model, validation),
+                validation_mae_datum_free_nm=validation_error(model, validation),
                 seconds=time.monotonic() - started,
             )
         )
@@ -211,7 +211,8 @@ def learning_rate(config: TrainingConfig, step: int) -> float:
     return config.learning_rate * (stop + (start - stop) * (1 + math.cos(math.pi * along)) / 2)
 
 
-def _validation_error(model: Simulator, scans: Sequence[PrintedScan]) -> float | None:
+def validation_error(model: Simulator, scans: Sequence[PrintedScan]) -> float | None:
+    """Mean datum-free error over scans, nm; None without scans."""
     if not scans:
         return None
     scores = [score_scan(scan.id, scan.height_um, predict_scan(model, scan), scan.valid) for scan in scans]

@@ -13,6 +13,11 @@ from litho_models.frozen.files import load_simulator, save_frozen
 
 # Where `train` and `close-loop` leave their model within the run folder.
 MODEL_FOLDER = "model"
+# The part of a model that `Simulator.printer` leaves out, among the effects of undetermined role.
+SCAN_AXIS = "scan-axis"
+_WITHOUT_IT = (
+    f"Stated errors are those with {SCAN_AXIS}, which belongs to measured maps and is left out here."
+)
 _CARRIED_FIELDS = {
     "training_level_share",
     "training_step_share",
@@ -45,16 +50,22 @@ def freeze(
         out: folder of the frozen model.
         attribute: whose the effects of undetermined role are taken to be, of all of them or by name:
             those of the printer become part of the model, those of the microscope do not. The card says so.
+            ``scan-axis`` is what a base model itself adds along the lines of the scan.
 
     Raises:
-        InputError: no model there, an effect that is not among the undetermined ones, or another side.
+        InputError: no model there, an effect that is not among the undetermined ones, or another side; or
+            ``scan-axis`` for the printer, of a model that was frozen without it.
     """
     folder = zoo.model_folder(source)
     folder = folder if (folder / CARD_FILE).exists() else folder / MODEL_FOLDER
     if not (folder / CARD_FILE).exists():
         raise InputError(f"no model in {source}", wanted="a folder of `litho-models train` or a frozen model")
     card = ModelCard.read(folder / CARD_FILE)
+    simulator = load_simulator(folder, card)
+    decided = card.attributed.get(SCAN_AXIS) == "printer"
+    printer = simulator if decided else simulator.printer()
     undetermined = dict(card.undetermined_effects)
+    undetermined |= {} if printer is simulator else {SCAN_AXIS: {}}
     sides = {"printer": dict(card.process_effects), "microscope": dict(card.measurement_effects)}
     if isinstance(attribute, str):
         attribute = dict.fromkeys(undetermined, attribute) or {"": attribute}
@@ -68,9 +79,18 @@ def freeze(
                 wanted=", ".join(undetermined) or "a model with an effect of undetermined role",
             )
         sides[side][name] = undetermined.pop(name)
+    taken = sides["printer"].pop(SCAN_AXIS, None) is not None
+    if taken and printer is simulator:
+        raise InputError(
+            f"{SCAN_AXIS} for the printer",
+            got=f"{card.name}, which was frozen without it",
+            wanted="the folder of `train` or `close-loop`",
+        )
     kept = card.model_dump(mode="json", by_alias=True, include=_CARRIED_FIELDS)
     kept["undetermined_effects"], kept["measurement_effects"] = undetermined, sides["microscope"]
     kept["attributed"] = {**card.attributed, **(attribute or {})}
-    simulator = load_simulator(folder, card)
+    if not taken and printer is not simulator:
+        simulator = printer
+        kept["limitations"] = [*card.limitations, _WITHOUT_IT]
     save_frozen(simulator, out, name=card.name, process_effects=sides["printer"], **kept)
     return ModelCard.read(Path(out) / CARD_FILE)

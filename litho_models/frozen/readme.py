@@ -27,6 +27,11 @@ _RESULT = """
     metrics:
     - {{type: {metric}, value: {value:.4f}, config: "nuisance policy {policy}, background {background}"}}"""
 
+_INSIDE = (
+    "Inside, beside them: `scan-axis`, what the height along x adds to a measured map. `litho-models freeze` "
+    "leaves it out unless it is attributed to the printer."
+)
+
 
 def model_readme(card: ModelCard) -> str:
     """Markdown with a Hugging Face front matter: what the model is, where it may be used, what it scored."""
@@ -75,6 +80,7 @@ def model_readme(card: ModelCard) -> str:
         "## Effects\n",
         f"Process effects inside the model: {_names(card.process_effects)}. Measurement effects, left out: "
         f"{_names(card.measurement_effects)}. Undetermined, left out: {_names(card.undetermined_effects)}.\n",
+        *([f"{_INSIDE}\n"] if card.hyper_parameters.get("scan_axis") else []),
         *([f"{_attribution(card)}\n"] if card.attributed else []),
         "## Limitations\n",
         "\n".join(f"- {line}" for line in card.limitations) or "- none stated",

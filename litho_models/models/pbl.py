@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import math
 from itertools import pairwise
-from typing import Annotated, Any, ClassVar, cast
+from typing import Annotated, Any, ClassVar, Self, cast
 
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -21,6 +21,13 @@ from litho_models.layers.gaussian import Edge, Support, blur_interior, pad_field
 from litho_models.layers.lookup import PointwiseNet
 from litho_models.layers.precision import adjoint_dtype
 from litho_models.layers.ranges import Range
+from litho_models.models.feature_networks import (
+    FeatureNetwork,
+    FeatureNetworkConfig,
+    ScanAxis,
+    ScanAxisConfig,
+    Surroundings,
+)
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 
 Channels = Annotated[int, Field(ge=1, le=1024)]
@@ -42,7 +49,18 @@ class PblConfig(SimulatorConfig):
     edge: Edge = "replicate"
     knots: int = Field(1025, ge=0, le=1_000_000, description="points of a pointwise network; 0: each pixel")
 
+    # Not in the paper, nor in frozen models of older versions, whose cards do not know these three.
+    transposable: bool = Field(False, description="areawise network that does not know x from y")
+    surroundings: FeatureNetworkConfig | None = None
+    scan_axis: ScanAxisConfig | None = Field(None, description="what the microscope adds along its lines")
+
     VARIANT_FIELDS: ClassVar[dict[str, dict[str, Any]]] = {
+        "default": {
+            "areawise_channels": (16, 16, 16),
+            "transposable": True,
+            "surroundings": {},
+            "scan_axis": {},
+        },
         "paper": {"starts_as_blur": False, "edge": "zero"},
         "authors": {
             "starts_as_blur": False,
@@ -55,12 +73,22 @@ class PblConfig(SimulatorConfig):
         },
     }
 
+    @model_validator(mode="after")
+    def _can_be_built(self) -> Self:
+        if self.edge == "zero" and (self.surroundings or self.scan_axis):
+            raise ValueError("surroundings and scan_axis take edge 'replicate'")
+        return self
+
 
 class Pbl(Simulator):
     """H = g_mismatch(Ĥ · g_shrink(Ĥ * h_diffusion)) with Ĥ = g_thresh(M * h_optical), heights in µm.
 
     With ``starts_as_blur`` the three networks learn a difference: g_thresh(I) = I + net(I),
     g_shrink = 1 + net, g_mismatch(H) = H + net(H), last layers zero at the start.
+
+    To this chain the default adds two networks of fixed features. ``surroundings`` is what the layout within
+    some micrometres does, x and y alike. ``scan_axis`` is what the height along x does to the measured map:
+    fitted with the rest, so that the rest need not learn it, and left out of ``printer()``.
     """
 
     name = "pbl"
@@ -72,11 +100,37 @@ class Pbl(Simulator):
         slope = config.leaky_slope
         self.thresh = PointwiseNet(config.pointwise_channels, slope, config.knots)
         self.shrink = PointwiseNet(config.pointwise_channels, slope, config.knots)
-        self.mismatch = AreawiseNet(config.areawise_channels, slope)
+        self.mismatch = AreawiseNet(config.areawise_channels, slope, config.transposable)
         self.tau = nn.Parameter(self.ranges["tau"].raw(config.sigma_diffusion_init_um))
         if config.starts_as_blur:
             for part in (self.thresh, self.shrink, self.mismatch):
                 part.start_at_zero()
+        size = config.pitch_um, config.full_height_um
+        around, along = config.surroundings, config.scan_axis
+        self.surroundings = None if around is None else Surroundings(around, *size)
+        self.scan_axis = None if along is None else ScanAxis(along, *size)
+
+    @property
+    def feature_networks(self) -> list[FeatureNetwork]:
+        """Those that the model has, in the order of ``feature_fields``."""
+        return [network for network in (self.surroundings, self.scan_axis) if network is not None]
+
+    def printer(self) -> Pbl:
+        return self if self.scan_axis is None else self._without("scan_axis")
+
+    def chain(self) -> Pbl:
+        """The paper's chain alone, with weights of its own."""
+        return self._without("surroundings", "scan_axis") if self.feature_networks else self
+
+    def take(self, chain: Simulator) -> None:
+        """Replace the weights of the chain."""
+        self.load_state_dict(self.state_dict() | chain.state_dict())
+
+    def _without(self, *parts: str) -> Pbl:
+        smaller = Pbl(self.config.model_copy(update=dict.fromkeys(parts)))
+        own = smaller.state_dict()
+        smaller.load_state_dict({name: value for name, value in self.state_dict().items() if name in own})
+        return smaller.to(self.tau.device).train(self.training)
 
     @property
     def ranges(self) -> dict[str, Range]:
@@ -89,9 +143,28 @@ class Pbl(Simulator):
 
     @property
     def reach_px(self) -> int:
+        around, along = (0 if part is None else part.reach_px for part in (self.surroundings, self.scan_axis))
+        return max(self._chain_px + along, around)
+
+    @property
+    def _chain_px(self) -> int:
         return sum(self._radii_px()) + self.mismatch.reach_px
 
     def interior(self, layout_um: Tensor) -> Tensor:
+        height, fields = self.feature_fields(layout_um)
+        for network, field in zip(self.feature_networks, fields, strict=True):
+            height = height + network(field)
+        return height
+
+    def feature_fields(self, layout_um: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """What the chain makes of the interior, and the fields whose features each network sees, µm."""
+        along = 0 if self.scan_axis is None else self.scan_axis.reach_px
+        printed = self._chain_interior(crop_border(layout_um, self.reach_px - self._chain_px - along))
+        around = self.surroundings
+        layouts = [] if around is None else [crop_border(layout_um, self.reach_px - around.reach_px)]
+        return crop_border(printed, along), layouts if self.scan_axis is None else [*layouts, printed]
+
+    def _chain_interior(self, layout_um: Tensor) -> Tensor:
         optical, diffusion = self._radii_px()
         initial = self._threshold(self._blur(layout_um, self._sigma_optical(layout_um), optical))
         dose = self._blur(initial, self.sigma_diffusion_um, diffusion)
@@ -155,12 +228,14 @@ class Pbl(Simulator):
 class AreawiseNet(nn.Module):
     """Stack of 3 x 3 convolutions, 1 -> channels -> 1, leaky ReLU after each but the last.
 
+    ``transposable``: of each kernel is used the mean with its transpose, so that x and y are alike.
     ``activation`` may be any function of one value; the compiled stack knows the leaky ReLU only, and every
     other one runs layer by layer.
     """
 
-    def __init__(self, channels: tuple[int, ...], leaky_slope: float):
+    def __init__(self, channels: tuple[int, ...], leaky_slope: float, transposable: bool = False):
         super().__init__()
+        self.transposable = transposable
         widths = (1, *channels, 1)
         convolutions = [nn.Conv2d(inputs, outputs, 3) for inputs, outputs in pairwise(widths)]
         self.hidden = nn.ModuleList(convolutions[:-1])
@@ -183,12 +258,12 @@ class AreawiseNet(nn.Module):
                 return self._in_tiles(height_um, activation.negative_slope)
         features = height_um.contiguous(memory_format=torch.channels_last)
         for layer in cast(list[nn.Conv2d], list(self.hidden)):
-            features = functional.conv2d(features, layer.weight, layer.bias, padding=padding)
+            features = functional.conv2d(features, self._kernel(layer), layer.bias, padding=padding)
             features = self.activation(features)
         # The sum over channels is the height: full precision also where the stack runs in bfloat16.
         with torch.autocast(device_type=height_um.device.type, enabled=False):
             return functional.conv2d(
-                features.to(self.last.weight.dtype), self.last.weight, self.last.bias, padding=padding
+                features.to(self.last.weight.dtype), self._kernel(self.last), self.last.bias, padding=padding
             )
 
     def _in_tiles(self, height_um: Tensor, leaky_slope: float) -> Tensor:
@@ -198,12 +273,16 @@ class AreawiseNet(nn.Module):
         with torch.autocast(device_type="cpu", enabled=False):
             return convolution_stack(
                 height_um.to(dtype),
-                [layer.weight for layer in layers],
+                [self._kernel(layer) for layer in layers],
                 [cast(Tensor, layer.bias) for layer in layers],
                 leaky_slope=leaky_slope,
                 hidden_dtype=hidden,
                 adjoint_dtype=adjoint_dtype() or hidden,
             )
+
+    def _kernel(self, layer: nn.Conv2d) -> Tensor:
+        kernel = layer.weight
+        return (kernel + kernel.transpose(-1, -2)) / 2 if self.transposable else kernel
 
     def start_at_zero(self) -> None:
         """Make the network the zero function, keeping its hidden layers random."""

@@ -29,15 +29,27 @@ NARROW = {
     "physics": {"sigma_diffusion_init_um": 0.3},
     "fno": {"width": 6, "modes": (4, 4), "projection_channels": 8},
 }
-SMALL_TILES = {"fno": {"tile_px": 32, "overlap_px": 16}}
+# Of the default variant alone.
+SMALL_PARTS = {
+    "fno": {"tile_px": 32, "overlap_px": 16},
+    "pbl": {
+        "surroundings": {
+            "blurs_um": (0.2,),
+            "slope_blurs_um": (0.1,),
+            "shifts_um": (0.2,),
+            "steep_um": (0.3,),
+        },
+        "scan_axis": {"blurs_um": (0.2,), "slope_blurs_um": (0.1,), "shifts_um": (0.2,), "steep_um": (0.3,)},
+    },
+}
 LOCAL = [name for name in MODELS if build_model(name).reach_px is not None]
 
 
 def make(name: str, variant: str = "default", **fields: object) -> Simulator:
     """A model whose every parameter differs from its start, so that no part is idle."""
     torch.manual_seed(0)
-    tiles = SMALL_TILES.get(name, {}) if variant == "default" else {}
-    model = build_model(name, variant, **{**NARROW.get(name, {}), **tiles, **fields})
+    parts = SMALL_PARTS.get(name, {}) if variant == "default" else {}
+    model = build_model(name, variant, **{**NARROW.get(name, {}), **parts, **fields})
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.add_(0.03 * torch.randn_like(parameter))

@@ -1,0 +1,125 @@
+"""Networks of fixed features, fitted to single pixels: their features are made once for each scan."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from litho_data.foundation.commands import progress
+from litho_data.foundation.units import NM_PER_UM
+from litho_data.store import PrintedScan
+from litho_models.fitting.checkpoint import RoundRecord
+from litho_models.fitting.config import TrainingConfig
+from litho_models.fitting.stochastic import learning_rate, validation_error
+from litho_models.layers.gaussian import pad_field
+from litho_models.models.pbl import Pbl
+from litho_models.scan_terms import FloatMap, TermPixels, Terms, least_squares, line_terms, term_maps
+from litho_models.scan_terms.training import PINNED, training_terms
+
+# Pixels of all scans together, on a square grid in each: 100 MB of features.
+FITTED_PX = 2**18
+EPOCHS, BATCH_PX, LEARNING_RATE = 8, 1024, 3e-3
+# Passes over all pixels after which the terms of the scans are estimated anew.
+EPOCHS_PER_ROUND = 2
+
+
+class _Pixels(NamedTuple):
+    """Of one scan: features (n, all), what is measured beyond the chain (n,) µm, its own terms (m, n)."""
+
+    features: Tensor
+    rest_um: FloatMap
+    terms: FloatMap
+
+
+def fit_feature_networks(
+    model: Pbl, scans: Sequence[PrintedScan], validation: Sequence[PrintedScan], config: TrainingConfig
+) -> RoundRecord:
+    """Fit the feature networks of ``model`` in place, to the mean absolute error of what its chain leaves.
+
+    Offsets of lines are left out of the terms of the scans, as they average out.
+
+    Returns:
+        the round, its error with the terms of the scans taken out; ``validation`` scans change nothing.
+    """
+    started = time.monotonic()
+    terms = training_terms(config.nuisance, config.free_gain)
+    terms -= {term.name for term in line_terms(terms)}
+    count = FITTED_PX // len(scans)
+    parts = [_pixels(model, scan, terms, count) for scan in progress(scans, "features of pixels")]
+    sizes = [network.feature_count for network in model.feature_networks]
+    centre = torch.stack([part.features.mean(dim=0) for part in parts]).mean(dim=0)
+    spread = torch.stack([part.features.var(dim=0) for part in parts]).mean(dim=0).sqrt()
+    scale = torch.where(spread > 1e-6 * spread.max(), spread, 1.0)
+    for network, own, width in zip(
+        model.feature_networks, centre.split(sizes), scale.split(sizes), strict=True
+    ):
+        network.standardise(own, width)
+
+    def heights(features: Tensor) -> Tensor:
+        both = zip(model.feature_networks, features.split(sizes, dim=1), strict=True)
+        return torch.stack([network.at_pixels(own) for network, own in both]).sum(dim=0)
+
+    features = torch.cat([part.features for part in parts])
+    steps = EPOCHS * -(-len(features) // BATCH_PX)
+    schedule = config.model_copy(
+        update={"steps": steps, "learning_rate": LEARNING_RATE, "schedule": "one-cycle"}
+    )
+    learned = [weight for network in model.feature_networks for weight in network.parameters()]
+    optimiser = torch.optim.AdamW(learned, lr=LEARNING_RATE, weight_decay=config.weight_decay)
+    random = torch.Generator().manual_seed(config.seed)
+    target, step = torch.zeros(0), 0
+    losses: list[float] = []
+    for epoch in progress(range(EPOCHS), f"fitting pixels of {model.name}"):
+        if epoch % EPOCHS_PER_ROUND == 0:
+            target = _targets(parts, heights, pinned=len(PINNED & terms))
+        losses = []
+        for batch in torch.randperm(len(features), generator=random).split(BATCH_PX):
+            for group in optimiser.param_groups:
+                group["lr"] = learning_rate(schedule, step)
+            loss = (heights(features[batch]) - target[batch]).abs().mean()
+            optimiser.zero_grad(set_to_none=True)
+            loss.backward()
+            optimiser.step()
+            losses.append(loss.item())
+            step += 1
+    return RoundRecord(
+        step=config.steps + step,
+        training_mae_nm=NM_PER_UM * float(np.mean(losses)),
+        validation_mae_datum_free_nm=validation_error(model, validation),
+        seconds=time.monotonic() - started,
+    )
+
+
+def _targets(parts: Sequence[_Pixels], heights: Callable[[Tensor], Tensor], pinned: int) -> Tensor:
+    """What the networks are to add at all pixels, (all n,) µm: the terms of the scans taken out."""
+    with torch.no_grad():
+        rests = [part.rest_um - heights(part.features).double().numpy() for part in parts]
+    own = np.array([least_squares(part.terms, rest) for part, rest in zip(parts, rests, strict=True)])
+    own[:, :pinned] -= own[:, :pinned].mean(axis=0)
+    freed = [part.rest_um - found @ part.terms for part, found in zip(parts, own, strict=True)]
+    return torch.from_numpy(np.concatenate(freed).astype(np.float32))
+
+
+def _pixels(model: Pbl, scan: PrintedScan, terms: Terms, count: int) -> _Pixels:
+    usable = scan.valid & np.isfinite(scan.height_um)
+    step = max(1, round((usable.size / count) ** 0.5))
+    grid = np.zeros_like(usable)
+    grid[::step, ::step] = True
+    at = np.flatnonzero(usable & grid)
+    chosen = torch.from_numpy(at)
+    with torch.no_grad():
+        layout = pad_field(torch.from_numpy(scan.layout_um)[None, None], model.reach_px, model.reach_px)
+        printed, fields = model.feature_fields(layout)
+        seen = [
+            feature.flatten()[chosen]
+            for network, field in zip(model.feature_networks, fields, strict=True)
+            for feature in network.features(field)
+        ]
+    rest = scan.height_um.reshape(-1)[at].astype(np.float64) - printed.flatten()[chosen].double().numpy()
+    maps = term_maps(TermPixels(scan.layout_um, at=at), terms)
+    return _Pixels(torch.stack(seen, dim=1), rest, maps)

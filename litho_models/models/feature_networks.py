@@ -1,0 +1,202 @@
+"""Networks of fixed features of a field: what surrounds a pixel of a layout, and what a height does along x.
+
+The features have no parameters, so that such a network is fitted to single pixels
+(``litho_models.fitting.pixels``): seconds, where a network of crops takes minutes.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import ClassVar
+
+import torch
+from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+
+from litho_models.layers.gaussian import kernel_radius_px
+from litho_models.models.affine_mtf import blurred_interior
+from litho_models.simulator import crop_border
+
+# Relative height per µm below which the length of a slope is rounded off, so that it has a derivative.
+_LEAST_SLOPE = 1e-2
+# Pixels that go through the network at once: some hundred bytes each, whatever the size of the field.
+_PIXELS_AT_ONCE = 2**16
+
+Widths = tuple[float, ...]
+
+
+class FeatureNetworkConfig(BaseModel):
+    """Which features, all lengths in µm, and how many hidden units see them."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    hidden: tuple[int, ...] = Field((48, 32), min_length=1, max_length=8, description="hidden units")
+    blurs_um: Widths = Field((0.1, 0.2, 0.3, 0.45, 0.65, 1.0, 1.6, 2.5), description="σ")
+    slope_blurs_um: Widths = Field((0.15, 0.3, 0.6), min_length=1, description="σ of what has a slope")
+    shifts_um: Widths = Field((0.2, 0.5, 1.0), min_length=1, description="displacements")
+    steep_um: Widths = Field((0.4, 1.0, 2.0), description="σ of the mean steepness around a pixel")
+
+
+class ScanAxisConfig(FeatureNetworkConfig):
+    hidden: tuple[int, ...] = (32, 16)
+    blurs_um: Widths = (0.3,)
+    slope_blurs_um: Widths = (0.1, 0.3)
+    shifts_um: Widths = (0.1, 0.2, 0.4, 0.8, 1.6)
+
+
+class FeatureNetwork(nn.Module, ABC):
+    """A function of the features of each pixel, µm: linear, and beside it a network; zero at the start."""
+
+    # Whether the network may add a height of its own, the same everywhere.
+    has_constant: ClassVar[bool] = True
+    centre: Tensor
+    scale: Tensor
+
+    def __init__(self, config: FeatureNetworkConfig, pitch_um: float, full_height_um: float):
+        super().__init__()
+        self.config, self.pitch_um, self.full_height_um = config, pitch_um, full_height_um
+        count = self.feature_count
+        self.register_buffer("centre", torch.zeros(count))
+        self.register_buffer("scale", torch.ones(count))
+        self.linear = nn.Linear(count, 1, bias=self.has_constant)
+        layers: list[nn.Module] = []
+        for inputs, outputs in pairwise((count, *config.hidden)):
+            layers += [nn.Linear(inputs, outputs), nn.SiLU()]
+        last = nn.Linear(config.hidden[-1], 1, bias=False)
+        self.layers = nn.Sequential(*layers, last)
+        for weight in (*self.linear.parameters(), last.weight):
+            nn.init.zeros_(weight)
+
+    @property
+    @abstractmethod
+    def feature_count(self) -> int:
+        """Number of features."""
+
+    @abstractmethod
+    def features(self, field_um: Tensor) -> list[Tensor]:
+        """Features (b, 1, y - 2r, x - 2r) of a field (b, 1, y, x), r = ``reach_px``."""
+
+    @property
+    def reach_px(self) -> int:
+        """How far features reach."""
+        config = self.config
+        steep = 1 + self._radius(config.slope_blurs_um[:1]) + self._radius(config.steep_um)
+        slopes = 1 + self._radius(config.slope_blurs_um)
+        return max(self._radius(config.blurs_um), slopes, self._steps_px()[-1], steep)
+
+    def forward(self, field_um: Tensor) -> Tensor:
+        """What the network adds to the height of the interior, (b, 1, y - 2r, x - 2r) µm."""
+        features = torch.stack([feature[:, 0] for feature in self.features(field_um)], dim=-1)
+        with torch.autocast(device_type=field_um.device.type, enabled=False):
+            # Computed again for a gradient: the hidden units of a field would take gigabytes.
+            parts = [
+                checkpoint(self.at_pixels, part, use_reentrant=False)
+                for part in features.flatten(0, -2).split(_PIXELS_AT_ONCE)
+            ]
+        return torch.cat(parts).view(features.shape[:-1])[:, None]
+
+    def at_pixels(self, features: Tensor) -> Tensor:
+        """The same from features (n, features): (n,) µm."""
+        standard = (features - self.centre) / self.scale
+        return (self.linear(standard) + self.layers(standard))[:, 0]
+
+    def standardise(self, centre: Tensor, scale: Tensor) -> None:
+        """State mean and standard deviation (features,) of what the network sees."""
+        self.centre.copy_(centre)
+        self.scale.copy_(scale)
+
+    def _blurred(self, field: Tensor, sigma_um: float, margin_px: int = 0) -> Tensor:
+        return blurred_interior(field, sigma_um, self.pitch_um, self.reach_px - margin_px)
+
+    def _averaged(self, field: Tensor, margin_px: int) -> list[Tensor]:
+        """Means around each pixel, of a field with a margin."""
+        return [blurred_interior(field, width, self.pitch_um, margin_px) for width in self.config.steep_um]
+
+    def _radius(self, sigmas_um: Sequence[float]) -> int:
+        return max((kernel_radius_px(sigma / self.pitch_um) for sigma in sigmas_um), default=0)
+
+    def _steps_px(self) -> list[int]:
+        return sorted(max(1, round(shift / self.pitch_um)) for shift in self.config.shifts_um)
+
+
+class Surroundings(FeatureNetwork):
+    """Of the layout around a pixel, x and y alike: blurs, slopes, displaced copies, mean steepness."""
+
+    @property
+    def feature_count(self) -> int:
+        config = self.config
+        groups = len(config.blurs_um), 2 * len(config.slope_blurs_um), 3 * len(config.shifts_um)
+        return 1 + sum(groups) + 2 * len(config.steep_um)
+
+    def features(self, field_um: Tensor) -> list[Tensor]:
+        config, field, reach = self.config, field_um / self.full_height_um, self.reach_px
+        found = [crop_border(field, reach), *(self._blurred(field, sigma) for sigma in config.blurs_um)]
+        for sigma in config.slope_blurs_um:
+            length, curvature = self._slope(self._blurred(field, sigma, margin_px=1))
+            found += [length, curvature]
+        steps = self._steps_px()
+        sharp = self._blurred(field, config.slope_blurs_um[0], margin_px=steps[-1])
+        for step in steps:
+            around = crop_border(sharp, steps[-1] - step)
+            here = crop_border(around, step)
+            sides = _sides(around, step, -2) + _sides(around, step, -1)
+            found.append(sum(sides[1:], sides[0]))
+            found.append(sum(((side - here).abs() for side in sides), torch.zeros_like(here)))
+            found.append((sides[1] - sides[0]).abs() + (sides[3] - sides[2]).abs())
+        margin = self._radius(config.steep_um)
+        length, _ = self._slope(self._blurred(field, config.slope_blurs_um[0], margin_px=margin + 1))
+        return found + self._averaged(length, margin) + self._averaged(length * length, margin)
+
+    def _slope(self, height: Tensor) -> tuple[Tensor, Tensor]:
+        """Length of the slope and curvature, per µm and µm²; from a height with a margin of 1 px."""
+        (up, down), (left, right) = _sides(height, 1, -2), _sides(height, 1, -1)
+        y, x = (down - up) / (2 * self.pitch_um), (right - left) / (2 * self.pitch_um)
+        curvature = (up + down + left + right - 4 * crop_border(height, 1)) / self.pitch_um**2
+        return (y * y + x * x + _LEAST_SLOPE**2).sqrt(), curvature
+
+
+class ScanAxis(FeatureNetwork):
+    """Of a printed height along x, as a microscope's lines go over it: slopes, steps, mean steepness.
+
+    All of them are 0 where the print is flat, and so is what the network adds there.
+    """
+
+    has_constant = False
+
+    def at_pixels(self, features: Tensor) -> Tensor:
+        return super().at_pixels(features) - super().at_pixels(torch.zeros_like(features[:1]))
+
+    @property
+    def feature_count(self) -> int:
+        config = self.config
+        groups = len(config.blurs_um), 3 * len(config.slope_blurs_um), 5 * len(config.shifts_um)
+        return sum(groups) + 2 * len(config.steep_um)
+
+    def features(self, field_um: Tensor) -> list[Tensor]:
+        config, field, reach = self.config, field_um / self.full_height_um, self.reach_px
+        here = crop_border(field, reach)
+        found = [self._blurred(field, sigma) - here for sigma in config.blurs_um]
+        for sigma in config.slope_blurs_um:
+            blurred = self._blurred(field, sigma, margin_px=1)
+            left, right = _sides(blurred, 1, -1)
+            slope = (right - left) / (2 * self.pitch_um)
+            curved = (left + right - 2 * crop_border(blurred, 1)) / self.pitch_um**2
+            found += [slope, slope.abs(), curved]
+        for step in self._steps_px():
+            left, right = _sides(crop_border(field, reach - step), step, -1)
+            before, after = left - here, right - here
+            found += [before, after, before.abs(), after.abs(), (right - left).abs()]
+        margin = self._radius(config.steep_um)
+        left, right = _sides(self._blurred(field, config.slope_blurs_um[0], margin_px=margin + 1), 1, -1)
+        slope = (right - left) / (2 * self.pitch_um)
+        return found + self._averaged(slope.abs(), margin) + self._averaged(slope * slope, margin)
+
+
+def _sides(field: Tensor, step: int, axis: int) -> tuple[Tensor, Tensor]:
+    """Pixels ``step`` before and after along an axis, of those farther than ``step`` from the edge."""
+    inner = field.narrow(-3 - axis, step, field.shape[-3 - axis] - 2 * step)
+    length = field.shape[axis] - 2 * step
+    return inner.narrow(axis, 0, length), inner.narrow(axis, 2 * step, length)
