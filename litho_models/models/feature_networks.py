@@ -20,8 +20,9 @@ from litho_models.layers.gaussian import kernel_radius_px
 from litho_models.models.affine_mtf import blurred_interior
 from litho_models.simulator import crop_border
 
-# Relative height per µm below which the length of a slope is rounded off, so that it has a derivative.
-_LEAST_SLOPE = 1e-2
+# Change over σ, relative to the highest level, below which the length of a slope is rounded off, so that it
+# has a derivative: 2 nm.
+_LEAST_SLOPE = 2e-3
 # Pixels that go through the network at once: some hundred bytes each, whatever the size of the field.
 _PIXELS_AT_ONCE = 2**16
 
@@ -135,8 +136,7 @@ class Surroundings(FeatureNetwork):
         config, field, reach = self.config, field_um / self.full_height_um, self.reach_px
         found = [crop_border(field, reach), *(self._blurred(field, sigma) for sigma in config.blurs_um)]
         for sigma in config.slope_blurs_um:
-            length, curvature = self._slope(self._blurred(field, sigma, margin_px=1))
-            found += [length, curvature]
+            found += self._slope(self._blurred(field, sigma, margin_px=1), sigma)
         steps = self._steps_px()
         sharp = self._blurred(field, config.slope_blurs_um[0], margin_px=steps[-1])
         for step in steps:
@@ -147,14 +147,16 @@ class Surroundings(FeatureNetwork):
             found.append(sum(((side - here).abs() for side in sides), torch.zeros_like(here)))
             found.append((sides[1] - sides[0]).abs() + (sides[3] - sides[2]).abs())
         margin = self._radius(config.steep_um)
-        length, _ = self._slope(self._blurred(field, config.slope_blurs_um[0], margin_px=margin + 1))
+        sigma = config.slope_blurs_um[0]
+        length, _ = self._slope(self._blurred(field, sigma, margin_px=margin + 1), sigma)
         return found + self._averaged(length, margin) + self._averaged(length * length, margin)
 
-    def _slope(self, height: Tensor) -> tuple[Tensor, Tensor]:
-        """Length of the slope and curvature, per µm and µm²; from a height with a margin of 1 px."""
+    def _slope(self, height: Tensor, sigma_um: float) -> tuple[Tensor, Tensor]:
+        """Length of the slope over σ and curvature over σ²; from a height with a margin of 1 px."""
         (up, down), (left, right) = _sides(height, 1, -2), _sides(height, 1, -1)
-        y, x = (down - up) / (2 * self.pitch_um), (right - left) / (2 * self.pitch_um)
-        curvature = (up + down + left + right - 4 * crop_border(height, 1)) / self.pitch_um**2
+        per_px = sigma_um / self.pitch_um
+        y, x = (down - up) * (per_px / 2), (right - left) * (per_px / 2)
+        curvature = (up + down + left + right - 4 * crop_border(height, 1)) * per_px**2
         return (y * y + x * x + _LEAST_SLOPE**2).sqrt(), curvature
 
 
@@ -180,19 +182,22 @@ class ScanAxis(FeatureNetwork):
         here = crop_border(field, reach)
         found = [self._blurred(field, sigma) - here for sigma in config.blurs_um]
         for sigma in config.slope_blurs_um:
-            blurred = self._blurred(field, sigma, margin_px=1)
-            left, right = _sides(blurred, 1, -1)
-            slope = (right - left) / (2 * self.pitch_um)
-            curved = (left + right - 2 * crop_border(blurred, 1)) / self.pitch_um**2
+            slope, curved = self._slope(self._blurred(field, sigma, margin_px=1), sigma)
             found += [slope, slope.abs(), curved]
         for step in self._steps_px():
             left, right = _sides(crop_border(field, reach - step), step, -1)
             before, after = left - here, right - here
             found += [before, after, before.abs(), after.abs(), (right - left).abs()]
         margin = self._radius(config.steep_um)
-        left, right = _sides(self._blurred(field, config.slope_blurs_um[0], margin_px=margin + 1), 1, -1)
-        slope = (right - left) / (2 * self.pitch_um)
+        sigma = config.slope_blurs_um[0]
+        slope, _ = self._slope(self._blurred(field, sigma, margin_px=margin + 1), sigma)
         return found + self._averaged(slope.abs(), margin) + self._averaged(slope * slope, margin)
+
+    def _slope(self, height: Tensor, sigma_um: float) -> tuple[Tensor, Tensor]:
+        """Slope over σ and curvature over σ², both along x; from a height with a margin of 1 px."""
+        left, right = _sides(height, 1, -1)
+        per_px = sigma_um / self.pitch_um
+        return (right - left) * (per_px / 2), (left + right - 2 * crop_border(height, 1)) * per_px**2
 
 
 def _sides(field: Tensor, step: int, axis: int) -> tuple[Tensor, Tensor]:
