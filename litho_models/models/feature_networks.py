@@ -163,7 +163,7 @@ class Surroundings(FeatureNetwork):
 class ScanAxis(FeatureNetwork):
     """Of a printed height along x, as a microscope's lines go over it: slopes, steps, mean steepness.
 
-    All of them are 0 where the print is flat, and so is what the network adds there.
+    All of them are 0 where the print does not change along x, and so is what the network adds there.
     """
 
     has_constant = False
@@ -180,7 +180,9 @@ class ScanAxis(FeatureNetwork):
     def features(self, field_um: Tensor) -> list[Tensor]:
         config, field, reach = self.config, field_um / self.full_height_um, self.reach_px
         here = crop_border(field, reach)
-        found = [self._blurred(field, sigma) - here for sigma in config.blurs_um]
+        found = [
+            blurred_interior(field, (0.0, sigma), self.pitch_um, reach) - here for sigma in config.blurs_um
+        ]
         for sigma in config.slope_blurs_um:
             slope, curved = self._slope(self._blurred(field, sigma, margin_px=1), sigma)
             found += [slope, slope.abs(), curved]
