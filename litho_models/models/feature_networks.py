@@ -91,12 +91,13 @@ class FeatureNetwork(nn.Module, ABC):
     def forward(self, field_um: Tensor) -> Tensor:
         """What the network adds to the height of the interior, (b, 1, y - 2r, x - 2r) µm."""
         features = torch.stack([feature[:, 0] for feature in self.features(field_um)], dim=-1)
+        pixels = features.flatten(0, -2).split(_PIXELS_AT_ONCE)
         with torch.autocast(device_type=field_um.device.type, enabled=False):
-            # Computed again for a gradient: the hidden units of a field would take gigabytes.
-            parts = [
-                checkpoint(self.at_pixels, part, use_reentrant=False)
-                for part in features.flatten(0, -2).split(_PIXELS_AT_ONCE)
-            ]
+            if torch.is_grad_enabled():
+                # Computed again for a gradient: the hidden units of a field would take gigabytes.
+                parts = [checkpoint(self.at_pixels, part, use_reentrant=False) for part in pixels]
+            else:
+                parts = [self.at_pixels(part) for part in pixels]
         return torch.cat(parts).view(features.shape[:-1])[:, None]
 
     def at_pixels(self, features: Tensor) -> Tensor:

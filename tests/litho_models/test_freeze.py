@@ -324,6 +324,29 @@ def test_an_undetermined_effect_is_frozen_under_either_attribution_and_the_card_
         freeze(tmp_path / "printer", tmp_path / "again", "microscope")
 
 
+def test_what_a_model_adds_along_the_scan_lines_is_frozen_under_either_attribution(tmp_path):
+    model = build_model("pbl", sigma_diffusion_init_um=0.3)
+    with torch.no_grad():
+        model.scan_axis.linear.weight.fill_(0.02)
+    source = save_frozen(model, tmp_path / "source")
+    assert "Inside, beside them: `scan-axis`" in (source / README_FILE).read_text(encoding="utf-8")
+    cards = {side: freeze(source, tmp_path / side, side) for side in ("printer", "microscope")}
+    cards["left"] = freeze(source, tmp_path / "left")
+    cards["again"] = freeze(tmp_path / "printer", tmp_path / "again")
+    layout = 0.1 * torch.arange(13.0).repeat_interleave(8).expand(1, 1, 104, 104).contiguous()
+    heights = {name: load_frozen(tmp_path / name)(layout) for name in ("source", *cards)}
+    for name, same in (("printer", "source"), ("again", "source"), ("microscope", "left")):
+        assert torch.equal(heights[name], heights[same])
+    assert float((heights["source"] - heights["left"]).abs().max()) > 0.01
+    assert (cards["left"].undetermined_effects, cards["left"].attributed) == ({"scan-axis": {}}, {})
+    assert cards["microscope"].measurement_effects == {"scan-axis": {}}
+    assert "belongs to measured maps" in cards["microscope"].limitations[-1]
+    assert cards["printer"].process_effects == {}
+    assert cards["again"].attributed == {"scan-axis": "printer"}
+    with pytest.raises(InputError, match="frozen without it"):
+        freeze(tmp_path / "left", tmp_path / "wrong", {"scan-axis": "printer"})
+
+
 def test_the_older_option_tells_the_new_one(folder, tmp_path):
     command = ["freeze", str(folder), "--out", str(tmp_path / "out")]
     for words, said in (
