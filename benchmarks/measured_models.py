@@ -21,10 +21,10 @@ _FREE = {
 }
 
 
-def in_one(networks: dict[str, Any], closed_form: dict[str, Any]) -> dict[str, Any]:
+def in_one(older: dict[str, Any], newer: dict[str, Any]) -> dict[str, Any]:
     """One benchmark of two runs on the same scans: the models of the second, and what only the first has.
 
-    Networks take hours, so that models in closed form are made anew without them.
+    Networks take long, so that what changes is made anew without the others.
 
     Raises:
         ValueError: other data, other scans, folds or terms.
@@ -35,16 +35,15 @@ def in_one(networks: dict[str, Any], closed_form: dict[str, Any]) -> dict[str, A
         ("nuisance", ("policy", "k", "block_px", "buffer_px", "background")),
     ):
         for part in parts:
-            if networks[key][part] != closed_form[key][part]:
-                raise ValueError(f"{key}.{part}: {networks[key][part]}, {closed_form[key][part]}")
-    new = {score["model"] for score in closed_form["scores"]}
+            if older[key][part] != newer[key][part]:
+                raise ValueError(f"{key}.{part}: {older[key][part]}, {newer[key][part]}")
+    new = {score["model"] for score in newer["scores"]}
     rows = {
-        key: closed_form[key] + [row for row in networks[key] if row["model"] not in new]
-        for key in ("scores", "fits")
+        key: newer[key] + [row for row in older[key] if row["model"] not in new] for key in ("scores", "fits")
     }
     scores = [ModelScores.model_validate(score) for score in rows["scores"]]
     paired = [paired_scores(*pair).model_dump(mode="json") for pair in combinations(scores, 2)]
-    return networks | rows | {"paired": paired}
+    return older | rows | {"paired": paired, "training": older["training"] | newer["training"]}
 
 
 def benchmark_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:

@@ -7,16 +7,25 @@ from pathlib import Path
 
 import torch
 
+from litho_data.foundation.errors import InputError
 from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import load_simulator
 from litho_models.models.pbl import Pbl, PblConfig
 
 
 def load_pbl(folder: Path) -> Pbl:
-    """The trained PBL in a folder, with weights that learn."""
+    """The trained PBL in a folder, its chain alone, with weights that learn.
+
+    Raises:
+        InputError: a chain that the plain version does not have.
+    """
     model = load_simulator(folder, ModelCard.read(folder))
     assert isinstance(model, Pbl)
-    return model
+    if model.mismatch.transposable:
+        raise InputError(
+            "areawise network", got="one that does not know x from y", wanted="the published one"
+        )
+    return model.chain()
 
 
 def random_layout(config: PblConfig, size_px: int, batch: int = 1) -> torch.Tensor:

@@ -71,7 +71,7 @@ def test_pixels_tell_what_the_microscope_adds_along_x_from_what_is_printed(monke
     model = narrow()
     record = pixels.fit_feature_networks(model, scans, [], TrainingConfig(nuisance="full", steps=7))
     assert record.step == 7 + pixels.EPOCHS * -(-5 * 96**2 // 256)
-    # White noise of 4 nm has a mean absolute value of 3.2 nm; the printer's nonlinearity is learned to some nm.
+    # White noise of 4 nm has a mean absolute value of 3.2 nm; the print is learned to some nm.
     assert 3.2 < record.training_mae_nm < 2 * 3.2
     unseen = make_scan(20, noise_um=0.0, datum_um=0.0)
     printed = printed_height_um(unseen.layout_um)

@@ -19,11 +19,19 @@ from litho_models.simulator import crop_border
 
 pytestmark = pytest.mark.numerics
 
+# What the plain version has: the chain alone.
+CHAIN = {"surroundings": None, "scan_axis": None, "transposable": False}
+
 
 def make_pbl(**fields):
     torch.manual_seed(0)
     model = build_model(
-        "pbl", pointwise_channels=(16, 8), areawise_channels=(8, 8), sigma_diffusion_init_um=0.3, **fields
+        "pbl",
+        pointwise_channels=(16, 8),
+        areawise_channels=(8, 8),
+        sigma_diffusion_init_um=0.3,
+        **CHAIN,
+        **fields,
     )
     with torch.no_grad():
         for parameter in model.parameters():
@@ -63,7 +71,7 @@ def test_the_plain_model_is_the_same_function_with_the_same_gradients():
 
 def test_the_work_of_the_published_network_is_counted():
     # 9 · (64 + 64·64 + 64·32 + 32·32 + 32) multiply-adds per pixel.
-    config = build_model("pbl").config
+    config = build_model("pbl", "paper").config
     assert areawise_gflop(config, 1_000_000) == pytest.approx(2 * 9 * 7264 / 1000)
     assert predict.gradient_gflop(config, "mixed", 10) == {
         "float32": areawise_gflop(config, 10),

@@ -16,7 +16,7 @@ from litho_data.foundation.errors import InputError
 from litho_models.fitting import TrainingConfig, fit, fit_with_record
 from litho_models.fitting import stochastic as network
 from litho_models.fitting.checkpoint import CheckpointFolder
-from litho_models.fitting.config import FAST_STEPS, PAPER_LEARNING_RATE
+from litho_models.fitting.config import FAST_CHAIN, FAST_STEPS, PAPER_LEARNING_RATE
 from litho_models.fitting.crops import Window, cut, plan_batch
 from litho_models.fitting.small_models import fit_small_model
 from litho_models.fitting.stochastic import learning_rate
@@ -349,10 +349,14 @@ def test_the_paper_recipe_trains_physics_with_adam_towards_the_printer():
 
 
 def test_the_fast_recipe_takes_each_network_s_own_number_of_steps_unless_told():
-    assert {name: TrainingConfig.of_recipe("fast", name).steps for name in FAST_STEPS} == FAST_STEPS
+    alone = {"variant": "paper"}
+    assert {name: TrainingConfig.of_recipe("fast", name, **alone).steps for name in FAST_STEPS} == FAST_STEPS
+    # The networks of a default PBL are fitted to pixels, so that its chain takes fewer.
+    assert FAST_CHAIN["steps"] < FAST_STEPS["pbl"]
     assert TrainingConfig.of_recipe("fast", "pbl", steps=7).steps == 7
     # A cached fit is found by its settings: a default must be what spelling it out is.
-    assert TrainingConfig.of_recipe("fast", "pbl") == TrainingConfig.of_recipe("fast", "pbl", steps=2000)
+    assert TrainingConfig.of_recipe("fast", "pbl") == TrainingConfig(**FAST_CHAIN)
+    assert TrainingConfig.of_recipe("fast", "fno") == TrainingConfig.of_recipe("fast", "fno", steps=1000)
 
 
 def test_one_cycle_rises_to_the_rate_and_falls_to_a_thousandth():
@@ -439,6 +443,7 @@ def test_several_processes_give_the_loss_curve_of_one(world, tmp_path):
         # A pass per crop: processes must add their gradients once per step all the same.
         "crops._PASS_PX = 1\n"
         "settings = dict(steps=4, rounds=2, batch=4, crop_px=32, precision='32-true', nuisance='offset')\n"
+        "settings |= dict(validation_scans=2)\n"
         f"train({str(store)!r}, 'pbl', sys.argv[1], settings=settings)\n"
     )
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
@@ -446,7 +451,8 @@ def test_several_processes_give_the_loss_curve_of_one(world, tmp_path):
     torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", f"--nproc-per-node={world}"]
     subprocess.run([*torchrun, script, tmp_path / "many"], check=True, env=environment)
     one, many = (TrainingRun.read(tmp_path / name).history for name in ("one", "many"))
-    # Gradients are summed in another order: float32 rounding, a few 1e-6 after four steps.
-    for a, b in zip(one, many, strict=True):
-        assert b.training_mae_nm == pytest.approx(a.training_mae_nm, rel=1e-4)
-        assert b.validation_mae_datum_free_nm == pytest.approx(a.validation_mae_datum_free_nm, rel=1e-4)
+    # Gradients are summed in another order: float32 rounding, a few 1e-6 after four steps. The last round is
+    # that of the feature networks on pixels, alike in each process, in hundreds of steps that add to it.
+    for a, b, near in zip(one, many, (1e-4, 1e-4, 2e-2), strict=True):
+        assert b.training_mae_nm == pytest.approx(a.training_mae_nm, rel=near)
+        assert b.validation_mae_datum_free_nm == pytest.approx(a.validation_mae_datum_free_nm, rel=near)
