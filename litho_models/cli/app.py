@@ -11,6 +11,7 @@ import typer
 import litho_models
 from litho_data.foundation.commands import new_app, run_app
 from litho_data.foundation.errors import InputError
+from litho_models.cli.check import check
 from litho_models.cli.loop import close_loop
 from litho_models.cli.next_print import next_print
 from litho_models.cli.noise import noise
@@ -19,6 +20,7 @@ app = new_app("Train, judge and correct models of the printer. Lengths in µm, h
 app.command("close-loop")(close_loop)
 app.command("next-print")(next_print)
 app.command()(noise)
+app.command()(check)
 
 StorePath = Annotated[Path, typer.Argument(help="dataset store made by `litho-data build`")]
 Out = Annotated[Path, typer.Option(help="folder of the result")]

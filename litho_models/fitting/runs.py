@@ -23,6 +23,7 @@ from litho_models.frozen.files import save_frozen
 from litho_models.frozen.freezing import MODEL_FOLDER
 from litho_models.prediction.tiles import predict_scan
 from litho_models.scan_terms.background import learn_background
+from litho_models.scoring.scan_figures import baseline_of
 from litho_models.simulator import Variant
 
 CHECKPOINT_FOLDER = "checkpoint"
@@ -96,6 +97,7 @@ def train(
     )
     if int(os.environ.get("RANK", "0")) > 0:
         return record  # under torchrun the first process writes
+    heights = [predict_scan(fitted.model, scan) for scan in used]
     save_frozen(
         fitted.model,
         folder / MODEL_FOLDER,
@@ -108,7 +110,8 @@ def train(
         },
         training_level_share=level_share(used),
         training_step_share=step_share(used),
-        background=learn_background(used, [predict_scan(fitted.model, scan) for scan in used]),
+        background=learn_background(used, heights),
+        baseline=baseline_of(used, heights, held_out=False),
         command=record.run.command,
         split={
             "kind": "development",

@@ -40,8 +40,10 @@ class ModelCard(RunFacts, Result):
 
     ``background`` is what the microscope added to the training scans on average; only a comparison with
     measured maps uses it, the model's height never contains it. ``at_bounds`` are fitted values on a bound of
-    their range, and that bound. ``attributed`` says whose an effect of undetermined role was taken to be when
-    the model was frozen; older cards list those of the printer in ``declared_processes``.
+    their range, and that bound. ``baseline``: the figures (``ScanFigures``) of the scans that the model was
+    made of, with which ``litho-models check`` compares new prints. ``attributed`` says whose an effect of
+    undetermined role was taken to be when the model was frozen; older cards list those of the printer in
+    ``declared_processes``.
     """
 
     model_config = ConfigDict(allow_inf_nan=False)
@@ -71,6 +73,7 @@ class ModelCard(RunFacts, Result):
     background: Background | None = None
     metrics: list[CardMetric] = Field(default_factory=list)
     noise_floor: dict[str, JsonValue] | None = None
+    baseline: list[dict[str, JsonValue]] = Field(default_factory=list)
     process_effects: EffectValues = Field(default_factory=dict)
     measurement_effects: EffectValues = Field(default_factory=dict)
     undetermined_effects: EffectValues = Field(default_factory=dict)

@@ -31,6 +31,7 @@ _CARRIED_FIELDS = {
     "background",
     "metrics",
     "noise_floor",
+    "baseline",
     "declared_processes",
     "confusable_sets",
     "unexplained_fraction",

@@ -1,0 +1,89 @@
+"""``litho-models check``: does a printer still behave as its frozen model says, and when to look again."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.run_facts import run_info
+from litho_data.store import open_store
+from litho_models.frozen import zoo
+from litho_models.frozen.files import load_frozen
+from litho_models.monitoring import wording
+from litho_models.monitoring.inputs import gather
+from litho_models.monitoring.judging import DEFAULT_RATE, judge
+from litho_models.monitoring.prints import FIGURES
+from litho_models.monitoring.report import write_check_report
+from litho_models.monitoring.result import Check, CheckedModel
+
+
+def check(
+    model: str | Path,
+    store: str | Path,
+    out: str | Path,
+    *,
+    reference: str | Path | None = None,
+    new: Sequence[str] = (),
+    residuals: Sequence[str | Path] = (),
+    false_alarms: float = DEFAULT_RATE,
+    tolerance: float | None = None,
+    device: str = "cpu",
+) -> Check:
+    """Compare new prints with those that a model was made of; write ``check.json``, a report and tables.
+
+    Args:
+        model: folder of a frozen model, or ``zoo:NAME``.
+        store: dataset store of the new prints; locked scans of the model's own prints are left out.
+        out: result folder.
+        reference: store of unchanged prints; by default those that the card of the model tells of.
+        new: names of prints of ``store`` that are new; its others are then the reference.
+        residuals: folders of ``litho-models benchmark`` on the reference prints: its predictions, of prints
+            that no fit had seen, take the place of the model's.
+        false_alarms: chance that an unchanged data set raises an alarm, over all figures.
+        tolerance: largest drift of a figure, relative (0.05 is 5 %); three times its spread by default.
+        device: where the model runs.
+
+    Raises:
+        InputError: a model, store or benchmark that cannot be read or does not fit, or too few prints.
+    """
+    if not 0 < false_alarms < 0.5:
+        raise InputError("rate of false alarms", got=false_alarms, wanted="between 0 and 0.5")
+    if tolerance is not None and not 0 < tolerance < 1:
+        raise InputError("tolerance", got=tolerance, wanted="between 0 and 1: 0.05 is 5 %")
+    dataset = open_store(store)
+    frozen = load_frozen(zoo.model_folder(model), device=device)
+    found = gather(frozen, dataset, reference, new, residuals)
+    figures, limits = list(FIGURES), []
+    if wording.too_optimistic(found.reference, frozen.card["parameters"]):
+        figures = [figure for figure in figures if figure.name != "error"]
+        limits.append(
+            f"The error is not judged: with {frozen.card['parameters']} parameters the model fits the "
+            "reference prints, which it has seen, better than new ones. --residuals of a benchmark of the "
+            "reference, or a --reference of other prints, allows it."
+        )
+    judged = judge(
+        found.reference,
+        found.new,
+        rate=false_alarms,
+        tolerance=tolerance,
+        figures=figures,
+        between=found.between,
+    )
+    result = Check(
+        schema="litho-models/check/1",
+        run=run_info([], len(found.new), found.dropped),
+        dataset=dataset.dataset_id,
+        model=CheckedModel(name=frozen.name, sha256=frozen.sha256, dataset=frozen.card["dataset"]),
+        reference=found.words,
+        false_alarm_rate=false_alarms,
+        alarm=any(one.alarm is not None for one in judged),
+        verdict=wording.verdict(judged, false_alarms),
+        figures=judged,
+        reference_scans=found.reference,
+        new_scans=found.new,
+        notes=[*limits, *wording.notes(found.reference, found.new, judged)],
+    )
+    result.write(out)
+    write_check_report(result, out)
+    return result

@@ -1,0 +1,185 @@
+"""What is checked against what: the scans of a store, and a reference from a store, a print or a card."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from pydantic import ValidationError
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import first_error
+from litho_data.store import PrintedScan, Store, open_store
+from litho_models.frozen.on_store import locked_by_the_card, made_of_these_prints, predict_frozen, trained_ids
+from litho_models.frozen.simulator import FrozenSimulator
+from litho_models.noise.residuals import read_residuals
+from litho_models.scoring.scan_figures import ScanFigures, scan_figures
+
+FEWEST_REFERENCE_PRINTS = 4
+# A printer whose heights are half or twice those of its model is another one.
+_OWN_GAIN = (0.5, 2.0)
+
+
+class Figures(NamedTuple):
+    """Figures of reference and new scans, what was left out, and the reference in words.
+
+    ``between``: the new prints were made among the reference ones.
+    """
+
+    reference: list[ScanFigures]
+    new: list[ScanFigures]
+    dropped: list[str]
+    words: str
+    between: bool = False
+
+
+def gather(
+    frozen: FrozenSimulator,
+    dataset: Store,
+    reference: str | Path | None,
+    new: Sequence[str],
+    residuals: Sequence[str | Path],
+) -> Figures:
+    """Figures of the new prints and of the reference, of scans of one dose.
+
+    Raises:
+        InputError: more than one reference or none, unknown prints, stores of another geometry or with scans
+            in common, or too few prints.
+    """
+    if reference is not None and new:
+        raise InputError("reference", got="a store and --new", wanted="one of the two")
+    if residuals and reference is None and not new:
+        raise InputError(
+            "--residuals", got="no prints that they are of", wanted="--reference or --new with it"
+        )
+    frozen.check_geometry(dataset.pitch_um, dataset.level_height_um)
+    dropped: list[str] = []
+    if new:
+        found = _within(frozen, dataset, new, residuals, dropped)
+    elif reference is not None:
+        other = open_store(reference)
+        _check_apart(dataset, other)
+        frozen.check_geometry(other.pitch_um, other.level_height_um)
+        old, now = _rows(frozen, other, residuals, dropped), _rows(frozen, dataset, (), dropped)
+        found = Figures(old, now, dropped, f"{other.name}, {reference}")
+    else:
+        found = _of_card(frozen, dataset, dropped)
+    found = _of_one_dose(found)
+    _check_reference(found.reference, frozen)
+    if not found.new:
+        raise InputError(
+            f"scans of {dataset.path}", got="none to compare", wanted="one of the reference's dose"
+        )
+    return found
+
+
+def _within(
+    frozen: FrozenSimulator,
+    dataset: Store,
+    new: Sequence[str],
+    residuals: Sequence[str | Path],
+    dropped: list[str],
+) -> Figures:
+    """Some prints of a store against its others."""
+    rows = _rows(frozen, dataset, residuals, dropped)
+    known = list(dict.fromkeys(row.print for row in rows))
+    if unknown := [name for name in new if name not in known]:
+        raise InputError(
+            "--new", got=unknown[0], wanted=f"a print of {dataset.path}: {', '.join(known[:30])}"
+        )
+    old = [row for row in rows if row.print not in new]
+    now = [row for row in rows if row.print in new]
+    return Figures(old, now, dropped, f"the other prints of {dataset.name}", between=True)
+
+
+def _of_card(frozen: FrozenSimulator, dataset: Store, dropped: list[str]) -> Figures:
+    """All prints of a store against those that the card of the model tells of."""
+    hint = "--reference STORE takes the prints of a store, --new PRINT the other prints of this one"
+    if not frozen.card["baseline"]:
+        raise InputError(
+            f"card of {frozen.name}", got="no figures of prints", wanted="a reference", hint=hint
+        )
+    if made_of_these_prints(frozen, dataset):
+        raise InputError(
+            f"store {dataset.path}", got="the prints that the model was made of", wanted="new ones", hint=hint
+        )
+    try:
+        known = [ScanFigures.model_validate(row) for row in frozen.card["baseline"]]
+    except ValidationError as error:
+        raise InputError(f"baseline in the card of {frozen.name}", got=first_error(error)) from error
+    words = f"the prints in the card of {frozen.name}"
+    return Figures(known, _rows(frozen, dataset, (), dropped), dropped, words)
+
+
+def _rows(
+    frozen: FrozenSimulator, store: Store, residuals: Sequence[str | Path], dropped: list[str]
+) -> list[ScanFigures]:
+    """Figures of the scans of a store; locked ones of the model's own prints are left out."""
+    rows = []
+    for scan, expected, held_out in _predicted(frozen, store, residuals, dropped):
+        row = scan_figures(scan, expected, held_out=held_out)
+        if row is None:
+            dropped.append(f"{scan.id}: a flat layout has no gain")
+        else:
+            rows.append(row)
+    return rows
+
+
+def _predicted(
+    frozen: FrozenSimulator, store: Store, residuals: Sequence[str | Path], dropped: list[str]
+) -> Iterator[tuple[PrintedScan, np.ndarray, bool]]:
+    """Scans, what is expected of each, and whether the model had not seen it."""
+    if residuals:
+        found = read_residuals(store, residuals, frozen.card["model"])
+        yield from ((*pair, found.held_out) for pair in zip(found.scans, found.maps_um, strict=True))
+        return
+    seen, locked = trained_ids(frozen, store), set()
+    if made_of_these_prints(frozen, store):
+        locked = {*store.locked_ids, *locked_by_the_card(frozen, store)}
+        dropped += [f"{scan_id}: lock box" for scan_id in sorted(locked)]
+    for scan in (store.scan(scan_id) for scan_id in store.ids if scan_id not in locked):
+        yield scan, predict_frozen(frozen, scan), scan.id not in seen
+
+
+def _of_one_dose(found: Figures) -> Figures:
+    """The scans at the dose that most reference scans have: another dose is another gain by intent."""
+    doses = Counter(row.dose for row in found.reference if row.dose is not None)
+    if not doses:
+        return found
+    dose = doses.most_common(1)[0][0]
+    kept = [[row for row in rows if row.dose in (None, dose)] for rows in (found.reference, found.new)]
+    others = [row for row in (*found.reference, *found.new) if row.dose not in (None, dose)]
+    dropped = [*found.dropped, *(f"{row.scan}: dose {row.dose:g}, not {dose:g}" for row in others)]
+    return found._replace(reference=kept[0], new=kept[1], dropped=dropped)
+
+
+def _check_apart(dataset: Store, other: Store) -> None:
+    files, known = (set(store.files_sha256(store.ids).values()) for store in (dataset, other))
+    if dataset.sha256 == other.sha256 or files & known:
+        raise InputError(
+            "reference",
+            got=f"scans of {dataset.path} in {other.path} too",
+            wanted="prints that are not checked",
+            hint="--new PRINT checks some prints of a store against its others",
+        )
+
+
+def _check_reference(rows: Sequence[ScanFigures], frozen: FrozenSimulator) -> None:
+    prints = len({row.print for row in rows})
+    if prints < FEWEST_REFERENCE_PRINTS:
+        raise InputError(
+            "prints in the reference",
+            got=prints,
+            wanted=f"{FEWEST_REFERENCE_PRINTS} at least: fewer do not tell how much unchanged prints differ",
+        )
+    gain = float(np.median([row.gain for row in rows]))
+    if not _OWN_GAIN[0] < gain < _OWN_GAIN[1] or min(row.gain for row in rows) <= 0:
+        raise InputError(
+            f"reference prints against model {frozen.name}",
+            got=f"{gain:.2f} times the predicted heights",
+            wanted=f"{_OWN_GAIN[0]:g} to {_OWN_GAIN[1]:g}",
+            hint="it is the model of another printer, or scans and layouts do not belong together",
+        )

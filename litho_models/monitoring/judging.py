@@ -1,0 +1,117 @@
+"""From figures of scans to a judgement of each figure: pure, without files or models."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from litho_models.monitoring.change_point import (
+    Series,
+    Step,
+    comparisons,
+    first_step,
+    noticeable_step,
+)
+from litho_models.monitoring.forecast import forecast
+from litho_models.monitoring.prints import FIGURES, Figure, PrintValues, Spread, print_values, spread_of
+from litho_models.monitoring.result import Alarm, FigureCheck
+from litho_models.scoring.scan_figures import ScanFigures
+
+DEFAULT_RATE = 0.005
+# The default tolerance, in spreads between prints.
+TOLERANCE_SPREADS = 3.0
+
+
+def judge(
+    reference: Sequence[ScanFigures],
+    new: Sequence[ScanFigures],
+    *,
+    rate: float = DEFAULT_RATE,
+    tolerance: float | None = None,
+    figures: Sequence[Figure] = FIGURES,
+    between: bool = False,
+) -> list[FigureCheck]:
+    """Every figure of the new prints against the reference.
+
+    Args:
+        reference, new: scans of prints, in any order; of three reference prints at least.
+        rate: chance of a false alarm in an unchanged set, shared equally by the figures.
+        tolerance: largest drift that is allowed, relative; three times the spread by default.
+        between: the new prints were made among the reference ones: the trend is over the common order.
+            Otherwise they follow the reference.
+    """
+    return [
+        _judged(figure, reference, new, rate / len(figures), tolerance, between=between) for figure in figures
+    ]
+
+
+def alarms(
+    reference: Sequence[ScanFigures],
+    new: Sequence[ScanFigures],
+    *,
+    rate: float = DEFAULT_RATE,
+    figures: Sequence[Figure] = FIGURES,
+) -> dict[str, Step | None]:
+    """The step that is noticed in each figure, as ``judge`` finds it, and nothing else."""
+    found = {}
+    for figure in figures:
+        parts = print_values(reference, figure), print_values(new, figure)
+        series = _series(*parts, spread_of(reference, figure))
+        found[figure.name] = first_step(series, rate / len(figures))[0]
+    return found
+
+
+def _series(old: PrintValues, now: PrintValues, spread: Spread) -> Series:
+    variances = [spread.relative_variance(part.counts) for part in (old, now)]
+    return Series(old.values, now.values, variances[0], variances[1])
+
+
+def _judged(
+    figure: Figure,
+    reference: Sequence[ScanFigures],
+    new: Sequence[ScanFigures],
+    rate: float,
+    tolerance: float | None,
+    *,
+    between: bool,
+) -> FigureCheck:
+    old, now = print_values(reference, figure), print_values(new, figure)
+    spread = spread_of(reference, figure)
+    series = _series(old, now, spread)
+    variances = series.reference_variance, series.new_variance
+    step, smallest = first_step(series, rate)
+    noticeable = spread.sd * noticeable_step(*variances, rate)
+    allowed = tolerance if tolerance is not None else TOLERANCE_SPREADS * spread.sd
+    values, variance = np.concatenate([old.values, now.values]), np.concatenate(variances)
+    of_reference = np.arange(len(values)) < len(old.values)
+    if between:
+        names = print_values([*reference, *new], figure).names
+        order = [[*old.names, *now.names].index(name) for name in names]
+        values, variance, of_reference = values[order], variance[order], of_reference[order]
+    trend = forecast(values, variance, of_reference, allowed)
+    return FigureCheck(
+        name=figure.name,
+        mean=float(np.exp(spread.mean)),
+        spread=spread.sd,
+        spread_ci95=spread.sd_ci95,
+        reference_prints=len(old.values),
+        new_prints=len(now.values),
+        alarm=None
+        if step is None
+        else Alarm(
+            noticed_at=now.names[step.noticed],
+            since=now.names[step.since],
+            step=float(np.expm1(step.size)),
+            step_ci95=(float(np.expm1(step.ci95[0])), float(np.expm1(step.ci95[1]))),
+            p=step.p,
+        ),
+        smallest_p=smallest,
+        threshold_p=rate / comparisons(len(now.values)),
+        noticeable_step=float(np.expm1(noticeable)) if noticeable < 1 else None,
+        tolerance=allowed,
+        trend=trend.per_print,
+        trend_ci95=trend.ci95,
+        trend_p=trend.p,
+        measure_again_in=0 if step is not None else trend.prints_left,
+    )

@@ -1,0 +1,114 @@
+"""From scans to prints: one value per print of each figure, and how much the values of prints differ."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+
+from litho_models.scoring.scan_figures import ScanFigures
+
+_LEAST_GAIN = 0.01
+
+
+class Figure(NamedTuple):
+    """A figure that is watched.
+
+    ``of``: its value for one scan, a logarithm: differences are relative, a step of 0.03 is 3 %.
+    """
+
+    name: str
+    words: str
+    of: Callable[[ScanFigures], float]
+    causes: str
+
+
+FIGURES = (
+    Figure(
+        "gain",
+        "height gain",
+        # A print that failed has no gain to speak of, and may have one below 0.
+        lambda scan: float(np.log(max(scan.gain, _LEAST_GAIN))),
+        "the printer (dose, development) or the height scale of the microscope: a scan of a step of known "
+        "height tells them apart",
+    ),
+    Figure(
+        "error",
+        "error beyond offset, gain, tilt and bow",
+        lambda scan: float(np.log(scan.error_nm)),
+        "rougher or blurred prints, an effect that the model lacks, layouts of another kind, or the tip of "
+        "the microscope: a scan of an older print with the same tip tells them apart",
+    ),
+)
+
+
+class PrintValues(NamedTuple):
+    """One value per print in printing order, the mean over its scans, ``counts`` of them; (n,) each."""
+
+    names: list[str]
+    values: np.ndarray
+    counts: np.ndarray
+
+
+class Spread(NamedTuple):
+    """How the values of unchanged prints vary.
+
+    Attributes:
+        mean: over the prints; ``sd``: between them, with its 95 % interval.
+        between, within: variance of prints, and of scans within a print; ``within`` is None where no print
+            has two scans.
+    """
+
+    mean: float
+    sd: float
+    sd_ci95: tuple[float, float]
+    between: float
+    within: float | None
+
+    def relative_variance(self, counts: np.ndarray) -> np.ndarray:
+        """Variance of the value of a print with so many scans, in units of a usual one; (n,)."""
+        if self.within is None:
+            return np.ones(len(counts))
+        variance = self.between + self.within / counts
+        return variance / self.sd**2 if self.sd > 0 else np.ones(len(counts))
+
+
+def in_order(rows: Sequence[ScanFigures]) -> list[str]:
+    """The prints in printing order: that of the first scan of each."""
+    first: dict[str, tuple[int, str]] = {}
+    for row in rows:
+        first[row.print] = min(first.get(row.print, (row.order, row.print)), (row.order, row.print))
+    return sorted(first, key=first.__getitem__)
+
+
+def print_values(rows: Sequence[ScanFigures], figure: Figure) -> PrintValues:
+    """The value of each print, in printing order."""
+    names = in_order(rows)
+    of_print = [[figure.of(row) for row in rows if row.print == name] for name in names]
+    return PrintValues(
+        names, np.array([np.mean(part) for part in of_print]), np.array([len(part) for part in of_print])
+    )
+
+
+def spread_of(rows: Sequence[ScanFigures], figure: Figure) -> Spread:
+    """Mean and spread over prints, two at least; variance components by one-way analysis of variance.
+
+    A print with one scan varies more than one with four. What of it is the print and what the scan follows
+    from scans of one print; a negative variance between prints counts as 0.
+    """
+    prints = print_values(rows, figure)
+    n = len(prints.values)
+    mean, sd = float(prints.values.mean()), float(prints.values.std(ddof=1))
+    freedom = n - 1
+    ends = tuple(float(sd * np.sqrt(freedom / chi2.ppf(level, freedom))) for level in (0.975, 0.025))
+    scans, rest = int(prints.counts.sum()), 0.0
+    for name, value in zip(prints.names, prints.values, strict=True):
+        rest += sum((figure.of(row) - value) ** 2 for row in rows if row.print == name)
+    if scans == n:
+        return Spread(mean, sd, (ends[0], ends[1]), sd**2, None)
+    within = rest / (scans - n)
+    # The variance of the means of prints is that between prints and the mean share of the scans.
+    between = max(sd**2 - within * float(np.mean(1 / prints.counts)), 0.0)
+    return Spread(mean, sd, (ends[0], ends[1]), between, within)

@@ -1,0 +1,123 @@
+"""``report.html`` of a check: the verdict, a control chart for each figure, and a table of scans."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from litho_data.foundation.report import Page, new_figure
+from litho_models.monitoring.prints import print_values
+from litho_models.monitoring.result import Check, FigureCheck
+from litho_models.monitoring.wording import figure_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.figure import Figure
+
+
+def write_check_report(result: Check, out: str | Path) -> Path:
+    """Render the result into ``out``; returns the page."""
+    page = Page(f"Check of {result.model.name} on {result.dataset.name}", result.verdict[0])
+    for sentence in result.verdict[1:]:
+        page.paragraph(sentence)
+    for note in result.notes:
+        page.note(note)
+    for one in result.figures:
+        page.figure(control_chart(result, one), _chart_text(one))
+    page.table(
+        _figures_table(result),
+        "Relative figures: 0.01 is 1 %. p: two-sided chance at one given print, at most the threshold for an "
+        f"alarm; the rate of {result.false_alarm_rate:g} is shared by the figures and, in each, by all pairs "
+        "of a last print and a first changed one.",
+        "figures.csv",
+        digits=4,
+    )
+    page.table(_scans_table(result), f"Every scan; reference: {result.reference}.", "scans.csv", digits=4)
+    page.code(result.run.command)
+    return page.write(out)
+
+
+def control_chart(result: Check, one: FigureCheck) -> Figure:
+    """The figure of every print against the reference: dots of prints, small dots of scans, spread, steps."""
+    figure = new_figure(8.5, 3.4)
+    axes = figure.subplots()
+    watched = figure_of(one)
+    start = 0
+    for rows, colour, label in (
+        (result.reference_scans, "#5b6675", "reference"),
+        (result.new_scans, "#0b6aa2", "new"),
+    ):
+        prints = print_values(rows, watched)
+        place = np.arange(start, start + len(prints.values))
+        of_scans = [(place[prints.names.index(row.print)], _relative(watched.of(row), one)) for row in rows]
+        axes.plot(*np.array(of_scans).T, ".", color=colour, alpha=0.35, ms=4)
+        axes.plot(place, _relative(prints.values, one), "o", color=colour, label=label)
+        if rows is result.new_scans and one.alarm is not None:
+            since = start + prints.names.index(one.alarm.since)
+            axes.axvspan(since - 0.5, place[-1] + 0.5, color="#c23b22", alpha=0.12, label="changed")
+        start = place[-1] + 1
+    spread = 100 * one.spread
+    axes.axhline(0, color="#1c2430", lw=0.8)
+    axes.axhspan(-spread, spread, color="#9aa7b5", alpha=0.25, label="spread of the reference")
+    for sign in (-1, 1):
+        axes.axhline(sign * 100 * one.tolerance, color="#d99b00", ls="--", lw=1)
+    axes.axvline(one.reference_prints - 0.5, color="#1c2430", lw=0.8, ls=":")
+    axes.set_xlabel("print, in printing order")
+    axes.set_ylabel("against the reference, %")
+    axes.set_title(watched.words, fontsize=10)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=8, ncols=2)
+    return figure
+
+
+def _relative(value: float | np.ndarray, one: FigureCheck) -> np.ndarray:
+    """A logarithm of a figure as its difference from the reference mean, %."""
+    return 100 * np.expm1(np.asarray(value) - np.log(one.mean))
+
+
+def _chart_text(one: FigureCheck) -> str:
+    unit = " nm" if one.name == "error" else ""
+    return (
+        f"Large dots are prints, small ones their scans. 0 is the mean of {one.reference_prints} reference "
+        f"prints, {one.mean:.4g}{unit}; dashed: the tolerance, {100 * one.tolerance:.1f} %."
+    )
+
+
+def _figures_table(result: Check) -> pd.DataFrame:
+    import pandas as pd
+
+    rows = []
+    for one in result.figures:
+        alarm = one.alarm
+        rows.append(
+            {
+                "figure": one.name,
+                "reference_mean": one.mean,
+                "spread": one.spread,
+                "smallest_p": f"{one.smallest_p:.2g}",
+                "threshold_p": f"{one.threshold_p:.2g}",
+                "alarm_at": alarm.noticed_at if alarm else "–",
+                "since": alarm.since if alarm else "–",
+                "step": alarm.step if alarm else float("nan"),
+                "noticeable_step": np.nan if one.noticeable_step is None else one.noticeable_step,
+                "trend_per_print": one.trend,
+                "trend_low": one.trend_ci95[0],
+                "trend_high": one.trend_ci95[1],
+                "measure_again_in": one.measure_again_in,
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def _scans_table(result: Check) -> pd.DataFrame:
+    import pandas as pd
+
+    return pd.DataFrame(
+        [
+            {"set": name, **row.model_dump()}
+            for name, rows in (("reference", result.reference_scans), ("new", result.new_scans))
+            for row in rows
+        ]
+    )

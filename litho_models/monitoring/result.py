@@ -1,0 +1,83 @@
+"""``check.json``: whether the printer still behaves as its model says, figure by figure."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from pydantic import Field
+
+from litho_data.foundation.results import Record, Result
+from litho_data.foundation.run_facts import RunInfo
+from litho_data.store.schema import DatasetId
+from litho_models.scoring.scan_figures import ScanFigures
+
+
+class CheckedModel(Record):
+    """Name and hash of the model, and the dataset it was made of."""
+
+    name: str
+    sha256: str
+    dataset: DatasetId | None
+
+
+class Alarm(Record):
+    """A step in the mean of a figure, relative: noticed after which print, first changed print.
+
+    ``step``: mean from ``since`` on minus the mean before, with an interval that does not allow for the
+    choice of ``since``. ``p``: at one given print, to be compared with ``threshold_p``.
+    """
+
+    noticed_at: str
+    since: str
+    step: float
+    step_ci95: tuple[float, float]
+    p: float
+
+
+class FigureCheck(Record):
+    """One figure of the new prints against the reference; all but ``mean`` are relative, 0.01 is 1 %.
+
+    ``mean`` and ``spread``: of the reference prints. ``smallest_p`` of all comparisons sounds the alarm at
+    ``threshold_p``. ``noticeable_step``: what is noticed within three prints in 9 of 10 cases; None where no
+    step is. ``trend``: change per print over all prints. ``measure_again_in``: prints until the 95 % bound of
+    the drift reaches ``tolerance``.
+    """
+
+    name: str
+    mean: float
+    spread: float
+    spread_ci95: tuple[float, float]
+    reference_prints: int
+    new_prints: int
+    alarm: Alarm | None
+    smallest_p: float
+    threshold_p: float
+    noticeable_step: float | None
+    tolerance: float
+    trend: float
+    trend_ci95: tuple[float, float]
+    trend_p: float
+    measure_again_in: int
+
+
+class Check(Result):
+    """``check.json``; ``verdict`` is for people, ``alarm`` for machines.
+
+    ``false_alarm_rate``: chance that a data set like this of an unchanged printer raises an alarm.
+    """
+
+    SCHEMA: ClassVar[str] = "litho-models/check/1"
+    FILE_NAME: ClassVar[str] = "check.json"
+
+    schema_: Literal["litho-models/check/1"] = Field("litho-models/check/1", alias="schema")
+    run: RunInfo
+    dataset: DatasetId
+    model: CheckedModel
+    reference: str
+    false_alarm_rate: float
+    alarm: bool
+    verdict: list[str]
+    figures: list[FigureCheck]
+    reference_scans: list[ScanFigures]
+    new_scans: list[ScanFigures]
+    notes: list[str]

@@ -1,0 +1,291 @@
+"""Whether a printer still behaves as its model says: rates of alarms, invariances, and the whole command."""
+
+from __future__ import annotations
+
+import json
+import sys
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from litho_data.foundation.errors import InputError
+from litho_models import check
+from litho_models.cli.app import main
+from litho_models.fitting.runs import train
+from litho_models.frozen.freezing import freeze
+from litho_models.monitoring.change_point import (
+    Series,
+    comparisons,
+    first_step,
+    noticeable_step,
+    step_statistics,
+)
+from litho_models.monitoring.forecast import forecast
+from litho_models.monitoring.prints import FIGURES, print_values, spread_of
+from litho_models.monitoring.result import Check
+from litho_models.scan_terms import POLICIES
+from litho_models.scan_terms.cross_fit import fitted_terms
+from litho_models.scoring.scan_figures import ScanFigures, scan_figures
+from tests.litho_models.prints import make_scan, make_scans, printed_height_um, write_store
+
+GAIN = FIGURES[0]
+
+
+def _equal(reference: np.ndarray, new: np.ndarray) -> Series:
+    return Series(reference, new, np.ones(reference.shape[-1]), np.ones(new.shape[-1]))
+
+
+def _alarms(series: Series, rate: float) -> np.ndarray:
+    """Whether each set alarms at any print, from the t of all comparisons."""
+    n, m = series.reference.shape[-1], series.new.shape[-1]
+    limit = stats.t.isf(rate / comparisons(m) / 2, n + np.arange(m) - 1)
+    return (np.nanmax(np.abs(step_statistics(series)[1]), axis=1) >= limit[:, None]).any(axis=0)
+
+
+def test_each_comparison_is_students_t_with_the_spread_pooled():
+    random = np.random.default_rng(0)
+    reference, new = random.normal(5, 2, 6), random.normal(5, 2, 4)
+    sizes, found = step_statistics(_equal(reference, new))
+    for last in range(4):
+        for first in range(last + 1):
+            before, after = np.concatenate([reference, new[:first]]), new[first : last + 1]
+            # Rounding only.
+            assert sizes[last, first] == pytest.approx(after.mean() - before.mean(), rel=1e-9)
+            if len(after) > 1:
+                assert found[last, first] == pytest.approx(stats.ttest_ind(after, before).statistic, rel=1e-9)
+    alone = (new[0] - reference.mean()) / (reference.std(ddof=1) * np.sqrt(1 + 1 / 6))
+    assert found[0, 0] == pytest.approx(alone, rel=1e-9)
+
+
+@pytest.mark.parametrize(("n", "m"), [(4, 1), (5, 3), (24, 3), (12, 8)])
+def test_the_rate_of_false_alarms_holds_whatever_mean_and_spread(n, m):
+    draws, rate = 20_000, 0.02
+    random = np.random.default_rng([n, m])
+    series = _equal(random.normal(7, 0.3, (draws, n)), random.normal(7, 0.3, (draws, m)))
+    share = float(_alarms(series, rate).mean())
+    # Four standard errors of a share; below the rate, as comparisons that go together count apart.
+    assert share <= rate + 4 * np.sqrt(rate / draws)
+    assert share >= 0.5 * rate
+    one = first_step(Series(series.reference[0], series.new[0], *series[2:]), rate)[0]
+    assert (one is not None) == bool(_alarms(series, rate)[0])
+
+
+def test_a_normal_distribution_in_place_of_students_would_alarm_too_often():
+    """What the law above guards against: with 5 reference prints the rate would be ten times as high."""
+    random = np.random.default_rng(1)
+    series = _equal(random.normal(size=(20_000, 5)), random.normal(size=(20_000, 1)))
+    z = (series.new[:, 0] - series.reference.mean(axis=1)) / series.reference.std(axis=1, ddof=1)
+    assert np.mean(np.abs(z) >= stats.norm.isf(0.0025)) > 0.03
+
+
+def test_the_step_that_is_noticed_is_that_of_the_noncentral_t():
+    n, rate = 8, 0.01
+    step = noticeable_step(np.ones(n), np.ones(1), rate)
+    power = stats.nct.sf(stats.t.isf(rate / 2, n - 1), n - 1, step / np.sqrt(1 + 1 / n))
+    # 4,000 draws: three standard errors are 0.014, and the bisection stops within 1 % of the step.
+    assert power == pytest.approx(0.9, abs=0.025)
+
+
+def test_an_alarm_names_the_first_changed_print_and_the_size_of_the_step():
+    random = np.random.default_rng(5)
+    new = random.normal(0, 0.01, 6)
+    new[2:] += 0.2
+    step, smallest = first_step(_equal(random.normal(0, 0.01, 20), new), 0.005)
+    assert step is not None
+    assert (step.noticed, step.since) == (2, 2)
+    assert step.ci95[0] < 0.2 < step.ci95[1]
+    assert smallest <= step.p
+
+
+def _scans(values: np.ndarray, first_print: int = 0) -> list[ScanFigures]:
+    """Scans with these gains, (prints, scans)."""
+    return [
+        ScanFigures(
+            scan=f"P{p}F{f}",
+            print=f"P{p}",
+            order=p,
+            gain=float(value),
+            gain_error=0.001,
+            error_nm=15.0,
+            pixels=10_000,
+            relief_nm=150.0,
+            steepness=0.2,
+        )
+        for p, row in enumerate(values, first_print)
+        for f, value in enumerate(row)
+    ]
+
+
+@pytest.mark.parametrize(("between", "within"), [(0.02, 0.0), (0.0, 0.02), (0.01, 0.02)])
+def test_prints_of_one_scan_beside_prints_of_four_keep_the_rate(between, within):
+    """A print with one scan varies more; without allowing for it the second case alarms far too often."""
+    draws, rate = 800, 0.05
+    random = np.random.default_rng(11)
+    alarms = 0
+    for _ in range(draws):
+        old, now = (
+            np.exp(random.normal(0, between, (prints, 1)) + random.normal(0, within, (prints, scans)))
+            for prints, scans in ((10, 4), (2, 1))
+        )
+        rows, fresh = _scans(old), _scans(now, 10)
+        spread = spread_of(rows, GAIN)
+        parts = [print_values(group, GAIN) for group in (rows, fresh)]
+        variances = [spread.relative_variance(part.counts) for part in parts]
+        step, _ = first_step(Series(parts[0].values, parts[1].values, *variances), rate)
+        alarms += step is not None
+    # Four standard errors are 0.031. The variances are themselves estimated.
+    assert alarms / draws <= rate + 0.031
+
+
+def test_a_steady_drift_reaches_the_tolerance_when_it_must():
+    values = 0.01 * np.arange(12.0)
+    reference = np.arange(12) < 9
+    found = forecast(values, np.ones(12), reference, tolerance=0.2)
+    assert found.per_print == pytest.approx(0.01)
+    # 0.2 is reached 20 prints after the middle of the reference (4), which is 7 prints ago.
+    assert found.prints_left in (12, 13)  # rounding may take the thirteenth
+    noisy = values + np.random.default_rng(0).normal(0, 0.02, 12)
+    assert forecast(noisy, np.ones(12), reference, tolerance=0.2).prints_left < 12
+
+
+def test_figures_do_not_depend_on_datum_tilt_and_bow_and_follow_the_height():
+    scan = make_scan(0)
+    height, level = scan.height_um.astype(np.float64), scan.layout_um
+    y, x = np.meshgrid(*(np.linspace(-1, 1, size) for size in scan.shape), indexing="ij")
+    surface = 0.3 + 0.05 * x - 0.02 * y + 0.04 * x * x - 0.03 * x * y + 0.06 * y * y
+    plain, moved, taller = (
+        scan_figures(_with_height(scan, changed), level)
+        for changed in (height, height + surface, 1.1 * height)
+    )
+    assert plain is not None
+    assert moved is not None
+    assert taller is not None
+    # Heights are kept in float32: 0.5 µm to 3e-8 µm, averaged over thousands of pixels.
+    assert moved.gain == pytest.approx(plain.gain, rel=1e-6)
+    assert moved.error_nm == pytest.approx(plain.error_nm, rel=1e-5)
+    assert taller.gain == pytest.approx(1.1 * plain.gain, rel=1e-6)
+    # The gain of the joint fit of all seven terms.
+    joint = fitted_terms(scan.height_um, level, scan.valid, POLICIES["full"])[0]
+    assert np.min(np.abs(1 + joint - plain.gain)) < 1e-6
+
+
+def _with_height(scan, height_um):
+    from dataclasses import replace
+
+    return replace(scan, height_um=height_um.astype(np.float32))
+
+
+def test_a_flat_layout_has_no_gain():
+    from dataclasses import replace
+
+    scan = make_scan(0)
+    flat = replace(scan, mask_level=np.full_like(scan.mask_level, 5))
+    assert scan_figures(flat, np.full(scan.shape, 0.4)) is None
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory):
+    """A model of twelve prints, and two sets of new ones: as before, and 8 % taller from the second on."""
+    folder = tmp_path_factory.mktemp("check")
+    scans = make_scans(44, size_px=64)
+    made = write_store(folder / "made.zarr", scans[:24])
+    train(made, "affine", folder / "run")
+    freeze(folder / "run", folder / "model")
+    later = scans[24:32]
+    taller = [
+        _with_height(scan, scan.height_um + 0.08 * printed_height_um(scan.layout_um) * (place > 1))
+        for place, scan in enumerate(later)
+    ]
+    write_store(folder / "same.zarr", later, name="same")
+    write_store(folder / "taller.zarr", taller, name="taller")
+    write_store(folder / "few.zarr", scans[32:38], name="few")
+    return folder
+
+
+def test_unchanged_prints_raise_no_alarm_and_a_datum_means_nothing(lab, tmp_path):
+    plain = check(lab / "model", lab / "same.zarr", tmp_path / "out")
+    assert not plain.alarm
+    assert plain.verdict[0].startswith("No alarm: 4 new prints")
+    assert plain.figures[0].reference_prints == 12
+    assert Check.read(tmp_path / "out") == plain
+    other = [make_scan(number, size_px=64, datum_um=0.4, bow_um=0.1) for number in range(24, 32)]
+    moved = check(lab / "model", write_store(tmp_path / "moved.zarr", other, name="m"), tmp_path / "moved")
+    for first, second in zip(plain.figures, moved.figures, strict=True):
+        # As above, at heights of float32.
+        assert second.smallest_p == pytest.approx(first.smallest_p, rel=1e-3)
+
+
+def test_taller_prints_end_the_strict_command_with_3(lab, tmp_path, monkeypatch, capsys):
+    arguments = ["check", str(lab / "model"), str(lab / "taller.zarr"), "--out", str(tmp_path / "out")]
+    assert _exit_code(monkeypatch, [*arguments, "--strict"]) == 3
+    assert capsys.readouterr().out.startswith("ALARM, noticed at print 15: since print 13 the height gain is")
+    assert _exit_code(monkeypatch, arguments) == 0
+    found = Check.read(tmp_path / "out")
+    alarm = found.figures[0].alarm
+    assert found.alarm
+    assert alarm is not None
+    assert alarm.since == "13"
+    assert alarm.step_ci95[0] < 0.08 < alarm.step_ci95[1]
+    assert found.figures[0].measure_again_in == 0
+    assert found.run.command.startswith("litho-models check ")
+    assert "changed" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_prints_of_one_store_are_checked_against_its_others(lab, tmp_path):
+    found = check(lab / "model", lab / "made.zarr", tmp_path / "out", new=["3", "7"])
+    assert (found.figures[0].reference_prints, found.figures[0].new_prints) == (10, 2)
+    assert any("made of some of the new prints" in note for note in found.notes)
+
+
+@pytest.mark.parametrize(
+    ("store", "given", "message"),
+    [
+        ("same", {"reference": "few"}, "prints in the reference, got 3, wanted 4 at least"),
+        ("same", {"reference": "same"}, "scans of .* too, wanted prints that are not checked; --new"),
+        ("same", {"reference": "made", "new": ["12"]}, "got a store and --new, wanted one of the two"),
+        ("same", {"new": ["99"]}, "--new, got 99, wanted a print of"),
+        ("made", {}, "got the prints that the model was made of, wanted new ones; --reference"),
+        ("same", {"residuals": ["made"]}, "--residuals, got no prints"),
+        ("same", {"false_alarms": 0.0}, "rate of false alarms, got 0.0"),
+        ("same", {"tolerance": 5.0}, "0.05 is 5 %"),
+        ("pitch", {}, "pitch_um for model affine, got 0.2 µm, wanted 0.1 µm"),
+        ("other", {"reference": "other-too"}, "it is the model of another printer"),
+    ],
+)
+def test_bad_input_is_one_line(lab, tmp_path, store, given, message):
+    if store == "pitch":
+        write_store(lab / "pitch.zarr", make_scans(2, size_px=64), pitch_um=0.2, name="pitch")
+    for place, name in enumerate(("other", "other-too") if store == "other" else ()):
+        flat = [
+            _with_height(scan, 0.2 * scan.height_um)
+            for scan in make_scans(20, size_px=64)[10 * place : 10 * place + 10]
+        ]
+        write_store(lab / f"{name}.zarr", flat, name=name)
+    given = {**given, **({"reference": lab / f"{given['reference']}.zarr"} if "reference" in given else {})}
+    with pytest.raises(InputError, match=message) as caught:
+        check(lab / "model", lab / f"{store}.zarr", tmp_path / "out", **given)
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_older_card_asks_for_a_reference_and_takes_one(lab, tmp_path):
+    freeze(lab / "model", tmp_path / "older")
+    file = tmp_path / "older" / "card.json"
+    card = json.loads(file.read_text())
+    assert len(card.pop("baseline")) == 20
+    file.write_text(json.dumps(card))
+    with pytest.raises(InputError, match="got no figures of prints, wanted a reference; --reference"):
+        check(tmp_path / "older", lab / "same.zarr", tmp_path / "out")
+    given = check(tmp_path / "older", lab / "same.zarr", tmp_path / "out", reference=lab / "made.zarr")
+    of_card = check(lab / "model", lab / "same.zarr", tmp_path / "of_card")
+    assert given.figures == of_card.figures
+
+
+def _exit_code(monkeypatch, arguments: list[str]) -> int:
+    monkeypatch.setattr(sys, "argv", ["litho-models", *arguments])
+    try:
+        main()
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
