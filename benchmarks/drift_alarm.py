@@ -1,20 +1,23 @@
 """How often `litho-models check` alarms on an unchanged printer, and how often it notices a step.
 
-    python -m benchmarks.drift_alarm [--store runs/neural-lithography/store.zarr
-        --residuals runs/neural-lithography/leave-one-print-out] [--publish]
+    python -m benchmarks.drift_alarm --store runs/neural-lithography/store.zarr
+        --residuals runs/neural-lithography/leave-one-print-out [--publish]
 
 Virtual prints: the height gain of every print is drawn with a spread of 1 or 5 %; a Physics model is fitted
-to prints of the same fab. Each reference of 48 prints is compared with five sets of three new prints, as
-before, and with five whose gain is three spreads higher or lower; its first 12 and 24 prints are smaller
+to prints of the same fab. Each reference of 48 prints is compared with ten sets of three new prints, as
+before, and with ten whose gain is three spreads higher or lower; its first 12 and 24 prints are smaller
 references.
 Fields lie on their layouts (microscope `aligned`), so that nothing is registered. Beside it the same rule on
-Gaussian figures, many times. With a store of measured prints: each print in turn as the new one.
+Gaussian figures, many times; and the measured prints, each in turn as the new one. An interrupted run
+resumes.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,18 +35,19 @@ from litho_data.virtual_fab.knobs import KnobBoard
 from litho_data.virtual_fab.printer import Cause, Job
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 from litho_models.fitting import TrainingConfig, fit_with_record
+from litho_models.frozen.files import load_frozen, save_frozen
+from litho_models.frozen.on_store import predict_frozen
+from litho_models.frozen.simulator import FrozenSimulator
 from litho_models.monitoring.change_point import Series, comparisons, step_statistics
 from litho_models.monitoring.judging import DEFAULT_RATE, alarms, judge
 from litho_models.monitoring.prints import FIGURES
 from litho_models.noise.residuals import read_residuals
-from litho_models.prediction.tiles import predict_scan
 from litho_models.scoring.scan_figures import ScanFigures, scan_figures
-from litho_models.simulator import Simulator
 
 PAGE = Path(__file__).parents[1] / "docs" / "checking.md"
 RESULT = PAGE.parent / "results" / "drift-alarm" / "drift_alarm.json"
 SPREADS, REFERENCES, SHIFT_SPREADS, NEW_PRINTS = (0.01, 0.05), (12, 24, 48), 3.0, 3
-STORES, SETS = 20, 5
+STORES, SETS = 10, 10
 SIZE_PX, SCANS_PER_PRINT, CALIBRATION_PRINTS = 192, 2, 6
 DRAWS, RULE_REFERENCES = 100_000, (6, 12, 24, 48, 96)
 FIRST_SEED = 30_000
@@ -87,36 +91,37 @@ def printed_scans(gain: np.ndarray, seed: int) -> list[PrintedScan]:
     return scans
 
 
-def calibrated_model(seed: int) -> Simulator:
-    """Physics, fitted to prints of gain 1."""
-    scans = printed_scans(np.ones(CALIBRATION_PRINTS), seed)
-    return fit_with_record("physics", scans, TrainingConfig.of_recipe("fast", "physics")).model
+def calibrated_model(cache: Path) -> FrozenSimulator:
+    """Physics, fitted to prints of gain 1; made once."""
+    if not (cache / "model").exists():
+        scans = printed_scans(np.ones(CALIBRATION_PRINTS), FIRST_SEED - 1)
+        fitted = fit_with_record("physics", scans, TrainingConfig.of_recipe("fast", "physics")).model
+        save_frozen(fitted, cache / "model")
+    return load_frozen(cache / "model")
 
 
-def figures(model: Simulator, gain: np.ndarray, seed: int) -> list[ScanFigures]:
+def figures(model: FrozenSimulator, gain: np.ndarray, seed: int) -> list[ScanFigures]:
     """Print, scan, predict and measure."""
-    rows = [scan_figures(scan, predict_scan(model, scan)) for scan in printed_scans(gain, seed)]
+    rows = [scan_figures(scan, predict_frozen(model, scan)) for scan in printed_scans(gain, seed)]
     return [row for row in rows if row is not None]
 
 
-def virtual_board(spread: float, model: Simulator, first_seed: int) -> list[dict[str, Any]]:
-    """Every new set of every reference: which figures alarmed, by the number of reference prints."""
+def virtual_sets(spread: float, store: int, model: FrozenSimulator) -> list[dict[str, Any]]:
+    """Every new set of one reference: which figures alarmed, by the number of reference prints."""
+    seed = FIRST_SEED + 10_000 * SPREADS.index(spread) + 100 * store
+    random = np.random.default_rng(seed)
+    reference = figures(model, 1 + spread * random.normal(size=max(REFERENCES)), seed)
     board = []
-    for store in range(STORES):
-        seed = first_seed + 100 * store
-        random = np.random.default_rng(seed)
-        reference = figures(model, 1 + spread * random.normal(size=max(REFERENCES)), seed)
-        for number in range(2 * SETS):
-            shift = 0.0 if number < SETS else spread * SHIFT_SPREADS * random.choice([-1, 1])
-            gain = 1 + spread * random.normal(size=NEW_PRINTS) + shift
-            new = figures(model, gain, seed + 1 + number)
-            noticed = {}
-            for prints in REFERENCES:
-                part = [row for row in reference if int(row.print) < prints]
-                found = alarms(part, new)
-                noticed[str(prints)] = [name for name, step in found.items() if step is not None]
-            board.append({"seed": seed + 1 + number, "shift": float(shift), "alarms": noticed})
-        print(f"spread {spread:g}: reference {store + 1} of {STORES}", flush=True)
+    for number in range(2 * SETS):
+        shift = 0.0 if number < SETS else spread * SHIFT_SPREADS * random.choice([-1, 1])
+        gain = 1 + spread * random.normal(size=NEW_PRINTS) + shift
+        new = figures(model, gain, seed + 1 + number)
+        noticed = {}
+        for prints in REFERENCES:
+            part = [row for row in reference if int(row.print) < prints]
+            found = alarms(part, new)
+            noticed[str(prints)] = [name for name, step in found.items() if step is not None]
+        board.append({"seed": seed + 1 + number, "shift": float(shift), "alarms": noticed})
     return board
 
 
@@ -153,10 +158,11 @@ def measured_prints(store: Path, residuals: Path, model: str) -> dict[str, Any]:
 
 def texts(record: Mapping[str, Any]) -> dict[str, str]:
     """The text of each mark of the page."""
-    made = {"virtual prints": _virtual_text(record), "rule": _rule_text(record["rule"])}
-    if record.get("measured"):
-        made["measured prints"] = _measured_text(record["measured"])
-    return made
+    return {
+        "virtual prints": _virtual_text(record),
+        "rule": _rule_text(record["rule"]),
+        "measured prints": _measured_text(record["measured"]),
+    }
 
 
 def _virtual_text(record: Mapping[str, Any]) -> str:
@@ -221,30 +227,54 @@ def _measured_text(measured: Mapping[str, Any]) -> str:
     )
 
 
+def _part(spread: float, store: int) -> str:
+    return f"virtual-{spread:g}-{store:02d}"
+
+
+def _sets_of_cache(cache: Path, spread: float, store: int) -> list[dict[str, Any]]:
+    return virtual_sets(spread, store, calibrated_model(cache))
+
+
 def main() -> None:
     """Run, print, write."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--store", type=Path, help="measured prints")
-    parser.add_argument("--residuals", type=Path, help="their leave-one-print-out benchmark")
+    parser.add_argument("--store", type=Path, required=True, help="measured prints")
+    parser.add_argument("--residuals", type=Path, required=True, help="their leave-one-print-out benchmark")
     parser.add_argument("--model", default="physics", help="which model of it")
+    parser.add_argument("--cache", type=Path, default=Path("runs/drift-alarm"), help="a file per part")
+    parser.add_argument("--parts", type=int, help="make so many missing parts and stop")
     parser.add_argument("--out", type=Path, default=RESULT, help="JSON file to write")
     parser.add_argument("--publish", action="store_true", help="write the figures into the page")
     given = parser.parse_args()
-    model = calibrated_model(FIRST_SEED - 1)
+    parts: dict[str, Callable[[], Any]] = {
+        "rule": lambda: [rule_on_gaussian_figures(prints) for prints in RULE_REFERENCES],
+        "measured": lambda: measured_prints(given.store, given.residuals, given.model),
+    }
+    for store in range(STORES):
+        for spread in SPREADS:
+            parts[_part(spread, store)] = partial(_sets_of_cache, given.cache, spread, store)
+    missing = [name for name in parts if not (given.cache / f"{name}.json").exists()]
+    for name in missing[: given.parts]:
+        write_record(given.cache / f"{name}.json", {"part": parts[name]()})
+        print(name, flush=True)
+    if given.parts is not None and len(missing) > given.parts:
+        return
+    made = {
+        name: json.loads((given.cache / f"{name}.json").read_text(encoding="utf-8"))["part"] for name in parts
+    }
     record: dict[str, Any] = {
         "schema": "litho-models/drift-alarm/1",
         "rate": DEFAULT_RATE,
         **origin(),
-        "rule": [rule_on_gaussian_figures(prints) for prints in RULE_REFERENCES],
+        "rule": made["rule"],
         "virtual": {
-            str(spread): virtual_board(spread, model, FIRST_SEED + 10_000 * place)
-            for place, spread in enumerate(SPREADS)
+            str(spread): [one for store in range(STORES) for one in made[_part(spread, store)]]
+            for spread in SPREADS
         },
+        "measured": made["measured"],
     }
-    if given.store is not None:
-        record["measured"] = measured_prints(given.store, given.residuals, given.model)
     write_record(given.out, record)
     for mark, text in texts(record).items():
         print(text)

@@ -64,10 +64,10 @@ def _quiet_text(check: FigureCheck) -> str:
     if check.noticeable_step is None:
         seen = "with so few reference prints hardly any step would be noticed"
     else:
-        within = min(SOON, check.new_prints)
+        rise = check.noticeable_step
         seen = (
-            f"a step of {100 * check.noticeable_step:.1f} % at the first new print would be noticed within "
-            f"{_count(within, 'print')} in 9 of 10 cases"
+            f"a rise by {100 * rise:.1f} % or a fall by {100 * rise / (1 + rise):.1f} % at the first new "
+            f"print would be noticed within {_count(min(SOON, check.new_prints), 'print')} in 9 of 10 cases"
         )
     low, high = (100 * end for end in check.spread_ci95)
     words = figure_of(check).words
