@@ -25,7 +25,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from benchmarks.markdown_table import markdown_table
-from benchmarks.record import origin, publish, write_record
+from benchmarks.record import NOT_MEASURED, origin, publish, write_record
 from litho_data.foundation.commands import run_script
 from litho_data.store import PrintedScan, open_store
 from litho_data.virtual_fab.canvas import Canvas
@@ -167,6 +167,9 @@ def texts(record: Mapping[str, Any]) -> dict[str, str]:
 
 def _virtual_text(record: Mapping[str, Any]) -> str:
     rows = []
+    if not all(record["virtual"].values()):
+        return NOT_MEASURED
+    references = len(next(iter(record["virtual"].values()))) // (2 * SETS)
     for spread, board in record["virtual"].items():
         for prints in map(str, REFERENCES):
             same = [one["alarms"][prints] for one in board if not one["shift"]]
@@ -183,7 +186,7 @@ def _virtual_text(record: Mapping[str, Any]) -> str:
         ("spread of the gain", "reference prints", "alarms, unchanged", "noticed, gain moved by 3 spreads"),
         rows,
         f"Virtual prints, {SCANS_PER_PRINT} fields of {SIZE_PX} px each; sets of {NEW_PRINTS} new prints, "
-        f"{SETS} unchanged and {SETS} moved beside each of {STORES} references. Rate set: {DEFAULT_RATE:g}. "
+        f"{SETS} unchanged and {SETS} moved beside each of {references} references. Rate: {DEFAULT_RATE:g}. "
         "The smaller references are the first prints of the larger ones.",
     )
 
@@ -244,7 +247,9 @@ def main() -> None:
     parser.add_argument("--residuals", type=Path, required=True, help="their leave-one-print-out benchmark")
     parser.add_argument("--model", default="physics", help="which model of it")
     parser.add_argument("--cache", type=Path, default=Path("runs/drift-alarm"), help="a file per part")
-    parser.add_argument("--parts", type=int, help="make so many missing parts and stop")
+    parser.add_argument(
+        "--parts", type=int, help="make so many missing parts and stop; what is complete is written"
+    )
     parser.add_argument("--out", type=Path, default=RESULT, help="JSON file to write")
     parser.add_argument("--publish", action="store_true", help="write the figures into the page")
     given = parser.parse_args()
@@ -259,19 +264,21 @@ def main() -> None:
     for name in missing[: given.parts]:
         write_record(given.cache / f"{name}.json", {"part": parts[name]()})
         print(name, flush=True)
-    if given.parts is not None and len(missing) > given.parts:
-        return
     made = {
-        name: json.loads((given.cache / f"{name}.json").read_text(encoding="utf-8"))["part"] for name in parts
+        name: json.loads(file.read_text(encoding="utf-8"))["part"]
+        for name in parts
+        if (file := given.cache / f"{name}.json").exists()
     }
+    if not {"rule", "measured"} <= made.keys():
+        return
+    done = [store for store in range(STORES) if all(_part(spread, store) in made for spread in SPREADS)]
     record: dict[str, Any] = {
         "schema": "litho-models/drift-alarm/1",
         "rate": DEFAULT_RATE,
         **origin(),
         "rule": made["rule"],
         "virtual": {
-            str(spread): [one for store in range(STORES) for one in made[_part(spread, store)]]
-            for spread in SPREADS
+            str(spread): [one for store in done for one in made[_part(spread, store)]] for spread in SPREADS
         },
         "measured": made["measured"],
     }

@@ -39,8 +39,8 @@ class FigureCheck(Record):
 
     ``mean`` and ``spread``: of the reference prints. ``smallest_p`` of all comparisons sounds the alarm at
     ``threshold_p``. ``noticeable_step``: the rise r at the first new print that is noticed within three
-    prints in 9 of 10 cases, and so is a fall by r/(1 + r); None where it is beyond a factor of e. ``trend``: change
-    per print over all prints. ``measure_again_in``: prints until the 95 % bound of the drift reaches
+    prints in 9 of 10 cases, and so is a fall by r/(1 + r); None where it is beyond a factor of e. ``trend``:
+    change per print over all prints. ``measure_again_in``: prints until the 95 % bound of the drift reaches
     ``tolerance``.
     """
 
