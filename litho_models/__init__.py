@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from litho_models.loop import close_loop_on_store as close_loop
     from litho_models.models import build_model as build_model
     from litho_models.models.authors import model_of_authors as model_of_authors
-    from litho_models.monitoring import check as check
     from litho_models.noise import analyse_noise as analyse_noise
     from litho_models.scan_terms import register_scan_term as register_scan_term
     from litho_models.scoring.metric_registry import register_metric as register_metric
@@ -38,7 +37,6 @@ else:
             "analyse_noise": "litho_models.noise",
             "benchmark": "litho_models.evaluation.benchmark",
             "build_model": "litho_models.models",
-            "check": "litho_models.monitoring",
             "close_loop": "litho_models.loop:close_loop_on_store",
             "compare": "litho_models.evaluation.compare",
             "evaluate": "litho_models.evaluation.evaluate",
@@ -63,7 +61,6 @@ __all__ = [
     "analyse_noise",
     "benchmark",
     "build_model",
-    "check",
     "close_loop",
     "compare",
     "evaluate",

@@ -7,8 +7,6 @@ from typing import Annotated
 
 import typer
 
-import litho_models
-
 # Neither bad input (2) nor a defect of ours (1).
 EXIT_ALARM = 3
 
@@ -46,7 +44,9 @@ def check(
 
     Example: litho-models check printer new-prints.zarr --out check
     """
-    result = litho_models.check(
+    from litho_models.monitoring import check as check_prints
+
+    result = check_prints(
         model,
         store,
         out,

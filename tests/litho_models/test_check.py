@@ -12,10 +12,10 @@ from scipy import stats
 from benchmarks import drift_alarm
 from benchmarks.record import published
 from litho_data.foundation.errors import InputError
-from litho_models import check
 from litho_models.cli.app import main
 from litho_models.fitting.runs import train
 from litho_models.frozen.freezing import freeze
+from litho_models.monitoring import check
 from litho_models.monitoring.change_point import (
     Series,
     comparisons,
