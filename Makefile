@@ -6,12 +6,13 @@ OUT ?= runs
 WORKERS ?= 1
 PUBLISH ?=
 STAMP := .venv/.installed
+DOCS_STAMP := .venv/.docs-installed
 CPUS ?=
 # Two test processes on two cores: one thread each.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n 2
 
-.PHONY: help setup demo trials gap test test-fast test-cpus check check-all format clean
+.PHONY: help setup demo trials gap docs test test-fast test-cpus check check-all format clean
 
 help:              ## list the targets
 	@grep -hE '^[a-z-]+: .*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## /\1	/' | expand -t 14
@@ -32,6 +33,14 @@ trials: $(STAMP)   ## blind trials of the closed loop: make trials WORKERS=2, PU
 gap: $(STAMP)      ## the design-to-manufacturing gap at full size, hours: make gap WORKERS=2 [CORRECTED=DIR] [PROOF=1] [PUBLISH=1]
 	$(BIN)/python -m benchmarks.gap --out $(OUT)/gap --workers $(WORKERS) $(if $(CORRECTED),--corrected $(CORRECTED)) \
 		$(if $(PROOF),--proof) $(if $(PUBLISH),--publish)
+
+docs: $(DOCS_STAMP) ## build the site of the documentation into runs/site; a broken link is an error
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
+	@echo "look at it: $(BIN)/python -m http.server --directory runs/site, then http://localhost:8000"
+
+$(DOCS_STAMP): $(STAMP)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[docs]'
+	@touch $@
 
 test: $(STAMP)     ## pass all tests but the longest; the report is runs/tests/report.xml
 	$(PYTEST) -m "not long" --durations 15 --junitxml $(OUT)/tests/report.xml

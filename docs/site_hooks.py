@@ -1,0 +1,90 @@
+"""What the site adds to the pages: the reference, files outside docs/ that pages link to, words explained."""
+
+from __future__ import annotations
+
+import ast
+import posixpath
+import re
+from pathlib import Path
+from typing import Any
+
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("litho_data", "litho_models", "litho_design")
+_LINK = re.compile(r"\]\((?P<place>\.\./[^)#\s]+)(?P<anchor>#[^)\s]*)?\)")
+_LANGUAGES = {".py": "python", ".toml": "toml", ".json": "json"}
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add a page for the public face of every package, and one for every file outside that is linked to."""
+    for package in PACKAGES:
+        files.append(File.generated(config, f"reference/{package}.md", content=_reference(package)))
+    outside = {
+        place
+        for page in files.documentation_pages()
+        if page.abs_src_path
+        for place in _outside(page.src_uri, Path(page.abs_src_path).read_text("utf-8"))
+    }
+    for place in sorted(outside):
+        files.append(File.generated(config, f"files/{place}.md", content=_shown(ROOT / place)))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
+    """Lead links that leave docs/ to the pages made for them; explain the words of the glossary."""
+
+    def inside(link: re.Match[str]) -> str:
+        place = _target(page.file.src_uri, link["place"])
+        if place is None:
+            return link[0]
+        return f"]({posixpath.relpath(f'files/{place}.md', posixpath.dirname(page.file.src_uri) or '.')})"
+
+    text = _LINK.sub(inside, markdown)
+    return text if page.file.src_uri == "glossary.md" else text + _abbreviations()
+
+
+def on_page_content(html: str, page: Any, config: Any, files: Files) -> str:
+    """Sphinx's roles in docstrings are only code here."""
+    return re.sub(r":(?:func|class|mod|meth|data):<code>~?", "<code>", html)
+
+
+def _outside(page: str, text: str) -> set[str]:
+    found = {_target(page, link["place"]) for link in _LINK.finditer(text)}
+    return {place for place in found if place is not None}
+
+
+def _target(page: str, link: str) -> str | None:
+    """The file outside docs/ that a link of a page leads to, from the root of the checkout; else None."""
+    place = posixpath.normpath(posixpath.join("docs", posixpath.dirname(page), link))
+    return None if place.startswith("docs/") else place
+
+
+def _shown(file: Path) -> str:
+    """A file as a page: Markdown without its links, code as code."""
+    text = file.read_text("utf-8")
+    if file.suffix == ".md":
+        return re.sub(r"!?\[([^\]]*)\]\((?!http)[^)]*\)", r"\1", text)
+    return f"# {file.name}\n\n```{_LANGUAGES.get(file.suffix, '')}\n{text}\n```\n"
+
+
+def _reference(package: str) -> str:
+    tree = ast.parse((ROOT / package / "__init__.py").read_text("utf-8"))
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "__all__":
+            names = [name for name in ast.literal_eval(node.value) if not name.startswith("_")]
+    entries = "\n".join(f"::: {package}.{name}\n" for name in names)
+    return f"# {package}\n\n{ast.get_docstring(tree)}\n\n{entries}"
+
+
+def _abbreviations() -> str:
+    """The glossary as definitions that show where its words stand."""
+    rows = re.findall(
+        r"^\| ([^|]+?) \| ([^|]+?) \|", (ROOT / "docs" / "glossary.md").read_text("utf-8"), re.M
+    )
+    found = [
+        f"*[{word}]: {re.sub(r'[`*]', '', meaning)}"
+        for words, meaning in rows[1:]
+        for word in words.split(", ")
+    ]
+    return "\n\n" + "\n".join(found) + "\n"

@@ -1,0 +1,74 @@
+# %% [markdown]
+# # From scans to a dataset
+#
+# You have AFM scans of prints and the layouts that were printed. By the end of this page you have one dataset in
+# which every scan lies on its layout, pixel by pixel, and which knows where each of its numbers comes from. Here
+# the scans come from the built-in virtual fab; for your own, only the first step differs ([how](../own_data.md)).
+
+# %%
+import litho_data
+
+card = litho_data.simulate("campaign", count=6, size_px=160, seed=3)
+print(card)
+
+# %% [markdown]
+# `card.toml` says which file is a scan, which layout belongs to it, and what the files do not say themselves: pitch,
+# height of a level, units. The scans are what an instrument writes: tilted, bowed, slightly rotated, with an unknown
+# zero. Read one:
+
+# %%
+scan = litho_data.read_scan(card.parent / "scans" / "P1F1.txt", size_um=(16.8, 16.8), unit="m")
+low, high = scan.height_um.min(), scan.height_um.max()
+print(f"{scan.name}: {scan.height_um.shape} pixels, heights {low:.2f} … {high:.2f} µm")
+
+# %% [markdown]
+# One call reads all of them, levels them, finds each on its layout and stores the result with its history.
+
+# %%
+result = litho_data.build_dataset(card, "prints.zarr")
+print(result.n_scans, "scans stored,", len(result.skipped), "skipped")
+
+# %% [markdown]
+# The quality table tells how well each scan found its layout. `ncc_after` is the correlation of height and layout
+# once registered, `tre_median_nm` the distance between matching details that were kept out of the fit
+# ([what is good](../registration.md)).
+
+# %%
+store = litho_data.open_store("prints.zarr")
+columns = ["scan", "ncc_before", "ncc_after", "tre_median_nm", "rotation_deg"]
+print(store.quality[columns].round(3).to_string(index=False))
+
+# %% [markdown]
+# Look at one scan beside its layout. Both are on the same grid, in µm; pixels that were not measured are NaN.
+
+# %%
+
+from litho_data.foundation.report_pictures import new_figure
+
+printed = store.scan(store.ids[0])
+figure = new_figure(9, 3.2)
+panels = {
+    "layout, µm": printed.layout_um,
+    "measured height, µm": printed.height_um,
+    "measured − layout, µm": printed.height_um - printed.layout_um,
+}
+for axes, (title, image) in zip(figure.subplots(1, 3), panels.items(), strict=True):
+    shown = axes.imshow(image, cmap="viridis")
+    axes.set_title(title, fontsize=10)
+    axes.set_axis_off()
+    figure.colorbar(shown, ax=axes, shrink=0.8)
+figure
+
+# %% [markdown]
+# The print has less contrast than its layout and rounds it off: that is what a model of the printer has to learn. Before you
+# pass the dataset on, make sure that nothing has changed since it was built:
+
+# %%
+checked = litho_data.verify("prints.zarr")
+print(
+    f"{checked.n_arrays} arrays and {checked.n_raw_files} raw files hashed again, {len(checked.findings)} changed"
+)
+
+# %% [markdown]
+# `prints.zarr` opens with `xarray.open_zarr` as well, without this package. Next: [which model predicts these prints
+# best](models.md), [how levelling works](../levelling.md), [what is in the file](../dataset_store.md).

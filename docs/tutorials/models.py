@@ -1,0 +1,62 @@
+# %% [markdown]
+# # Which model predicts best?
+#
+# You want to know which model of the printer to trust, and by how much. By the end of this page you have compared
+# three on scans that none of them was trained on, with intervals, and know how much of the error is noise.
+
+# %%
+import litho_data
+import litho_models
+
+card = litho_data.simulate("campaign", count=8, size_px=128, seed=0)
+built = litho_data.build_dataset(card, "prints.zarr")
+
+# %% [markdown]
+# `benchmark` deals the scans into folds. Each fold is predicted by models trained on the others; locked scans are
+# in none. The error is the mean absolute difference of measured and predicted height once the unknown zero of
+# each scan is taken out ([why](../evaluation.md#two-errors)).
+
+# %%
+result = litho_models.benchmark("prints.zarr", "benchmark", models=("affine", "linear", "physics"), folds=2)
+for scores in result.scores:
+    low, high = scores.mae_datum_free_ci95_nm
+    print(f"{scores.model:8} {scores.mae_datum_free_nm:6.2f} nm   95 % over scans {low:.2f} … {high:.2f}")
+
+# %% [markdown]
+# Intervals that overlap do not mean that two models are alike: they are compared scan by scan.
+
+# %%
+for pair in result.paired:
+    print(
+        f"{pair.first} − {pair.second}: {pair.mean_nm:+.2f} nm, "
+        f"{pair.first} better in {pair.first_better} of {pair.scans} scans, p = {pair.p:.2g}"
+    )
+
+# %% [markdown]
+# Scans of one print are not independent; where there are several prints, the same test over prints is in
+# `pair.over_prints`. And a part of every error is noise that no model can predict:
+
+# %%
+floor = result.noise_floor
+print(f"noise: {floor.mae_at('offset'):.2f} nm ({floor.kind})")
+
+# %% [markdown]
+# The same as bars, one colour a model, as in `benchmark/report.html`, which has all figures and tables:
+
+# %%
+from litho_models.evaluation.plots import error_bars
+
+error_bars(result.scores, floor.mae_at("offset"), paper_line=False)
+
+# %% [markdown]
+# Train the one you chose on all scans but the locked ones, and freeze it: a folder with weights and a card that
+# designs, and other people, can load.
+
+# %%
+litho_models.train("prints.zarr", "physics", "run")
+litho_models.freeze("run", "printer")
+print(litho_models.load_frozen("printer"))
+
+# %% [markdown]
+# Next: [what the model still lacks](../closing_the_loop.md), [what the scores mean](../evaluation.md), [a hologram
+# through the printer](optics.md).

@@ -1,0 +1,58 @@
+# %% [markdown]
+# # A hologram through the printer
+#
+# You want a printed element to show an image. By the end of this page you have designed one through a model of the
+# printer, judged it with another model, and written the file for the printer. The models come with the package.
+
+# %%
+import litho_design
+
+settings = litho_design.hologram_settings(
+    changes={"layout.size_px": 192, "optics.distance_um": 18, "search.iterations": 30}
+)
+designs = {
+    name: litho_design.design_hologram("text", model, name, settings=settings)
+    for name, model in {"without": "none", "with": "zoo:physics"}.items()
+}
+
+# %% [markdown]
+# `without` was designed for a perfect printer, `with` through a model trained on measured prints. What each expects
+# of itself says nothing yet. Let a model that had no part in either print both, and look at the image behind them:
+
+# %%
+judged = {
+    name: litho_design.score(name, f"score-{name}", judges=["zoo:pbl"]).scores[0].figures for name in designs
+}
+for name, figures in judged.items():
+    print(f"{name:8} {figures['si_psnr_db']:.1f} dB, SSIM {figures['ssim']:.3f}")
+
+# %% [markdown]
+# The images, as the independent model prints both elements:
+
+# %%
+from litho_data.foundation.report_pictures import new_figure
+
+printer = litho_design.load_printer("zoo:pbl", settings.layout)
+loaded = {name: litho_design.load_design(name) for name in designs}
+images = {"wanted": loaded["with"].target.numpy()}
+for name, design in loaded.items():
+    title = f"designed {name} the model: {judged[name]['si_psnr_db']:.1f} dB"
+    images[title] = design.display(design.image(design.printed_um(printer)))
+figure = new_figure(9.6, 3.5)
+for axes, (title, image) in zip(figure.subplots(1, 3), images.items(), strict=True):
+    axes.imshow(image, cmap="inferno", vmin=0, vmax=1.5)
+    axes.set_title(title, fontsize=10)
+    axes.set_axis_off()
+figure
+
+# %% [markdown]
+# Both are predictions. The one that counts is a photograph of the print; `litho_design.score` takes it, or an AFM
+# scan, in place of the model. To print it, export the layout: an image of levels, with a sidecar that gives heights
+# and size and reads it back.
+
+# %%
+print(litho_design.export("with", "png16", "to-printer").name)
+
+# %% [markdown]
+# Next: [what the scores mean, lenses, process windows](../optics.md), [comparing models as
+# designers](../optics.md#the-design-to-manufacturing-gap).

@@ -1,0 +1,81 @@
+"""Run the tutorials and write their pages: `python docs/tutorials/render.py [NAME …]`.
+
+A tutorial is a script in cells (`# %%` code, `# %% [markdown]` words in comments). Its page shows the words, the
+code, and what the code printed and drew when it ran, in an empty folder, in one go.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import io
+import os
+import re
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).parent
+NAMES = ("datasets", "models", "optics")
+# Progress and paths of the run, which say nothing to the reader.
+_NOISE = re.compile(r"^\s*(for comparison:|.*it/s)")
+
+
+def cells(script: str) -> list[tuple[str, str]]:
+    """The cells of a script in order: ("markdown" or "code", text)."""
+    found = []
+    for part in re.split(r"^# %%", script, flags=re.MULTILINE)[1:]:
+        head, _, body = part.partition("\n")
+        if "[markdown]" in head:
+            found.append(("markdown", re.sub(r"^# ?", "", body, flags=re.MULTILINE).strip()))
+        else:
+            found.append(("code", body.strip()))
+    return found
+
+
+def run_cell(code: str, names: dict[str, Any]) -> tuple[str, Any]:
+    """What a cell prints, and the value of its last expression; ``names`` are those of the cells before it."""
+    tree = ast.parse(code)
+    last = tree.body.pop() if tree.body and isinstance(tree.body[-1], ast.Expr) else None
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(io.StringIO()):
+        exec(compile(tree, "tutorial", "exec"), names)
+        value = None if last is None else eval(compile(ast.Expression(last.value), "tutorial", "eval"), names)
+    lines = [line.rstrip() for line in said.getvalue().splitlines() if not _NOISE.match(line)]
+    return "\n".join(lines), value
+
+
+def render(name: str) -> None:
+    """Run one tutorial and write ``NAME.md`` and its figures ``NAME-1.svg`` … beside the script."""
+    from matplotlib.figure import Figure
+
+    names: dict[str, Any] = {}
+    page = [f"<!-- written by render.py from {name}.py -->"]
+    figures = 0
+    here = Path.cwd()
+    with tempfile.TemporaryDirectory() as folder:
+        os.chdir(folder)
+        try:
+            for kind, text in cells((HERE / f"{name}.py").read_text("utf-8")):
+                page.append(text if kind == "markdown" else f"```python\n{text}\n```")
+                if kind == "markdown":
+                    continue
+                said, value = run_cell(text, names)
+                if isinstance(value, Figure):
+                    figures += 1
+                    value.savefig(HERE / f"{name}-{figures}.jpg", dpi=100, pil_kwargs={"quality": 85})
+                    page.append(f"![What the code above draws]({name}-{figures}.jpg)")
+                elif value is not None:
+                    said = f"{said}\n{value}".strip()
+                if said:
+                    page.append(f"```text\n{said}\n```")
+        finally:
+            os.chdir(here)
+    page.append(f"*This page is what [the script]({name}.py) printed and drew when `render.py` ran it.*")
+    (HERE / f"{name}.md").write_text("\n\n".join(page) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    for chosen in sys.argv[1:] or NAMES:
+        render(chosen)

@@ -1,0 +1,99 @@
+"""The documentation: links and anchors lead somewhere, every page is on the site, tutorials are what ran."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+_FENCED = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
+# What is made small for the test; each must be there, so that a tutorial cannot drift away from it.
+SMALLER = {
+    "datasets": {"count=6, size_px=160": "count=2, size_px=128", "(16.8, 16.8)": "(13.6, 13.6)"},
+    "models": {
+        "count=8": "count=4",
+        # So few scans have no interval.
+        "scores.mae_datum_free_ci95_nm": "scores.mae_datum_free_ci95_nm or (0.0, 0.0)",
+        '("affine", "linear", "physics"), folds=2': '("affine", "linear"), folds=2',
+        '"physics", "run"': '"affine", "run"',
+    },
+    "optics": {
+        '"layout.size_px": 192, "optics.distance_um": 18, "search.iterations": 30': '"layout.size_px": 64, '
+        '"optics.distance_um": 12, "search.iterations": 2, "search.polish_rounds": 0, "window.yield_draws": 4'
+    },
+}
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors of a page's headings, as on GitHub and on the site."""
+    text = _FENCED.sub("", page.read_text("utf-8"))
+    found = set()
+    for title in re.findall(r"^#+ (.+)$", text, re.MULTILINE):
+        words = re.sub(r"\[([^\]]*)\]\([^)]*\)|[`*]", r"\1", title).strip().lower()
+        found.add(re.sub(r"[^\w\- ]", "", words).replace(" ", "-"))
+    return found
+
+
+def broken(page: Path) -> list[str]:
+    """Links of a page to a file or an anchor that is not there."""
+    found = []
+    for link in re.findall(r"\]\(([^)\s]+)\)", _FENCED.sub("", page.read_text("utf-8"))):
+        if re.match(r"https?:|mailto:", link):
+            continue
+        place, _, anchor = link.partition("#")
+        target = (page.parent / place) if place else page
+        if not target.exists() or (anchor and target.suffix == ".md" and anchor not in anchors(target)):
+            found.append(link)
+    return found
+
+
+def test_links_and_anchors_lead_somewhere():
+    assert {page.relative_to(ROOT).as_posix(): bad for page in PAGES if (bad := broken(page))} == {}
+
+
+def test_a_broken_link_and_a_wrong_anchor_are_found(tmp_path):
+    (tmp_path / "a.md").write_text(
+        "# One thing\n[x](a.md#one-thing) [y](a.md#other) [z](b.md) [w](#one-thing)"
+    )
+    assert broken(tmp_path / "a.md") == ["a.md#other", "b.md"]
+
+
+def test_every_page_is_on_the_site():
+    nav = (ROOT / "mkdocs.yml").read_text("utf-8").partition("\nnav:\n")[2]
+    named = re.findall(r": (\S+\.md)$", nav, re.MULTILINE)
+    written = {page.relative_to(DOCS).as_posix() for page in PAGES[1:]}
+    assert {name for name in named if not name.startswith("reference/")} == written
+    assert len(named) == len(set(named))
+
+
+@pytest.fixture(scope="module")
+def renderer():
+    spec = importlib.util.spec_from_file_location("render", DOCS / "tutorials" / "render.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("name", SMALLER)
+def test_a_tutorial_runs_and_its_page_shows_its_code(renderer, name, tmp_path, monkeypatch):
+    script = (DOCS / "tutorials" / f"{name}.py").read_text("utf-8")
+    cells = renderer.cells(script)
+    page = (DOCS / "tutorials" / f"{name}.md").read_text("utf-8")
+    shown = re.findall(r"^```python\n(.*?)\n```", page, re.MULTILINE | re.DOTALL)
+    assert shown == [text for kind, text in cells if kind == "code"]
+    assert all(text in page for kind, text in cells if kind == "markdown")
+    for words, smaller in SMALLER[name].items():
+        assert words in script
+        script = script.replace(words, smaller)
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    ran = [renderer.run_cell(text, names) for kind, text in renderer.cells(script) if kind == "code"]
+    # What the page shows below each cell is what the cell printed: as many lines, of other numbers.
+    outputs = re.findall(r"^```text\n(.*?)\n```", page, re.MULTILINE | re.DOTALL)
+    assert len(outputs) == len([said for said, _ in ran if said])
+    assert page.count("](" + name + "-") == len([value for _, value in ran if hasattr(value, "savefig")]) > 0
