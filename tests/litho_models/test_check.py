@@ -290,8 +290,10 @@ def test_the_page_quotes_the_committed_board():
         assert published(drift_alarm.PAGE, mark) == text
     for board in record["virtual"].values():
         unchanged = [one for one in board if not one["shift"]]
+        # So many alarms that an unchanged printer shows more in one board of a thousand.
+        most = stats.binom.isf(0.001, len(unchanged), record["rate"])
         for prints in map(str, drift_alarm.REFERENCES):
-            assert sum(bool(one["alarms"][prints]) for one in unchanged) <= 1
+            assert sum(bool(one["alarms"][prints]) for one in unchanged) <= most
 
 
 def test_the_gains_of_virtual_prints_are_those_planted():
