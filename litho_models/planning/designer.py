@@ -16,7 +16,7 @@ from litho_data.register.coarse import SEARCH_BLUR_PX
 from litho_data.register.orientation import rival_alignment
 from litho_data.register.topography import predicted_topography
 from litho_models.loop.result.questions import OpenQuestions
-from litho_models.planning.layouts import TILE_PX, Limits, climb, score, starts
+from litho_models.planning.layouts import NEAREST, TILE_PX, Limits, climb, score, starts
 from litho_models.planning.rivalry import Place, PlannedPrint, Rivalry, Way
 from litho_models.planning.ways import choose_ways
 
@@ -131,7 +131,8 @@ class Designer:
         refitted = rivalry.refitted([PlannedPrint(as_tensor(level), self.ways)])
         refit_s, clock = time.perf_counter() - clock, time.perf_counter()
         soft = as_tensor(level).requires_grad_()
-        rivalry.separations([PlannedPrint(soft, self.ways)], refitted).sum().backward()
+        nearest = range(min(NEAREST, len(rivalry.pairs)))
+        rivalry.separations([PlannedPrint(soft, self.ways)], refitted, nearest).sum().backward()
         step_s = time.perf_counter() - clock
         tile_s = self.steps * step_s + (1 + self.steps / 10) * refit_s
         area = (self.size_px / self.tile_px) ** 2

@@ -175,11 +175,19 @@ class Rivalry:
             parts = self._of_pairs(prints, partners)
         return [Contrast(*np.array([[float(x) for x in one] for one in part]).T) for part in parts]
 
-    def separations(self, prints: Sequence[PlannedPrint], refitted: Sequence[EffectChain]) -> Tensor:
-        """Distance of each directed pair in standard deviations, (pairs,); differentiable in the levels."""
+    def separations(
+        self,
+        prints: Sequence[PlannedPrint],
+        refitted: Sequence[EffectChain],
+        only: Sequence[int] | None = None,
+    ) -> Tensor:
+        """Distance of each directed pair, or ``only`` of these, in standard deviations, (pairs,).
+
+        Differentiable in the levels.
+        """
         spread = self.question.spread
         scores = []
-        for part in self._of_pairs(prints, refitted):
+        for part in self._of_pairs(prints, refitted, only):
             squares, sd, _ = zip(*part, strict=True)
             total = torch.stack(squares).sum()
             variance = (torch.stack(sd) ** 2 + (spread * torch.stack(squares)) ** 2).sum()
@@ -187,13 +195,17 @@ class Rivalry:
         return torch.stack(scores)
 
     def _of_pairs(
-        self, prints: Sequence[PlannedPrint], partners: Sequence[EffectChain]
+        self,
+        prints: Sequence[PlannedPrint],
+        partners: Sequence[EffectChain],
+        only: Sequence[int] | None = None,
     ) -> list[list[tuple[Tensor, Tensor, int]]]:
         """Per directed pair and print: squared distance, deviation by noise, pixels."""
-        true = [self._predict(chain, prints) for chain in self.chains]
+        wanted = range(len(self.pairs)) if only is None else only
+        firsts = {self.pairs[i][0] for i in wanted}
+        true = {first: self._predict(self.chains[first], prints) for first in firsts}
         return [
-            self._of_pair(true[pair[0]], self._predict(partner, prints), prints)
-            for pair, partner in zip(self.pairs, partners, strict=True)
+            self._of_pair(true[self.pairs[i][0]], self._predict(partners[i], prints), prints) for i in wanted
         ]
 
     def _of_pair(

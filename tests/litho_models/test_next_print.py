@@ -12,6 +12,7 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
+from benchmarks import two_rounds
 from litho_data.cards.card import load_card
 from litho_data.cards.tables import read_table
 from litho_data.foundation.errors import InputError
@@ -34,7 +35,7 @@ from litho_models.loop.run import _attributed, _new_scans
 from litho_models.loop.second_round import decide, with_decisions
 from litho_models.planning import power
 from litho_models.planning.layouts import Limits, climb, score, starts
-from litho_models.planning.record import NextPrint
+from litho_models.planning.record import NextPrint, PlannedQuestion
 from litho_models.planning.rivalry import PlannedPrint, Printing, Rivalry, Way
 from litho_models.planning.run import next_print
 from litho_models.scan_terms import Blocks
@@ -382,6 +383,30 @@ def test_new_prints_have_to_be_of_this_printer_and_turned_as_they_say(tmp_path: 
     store.__dict__["manifest"] = {"card": {"plan": {"dataset_sha256": "a" * 64}}}
     with pytest.raises(InputError, match="plan for dataset aaaaaaaaaaaa"):
         _new_scans(first, store)
+
+
+def test_what_is_planted_is_drawn_before_anything_is_run_and_judged_by_its_owner() -> None:
+    drawn = two_rounds.draws(24, 1)
+    assert drawn == two_rounds.draws(24, 1)
+    assert drawn != two_rounds.draws(24, 2)
+    assert all(12 <= one["rms_nm"] <= 30 for one in drawn)
+    assert {one["knob"] for one in drawn} == set(two_rounds.DEALT)
+    answer = {
+        "question": "slope-thinning",
+        "kind": "role",
+        "declared": ["slope-thinning", "slope-thinning" + IN_SCAN],
+        "verdict": "decided",
+        "evidence": "",
+        "prints": 4,
+        "scans": 8,
+    }
+    planned = PlannedQuestion.model_construct(power=[1.0] * 12, status="decides")
+    for left, right in (("slope-thinning", True), ("slope-thinning" + IN_SCAN, False)):
+        decision = Decision.model_validate({**answer, "left": [left]})
+        told = two_rounds.judged(decision, planned, "slope-thinning-x")
+        assert told["counts"]
+        assert told["right"] is right
+        assert told["wrong"] is not right
 
 
 def test_a_plan_is_printed_by_the_same_machine_with_new_chance() -> None:
