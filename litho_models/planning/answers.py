@@ -25,7 +25,7 @@ def of_rivals(
     question, spread = rivalry.question, rivalry.question.spread
     pairs = _pairs(rivalry, rivalry.contrasts(planned))
     control = _pairs(rivalry, rivalry.contrasts(random))
-    hardest = min(pairs, key=lambda pair: pair.power[prints - 1])
+    hardest = min(pairs, key=lambda pair: (pair.power[prints - 1], pair.difference_nm))
     names = [rival.name for rival in question.rivals]
     status = _status(hardest.power, prints)
     ways = "; ".join(f"{what}: {z:.1f}" for what, z in tried.items())
@@ -40,6 +40,7 @@ def of_rivals(
         rivals=names,
         pairs=pairs,
         difference_nm=hardest.difference_nm,
+        random_difference_nm=min(pair.difference_nm for pair in control),
         noise_nm=hardest.noise_nm,
         power=hardest.power,
         random_power=np.min([pair.power for pair in control], axis=0).tolist(),
@@ -83,7 +84,9 @@ def of_others(
     if question.kind == "generic" and question.turning is not None:
         turning = question.turning
         difference, noise = turning.rms_nm, turning.noise_nm
-        powers = [power.of_generic(question, n) for n in _COUNTS]
+        # Only the first print is scanned once more at the end.
+        shown = [n if turning.by == "turned scan" else 1 for n in _COUNTS]
+        powers = [power.of_generic(question, n) for n in shown]
         why = f"{turning.by}: as the printer's and as the microscope's it differs by {difference:.1f} nm rms"
         if difference < 0.1:
             why += "; turning a print does not show it: a second tip and a step standard do"
@@ -123,6 +126,7 @@ def of_others(
         rivals=[],
         pairs=[],
         difference_nm=difference,
+        random_difference_nm=difference,
         noise_nm=noise,
         power=powers,
         random_power=powers,

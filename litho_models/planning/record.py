@@ -40,7 +40,8 @@ class PlannedQuestion(Record):
     """An open question and what the plan makes of it.
 
     ``power``: probability of a right decision with 1, 2, 3, … prints; ``random_power``: with random layouts
-    and the same scans. ``prints_needed``: for a power of 0.95.
+    and the same scans, as ``random_difference_nm``, the smallest of any pair. ``prints_needed``: for a
+    power of 0.95.
     """
 
     name: str
@@ -51,6 +52,7 @@ class PlannedQuestion(Record):
     rivals: list[str]
     pairs: list[PlannedPair]
     difference_nm: float | None
+    random_difference_nm: float | None
     noise_nm: float | None
     power: list[float]
     random_power: list[float]
