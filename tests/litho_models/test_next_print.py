@@ -25,7 +25,7 @@ from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 from litho_models.effects import FieldContext, get_effect
 from litho_models.effects.chain import EffectChain
 from litho_models.frozen.files import save_frozen
-from litho_models.loop.parameters import get_vector
+from litho_models.loop.parameters import chain_at, get_vector
 from litho_models.loop.prepared import prepare_scans
 from litho_models.loop.residual_spectrum import NoiseSpectrum, residual_spectrum
 from litho_models.loop.result.exporting import part_of
@@ -44,6 +44,7 @@ from tests.litho_models.prints import write_store
 
 SLOPE = {"slope-thinning": {"along_x_um": 0.2, "along_y_um": 0.0}}
 NOISE_NM = 10.0
+DOCS = Path(__file__).parents[2] / "docs"
 TURNED = (Way(), Way(turned_deg=90))
 
 
@@ -220,6 +221,19 @@ def test_the_linearised_refit_comes_near_the_full_one(rivalry: Rivalry, limits: 
     assert one == pytest.approx(full, rel=0.1)
 
 
+def test_a_model_that_fades_to_nothing_explains_no_loss_on_slopes(rivalry: Rivalry, limits: Limits) -> None:
+    """Each scan's own gain is the refitted model's: a gain of the true print would explain all of it."""
+    prints = [PlannedPrint(torch.from_numpy(first_layout(limits).astype(np.float32)), (Way(),))]
+    chain = rivalry.chains[0]
+    slot = [name for name, _ in chain.base.named_parameters()].index("raw_gain")
+    faded = chain_at(chain, np.where(np.arange(len(get_vector(chain))) == slot, -12.0, get_vector(chain)))
+    found = rivalry.contrasts(prints, [faded] * len(rivalry.pairs))[0].rms_nm
+    with torch.no_grad():
+        heights = [rivalry.printing.predict(one, prints[0], Way()) for one in (chain, true_model({}))]
+    # Gain, registration, tilt and bow take some of what is lost on slopes, not two thirds of it.
+    assert found > 1e3 * float((heights[0] - heights[1]).std()) / 3
+
+
 def test_layouts_climb_and_stay_printable(rivalry: Rivalry, limits: Limits) -> None:
     start = first_layout(limits)
     soft = climb(rivalry, start, TURNED, limits, steps=10)
@@ -309,6 +323,18 @@ def test_nothing_open_and_no_questions_kept_are_said(tmp_path: Path) -> None:
     (loop / OpenQuestions.FILE_NAME).unlink()
     with pytest.raises(InputError, match=r"open_questions\.json"):
         next_print(loop, tmp_path / "plan")
+
+
+def test_the_page_quotes_the_plan_for_the_measured_prints() -> None:
+    plan = NextPrint.read(DOCS / "results" / "next-print")
+    page = (DOCS / "next_print.md").read_text(encoding="utf-8")
+    assert plan.questions
+    for question in plan.questions:
+        row = next(line for line in page.splitlines() if line.startswith(f"| {question.name} |"))
+        assert row.endswith(f"| {question.status} |")
+        if question.kind != "fact":
+            assert f"| {question.power[plan.prints - 1]:.2f} |" in row
+    assert plan.run.command in page
 
 
 # --- the second round
