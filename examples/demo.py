@@ -257,7 +257,7 @@ def write_index(out: Path, name: str, steps: list[Step], seconds: list[float]) -
     )
     page.heading("Reports")
     page.links([(os.path.relpath(s.report, out), s.title) for s in steps if s.report])
-    page.heading("What was run")
+    page.heading("What was run", folded=True)
     table = pd.DataFrame(
         {"step": [s.title for s in steps], "seconds": seconds, "command": [_spell(s.command) for s in steps]}
     )

@@ -34,12 +34,17 @@ def write_report(
     page = Page(
         f"What to print next: {plan.dataset.name}",
         f"{plan.prints} prints of {plan.field_um:g} µm in {len(plan.scans)} scans, three of them references.",
+        run=plan.run,
+        facts={"dataset": plan.dataset.sha256},
     )
     decided = [q for q in plan.questions if q.status == "decides"]
+    names = ": " + ", ".join(q.name for q in decided) if decided else ""
+    page.verdict(
+        f"These prints decide {len(decided)} of {len(plan.questions)} open questions with a power of "
+        f"{ENOUGH} or more{names}."
+    )
     page.tiles(
         [
-            (f"{len(plan.questions)}", "open questions"),
-            (f"{len(decided)}", f"decided with a power of {ENOUGH} or more"),
             (f"{plan.levels[0]} to {plan.levels[1]}", "levels used"),
             (f"{plan.smallest_feature_um:.2g} µm", "half a period of the finest structure"),
         ]
@@ -50,7 +55,7 @@ def write_report(
         _layouts_figure(levels, plan), "Levels of the first prints; tiles come in another order in each."
     )
     for question in plan.questions:
-        page.heading(f"{question.name}: {question.status}")
+        page.heading(f"{question.name}: {question.status}", folded=True)
         page.paragraph(f"{question.text}. {question.why}.")
         for outcome in question.outcomes:
             page.paragraph(f"– {outcome}.")
@@ -65,12 +70,10 @@ def write_report(
             page.figure(
                 _power_figure(question), "Probability of a right decision; grey: with random layouts."
             )
-    page.heading("Scans")
+    page.heading("Scans", folded=True)
     page.table(
         pd.DataFrame([scan.model_dump() for scan in plan.scans]), "In the order of scanning.", "order.csv"
     )
-    page.heading("How it was planned")
-    page.code(plan.run.command or "litho_models.planning.run.next_print")
     return page.write(folder)
 
 
