@@ -551,7 +551,7 @@ def test_a_store_without_references_has_the_floor_that_residuals_show(store, tmp
     with pytest.raises(InputError, match="neural-lithography"):
         stated_floor("neural-lithography", tmp_path / "out")
     page = (tmp_path / "out" / "report.html").read_text()
-    assert "upper-estimate" in page
+    assert f"At most {result.noise_floor.mae_nm:.2f} nm" in page
     assert "http://" not in page.replace("http://www.w3.org", "")
 
 
