@@ -22,6 +22,7 @@ from litho_data.virtual_fab.afm import scan_surface
 from litho_data.virtual_fab.geometry import place_scan
 from litho_data.virtual_fab.jobs import Plan, random_jobs
 from litho_data.virtual_fab.knobs import KnobBoard
+from litho_data.virtual_fab.printer import Job
 
 # The effects catalogue has 34 entries; this is the list that a truth file may name besides `off-catalogue`.
 CATALOGUE = {
@@ -203,7 +204,8 @@ class TestSignatures:
             (-(x_um**2 + y_um**2) / 8, -(x_um**2 + y_um**2) / (2 * (4 + radius_um))),
         )
         for surface, expected in cases:
-            found = scan_surface(surface, frame, Noise.off(), board, 0, np.random.default_rng(0))
+            job = Job("dome", np.zeros(frame.shape, np.uint8))
+            found = scan_surface(surface, frame, Noise.off(), board, job, np.random.default_rng(0))
             # Contact is searched on a grid of 0.01 µm per axis: (0.005 µm)²/2R short at most, twice.
             np.testing.assert_allclose(found[20:-20, 20:-20], expected[20:-20, 20:-20], atol=7e-5)
 
