@@ -22,7 +22,6 @@ from litho_data.virtual_fab.afm import scan_surface
 from litho_data.virtual_fab.geometry import place_scan
 from litho_data.virtual_fab.jobs import Plan, random_jobs
 from litho_data.virtual_fab.knobs import KnobBoard
-from litho_data.virtual_fab.printer import Job
 
 # The effects catalogue has 34 entries; this is the list that a truth file may name besides `off-catalogue`.
 CATALOGUE = {
