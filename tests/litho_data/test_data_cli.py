@@ -31,7 +31,7 @@ def test_the_commands_on_a_store(own_campaign: Path) -> None:
     store = str(own_campaign / "prints.zarr")
     verified = run.invoke(app, ["verify", store])
     assert verified.exit_code == 0, verified.output
-    assert "unchanged: 21 arrays, 15 steps, 6 raw files" in verified.output
+    assert "unchanged: 24 arrays, 18 steps, 6 raw files" in verified.output
     assert "from scans/P11.txt" in run.invoke(app, ["history", store, "P11"]).output
     replayed = run.invoke(app, ["replay", store, "P11", "--array", "height_um"])
     assert "largest difference 0, over 1 arrays" in replayed.output

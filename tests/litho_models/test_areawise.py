@@ -153,7 +153,7 @@ def test_a_frozen_pbl_prints_what_the_trained_one_does(tmp_path):
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.add_(0.03 * torch.randn_like(parameter))
-    layout = torch.randint(0, 13, (1, 1, 160, 170)) * 0.1
+    layout = torch.randint(0, 13, (1, 1, 230, 240)) * 0.1
     trained = model(layout)
     assert trained.grad_fn is not None
     frozen = load_frozen(save_frozen(model, tmp_path / "pbl"))
@@ -161,5 +161,5 @@ def test_a_frozen_pbl_prints_what_the_trained_one_does(tmp_path):
     reach = model.reach_px
     assert frozen.has_interior
     inside = frozen.interior(layout)
-    assert inside.shape == (1, 1, 160 - 2 * reach, 170 - 2 * reach)
+    assert inside.shape == (1, 1, 230 - 2 * reach, 240 - 2 * reach)
     assert torch.allclose(inside, trained.detach()[..., reach:-reach, reach:-reach], atol=1e-6)
