@@ -66,8 +66,8 @@ def texts(folder: Path) -> dict[str, str]:
     def found(file: str) -> dict[str, Any]:
         return json.loads((folder / file).read_text(encoding="utf-8"))
 
-    # The draws of the paper's split are of the PBL of that run.
-    first = in_one(found("benchmark.json"), found("benchmark_least_squares.json"))
+    # The draws of the paper's split are of the models of that run.
+    first = found("benchmark.json")
     networks = in_one(found("benchmark.json"), found("benchmark_pbl.json"))
     benchmark = in_one(networks, found("benchmark_least_squares.json"))
     return {
