@@ -69,12 +69,12 @@ def main() -> None:
 
 
 def measure(
-    knobs: tuple[str, ...], recipe: str, count: int, size_px: int, workers: int = 1
+    knobs: tuple[str, ...], recipe: str, count: int, size_px: int, workers: int = 1, seed: int = SEED
 ) -> dict[str, Any]:
     """Simulate, build, and compare errors with their uncertainty; nm where it says so."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        card = simulate(folder / "fab", count=count, size_px=size_px, seed=SEED, knobs=knobs)
+        card = simulate(folder / "fab", count=count, size_px=size_px, seed=seed, knobs=knobs)
         if recipe:
             card.with_name("recipe.toml").write_text(recipe, encoding="utf-8")
             card.write_text(card.read_text(encoding="utf-8") + _LEVEL, encoding="utf-8")
