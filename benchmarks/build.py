@@ -22,7 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.record import origin, publish, usable_cores, write_record
+from benchmarks.record import conclude, origin, usable_cores
 from litho_data.foundation.commands import run_script
 from litho_data.layouts import random_layout
 from litho_data.layouts.card_text import write_layout
@@ -79,10 +79,7 @@ def main() -> None:
         "generator": "blurred random layouts with white noise, .npy",
         "runs": runs,
     }
-    write_record(arguments.out, record)
-    print(as_markdown(record))
-    if arguments.publish:
-        publish(PAGE, NAME, as_markdown(record))
+    conclude(record, as_markdown(record), arguments.out, PAGE, NAME, published=arguments.publish)
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:

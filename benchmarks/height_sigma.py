@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.markdown_table import markdown_table
-from benchmarks.record import origin, publish, write_record
+from benchmarks.record import conclude, origin
 from litho_data.build.build import build_dataset
 from litho_data.foundation.commands import run_script
 from litho_data.store import open_store
@@ -62,10 +62,7 @@ def main() -> None:
             for what, (knobs, recipe) in CONDITIONS.items()
         ],
     }
-    write_record(arguments.out, record)
-    print(as_markdown(record))
-    if arguments.publish:
-        publish(PAGE, NAME, as_markdown(record))
+    conclude(record, as_markdown(record), arguments.out, PAGE, NAME, published=arguments.publish)
 
 
 def measure(

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.record import origin, publish, usable_cores, write_record
+from benchmarks.record import conclude, origin, usable_cores
 from litho_data.foundation.commands import run_script
 from litho_data.level import (
     align_rows,
@@ -75,10 +75,7 @@ def main() -> None:
         "goal": GOAL,
         "methods": measure(height_um, arguments.repeats),
     }
-    write_record(arguments.out, record)
-    print(as_markdown(record))
-    if arguments.publish:
-        publish(PAGE, NAME, as_markdown(record))
+    conclude(record, as_markdown(record), arguments.out, PAGE, NAME, published=arguments.publish)
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:

@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.record import origin, publish, write_record
+from benchmarks.record import conclude, origin, write_record
 from litho_data.foundation.commands import run_script
 from litho_data.layouts import random_layout
 from litho_data.store import PrintedScan
@@ -66,10 +66,7 @@ def main() -> None:
         **origin(),
         "stores": _run_all(arguments.cache, arguments.stores, arguments.workers),
     }
-    write_record(arguments.out, record)
-    print(as_markdown(record))
-    if arguments.publish:
-        publish(PAGE, NAME, as_markdown(record))
+    conclude(record, as_markdown(record), arguments.out, PAGE, NAME, published=arguments.publish)
 
 
 def calibrate_one(seed: int) -> dict[str, Any]:

@@ -23,7 +23,7 @@ import numpy as np
 
 from benchmarks.build import cost_of
 from benchmarks.markdown_table import markdown_table
-from benchmarks.record import origin, publish, write_record
+from benchmarks.record import conclude, origin, write_record
 from litho_data.foundation.commands import progress, run_script
 from litho_data.foundation.errors import InputError
 from litho_data.readers import list_channels, read_scan
@@ -84,10 +84,7 @@ def main() -> None:
         "damaged_header": damaged_header(folder / DAMAGED),
         "bodies": bodies_within_limits(arguments.bodies),
     }
-    write_record(arguments.out, record)
-    print(as_markdown(record))
-    if arguments.publish:
-        publish(PAGE, NAME, as_markdown(record))
+    conclude(record, as_markdown(record), arguments.out, PAGE, NAME, published=arguments.publish)
 
 
 def file_row(path: Path, folder: Path) -> dict[str, Any]:

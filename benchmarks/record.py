@@ -32,6 +32,20 @@ def write_record(path: Path, record: Mapping[str, Any]) -> None:
         temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 
 
+def conclude(
+    record: Mapping[str, Any], text: str, out: Path, page: Path, name: str, *, published: bool
+) -> None:
+    """End a benchmark: write its record to ``out``, print its text, and put that into its page if wanted.
+
+    Raises:
+        InputError: as ``publish``.
+    """
+    write_record(out, record)
+    print(text)
+    if published:
+        publish(page, name, text)
+
+
 def publish(page: Path, name: str, text: str) -> None:
     """Put a text between the two marks of that name in a Markdown page.
 

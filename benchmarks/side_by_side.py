@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.record import origin, publish, usable_cores, write_record
+from benchmarks.record import conclude, origin, usable_cores
 from litho_models.frozen import zoo
 
 PAGE = Path(__file__).parents[1] / "docs" / "speed.md"
@@ -108,10 +108,7 @@ def run(
         "peak_gflops": peaks,
         "sides": rows,
     }
-    write_record(arguments.out, record)
-    print(as_markdown(record))
-    if arguments.publish:
-        publish(PAGE, name, as_markdown(record))
+    conclude(record, as_markdown(record), arguments.out, PAGE, name, published=arguments.publish)
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:

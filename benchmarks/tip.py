@@ -18,7 +18,7 @@ import numpy as np
 import scipy.ndimage
 
 from benchmarks.markdown_table import markdown_table
-from benchmarks.record import origin, publish, write_record
+from benchmarks.record import conclude, origin
 from litho_data.foundation.commands import progress, run_script
 from litho_data.scan import Scan
 from litho_data.tip import estimate_tip, tip_certain
@@ -56,10 +56,7 @@ def main() -> None:
         "size_px": SIZE_PX,
         "cases": [row for case in progress(cases, "tips") for row in measure(*case, arguments.seeds)],
     }
-    write_record(arguments.out, record)
-    print(as_markdown(record))
-    if arguments.publish:
-        publish(PAGE, NAME, as_markdown(record))
+    conclude(record, as_markdown(record), arguments.out, PAGE, NAME, published=arguments.publish)
 
 
 def measure(kind: str, radius_um: float, height_um: float, seeds: int) -> list[dict[str, Any]]:

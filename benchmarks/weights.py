@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.markdown_table import markdown_table
-from benchmarks.record import origin, publish, write_record
+from benchmarks.record import conclude, origin
 from litho_data.foundation.commands import run_script
 from litho_models.evaluation.compare import compare
 from litho_models.evaluation.results import Benchmark
@@ -47,10 +47,7 @@ def main() -> None:
         "folds": results[0].split.folds,
         "models": json.loads(table.to_json(orient="records")),
     }
-    write_record(arguments.out, record)
-    print(as_markdown(record))
-    if arguments.publish:
-        publish(PAGE, NAME, as_markdown(record))
+    conclude(record, as_markdown(record), arguments.out, PAGE, NAME, published=arguments.publish)
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
