@@ -18,6 +18,7 @@ from torch.utils.checkpoint import checkpoint
 
 from litho_models.layers.gaussian import kernel_radius_px
 from litho_models.models.affine_mtf import blurred_interior
+from litho_models.models.features import neighbours
 from litho_models.simulator import crop_border
 
 # Change over σ, relative to the highest level, below which the length of a slope is rounded off, so that it
@@ -143,7 +144,7 @@ class Surroundings(FeatureNetwork):
         for step in steps:
             around = crop_border(sharp, steps[-1] - step)
             here = crop_border(around, step)
-            sides = _sides(around, step, -2) + _sides(around, step, -1)
+            sides = neighbours(around, step)
             found.append(sum(sides[1:], sides[0]))
             found.append(sum(((side - here).abs() for side in sides), torch.zeros_like(here)))
             found.append((sides[1] - sides[0]).abs() + (sides[3] - sides[2]).abs())
@@ -154,7 +155,7 @@ class Surroundings(FeatureNetwork):
 
     def _slope(self, height: Tensor, sigma_um: float) -> tuple[Tensor, Tensor]:
         """Length of the slope over σ and curvature over σ²; from a height with a margin of 1 px."""
-        (up, down), (left, right) = _sides(height, 1, -2), _sides(height, 1, -1)
+        up, down, left, right = neighbours(height, 1)
         per_px = sigma_um / self.pitch_um
         y, x = (down - up) * (per_px / 2), (right - left) * (per_px / 2)
         curvature = (up + down + left + right - 4 * crop_border(height, 1)) * per_px**2
@@ -188,7 +189,7 @@ class ScanAxis(FeatureNetwork):
             slope, curved = self._slope(self._blurred(field, sigma, margin_px=1), sigma)
             found += [slope, slope.abs(), curved]
         for step in self._steps_px():
-            left, right = _sides(crop_border(field, reach - step), step, -1)
+            _, _, left, right = neighbours(crop_border(field, reach - step), step)
             before, after = left - here, right - here
             found += [before, after, before.abs(), after.abs(), (right - left).abs()]
         margin = self._radius(config.steep_um)
@@ -198,13 +199,6 @@ class ScanAxis(FeatureNetwork):
 
     def _slope(self, height: Tensor, sigma_um: float) -> tuple[Tensor, Tensor]:
         """Slope over σ and curvature over σ², both along x; from a height with a margin of 1 px."""
-        left, right = _sides(height, 1, -1)
+        _, _, left, right = neighbours(height, 1)
         per_px = sigma_um / self.pitch_um
         return (right - left) * (per_px / 2), (left + right - 2 * crop_border(height, 1)) * per_px**2
-
-
-def _sides(field: Tensor, step: int, axis: int) -> tuple[Tensor, Tensor]:
-    """Pixels ``step`` before and after along an axis, of those farther than ``step`` from the edge."""
-    inner = field.narrow(-3 - axis, step, field.shape[-3 - axis] - 2 * step)
-    length = field.shape[axis] - 2 * step
-    return inner.narrow(axis, 0, length), inner.narrow(axis, 2 * step, length)

@@ -90,7 +90,7 @@ class Features(Simulator):
     def _slopes(self, height: Tensor) -> list[Tensor]:
         """Height, slopes, their sizes and second derivatives, per µm; from a height with a margin of 1 px."""
         pitch, inner = self.pitch_um, crop_border(height, 1)
-        up, down, left, right = _neighbours(height, 1)
+        up, down, left, right = neighbours(height, 1)
         y, x = (down - up) / (2 * pitch), (right - left) / (2 * pitch)
         corners = height[..., 2:, 2:] + height[..., :-2, :-2] - height[..., 2:, :-2] - height[..., :-2, 2:]
         curved = [up + down - 2 * inner, left + right - 2 * inner, corners / 4]
@@ -102,7 +102,7 @@ class Features(Simulator):
         sharp = self._blurred(layout, self.config.shift_sigma_um, margin_px=steps[-1])
         here = crop_border(sharp, steps[-1])
         for step in steps:
-            up, down, left, right = _neighbours(crop_border(sharp, steps[-1] - step), step)
+            up, down, left, right = neighbours(crop_border(sharp, steps[-1] - step), step)
             found += [up, down, left, right]
             for before, after in ((up, down), (left, right)):
                 found += [(before - here).abs(), (after - here).abs(), (after - before).abs()]
@@ -119,7 +119,7 @@ class Features(Simulator):
         widths, found = self.config.steep_widths_um, []
         margin = self._widest(widths)
         for sigma in self.config.steep_sigmas_um:
-            up, down, left, right = _neighbours(self._blurred(layout, sigma, margin_px=margin + 1), 1)
+            up, down, left, right = neighbours(self._blurred(layout, sigma, margin_px=margin + 1), 1)
             for slope in (
                 (down - up) * (sigma / self.pitch_um / 2),
                 (right - left) * (sigma / self.pitch_um / 2),
@@ -220,7 +220,7 @@ def _weighted(weights: Tensor, features: Sequence[Tensor]) -> Tensor:
     return height
 
 
-def _neighbours(field: Tensor, step: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def neighbours(field: Tensor, step: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Pixels ``step`` above, below, left and right of those farther than ``step`` from the edge."""
     inner, far, near = slice(step, -step), slice(2 * step, None), slice(None, -2 * step)
     return field[..., near, inner], field[..., far, inner], field[..., inner, near], field[..., inner, far]
