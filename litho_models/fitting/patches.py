@@ -63,6 +63,7 @@ class PatchDataset(Dataset[Patch]):
     ):
         opened = store if isinstance(store, Store) else open_store(store)
         self._scans = _chosen(opened, ids)
+        self._layouts_um = [scan.layout_um for scan in self._scans]
         smallest = min(min(scan.shape) for scan in self._scans)
         if not 1 <= size_px <= smallest:
             raise InputError("size_px of a patch", got=size_px, wanted=f"1 to {smallest}, the smallest scan")
@@ -94,11 +95,12 @@ class PatchDataset(Dataset[Patch]):
         along_y, along_x = (bool(drawn) for drawn in random.integers(2, size=2))
         flip = (along_y and self.flips in ("y", "both"), along_x and self.flips in ("x", "both"))
         window = Window(number, y, x, self.size_px, flip)
-        valid = scan.valid & np.isfinite(scan.height_um)
+        height_um = cut(scan.height_um, window)
+        valid = cut(scan.valid, window) & np.isfinite(height_um)
         return Patch(
-            layout_um=_tensor(cut(scan.layout_um, window, self.margin_px), np.float32),
-            height_um=_tensor(cut(np.where(valid, scan.height_um, 0), window), np.float32),
-            valid=_tensor(cut(valid, window), bool),
+            layout_um=_tensor(cut(self._layouts_um[number], window, self.margin_px), np.float32),
+            height_um=_tensor(np.where(valid, height_um, 0), np.float32),
+            valid=_tensor(valid, bool),
             scan=scan.id,
             y_px=y,
             x_px=x,

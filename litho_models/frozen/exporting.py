@@ -63,7 +63,7 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int | tuple[i
             file = temporary.with_suffix(target.suffix)
             try:
                 write = _write_pt2 if target.suffix == ".pt2" else _write_onnx
-                printed = write(program, file, layouts[1], facts, model.name)
+                printed = write(program, file, layouts[1], facts)
                 file.replace(temporary)
             finally:
                 file.unlink(missing_ok=True)
@@ -148,16 +148,12 @@ class _Program(nn.Module):
         return self.traced(layout_um)
 
 
-def _write_pt2(
-    program: ExportedProgram, file: Path, layout_um: Tensor, facts: dict[str, Any], name: str
-) -> Tensor:
+def _write_pt2(program: ExportedProgram, file: Path, layout_um: Tensor, facts: dict[str, Any]) -> Tensor:
     torch.export.save(program, file, extra_files={"card.json": json.dumps(facts)})
     return torch.export.load(file).module()(layout_um)
 
 
-def _write_onnx(
-    program: ExportedProgram, file: Path, layout_um: Tensor, facts: dict[str, Any], name: str
-) -> Tensor:
+def _write_onnx(program: ExportedProgram, file: Path, layout_um: Tensor, facts: dict[str, Any]) -> Tensor:
     try:
         import onnxruntime
         import onnxscript  # noqa: F401
@@ -171,7 +167,7 @@ def _write_onnx(
         except torch.onnx.errors.OnnxExporterError as error:
             complex_numbers = "complex" in str(error)
             raise InputError(
-                f"model {name} to export to ONNX",
+                f"model {facts['name']} to export to ONNX",
                 got="complex numbers, which its operators do not have"
                 if complex_numbers
                 else type(error).__name__,
