@@ -41,6 +41,10 @@ SpreadOf = Annotated[
         "scans left out."
     ),
 ]
+RoughnessOf = Annotated[
+    Path | None,
+    typer.Option(help="noise.json of litho-models noise: the surface of a print is as rough as measured."),
+]
 Ensemble = Annotated[
     list[str] | None, typer.Option(help="NAME=MODEL of a further model in the loss; may be repeated.")
 ]
@@ -90,12 +94,13 @@ def hoe(
         ),
     ] = None,
     spread_of: SpreadOf = None,
+    roughness_of: RoughnessOf = None,
     ensemble: Ensemble = None,
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
     """Design a holographic element; an interrupted run in OUT is continued."""
-    settings = _settings(given, _hologram, "hoe", spread_of)
+    settings = _settings(given, _hologram, "hoe", spread_of, roughness_of)
     if front is not None:
         _front(front, target, model, out, settings, ensemble or (), device, extrapolate)
         return
@@ -118,12 +123,13 @@ def correct(
     out: Out,
     given: Given,
     spread_of: SpreadOf = None,
+    roughness_of: RoughnessOf = None,
     ensemble: Ensemble = None,
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
     """Find the layout whose print is the wanted relief; an interrupted run in OUT is continued."""
-    settings = _settings(given, _relief, "correct", spread_of)
+    settings = _settings(given, _relief, "correct", spread_of, roughness_of)
     from litho_design.workflows.design import correct as correct_relief
 
     design = correct_relief(
@@ -140,12 +146,13 @@ def lens(
     objects: Objects = None,
     held_out_objects: HeldOutObjects = None,
     spread_of: SpreadOf = None,
+    roughness_of: RoughnessOf = None,
     ensemble: Ensemble = None,
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
     """Design a multi-level diffractive lens; an interrupted run in OUT is continued."""
-    settings = _settings(given, _lens, "lens", spread_of)
+    settings = _settings(given, _lens, "lens", spread_of, roughness_of)
     from litho_design.workflows.design import design_lens
 
     design = design_lens(
@@ -175,6 +182,7 @@ def compare(
     objects: Objects = None,
     held_out_objects: HeldOutObjects = None,
     spread_of: SpreadOf = None,
+    roughness_of: RoughnessOf = None,
     seeds: Annotated[int, typer.Option(help="Number of seeds: 0, 1, 2 …")] = 3,
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
@@ -182,10 +190,10 @@ def compare(
     """Design with every arm, print with every judge: the design-to-manufacturing gap."""
     settings: Any
     if task == "hoe":
-        settings = _settings(given, _hologram, task, spread_of)
+        settings = _settings(given, _hologram, task, spread_of, roughness_of)
     else:
         kind = {"task": task.removeprefix("lens-")}
-        settings = _settings(given, lambda changes: _lens({**changes, **kind}), task, spread_of)
+        settings = _settings(given, lambda changes: _lens({**changes, **kind}), task, spread_of, roughness_of)
     from litho_design.judging.gap import headline
     from litho_design.workflows.compare import compare as run_comparison
 
@@ -224,17 +232,27 @@ def _lens(changes: Mapping[str, Any]) -> LensSettings:
 
 
 def _settings(
-    given: Given, make: Callable[[Mapping[str, Any]], S], task: str, spread_of: Path | None = None
+    given: Given,
+    make: Callable[[Mapping[str, Any]], S],
+    task: str,
+    spread_of: Path | None = None,
+    roughness_of: Path | None = None,
 ) -> S:
     """The preset, then the settings file, the measured spreads and the command line, each over the last."""
     made = make(given.over(make({}), task))
-    if spread_of is None:
-        return made
-    from litho_data.store import open_store
-    from litho_design.optimisation.process_window import measured_window
+    window = made.window
+    if spread_of is not None:
+        from litho_data.store import open_store
+        from litho_design.optimisation.process_window import measured_window
 
-    measured = made.model_copy(update={"window": measured_window(open_store(spread_of), made.window)})
-    return changed(measured, given.options)
+        window = measured_window(open_store(spread_of), window)
+    if roughness_of is not None:
+        from litho_design.optimisation.roughness import measured_roughness
+
+        rough = measured_roughness(roughness_of, made.layout.level_height_um)
+        window = window.model_copy(update={"roughness": rough})
+    measured = made.model_copy(update={"window": window})
+    return measured if window is made.window else changed(measured, given.options)
 
 
 def _front(

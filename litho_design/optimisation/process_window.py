@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -14,12 +14,14 @@ from litho_data.foundation.grid import PixelGrid
 from litho_data.foundation.results import Record
 from litho_data.foundation.settings import leaves, setting
 from litho_design.optics import Optics, sampling_limit_um
+from litho_design.optimisation.roughness import Roughness
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 _NARROWEST_BLUR_PX = 0.2
-_UNSEEN_STREAM = 1
+_UNSEEN_STREAM, _SURFACE_STREAM = 1, 2
+_SMOOTH = Roughness()
 # Figures that are better when lower.
 _ERRORS = ("loss", "mae_", "rms_", "rmse_", "p95_", "speckle_", "fwhm_")
 
@@ -44,6 +46,7 @@ class ProcessWindow(Record):
     wavelength_sd_um: float = setting(
         0.0, "Spread of the wavelength", unit="µm", option="--wavelength-sd-um", ge=0
     )
+    roughness: Roughness = setting(_SMOOTH, "Surface of a print")
     samples: int = setting(
         0,
         "Draws of the process window in the loss; 0 designs for the print as modelled",
@@ -70,9 +73,17 @@ class ProcessWindow(Record):
 def spreads(window: ProcessWindow) -> list[str]:
     """Every spread of a window with its value and unit, for reports."""
     found = [leaf for leaf in leaves(window) if leaf.help.startswith("Spread of the ")]
-    return [
-        f"{leaf.help.removeprefix('Spread of the ')} {leaf.value:g} {leaf.unit}".strip() for leaf in found
-    ]
+    told = []
+    for leaf in found:
+        values = leaf.value if isinstance(leaf.value, tuple) else (leaf.value,)
+        if values:
+            told.append(f"{leaf.help.removeprefix('Spread of the ')} {_range(values)} {leaf.unit}".strip())
+    return told
+
+
+def _range(values: Sequence[float]) -> str:
+    low, high = min(values), max(values)
+    return f"{low:g}" if low == high else f"{low:.3g} to {high:.3g}"
 
 
 @dataclass(frozen=True)
@@ -83,17 +94,28 @@ class Draw:
     offset_um: float
     blur_um: float
     optics: Optics
+    roughness: Roughness = _SMOOTH
+    surface_seed: tuple[int, ...] = ()
+    _surfaces: dict[tuple[int, ...], Tensor] = field(default_factory=dict, compare=False, repr=False)
 
     def apply(self, height_um: Tensor, pitch_um: float) -> Tensor:
         """Printed height of this draw, µm, of a map (size, size) or of rings (n,) from the centre.
 
         A uniform offset changes no image, only the scores of heights.
         Rings are blurred along the radius only, which is exact where they are much wider than the blur
-        or far from the centre.
+        or far from the centre. A rough surface, of maps only, is laid on the blurred print.
         """
         changed = height_um * self.gain + self.offset_um
         sigma_px = self.blur_um / pitch_um
-        return changed if sigma_px < _NARROWEST_BLUR_PX else _blur(changed, sigma_px)
+        if sigma_px >= _NARROWEST_BLUR_PX:
+            changed = _blur(changed, sigma_px)
+        if not self.roughness.sigma_um:
+            return changed
+        shape = tuple(height_um.shape)
+        if shape not in self._surfaces:
+            seed = list(self.surface_seed)
+            self._surfaces[shape] = self.roughness.unit_surface(shape, pitch_um, seed).to(height_um.device)
+        return changed + self.roughness.surface_um(height_um, self._surfaces[shape])
 
 
 def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = False) -> list[Draw]:
@@ -104,6 +126,7 @@ def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = F
     shared = window.gain_offset_correlation
     seed = [window.seed, _UNSEEN_STREAM] if unseen else window.seed
     # Five numbers a draw: a further spread needs a stream of its own, or all older draws change.
+    stream = (window.seed, _SURFACE_STREAM, int(unseen))
     normal = np.random.default_rng(seed).standard_normal((count, 5)).tolist()
     return [
         Draw(
@@ -113,8 +136,10 @@ def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = F
             optics=optics.at_wavelength(
                 optics.wavelength_um + window.wavelength_sd_um * wavelength
             ).model_copy(update={"distance_um": optics.distance_um + window.defocus_sd_um * defocus}),
+            roughness=window.roughness,
+            surface_seed=(*stream, number),
         )
-        for gain, offset, blur, defocus, wavelength in normal
+        for number, (gain, offset, blur, defocus, wavelength) in enumerate(normal)
     ]
 
 

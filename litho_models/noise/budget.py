@@ -22,6 +22,7 @@ from litho_models.scoring.statistics import pixel_interval
 
 FLAT_SHARE = 0.25
 _FEWEST_PIXELS = 1000
+_FARTHEST_PX = 40
 
 
 class FlatLevel(Record):
@@ -42,6 +43,7 @@ class NoiseBudget(Record):
 
     ``flat_levels`` are of the pixels whose layout slope is at most ``flat_slope``, the flattest quarter.
     ``flat_texture`` is of the same pixels of all scans, freed of policy ``full``: lines are left in.
+    ``flat_length_um`` (y, x): distance over which the correlation of these falls to 1/e; None in older files.
     """
 
     model: str
@@ -49,6 +51,7 @@ class NoiseBudget(Record):
     flat_slope: float
     flat_levels: list[FlatLevel]
     flat_texture: Texture | None = None
+    flat_length_um: tuple[float, float] | None = None
 
 
 def noise_budget(found: Residuals, seed: int = 0) -> NoiseBudget:
@@ -82,21 +85,41 @@ def noise_budget(found: Residuals, seed: int = 0) -> NoiseBudget:
                 mae_nm=float(sizes[mine].mean()),
             )
         )
+    flats = _flat_residuals(found, slopes, limit)
+    pitch_um = found.scans[0].pitch_um
+    small = min(min(flat.shape) for flat in flats) < FEWEST_LINES
     return NoiseBudget(
         model=found.model,
-        flat_texture=_flat_texture(found, slopes, limit),
+        flat_texture=None if small else texture(f"residuals of {found.model}", flats, pitch_um),
+        flat_length_um=(_length_um(flats, pitch_um, 0), _length_um(flats, pitch_um, 1)),
         floor=estimated_floor(found.model, found.scans, found.maps_um, blocks, seed),
         flat_slope=limit,
         flat_levels=rows,
     )
 
 
-def _flat_texture(found: Residuals, slopes: Sequence[np.ndarray], limit: float) -> Texture | None:
-    """Texture of the residuals where the layout is flat, in its frame; None for small fields."""
+def _flat_residuals(found: Residuals, slopes: Sequence[np.ndarray], limit: float) -> list[np.ndarray]:
+    """What policy ``full`` leaves where the layout is flat, in its frame, µm; NaN elsewhere."""
     flats = []
     for scan, expected, slope in zip(found.scans, found.maps_um, slopes, strict=True):
-        if min(scan.shape) < FEWEST_LINES:
-            return None
         fit = cross_fit(scan.height_um, expected, scan.valid, POLICIES["full"], found.protocol.blocks)
         flats.append(np.where(slope <= limit, fit.residual_um, np.nan))
-    return texture(f"residuals of {found.model}", flats, found.scans[0].pitch_um)
+    return flats
+
+
+def _length_um(maps_um: Sequence[np.ndarray], pitch_um: float, axis: int) -> float:
+    """Distance along an axis over which the correlation of maps with gaps falls to 1/e, at most 40 px."""
+    correlation = [1.0]
+    while correlation[-1] > np.exp(-1) and len(correlation) <= _FARTHEST_PX:
+        lag = len(correlation)
+        products = variances = 0.0
+        for one in maps_um:
+            rows = np.moveaxis(one, axis, 0)
+            both = rows[lag:] * rows[:-lag]
+            products += float(np.nanmean(both))
+            variances += float(np.nanmean(one**2))
+        correlation.append(products / variances)
+    before, after = correlation[-2:]
+    if after > np.exp(-1):
+        return pitch_um * _FARTHEST_PX
+    return float(pitch_um * (len(correlation) - 2 + (before - np.exp(-1)) / (before - after)))

@@ -278,6 +278,11 @@ def _budget(page: Page, found: NoiseBudget) -> None:
         "flat_levels.csv",
         words=COLUMNS,
     )
+    if found.flat_length_um is not None:
+        y_um, x_um = found.flat_length_um
+        page.paragraph(
+            f"There heights hang together over {y_um:.2f} µm along y and {x_um:.2f} µm along x (to 1/e)."
+        )
     if found.flat_texture is not None:
         _texture(page, found.flat_texture)
 

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.integrate import quad
+from scipy.signal import lfilter
 from scipy.stats import norm
 from scipy.stats import t as student
 
@@ -434,6 +435,21 @@ def test_flat_places_show_the_roughness_of_their_level(random):
     for row in found.flat_levels:
         # A thousand pixels know σ to 2 %; terms from the other half add to it.
         assert row.sigma_nm == pytest.approx(10 + 2 * row.level, rel=0.08)
+    # White noise falls to nothing in one pixel of 0.1 µm, a straight line from 1 to 0: 1/e after 0.063.
+    assert found.flat_length_um == pytest.approx((0.0632, 0.0632), rel=0.05)
+
+
+def test_the_roughness_of_flat_places_hangs_together_as_far_as_it_was_made_to(random):
+    scans = []
+    for scan in make_scans(7, size_px=256, noise_um=0.0):
+        surface = random.normal(0, 0.02, scan.shape)
+        for axis, kept in enumerate((np.exp(-0.1 / 0.3), np.exp(-0.1 / 0.6))):
+            surface = lfilter([np.sqrt(1 - kept**2)], [1, -kept], surface, axis=axis)
+        scans.append(replace(scan, height_um=(scan.height_um + surface).astype(np.float32)))
+    found = noise_budget(Residuals("made", scans, heights_um(scans), [], None, 1, True))
+    # 7 · 256² / 4 pixels over 7 · 13 that hang together: 1,260 heights, 3 % of a correlation of 0.37, so 8 %;
+    # terms of the scans take some of the long waves.
+    assert found.flat_length_um == pytest.approx((0.3, 0.6), rel=0.15)
 
 
 # --- σ(x) and its calibration -------------------------------------------------------------------
