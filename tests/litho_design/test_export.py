@@ -152,7 +152,7 @@ def test_stl_is_closed_upright_and_has_the_volume_of_its_columns(tmp_path):
     levels = np.kron(LETTER * 3, np.ones((2, 2), np.uint8)) + np.arange(8, dtype=np.uint8) % 3
     write_stl(tmp_path / "f.stl", levels, 0.4, 0.1, 1.0)
     triangles = read_stl_triangles(tmp_path / "f.stl").astype(np.float64)
-    # Flanks lie half on either side of a change: only the corners, 4e-4 of a cell, differ.
+    # One corner of two columns that touch along an edge stands 1/128 of a cell aside.
     assert _volume(triangles) == pytest.approx((1.0 + 0.1 * levels).sum() * 0.16, rel=1e-4)
     # 8 x 10 cells of 0.4 µm, to 1e-9 m.
     assert triangles.reshape(-1, 3).min(0) == pytest.approx((0, 0, 0), abs=1e-3)
@@ -162,6 +162,24 @@ def test_stl_is_closed_upright_and_has_the_volume_of_its_columns(tmp_path):
     assert high[..., 1].max() == pytest.approx(4.0)
     with pytest.raises(InputError, match="pedestal"):
         write_stl(tmp_path / "g.stl", levels, 0.4, 0.1, 0.0)
+
+
+def test_stl_has_no_more_triangles_than_its_corners_need(tmp_path):
+    def triangles(levels):
+        return write_stl(tmp_path / "f.stl", np.array(levels, np.uint8), 0.4, 0.1, 1.0)
+
+    # A closed surface of V corners has 2 V - 4 triangles. A staircase of n steps has 2 n + 2 on either side.
+    for steps in (1, 2, 7):
+        assert triangles([range(steps)] * 5) == 2 * (4 * steps + 4) - 4
+    # A frame around a pit, and a pillar in the pit: three times eight corners but for one lid and one floor.
+    assert triangles(np.pad([[0]], 1, constant_values=1)) == 2 * 16 - 4
+    assert triangles(np.pad(np.pad([[2]], 1), 1, constant_values=1)) == 2 * 24 - 4
+    # Columns that touch along an edge: eight corners of them, seven of the floor between, four below.
+    for other in (1, 2):
+        assert triangles([[1, 0], [0, other]]) == 2 * 19 - 4
+    # Finer cells of the same relief are the same solid.
+    levels = np.random.default_rng(0).integers(0, 4, (9, 7))
+    assert triangles(levels) == triangles(np.kron(levels, np.ones((2, 3), int)))
 
 
 @pytest.mark.parametrize("seed", range(20))
