@@ -101,16 +101,14 @@ def at_resolution(target: Tensor, grid: PixelGrid, optics: Optics) -> Tensor:
     It is blurred by the focus of a square aperture, sinc^2(2 NA x / wavelength) along both axes, with the
     NA from the axis to the edge; dark beyond the window.
     """
-    blurred = target
-    for axis in (0, 1):
-        size_um, pitch_um, count = grid.size_um[axis], grid.pitch_um[axis], grid.shape[axis]
+    blurs = []
+    for size_um, pitch_um, count in zip(grid.size_um, grid.pitch_um, grid.shape, strict=True):
         aperture = size_um / 2 / math.hypot(size_um / 2, optics.distance_um)
         x = torch.arange(1 - count, count, dtype=target.dtype, device=target.device) * pitch_um
         focus = torch.sinc(2 * aperture * x / optics.wavelength_um).square()
-        rows = blurred.movedim(axis, -1)[:, None]
-        seen = torch.nn.functional.conv1d(rows, (focus / focus.sum())[None, None], padding=count - 1)
-        blurred = seen[:, 0].movedim(-1, axis)
-    return blurred
+        # Row i holds what pixel i sees of every other: two products of matrices instead of long convolutions.
+        blurs.append((focus / focus.sum()).unfold(0, count, 1).flip(1))
+    return blurs[0] @ target @ blurs[1].T
 
 
 def zero_order_share(element: Tensor) -> float:
