@@ -433,6 +433,12 @@ def test_what_is_planted_is_drawn_before_anything_is_run_and_judged_by_its_owner
         assert told["counts"]
         assert told["right"] is right
         assert told["wrong"] is not right
+    # A name that was not planted is wrong where names were asked for, and a role of it is nobody's.
+    other = Decision.model_validate({**answer, "declared": ["a", "b"], "left": ["a"]})
+    for kind, wrong in (("set", True), ("suspects", True), ("role", False)):
+        told = two_rounds.judged(other.model_copy(update={"kind": kind}), planned, "slope-thinning-x")
+        assert not told["counts"]
+        assert told["wrong"] is wrong
 
 
 def test_a_plan_is_printed_by_the_same_machine_with_new_chance() -> None:
