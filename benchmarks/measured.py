@@ -73,7 +73,7 @@ def texts(folder: Path) -> dict[str, str]:
     return {
         "headline": headline_table(benchmark, found("noise.json")),
         "equal freedom": equal_freedom_table(
-            [found(f"close_loop{suffix}.json") for suffix in ("", *(f"_{b}" for b in SMALL_BASES))]
+            [found(f"close_loop{suffix}.json") for suffix in ("", *(f"_{b}" for b in (*SMALL_BASES, "pbl")))]
         ),
         "benchmark": benchmark_table(benchmark, found("noise.json")),
         "paper split": paper_table([found(f"benchmark_paper_{seed}.json") for seed in PAPER_SEEDS], first),
@@ -89,8 +89,7 @@ def texts(folder: Path) -> dict[str, str]:
         "loop": loop_table(found("close_loop.json")),
         "loop with PBL": loop_table(found("close_loop_pbl.json"), found("close_loop.json")),
         "locked scans": locked_table(
-            [found("close_loop.json"), found("close_loop_pbl.json")],
-            [ModelCard.read(zoo.folder(name)) for name in ZOO_MODELS],
+            found("close_loop.json"), [ModelCard.read(zoo.folder(name)) for name in ZOO_MODELS]
         ),
         "design": design_table(found("gap.json")),
     }

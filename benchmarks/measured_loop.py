@@ -12,12 +12,6 @@ from litho_models.frozen.card import ModelCard
 from litho_models.loop.report.wording import chosen_text, over_text, terms_text
 from litho_models.loop.result.record import EqualTerms, NestedResult
 
-# Of results that do not record where the offsets of lines came from.
-OLDER_PIXELS = (
-    "Scored before line offsets came from the other side of the scan, the loop without a border of 8 px: "
-    "to be made again on the benchmark's pixels."
-)
-
 
 def equal_freedom_table(loops: Sequence[dict[str, Any]]) -> str:
     """Errors before and after with the same terms per scan, of loops on several base models."""
@@ -131,11 +125,11 @@ def loop_table(loop: dict[str, Any], on_physics: dict[str, Any] | None = None) -
                 f"{effect['role']}, {effect['verdict']}{known}",
                 f"{effect['before_nm']:.2f} nm ({figure})",
                 f"{effect['after_nm']:.2f} nm",
-                _both_terms(effect.get("terms_per_scan")),
+                " → ".join(f"{k:.0f}" for k in effect["terms_per_scan"]),
                 f"{better} of {count}",
             )
         )
-    equal, signature = loop.get("equal_terms") is not None, loop["residual"]["signature"]
+    signature = loop["residual"]["signature"]
     return markdown_table(
         ("step", "what it is", "held-out error before", "after", "terms per scan", "scans better"),
         rows,
@@ -145,21 +139,9 @@ def loop_table(loop: dict[str, Any], on_physics: dict[str, Any] | None = None) -
         *_absorbed(loop, on_physics),
         f"Base model {loop['base_model']}, {loop['split']['folds']} folds by scan: "
         f"{before['mae_datum_free_nm']:.2f} nm before with the zero of each scan free, "
-        f"{after['mae_datum_free_nm']:.2f} nm after with "
-        + ("the same. " if equal else "all accepted terms free: not the same freedom. ")
-        + f"{_background([loop]).capitalize()}. "
-        f"What is left: {loop['residual']['state']}"
-        + (f"; {'' if equal else 'it '}{signature}." if signature else "."),
-        *_older_pixels([loop]),
+        f"{after['mae_datum_free_nm']:.2f} nm after with the same. {_background([loop]).capitalize()}. "
+        f"What is left: {loop['residual']['state']}" + (f"; {signature}." if signature else "."),
     )
-
-
-def _both_terms(numbers: Sequence[float] | None) -> str:
-    return " → ".join(f"{k:.0f}" for k in numbers) if numbers else "not recorded"
-
-
-def _older_pixels(loops: Sequence[dict[str, Any]]) -> list[str]:
-    return [OLDER_PIXELS] if any(loop["nuisance"].get("line_gap_px") is None for loop in loops) else []
 
 
 def _absorbed(loop: dict[str, Any], on_physics: dict[str, Any] | None) -> list[str]:
@@ -189,11 +171,8 @@ def _absorbed(loop: dict[str, Any], on_physics: dict[str, Any] | None) -> list[s
     return sentences
 
 
-def locked_table(loops: Sequence[dict[str, Any]], cards: Sequence[ModelCard]) -> str:
-    """The errors on the locked scans: the models of the zoo, and both loops before and after.
-
-    Loops of schema 1 have one term per scan before, and all accepted ones after.
-    """
+def locked_table(loop: dict[str, Any], cards: Sequence[ModelCard]) -> str:
+    """The errors on the locked scans: the models of the zoo, and a loop before and after."""
     rows = []
     for card in cards:
         # The first of a name and policy is the one with the background.
@@ -201,30 +180,24 @@ def locked_table(loops: Sequence[dict[str, Any]], cards: Sequence[ModelCard]) ->
         errors = {(metric.name, metric.policy): metric.value for metric in held_out}
         figures = [("mae_datum_free", "offset"), ("mae_datum_free", "full+rows"), ("mae_abs", "none")]
         rows.append((card.name, *(f"{errors[key]:.2f} nm" for key in figures)))
-    for loop in loops:
-        for when in ("before", "after"):
-            rows.append((f"loop on {loop['base_model']}, {when}", *_locked_errors(loop, when)))
-    locked = loops[0]["split"]["lock_box"]
-    others = loops[0]["run"]["n_scans"] - len(locked)
+    for when in ("before", "after"):
+        rows.append((f"loop on {loop['base_model']}, {when}", *_locked_errors(loop, when)))
+    locked = loop["split"]["lock_box"]
+    others = loop["run"]["n_scans"] - len(locked)
     return markdown_table(
         ("", "zero of each scan free", "tilt, bow, gain and lines free too", "absolute error"),
         rows,
         f"The {len(locked)} locked scans ({', '.join(locked)}), a check of optimism: models, recipes and "
         f"loops are chosen without them; all was fitted to the other {others}. Models: those of the package, "
-        "with the background of their training scans. Loops: with one term per scan in the first column, and "
-        "in the second with all that they accepted, fitted on pixels that are not scored, the loop on "
-        f"Physics the registration too; {_background(loops)}. Intervals resample scans.",
-        *_older_pixels(loops),
+        "with the background of their training scans. The loop: with one term per scan in the first column, "
+        "and in the second with all that it accepted, the registration too, fitted on pixels that are not "
+        f"scored; {_background([loop])}. Intervals resample scans.",
     )
 
 
 def _locked_errors(loop: dict[str, Any], when: str) -> tuple[str, str, str]:
     """With the zero of each scan free, with the accepted terms, and with nothing fitted."""
-    errors = loop[f"locked_{when}"]
-    absolute = f"{errors['mae_abs_nm']:.2f} nm"
-    if loop.get("locked_equal_terms") is None:
-        free = with_interval(errors["mae_datum_free_nm"], errors["mae_datum_free_ci95_nm"])
-        return (free, "–", absolute) if when == "before" else ("–", free, absolute)
+    absolute = f"{loop[f'locked_{when}']['mae_abs_nm']:.2f} nm"
     rows = {row["terms"]: row[when] for row in loop["locked_equal_terms"]}
     first, all_terms = (
         with_interval(rows[t]["mae_nm"], rows[t]["mae_ci95_nm"]) for t in ("offset", "accepted")
