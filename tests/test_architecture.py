@@ -32,7 +32,7 @@ ROOMS = {
     ),
     "litho_design": (
         "optics", "images", "printers", "optimisation", "elements", "tasks", "holograms", "lenses", "reliefs",
-        "judging", "exports", "reports", "workflows", "cli",
+        "judging", "large", "exports", "reports", "workflows", "cli",
     ),
 }  # fmt: skip
 HEAVY = ("torch", "cv2", "xarray", "zarr", "matplotlib", "pandas", "skimage", "SurfaceTopography")

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from litho_data.foundation.commands import new_app, run_app
 from litho_data.foundation.errors import InputError
-from litho_design.cli.design import compare, correct, first, hoe, lens, settings
-from litho_design.cli.options import Device, Extrapolate, Out
+from litho_design.cli.design import compare, correct, estimate, first, hoe, lens, settings
+from litho_design.cli.options import BandPx, Device, Extrapolate, Out
+
+if TYPE_CHECKING:
+    from litho_design.judging.score import ScoreResult
 
 app = new_app("Design diffractive optics through a frozen model of the printer, score them, export them.")
 app.command()(first)
@@ -18,6 +21,7 @@ app.command()(hoe)
 app.command()(lens)
 app.command()(correct)
 app.command()(compare)
+app.command()(estimate)
 app.command()(settings)
 
 
@@ -75,18 +79,40 @@ def score(
         Path | None,
         typer.Option(help="Python file that registers the task of the design, one of your own; it is run."),
     ] = None,
+    stream: Annotated[
+        bool,
+        typer.Option(
+            "--stream", help="Hologram of any size: printed and scored band by band, the rest on disk."
+        ),
+    ] = False,
+    band_px: BandPx = 512,
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
     """Score a design as models print it, as an AFM measured it, or as a camera saw it."""
     from litho_design.judging.measured import MeasuredSource
     from litho_design.judging.photographs import PhotoSource
-    from litho_design.reports.advice import baseline_line, headline
     from litho_design.tasks.task import register_tasks_of
     from litho_design.workflows.score import score as score_design
 
     if not judge and scan is None and camera is None:
         raise InputError("score", got="nothing to judge with", wanted="--judge, --scan or --camera")
+    if stream:
+        if (
+            scan is not None
+            or camera is not None
+            or element is not None
+            or task_file is not None
+            or device != "cpu"
+        ):
+            raise InputError("--stream", got="another option than --judge", wanted="models as judges")
+        from litho_design.optimisation.budget import peak_memory_gib
+        from litho_design.workflows.large import score_from_disk
+
+        result = score_from_disk(design, out, judges=judge or (), band_px=band_px, extrapolate=extrapolate)
+        _print_scores(result, out)
+        print(f"peak memory {peak_memory_gib():.2f} GiB")
+        return
     if camera is not None and camera_pitch_um is None:
         raise InputError(
             "--camera", got="no --camera-pitch-um", wanted="the camera's pixel in the image plane, µm"
@@ -110,6 +136,12 @@ def score(
         device=device,
         extrapolate=extrapolate,
     )
+    _print_scores(result, out)
+
+
+def _print_scores(result: ScoreResult, out: Path) -> None:
+    from litho_design.reports.advice import baseline_line, headline
+
     for item in result.scores:
         print(f"{item.kind} {item.judge.name}: {headline(item.figures, item.uncertainty)}")
         for remark in item.remarks():

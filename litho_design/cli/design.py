@@ -12,6 +12,7 @@ import typer
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.settings import changed
 from litho_design.cli.options import (
+    BandPx,
     Device,
     Extrapolate,
     Given,
@@ -96,11 +97,25 @@ def hoe(
     spread_of: SpreadOf = None,
     roughness_of: RoughnessOf = None,
     ensemble: Ensemble = None,
+    large: Annotated[
+        bool,
+        typer.Option(
+            "--large",
+            help="In bands of rows, for elements beyond the memory of a process; `torchrun --no-python` "
+            "shares them among processes.",
+        ),
+    ] = False,
+    band_px: BandPx = 512,
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
     """Design a holographic element; an interrupted run in OUT is continued."""
     settings = _settings(given, _hologram, "hoe", spread_of, roughness_of)
+    if large:
+        if front is not None or ensemble:
+            raise InputError("--large", got="--front or --ensemble", wanted="one design through one model")
+        _large(target, model, out, settings, band_px, device, extrapolate)
+        return
     if front is not None:
         _front(front, target, model, out, settings, ensemble or (), device, extrapolate)
         return
@@ -208,6 +223,30 @@ def compare(
     print(out / "report.html")
 
 
+@takes_settings(HologramSettings())
+def estimate(
+    model: Model,
+    given: Given,
+    ranks: Annotated[int, typer.Option(help="Processes that would share the element.", min=1)] = 1,
+    measure_px: Annotated[
+        str, typer.Option(help="Sides of the elements to be measured, at least two, px.")
+    ] = "512,1024",
+    band_px: BandPx = 512,
+    device: Device = "cpu",
+    extrapolate: Extrapolate = False,
+) -> None:
+    """Measure small holograms here, and print what `hoe --large` with these settings would take."""
+    from litho_design.workflows.large import estimate_large
+
+    made = _settings(given, _hologram, "estimate")
+    try:
+        sizes = [int(word) for word in measure_px.split(",")]
+    except ValueError:
+        raise InputError("--measure-px", got=repr(measure_px), wanted="numbers of pixels") from None
+    for line in estimate_large(model, made, sizes, ranks, band_px, device=device, extrapolate=extrapolate):
+        print(line)
+
+
 @takes_settings(HologramSettings(), LensSettings(), ReliefSettings())
 def settings(
     element: Annotated[Literal["hoe", "lens", "relief"], typer.Argument(help="What would be designed.")],
@@ -255,6 +294,25 @@ def _settings(
     return measured if window is made.window else changed(measured, given.options)
 
 
+def _large(
+    target: str,
+    model: str,
+    out: Path,
+    settings: HologramSettings,
+    band_px: int,
+    device: str,
+    extrapolate: bool,
+) -> None:
+    from litho_design.large.bands import Ranks
+    from litho_design.workflows.large import design_large_hologram
+
+    design = design_large_hologram(
+        target, model, out, settings=settings, band_px=band_px, device=device, extrapolate=extrapolate
+    )
+    if Ranks.joined().rank == 0:
+        _print_design(design, out)
+
+
 def _front(
     front: str,
     target: str,
@@ -300,4 +358,5 @@ def _print_design(design: Design, out: Path) -> None:
     print(stroke_advice(design))
     if design.baselines:
         print(baseline_line(design.baselines))
-    print(f"{out / 'report.html'}: {headline(design.predicted)} (judged by its own model)")
+    page = out / "report.html"
+    print(f"{page if page.exists() else out}: {headline(design.predicted)} (judged by its own model)")

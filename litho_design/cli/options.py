@@ -24,6 +24,12 @@ Extrapolate = Annotated[
         "--extrapolate", help="Accept heights beyond the model's calibration; recorded in the result."
     ),
 ]
+BandPx = Annotated[
+    int,
+    typer.Option(
+        help="Rows of a band at most, px: with --large or --stream memory grows with its square.", min=8
+    ),
+]
 _Config = Annotated[
     Path | None,
     typer.Option(

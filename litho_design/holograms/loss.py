@@ -5,6 +5,7 @@ To add a term, give it a weight in ``HologramLoss`` and a line in ``hologram_los
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Literal
 
 from litho_data.foundation.results import Record
@@ -48,7 +49,11 @@ def counted_pixels(target: Tensor, settings: HologramLoss, pitch_um: float) -> T
 
 
 def hologram_loss(
-    share: Tensor, target: Tensor, settings: HologramLoss, counted: Tensor | None = None
+    share: Tensor,
+    target: Tensor,
+    settings: HologramLoss,
+    counted: Tensor | None = None,
+    total: Callable[[Tensor], Tensor] | None = None,
 ) -> tuple[Tensor, dict[str, float]]:
     """Loss of an image and its parts by name.
 
@@ -56,15 +61,18 @@ def hologram_loss(
         share: share of the incident power on each pixel (size, size).
         target: wanted intensity in [0, 1], (size, size).
         counted: pixels that count in the error, bool (size, size); None for all.
+        total: sum over the pixels of the image, of which the others may be a part; None where they are all.
     """
-    # Not at the top: the command line reads the weights without torch.
-    from litho_design.images.similarity import matched_scale
+    import torch  # the command line reads the weights without it
 
-    efficiency = share[target > 0].sum()
+    total = total or torch.sum
+    efficiency = total(share[target > 0])
     if counted is not None:
         share, target = share[counted], target[counted]
-    lit = (share * target).sum()
-    factor = target.sum() / lit if settings.scale == "paper" else matched_scale(share, target)
-    rmse = (factor * share - target).square().mean().sqrt()
+    lit = total(share * target)
+    factor = (
+        total(target) / lit if settings.scale == "paper" else lit / total(share.square()).clamp(min=1e-30)
+    )
+    rmse = (total((factor * share - target).square()) / total(torch.ones_like(target))).sqrt()
     loss = rmse + settings.efficiency_weight * (1 - efficiency)
     return loss, {"rmse": float(rmse.detach()), "efficiency": float(efficiency.detach())}

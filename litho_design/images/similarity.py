@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -28,22 +29,29 @@ def paper_rmse(image: Tensor, target: Tensor) -> Tensor:
 
 
 def ssim(image: Tensor, target: Tensor) -> float:
-    """Structural similarity of two images in [0, 1] (Wang et al. 2004), window 11, sigma 1.5.
+    """Structural similarity of two images in [0, 1], the mean of ``ssim_map``.
 
     Windows that reach over the edge do not count.
     """
+    edge = SSIM_WINDOW_PX // 2
+    found = ssim_map(image.double().cpu().numpy(), target.double().cpu().numpy())
+    return float(found[edge:-edge, edge:-edge].mean())
+
+
+def ssim_map(image: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Structural similarity at each pixel of images in [0, 1]: window 11, sigma 1.5 (Wang et al. 2004)."""
     from skimage.metrics import structural_similarity
 
-    return float(
-        structural_similarity(
-            image.double().cpu().numpy(),
-            target.double().cpu().numpy(),
-            data_range=1.0,
-            gaussian_weights=True,
-            sigma=1.5,
-            use_sample_covariance=False,
-        )
-    )
+    found: np.ndarray = structural_similarity(
+        image,
+        target,
+        data_range=1.0,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        full=True,
+    )[1]
+    return found
 
 
 def likeness(image: Tensor, target: Tensor, resolved: Tensor) -> dict[str, float]:

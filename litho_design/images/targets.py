@@ -15,6 +15,8 @@ from litho_data.foundation.results import Record
 
 DrawnTarget = Literal["text", "ring", "chart", "spots", "letters"]
 _OVERSAMPLE = 4
+# Drawn at a time: a large picture in double precision takes more memory than its design.
+_ROWS = 256
 
 
 class TargetRecord(Record):
@@ -87,34 +89,37 @@ def stroke_width_px(pixels: np.ndarray) -> float:
 def draw_target(name: str, size_px: int) -> np.ndarray:
     """Draw a target with anti-aliased edges: float32 (size, size) in [0, 1]."""
     fine = size_px * _OVERSAMPLE
-    y, x = np.mgrid[0:fine, 0:fine]
+    draw = {"text": _text, "ring": _ring, "chart": _chart, "spots": _spots, "letters": _letters}[name]
     # Unit square with the origin in the middle, y down.
-    y, x = (y + 0.5) / fine - 0.5, (x + 0.5) / fine - 0.5
-    picture = {"text": _text, "ring": _ring, "chart": _chart, "spots": _spots, "letters": _letters}[name](
-        y, x
-    )
-    blocks = picture.reshape(size_px, _OVERSAMPLE, size_px, _OVERSAMPLE)
-    return blocks.mean((1, 3)).astype(np.float32)
+    place = (np.arange(fine) + 0.5) / fine - 0.5
+    picture = np.empty((size_px, size_px), np.float32)
+    for first in range(0, size_px, _ROWS):
+        rows = slice(first * _OVERSAMPLE, (first + _ROWS) * _OVERSAMPLE)
+        drawn = draw(*np.meshgrid(place[rows], place, indexing="ij"))
+        blocks = drawn.reshape(-1, _OVERSAMPLE, size_px, _OVERSAMPLE)
+        picture[first : first + _ROWS] = blocks.mean((1, 3))
+    return picture
 
 
 def _text(y: np.ndarray, x: np.ndarray) -> np.ndarray:
-    return _words(len(y), ((0.44, "LITHO"), (0.72, "LOOP")), 150)
+    return _words(y, ((0.44, "LITHO"), (0.72, "LOOP")), 150)
 
 
 def _letters(y: np.ndarray, x: np.ndarray) -> np.ndarray:
     """Rows of small letters and digits: fine detail of many directions."""
-    return _words(len(y), ((0.25, "RSWKG"), (0.5, "28395"), (0.75, "aekxm")), 130)
+    return _words(y, ((0.25, "RSWKG"), (0.5, "28395"), (0.75, "aekxm")), 130)
 
 
-def _words(size: int, rows: tuple[tuple[float, str], ...], line_height: float) -> np.ndarray:
+def _words(y: np.ndarray, rows: tuple[tuple[float, str], ...], line_height: float) -> np.ndarray:
     import cv2
 
-    canvas = np.zeros((size, size), np.uint8)
+    size, first = y.shape[1], round((y[0, 0] + 0.5) * y.shape[1] - 0.5)
+    canvas = np.zeros(y.shape, np.uint8)
     for row, word in rows:
         scale = size / line_height
         thickness = max(1, round(size / 45))
         (width, _), _ = cv2.getTextSize(word, cv2.FONT_HERSHEY_SIMPLEX, scale, thickness)
-        where = (int((size - width) / 2), int(row * size))
+        where = (int((size - width) / 2), int(row * size) - first)
         cv2.putText(canvas, word, where, cv2.FONT_HERSHEY_SIMPLEX, scale, 255, thickness, cv2.LINE_8)
     return canvas / 255.0
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
@@ -61,15 +61,8 @@ class ASMPropagator(nn.Module):
                 hint="use RSPropagator for another pitch",
             )
         self.source, self.target = source, target
-        axes = [_axis_band(source, target, axis, distance_um, wavelength_um) for axis in (0, 1)]
-        fy, fx = axes[0].frequency[:, None], axes[1].frequency[None, :]
-        band = axes[0].inside[:, None] & axes[1].inside[None, :]
-        squared = torch.complex(wavelength_um**-2 - fy**2 - fx**2, torch.zeros(()).double())
-        axial = squared.sqrt()
-        if distance_um < 0:
-            band = band & (axial.imag == 0)
-        shift = 2 * math.pi * (fy * axes[0].start_um + fx * axes[1].start_um)
-        kernel = torch.fft.ifft2(torch.exp(2j * math.pi * distance_um * axial + 1j * shift) * band)
+        axes = spectrum_axes(source, target, distance_um, wavelength_um)
+        kernel = torch.fft.ifft2(transfer_function(*axes, distance_um, wavelength_um))
         transfer = torch.fft.fft2(kernel[axes[0].kept[:, None], axes[1].kept[None, :]])
         self.register_buffer("transfer", transfer.to(dtype)[None, None], persistent=False)
 
@@ -83,7 +76,7 @@ class ASMPropagator(nn.Module):
 
 
 @dataclass(frozen=True)
-class _AxisBand:
+class SpectrumAxis:
     """One axis: frequencies (cycles/µm), those kept, samples of the kernel in use, shift of the grids."""
 
     frequency: Tensor
@@ -91,10 +84,33 @@ class _AxisBand:
     kept: Tensor
     start_um: float
 
+    def part(self, which: slice) -> SpectrumAxis:
+        """Some of the frequencies."""
+        return replace(self, frequency=self.frequency[which], inside=self.inside[which])
+
+
+def spectrum_axes(
+    source: PixelGrid, target: PixelGrid, distance_um: float, wavelength_um: float
+) -> tuple[SpectrumAxis, SpectrumAxis]:
+    """Both axes, y first, of the spectrum between two grids."""
+    y, x = (_axis_band(source, target, axis, distance_um, wavelength_um) for axis in (0, 1))
+    return y, x
+
+
+def transfer_function(y: SpectrumAxis, x: SpectrumAxis, distance_um: float, wavelength_um: float) -> Tensor:
+    """What free space does to each frequency, complex128 (y, x); 0 where the period is too short for it."""
+    fy, fx = y.frequency[:, None], x.frequency[None, :]
+    band = y.inside[:, None] & x.inside[None, :]
+    axial = torch.complex(wavelength_um**-2 - fy**2 - fx**2, torch.zeros(()).double()).sqrt()
+    if distance_um < 0:
+        band = band & (axial.imag == 0)
+    shift = 2 * math.pi * (fy * y.start_um + fx * x.start_um)
+    return torch.exp(2j * math.pi * distance_um * axial + 1j * shift) * band
+
 
 def _axis_band(
     source: PixelGrid, target: PixelGrid, axis: int, distance_um: float, wavelength_um: float
-) -> _AxisBand:
+) -> SpectrumAxis:
     pitch, there, here = source.pitch_um[axis], target.shape[axis], source.shape[axis]
     shortest = fast_length(here + there - 1)
     sine = min(wavelength_um / (2 * pitch), 1 - 1e-6)
@@ -113,4 +129,4 @@ def _axis_band(
     index = torch.arange(shortest)
     index = torch.where(index < there, index, index - shortest).clamp(min=1 - here)
     # At zero distance nothing moves, evanescent waves included.
-    return _AxisBand(frequency, inside | (distance_um == 0), index % length, start)
+    return SpectrumAxis(frequency, inside | (distance_um == 0), index % length, start)

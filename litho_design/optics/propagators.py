@@ -25,7 +25,11 @@ def make_propagator(
         InputError: a distance below the sampling limit where ``rayleigh-sommerfeld`` is asked for, or unequal
             pitches for the angular spectrum.
     """
-    near = optics.distance_um < sampling_limit_um(source, target, optics.wavelength_um)
-    spectrum = optics.propagation == "angular-spectrum" or (optics.propagation == "auto" and near)
-    kind = ASMPropagator if spectrum else RSPropagator
+    kind = ASMPropagator if takes_spectrum(source, target, optics) else RSPropagator
     return kind(source, target, optics.distance_um, optics.wavelength_um, dtype=dtype)
+
+
+def takes_spectrum(source: PixelGrid, target: PixelGrid, optics: Optics) -> bool:
+    """Whether the angular spectrum carries the wave, by request or because the sum would be aliased."""
+    near = optics.distance_um < sampling_limit_um(source, target, optics.wavelength_um)
+    return optics.propagation == "angular-spectrum" or (optics.propagation == "auto" and near)

@@ -64,7 +64,12 @@ class Optics(Record):
 
 
 def element_field(
-    height_um: Tensor, grid: PixelGrid, optics: Optics, aperture: Tensor | None = None
+    height_um: Tensor,
+    grid: PixelGrid,
+    optics: Optics,
+    aperture: Tensor | None = None,
+    *,
+    pixels: int | None = None,
 ) -> Tensor:
     """The wave just behind a phase element lit by a plane wave of unit power.
 
@@ -76,6 +81,7 @@ def element_field(
         height_um: real (..., ny, nx), µm.
         grid: geometry of ``height_um``.
         aperture: optional real mask (ny, nx) in [0, 1].
+        pixels: of the whole element, where ``grid`` is a part of it.
 
     Returns:
         complex (..., ny, nx), 1/µm.
@@ -89,7 +95,7 @@ def element_field(
         phase = phase + path_um * (2 * math.pi / optics.wavelength_um)
     area = math.prod(grid.pitch_um)
     if aperture is None:
-        amplitude = torch.full_like(phase, 1 / math.sqrt(math.prod(grid.shape) * area))
+        amplitude = torch.full_like(phase, 1 / math.sqrt((pixels or math.prod(grid.shape)) * area))
     else:
         power = float(aperture.double().square().sum()) * area
         amplitude = (aperture / math.sqrt(power)).to(phase).expand_as(phase)

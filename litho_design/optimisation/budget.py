@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import resource
 import time
+from collections.abc import Callable
 
 import torch
 from torch import nn
@@ -41,15 +42,20 @@ class Budget(Record):
         )
 
 
-def measure_budget(parameters: Parametrisation, objective: Objective, search: SearchSettings) -> Budget:
+def measure_budget(
+    parameters: Parametrisation,
+    objective: Objective,
+    search: SearchSettings,
+    clock: Callable[[], float] = time.perf_counter,
+) -> Budget:
     """Time one iteration with gradient and one without, on the parameters as they are."""
     assert isinstance(parameters, nn.Module)
     device = next(parameters.parameters()).device
-    started = time.perf_counter()
+    started = clock()
     loss, _ = objective(parameters.sample(search.temperature(0), search.hard(0), seed=0))
     loss.backward()
     _wait(device)
-    middle = time.perf_counter()
+    middle = clock()
     with torch.no_grad():
         objective(parameters.sample(search.temperature(0), search.hard(0), seed=0))
     _wait(device)
@@ -57,14 +63,14 @@ def measure_budget(parameters: Parametrisation, objective: Objective, search: Se
         parameter.grad = None
     return Budget(
         seconds_per_iteration=middle - started,
-        seconds_per_evaluation=time.perf_counter() - middle,
+        seconds_per_evaluation=clock() - middle,
         peak_memory_gib=peak_memory_gib(device),
     )
 
 
-def peak_memory_gib(device: torch.device) -> float:
+def peak_memory_gib(device: torch.device | None = None) -> float:
     """Highest memory so far: of the device on CUDA, of the process elsewhere."""
-    if device.type == "cuda":
+    if device is not None and device.type == "cuda":
         return torch.cuda.max_memory_allocated(device) / 2**30
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / _KIB_PER_GIB
 

@@ -13,11 +13,14 @@ _START_SPREAD_LEVELS = 1.0
 
 
 class CellMap(nn.Module):
-    """Spread one value per free cell over the pixels of the layout, and average back."""
+    """Spread one value per free cell over the pixels of the layout, and average back.
+
+    With ``rows`` it is the map of these rows of pixels only; ``own`` takes their cells out of those of all.
+    """
 
     ring: Tensor
 
-    def __init__(self, layout: LayoutSettings):
+    def __init__(self, layout: LayoutSettings, rows: range | None = None):
         super().__init__()
         self.size_px, self.cell_px = layout.size_px, layout.cell_px
         self.radial = layout.symmetry == "radial"
@@ -29,6 +32,14 @@ class CellMap(nn.Module):
             self.cells: tuple[int, ...] = (int(ring.max()) + 1,)
         else:
             self.cells = (self.size_px // self.cell_px,) * 2
+        self.of_all, self._own = self.cells, slice(None)
+        if rows is not None:
+            self._own = slice(rows.start // self.cell_px, rows.stop // self.cell_px)
+            self.cells = (len(rows) // self.cell_px, self.cells[-1])
+
+    def own(self, values: Tensor) -> Tensor:
+        """Of one value per cell of the whole layout those of the own rows."""
+        return values[self._own]
 
     def forward(self, values: Tensor) -> Tensor:
         """(..., *cells) to (..., size, size)."""
@@ -93,9 +104,9 @@ class GumbelLevels(nn.Module):
 class DirectLevels(nn.Module):
     """One real level per cell; rounding passes the gradient straight through when ``hard``."""
 
-    def __init__(self, layout: LayoutSettings):
+    def __init__(self, layout: LayoutSettings, rows: range | None = None):
         super().__init__()
-        self.cells = CellMap(layout)
+        self.cells = CellMap(layout, rows)
         self.levels = layout.levels
         self.height = nn.Parameter(torch.zeros(self.cells.cells))
 
@@ -123,7 +134,8 @@ class DirectLevels(nn.Module):
     def start_random(self, seed: int) -> None:
         """Uniform over the whole range."""
         generator = torch.Generator().manual_seed(seed)
-        self.height.copy_(torch.rand(self.height.shape, generator=generator) * (self.levels - 1))
+        drawn = torch.rand(self.cells.of_all, generator=generator)
+        self.height.copy_(self.cells.own(drawn) * (self.levels - 1))
 
     def _kept(self) -> Tensor:
         """Heights within the range, which an optimiser that does not project may have left."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -11,6 +11,9 @@ from torch import Tensor
 
 from litho_design.optics import Optics, centred_grid
 from litho_design.optimisation.parameters import CellMap
+
+# Amplitude, the element's being 1, below which a wave has no phase.
+_DARK = 1e-12
 
 
 def gerchberg_saxton(
@@ -23,6 +26,7 @@ def gerchberg_saxton(
     seed: int,
     level_phase: Tensor | None = None,
     counted: Tensor | None = None,
+    total: Callable[[Tensor], Tensor] | None = None,
 ) -> tuple[Tensor, list[float]]:
     """A phase per cell whose propagated amplitude approaches sqrt(target).
 
@@ -41,31 +45,36 @@ def gerchberg_saxton(
             wanted amplitude then follows the light that is there.
         level_phase: printed phase of each level, radian (levels,); if given, the second half of the
             iterations projects on these phases instead of on the whole circle.
+        total: sum over the pixels of the element, of which cells and target may be a part; None where they
+            are all of it.
 
     Returns:
         Phase per cell, radian, and the amplitude error sqrt(sum (|P u| - a)^2) before each step.
     """
+    add = total or torch.sum
+
+    def norm(values: Tensor) -> Tensor:
+        return add(values.square()).sqrt()
+
     generator = torch.Generator().manual_seed(seed)
-    phase = (torch.rand(cells.cells, generator=generator) * 2 * math.pi).to(target)
+    phase = cells.own(torch.rand(cells.of_all, generator=generator) * 2 * math.pi).to(target)
     amplitude = target.clamp(min=0).sqrt()
     incident = math.sqrt(math.prod(propagator.source.shape) * math.prod(propagator.source.pitch_um))
     area = math.prod(propagator.target.pitch_um)
-    amplitude = amplitude * (incident / math.sqrt(float(amplitude.square().sum()) * area))
+    amplitude = amplitude * (incident / math.sqrt(float(add(amplitude.square())) * area))
     wanted, lit = amplitude.clone(), amplitude > 0
     errors = []
     for step in range(iterations):
         wave = cells(torch.polar(torch.ones_like(phase), phase))
         seen = propagator(wave)
         size = seen.abs()
-        errors.append(float((size - amplitude).square().sum().sqrt()))
+        errors.append(float(norm(size - amplitude)))
         if weighted:
-            shortfall = (
-                amplitude[lit] / size[lit].clamp(min=1e-12) * (size[lit].norm() / amplitude[lit].norm())
-            )
+            shortfall = amplitude[lit] / size[lit].clamp(min=_DARK) * (norm(size[lit]) / norm(amplitude[lit]))
             wanted[lit] *= shortfall.clamp(0.5, 2).sqrt()
-            wanted *= amplitude.norm() / wanted.norm()
-        aim = wanted if counted is None else wanted * (size[counted].norm() / wanted.norm())
-        missing = seen * (aim / size.clamp(min=1e-12 * float(size.max())) - 1)
+            wanted *= norm(amplitude) / norm(wanted)
+        aim = wanted if counted is None else wanted * (norm(size[counted]) / norm(wanted))
+        missing = seen * (aim / size.clamp(min=_DARK) - 1)
         missing = missing if counted is None else missing * counted
         mean_wave = cells.average(wave + propagator.adjoint(missing))
         phase = mean_wave.angle()

@@ -21,7 +21,6 @@ from litho_design.optimisation.settings import SearchSettings
 from litho_design.printers.layout import LayoutSettings
 
 Objective = Callable[[Tensor], tuple[Tensor, dict[str, float]]]
-_CHECKPOINT = "checkpoint.pt"
 # What torch raises for a damaged file depends on the place of the damage.
 _DAMAGED = (
     RuntimeError,
@@ -57,6 +56,7 @@ def search_layout(
     folder: Path | None = None,
     fingerprint: str = "",
     what: str = "designing",
+    part: str = "",
 ) -> SearchState:
     """Minimise ``objective`` over layouts; only the printable (argmax) layout is scored and kept.
 
@@ -65,6 +65,7 @@ def search_layout(
         objective: maps levels on pixels (1, 1, size, size) to a scalar loss and its named parts.
         folder: where ``checkpoint.pt`` is written and looked for; None to run without.
         fingerprint: identifies the task; a checkpoint of another task is refused.
+        part: which part of a shared search this is, in the name of its checkpoint.
 
     Returns:
         The state with the argmax levels kept (``best_levels``, per cell) and the history, one
@@ -76,28 +77,33 @@ def search_layout(
     optimiser_class = torch.optim.Adam if settings.optimiser == "adam" else torch.optim.AdamW
     optimiser = optimiser_class(parameters.parameters(), lr=settings.learning_rate)
     state = SearchState()
-    if folder is not None and (folder / _CHECKPOINT).exists():
-        state = _resume(folder / _CHECKPOINT, parameters, optimiser, fingerprint)
+    checkpoint = None if folder is None else _checkpoint(folder, part)
+    if checkpoint is not None and checkpoint.exists():
+        state = _resume(checkpoint, parameters, optimiser, fingerprint)
     remaining = range(state.iteration, settings.iterations)
     for iteration in progress(remaining, what, total=len(remaining)):
         step_loss = _step(parameters, objective, optimiser, settings, iteration)
         state.iteration = iteration + 1
         if iteration % settings.evaluate_every == 0 or state.iteration == settings.iterations:
             _evaluate(parameters, objective, settings, state, step_loss)
-        if folder is not None and state.iteration % settings.checkpoint_every == 0:
-            _save(folder / _CHECKPOINT, parameters, optimiser, state, fingerprint)
+        if checkpoint is not None and state.iteration % settings.checkpoint_every == 0:
+            _save(checkpoint, parameters, optimiser, state, fingerprint)
     return state
 
 
-def finished_iterations(folder: Path) -> int:
+def finished_iterations(folder: Path, part: str = "") -> int:
     """Finished iterations of an interrupted run in ``folder``; 0 without one."""
-    path = folder / _CHECKPOINT
+    path = _checkpoint(folder, part)
     return int(_load(path)["iteration"]) if path.exists() else 0
 
 
-def remove_checkpoint(folder: Path) -> None:
+def remove_checkpoint(folder: Path, part: str = "") -> None:
     """Delete the checkpoint of a finished design."""
-    (folder / _CHECKPOINT).unlink(missing_ok=True)
+    _checkpoint(folder, part).unlink(missing_ok=True)
+
+
+def _checkpoint(folder: Path, part: str) -> Path:
+    return folder / f"checkpoint{part}.pt"
 
 
 def _step(

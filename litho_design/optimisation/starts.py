@@ -37,6 +37,8 @@ class Scene:
         target: wanted image (size, size) in [0, 1]; None for a lens.
         counted: pixels of the image where light is not free, bool (size, size); None for all.
         propagator: from the element to the image; None for a lens.
+        total: sum over the pixels of the element, of which cells and target may be a part; None where they
+            are all of it.
     """
 
     cells: CellMap
@@ -48,6 +50,7 @@ class Scene:
     target: Tensor | None = None
     counted: Tensor | None = None
     propagator: Any = None
+    total: Callable[[Tensor], Tensor] | None = None
 
 
 def check_start(name: str, fit: Sequence[str], task: str) -> None:
@@ -83,6 +86,7 @@ def _gerchberg_saxton(scene: Scene, *, weighted: bool = False) -> Tensor:
         seed=scene.seed,
         level_phase=scene.level_phase,
         counted=scene.counted,
+        total=scene.total,
     )
     return nearest_levels(phase, scene.level_phase)
 

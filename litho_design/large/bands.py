@@ -1,0 +1,201 @@
+"""Bands of rows: the unit in which a large element is printed and transformed, and who holds which.
+
+Bands are those of the layout, whoever computes them: an element has the same ones, and in each of them the
+same numbers, with one process and with many.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+from litho_data.foundation.errors import InputError
+
+
+@dataclass(frozen=True)
+class Ranks:
+    """The processes that share an element: those that torchrun started, or this one alone."""
+
+    rank: int = 0
+    count: int = 1
+
+    @classmethod
+    def joined(cls) -> Ranks:
+        """Join the processes of torchrun, over gloo for processors and NCCL for GPUs; alone without it."""
+        if int(os.environ.get("WORLD_SIZE", "1")) == 1:
+            return cls()
+        if not dist.is_initialized():
+            dist.init_process_group()
+        return cls(dist.get_rank(), dist.get_world_size())
+
+    def device(self, device: str | torch.device) -> str | torch.device:
+        """``device`` for this process: each takes a GPU of its own where ``cuda`` is asked for."""
+        return f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if str(device) == "cuda" else device
+
+    def share(self, count: int, rank: int | None = None) -> range:
+        """Which of ``count`` things in a row are those of a process, by default of this one."""
+        place = self.rank if rank is None else rank
+        return range(count * place // self.count, count * (place + 1) // self.count)
+
+    def exchange(self, parts: Sequence[Tensor], sizes: Sequence[int]) -> Tensor:
+        """Send ``parts[r]`` to process r, and get from each ``sizes[r]`` entries, flat one after the other.
+
+        Args:
+            parts: one tensor per process, real or complex, of one dtype.
+        """
+        if self.count == 1:
+            return parts[0].reshape(-1)
+        sent = torch.cat([part.reshape(-1) for part in parts])
+        received = sent.new_empty(sum(sizes))
+        # The collectives of gloo know no complex numbers.
+        to, of = (torch.view_as_real(one) if one.is_complex() else one for one in (received, sent))
+        dist.all_to_all_single(to, of, list(sizes), [part.numel() for part in parts])
+        return received
+
+    def total(self, values: Tensor) -> Tensor:
+        """Sum over the values of all processes in double precision, () float64.
+
+        Differentiable: what each of them does with the sum counts in the gradient (see ``shared_loss``).
+        """
+        total: Tensor = _Total.apply(values.sum(dtype=torch.float64), self)
+        return total
+
+    def shared_loss(self, loss: Tensor) -> Tensor:
+        """A loss that all processes have: it counts once when each of them sends its gradient back."""
+        return (loss - loss.detach()) / self.count + loss.detach()
+
+    def wait(self) -> None:
+        """Until all processes are here."""
+        if self.count > 1:
+            dist.barrier()
+
+
+class _Total(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, value: Tensor, ranks: Ranks) -> Tensor:
+        ctx.ranks = ranks
+        return _summed(value, ranks)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        return _summed(gradient, ctx.ranks), None
+
+
+def _summed(value: Tensor, ranks: Ranks) -> Tensor:
+    total = value.clone()
+    if ranks.count > 1:
+        dist.all_reduce(total)
+    return total
+
+
+@dataclass(frozen=True)
+class Bands:
+    """The bands of a square element, and those that this process holds.
+
+    Args:
+        size_px: side of the element.
+        most_px: rows of a band at most; all have the same number but the last, which may have fewer.
+        ranks: the processes.
+        cell_px: side of a free cell, which no band cuts.
+
+    Raises:
+        InputError: more processes than bands.
+    """
+
+    size_px: int
+    most_px: int
+    ranks: Ranks = Ranks()
+    cell_px: int = 1
+
+    def __post_init__(self) -> None:
+        if self.count < self.ranks.count:
+            raise InputError(
+                "processes",
+                got=f"{self.ranks.count} for {self.count} bands of {self.band_px} of {self.size_px} rows",
+                wanted="at most one per band",
+                hint="fewer processes, or a smaller --band-px",
+            )
+
+    @property
+    def band_px(self) -> int:
+        """Rows of every band but the last."""
+        count = -(-self.size_px // self.most_px)
+        return -(-self.size_px // (count * self.cell_px)) * self.cell_px
+
+    @property
+    def count(self) -> int:
+        """How many bands the element has."""
+        return -(-self.size_px // self.band_px)
+
+    def rows(self, rank: int | None = None) -> range:
+        """The rows of the element that a process holds, by default this one."""
+        own = self.ranks.share(self.count, rank)
+        return range(own.start * self.band_px, min(own.stop * self.band_px, self.size_px))
+
+    def own(self) -> list[slice]:
+        """The bands of this process, as rows of what it holds."""
+        rows = len(self.rows())
+        return [slice(start, min(start + self.band_px, rows)) for start in range(0, rows, self.band_px)]
+
+    def check_halo(self, halo: int) -> None:
+        """Refuse bands so narrow that a row counts in the surroundings of two others.
+
+        Raises:
+            InputError: fewer rows than twice the halo, or than the halo in the last band.
+        """
+        last = self.size_px - (self.count - 1) * self.band_px
+        if self.count > 1 and (self.band_px < 2 * halo or last < halo):
+            raise InputError(
+                "rows of a band",
+                got=f"{self.band_px} px, and {last} in the last, where the printer reaches {halo} px",
+                wanted=f"at least {2 * halo} and {halo} px",
+                hint="a larger --band-px",
+            )
+
+    def with_halo(self, values: Tensor, halo: int) -> Tensor:
+        """The own rows (rows, x) with ``halo`` of the neighbours' on both sides, zero beyond the element.
+
+        ``add_halo`` is its adjoint.
+        """
+        around = torch.nn.functional.pad(values, (0, 0, halo, halo))
+        if halo:
+            before, after = self._from_neighbours(values[:halo], values[-halo:])
+            around[:halo] += before
+            around[-halo:] += after
+        return around
+
+    def add_halo(self, around: Tensor, halo: int) -> Tensor:
+        """Own rows with what others found for them: each sends its ``halo`` rows to whom they belong."""
+        own = around[halo : len(around) - halo].clone()
+        if halo:
+            before, after = self._from_neighbours(around[:halo], around[-halo:])
+            own[:halo] += before
+            own[-halo:] += after
+        return own
+
+    def _from_neighbours(self, first: Tensor, last: Tensor) -> list[Tensor]:
+        """What the processes before and after send here when each sends its ends to its neighbours."""
+        rank, count = self.ranks.rank, self.ranks.count
+        parts, sizes = [first[:0]] * count, [0] * count
+        sides = {rank - 1: first, rank + 1: last}
+        for other in sides.keys() & set(range(count)):
+            parts[other], sizes[other] = sides[other], sides[other].numel()
+        got = self.ranks.exchange(parts, sizes).split(sizes)
+        return [
+            got[other].reshape(first.shape) if 0 <= other < count else torch.zeros_like(first)
+            for other in sides
+        ]
+
+
+Allocate = Callable[[tuple[int, ...], torch.dtype], Tensor]
+
+
+def in_memory(device: torch.device) -> Allocate:
+    """Room for arrays in the memory of a device."""
+    return lambda shape, dtype: torch.empty(shape, dtype=dtype, device=device)

@@ -1,0 +1,136 @@
+"""What a large design costs: a model of time, memory and network, fitted to small sizes measured here."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+
+import torch
+
+from litho_data.foundation.results import Record
+from litho_design.holograms.settings import HologramSettings
+from litho_design.images.targets import draw_target
+from litho_design.large.bands import Bands
+from litho_design.large.hologram import BandedHologram
+from litho_design.optics.sampling import fast_length
+from litho_design.optimisation.budget import measure_budget, peak_memory_gib
+from litho_design.optimisation.parameters import DirectLevels
+from litho_design.printers.printer import Printer
+
+_GIB = 2**30
+# A row of the spectrum is kept, sent and received: two complex64 of twice the length more than alone.
+_EXCHANGE_BYTES_PER_PX = 2 * 2 * 8
+_LEVEL, _HEIGHT, _IMAGE, _TARGET = 1, 4, 4, 4
+
+
+class MeasuredSize(Record):
+    """Cost of one size in one process: an iteration, the transforms in it, an evaluation without gradient."""
+
+    size_px: int
+    iteration_s: float
+    transforms_s: float
+    evaluation_s: float
+    peak_memory_gib: float
+
+
+class CostModel(Record):
+    """Transforms grow as K² log K, K being twice the side; all other time and memory as the pixels."""
+
+    transform_s_per_operation: float
+    rest_s_per_px: float
+    evaluation_s_per_px: float
+    memory_gib: float
+    memory_gib_per_px: float
+
+    def iteration_s(self, size_px: int, ranks: int = 1) -> float:
+        """Time of one iteration of the search, with gradient, without what the network takes."""
+        return (
+            self.transform_s_per_operation * _operations(size_px) + self.rest_s_per_px * size_px**2
+        ) / ranks
+
+    def evaluation_s(self, size_px: int, ranks: int = 1) -> float:
+        """Time of one evaluation of a printable layout."""
+        half = self.transform_s_per_operation * _operations(size_px) / 2
+        return (half + self.evaluation_s_per_px * size_px**2) / ranks
+
+    def memory_of_rank_gib(self, size_px: int, ranks: int = 1) -> float:
+        """Peak memory of each process."""
+        own = size_px**2 / ranks
+        exchange = _EXCHANGE_BYTES_PER_PX * own / _GIB if ranks > 1 else 0.0
+        return self.memory_gib + self.memory_gib_per_px * own + exchange
+
+    def search_s(self, size_px: int, settings: HologramSettings, ranks: int = 1) -> float:
+        """Time of the start and the search."""
+        search = settings.search
+        starts = 0 if search.start == "random" else search.start_iterations
+        evaluations = search.iterations / search.evaluate_every + 2
+        return (
+            starts * self.transform_s_per_operation * _operations(size_px) / ranks
+            + search.iterations * self.iteration_s(size_px, ranks)
+            + evaluations * self.evaluation_s(size_px, ranks)
+        )
+
+
+def sent_gib(size_px: int, ranks: int) -> float:
+    """What each process sends in one iteration: its rows, four times, but for its own share."""
+    rows = size_px / ranks * fast_length(2 * size_px - 1) * 8
+    return 4 * rows * (ranks - 1) / ranks / _GIB
+
+
+def disk_gib(size_px: int) -> float:
+    """Size of the folder of a large design."""
+    return (_LEVEL + _HEIGHT + _IMAGE + _TARGET) * size_px**2 / _GIB
+
+
+def measure_size(
+    settings: HologramSettings,
+    printer: Printer,
+    size_px: int,
+    band_px: int,
+    clock: Callable[[], float] = time.perf_counter,
+) -> MeasuredSize:
+    """Time one iteration, its transforms and an evaluation of an element of ``size_px``; memory so far.
+
+    Args:
+        clock: seconds; ``time.process_time`` on a machine that does other work.
+    """
+    layout = settings.layout.model_copy(update={"size_px": size_px})
+    bands = Bands(size_px, band_px, cell_px=layout.cell_px)
+    hologram = BandedHologram(
+        settings.model_copy(update={"layout": layout}), printer, draw_target("ring", size_px), bands
+    )
+    parameters = DirectLevels(layout).to(printer.device)
+    parameters.start_random(0)
+    budget = measure_budget(parameters, hologram.objective, settings.search, clock)
+    wave = torch.ones(size_px, size_px, dtype=torch.complex64, device=printer.device)
+    started = clock()
+    hologram.propagator.adjoint(hologram.propagator(wave))
+    transforms = clock() - started
+    return MeasuredSize(
+        size_px=size_px,
+        iteration_s=budget.seconds_per_iteration,
+        transforms_s=transforms,
+        evaluation_s=budget.seconds_per_evaluation,
+        peak_memory_gib=peak_memory_gib(printer.device),
+    )
+
+
+def fit_cost(measured: Sequence[MeasuredSize]) -> CostModel:
+    """The model that meets the largest size; memory grows from the second largest, which comes before it."""
+    before, last = sorted(measured, key=lambda one: one.size_px)[-2:]
+    pixels, operations = last.size_px**2, _operations(last.size_px)
+    growth = (last.peak_memory_gib - before.peak_memory_gib) / (pixels - before.size_px**2)
+    return CostModel(
+        transform_s_per_operation=last.transforms_s / operations,
+        rest_s_per_px=max(last.iteration_s - last.transforms_s, 0.0) / pixels,
+        evaluation_s_per_px=max(last.evaluation_s - last.transforms_s / 2, 0.0) / pixels,
+        memory_gib=last.peak_memory_gib - growth * pixels,
+        memory_gib_per_px=growth,
+    )
+
+
+def _operations(size_px: int) -> float:
+    """Of a transform and its inverse of twice the side, in units that are fitted."""
+    length = fast_length(2 * size_px - 1)
+    return length**2 * math.log2(length)

@@ -1,0 +1,176 @@
+"""A wave carried to a parallel plane by a Fourier transform that several processes share.
+
+Rows are transformed where they lie; one exchange gives every process whole columns; these are transformed,
+multiplied and transformed back, and a second exchange returns the rows (Takahashi, Fast Fourier Transform
+Algorithms for Parallel Computers, ch. 8: the transposed form of the two-dimensional transform).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from litho_design.large.bands import Allocate, Bands, in_memory
+from litho_design.optics import ASMPropagator, Optics, centred_grid
+from litho_design.optics.angular_spectrum import spectrum_axes, transfer_function
+from litho_design.optics.propagators import takes_spectrum
+from litho_design.optics.rayleigh_sommerfeld import rs_kernel
+from litho_design.optics.sampling import check_distance, fast_length
+
+_COLUMNS = 256
+
+
+class BandedPropagator:
+    """As ``make_propagator`` between equal grids, of a field whose bands of rows are shared.
+
+    Field and result are the rows of this process, complex64 (rows, size). The kernel is even along both axes,
+    so that half of each column of its transform is kept.
+
+    Args:
+        pitch_um: pixel, µm.
+        optics: wavelength, distance, kind of propagation.
+        bands: of the element.
+        allocate: room for the large arrays; memory of the processor by default.
+
+    Raises:
+        InputError: a distance at which the Rayleigh-Sommerfeld kernel is aliased, where that is asked for.
+    """
+
+    def __init__(self, pitch_um: float, optics: Optics, bands: Bands, allocate: Allocate | None = None):
+        size = bands.size_px
+        self.bands, self.allocate = bands, allocate or in_memory(torch.device("cpu"))
+        self.source = self.target = centred_grid((size, size), pitch_um)
+        self.length = fast_length(2 * size - 1)
+        width = min(_COLUMNS, bands.band_px)
+        blocks = range(0, self.length, width)
+        self._starts = [
+            blocks[one] if one < len(blocks) else self.length
+            for one in (bands.ranks.share(len(blocks), rank).start for rank in range(bands.ranks.count))
+        ] + [self.length]
+        first, last = self._starts[bands.ranks.rank : bands.ranks.rank + 2]
+        self._blocks = [slice(at - first, min(at + width, last) - first) for at in range(first, last, width)]
+        self._transfer = self.allocate((last - first, self.length // 2 + 1), torch.complex64)
+        spectrum = takes_spectrum(self.source, self.target, optics)
+        (self._spectrum_transfer if spectrum else self._kernel_transfer)(optics)
+
+    def __call__(self, field: Tensor) -> Tensor:
+        """Carry the field; gradients go back by the adjoint."""
+        carried: Tensor = _Carry.apply(field, self)
+        return carried
+
+    def adjoint(self, field: Tensor) -> Tensor:
+        """P^H of the propagation: it sends a field back."""
+        return self._of_tensor(field, conjugate=True)
+
+    def carry(
+        self,
+        given: Callable[[slice], Tensor],
+        keep: Callable[[slice, Tensor], None],
+        *,
+        conjugate: bool = False,
+    ) -> None:
+        """The propagation (or its adjoint) band by band; nothing is recorded for gradients.
+
+        Args:
+            given: the field of a band of the own rows, complex (rows, size).
+            keep: called with each band and what arrives there.
+        """
+        size = self.bands.size_px
+        columns = self._to_columns(given)
+        for block in self._blocks:
+            wave = torch.fft.fft(columns[:, block].T.contiguous().to(self._transfer.device), n=self.length)
+            half, rest = self._transfer[block], self.length - self.length // 2 - 1
+            # Above the middle frequency stand the same numbers, backwards.
+            mirrored = half[:, 1 : rest + 1].flip(1)
+            wave[:, : half.shape[1]] *= half.conj() if conjugate else half
+            wave[:, half.shape[1] :] *= mirrored.conj() if conjugate else mirrored
+            columns[:, block] = torch.fft.ifft(wave)[:, :size].T
+        rows = self._to_rows(columns)
+        for band in self.bands.own():
+            keep(band, torch.fft.ifft(rows[band])[:, :size])
+
+    def _of_tensor(self, field: Tensor, *, conjugate: bool) -> Tensor:
+        carried = torch.empty_like(field)
+
+        def keep(band: slice, wave: Tensor) -> None:
+            carried[band] = wave
+
+        self.carry(lambda band: field[band], keep, conjugate=conjugate)
+        return carried
+
+    def _to_columns(self, given: Callable[[slice], Tensor]) -> Tensor:
+        """Transformed rows, one band after the other, as whole columns: (size, own columns)."""
+        bands, ranks = self.bands, self.bands.ranks
+        rows = self.allocate((len(bands.rows()), self.length), torch.complex64)
+        for band in bands.own():
+            rows[band] = torch.fft.fft(given(band), n=self.length)
+        if ranks.count == 1:
+            return rows
+        width = self._width(ranks.rank)
+        parts = [rows[:, self._starts[rank] : self._starts[rank + 1]] for rank in range(ranks.count)]
+        got = ranks.exchange(parts, [len(bands.rows(rank)) * width for rank in range(ranks.count)])
+        return got.reshape(bands.size_px, width)
+
+    def _to_rows(self, columns: Tensor) -> Tensor:
+        """The inverse exchange: (size, own columns) to (own rows, length)."""
+        bands, ranks = self.bands, self.bands.ranks
+        if ranks.count == 1:
+            return columns
+        parts = [columns[rows.start : rows.stop] for rows in map(bands.rows, range(ranks.count))]
+        widths = [self._width(rank) for rank in range(ranks.count)]
+        own = len(bands.rows())
+        sizes = [own * width for width in widths]
+        got = ranks.exchange(parts, sizes).split(sizes)
+        return torch.cat([part.reshape(own, width) for part, width in zip(got, widths, strict=True)], 1)
+
+    def _width(self, rank: int) -> int:
+        return self._starts[rank + 1] - self._starts[rank]
+
+    def _kernel_transfer(self, optics: Optics) -> None:
+        """The transform of the Rayleigh-Sommerfeld kernel: rows in double, then columns in double."""
+        pitch, size = self.source.pitch_um[0], self.bands.size_px
+        check_distance(optics.distance_um, self.source, self.target, optics.wavelength_um)
+        # Pixels between source and target in wrapped order; places out of use repeat the largest.
+        index = torch.arange(self.length)
+        wrapped = torch.minimum(index, self.length - index).clamp(max=size - 1)
+        away_um, below_um = wrapped.double() * pitch, torch.arange(size).double() * pitch
+        start = self.bands.rows().start
+
+        def row(band: slice) -> Tensor:
+            y = below_um[start + band.start : start + band.stop, None]
+            return rs_kernel(y, away_um[None], optics.distance_um, optics.wavelength_um) * pitch**2
+
+        columns = self._to_columns(row)
+        for block in self._blocks:
+            line = columns[:, block].T.to(torch.complex128)[:, wrapped]
+            self._transfer[block] = torch.fft.fft(line)[:, : self.length // 2 + 1].to(torch.complex64)
+
+    def _spectrum_transfer(self, optics: Optics) -> None:
+        """The transfer function of free space; small elements want a longer period for it than theirs."""
+        given = (self.source, self.target, optics.distance_um, optics.wavelength_um)
+        first, last = self._starts[self.bands.ranks.rank : self.bands.ranks.rank + 2]
+        rows, columns = spectrum_axes(*given)
+        half = self.length // 2 + 1
+        if len(rows.frequency) > self.length:
+            self._transfer[:] = ASMPropagator(*given).transfer[0, 0, :half, first:last].T
+            return
+        for block in self._blocks:
+            own = columns.part(slice(first + block.start, first + block.stop))
+            found = transfer_function(
+                rows.part(slice(0, half)), own, optics.distance_um, optics.wavelength_um
+            )
+            self._transfer[block] = found.T.to(torch.complex64)
+
+
+class _Carry(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, field: Tensor, propagator: BandedPropagator) -> Tensor:
+        ctx.propagator = propagator
+        return propagator._of_tensor(field, conjugate=False)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        return ctx.propagator.adjoint(gradient), None

@@ -1,0 +1,138 @@
+"""Print and score of an existing layout of any size: arrays stay on disk, and one band is in memory.
+
+The figures have the names and meanings of ``HologramScore``; those that need the whole image at once (camera,
+resolved target, uniformity) are left out.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from litho_design.images.similarity import SSIM_WINDOW_PX, ssim_map
+from litho_design.large.bands import Allocate, Bands
+from litho_design.large.hologram import part_of_grid
+from litho_design.large.printing import check_printer, print_band
+from litho_design.large.propagator import BandedPropagator
+from litho_design.optics import Optics, element_field, intensity_share
+from litho_design.printers.printer import Printer
+
+_PREVIEW_PX = 1024
+
+
+def on_disk(folder: Path) -> Allocate:
+    """Room for arrays in files of a folder, which are gone from it at once and from the disk when unused."""
+
+    def allocate(shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+        file = folder / "array.bin"
+        kind = torch.empty(0, dtype=dtype).numpy().dtype
+        array = np.memmap(file, kind, "w+", shape=shape)
+        file.unlink()
+        return torch.from_numpy(array)
+
+    return allocate
+
+
+@torch.no_grad()
+def print_from_disk(level: np.ndarray, printer: Printer, bands: Bands, height_um: np.ndarray) -> None:
+    """Print levels (size, size) into ``height_um`` (size, size), µm, band by band; both may be on disk."""
+    check_printer(printer, bands)
+    halo, size = printer.halo_px, bands.size_px
+    for band in bands.own():
+        around = torch.zeros(band.stop - band.start + 2 * halo, size)
+        first, last = max(band.start - halo, 0), min(band.stop + halo, size)
+        above = first - (band.start - halo)
+        around[above : above + last - first] = torch.from_numpy(level[first:last].astype(np.float32))
+        height_um[band] = print_band(around.to(printer.device), printer, bands.band_px).cpu().numpy()
+
+
+@torch.no_grad()
+def image_from_disk(
+    height_um: np.ndarray,
+    pitch_um: float,
+    optics: Optics,
+    bands: Bands,
+    image: np.ndarray,
+    allocate: Allocate,
+) -> float:
+    """Share of the incident power behind a print (size, size), into ``image``; returns the zero order."""
+    propagator = BandedPropagator(pitch_um, optics, bands, allocate)
+    grid, size = propagator.source, bands.size_px
+    mean = torch.zeros((), dtype=torch.complex128)
+
+    def wave(band: slice) -> Tensor:
+        nonlocal mean
+        part = part_of_grid(grid, range(band.start, band.stop))
+        field = element_field(torch.from_numpy(np.array(height_um[band])), part, optics, pixels=size**2)
+        mean = mean + field.sum(dtype=torch.complex128)
+        return field
+
+    def keep(band: slice, field: Tensor) -> None:
+        image[band] = intensity_share(field, grid).numpy()
+
+    propagator.carry(wave, keep)
+    # A thin element has the same amplitude everywhere, so that its power is known.
+    return float(mean.abs().square()) * pitch_um**2 / size**2
+
+
+def image_figures(image: np.ndarray, target: np.ndarray, bands: Bands) -> dict[str, float]:
+    """Figures of an image (size, size), share of the incident power, against its target in [0, 1]."""
+    signal = paper = dark = power = square = both = wanted = wanted_square = lit_square = 0.0
+    lit = 0
+    for band in bands.own():
+        share, aim = (np.asarray(one[band], np.float64) for one in (image, target))
+        bright = aim > 0.5
+        lit += int(bright.sum())
+        signal += float(share[bright].sum())
+        lit_square += float(np.square(share[bright]).sum())
+        dark += float(share[~bright].sum())
+        paper += float(share[aim > 0].sum())
+        power += float(share.sum())
+        square += float(np.square(share).sum())
+        both += float((share * aim).sum())
+        wanted += float(aim.sum())
+        wanted_square += float(np.square(aim).sum())
+    pixels = bands.size_px**2
+    scale, average = both / max(square, 1e-300), both / wanted
+    likeness, clipped = _likeness(image, target, scale, bands)
+    mean = signal / lit
+    return {
+        "eff_signal": signal,
+        "eff_paper": paper,
+        "eff_window": power,
+        "si_psnr_db": -10 * math.log10(max((wanted_square - scale * both) / pixels, 1e-30)),
+        "rmse_paper": math.sqrt((square / average**2 - 2 * both / average + wanted_square) / pixels),
+        "ssim": likeness,
+        "clipped_share": clipped,
+        "speckle_contrast": math.sqrt(max(lit_square / lit - mean**2, 0.0)) / mean,
+        "background_ratio": mean / (dark / (pixels - lit)),
+    }
+
+
+def preview(image: np.ndarray, bands: Bands) -> np.ndarray:
+    """An image of at most about 1,024 px a side: means over squares of pixels."""
+    step = -(-bands.size_px // _PREVIEW_PX)
+    side = bands.size_px // step
+    rows = [
+        np.asarray(image[row * step : (row + 1) * step, : side * step], np.float64) for row in range(side)
+    ]
+    return np.stack([row.reshape(step, side, step).mean((0, 2)) for row in rows])
+
+
+def _likeness(image: np.ndarray, target: np.ndarray, scale: float, bands: Bands) -> tuple[float, float]:
+    """SSIM at the matched scale, and the share of pixels that it clips."""
+    around = SSIM_WINDOW_PX // 2
+    size, total, clipped = bands.size_px, 0.0, 0
+    for band in bands.own():
+        first, last = max(band.start - around, 0), min(band.stop + around, size)
+        seen = scale * np.asarray(image[first:last], np.float64)
+        clipped += int((seen[band.start - first : band.stop - first] > 1).sum())
+        found = ssim_map(np.clip(seen, 0, 1), np.asarray(target[first:last], np.float64))
+        # Windows that reach over the edge of the element do not count.
+        inner = slice(max(band.start, around) - first, min(band.stop, size - around) - first)
+        total += float(found[inner, around : size - around].sum())
+    return total / (size - 2 * around) ** 2, clipped / size**2

@@ -1,0 +1,202 @@
+"""Elements of more than a millimetre: designed in bands by one or several processes, scored from disk."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.hashes import file_sha256
+from litho_data.foundation.outputs import require_own_folder
+from litho_data.foundation.run_facts import run_facts
+from litho_design.holograms.settings import HologramSettings, hologram_settings
+from litho_design.images.targets import Target, load_target
+from litho_design.judging.score import JudgedScore, ScoreResult
+from litho_design.large.bands import Bands, Ranks
+from litho_design.large.cost import disk_gib, fit_cost, measure_size, sent_gib
+from litho_design.large.run import design_in_bands
+from litho_design.large.score import image_figures, image_from_disk, on_disk, preview, print_from_disk
+from litho_design.printers.printer import Printer
+from litho_design.printers.source import Device, load_printer, load_printers
+from litho_design.reports.score import write_score_report
+from litho_design.tasks.design import HEIGHT_FILE, IMAGE_FILE, LEVELS_FILE, TARGET_FILE, Design
+
+BAND_PX = 512
+
+
+def design_large_hologram(
+    target: str | Path | np.ndarray | Target,
+    model: str | Path | Printer,
+    out: str | Path,
+    *,
+    settings: HologramSettings | None = None,
+    band_px: int = BAND_PX,
+    device: Device = "cpu",
+    extrapolate: bool = False,
+    announce: bool = True,
+) -> Design:
+    """Optimise the layout of a hologram in bands of rows, in this process or shared by those of torchrun.
+
+    Args:
+        target, model, out, settings, device, extrapolate, announce: as for ``design_hologram``; with ``cuda``
+            each process takes a GPU of its own. The model has to have a finite reach.
+        band_px: most rows of a band. Memory for the print grows with its square, and bands are the most
+            processes that can share the element; below some four times the model's reach most of the time
+            goes into what is printed twice.
+
+    Raises:
+        InputError: as ``design_hologram``; settings or a model that a large element cannot have, or more
+            processes than bands.
+    """
+    made, ranks = settings or hologram_settings(), Ranks.joined()
+    layout = made.layout
+    printer = load_printer(model, layout, device=ranks.device(device), extrapolate=extrapolate)
+    bands = Bands(layout.size_px, band_px, ranks, layout.cell_px)
+    return design_in_bands(made, printer, load_target(target, layout.size_px), out, bands, announce=announce)
+
+
+def score_from_disk(
+    design: str | Path,
+    out: str | Path,
+    *,
+    judges: Iterable[str | Printer],
+    band_px: int = BAND_PX,
+    extrapolate: bool = False,
+) -> ScoreResult:
+    """Score the layout of a hologram by models as ``score`` does, with everything large on disk.
+
+    Needs room in ``out`` for 50 bytes per pixel, for the time that it takes.
+
+    Raises:
+        InputError: as ``score``; a design that is no hologram of a thin element, or a judge without a
+            finite reach.
+    """
+    require_own_folder(out, ScoreResult.FILE_NAME)
+    folder, record = Path(design), Design.read(design)
+    layout, optics = record.layout, record.optics
+    if record.task != "hoe" or optics.element != "thin":
+        got = f"{record.task}, {optics.element}"
+        raise InputError("design to score from disk", got=got, wanted="a hologram, thin")
+    level, expected, seen, target = (
+        _opened(folder, record, name) for name in (LEVELS_FILE, HEIGHT_FILE, IMAGE_FILE, TARGET_FILE)
+    )
+    printers = load_printers(judges, layout, extrapolate=extrapolate)
+    if not printers:
+        raise InputError("score", got="nothing to judge with", wanted="a judge")
+    bands = Bands(layout.size_px, band_px)
+    Path(out).mkdir(parents=True, exist_ok=True)
+    scores, pictures = [], {"in design": preview(seen, bands)}
+    for printer in printers.values():
+        judge = printer.record()
+        with tempfile.TemporaryDirectory(prefix=".large-", dir=out) as name:
+            room = Path(name)
+            height, image = (
+                np.memmap(room / file, np.float32, "w+", shape=level.shape) for file in ("height", "image")
+            )
+            print_from_disk(level, printer, bands, height)
+            zero_order = image_from_disk(height, layout.pitch_um, optics, bands, image, on_disk(room))
+            mean, rms = _difference(height, expected, bands)
+            figures = image_figures(image, target, bands) | {"zero_order_share": zero_order}
+            pictures[f"printed by {judge.name}"] = preview(image, bands)
+        scores.append(
+            JudgedScore(
+                kind="model",
+                judge=judge,
+                independent=judge.sha256 != record.printer.sha256,
+                mean_height_difference_um=mean,
+                rms_height_difference_um=rms,
+                figures=figures,
+            )
+        )
+    result = ScoreResult(
+        **run_facts(),
+        design=str(folder),
+        design_sha256=file_sha256(folder / Design.FILE_NAME),
+        layout_sha256=record.files[LEVELS_FILE],
+        task=record.task,
+        designed_with=record.printer,
+        layout=layout,
+        optics=optics,
+        seeds=[int(record.settings["search"]["seed"])],
+        reference_efficiency=record.reference_efficiency,
+        designed=record.predicted,
+        baselines=record.baselines,
+        scores=scores,
+    )
+    brightest = {title: picture / picture.max() for title, picture in pictures.items()}
+    write_score_report(Path(out), result, brightest, layout.size_um, {}, layout.size_um)
+    result.write(out)
+    return result
+
+
+def estimate_large(
+    model: str | Path | Printer,
+    settings: HologramSettings,
+    measure_px: Sequence[int],
+    ranks: int = 1,
+    band_px: int = BAND_PX,
+    *,
+    device: Device = "cpu",
+    extrapolate: bool = False,
+) -> list[str]:
+    """What ``design_large_hologram`` would take with these settings, from small elements measured here.
+
+    Args:
+        measure_px: sides of at least two elements, whose last two the model of the cost is fitted to.
+        ranks: processes that would share the element, each on a machine like this one.
+
+    Returns:
+        One sentence for each size that was measured, and those of the estimate.
+
+    Raises:
+        InputError: fewer than two sizes, sizes that cells do not fill, or what ``design_large_hologram``
+            refuses.
+    """
+    sizes = sorted(set(measure_px))
+    if len(sizes) < 2:
+        raise InputError("sizes to measure", got=sizes, wanted="at least two")
+    layout, search = settings.layout, settings.search
+    Bands(layout.size_px, band_px, Ranks(0, ranks), layout.cell_px)
+    printer = load_printer(model, layout, device=device, extrapolate=extrapolate)
+    measured = [measure_size(settings, printer, size, band_px) for size in sizes]
+    cost, size = fit_cost(measured), layout.size_px
+    lines = [
+        f"measured: {one.size_px} px, {one.iteration_s:.2f} s per iteration, {one.transforms_s:.2f} s of it "
+        f"for the transforms; {one.peak_memory_gib:.2f} GiB"
+        for one in measured
+    ]
+    hours = cost.search_s(size, settings, ranks) / 3600
+    lines.append(
+        f"estimate for {size} px ({layout.size_um / 1000:.3g} mm), {search.iterations} iterations: "
+        f"{cost.iteration_s(size, ranks):.3g} s per iteration, {hours:.3g} h in all; memory "
+        f"{cost.memory_of_rank_gib(size, ranks):.3g} GiB{' in each process' if ranks > 1 else ''}; folder of "
+        f"{disk_gib(size):.3g} GiB"
+    )
+    if ranks > 1:
+        lines.append(
+            f"{ranks} processes on as many machines like this one; each sends "
+            f"{sent_gib(size, ranks):.3g} GiB per iteration, whose time is not in the estimate"
+        )
+    return lines
+
+
+def _opened(folder: Path, record: Design, name: str) -> np.ndarray:
+    """An array of a design on disk, checked against the hash in its record."""
+    if record.files.get(name) != file_sha256(folder / name):
+        raise InputError(f"array {folder / name}", got="a file changed after the design")
+    found: np.ndarray = np.load(folder / name, mmap_mode="r")
+    return found
+
+
+def _difference(height: np.ndarray, expected: np.ndarray, bands: Bands) -> tuple[float, float]:
+    """Mean and rms of one print minus the other, µm."""
+    total = square = 0.0
+    for band in bands.own():
+        off = np.asarray(height[band], np.float64) - expected[band]
+        total += float(off.sum())
+        square += float(np.square(off).sum())
+    pixels = bands.size_px**2
+    return total / pixels, float(np.sqrt(square / pixels))

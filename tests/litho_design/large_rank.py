@@ -1,0 +1,67 @@
+"""What one of several processes does in the tests of large elements, where each of them can import it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import torch
+import torch.distributed as dist
+
+from litho_design.holograms.settings import HologramSettings, hologram_settings
+from litho_design.images.targets import load_target
+from litho_design.large.bands import Bands, Ranks
+from litho_design.large.hologram import BandedHologram
+from litho_design.large.run import design_in_bands
+from litho_design.printers.printer import Printer
+from tests.litho_design.conftest import BlurPrinter
+
+SIZE, BAND, ITERATIONS = 160, 32, 20
+
+
+def settings(iterations: int = ITERATIONS) -> HologramSettings:
+    """A hologram of 16 µm at 30 µm."""
+    changes = {"layout.size_px": SIZE, "optics.distance_um": 30.0, "search.start_iterations": 4}
+    changes |= {"search.iterations": iterations, "search.checkpoint_every": 8, "search.evaluate_every": 5}
+    return hologram_settings(changes=changes)
+
+
+def printer() -> Printer:
+    """A blur that reaches 8 px."""
+    return Printer(BlurPrinter(), settings().layout, source="closed form")
+
+
+def work(folder: Path, ranks: Ranks) -> None:
+    """Field, gradient and layout of one process, for the parent to compare."""
+    torch.set_num_threads(1)
+    bands = Bands(SIZE, BAND, ranks, cell_px=4)
+    rows = bands.rows()
+    target = load_target("ring", SIZE)
+    hologram = BandedHologram(settings(), printer(), target.pixels, bands)
+    draw = torch.Generator().manual_seed(0)
+    level = 12 * torch.rand(SIZE, SIZE, generator=draw)[rows.start : rows.stop]
+    field = torch.randn(SIZE, SIZE, dtype=torch.complex64, generator=draw)[rows.start : rows.stop]
+    level.requires_grad_()
+    loss, _ = hologram.objective(level[None, None])
+    loss.backward()
+    np.savez(
+        folder / f"{ranks.rank}.npz",
+        field=hologram.propagator(field).numpy(),
+        back=hologram.propagator.adjoint(field).numpy(),
+        gradient=level.grad.numpy(),
+        loss=float(loss.detach()),
+    )
+    design_in_bands(settings(), printer(), target, folder / "design", bands, announce=False)
+
+
+def start(rank: int, count: int, port: int, folder: Path) -> None:
+    """Join the others and work."""
+    os.environ |= {
+        "RANK": str(rank),
+        "WORLD_SIZE": str(count),
+        "MASTER_ADDR": "127.0.0.1",
+        "MASTER_PORT": str(port),
+    }
+    work(folder, Ranks.joined())
+    dist.destroy_process_group()

@@ -1,0 +1,207 @@
+"""Large elements: bands of rows give what one piece gives, on any number of processes and from disk."""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import socket
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from litho_data.foundation.errors import InputError
+from litho_design.cli.app import main
+from litho_design.holograms.task import HologramTask
+from litho_design.images.targets import load_target
+from litho_design.judging.loaded import load_design
+from litho_design.large.bands import Bands, Ranks
+from litho_design.large.cost import MeasuredSize, fit_cost, sent_gib
+from litho_design.large.hologram import BandedHologram
+from litho_design.large.propagator import BandedPropagator
+from litho_design.large.run import design_in_bands
+from litho_design.optics import Optics, centred_grid, make_propagator
+from litho_design.optics.sampling import fast_length
+from litho_design.optimisation.search import search_layout
+from litho_design.tasks.design import LEVELS_FILE, Design
+from litho_design.workflows.large import score_from_disk
+from litho_design.workflows.score import score
+from tests.litho_design import large_rank
+from tests.litho_design.large_rank import BAND, SIZE
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory) -> Path:
+    """The folder of one process."""
+    folder = tmp_path_factory.mktemp("one")
+    large_rank.work(folder, Ranks())
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("size", "distance_um", "pitch_um", "kind"),
+    [
+        (97, 30.0, 0.1, "rayleigh-sommerfeld"),
+        (96, 100.0, 0.5, "angular-spectrum"),  # a period longer than the element
+        (96, 1e4, 4.0, "angular-spectrum"),  # its own period
+    ],
+)
+def test_propagation_in_bands_is_that_of_the_whole(size, distance_um, pitch_um, kind):
+    optics = Optics(distance_um=distance_um, propagation=kind)
+    grid = centred_grid((size, size), pitch_um)
+    whole, banded = make_propagator(grid, grid, optics), BandedPropagator(pitch_um, optics, Bands(size, 40))
+    draw = torch.Generator().manual_seed(0)
+    field, other = (torch.randn(size, size, dtype=torch.complex64, generator=draw) for _ in range(2))
+    # Rounding of a float32 transform: a few 6e-8 times the root of log2(192**2), of the largest amplitude.
+    for one, two in ((whole(field), banded(field)), (whole.adjoint(field), banded.adjoint(field))):
+        assert (one - two).abs().max() < 1e-6 * one.abs().max()
+    field.requires_grad_()
+    (slope,) = torch.autograd.grad((banded(field).conj() * other).sum().real, field)
+    assert torch.equal(slope, banded.adjoint(other))
+
+
+def test_loss_and_gradient_in_bands_are_those_of_the_whole():
+    settings, printer = large_rank.settings(), large_rank.printer()
+    target = load_target("ring", SIZE)
+    level = (12 * torch.rand(1, 1, SIZE, SIZE, generator=torch.Generator().manual_seed(0))).requires_grad_()
+    found = []
+    for task in (
+        HologramTask(settings, printer, target),
+        BandedHologram(settings, printer, target.pixels, Bands(SIZE, BAND, cell_px=4)),
+    ):
+        loss, _ = task.objective(level)
+        found.append((loss.detach(), torch.autograd.grad(loss, level)[0]))
+    (loss, slope), (banded_loss, banded_slope) = found
+    assert banded_loss == pytest.approx(float(loss), rel=1e-6)
+    # Sums of 160**2 float32 numbers, in another order.
+    assert (slope - banded_slope).abs().max() < 1e-5 * slope.abs().max()
+
+
+def test_ranks_give_the_layout_of_one_process(alone, tmp_path):
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["tests.litho_design.large_rank"])
+    running = {}
+    for count in (2, 3, 5):
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        folder = tmp_path / str(count)
+        folder.mkdir()
+        given = [(rank, count, port, folder) for rank in range(count)]
+        running[count] = [context.Process(target=large_rank.start, args=one) for one in given]
+        for process in running[count]:
+            process.start()
+    wanted, layout = np.load(alone / "0.npz"), np.load(alone / "design" / LEVELS_FILE)
+    for count, processes in running.items():
+        for process in processes:
+            process.join(120)
+            assert process.exitcode == 0
+        parts = [np.load(tmp_path / str(count) / f"{rank}.npz") for rank in range(count)]
+        for name in ("field", "back", "gradient"):
+            joined = np.concatenate([part[name] for part in parts])
+            assert np.abs(joined - wanted[name]).max() <= 1e-6 * np.abs(wanted[name]).max(), name
+        # The sum over the pixels is in double: only what it is made of is rounded to float32.
+        assert [float(part["loss"]) for part in parts] == pytest.approx(
+            [float(wanted["loss"])] * count, rel=1e-9
+        )
+        np.testing.assert_array_equal(np.load(tmp_path / str(count) / "design" / LEVELS_FILE), layout)
+        assert not list((tmp_path / str(count) / "design").glob("checkpoint*"))
+
+
+def test_an_interrupted_run_ends_the_same_and_other_checkpoints_are_refused(alone, tmp_path, monkeypatch):
+    settings, printer, target = large_rank.settings(), large_rank.printer(), load_target("ring", SIZE)
+    bands = Bands(SIZE, BAND, cell_px=4)
+
+    def stopped(parameters, objective, *given, **named):
+        calls = iter(range(14))
+
+        def interrupted(level):
+            if next(calls, None) is None:
+                raise KeyboardInterrupt
+            return objective(level)
+
+        return search_layout(parameters, interrupted, *given, **named)
+
+    monkeypatch.setattr("litho_design.large.run.search_layout", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        design_in_bands(settings, printer, target, tmp_path, bands, announce=False)
+    monkeypatch.undo()
+    (kept,) = tmp_path.glob("checkpoint*.pt")
+    kept.rename(tmp_path / "checkpoint-1-of-2.pt")
+    with pytest.raises(InputError, match="another number of processes"):
+        design_in_bands(settings, printer, target, tmp_path, bands, announce=False)
+    (tmp_path / "checkpoint-1-of-2.pt").rename(kept)
+    design_in_bands(settings, printer, target, tmp_path, bands, announce=False)
+    layouts = [np.load(folder / LEVELS_FILE) for folder in (alone / "design", tmp_path)]
+    np.testing.assert_array_equal(*layouts)
+
+
+def test_a_score_from_disk_is_that_of_the_whole(alone, tmp_path):
+    design, printer = alone / "design", large_rank.printer()
+    (streamed,) = score_from_disk(design, tmp_path / "disk", judges=[printer], band_px=48).scores
+    (whole,) = score(load_design(design), tmp_path / "whole", judges=[printer]).scores
+    assert len(streamed.figures) == 10
+    for name, value in streamed.figures.items():
+        # Waves differ by rounding, 1e-6 of the largest amplitude; figures are sums of squares of them.
+        assert value == pytest.approx(whole.figures[name], rel=1e-4, abs=1e-7), name
+    assert streamed.rms_height_difference_um == pytest.approx(whole.rms_height_difference_um, abs=1e-7)
+    assert not list((tmp_path / "disk").glob(".large-*"))
+    # The record of the design has the same figures, but for the zero order.
+    predicted = Design.read(design).predicted
+    assert predicted == pytest.approx({name: whole.figures[name] for name in predicted}, rel=1e-4, abs=1e-7)
+
+
+def test_what_a_large_element_cannot_have_is_refused():
+    settings, printer, target = large_rank.settings(), large_rank.printer(), load_target("ring", SIZE)
+    with pytest.raises(InputError, match="at most one per band"):
+        Bands(SIZE, 64, Ranks(0, 4))
+    with pytest.raises(InputError, match="rows of a band"):
+        BandedHologram(settings, printer, target.pixels, Bands(SIZE, 12, cell_px=4))
+    thick = settings.model_copy(update={"optics": settings.optics.model_copy(update={"element": "thick"})})
+    with pytest.raises(InputError, match=r"optics\.element of a large element"):
+        BandedHologram(thick, printer, target.pixels, Bands(SIZE, BAND, cell_px=4))
+    printer.simulator.reach_um = None
+    with pytest.raises(InputError, match="depends on the whole image"):
+        BandedHologram(settings, printer, target.pixels, Bands(SIZE, BAND, cell_px=4))
+
+
+def test_the_estimate_follows_its_laws(tmp_path, capsys, monkeypatch):
+    """On sizes whose cost is known: the model meets them, and the one that it was not fitted to."""
+
+    def known(size):
+        operations = fast_length(2 * size - 1) ** 2 * math.log2(fast_length(2 * size - 1))
+        transforms = 3e-9 * operations
+        return MeasuredSize(
+            size_px=size, iteration_s=transforms + 2e-6 * size**2, transforms_s=transforms,
+            evaluation_s=transforms / 2 + 1e-6 * size**2, peak_memory_gib=0.5 + 1e-7 * size**2,
+        )  # fmt: skip
+
+    cost, unused = fit_cost([known(512), known(1024)]), known(4096)
+    assert cost.iteration_s(4096) == pytest.approx(unused.iteration_s)
+    assert cost.evaluation_s(4096) == pytest.approx(unused.evaluation_s)
+    assert cost.memory_of_rank_gib(4096) == pytest.approx(unused.peak_memory_gib)
+    assert cost.iteration_s(4096, 4) == pytest.approx(unused.iteration_s / 4)
+    # Two processes hold half of the rows, 8,192 complex64 wide, and send half of them, four times.
+    assert sent_gib(4096, 2) == pytest.approx(4 * 2048 * fast_length(8191) * 8 / 2 / 2**30)
+    given = [
+        "--model",
+        "none",
+        "--size-px",
+        "2048",
+        "--measure-px",
+        "64,128",
+        "--ranks",
+        "2",
+        "--band-px",
+        "64",
+    ]
+    monkeypatch.setattr("sys.argv", ["litho-design", "estimate", *given])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 0
+    first, second, told, shared = capsys.readouterr().out.splitlines()
+    assert "64 px" in first
+    assert "128 px" in second
+    assert "2048 px (0.205 mm), 300 iterations" in told
+    assert "0.0625 GiB per iteration" in shared
