@@ -163,11 +163,25 @@ def lens(
     spread_of: SpreadOf = None,
     roughness_of: RoughnessOf = None,
     ensemble: Ensemble = None,
+    large: Annotated[
+        bool, typer.Option("--large", help="Ring by ring, for a lens of any size that focuses light.")
+    ] = False,
+    band_px: BandPx = 512,
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
     """Design a multi-level diffractive lens; an interrupted run in OUT is continued."""
     settings = _settings(given, _lens, "lens", spread_of, roughness_of)
+    if large:
+        if objects or held_out_objects or ensemble:
+            raise InputError("--large", got="objects or --ensemble", wanted="one lens through one model")
+        from litho_design.workflows.large import design_large_lens
+
+        design = design_large_lens(
+            model, out, settings=settings, tile_px=band_px, device=device, extrapolate=extrapolate
+        )
+        _print_design(design, out)
+        return
     from litho_design.workflows.design import design_lens
 
     design = design_lens(

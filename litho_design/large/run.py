@@ -29,6 +29,7 @@ from litho_design.optimisation.search import finished_iterations, remove_checkpo
 from litho_design.optimisation.starts import start_search
 from litho_design.printers.layout import printability
 from litho_design.printers.printer import Printer
+from litho_design.printers.training import out_of_distribution
 from litho_design.tasks.design import HEIGHT_FILE, IMAGE_FILE, LEVELS_FILE, TARGET_FILE, Design, RunRecord
 
 _LEFT_OUT = (
@@ -121,6 +122,7 @@ def design_in_bands(
                 heights, settings.optics.wave_height_um, level_height_um=layout.level_height_um
             ),
             printability=printability(levels, layout),
+            out_of_distribution=out_of_distribution(levels, layout, printer.card),
             notes=[_LEFT_OUT, f"{bands.count} bands of {bands.band_px} rows, {ranks.count} process(es)"],
             iterations=state.iteration,
             start_loss=start_loss,

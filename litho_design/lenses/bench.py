@@ -21,20 +21,13 @@ from litho_design.optics.imaging import Blur, bin_pixels, richardson_lucy
 from litho_design.printers.layout import LayoutSettings
 
 
-class LensBench(nn.Module):
-    """A plane wave through a printed lens onto the focal window."""
-
-    aperture: Tensor
+class LensOptics(nn.Module):
+    """What the benches of a plane and of rings share: aperture, focal window, the perfect lens."""
 
     def __init__(self, layout: LayoutSettings, optics: Optics, view: LensView):
         super().__init__()
         self.layout, self.optics, self.view = layout, optics, view
-        self.grid = centred_grid((layout.size_px, layout.size_px), layout.pitch_um)
         self.window = centred_grid((view.window_px, view.window_px), layout.pitch_um)
-        self.propagator = make_propagator(self.grid, self.window, optics)
-        radius = np.hypot(self.grid.y_um[:, None], self.grid.x_um[None, :])
-        inside = radius < layout.size_um / 2 if view.aperture == "circle" else np.ones_like(radius)
-        self.register_buffer("aperture", torch.from_numpy(inside).float(), persistent=False)
 
     @property
     def numerical_aperture(self) -> float:
@@ -42,32 +35,52 @@ class LensBench(nn.Module):
         half = self.layout.size_um / 2
         return half / math.hypot(half, self.optics.distance_um)
 
+    def radius_um(self) -> Tensor:
+        """Distance from the axis, float64, µm, of each height that is asked for."""
+        raise NotImplementedError
+
+    def ideal_height_um(self) -> Tensor:
+        """Heights of a perfect lens, wrapped to one wave, µm."""
+        focal_um = self.optics.distance_um
+        path = focal_um - (self.radius_um() ** 2 + focal_um**2).sqrt()
+        # The height that delays the wave by the path difference; wrapping changes nothing.
+        height = path * self.optics.wave_height_um / self.optics.wavelength_um
+        return torch.remainder(height, self.optics.wave_height_um).float()
+
+
+class LensBench(LensOptics):
+    """A plane wave through a printed lens onto the focal window."""
+
+    aperture: Tensor
+
+    def __init__(self, layout: LayoutSettings, optics: Optics, view: LensView):
+        super().__init__(layout, optics, view)
+        self.grid = centred_grid((layout.size_px, layout.size_px), layout.pitch_um)
+        self.propagator = make_propagator(self.grid, self.window, optics)
+        radius = np.hypot(self.grid.y_um[:, None], self.grid.x_um[None, :])
+        inside = radius < layout.size_um / 2 if view.aperture == "circle" else np.ones_like(radius)
+        self.register_buffer("aperture", torch.from_numpy(inside).float(), persistent=False)
+
     def forward(self, height_um: Tensor) -> Tensor:
         """PSF of a height map (size, size), µm: share of the incident power per window pixel."""
         field = element_field(height_um, self.grid, self.optics, self.aperture)
         return intensity_share(self.propagator(field), self.window)
 
-    def ideal_height_um(self) -> Tensor:
-        """Height (size, size) of a perfect lens, wrapped to one wave, µm."""
-        y, x = torch.from_numpy(self.grid.y_um)[:, None], torch.from_numpy(self.grid.x_um)[None, :]
-        path = self.optics.distance_um - (x**2 + y**2 + self.optics.distance_um**2).sqrt()
-        # The height that delays the wave by the path difference; wrapping changes nothing.
-        height = path * self.optics.wave_height_um / self.optics.wavelength_um
-        wrapped = torch.remainder(height, self.optics.wave_height_um)
-        return wrapped.float().to(self.aperture.device)
+    def radius_um(self) -> Tensor:
+        """Of each pixel (size, size)."""
+        y, x = (torch.from_numpy(axis) for axis in (self.grid.y_um, self.grid.x_um))
+        return torch.hypot(y[:, None], x[None, :]).to(self.aperture.device)
 
 
-class RadialLensBench(nn.Module):
+class RadialLensBench(LensOptics):
     """The same PSF from the height along the central row, for ring layouts and circular apertures."""
 
     lower: Tensor
     share: Tensor
 
     def __init__(self, layout: LayoutSettings, optics: Optics, view: LensView):
-        super().__init__()
-        self.optics, self.pitch_um = optics, layout.pitch_um
-        rings = layout.size_px // 2
-        window = centred_grid((view.window_px, view.window_px), layout.pitch_um)
+        super().__init__(layout, optics, view)
+        rings, window = layout.size_px // 2, self.window
         radius = torch.from_numpy(np.hypot(window.y_um[:, None], window.x_um[None, :]))
         nodes = torch.arange(int(float(radius.max()) / layout.pitch_um) + 2) * layout.pitch_um
         self.propagator = RadialPropagator(
@@ -84,7 +97,12 @@ class RadialLensBench(nn.Module):
         wave = self.propagator(torch.polar(torch.full_like(phase, self._incident**-0.5), phase))
         # The wave is smooth on the scale of a pixel: interpolate it, not the intensity.
         here = wave[self.lower] * (1 - self.share) + wave[self.lower + 1] * self.share
-        return (here.real.square() + here.imag.square()) * self.pitch_um**2
+        return (here.real.square() + here.imag.square()) * self.layout.pitch_um**2
+
+    def radius_um(self) -> Tensor:
+        """Of the middle of each ring (rings,)."""
+        rings = torch.arange(self.propagator.rings, dtype=torch.float64, device=self.share.device)
+        return (rings + 0.5) * self.layout.pitch_um
 
 
 def centre_to_background(psf: Tensor, centre_px: int, element_px: int) -> Tensor:

@@ -12,7 +12,14 @@ from torch import Tensor
 
 from litho_data.foundation.results import Record
 from litho_design.images.similarity import similarity
-from litho_design.lenses.bench import LensBench, centre_to_background, reconstruct, record, sensor_psf
+from litho_design.lenses.bench import (
+    LensBench,
+    RadialLensBench,
+    centre_to_background,
+    reconstruct,
+    record,
+    sensor_psf,
+)
 from litho_design.lenses.objects import object_stack
 from litho_design.lenses.settings import ImagingSettings, LensSettings
 
@@ -58,8 +65,8 @@ class ImagingScore(Record):
 
 
 @torch.no_grad()
-def lens_score(bench: LensBench, height_um: Tensor) -> LensScore:
-    """Score the plane PSF of a printed height map (size, size), µm."""
+def lens_score(bench: LensBench | RadialLensBench, height_um: Tensor) -> LensScore:
+    """Score the PSF of printed heights, µm: a plane (size, size), or rings (rings,)."""
     psf, ideal = (bench(height).double() for height in (height_um, bench.ideal_height_um()))
     pitch = bench.layout.pitch_um
     fwhm_ideal = half_maximum_width_um(ideal, pitch)

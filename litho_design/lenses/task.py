@@ -33,6 +33,7 @@ from litho_design.lenses.settings import LensSettings
 from litho_design.optics import Optics
 from litho_design.optimisation.parameters import CellMap
 from litho_design.optimisation.starts import Scene
+from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 from litho_design.tasks.task import Task, register_task
 
@@ -91,7 +92,9 @@ class LensTask(Task):
         rings, placed = settings.view.path == "radial", any(p.depends_on_position for p in self.printers)
         self.radial = rings and not placed
         self.strips = (
-            [_strip_rings(self.cells, p.strip_halo_px) for p in self.printers] if self.radial else []
+            [strip_rings(settings.layout, p.strip_halo_px, self.cells.cells[0]) for p in self.printers]
+            if self.radial
+            else []
         )
         self.notes += [_PLANE_NOTE] if rings and placed else []
         self.notes += _narrow_window(self.bench)
@@ -223,13 +226,15 @@ def _narrow_window(bench: LensBench) -> list[str]:
     ]
 
 
-def _strip_rings(cells: CellMap, halo_px: int) -> Tensor:
-    """Ring under each pixel of the strip: two central rows, rings 0 to the aperture, a halo all round."""
-    assert cells.radial
-    along = torch.arange(-halo_px, cells.size_px // 2 + halo_px, dtype=torch.float64) + 0.5
+def strip_rings(layout: LayoutSettings, halo_px: int, rings: int) -> Tensor:
+    """Ring under each pixel of a strip: two central rows, rings 0 to the aperture, a halo all round.
+
+    Beyond the last of the ``rings`` the strip goes on with that one.
+    """
+    along = torch.arange(-halo_px, layout.size_px // 2 + halo_px, dtype=torch.float64) + 0.5
     across = torch.arange(-halo_px - 1, halo_px + 1, dtype=torch.float64) + 0.5
-    ring = (torch.hypot(across[:, None], along[None, :]) / cells.cell_px).floor().long()
-    return ring.clamp(max=cells.cells[0] - 1).to(cells.ring.device)
+    ring = (torch.hypot(across[:, None], along[None, :]) / layout.cell_px).floor().long()
+    return ring.clamp(max=rings - 1)
 
 
 def _check(settings: LensSettings) -> None:

@@ -104,9 +104,9 @@ class GumbelLevels(nn.Module):
 class DirectLevels(nn.Module):
     """One real level per cell; rounding passes the gradient straight through when ``hard``."""
 
-    def __init__(self, layout: LayoutSettings, rows: range | None = None):
+    def __init__(self, layout: LayoutSettings, rows: range | None = None, *, cells: CellMap | None = None):
         super().__init__()
-        self.cells = CellMap(layout, rows)
+        self.cells = cells or CellMap(layout, rows)
         self.levels = layout.levels
         self.height = nn.Parameter(torch.zeros(self.cells.cells))
 

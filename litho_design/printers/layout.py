@@ -78,7 +78,7 @@ def printability(levels: np.ndarray, layout: LayoutSettings) -> Printability:
         levels: integer levels (ny, nx).
     """
     runs = np.concatenate([_inner_runs(levels), _inner_runs(levels.T)])
-    steps = np.concatenate([np.abs(np.diff(levels.astype(int), axis=axis)).ravel() for axis in (0, 1)])
+    steps = np.concatenate([np.abs(np.diff(levels.astype(np.int16), axis=axis)).ravel() for axis in (0, 1)])
     steepest = float(steps.max(initial=0)) * layout.level_height_um
     return Printability(
         pitch_um=layout.pitch_um,
@@ -98,8 +98,8 @@ def _smallest_ring_um(levels: np.ndarray, layout: LayoutSettings) -> float | Non
     """Narrowest run of one level along the radius; None without rings, or where only one level is left."""
     if layout.symmetry != "radial":
         return None
-    middle = levels.shape[0] // 2
-    edges = np.flatnonzero(np.diff(levels[middle, middle:].astype(int))) + 1
+    middle_y, middle_x = (side // 2 for side in levels.shape)
+    edges = np.flatnonzero(np.diff(levels[middle_y, middle_x:].astype(int))) + 1
     if edges.size == 0:
         return None
     # The central disc is twice as wide as its run, and the outermost ring may be cut.

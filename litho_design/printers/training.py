@@ -48,8 +48,9 @@ def out_of_distribution(
     if trained is None:
         return None
     share = np.bincount(levels.ravel(), minlength=len(trained)) / levels.size
-    steps = np.concatenate([np.abs(np.diff(levels.astype(int), axis=axis)).ravel() for axis in (0, 1)])
-    step_share = np.bincount(steps, minlength=len(trained)) / max(steps.size, 1)
+    steps = (np.abs(np.diff(levels.astype(np.int16), axis=axis)).ravel() for axis in (0, 1))
+    counts = np.sum([np.bincount(one, minlength=len(trained)) for one in steps], axis=0)
+    step_share = counts / max(counts.sum(), 1)
     trained_steps = training_share(card, "training_step_share", layout.levels)
     apart = None if trained_steps is None else _distance(step_share, trained_steps)
     distance, top = _distance(share, trained), layout.levels - 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from litho_design.tasks.design import Design
+from litho_design.tasks.design import LEVELS_FILE, Design
 
 # Figures whose loss is told in dB: already in dB (0), shares of power (10), lengths (20).
 _IN_DB = {"si_psnr_db": 0, "eff_signal": 10, "focusing_efficiency": 10, "rms_nm": -20}
@@ -27,7 +27,7 @@ def distribution_warning(design: Design) -> str:
     """A warning where a layout is far from the training layouts, or where that is unknown; else empty."""
     gauge = design.out_of_distribution
     if gauge is None:
-        if design.printer.source == "none":
+        if design.printer.source == "none" or LEVELS_FILE not in design.files:
             return ""
         return (
             f"the card of the model {design.printer.name} does not describe its training layouts, so the "

@@ -17,8 +17,10 @@ from litho_design.images.targets import Target, load_target
 from litho_design.judging.score import JudgedScore, ScoreResult
 from litho_design.large.bands import Bands, Ranks
 from litho_design.large.cost import disk_gib, fit_cost, measure_size, sent_gib
+from litho_design.large.lens import design_in_rings
 from litho_design.large.run import design_in_bands
 from litho_design.large.score import image_figures, image_from_disk, on_disk, preview, print_from_disk
+from litho_design.lenses.settings import LensSettings, lens_settings
 from litho_design.printers.printer import Printer
 from litho_design.printers.source import Device, load_printer, load_printers
 from litho_design.reports.score import write_score_report
@@ -56,6 +58,30 @@ def design_large_hologram(
     printer = load_printer(model, layout, device=ranks.device(device), extrapolate=extrapolate)
     bands = Bands(layout.size_px, band_px, ranks, layout.cell_px)
     return design_in_bands(made, printer, load_target(target, layout.size_px), out, bands, announce=announce)
+
+
+def design_large_lens(
+    model: str | Path | Printer,
+    out: str | Path,
+    *,
+    settings: LensSettings | None = None,
+    tile_px: int = BAND_PX,
+    device: Device = "cpu",
+    extrapolate: bool = False,
+    announce: bool = True,
+) -> Design:
+    """Optimise the rings of a lens that focuses light; nothing of the plane is made, up to 10 mm and more.
+
+    Args:
+        model, out, settings, device, extrapolate, announce: as for ``design_lens``.
+        tile_px: length of the tiles in which the strip along a radius is printed.
+
+    Raises:
+        InputError: as ``design_lens``; settings or a model that a lens of rings cannot have.
+    """
+    made = settings or lens_settings()
+    printer = load_printer(model, made.layout, device=device, extrapolate=extrapolate)
+    return design_in_rings(made, printer, out, tile_px=tile_px, announce=announce)
 
 
 def score_from_disk(

@@ -19,15 +19,20 @@ from litho_design.judging.loaded import load_design
 from litho_design.large.bands import Bands, Ranks
 from litho_design.large.cost import MeasuredSize, fit_cost, sent_gib
 from litho_design.large.hologram import BandedHologram
+from litho_design.large.lens import RING_HEIGHT_FILE, RINGS_FILE, RingLens, design_in_rings
 from litho_design.large.propagator import BandedPropagator
 from litho_design.large.run import design_in_bands
+from litho_design.lenses.settings import lens_settings
+from litho_design.lenses.task import lens_task
 from litho_design.optics import Optics, centred_grid, make_propagator
 from litho_design.optics.sampling import fast_length
 from litho_design.optimisation.search import search_layout
+from litho_design.printers.printer import Printer
 from litho_design.tasks.design import LEVELS_FILE, Design
 from litho_design.workflows.large import score_from_disk
 from litho_design.workflows.score import score
 from tests.litho_design import large_rank
+from tests.litho_design.conftest import BlurPrinter
 from tests.litho_design.large_rank import BAND, SIZE
 
 
@@ -205,3 +210,34 @@ def test_the_estimate_follows_its_laws(tmp_path, capsys, monkeypatch):
     assert "128 px" in second
     assert "2048 px (0.205 mm), 300 iterations" in told
     assert "0.0625 GiB per iteration" in shared
+
+
+def test_a_lens_in_rings_is_the_lens_of_the_plane(tmp_path):
+    changes = {
+        "layout.size_px": 256,
+        "optics.distance_um": 40.0,
+        "view.window_px": 64,
+        "search.iterations": 6,
+    }
+    settings = lens_settings(changes=changes | {"search.evaluate_every": 2})
+    printer = Printer(BlurPrinter(), settings.layout, source="closed form")
+    plane, rings = lens_task(settings, printer), RingLens(settings, printer, 48)
+    free = 12 * torch.rand(plane.cells.cells, generator=torch.Generator().manual_seed(0))
+    radius = rings.cells(free[: rings.cells.cells[0]])[None, None]
+    printed = rings.printed_um(radius)
+    # Beyond the aperture the plane has corners, which the print reaches for 8 px: 1e-5 µm is rounding.
+    assert (printed - plane.printed_rings(plane.cells(free)[None, None]))[:-8].abs().max() < 1e-5
+    found, whole = (
+        (one.objective(two)[0], one.score(one.bench.ideal_height_um()))
+        for one, two in ((rings, radius), (plane, plane.cells(free)[None, None]))
+    )
+    # A circle of square pixels against true rings: a pixel of the edge in 128, twice, in power.
+    assert found[1].focusing_efficiency == pytest.approx(whole[1].focusing_efficiency, rel=1 / 64)
+    assert found[1].fwhm_um == pytest.approx(whole[1].fwhm_um, rel=1 / 64)
+    design = design_in_rings(settings, printer, tmp_path, tile_px=48, announce=False)
+    assert design.argmax_loss < design.start_loss
+    level, height = (np.load(tmp_path / name) for name in (RINGS_FILE, RING_HEIGHT_FILE))
+    assert level.shape == height.shape == (128,)
+    again = rings.score(rings.printed_um(torch.from_numpy(level).float()[None, None])).model_dump()
+    assert design.predicted == pytest.approx(again, rel=1e-6)
+    assert 0.2 < design.predicted["strehl"] <= 1

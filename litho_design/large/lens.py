@@ -1,0 +1,211 @@
+"""A lens of any size ring by ring: a strip along one radius is printed, and the wave of rings is carried.
+
+Nothing of the plane is ever made: an element of 10 mm is 50,000 rings of 0.1 µm, not 10¹⁰ pixels.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.utils.checkpoint import checkpoint
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import writable
+from litho_data.foundation.hashes import record_sha256
+from litho_data.foundation.outputs import require_own_folder
+from litho_data.foundation.run_facts import run_facts
+from litho_design.large.bands import Bands
+from litho_design.large.printing import check_printer
+from litho_design.lenses.bench import RadialLensBench, centre_to_background
+from litho_design.lenses.score import LensScore, lens_score
+from litho_design.lenses.settings import LensSettings
+from litho_design.lenses.task import strip_rings
+from litho_design.optics.stroke import measure_stroke
+from litho_design.optimisation.budget import measure_budget, peak_memory_gib
+from litho_design.optimisation.parameters import CellMap, DirectLevels
+from litho_design.optimisation.phases import focusing_levels, printed_phase
+from litho_design.optimisation.search import finished_iterations, remove_checkpoint, search_layout
+from litho_design.printers.layout import LayoutSettings, printability
+from litho_design.printers.printer import Printer
+from litho_design.tasks.design import Design, RunRecord, write_arrays
+
+RINGS_FILE = "ring_level.npy"
+RING_HEIGHT_FILE = "ring_height_um.npy"
+
+
+class RadiusMap(CellMap):
+    """Free rings along one radius: what ``CellMap`` is for the pixels of a plane."""
+
+    def __init__(self, layout: LayoutSettings):
+        nn.Module.__init__(self)
+        self.size_px, self.cell_px = layout.size_px, layout.cell_px
+        self._own = slice(None)
+        self.cells = self.of_all = (-(-layout.size_px // 2 // layout.cell_px),)
+
+    def forward(self, values: Tensor) -> Tensor:
+        """(..., rings) to (..., pixels of the radius)."""
+        return values.repeat_interleave(self.cell_px, -1)[..., : self.size_px // 2]
+
+    def average(self, pixels: Tensor) -> Tensor:
+        """Mean over the area of each ring of real or complex ``pixels`` along the radius."""
+        weight = (torch.arange(self.size_px // 2, device=pixels.device) + 0.5).to(pixels)
+        ring = torch.arange(self.size_px // 2, device=pixels.device) // self.cell_px
+        sums = [pixels.new_zeros(self.cells).index_add_(0, ring, one) for one in (pixels * weight, weight)]
+        return sums[0] / sums[1]
+
+
+class RingLens:
+    """A direct lens of rings, printed along a radius.
+
+    Args:
+        settings: of the lens, with rings, a circular aperture and a thin element.
+        printer: a frozen model with a finite reach, or nominal heights.
+        tile_px: length of the tiles in which the strip is printed.
+
+    Raises:
+        InputError: settings or a printer that a lens of rings cannot have.
+    """
+
+    def __init__(self, settings: LensSettings, printer: Printer, tile_px: int):
+        layout = settings.layout
+        wanted: dict[str, tuple[Any, Any]] = {
+            "task": (settings.task, "direct"),
+            "layout.symmetry": (layout.symmetry, "radial"),
+            "view.aperture": (settings.view.aperture, "circle"),
+            "optics.element": (settings.optics.element, "thin"),
+            "search.parametrisation": (settings.search.parametrisation, "direct"),
+            "window.samples": (settings.window.samples, 0),
+            "size_px modulo 2": (layout.size_px % 2, 0),
+        }
+        for name, (given, only) in wanted.items():
+            if given != only:
+                raise InputError(f"{name} of a large lens", got=repr(given), wanted=repr(only))
+        check_printer(printer, Bands(layout.size_px, layout.size_px))
+        self.settings, self.printer, self.tile_px = settings, printer, tile_px
+        self.bench = RadialLensBench(layout, settings.optics, settings.view).to(printer.device)
+        self.cells = RadiusMap(layout)
+        self._strip = strip_rings(layout, printer.halo_px, self.cells.cells[0]).to(printer.device)
+
+    def printed_um(self, level: Tensor) -> Tensor:
+        """Printed height, µm (rings of a pixel,), of levels along the radius (1, 1, pixels)."""
+        free = self.cells.average(level[0, 0])
+        strip, halo = free[self._strip][None, None], self.printer.halo_px
+        length = strip.shape[-1] - 2 * halo
+        parts = [
+            strip[..., at : min(at + self.tile_px, length) + 2 * halo]
+            for at in range(0, length, self.tile_px)
+        ]
+        printed = [
+            checkpoint(self.printer.print_patch, part, use_reentrant=False)
+            if torch.is_grad_enabled()
+            else self.printer.print_patch(part)
+            for part in parts
+        ]
+        return torch.cat(printed, -1)[0, 0].mean(0)
+
+    def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
+        """-log(centre-to-background ratio), and its parts."""
+        layout, view = self.settings.layout, self.settings.view
+        seen = self.bench(self.printed_um(level))
+        ratio = centre_to_background(seen, round(view.centre_um / layout.pitch_um), layout.size_px)
+        return -ratio.log(), {"cbr": float(ratio.detach()), "window": float(seen.detach().sum())}
+
+    def start(self, parameters: DirectLevels, heights: list[float]) -> None:
+        """Levels whose print is nearest to a perfect lens, or random ones."""
+        search, optics = self.settings.search, self.settings.optics
+        if search.start == "random":
+            return parameters.start_random(search.seed)
+        ideal = self.bench.ideal_height_um().double() * (2 * math.pi / optics.wave_height_um)
+        wave = self.cells.average(torch.polar(torch.ones_like(ideal), ideal))
+        levels = focusing_levels(wave.angle().float().cpu(), printed_phase(heights, optics))
+        return parameters.start_from(
+            levels.float(), jitter_levels=search.start_jitter_levels, seed=search.seed
+        )
+
+    @torch.no_grad()
+    def score(self, height_um: Tensor) -> LensScore:
+        """Figures of the PSF of a print along the radius."""
+        return lens_score(self.bench, height_um)
+
+
+def design_in_rings(
+    settings: LensSettings,
+    printer: Printer,
+    out: str | Path,
+    *,
+    tile_px: int,
+    announce: bool = True,
+) -> Design:
+    """Optimise the rings of a lens, and write the folder ``out``; an interrupted run resumes.
+
+    Raises:
+        InputError: what ``RingLens`` refuses, or ``out`` holds another result.
+    """
+    folder, search, layout = Path(out), settings.search, settings.layout
+    require_own_folder(folder, Design.FILE_NAME)
+    before = printer.weights_sha256()
+    fingerprint = record_sha256(["lens in rings", settings.model_dump(mode="json"), before])
+    if (folder / Design.FILE_NAME).exists():
+        design = Design.read(folder)
+        if design.fingerprint != fingerprint:
+            raise InputError(f"folder {folder}", got="another design", wanted="the same settings and model")
+        return design
+    with writable(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+    started = time.monotonic()
+    lens, heights = RingLens(settings, printer, tile_px), printer.level_heights_um()
+    parameters = DirectLevels(layout, cells=lens.cells).to(printer.device)
+    lens.start(parameters, heights)
+    with printer.at_precision(search.precision):
+        with torch.no_grad():
+            start_loss = float(lens.objective(lens.cells(parameters.best_levels().float())[None, None])[0])
+        budget = measure_budget(parameters, lens.objective, search)
+        if announce:
+            unpolished = search.model_copy(update={"polish_rounds": 0})
+            print(budget.sentence(unpolished, finished_iterations(folder)), file=sys.stderr)
+        state = search_layout(parameters, lens.objective, search, folder=folder, fingerprint=fingerprint)
+    assert state.best_levels is not None
+    level = lens.cells(state.best_levels)
+    with torch.no_grad():
+        height = lens.printed_um(level.float()[None, None])
+    rows = level.cpu().numpy().astype("uint8")
+    design = Design(
+        task="lens-direct",
+        variant=settings.variant,
+        fingerprint=fingerprint,
+        run=RunRecord(
+            **run_facts(),
+            device=str(printer.device),
+            threads=torch.get_num_threads(),
+            seconds=time.monotonic() - started,
+            seconds_per_iteration=budget.seconds_per_iteration,
+            peak_memory_gib=peak_memory_gib(printer.device),
+        ),
+        settings=settings.model_dump(mode="json"),
+        layout=layout,
+        optics=settings.optics,
+        printer=printer.record(),
+        printer_unchanged=printer.weights_sha256() == before,
+        stroke=measure_stroke(
+            heights, settings.optics.wave_height_um, level_height_um=layout.level_height_um
+        ),
+        printability=printability(torch.cat([level.flip(0), level])[None].cpu().numpy(), layout),
+        notes=["a lens in rings: levels and heights along one radius; no layout of the plane, no polish"],
+        iterations=state.iteration,
+        start_loss=start_loss,
+        sample_loss=state.history[-1]["sample_loss"],
+        argmax_loss=state.best_loss,
+        polished_loss=state.best_loss,
+        reference_efficiency=lens.score(lens.bench.ideal_height_um()).focusing_efficiency,
+        predicted=lens.score(height).model_dump(),
+        files=write_arrays(folder, {RINGS_FILE: rows, RING_HEIGHT_FILE: height.cpu().numpy()}),
+    )
+    design.write(folder)
+    remove_checkpoint(folder)
+    return design
