@@ -130,18 +130,20 @@ def option_paths(preset: BaseModel) -> dict[str, str]:
 def as_toml(settings: BaseModel) -> str:
     """Settings as a file for ``--config``, each with its meaning, unit, choices and option."""
     lines: list[str] = []
-    table = ""
-    for leaf in sorted(leaves(settings), key=lambda leaf: "." in leaf.path):
-        place, _, name = leaf.path.rpartition(".")
-        if place != table:
-            lines += ["", f"[{place}]"]
-            table = place
-        notes = [_described(leaf)]
-        if get_origin(leaf.kind) is Literal:
-            notes.append(", ".join(map(str, get_args(leaf.kind))))
-        notes += [" or ".join(leaf.options)] if leaf.options else []
-        value = leaf.value.model_dump() if isinstance(leaf.value, BaseModel) else leaf.value
-        lines += [f"# {'; '.join(notes)}", f"{name} = {json.dumps(value, ensure_ascii=False)}"]
+    # A table is written once, wherever its settings stand.
+    tables: dict[str, list[Leaf]] = {"": []}
+    for leaf in leaves(settings):
+        tables.setdefault(leaf.path.rpartition(".")[0], []).append(leaf)
+    for table, inside in tables.items():
+        lines += ["", f"[{table}]"] if table else []
+        for leaf in inside:
+            notes = [_described(leaf)]
+            if get_origin(leaf.kind) is Literal:
+                notes.append(", ".join(map(str, get_args(leaf.kind))))
+            notes += [" or ".join(leaf.options)] if leaf.options else []
+            value = leaf.value.model_dump() if isinstance(leaf.value, BaseModel) else leaf.value
+            name = leaf.path.rpartition(".")[2]
+            lines += [f"# {'; '.join(notes)}", f"{name} = {json.dumps(value, ensure_ascii=False)}"]
     return "\n".join(lines) + "\n"
 
 
