@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from litho_data.build.jobs import FieldJob
+from litho_data.build.jobs import FieldJob, scaled_pitch_um
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.workers import run_jobs
 from litho_data.tip.radius import PeakRadius, of_one_tip, peak_radius
@@ -38,10 +38,12 @@ def with_tip_found(jobs: Sequence[FieldJob], workers: int, dask: str | None) -> 
 
 
 def tip_of(job: FieldJob) -> PeakRadius | None:
-    """What one scan says about the tip; None if it cannot be read."""
+    """What one scan says about the tip, in calibrated lengths if there are standards; None if unread."""
     try:
-        read = job.read()
+        read, calibrated = job.read(), job.calibrate()
     except InputError:
         return None
-    pitch_y_um, pitch_x_um = read.facts["pitch_um"]
-    return peak_radius(read.arrays["raw_height_um"].astype(np.float64), (pitch_y_um, pitch_x_um))
+    scales = {} if calibrated is None else calibrated.facts
+    pitch_y_um, pitch_x_um = scaled_pitch_um(read.facts["pitch_um"], scales)
+    height_um = read.arrays["raw_height_um"].astype(np.float64) * scales.get("scale_z", 1.0)
+    return peak_radius(height_um, (pitch_y_um, pitch_x_um))

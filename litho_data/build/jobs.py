@@ -97,6 +97,13 @@ class FieldJob:
         """The scan as it was read; InputError if that fails."""
         return OPERATIONS["read-scan"].run(self._read_params, {self.scan_name: self.field.scan}, {})
 
+    def calibrate(self) -> Done | None:
+        """The scales of the microscope, None without standards; InputError if these do not show them."""
+        if not self.standards.described:
+            return None
+        described = {"standards": [dict(one) for one in self.standards.described]}
+        return OPERATIONS["calibrate"].run(described, self.standards.files, {})
+
     def run(self) -> Piece:
         """The finished scan; InputError if its files do not allow it."""
         steps = list(self._steps())
@@ -133,9 +140,7 @@ class FieldJob:
         yield read
         calibration: dict[str, np.ndarray] = {}
         pitch_um = read.facts["pitch_um"]
-        if self.standards.described:
-            described = {"standards": [dict(one) for one in self.standards.described]}
-            done = OPERATIONS["calibrate"].run(described, self.standards.files, {})
+        if (done := self.calibrate()) is not None:
             yield done
             calibration = done.arrays
             pitch_um = scaled_pitch_um(pitch_um, done.facts)

@@ -11,11 +11,16 @@ from typer.testing import CliRunner
 
 from litho_data import build_dataset, open_store, verify
 from litho_data.build.calibration import calibrate
+from litho_data.build.day_tip import tip_of
+from litho_data.build.jobs import field_jobs
+from litho_data.build.operations import load_recipe
+from litho_data.cards.listing import list_fields
 from litho_data.cli.app import app
 from litho_data.foundation.errors import InputError
 from litho_data.provenance.history import history
 from litho_data.provenance.replay import replay
 from litho_data.roughness import axis_scales, find_step, find_wave
+from litho_data.tip.radius import peak_radius
 from tests.litho_data.campaigns import MARGIN_PX, NOISE_UM, height_of, layout_of, write_campaign, write_scan
 
 PITCH_UM, PERIOD_UM, STEP_UM = 0.1, 1.5, 0.2
@@ -131,6 +136,17 @@ def test_a_build_applies_the_scales_and_carries_their_uncertainty(calibrated: Pa
         spread = scan.height_um[scan.valid].std()
         known = 1e3 * spread * quality["scale_z_uncertainty"][index] / quality["scale_z"][index]
         assert quality["sigma_calibration_nm"][index] == pytest.approx(known, rel=1e-4)
+
+
+def test_a_blind_tip_is_found_in_calibrated_lengths(calibrated: Path) -> None:
+    (job, *_) = field_jobs(list_fields(calibrated / "card.toml"), load_recipe(None))
+    found, true = tip_of(job), peak_radius(height_of(layout_of(0), 0), (PITCH_UM, PITCH_UM))
+    assert found is not None
+    assert found.radius_um is not None
+    # Scales are known to 1 %, and a radius goes with the square of a length over a height. One scale left
+    # out would be seen by 5 and 6 %, both by the 5 % of the depth.
+    assert found.radius_um == pytest.approx(true.radius_um, rel=0.03)
+    assert found.depth_um == pytest.approx(true.depth_um, rel=0.02)
 
 
 def test_the_standards_are_in_the_provenance(calibrated: Path) -> None:
