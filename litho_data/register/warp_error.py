@@ -27,7 +27,7 @@ class WarpError:
     Attributes:
         covariance: (k, k) of the amounts of the flows of ``register.flows``, normalised layout frame.
         surface_rms: of the quadratic surface that the scan has beside the print, its offset aside, over the
-            field, unit of the heights.
+            field, unit of the heights; without what the error of the fit adds to it on average.
         is_clear: whether there is such a surface.
     """
 
@@ -75,5 +75,7 @@ def warp_error(height: np.ndarray, layout_level: np.ndarray, blur_px: float, mod
     terms = slice(2, NUISANCES)
     surface, variance = middle[terms], np.diag(covariance)[terms]
     is_clear = bool(np.mean(surface**2 / np.maximum(variance, 1e-300)) > _CLEAR**2)
-    shown = np.einsum("k,kyx->yx", surface, quadratic_basis(shape)[1:])
-    return WarpError(covariance[NUISANCES:, NUISANCES:], float(shown.std()), is_clear)
+    # A fitted surface has the square of the true one and the variance of the fit.
+    products = np.cov(quadratic_basis(shape)[1:].reshape(len(surface), -1), bias=True)
+    squared = surface @ products @ surface - (products * covariance[terms, terms]).sum()
+    return WarpError(covariance[NUISANCES:, NUISANCES:], max(float(squared), 0.0) ** 0.5, is_clear)

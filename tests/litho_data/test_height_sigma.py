@@ -99,6 +99,22 @@ def test_the_warp_is_as_uncertain_as_it_comes_out():
     assert 0.7 < np.sqrt((ratio**2).mean()) < 1.4
 
 
+def test_the_error_of_its_fit_is_no_part_of_a_surface():
+    """The mean square that is found is the surface's own, whatever noise the fit had to do with."""
+    layout = layout_of(3, (256, 256))
+    topography = 0.05 * gaussian_filter(layout.astype(float), 2.0)
+    x = np.linspace(-1, 1, 256)
+    surface = 0.008 * (0.6 * x * 3**0.5 + 0.8 * (x**2 - 1 / 3) * (45 / 4) ** 0.5)
+    found = []
+    for seed in range(24):
+        white = gaussian_filter(np.random.default_rng(seed).standard_normal((256, 256)), 8.0)
+        height = topography + surface + 0.02 * white / white.std()
+        found.append(1e6 * warp_error(height, layout, 2.0, "affine").surface_rms ** 2)
+    # Noise of 20 nm correlated over 16 pixels gives the five terms 34 nm² in all. Squares of single scans
+    # scatter by 37 nm², so the mean of 24 by 8; three times that.
+    assert np.mean(found) == pytest.approx(64, abs=24)
+
+
 def test_a_surface_beside_the_print_counts_only_if_it_is_clear_or_levelled():
     layout = layout_of(2, (256, 256))
     x = np.linspace(-1, 1, 256)
