@@ -244,7 +244,7 @@ def estimate(
     ranks: Annotated[int, typer.Option(help="Processes that would share the element.", min=1)] = 1,
     measure_px: Annotated[
         str, typer.Option(help="Sides of the elements to be measured, at least two, px.")
-    ] = "512,1024",
+    ] = "1024,2048",
     band_px: BandPx = 512,
     device: Device = "cpu",
     extrapolate: Extrapolate = False,

@@ -7,11 +7,14 @@ import torch
 
 from litho_data.foundation.grid import PixelGrid
 from litho_design.images.targets import load_target
+from litho_design.large.bands import Bands
+from litho_design.large.hologram import BandedHologram
 from litho_design.lenses.settings import lens_settings
 from litho_design.optics import ASMPropagator, RadialPropagator, RSPropagator, centred_grid
 from litho_design.printers.layout import LayoutSettings
 from litho_design.workflows.design import design_hologram, design_lens
 from litho_design.workflows.score import score as score_design
+from tests.litho_design import large_rank
 
 GPU = "cuda"
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU on this machine")
@@ -42,6 +45,22 @@ def test_waves_are_the_same(name, dtype, tolerance):
     (slope_there,) = torch.autograd.grad(wave_there.abs().square().sum(), there)
     for one, other in ((wave, wave_there), (slope, slope_there)):
         assert (one - other.cpu()).abs().max() < tolerance * one.abs().max()
+
+
+def test_a_large_hologram_has_the_same_gradient():
+    found = []
+    for device in ("cpu", GPU):
+        printer, settings = large_rank.printer().to(device), large_rank.settings()
+        target = load_target("ring", large_rank.SIZE).pixels
+        bands = Bands(large_rank.SIZE, large_rank.BAND, cell_px=4)
+        level = 12 * torch.rand(1, 1, *target.shape, generator=torch.Generator().manual_seed(0))
+        level = level.to(device).requires_grad_()
+        loss, _ = BandedHologram(settings, printer, target, bands).objective(level)
+        found.append([float(loss.detach()), torch.autograd.grad(loss, level)[0].cpu()])
+    (loss, slope), (loss_there, slope_there) = found
+    # Convolutions on a GPU may round their factors to 10 bits.
+    assert loss_there == pytest.approx(loss, rel=1e-2)
+    assert (slope - slope_there).abs().max() < 1e-2 * slope.abs().max()
 
 
 @pytest.mark.parametrize("parametrisation", ["direct", "gumbel"])

@@ -79,8 +79,8 @@ def test_loss_and_gradient_in_bands_are_those_of_the_whole():
         found.append((loss.detach(), torch.autograd.grad(loss, level)[0]))
     (loss, slope), (banded_loss, banded_slope) = found
     assert banded_loss == pytest.approx(float(loss), rel=1e-6)
-    # Sums of 160**2 float32 numbers, in another order.
-    assert (slope - banded_slope).abs().max() < 1e-5 * slope.abs().max()
+    # Rounding of the transforms to float32, as above.
+    assert (slope - banded_slope).abs().max() < 1e-6 * slope.abs().max()
 
 
 def test_ranks_give_the_layout_of_one_process(alone, tmp_path):
