@@ -1,6 +1,6 @@
 """The noise analysis of virtual prints, whose roughness is known, in the documentation.
 
-    litho-data masks --out doses --pattern dose-matrix --count 7 --size 512
+    litho-data masks --out doses --pattern dose-matrix --count 7 --size-px 512
     litho-data simulate --out doses-printed --layouts doses/card.toml
     litho-data build doses-printed/raw/card.toml --out doses.zarr
     litho-models noise doses.zarr --out doses-noise

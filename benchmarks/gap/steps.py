@@ -18,7 +18,7 @@ def fab_jobs(out: Path, effort: Effort) -> list[list[Job]]:
         Job(
             name,
             command(
-                "litho-data", "simulate", "--out", out / name, "--count", count, "--size", effort.scan_px,
+                "litho-data", "simulate", "--out", out / name, "--count", count, "--size-px", effort.scan_px,
                 "--seed", seed, *_knob_options(),
             ),
             out / name / "truth" / "truth.json",

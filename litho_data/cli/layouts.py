@@ -32,7 +32,7 @@ def masks(
         str, typer.Option(help="random, or a calibration pattern: see --list-patterns")
     ] = "random",
     count: Annotated[int, typer.Option(min=1, help="number of random layouts")] = 12,
-    size: Annotated[int, typer.Option(min=8, help="side of a layout, pixels")] = 512,
+    size_px: Annotated[int, typer.Option(min=8, help="side of a layout")] = 512,
     levels: Annotated[int, typer.Option(min=2, max=256, help="number of levels, 0 … levels − 1")] = 13,
     cutoff_per_um: Annotated[float, typer.Option(help="low-pass cut-off, cycles/µm")] = 0.25,
     passband: Annotated[str, typer.Option(help="square (as the measured layouts) or round")] = "square",
@@ -52,14 +52,17 @@ def masks(
         ),
     ] = False,
 ) -> None:
-    """Write layouts (8-bit TIFF of level numbers), their statistics, and a card to add scans to."""
+    """Write layouts (8-bit TIFF of level numbers), their statistics, and a card to add scans to.
+
+    Example: litho-data masks --count 24 --levels 13 --out prints
+    """
     from litho_data.layouts import write_layout_set
 
     card = write_layout_set(
         out,
         pattern=pattern,
         count=count,
-        size_px=size,
+        size_px=size_px,
         levels=levels,
         cutoff_per_um=cutoff_per_um,
         passband=passband,
@@ -76,7 +79,7 @@ def simulate(
     out: Annotated[
         Path, typer.Option(help="folder to write (raw/ and truth/); an older result there is replaced")
     ],
-    preset: Annotated[str, typer.Option(help="plain, demo or measured-like")] = "plain",
+    preset: Annotated[str, typer.Option(help="plain, demo, measured-like or second-printer")] = "plain",
     layouts: Annotated[
         Path | None, typer.Option(help="print the layouts of this card instead of random ones")
     ] = None,
@@ -89,13 +92,13 @@ def simulate(
         typer.Option(help="earlier run (raw/ and truth/) whose machine prints the plan; give a new --seed"),
     ] = None,
     count: Annotated[int | None, typer.Option(min=1, help="number of scans; by default the preset's")] = None,
-    size: Annotated[
-        int | None, typer.Option(min=32, help="side of a layout, pixels; by default the preset's")
+    size_px: Annotated[
+        int | None, typer.Option(min=32, help="side of a layout; by default the preset's")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="seed of every random draw")] = 0,
     knob: Annotated[
         list[str] | None,
-        typer.Option(help="an effect, name=strength or name=strength@seed; repeat for more; --list-knobs"),
+        typer.Option(help="an effect, name=strength or name=strength@seed; repeatable; --list-knobs"),
     ] = None,
     noise: Annotated[str, typer.Option(help="default or off")] = "default",
     microscope: Annotated[str, typer.Option(help="default (small warps) or aligned (none)")] = "default",
@@ -113,7 +116,10 @@ def simulate(
         typer.Option("--list-knobs", help="list the knobs and stop", callback=_list_knobs, is_eager=True),
     ] = False,
 ) -> None:
-    """The virtual fab: print layouts, scan the prints, and write the files a laboratory would deliver."""
+    """The virtual fab: print layouts, scan the prints, and write the files a laboratory would deliver.
+
+    Example: litho-data simulate --preset demo --knob laser-drift=0.05 --out fab
+    """
     from litho_data.foundation.errors import InputError
     from litho_data.virtual_fab import jobs_of_card, simulate, simulate_plan
     from litho_data.virtual_fab.settings import preset as named_preset
@@ -121,28 +127,33 @@ def simulate(
     if (plan is None) != (fab is None):
         raise InputError("--plan and --fab", got="one of them", wanted="both: what is printed, and where")
     if plan is not None and fab is not None:
-        if layouts is not None or knob or any(value is not None for value in (count, size, write_field_um)):
+        if (
+            layouts is not None
+            or knob
+            or any(value is not None for value in (count, size_px, write_field_um))
+        ):
             wanted = "only --out and --seed: plan and fab have the rest"
             raise InputError("options beside --plan", wanted=wanted)
         card = simulate_plan(plan, fab, out, seed=seed)
         typer.echo(f"card   {card}\ntruth  {card.parent.parent / 'truth' / 'truth.json'}")
         return
-    if layouts is not None and any(value is not None for value in (count, size, write_field_um)):
-        wanted = "no --count, --size or --write-field-um: the card's layouts have them"
+    if layouts is not None and any(value is not None for value in (count, size_px, write_field_um)):
+        wanted = "no --count, --size-px or --write-field-um: the card's layouts have them"
         raise InputError("options beside --layouts", wanted=wanted)
     chosen = named_preset(preset)
     card = simulate(
         out,
         count=count or chosen.count,
-        size_px=size or chosen.size_px,
+        size_px=size_px or chosen.size_px,
         fields_per_print=chosen.fields_per_print,
         seed=seed,
         knobs=knob if knob is not None else chosen.knobs,
-        noise=noise,
-        microscope=microscope,
+        noise=chosen.noise if noise == "default" else noise,
+        microscope=chosen.microscope if microscope == "default" else microscope,
+        printer=chosen.printer,
         write_field_um=write_field_um,
         references=references,
         metadata=metadata,
-        jobs=jobs_of_card(layouts) if layouts is not None else None,
+        jobs=jobs_of_card(layouts, printer=chosen.printer) if layouts is not None else None,
     )
     typer.echo(f"card   {card}\ntruth  {card.parent.parent / 'truth' / 'truth.json'}")

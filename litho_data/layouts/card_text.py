@@ -33,6 +33,7 @@ class CardText:
         slow_axis: axis across the hatch lines, or empty if it is not stated.
         write_field_um: side of the write field, µm, or None if it is not stated.
         plan_of: hash of the dataset that the layouts were planned from, or empty.
+        scan_format: of the files of the microscope.
     """
 
     name: str
@@ -46,6 +47,7 @@ class CardText:
     slow_axis: str = ""
     write_field_um: float | None = None
     plan_of: str = ""
+    scan_format: str = "text-matrix"
 
     def toml(self) -> str:
         """The card's text."""
@@ -60,12 +62,14 @@ class CardText:
             f"levels = {self.levels}",
             "",
             "[scan]",
-            'files = "scans/{id}.txt"',
-            'format = "text-matrix"',
-            'unit = "m"',
-            f"size_um = [{round(self.scan_size_um[0], 9)}, {round(self.scan_size_um[1], 9)}]",
-            'fast_axis = "x"',
+            f'files = "scans/{{id}}.{"txt" if self.scan_format == "text-matrix" else self.scan_format}"',
+            f'format = "{self.scan_format}"',
         ]
+        if self.scan_format == "text-matrix":
+            # The others state both.
+            size_y, size_x = (round(side, 9) for side in self.scan_size_um)
+            lines += ['unit = "m"', f"size_um = [{size_y}, {size_x}]"]
+        lines += ['fast_axis = "x"']
         if self.print_pattern or self.table:
             lines += ["", "[ids]"]
             lines += [f"print = '{self.print_pattern}'"] * bool(self.print_pattern)

@@ -48,7 +48,9 @@ class Plan:
     def __post_init__(self) -> None:
         if self.count < 1 or self.fields_per_print < 1 or not self.cutoffs_per_um:
             raise InputError(
-                "plan of a virtual-fab run", got=self, wanted="at least one field, print and cut-off"
+                "plan of a virtual-fab run",
+                got=f"{self.count} fields, {self.fields_per_print} a print, cut-offs {self.cutoffs_per_um}",
+                wanted="at least one of each",
             )
         if min(self.size_px) < 32:
             raise InputError("size of a layout", got=f"{self.size_px} px", wanted="at least 32 x 32 px")
@@ -113,7 +115,7 @@ def _reference_jobs(plan: Plan, printer: Printer) -> Iterator[Job]:
     yield Job(id="P0F3", level=np.ascontiguousarray(steps), index=plan.count + 2, use="steps")
 
 
-def jobs_of_card(path: str | Path, *, first: int = 0) -> list[Job]:
+def jobs_of_card(path: str | Path, *, first: int = 0, printer: Printer | None = None) -> list[Job]:
     """The layouts of a dataset card, with what its table says about printing and scanning them.
 
     Rows of one print with the same layout are scans of one printed field if the table says how a scan was
@@ -122,13 +124,14 @@ def jobs_of_card(path: str | Path, *, first: int = 0) -> list[Job]:
     Args:
         path: the card.
         first: number of the first scan: what is drawn for a scan or print goes by its number.
+        printer: which prints them; the default one if None.
 
     Raises:
-        InputError: a bad card, no layout files, or layouts of a pitch or level height that the default
-            printer does not write.
+        InputError: a bad card, no layout files, or layouts of a pitch or level height that the printer
+            does not write.
     """
     card = load_card(path)
-    printer = Printer()
+    printer = printer or Printer()
     geometry = (card.layout.pitch_um, card.layout.level_height_um)
     if geometry != (printer.pitch_um, printer.level_height_um):
         raise InputError(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import zlib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, unknown_name
 
 Stage = Literal["exposure", "resist", "development", "measurement"]
 Role = Literal["process", "measurement", "nuisance", "undetermined"]
@@ -81,13 +80,7 @@ def checked(setting: KnobSetting) -> KnobSetting:
     """The setting itself, if its knob exists and its strength is within range."""
     knob = KNOBS.get(setting.name)
     if knob is None:
-        near = difflib.get_close_matches(setting.name, KNOBS, n=3, cutoff=0.4)
-        raise InputError(
-            "knob",
-            got=repr(setting.name),
-            wanted="a knob of the virtual fab" + (f", such as {', '.join(near)}" if near else ""),
-            hint="`litho-data simulate --list-knobs` lists them",
-        )
+        raise unknown_name("knob", setting.name, KNOBS, "`litho-data simulate --list-knobs` explains them")
     if not 0 <= setting.strength <= knob.limit:
         raise InputError(
             f"strength of knob {knob.name}", got=setting.strength, wanted=f"0 to {knob.limit_with_unit}"

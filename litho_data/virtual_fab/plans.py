@@ -40,14 +40,15 @@ def simulate_plan(
     if seed == truth.seed:
         raise InputError("seed", got=seed, wanted="another than the earlier run's: the prints are new")
     about = load_card(card)
+    microscope: dict[str, Any] = dict(truth.microscope)
     return simulate(
         out,
-        jobs=jobs_of_card(card, first=len(truth.scans)),
+        jobs=jobs_of_card(card, first=len(truth.scans), printer=_printer(truth)),
         seed=seed,
         knobs=[KnobSetting(knob.name, knob.strength, knob.seed) for knob in truth.knobs],
         cause=cause,
         noise=Noise(**truth.noise),
-        microscope=Microscope(**truth.microscope),
+        microscope=Microscope(**microscope),
         printer=_printer(truth),
         name=about.name,
         print_pattern=about.ids.print or "",

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import unknown_name
 
 
 @dataclass(frozen=True)
@@ -50,6 +51,7 @@ class Microscope:
         scale: largest relative error of each lateral scale.
         shear: largest shear.
         shift_um: largest shift along each axis, µm.
+        files: what it writes: ``text-matrix``, metres and nothing else, or ``gsf``, with size and unit.
     """
 
     margin_px: float = 14.0
@@ -57,6 +59,7 @@ class Microscope:
     scale: float = 0.015
     shear: float = 0.005
     shift_um: float = 0.3
+    files: Literal["text-matrix", "gsf"] = "text-matrix"
 
     @classmethod
     def aligned(cls) -> Microscope:
@@ -93,19 +96,23 @@ class Noise:
 
 @dataclass(frozen=True)
 class Preset:
-    """Count, size and knobs of a run; arguments of the caller override them.
+    """Count, size, knobs and machines of a run; arguments of the caller override them.
 
     Args:
         count: number of scans.
-        size_px: side of the layouts, pixels.
+        size_px: side of the layouts, pixels (one number, or ny and nx).
         fields_per_print: fields of one print block.
         knobs: ``name=strength[@seed]``.
+        printer, microscope, noise: the machines.
     """
 
     count: int
-    size_px: int
+    size_px: int | tuple[int, int]
     fields_per_print: int = 4
     knobs: tuple[str, ...] = ()
+    printer: Printer = Printer()
+    microscope: Microscope = Microscope()
+    noise: Noise = Noise()
 
 
 PRESETS = {
@@ -120,6 +127,15 @@ PRESETS = {
         size_px=512,
         knobs=("slope-thinning-x=0.4", "scan-line-stripes=8", "tilt-bow=20", "min-to-zero-datum=1"),
     ),
+    # Other in all that a program could know by heart.
+    "second-printer": Preset(
+        count=5,
+        size_px=(128, 192),
+        fields_per_print=1,
+        printer=Printer(pitch_um=0.2, level_height_um=0.02, levels=64, spot_sigma_um=0.5, base_um=0.05),
+        microscope=Microscope(margin_px=40.0, rotation_deg=0.3, shift_um=0.5, files="gsf"),
+        noise=Noise(roughness_nm=9.0, line_nm=2.0, pixel_nm=1.5, datum_nm=10.0),
+    ),
 }
 
 
@@ -130,5 +146,5 @@ def preset(name: str) -> Preset:
         InputError: no such preset.
     """
     if name not in PRESETS:
-        raise InputError("preset", got=repr(name), wanted=", ".join(PRESETS))
+        raise unknown_name("preset", name, PRESETS)
     return PRESETS[name]

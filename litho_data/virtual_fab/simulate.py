@@ -15,6 +15,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_folder
 from litho_data.foundation.outputs import require_replaceable_folder
 from litho_data.layouts.card_text import CardText, write_layout, write_table
+from litho_data.level.scan import write_heights
 from litho_data.readers.text_matrix import write_text_matrix
 from litho_data.virtual_fab.fab import Fab, FabScan, scan_job
 from litho_data.virtual_fab.jobs import PRINT_PATTERN, SCANNING, Plan, random_jobs
@@ -112,7 +113,7 @@ def simulate(
         for job in progress(source, "printing and scanning", total):
             scan = scan_job(fab, job)
             write_layout(raw, job.id, job.level)
-            write_text_matrix(raw / "scans" / f"{job.id}.txt", scan.height_um)
+            _write_scan(raw / "scans" / job.id, scan, fab.microscope)
             np.save(hidden / "prints" / f"{job.id}.npy", scan.clean_um.astype(np.float32))
             np.save(hidden / "surfaces" / f"{job.id}.npy", scan.surface_um.astype(np.float32))
             size_um = scan.frame.size_um
@@ -122,6 +123,15 @@ def simulate(
         _write_card(raw, fab, name, size_um, rows, metadata, write_field_um, plan_of, print_pattern)
         _truth(fab, scans).write(hidden)
     return Path(out) / "raw" / "card.toml"
+
+
+def _write_scan(file: Path, scan: FabScan, microscope: Microscope) -> None:
+    """One scan as its microscope writes it."""
+    if microscope.files == "gsf":
+        pitch_um = (scan.frame.pitch_um, scan.frame.pitch_um)
+        write_heights(file.with_suffix(".gsf"), scan.height_um, pitch_um=pitch_um, title=scan.job.id)
+    else:
+        write_text_matrix(file.with_suffix(".txt"), scan.height_um)
 
 
 # Not turned, on the way there, with the first tip.
@@ -185,6 +195,7 @@ def _write_card(
         print_pattern=print_pattern if full and in_prints else "",
         table=full,
         plan_of=plan_of,
+        scan_format=fab.microscope.files,
         slow_axis="y" if full else "",
         write_field_um=write_field_um if full else None,
     ).write(raw)

@@ -64,7 +64,7 @@ class Truth(Result):
 
     seed: int
     printer: dict[str, float]
-    microscope: dict[str, float]
+    microscope: dict[str, float | str]
     noise: dict[str, float]
     knobs: list[KnobTruth]
     scans: list[ScanTruth]

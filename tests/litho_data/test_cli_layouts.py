@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from litho_data.build.build import build_dataset
 from litho_data.cli.layouts import masks, simulate
-from litho_data.foundation.commands import new_app
+from litho_data.foundation.app import new_app
 from litho_data.foundation.errors import InputError
 from litho_data.store import open_store
 from litho_data.virtual_fab import KNOBS, Truth
@@ -33,7 +33,7 @@ def run(app, *arguments: str):
 def test_layouts_are_made_and_printed(app, tmp_path):
     assert (
         run(
-            app, "masks", "--out", tmp_path / "m", "--pattern", "dose-matrix", "--count", 3, "--size", 150
+            app, "masks", "--out", tmp_path / "m", "--pattern", "dose-matrix", "--count", 3, "--size-px", 150
         ).exit_code
         == 0
     )
@@ -47,7 +47,9 @@ def test_layouts_are_made_and_printed(app, tmp_path):
 
 @pytest.mark.slow
 def test_a_dose_matrix_becomes_heights_against_dose(app, tmp_path):
-    made = run(app, "masks", "--out", tmp_path / "m", "--pattern", "dose-matrix", "--count", 3, "--size", 192)
+    made = run(
+        app, "masks", "--out", tmp_path / "m", "--pattern", "dose-matrix", "--count", 3, "--size-px", 192
+    )
     printed = run(app, "simulate", "--out", tmp_path / "s", "--layouts", tmp_path / "m" / "card.toml")
     assert made.exit_code == printed.exit_code == 0
     result = build_dataset(tmp_path / "s" / "raw" / "card.toml", tmp_path / "s.zarr", strict=True)
@@ -84,7 +86,7 @@ def test_presets_are_overruled_by_what_is_stated(app, tmp_path):
         "demo",
         "--count",
         1,
-        "--size",
+        "--size-px",
         64,
         "--noise",
         "off",
@@ -106,7 +108,7 @@ def test_bad_input_is_one_clear_error(app, tmp_path):
     with pytest.raises(InputError, match="preset"):
         run(app, "simulate", "--out", tmp_path / "s", "--preset", "gigantic")
     with pytest.raises(InputError, match="level_height_um = nan"):
-        run(app, "masks", "--out", tmp_path / "m", "--count", 1, "--size", 64, "--level-height-um", "nan")
+        run(app, "masks", "--out", tmp_path / "m", "--count", 1, "--size-px", 64, "--level-height-um", "nan")
     with pytest.raises(InputError, match="seed of knob z-gain"):
         run(app, "simulate", "--out", tmp_path / "s", "--knob", "z-gain=0.1@-1")
     with pytest.raises(InputError, match="write field"):
@@ -115,9 +117,9 @@ def test_bad_input_is_one_clear_error(app, tmp_path):
 
 
 def test_options_that_a_card_settles_are_not_swallowed(app, tmp_path):
-    run(app, "masks", "--out", tmp_path / "m", "--count", 1, "--size", 64)
+    run(app, "masks", "--out", tmp_path / "m", "--count", 1, "--size-px", 64)
     card = ("--layouts", tmp_path / "m" / "card.toml")
-    for option in (("--count", 3), ("--size", 64), ("--write-field-um", 100)):
+    for option in (("--count", 3), ("--size-px", 64), ("--write-field-um", 100)):
         with pytest.raises(InputError, match="beside --layouts"):
             run(app, "simulate", "--out", tmp_path / "s", *card, *option)
     with pytest.raises(InputError, match="references"):
