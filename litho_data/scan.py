@@ -65,6 +65,16 @@ class Scan:
             grid = PixelGrid((height.shape[0], height.shape[1]), self.pitch_um)
             object.__setattr__(self, "pitch_um", (float(grid.pitch_um[0]), float(grid.pitch_um[1])))
 
+    def __repr__(self) -> str:
+        ny, nx = self.shape
+        pitch = f"{self.pitch_um[0]:g} x {self.pitch_um[1]:g} µm" if self.pitch_um else "an unknown pitch"
+        low, high = np.nanmin(self.height_um), np.nanmax(self.height_um)
+        missing = int(np.isnan(self.height_um).sum())
+        return (
+            f"<Scan {self.name}: {ny} x {nx} px of {pitch}, heights {low:.3g} to {high:.3g} µm, "
+            f"{missing} px missing>"
+        )
+
     @property
     def shape(self) -> tuple[int, int]:
         """(ny, nx) in pixels."""

@@ -14,6 +14,7 @@ from litho_data.foundation.files import atomic_file
 
 # An unexpected value may be of any size and nested to any depth.
 _SHORT = reprlib.Repr()
+_LONGEST = 40
 _SHORT.maxstring = _SHORT.maxother = 120
 
 
@@ -31,6 +32,29 @@ class Result(Record):
     FILE_NAME: ClassVar[str]
 
     schema_: str = Field(alias="schema")
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {', '.join(f'{name}: {value}' for name, value in self._facts())}>"
+
+    __str__ = __repr__
+
+    def _repr_html_(self) -> str:
+        import pandas as pd
+
+        return pd.DataFrame(self._facts()).to_html(index=False, header=False)
+
+    def _facts(self) -> list[tuple[str, str]]:
+        """What fits into a line: short values, names of parts, and how many there are of what is longer."""
+        facts = []
+        for name in type(self).model_fields:
+            value = getattr(self, name)
+            # A part that has a name is known by it: a dataset, a model.
+            value = getattr(value, "name", value)
+            if isinstance(value, list | tuple | dict):
+                value = len(value)
+            if name != "schema_" and isinstance(value, str | int | float) and 0 < len(str(value)) <= _LONGEST:
+                facts.append((name, str(value)))
+        return facts
 
     def write(self, folder: str | Path) -> Path:
         """Write ``folder/FILE_NAME`` atomically and return its path."""
@@ -52,10 +76,13 @@ class Result(Record):
         """
         file = Path(path)
         file = file / cls.FILE_NAME if file.is_dir() else file
+        kind = "/".join(cls.SCHEMA.split("/")[:2])
         try:
             content: Any = json.loads(file.read_text(encoding="utf-8"), parse_constant=_refuse)
-        except (OSError, ValueError, RecursionError) as error:
-            raise InputError(f"cannot read {file} as JSON", got=str(error), wanted=cls.SCHEMA) from error
+        except OSError as error:
+            raise InputError(f"cannot read {file}", got=error, wanted=f"a result {kind}") from error
+        except (ValueError, RecursionError) as error:
+            raise InputError(f"cannot read {file} as JSON", got=error, wanted=f"a result {kind}") from error
         schema = content.get("schema") if isinstance(content, dict) else None
         if schema not in (cls.SCHEMA, *cls.OLDER):
             raise InputError(f"schema of {file}", got=repr(schema), wanted=repr(cls.SCHEMA))
@@ -69,6 +96,8 @@ def first_error(error: ValidationError) -> str:
     """The first complaint of pydantic as one line: where, what, and the value."""
     first = error.errors()[0]
     where = ".".join(str(part) for part in first["loc"][:8]) or "(root)"
+    if first["type"] == "extra_forbidden":
+        return f"unknown key {where}"
     return f"{where}: {first['msg']} (value {_SHORT.repr(first['input'])})"
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -12,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.register.bend import Bend
 from litho_data.store.access import (
     decoded,
@@ -39,6 +40,9 @@ from litho_data.store.schema import (
 if TYPE_CHECKING:
     import pandas as pd
     import zarr
+
+
+_SHOWN_SCANS = 12
 
 
 @dataclass(frozen=True)
@@ -84,6 +88,13 @@ class PrintedScan:
     bend_um: Bend | None = None
     tip_radius_um: float | None = None
     height_sigma_um: np.ndarray | None = None
+
+    def __repr__(self) -> str:
+        ny, nx = self.shape
+        return (
+            f"<PrintedScan {self.id}: {ny} x {nx} px of {self.pitch_um:g} µm, print {self.print_id}, "
+            f"{self.levels} levels of {self.level_height_um:g} µm, {self.valid.mean():.1%} valid>"
+        )
 
     @property
     def quarter_turns(self) -> int:
@@ -139,6 +150,12 @@ class Store:
     def __repr__(self) -> str:
         return f"Store({self.name!r}, {len(self)} scans, pitch_um={self.pitch_um}, path={str(self.path)!r})"
 
+    def _repr_html_(self) -> str:
+        import pandas as pd
+
+        scans = pd.DataFrame({"scan": self.ids, "print": self._print_ids, "order": self._order})
+        return f"<p>{html.escape(repr(self))}</p>{scans.to_html(index=False, max_rows=_SHOWN_SCANS)}"
+
     def scan(self, scan_id: str) -> PrintedScan:
         """One scan, without padding.
 
@@ -147,9 +164,7 @@ class Store:
         """
         row = self._row.get(scan_id)
         if row is None:
-            raise InputError(
-                f"scan of {self.path}", got=repr(scan_id), wanted=f"one of {', '.join(self.ids[:30])}"
-            )
+            raise unknown_name(f"scan of {self.path}", scan_id, self.ids)
         return PrintedScan(
             id=scan_id,
             print_id=self._print_ids[row],

@@ -1,0 +1,33 @@
+"""What Python shows of scans, stores, models and results fits into a line or a small table."""
+
+from __future__ import annotations
+
+import numpy as np
+
+import litho_data
+import litho_models
+from litho_models.evaluation.results import Benchmark
+from tests.litho_models.prints import make_scan, make_scans, write_store
+
+PUBLISHED = "docs/results/neural-lithography/benchmark.json"
+
+
+def test_objects_are_shown_in_a_line(tmp_path):
+    scan = litho_data.Scan(np.arange(6.0).reshape(2, 3), (0.1, 0.2), name="P11")
+    assert repr(scan) == "<Scan P11: 2 x 3 px of 0.1 x 0.2 µm, heights 0 to 5 µm, 0 px missing>"
+    assert "P0F1: 96 x 96 px of 0.1 µm, print 0, 13 levels of 0.1 µm, 100.0% valid" in repr(make_scan(1))
+    store = litho_data.open_store(write_store(tmp_path / "prints.zarr", make_scans(3, 32)))
+    assert "'made', 3 scans" in repr(store)
+    shown = store._repr_html_()
+    assert "<td>P1F0</td>" in shown
+    assert repr(litho_models.zoo.load("pbl")).startswith("<FrozenSimulator pbl: 82,724 parameters")
+
+
+def test_a_result_is_shown_by_what_it_is_of_and_how_much_it_holds():
+    result = Benchmark.read(PUBLISHED)
+    shown = repr(result)
+    assert f"scores: {len(result.scores)}" in shown
+    assert "dataset: neural-lithography" in shown
+    # A hash of 64 digits says nothing to people.
+    assert len(shown) < 400
+    assert f"<td>{len(result.scores)}</td>" in result._repr_html_()
