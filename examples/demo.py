@@ -18,6 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from demo_story import FAB, tell
+
 from litho_data.foundation.report import Page
 
 BIN = Path(sys.executable).parent
@@ -118,7 +120,12 @@ def plan(out: Path, dataset: str) -> list[Step]:
     training = [] if effort.training_steps is None else ["--steps", effort.training_steps]
     steps = [
         source,
-        Step("Build the dataset", _data("build", card, "--out", store, "--workers", 2), store),
+        Step(
+            "Build the dataset",
+            _data("build", card, "--out", store, "--workers", 2),
+            store,
+            out / "store-report" / "report.html",
+        ),
         Step(
             "Compare the models on held-out scans",
             _models(
@@ -192,6 +199,8 @@ def plan(out: Path, dataset: str) -> list[Step]:
         "--size-px", effort.element_px, "--distance-um", effort.distance_um,
         "--iterations", effort.iterations, "--start", effort.start,
     )  # fmt: skip
+    # The printer itself, where it is a virtual one.
+    by_fab = () if dataset else ("--judge", f"{FAB}={out / 'fab' / 'truth'}")
     models = ",".join(["none", *(f"{name}={out / 'models' / name}" for name in ARMS)])
     steps += [
         Step("Freeze the corrected model", _models("freeze", loop, "--out", corrected), corrected),
@@ -210,7 +219,7 @@ def plan(out: Path, dataset: str) -> list[Step]:
         Step(
             "Designed with × judged with",
             _design(
-                "compare", "--models", models, "--judge", f"corrected={corrected}", *element,
+                "compare", "--models", models, "--judge", f"corrected={corrected}", *by_fab, *element,
                 "--seeds", effort.seeds, "--out", out / "compare",
             ),
             out / "compare" / "gap.json",
@@ -238,24 +247,27 @@ def write_index(out: Path, name: str, steps: list[Step], seconds: list[float]) -
     """One page that leads to all the reports."""
     import pandas as pd
 
-    loop = _read(out / "close-loop" / "close_loop.json")
     page = Page(
         f"litholoop: {name}", "From raw scans to a design that was optimised through the learned printer."
     )
-    page.tiles(
-        [
-            (
-                f"{loop['before']['mae_datum_free_nm']:.2f} nm",
-                "error of the base model on held-out scans, one term per scan free",
-            ),
-            (
-                f"{loop['after']['mae_datum_free_nm']:.2f} nm",
-                "with all that the loop added, the same term free",
-            ),
-            (", ".join(e["name"] for e in loop["effects"]) or "none", "effects found"),
-        ]
-    )
-    page.heading("Reports")
+    if (out / "fab").exists():
+        tell(page, out)
+    else:
+        loop = _read(out / "close-loop" / "close_loop.json")
+        page.tiles(
+            [
+                (
+                    f"{loop['before']['mae_datum_free_nm']:.2f} nm",
+                    "error of the base model on held-out scans, one term per scan free",
+                ),
+                (
+                    f"{loop['after']['mae_datum_free_nm']:.2f} nm",
+                    "with all that the loop added, the same term free",
+                ),
+                (", ".join(e["name"] for e in loop["effects"]) or "none", "effects found"),
+            ]
+        )
+    page.heading("All reports")
     page.links([(os.path.relpath(s.report, out), s.title) for s in steps if s.report])
     page.heading("What was run", folded=True)
     table = pd.DataFrame(

@@ -1,0 +1,135 @@
+"""The cards of the demo: what was planted in the virtual fab, what was found, what a hologram gains."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from litho_data import open_store
+from litho_data.foundation.report import Page
+from litho_data.foundation.report_pictures import new_figure
+from litho_data.virtual_fab import Truth
+from litho_design import load_printer
+from litho_design.judging.gap import GapResult, design_folder
+from litho_design.judging.loaded import LoadedDesign
+from litho_models.evaluation.results import Benchmark
+from litho_models.loop.result.record import CloseLoop
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# What compare calls the printer that printed the scans.
+FAB = "fab"
+PLANTED, OTHER = "#2a7ab8", "#b0b0b0"
+
+
+def tell(page: Page, out: Path, model: str = "pbl") -> None:
+    """Add verdict and cards to the index of a demo in ``out``; ``model``: what the hologram was made with."""
+    truth = Truth.read(out / "fab" / "truth")
+    loop = CloseLoop.read(out / "close-loop")
+    gap = GapResult.read(out / "compare")
+    planted = {knob.effect: f"{knob.name}, {knob.strength:g} {knob.unit}".strip() for knob in truth.knobs}
+    found = [effect.name for effect in loop.effects]
+    hit = [name for name in planted if name in found]
+    psnr = {
+        entry.arm: entry.judged["si_psnr_db"]
+        for entry in gap.entries
+        if entry.judge == FAB and entry.seed == gap.seeds[0]
+    }
+    terms = loop.headline
+    assert terms is not None
+    page.verdict(
+        f"{len(planted)} effects were hidden in the prints, and the loop found {len(hit)} of them"
+        f"{_also([name for name in found if name not in planted])}. On scans that it had not seen the error "
+        f"went from {terms.before.mae_nm:.2f} to {terms.after.mae_nm:.2f} nm. A hologram designed through "
+        f"{model} has {psnr[model]:.1f} dB when this printer prints it, and {psnr['none']:.1f} dB designed "
+        "without a model. One run, so nothing is said about chance."
+    )
+    page.heading("1. What was planted")
+    page.paragraph(
+        f"In the virtual fab, and in no file that the programs read: {'; '.join(planted.values())}."
+    )
+    page.figure(_first_scan(out / "store.zarr"), "The first field: its layout, its scan, and the difference.")
+    page.links([("store-report/report.html", "The dataset, scan by scan")])
+    page.heading("2. What was found")
+    page.paragraph(f"Found and planted: {', '.join(hit) or 'none'}. Planted and not found: "
+                   f"{', '.join(name for name in planted if name not in found) or 'none'}.")  # fmt: skip
+    page.figure(_gains(loop, set(planted)), "What each effect takes off the error; blue if it was planted.")
+    page.links([("close-loop/report.html", "The closed loop, with its evidence")])
+    page.heading("3. The error before and after, at equal freedom")
+    page.paragraph(
+        f"Mean absolute error of {terms.over_scans.count} scans, each predicted without being fitted to, "
+        f"with {terms.before.k:g} term per scan free before and {terms.after.k:g} after: "
+        f"{terms.gain_nm:.2f} nm less, better in {terms.over_scans.positive} scans."
+    )
+    pairs = {"before": terms.before, "after": terms.after}
+    page.figure(_bars({name: one.mae_nm for name, one in pairs.items()}, "error, nm"), "Before and after.")
+    page.heading("4. Which model predicts best")
+    scores = {one.model: one.mae_datum_free_nm for one in Benchmark.read(out / "benchmark").scores}
+    page.paragraph(f"On scans that no fit had seen, {min(scores, key=lambda name: scores[name])} does.")
+    page.figure(_bars(scores, "error, nm"), "Errors of the models on held-out scans, zero of each scan free.")
+    page.links(
+        [("benchmark/report.html", "The benchmark"), ("compare/report.html", "Designed × judged with")]
+    )
+    for number, (arm, how) in enumerate({"none": "without a model", model: f"through {model}"}.items(), 5):
+        folder = design_folder(Path("compare"), arm, gap.seeds[0])
+        page.heading(f"{number}. A hologram designed {how}")
+        page.paragraph(f"Printed by the fab itself, its image has {psnr[arm]:.1f} dB.")
+        page.figure(_hologram(out / folder, out / "fab" / "truth"), "Wanted; printed; what the print shows.")
+        page.links([((folder / "report.html").as_posix(), f"The hologram designed {how}")])
+
+
+def _also(names: list[str]) -> str:
+    return f", and besides them {', '.join(names)}" if names else ""
+
+
+def _first_scan(store: Path) -> Figure:
+    scan = open_store(store).scans()[0]
+    measured = np.where(scan.valid, scan.height_um, np.nan)
+    maps = {
+        "layout, µm": scan.layout_um,
+        "scan, µm": measured,
+        "scan - layout, nm": 1000 * (measured - scan.layout_um),
+    }
+    return _row(maps)
+
+
+def _gains(loop: CloseLoop, planted: set[str]) -> Figure:
+    figure = new_figure(8.0, 0.6 + 0.45 * max(1, len(loop.effects)))
+    axis = figure.subplots()
+    names = [effect.name for effect in loop.effects]
+    gains = [effect.before_nm - effect.after_nm for effect in loop.effects]
+    axis.barh(names, gains, color=[PLANTED if name in planted else OTHER for name in names])
+    axis.invert_yaxis()
+    axis.set_xlabel("error less, nm")
+    return figure
+
+
+def _bars(values: dict[str, float], label: str) -> Figure:
+    figure = new_figure(8.0, 0.6 + 0.45 * len(values))
+    axis = figure.subplots()
+    drawn = axis.barh(list(values), list(values.values()), color=PLANTED)
+    axis.bar_label(drawn, fmt="%.2f", padding=3)
+    axis.invert_yaxis()
+    axis.margins(x=0.12)
+    axis.set_xlabel(label)
+    return figure
+
+
+def _hologram(folder: Path, fab: Path) -> Figure:
+    design = LoadedDesign(folder)
+    printed = design.printed_um(load_printer(fab, design.record.layout))
+    assert design.target is not None
+    shown = {"wanted": design.target, "printed, µm": printed, "image": design.display(design.image(printed))}
+    return _row({title: np.asarray(picture) for title, picture in shown.items()})
+
+
+def _row(maps: dict[str, np.ndarray]) -> Figure:
+    figure = new_figure(10.5, 3.6)
+    for axis, (title, picture) in zip(figure.subplots(1, len(maps)), maps.items(), strict=True):
+        figure.colorbar(axis.imshow(picture), ax=axis, shrink=0.75)
+        axis.set_title(title)
+        axis.set_axis_off()
+    return figure

@@ -1,0 +1,52 @@
+"""The index of the demo tells its story in six cards, each with a picture and a page behind it."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import litho_data
+import litho_design
+import litho_models
+from litho_data.foundation.report import Page
+from tests.litho_models.prints import make_scans, write_store
+
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "docs" / "results" / "neural-lithography"
+
+
+def test_the_story_has_six_cards_with_pictures_and_links(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "examples")
+    from demo_story import FAB, tell
+
+    knobs = ["tilt-bow=15", "write-order-memory=0.15"]
+    litho_data.simulate(tmp_path / "fab", count=1, size_px=64, knobs=knobs)
+    write_store(tmp_path / "store.zarr", make_scans(2, 32))
+    for name in ("close_loop", "benchmark"):
+        folder = tmp_path / name.replace("_", "-")
+        folder.mkdir()
+        shutil.copy(RESULTS / f"{name}.json", folder)
+    model = litho_models.save_frozen(litho_models.build_model("identity"), tmp_path / "printer")
+    small = {"layout.size_px": 32, "optics.distance_um": 10, "search.iterations": 1}
+    settings = litho_design.hologram_settings(
+        changes={**small, "search.polish_rounds": 0, "window.yield_draws": 2}
+    )
+    litho_design.compare(
+        settings,
+        {"none": "none", "pbl": str(model)},
+        tmp_path / "compare",
+        judges={FAB: str(tmp_path / "fab" / "truth")},
+        seeds=(0,),
+        announce=False,
+    )
+    page = Page("demo")
+    tell(page, tmp_path)
+    text = page.write(tmp_path, "index.html").read_text("utf-8")
+    assert re.findall(r"<h2[^>]*>\s*(\d)\. ", text) == list("123456")
+    assert text.count("<figure") == 6
+    # tilt-bow is among the effects found on the measured prints, whose result stands in here.
+    assert "2 effects were hidden in the prints, and the loop found 1 of them" in text
+    assert "Planted and not found: write-order-memory" in text
+    for link in re.findall(r'href="(compare/[^"]+)"', text):
+        assert (tmp_path / link).is_file()
