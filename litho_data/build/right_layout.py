@@ -143,7 +143,7 @@ def _orientations(prints: Sequence[_Print]) -> list[tuple[str, str]]:
             what = "a mirror image of its layout" if mirrored else f"turned ({one.dihedral})"
             said.append((one.id, f"{what}, unlike the other scans: is the file of its layout the right one?"))
         elif one.dihedral in MIRRORED:
-            said.append((one.id, f"a mirror image of its layout ({one.dihedral})"))
+            said.append((one.id, f"a mirror image of its layout ({one.dihedral}); is its file mirrored?"))
     return said
 
 

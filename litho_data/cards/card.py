@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.results import Record, first_error
 from litho_data.foundation.units import um_per
 from litho_data.readers.registry import formats, reader_of
@@ -31,7 +31,7 @@ def load_card(path: str | Path) -> Card:
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(
             f"cannot read {file} as a dataset card",
-            got=(error.strerror if isinstance(error, OSError) else None) or str(error),
+            got=error,
             wanted="a TOML file",
         ) from error
     return check_card(content, f"card {file}")
@@ -239,8 +239,7 @@ def _readable(error: ValidationError, what: str) -> InputError:
     first = error.errors()[0]
     key = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
-        allowed = ", ".join(_model_at(first["loc"][:-1]).model_fields)
-        return InputError(f"{what}: unknown key {key}", got=repr(first["input"]), wanted=f"one of {allowed}")
+        return unknown_name(f"{what}: key", key, _model_at(first["loc"][:-1]).model_fields)
     if first["type"] == "missing":
         return InputError(f"{what}: key {key}", got="nothing", wanted="a value")
     if first["type"] == "value_error":

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from litho_data.cards.card import load_card
 from litho_data.foundation.commands import progress
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.hashes import file_sha256
 
 if TYPE_CHECKING:
@@ -68,8 +68,7 @@ def find_card(dataset: str | Path) -> Path:
         return Path(dataset)
     known = known_cards()
     if str(dataset) not in known:
-        wanted = f"{', '.join(known) or 'a name'} or the path of a card"
-        raise InputError("dataset", got=repr(str(dataset)), wanted=wanted)
+        raise unknown_name("dataset", dataset, known, also="the path of a card")
     return known[str(dataset)]
 
 
@@ -91,7 +90,7 @@ def _registry(card_path: Path) -> tuple[str, pooch.Pooch]:
     try:
         registry.load_registry(path)
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"cannot read registry {path}", got=str(error)) from error
+        raise InputError(f"cannot read registry {path}", got=error) from error
     if not registry.registry:
         raise InputError(f"registry {path}", got="no files", wanted="lines of file name and SHA-256")
     for file in registry.registry:
@@ -123,7 +122,7 @@ def _download(registry: pooch.Pooch, file: str) -> None:
     except (requests.RequestException, OSError) as error:
         url = registry.get_url(file)
         raise InputError(
-            f"cannot fetch {file}", got=str(error), wanted=url, hint="run fetch again to resume"
+            f"cannot fetch {file}", got=error, wanted=url, hint="run fetch again to resume"
         ) from error
     except ValueError as error:  # pooch removes a file that does not match
         url, wanted = registry.get_url(file), registry.registry[file]

@@ -31,7 +31,7 @@ def read_table(path: Path) -> dict[str, dict[str, str]]:
             rows = list(reader)
             columns = list(reader.fieldnames or ())
     except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"cannot read table {path}", got=str(error), wanted="a CSV file") from error
+        raise InputError(f"cannot read table {path}", got=error, wanted="a CSV file") from error
     unknown = [name for name in columns if name not in COLUMNS]
     if unknown or "id" not in columns:
         raise InputError(f"columns of {path}", got=columns, wanted=f"id and any of {', '.join(COLUMNS[1:])}")
@@ -81,7 +81,7 @@ def read_full_scales(path: Path) -> dict[str, float]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise InputError(f"cannot read {path}", got=str(error), wanted="a JSON object, m per id") from error
+        raise InputError(f"cannot read {path}", got=error, wanted="a JSON object, m per id") from error
     if not isinstance(content, dict):
         raise InputError(f"content of {path}", got=type(content).__name__, wanted="a JSON object, m per id")
     for key, value in content.items():

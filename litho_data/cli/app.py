@@ -12,7 +12,7 @@ import typer
 from litho_data.cli.layouts import masks, simulate
 from litho_data.cli.scan import inspect, level
 from litho_data.cli.tip import tip
-from litho_data.foundation.commands import new_app, run_app
+from litho_data.foundation.app import new_app, run_app
 
 app = new_app(
     "Raw AFM scans and layouts in, a dataset with provenance out. Lengths in µm unless said otherwise."
@@ -49,7 +49,10 @@ def fetch(
     ],
     into: Annotated[Path | None, typer.Option(help="folder to fill; by default the user cache")] = None,
 ) -> None:
-    """Download a known dataset, or find it in $LITHO_DATA_DIR or the user cache; checks every SHA-256."""
+    """Download a known dataset, or find it in $LITHO_DATA_DIR or the user cache; checks every SHA-256.
+
+    Example: litho-data fetch neural-lithography
+    """
     from litho_data.cards.fetch import fetch as fetch_dataset
 
     typer.echo(fetch_dataset(name, into))
@@ -76,7 +79,10 @@ def build(
         ),
     ] = None,
 ) -> None:
-    """Read, level, register and store all scans of a card; writes the store and a report beside it."""
+    """Read, level, register and store all scans of a card; writes the store and a report beside it.
+
+    Example: litho-data build prints/card.toml --out prints.zarr --workers 2
+    """
     from litho_data.build.build import build_dataset
     from litho_data.build.result import report_folder
 
@@ -98,7 +104,10 @@ def calibrate(
     card: Annotated[Path, typer.Argument(help="dataset card (TOML) with a [calibration] table")],
     data_dir: DataDir = None,
 ) -> None:
-    """Measure the card's gratings and step, and show the scales that a build would apply."""
+    """Measure the card's gratings and step, and show the scales that a build would apply.
+
+    Example: litho-data calibrate prints/card.toml
+    """
     from litho_data.build.calibration import calibrate as scales_of
 
     for axis, scale in scales_of(card, data_dir).items():
@@ -110,7 +119,10 @@ def calibrate(
 
 @app.command()
 def verify(store: StorePath, data_dir: DataDir = None) -> None:
-    """Hash a store and its raw files again and name everything that has changed since the build."""
+    """Hash a store and its raw files again and name everything that has changed since the build.
+
+    Example: litho-data verify prints.zarr
+    """
     from litho_data.provenance.verify import verify as verify_store
 
     result = verify_store(store, data_dir)
@@ -128,7 +140,10 @@ def history(
     store: StorePath,
     scan: Annotated[str | None, typer.Argument(help="id of a scan; without it, one line per scan")] = None,
 ) -> None:
-    """Print where the arrays of a scan come from: files, operations, parameters, hashes."""
+    """Print where the arrays of a scan come from: files, operations, parameters, hashes.
+
+    Example: litho-data history prints.zarr P11
+    """
     from litho_data.provenance.history import history as history_of
 
     typer.echo(history_of(store, scan))
@@ -139,11 +154,14 @@ def replay(
     store: StorePath,
     scan: Annotated[list[str] | None, typer.Argument(help="ids of scans; without, all")] = None,
     array: Annotated[
-        list[str] | None, typer.Option(help="name of an array, e.g. height_um; repeat for more")
+        list[str] | None, typer.Option(help="name of an array, e.g. height_um; repeatable")
     ] = None,
     data_dir: DataDir = None,
 ) -> None:
-    """Compute arrays again from the raw files and report the largest difference from the store."""
+    """Compute arrays again from the raw files and report the largest difference from the store.
+
+    Example: litho-data replay prints.zarr P11 --array height_um
+    """
     from litho_data.provenance.replay import replay as replay_store
 
     table = replay_store(store, scan, arrays=array, data_dir=data_dir)
@@ -161,7 +179,10 @@ def export(
         Path | None, typer.Option(help="file (zip) or folder to write; by default beside the store")
     ] = None,
 ) -> None:
-    """Write a store as one .zarr.zip file, as 8-bit pairs, or as an RO-Crate folder."""
+    """Write a store as one .zarr.zip file, as 8-bit pairs, or as an RO-Crate folder.
+
+    Example: litho-data export prints.zarr --format zip
+    """
     endings = {Format.zip: ".zarr.zip", Format.pairs: "-pairs", Format.ro_crate: "-crate"}
     target = out or store.parent / (store.name.split(".zarr")[0] + endings[format])
     if format is Format.zip:
@@ -191,7 +212,10 @@ def import_pairs(
     workers: Workers = 1,
     strict: Strict = False,
 ) -> None:
-    """Build a store from the authors' 8-bit pair format; four quadrants of one name become one field."""
+    """Build a store from the authors' 8-bit pair format; four quadrants of one name become one field.
+
+    Example: litho-data import-pairs pairs --out pairs.zarr
+    """
     from litho_data.build.result import report_folder
     from litho_data.exchange.pairs import import_pairs as build_from_pairs
 

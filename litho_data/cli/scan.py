@@ -39,7 +39,10 @@ def level(
     channel: ChannelName = None,
     full_scale_um: FullScale = None,
 ) -> None:
-    """Level one scan; writes the levelled heights, the removed surface and a record beside them."""
+    """Level one scan; writes the levelled heights, the removed surface and a record beside them.
+
+    Example: litho-data level P11.gwy --recipe recipe.toml --out P11.gsf
+    """
     from litho_data.level import Recipe
     from litho_data.level.scan import write_levelled
     from litho_data.readers import read_scan
@@ -68,6 +71,8 @@ def inspect(
 
     A picture needs one height channel: choose it with --channel if there are several, and give --unit
     (or --full-scale-um) if the file states none.
+
+    Example: litho-data inspect P11.gwy --picture P11.png
     """
     from rich.console import Console
 

@@ -30,6 +30,8 @@ def tip(
     """Estimate the radius of the tip, or the most that it can be, and where it did not touch.
 
     The surface in --maps is the highest that explains the image.
+
+    Example: litho-data tip P11.gwy P12.gwy --maps maps
     """
     from litho_data.readers import read_scan
     from litho_data.tip import estimate_tip

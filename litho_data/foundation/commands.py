@@ -1,59 +1,19 @@
-"""What the three command lines share: exit codes, one-line errors, a progress bar on stderr."""
+"""The command line that results record, and a progress bar on stderr."""
 
 from __future__ import annotations
 
-import errno
 import shlex
 import sys
-from collections.abc import Callable, Iterable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator, Sized
 from pathlib import Path
 from typing import TypeVar
 
-from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import running_command
 
 T = TypeVar("T")
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
-
-
-def new_app(help_text: str):
-    """A typer application with the settings of this project."""
-    import typer
-
-    def options(
-        version: bool = typer.Option(False, "--version", help="Print the version and exit.", is_eager=True),
-    ) -> None:
-        if version:
-            from litho_data import __version__
-
-            typer.echo(__version__)
-            raise typer.Exit()
-
-    return typer.Typer(
-        help=help_text,
-        callback=options,
-        # Without this, --version alone would be asked for a command.
-        invoke_without_command=True,
-        no_args_is_help=True,
-        pretty_exceptions_enable=False,
-    )
-
-
-def run_app(app, name: str) -> None:
-    """Run a typer application; bad input and a full disk become one line on stderr and exit code 2."""
-    try:
-        with running_command(command_line(name)):
-            app(prog_name=name)
-    except InputError as error:
-        print(f"{name}: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
-    except OSError as error:
-        if error.errno not in _NO_ROOM:
-            raise
-        where = f" {error.filename}" if error.filename else ""
-        hint = "a build goes on from here once there is room"
-        print(f"{name}: cannot write{where}, got {error.strerror}; {hint}", file=sys.stderr)
-        raise SystemExit(2) from None
+# What the first items take tells what the others will, and what is too short to be told.
+_TELLING_S, _MINUTE_S = 3.0, 60.0
 
 
 def run_script(main: Callable[[], T]) -> T:
@@ -74,10 +34,36 @@ def command_line(program: str | None = None) -> str:
     return shlex.join([*started, *sys.argv[1:]])
 
 
-def progress(items: Iterable[T], what: str, total: int | None = None) -> Iterator[T]:
-    """Iterate with a progress bar on stderr; without one if stderr is no terminal."""
+def progress(
+    items: Iterable[T], what: str, total: int | None = None, *, estimate_of: int | None = None
+) -> Iterator[T]:
+    """Iterate with a progress bar on stderr; without one if stderr is no terminal.
+
+    Once the first items tell how long the rest takes, and it is more than a minute, one line says so.
+
+    Args:
+        items: what is iterated over; ``what``: what is done with them.
+        total: how many there are, where ``len`` does not tell.
+        estimate_of: how many the estimate is of, by default all of these; 0 for none.
+    """
     from rich.console import Console
     from rich.progress import track
 
     console = Console(stderr=True)
-    yield from track(items, description=what, total=total, console=console, disable=not console.is_terminal)
+    count = total if total is not None else len(items) if isinstance(items, Sized) else 0
+    wanted = count if estimate_of is None else estimate_of
+    started = time.monotonic()
+    shown = track(items, description=what, total=total, console=console, disable=not console.is_terminal)
+    for done, item in enumerate(shown, start=1):
+        yield item
+        seconds = time.monotonic() - started
+        if wanted and seconds > _TELLING_S:
+            say_estimate(what, seconds / done * (wanted - done))
+            wanted = 0
+
+
+def say_estimate(what: str, seconds: float) -> None:
+    """One line on stderr before anything that takes more than a minute."""
+    if seconds > _MINUTE_S:
+        span = f"{seconds / 3600:.1f} h" if seconds > 3600 else f"{seconds / _MINUTE_S:.0f} min"
+        print(f"estimate: {what} takes about {span} more", file=sys.stderr)

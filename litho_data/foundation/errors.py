@@ -2,19 +2,54 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
+_MANY = 12
+
 
 class InputError(ValueError):
     """Bad input: the message is one line that says what is wrong, what was found and wanted, and a hint.
 
     The command lines print it without a traceback and exit with code 2; every other exception is a defect of
-    this project.
+    this project. ``got`` may be an exception: the message says why in words.
     """
 
     def __init__(self, what: str, *, got: object = None, wanted: object = None, hint: str = ""):
         parts = [what]
         if got is not None:
-            parts.append(f"got {got}")
+            parts.append(f"got {said(got) if isinstance(got, Exception) else got}")
         if wanted is not None:
             parts.append(f"wanted {wanted}")
         message = ", ".join(parts)
         super().__init__(" ".join(f"{message}; {hint}".split()) if hint else " ".join(message.split()))
+
+
+def said(error: Exception) -> str:
+    """Why something could not be read, without the words of Python."""
+    if isinstance(error, UnicodeDecodeError):
+        return "bytes that are no text"
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror.lower()
+    return str(error).partition("\n")[0] or type(error).__name__
+
+
+def unknown_name(
+    what: str, got: object, known: Iterable[str], hint: str = "", *, also: str = ""
+) -> InputError:
+    """The error for a name that is not known; the hint is the nearest one that is, where one is near.
+
+    Args:
+        what: what the name is of.
+        got: the name; ``known``: those that there are.
+        hint: where no known name is near.
+        also: what could have been given instead of a name, such as "an image file".
+    """
+    names = list(known)
+    near = difflib.get_close_matches(str(got), names)
+    # A screen of names helps nobody who misspelt one of them.
+    shown = [] if near and len(names) > _MANY else names
+    wanted = " or ".join(filter(None, (", ".join(shown), also)))
+    return InputError(
+        what, got=repr(str(got)), wanted=wanted or None, hint=f"did you mean {near[0]}?" if near else hint
+    )

@@ -83,9 +83,7 @@ def writable(target: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise InputError(
-            f"cannot write {target}", got=error.strerror or str(error), wanted="a place that can be written"
-        ) from error
+        raise InputError(f"cannot write {target}", got=error, wanted="a place that can be written") from error
 
 
 def _umask() -> int:

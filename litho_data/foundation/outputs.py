@@ -1,10 +1,17 @@
-"""Checks of the folder that a command writes to: only an older result of its own is ever replaced."""
+"""What ``--out`` may be, for every command: nothing but an older result of its own is ever replaced.
+
+A folder that is not there or empty is taken. In a folder with an earlier run of the same command on the same
+subject (dataset, model, design) the run resumes, or its result is made again. Anything else is refused, and
+nothing is changed.
+"""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from fnmatch import fnmatch
 from pathlib import Path
+from typing import Any
 
 from litho_data.foundation.errors import InputError
 
@@ -34,24 +41,60 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
         )
 
 
-def require_own_folder(path: str | Path, record: str) -> None:
-    """Accept a folder for the result with the record file ``record``, if no other result is in it.
+def require_own_folder(
+    path: str | Path, record: str, *begun: str, subject: Mapping[str, object] | None = None
+) -> None:
+    """Accept a folder for the result with the record file ``record``: a free or empty one, or its own.
 
     A file is the record of a result if it is named after the kind in its schema, such as ``close_loop.json``
     with schema ``litho-models/close-loop/1``.
 
+    Args:
+        path: where the result will be; what else lies in a folder of its own is left alone.
+        record: the file that a finished result holds.
+        begun: names, or patterns of names, of what an interrupted run of the same kind leaves.
+        subject: what the result will be of, by dotted names in the record, such as ``dataset.name``; an
+            older result there has to be of the same.
+
     Raises:
-        InputError: a file, or the folder of a result of another kind, whose report would be overwritten.
+        InputError: a file, or a folder with another result or with something else in it.
     """
     folder = Path(path)
     _refuse_a_file(folder)
-    for file in sorted(folder.glob("*.json")):
-        if file.name != record and _is_record(file):
+    # What desktops and version control leave is no content.
+    names = sorted(one.name for one in folder.glob("*") if not one.name.startswith("."))
+    strangers = [name for name in names if name != record and _is_record(folder / name)]
+    if not strangers and not any(fnmatch(name, mark) for name in names for mark in (record, *begun)):
+        strangers = names
+    if strangers:
+        store = "zarr.json" in names
+        raise InputError(
+            "output",
+            got=f"{folder}, which {'is a dataset store' if store else f'holds {strangers[0]}'}",
+            wanted="a new folder, or one of this command alone",
+            hint="" if store else f"for example {folder / Path(record).stem}",
+        )
+    require_same_subject(folder / record, subject or {})
+
+
+def require_same_subject(record: Path, subject: Mapping[str, object]) -> None:
+    """Refuse a folder whose result, if there is one, is of something else than ``subject`` says.
+
+    Raises:
+        InputError: another dataset, model or design.
+    """
+    held = _content(record)
+    for name, asked in subject.items():
+        found = held
+        for part in name.split("."):
+            found = found.get(part) if isinstance(found, dict) else None
+        if found is not None and found != asked:
+            what = name.removesuffix(".name")
             raise InputError(
                 "output",
-                got=f"{folder}, which holds {file.name}",
-                wanted="a folder of its own",
-                hint=f"for example {folder / Path(record).stem}",
+                got=f"{record.parent}, which holds a result of {what} {found}",
+                wanted=f"a folder for {what} {asked}",
+                hint="choose another --out",
             )
 
 
@@ -61,9 +104,13 @@ def _refuse_a_file(folder: Path) -> None:
 
 
 def _is_record(file: Path) -> bool:
-    try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return False
+    content = _content(file) if file.suffix == ".json" else None
     schema = content.get("schema") if isinstance(content, dict) else None
     return isinstance(schema, str) and schema.split("/")[1:2] == [file.stem.replace("_", "-")]
+
+
+def _content(file: Path) -> Any:
+    try:
+        return json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return None

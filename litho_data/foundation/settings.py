@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, Field, ValidationError
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, unknown_name
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -98,7 +98,9 @@ def flattened(settings: BaseModel, content: Mapping[str, Any], what: str = "sett
         elif isinstance(value, Mapping):
             flat |= flattened(settings, {f"{key}.{name}": inner for name, inner in value.items()}, what)
         else:
-            raise InputError(f"{what} {key}", got=repr(value), wanted=f"one of {_names(part, key)}")
+            raise InputError(
+                f"{what} {key}", got=repr(value), wanted=f"one of {', '.join(_names(part, key))}"
+            )
     return flat
 
 
@@ -112,14 +114,14 @@ def _find(settings: BaseModel, path: str, what: str) -> Any:
                 f"{what} {path}", got=f"a name below {above}", wanted=f"{above}, which is a value"
             )
         if name not in type(part).model_fields:
-            raise InputError(f"{what} {path}", got="an unknown name", wanted=f"one of {_names(part, above)}")
+            raise unknown_name(what, path, _names(part, above))
         part = getattr(part, name)
         done.append(name)
     return part
 
 
-def _names(part: BaseModel, above: str) -> str:
-    return ", ".join(f"{above}.{name}" if above else name for name in type(part).model_fields)
+def _names(part: BaseModel, above: str) -> list[str]:
+    return [f"{above}.{name}" if above else name for name in type(part).model_fields]
 
 
 def changed(settings: M, changes: Mapping[str, Any]) -> M:
@@ -140,11 +142,17 @@ def changed(settings: M, changes: Mapping[str, Any]) -> M:
     try:
         return type(settings).model_validate(content)
     except ValidationError as error:
-        first = error.errors()[0]
+        raise refused(error) from None
+
+
+def refused(error: ValidationError) -> InputError:
+    """What a record has to say about the first setting that it does not accept."""
+    first = error.errors()[0]
     where, said = ".".join(map(str, first["loc"])), first["msg"]
-    if said.startswith("Input should be "):
-        raise InputError(f"setting {where}", got=repr(first["input"]), wanted=said[len("Input should be ") :])
-    raise InputError(f"setting {where}", got=said.removeprefix("Value error, "))
+    limit = said.removeprefix("Input should be ")
+    if limit != said:
+        return InputError(f"setting {where}", got=repr(first["input"]), wanted=limit)
+    return InputError(f"setting {where}", got=said.removeprefix("Value error, "))
 
 
 def assigned(words: Iterable[str]) -> dict[str, Any]:
@@ -180,11 +188,9 @@ def read_settings(path: str | Path) -> dict[str, Any]:
     try:
         content = read(file.read_text(encoding="utf-8"))
     except OSError as error:
-        raise InputError(
-            f"settings file {file}", got=error.strerror, wanted="a file that can be read"
-        ) from None
+        raise InputError(f"settings file {file}", got=error, wanted="a file that can be read") from None
     except ValueError as error:
-        raise InputError(f"settings file {file}", got=str(error), wanted=file.suffix[1:].upper()) from None
+        raise InputError(f"settings file {file}", got=error, wanted=file.suffix[1:].upper()) from None
     if not isinstance(content, dict):
         raise InputError(f"settings file {file}", got=type(content).__name__, wanted="settings by name")
     return content

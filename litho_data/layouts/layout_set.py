@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from litho_data.foundation.commands import progress
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.files import atomic_folder
 from litho_data.foundation.outputs import require_replaceable_folder
 from litho_data.layouts.card_text import CARD_NAME, TABLE_NAME, CardText, write_layout, write_table
@@ -99,7 +99,7 @@ def write_layout_set(
             folder with something else in it, such as scans.
     """
     if pattern not in PATTERNS:
-        raise InputError("pattern", got=repr(pattern), wanted=", ".join(PATTERNS))
+        raise unknown_name("pattern", pattern, PATTERNS)
     if not 2 <= levels <= 256:
         raise InputError("levels of a layout", got=levels, wanted="2 to 256")
     shape = (size_px, size_px) if isinstance(size_px, int) else size_px

@@ -53,6 +53,12 @@ def random_layout(
     whole = shape if field_px is None else (field_px, field_px)
     if field_px is not None and field_px < max(shape):
         raise InputError("field_px of a random layout", got=field_px, wanted=f"at least {max(shape)}")
+    if cutoff_per_um * pitch_um > 0.5 + 1e-9:
+        raise InputError(
+            "cutoff_per_um of a random layout",
+            got=cutoff_per_um,
+            wanted=f"at most {0.5 / pitch_um:g} cycles/µm, the finest that pixels of {pitch_um:g} µm hold",
+        )
     field = low_pass(
         np.random.default_rng(seed).random(whole),
         cutoff_per_um=cutoff_per_um,

@@ -40,7 +40,7 @@ class Recipe(BaseModel):
         try:
             content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
         except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-            raise InputError(f"cannot read recipe {path}", got=str(error), wanted="a TOML file") from error
+            raise InputError(f"cannot read recipe {path}", got=error, wanted="a TOML file") from error
         return cls.from_dict(content, source=str(path))
 
     @classmethod

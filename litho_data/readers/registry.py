@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.readers import gsf, gwy, hdf5, npy, text_matrix, tiff, vendor
 from litho_data.readers.reader import Reader
 
@@ -53,7 +53,7 @@ def reader_of(format: str) -> Reader:
     for reader in _READERS:
         if reader.name == format:
             return reader
-    raise InputError("scan format", got=repr(format), wanted=" | ".join(("auto", *formats())))
+    raise unknown_name("scan format", format, ("auto", *formats()))
 
 
 def detect_format(path: Path) -> str:
@@ -81,5 +81,5 @@ def require_file(path: str | Path) -> Path:
             if not stream.read(1):
                 raise InputError(f"{file} is empty")
     except OSError as error:
-        raise InputError(f"cannot open {file}", got=error.strerror) from error
+        raise InputError(f"cannot open {file}", got=error) from error
     return file

@@ -34,7 +34,9 @@ def open_root(path: str | Path) -> zarr.Group:
         return zarr.open_group(source, mode="r", zarr_format=3, use_consolidated=False)
     except (OSError, ValueError, BadZipFile) as error:
         raise InputError(
-            f"cannot open {location} as a dataset store", got=str(error), wanted="a Zarr v3 group"
+            f"cannot open {location} as a dataset store",
+            got="no Zarr v3 group",
+            wanted="a store made by `litho-data build`",
         ) from error
 
 

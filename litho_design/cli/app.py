@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from litho_data.foundation.commands import new_app, run_app
+from litho_data.foundation.app import new_app, run_app
 from litho_data.foundation.errors import InputError
 from litho_design.cli.design import compare, correct, estimate, first, hoe, lens, settings
 from litho_design.cli.options import BandPx, Device, Extrapolate, Out
@@ -27,57 +27,55 @@ app.command()(settings)
 
 @app.command()
 def score(
-    design: Annotated[Path, typer.Argument(help="Folder of a design.")],
+    design: Annotated[Path, typer.Argument(help="folder of a design")],
     out: Out,
     judge: Annotated[
         list[str] | None,
-        typer.Option(
-            help="NAME=MODEL, MODEL or `none`; MODEL may be truth/ of a virtual fab; may be repeated."
-        ),
+        typer.Option(help="NAME=MODEL, MODEL or `none`; MODEL may be truth/ of a virtual fab; repeatable"),
     ] = None,
-    scan: Annotated[Path | None, typer.Option(help="AFM height map of the printed part.")] = None,
-    scan_unit: Annotated[str | None, typer.Option(help="Unit of its heights, if the file has none.")] = None,
-    scan_size_um: Annotated[float | None, typer.Option(help="Its side, µm, if the file has none.")] = None,
+    scan: Annotated[Path | None, typer.Option(help="AFM height map of the printed part")] = None,
+    scan_unit: Annotated[str | None, typer.Option(help="unit of its heights, if the file has none")] = None,
+    scan_size_um: Annotated[float | None, typer.Option(help="its side, µm, if the file has none")] = None,
     scan_levelling: Annotated[
         Literal["none", "plane", "bow"],
-        typer.Option(help="What is removed of the scan: nothing, a plane, or a bow of second order."),
+        typer.Option(help="what is removed of the scan: nothing, a plane, or a bow of second order"),
     ] = "bow",
     scan_scale_sd: Annotated[
-        float, typer.Option(help="Relative standard uncertainty of the microscope's height scale.")
+        float, typer.Option(help="relative standard uncertainty of the microscope's height scale")
     ] = 0.02,
     camera: Annotated[
         Path | None,
-        typer.Option(help="Photograph of the printed hologram's image, or through the printed lens."),
+        typer.Option(help="photograph of the printed hologram's image, or through the printed lens"),
     ] = None,
-    camera_pitch_um: Annotated[float | None, typer.Option(help="Its pixel in the image plane, µm.")] = None,
-    camera_dark_level: Annotated[float | None, typer.Option(help="Its dark level, counts.")] = None,
+    camera_pitch_um: Annotated[float | None, typer.Option(help="its pixel in the image plane, µm")] = None,
+    camera_dark_level: Annotated[float | None, typer.Option(help="its dark level, counts")] = None,
     camera_object: Annotated[
         str | None,
-        typer.Option(help="Object in front of the lens: one of the design's objects by name, or a picture."),
+        typer.Option(help="object in front of the lens: one of the design's objects by name, or a picture"),
     ] = None,
     camera_orientation: Annotated[
         str,
         typer.Option(
-            help="What brings the photograph upright: identity, rotate-90, rotate-180, rotate-270, flip-x, "
-            "flip-y, transpose or anti-transpose. One that fits another orientation better is refused."
+            help="what brings the photograph upright: identity, rotate-90, rotate-180, rotate-270, flip-x, "
+            "flip-y, transpose or anti-transpose. One that fits another orientation better is refused"
         ),
     ] = "identity",
     camera_power: Annotated[
         float | None,
         typer.Option(
-            help="Summed counts of all light that falls on the element, at the same exposure: gives "
-            "efficiencies."
+            help="summed counts of all light that falls on the element, at the same exposure: gives "
+            "efficiencies"
         ),
     ] = None,
     element: Annotated[
         Literal["thin", "thick"] | None,
         typer.Option(
-            help="Optics of the judges: thin, or thick (wave propagation method). As designed by default."
+            help="optics of the judges: thin, or thick (wave propagation method). As designed by default"
         ),
     ] = None,
     task_file: Annotated[
         Path | None,
-        typer.Option(help="Python file that registers the task of the design, one of your own; it is run."),
+        typer.Option(help="Python file that registers the task of the design, one of your own; it is run"),
     ] = None,
     stream: Annotated[
         bool,
@@ -89,7 +87,10 @@ def score(
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
-    """Score a design as models print it, as an AFM measured it, or as a camera saw it."""
+    """Score a design as models print it, as an AFM measured it, or as a camera saw it.
+
+    Example: litho-design score hologram --judge zoo:physics --out score
+    """
     from litho_design.judging.measured import MeasuredSource
     from litho_design.judging.photographs import PhotoSource
     from litho_design.tasks.task import register_tasks_of
@@ -153,22 +154,25 @@ def _print_scores(result: ScoreResult, out: Path) -> None:
 
 @app.command()
 def export(
-    design: Annotated[Path, typer.Argument(help="Folder of a design.")],
+    design: Annotated[Path, typer.Argument(help="folder of a design")],
     out: Out,
     format: Annotated[
-        Literal["png16", "bmp", "tiff", "stl", "gds"], typer.Option(help="File for the printer.")
+        Literal["png16", "bmp", "tiff", "stl", "gds"], typer.Option(help="file for the printer")
     ] = "png16",
-    pedestal_um: Annotated[float, typer.Option(help="Base under level 0, µm.")] = 1.0,
-    slicing_um: Annotated[float, typer.Option(help="Slicing distance for the job, µm.")] = 0.1,
-    hatching_um: Annotated[float, typer.Option(help="Hatching distance for the job, µm.")] = 0.1,
+    pedestal_um: Annotated[float, typer.Option(help="base under level 0, µm")] = 1.0,
+    slicing_um: Annotated[float, typer.Option(help="slicing distance for the job, µm")] = 0.1,
+    hatching_um: Annotated[float, typer.Option(help="hatching distance for the job, µm")] = 0.1,
     gds_layers: Annotated[
-        Literal["cumulative", "exclusive"], typer.Option(help="Layer k is level >= k, or level == k.")
+        Literal["cumulative", "exclusive"], typer.Option(help="layer k is level >= k, or level == k")
     ] = "cumulative",
     marks: Annotated[
-        bool, typer.Option("--marks", help="Also print an F (orientation) and a flat witness beside it.")
+        bool, typer.Option("--marks", help="also print an F (orientation) and a flat witness beside it")
     ] = False,
 ) -> None:
-    """Write the layout for the printer, with the sidecar that gives it heights and size."""
+    """Write the layout for the printer, with the sidecar that gives it heights and size.
+
+    Example: litho-design export hologram --format stl --out files
+    """
     from litho_design.exports.files import export as export_design
     from litho_design.exports.sidecar import sidecar_path
 

@@ -31,45 +31,44 @@ if TYPE_CHECKING:
 S = TypeVar("S", bound=DesignSettings)
 
 _TARGET_HELP = "an image file, or a drawing: text, ring, chart, spots, letters"
-Model = Annotated[
-    str, typer.Option(help="Folder of a frozen model, zoo:NAME, or `none` for nominal heights.")
-]
-Target = Annotated[str, typer.Option(help=f"Wanted image: {_TARGET_HELP}.")]
+Model = Annotated[str, typer.Option(help="folder of a frozen model, zoo:NAME, or `none` for nominal heights")]
+Target = Annotated[str, typer.Option(help=f"wanted image: {_TARGET_HELP}")]
 SpreadOf = Annotated[
     Path | None,
     typer.Option(
-        help="Dataset store: take the spread of gain and offset from its measured prints, the locked "
-        "scans left out."
+        help="dataset store: take the spread of gain and offset from its measured prints, the locked "
+        "scans left out"
     ),
 ]
 RoughnessOf = Annotated[
     Path | None,
-    typer.Option(help="noise.json of litho-models noise: the surface of a print is as rough as measured."),
+    typer.Option(help="noise.json of litho-models noise: the surface of a print is as rough as measured"),
 ]
 Ensemble = Annotated[
-    list[str] | None, typer.Option(help="NAME=MODEL of a further model in the loss; may be repeated.")
+    list[str] | None, typer.Option(help="NAME=MODEL of a further model in the loss; repeatable")
 ]
 Objects = Annotated[
     list[Path] | None,
     typer.Option(
-        help="Computational lens: picture, or folder of pictures, to image instead of the drawings; may be "
-        "repeated. Without --held-out-objects the last quarter by name, two at least, is held out."
+        help="computational lens: picture, or folder of pictures, to image instead of the drawings; "
+        "repeatable. Without --held-out-objects the last quarter by name, two at least, is held out"
     ),
 ]
 HeldOutObjects = Annotated[
     list[Path] | None,
-    typer.Option(
-        help="Computational lens: picture or folder of pictures that is only scored; may be repeated."
-    ),
+    typer.Option(help="computational lens: picture or folder of pictures that is only scored; repeatable"),
 ]
 
 
 def first(
-    out: Annotated[Path, typer.Option(help="Folder of the result.")] = Path("first"),
+    out: Annotated[Path, typer.Option(help="folder of the result")] = Path("first"),
     target: Target = "text",
     device: Device = "cpu",
 ) -> None:
-    """Design one small hologram with and without a printer's model, and show both printed: a minute."""
+    """Design one small hologram with and without a printer's model, and show both printed: a minute.
+
+    Example: litho-design first --target ring
+    """
     from litho_design.reports.first import DESIGNER, WITHOUT, psnr_db
     from litho_design.workflows.first import first as make_first
 
@@ -90,8 +89,8 @@ def hoe(
     front: Annotated[
         str | None,
         typer.Option(
-            help="Efficiency weights, comma-separated, such as 0,0.03,0.1,0.3,1: one design each, and the "
-            "front of efficiency against likeness."
+            help="efficiency weights, comma-separated, such as 0,0.03,0.1,0.3,1: one design each, and the "
+            "front of efficiency against likeness"
         ),
     ] = None,
     spread_of: SpreadOf = None,
@@ -109,7 +108,10 @@ def hoe(
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
-    """Design a holographic element; an interrupted run in OUT is continued."""
+    """Design a holographic element; an interrupted run in OUT is continued.
+
+    Example: litho-design hoe --model zoo:pbl --target photo.png --size-px 512 --out hologram
+    """
     settings = _settings(given, _hologram, "hoe", spread_of, roughness_of)
     if large:
         if front is not None or ensemble:
@@ -132,7 +134,7 @@ def hoe(
 def correct(
     relief: Annotated[
         str,
-        typer.Argument(help="Grey picture, float TIFF in µm, or a drawing: lens, blaze, staircase."),
+        typer.Argument(help="grey picture, float TIFF in µm, or a drawing: lens, blaze, staircase"),
     ],
     model: Model,
     out: Out,
@@ -143,7 +145,10 @@ def correct(
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
-    """Find the layout whose print is the wanted relief; an interrupted run in OUT is continued."""
+    """Find the layout whose print is the wanted relief; an interrupted run in OUT is continued.
+
+    Example: litho-design correct blaze --model zoo:pbl --out blaze
+    """
     settings = _settings(given, _relief, "correct", spread_of, roughness_of)
     from litho_design.workflows.design import correct as correct_relief
 
@@ -170,7 +175,10 @@ def lens(
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
-    """Design a multi-level diffractive lens; an interrupted run in OUT is continued."""
+    """Design a multi-level diffractive lens; an interrupted run in OUT is continued.
+
+    Example: litho-design lens --model zoo:pbl --distance-um 200 --out lens
+    """
     settings = _settings(given, _lens, "lens", spread_of, roughness_of)
     if large:
         if objects or held_out_objects or ensemble:
@@ -194,29 +202,30 @@ def lens(
 @takes_settings(HologramSettings(), LensSettings(), leave_out=("task", "search.seed", "ensemble.weight"))
 def compare(
     models: Annotated[
-        str, typer.Option(help="Arms, comma-separated: none, NAME=MODEL or MODEL (a folder, or zoo:NAME).")
+        str, typer.Option(help="arms, comma-separated: none, NAME=MODEL or MODEL (a folder, or zoo:NAME)")
     ],
     out: Out,
     given: Given,
     judge: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Further judges, NAME=MODEL or MODEL (or truth/ of a virtual fab); may be repeated."
-        ),
+        typer.Option(help="further judges, NAME=MODEL or MODEL (or truth/ of a virtual fab); repeatable"),
     ] = None,
     task: Annotated[
-        Literal["hoe", "lens-direct", "lens-computational"], typer.Option(help="What is designed.")
+        Literal["hoe", "lens-direct", "lens-computational"], typer.Option(help="what is designed")
     ] = "hoe",
-    target: Annotated[str, typer.Option(help=f"For hoe: {_TARGET_HELP}.")] = "text",
+    target: Annotated[str, typer.Option(help=f"for hoe: {_TARGET_HELP}")] = "text",
     objects: Objects = None,
     held_out_objects: HeldOutObjects = None,
     spread_of: SpreadOf = None,
     roughness_of: RoughnessOf = None,
-    seeds: Annotated[int, typer.Option(help="Number of seeds: 0, 1, 2 …")] = 3,
+    seeds: Annotated[int, typer.Option(help="number of seeds: 0, 1, 2 …")] = 3,
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
-    """Design with every arm, print with every judge: the design-to-manufacturing gap."""
+    """Design with every arm, print with every judge: the design-to-manufacturing gap.
+
+    Example: litho-design compare --models none,zoo:pbl --judge zoo:physics --out gap
+    """
     settings: Any
     if task == "hoe":
         settings = _settings(given, _hologram, task, spread_of, roughness_of)
@@ -263,10 +272,13 @@ def estimate(
 
 @takes_settings(HologramSettings(), LensSettings(), ReliefSettings())
 def settings(
-    element: Annotated[Literal["hoe", "lens", "relief"], typer.Argument(help="What would be designed.")],
+    element: Annotated[Literal["hoe", "lens", "relief"], typer.Argument(help="what would be designed")],
     given: Given,
 ) -> None:
-    """Print all settings with their meaning, as a file for --config; nothing is designed."""
+    """Print all settings with their meaning, as a file for --config; nothing is designed.
+
+    Example: litho-design settings hoe > hoe.toml
+    """
     make: Callable[[Mapping[str, Any]], DesignSettings]
     make = {"hoe": _hologram, "lens": _lens, "relief": _relief}[element]
     print(as_toml(_settings(given, make, element)), end="")

@@ -16,12 +16,12 @@ from pydantic import BaseModel
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.settings import Leaf, assigned, flattened, leaves, read_settings
 
-Out = Annotated[Path, typer.Option(help="Folder of the result.")]
+Out = Annotated[Path, typer.Option(help="folder of the result")]
 Device = Annotated[str, typer.Option(help="cpu, cuda, cuda:0 …")]
 Extrapolate = Annotated[
     bool,
     typer.Option(
-        "--extrapolate", help="Accept heights beyond the model's calibration; recorded in the result."
+        "--extrapolate", help="accept heights beyond the model's calibration; recorded in the result"
     ),
 ]
 BandPx = Annotated[
@@ -33,15 +33,15 @@ BandPx = Annotated[
 _Config = Annotated[
     Path | None,
     typer.Option(
-        "--config", help="TOML or JSON file of settings, as `litho-design settings` prints it; options win."
+        "--config", help="TOML or JSON file of settings, as `litho-design settings` prints it; options win"
     ),
 ]
 _Set = Annotated[
     list[str] | None,
     typer.Option(
         "--set",
-        help="PATH=VALUE for any setting, such as loss.efficiency_weight=0.2; may be repeated. "
-        "`litho-design settings` lists all of them.",
+        help="PATH=VALUE for any setting, such as loss.efficiency_weight=0.2; repeatable. "
+        "`litho-design settings` lists all of them",
     ),
 ]
 
@@ -75,7 +75,7 @@ class Given:
             if name != "--set" and path not in known:
                 raise InputError(name, got=f"the {task} task", wanted="a task that has this setting")
         content = {} if self.config is None else read_settings(self.config)
-        return flattened(preset, content, f"{self.config}:") | flattened(preset, self.options)
+        return flattened(preset, content, f"setting of {self.config}") | flattened(preset, self.options)
 
 
 def takes_settings(
@@ -153,7 +153,7 @@ def _parameter(name: str, same: Sequence[Leaf], presets: int) -> inspect.Paramet
     values = list(dict.fromkeys(_shown(one.value) for one in same))
     option = typer.Option(
         *leaf.options,
-        help=f"{_described(leaf)}.",
+        help=_described(leaf),
         show_default=" or ".join(values),
         rich_help_panel=leaf.group or None,
     )

@@ -9,7 +9,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.hashes import array_sha256, file_sha256
 from litho_data.foundation.results import Record
 
@@ -64,8 +64,7 @@ def load_target(source: str | Path | np.ndarray | Target, size_px: int) -> Targe
         pixels = draw_target(name, size_px)
         return Target(pixels, _record(name, pixels))
     if not Path(name).is_file():
-        drawings = ", ".join(get_args(DrawnTarget))
-        raise InputError("target", got=repr(name), wanted=f"an image file, or one of {drawings}")
+        raise unknown_name("target", name, get_args(DrawnTarget), also="an image file")
     pixels, notes = read_image(Path(name), size_px, "target")
     record = TargetRecord(name=Path(name).name, sha256=file_sha256(name), adaptation="; ".join(notes))
     return Target(pixels, record)

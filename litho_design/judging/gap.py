@@ -19,6 +19,7 @@ from litho_design.lenses.settings import LensSettings
 from litho_design.optimisation.settings import DesignSettings
 from litho_design.printers.printer import PrinterRecord
 from litho_design.reliefs.settings import ReliefSettings
+from litho_design.tasks.design import DESIGNS
 
 
 def headline(task: str) -> tuple[str, ...]:
@@ -87,7 +88,7 @@ class GapResult(RunFacts, Result):
 
 def design_folder(out: Path, arm: str, seed: int) -> Path:
     """Where the design of one arm and seed lies."""
-    return out / "designs" / arm / f"seed{seed}"
+    return out / DESIGNS / arm / f"seed{seed}"
 
 
 def summarise(entries: Sequence[GapEntry]) -> list[GapSummary]:

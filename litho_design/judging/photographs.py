@@ -10,7 +10,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.results import Record
 from litho_design.images.noise import uncertainties
 from litho_design.images.photograph import CameraRecord, photographed_image
@@ -203,10 +203,8 @@ def _object(task: LensTask, imaged: str | None) -> tuple[Tensor, ImagedObject]:
     items = (*settings.objects, *settings.test_objects)
     own = {object_name(item): item for item in items}
     if imaged is None or (imaged not in own and not Path(imaged).is_file()):
-        raise InputError(
-            "photographed object",
-            got="no --camera-object" if imaged is None else repr(imaged),
-            wanted=f"a picture's path, or one of {', '.join(own)}",
+        raise unknown_name(
+            "photographed object", imaged or "no --camera-object", own, also="a picture's path"
         )
     if imaged in own:
         if [object_name(item) for item in items].count(imaged) > 1:

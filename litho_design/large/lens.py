@@ -30,7 +30,12 @@ from litho_design.optics.stroke import measure_stroke
 from litho_design.optimisation.budget import measure_budget, peak_memory_gib
 from litho_design.optimisation.parameters import CellMap, DirectLevels
 from litho_design.optimisation.phases import focusing_levels, printed_phase
-from litho_design.optimisation.search import finished_iterations, remove_checkpoint, search_layout
+from litho_design.optimisation.search import (
+    CHECKPOINTS,
+    finished_iterations,
+    remove_checkpoint,
+    search_layout,
+)
 from litho_design.printers.layout import LayoutSettings, printability
 from litho_design.printers.printer import Printer
 from litho_design.tasks.design import Design, RunRecord, write_arrays
@@ -148,7 +153,7 @@ def design_in_rings(
         InputError: what ``RingLens`` refuses, or ``out`` holds another result.
     """
     folder, search, layout = Path(out), settings.search, settings.layout
-    require_own_folder(folder, Design.FILE_NAME)
+    require_own_folder(folder, Design.FILE_NAME, CHECKPOINTS)
     before = printer.weights_sha256()
     fingerprint = record_sha256(["lens in rings", settings.model_dump(mode="json"), before])
     if (folder / Design.FILE_NAME).exists():

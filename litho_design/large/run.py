@@ -25,7 +25,12 @@ from litho_design.optics.stroke import measure_stroke
 from litho_design.optimisation.budget import measure_budget, peak_memory_gib
 from litho_design.optimisation.parameters import DirectLevels
 from litho_design.optimisation.phases import printed_phase
-from litho_design.optimisation.search import finished_iterations, remove_checkpoint, search_layout
+from litho_design.optimisation.search import (
+    CHECKPOINTS,
+    finished_iterations,
+    remove_checkpoint,
+    search_layout,
+)
 from litho_design.optimisation.starts import start_search
 from litho_design.printers.layout import printability
 from litho_design.printers.printer import Printer
@@ -63,7 +68,7 @@ def design_in_bands(
     fingerprint = record_sha256(
         ["hoe in bands", settings.model_dump(mode="json"), before, target.record.sha256, bands.band_px]
     )
-    require_own_folder(folder, Design.FILE_NAME)
+    require_own_folder(folder, Design.FILE_NAME, CHECKPOINTS)
     if (folder / Design.FILE_NAME).exists():
         return _finished(folder, fingerprint)
     with writable(folder):

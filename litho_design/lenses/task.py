@@ -252,3 +252,20 @@ def _check(settings: LensSettings) -> None:
         raise InputError("search path 'radial'", got="a rough surface", wanted="one of maps", hint=hint)
     if radial and settings.layout.size_px % 2:
         raise InputError("size_px for the radial path", got=settings.layout.size_px, wanted="an even number")
+    if settings.task == "direct":
+        _check_outermost_zone(settings)
+
+
+def _check_outermost_zone(settings: LensSettings) -> None:
+    """Two cells draw a zone; the outermost of a lens is wavelength / sin(angle of the rim) wide."""
+    layout, optics = settings.layout, settings.optics
+    radius_um = layout.size_px * layout.pitch_um / 2
+    zone_um = optics.wavelength_um * math.hypot(radius_um, optics.distance_um) / radius_um
+    if zone_um < 2 * layout.cell_um:
+        sine = optics.wavelength_um / (2 * layout.cell_um)
+        raise InputError(
+            f"cells of {layout.cell_um:g} µm",
+            got=f"an outermost zone of the lens of {zone_um:.3g} µm",
+            wanted="two cells a zone",
+            hint=f"--distance-um {radius_um * math.sqrt(1 / sine**2 - 1):.4g} or more, or smaller cells",
+        )

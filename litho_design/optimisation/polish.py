@@ -64,7 +64,7 @@ def _gradient_moves(
     share = 0.02
     gain, move, loss = _rank_moves(best, cells, objective, level_count)
     losses = [loss]
-    for _ in progress(range(rounds), "polishing", total=rounds):
+    for _ in progress(range(rounds), "polishing", estimate_of=0):
         count = min(math.ceil(share * best.numel()), int((gain > 0).sum()))
         if count == 0:
             break

@@ -166,7 +166,8 @@ def check_draws(window: ProcessWindow, optics: Optics, source: PixelGrid, target
         limit_um = min(draw.optics.wavelength_um for draw in drawn)
     if optics.distance_um < limit_um:
         got, wanted = f"{optics.distance_um:g} µm", f"at least {limit_um:.4g} µm"
-        raise InputError("propagation distance", got=got, wanted=wanted)
+        hint = f"the wavelength is {optics.wavelength_um:g} µm: are nm meant?" if limit_um > 20 else ""
+        raise InputError("propagation distance", got=got, wanted=wanted, hint=hint)
     if nearest_um < limit_um:
         raise InputError(
             f"distance {optics.distance_um:g} µm with a defocus spread of {window.defocus_sd_um:g} µm",

@@ -21,6 +21,8 @@ from litho_design.optimisation.settings import SearchSettings
 from litho_design.printers.layout import LayoutSettings
 
 Objective = Callable[[Tensor], tuple[Tensor, dict[str, float]]]
+# What an interrupted run leaves, of all its parts.
+CHECKPOINTS = "checkpoint*.pt"
 # What torch raises for a damaged file depends on the place of the damage.
 _DAMAGED = (
     RuntimeError,
@@ -81,7 +83,7 @@ def search_layout(
     if checkpoint is not None and checkpoint.exists():
         state = _resume(checkpoint, parameters, optimiser, fingerprint)
     remaining = range(state.iteration, settings.iterations)
-    for iteration in progress(remaining, what, total=len(remaining)):
+    for iteration in progress(remaining, what, total=len(remaining), estimate_of=0):
         step_loss = _step(parameters, objective, optimiser, settings, iteration)
         state.iteration = iteration + 1
         if iteration % settings.evaluate_every == 0 or state.iteration == settings.iterations:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import unknown_name
 from litho_data.foundation.results import Record
 from litho_data.foundation.settings import changed, setting
 from litho_design.optics import Optics
@@ -121,4 +121,4 @@ def check_variant(variant: str) -> None:
         InputError: no such preset.
     """
     if variant not in get_args(Variant):
-        raise InputError("variant", got=repr(variant), wanted=", ".join(get_args(Variant)))
+        raise unknown_name("variant", variant, get_args(Variant))

@@ -81,7 +81,7 @@ def load_printers(
 def _load_simulator(source: str, device: Device, extrapolate: bool) -> Any:
     from litho_models import load_frozen, zoo
 
-    return load_frozen(zoo.model_folder(source, other="or none"), device=device, extrapolate=extrapolate)
+    return load_frozen(zoo.model_folder(source, other=["none"]), device=device, extrapolate=extrapolate)
 
 
 def _check_calibration(card: Mapping[str, Any], layout: LayoutSettings, extrapolate: bool) -> None:

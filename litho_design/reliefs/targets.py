@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.hashes import array_sha256, file_sha256
 from litho_design.images.targets import TargetRecord, read_image
 from litho_design.printers.layout import LayoutSettings
@@ -37,8 +37,7 @@ def load_relief(
         drawn = (height_um * _draw(name, size)).astype(np.float32)
         return drawn, _record(name, drawn)
     if not path.is_file():
-        known = ", ".join(get_args(DrawnRelief))
-        raise InputError("relief", got=repr(name), wanted=f"a picture, a float TIFF in µm, or one of {known}")
+        raise unknown_name("relief", name, get_args(DrawnRelief), also="a picture, or a float TIFF in µm")
     notes: list[str] = []
     heights = _float_tiff(path)
     if heights is None:

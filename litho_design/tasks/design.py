@@ -25,6 +25,8 @@ LEVELS_FILE = "layout_level.npy"
 HEIGHT_FILE = "predicted_height_um.npy"
 IMAGE_FILE = "image_share.npy"
 TARGET_FILE = "target.npy"
+# Of a result that is made of several designs.
+DESIGNS = "designs"
 
 
 class RunRecord(RunFacts):

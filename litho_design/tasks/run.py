@@ -25,6 +25,7 @@ from litho_design.optimisation.fabrication import outside
 from litho_design.optimisation.polish import polish_levels
 from litho_design.optimisation.robust import measure_disagreement
 from litho_design.optimisation.search import (
+    CHECKPOINTS,
     SearchState,
     finished_iterations,
     make_parametrisation,
@@ -87,7 +88,7 @@ def run_design(
     settings = task.settings
     _check_printers(task.printers)
     folder = Path(out)
-    require_own_folder(folder, Design.FILE_NAME)
+    require_own_folder(folder, Design.FILE_NAME, CHECKPOINTS)
     hashes_before = [printer.weights_sha256() for printer in task.printers]
     target = task.target_record.model_dump(mode="json") if task.target_record else None
     fingerprint = record_sha256(

@@ -16,7 +16,7 @@ import torch
 from pydantic import ConfigDict
 from torch import Tensor
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.results import Record
 from litho_design.images.targets import TargetRecord
 from litho_design.optics import Optics
@@ -267,10 +267,10 @@ def registered_task(name: str) -> type[Task]:
         InputError: no such task here.
     """
     if name not in _TASKS:
-        raise InputError(
+        raise unknown_name(
             "task",
-            got=repr(name),
-            wanted=", ".join(sorted(_TASKS)),
+            name,
+            sorted(_TASKS),
             hint="run the code that registers it (register_task), or give its file: --task-file",
         )
     return _TASKS[name]

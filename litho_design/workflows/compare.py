@@ -32,6 +32,7 @@ from litho_design.printers.printer import Printer
 from litho_design.printers.source import Device, load_printers
 from litho_design.reports.design import write_design_report
 from litho_design.reports.gap import write_gap_report
+from litho_design.tasks.design import DESIGNS
 from litho_design.tasks.run import run_design
 from litho_design.tasks.task import Task, registered_task
 
@@ -88,7 +89,7 @@ def compare(
     others = load_printers(judges, settings.layout, **fit)
     _check(designers, others, every_seed)
     folder = Path(out)
-    require_own_folder(folder, GapResult.FILE_NAME)
+    require_own_folder(folder, GapResult.FILE_NAME, DESIGNS)
     # Printers are checked before a target is drawn or a picture is read.
     make: Callable[[Any, Printer], Task]
     if task is not None:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
+from litho_data.foundation.errors import InputError
 from litho_design.holograms.settings import HologramSettings, hologram_settings
 from litho_design.holograms.task import HologramTask
 from litho_design.images.targets import Target, load_target
@@ -24,6 +26,8 @@ from litho_design.reports.design import write_design_report
 from litho_design.tasks.design import Design
 from litho_design.tasks.run import run_design
 from litho_design.tasks.task import Task, registered_task
+
+S = TypeVar("S", bound=DesignSettings)
 
 
 def design_hologram(
@@ -57,7 +61,7 @@ def design_hologram(
         InputError: a target of another size or without dark and bright pixels, a model that does not
             fit the layout, or a folder that holds another result.
     """
-    made = settings or hologram_settings()
+    made = _of_kind(settings or hologram_settings(), HologramSettings)
 
     def task(printer: Printer, others: list[Printer]) -> Task:
         return HologramTask(made, printer, load_target(target, made.layout.size_px), others)
@@ -94,7 +98,7 @@ def design_lens(
         InputError: as for ``design_hologram``; a radial search of a layout without rings or with a
             square aperture; or objects that are not pictures.
     """
-    made = settings or lens_settings()
+    made = _of_kind(settings or lens_settings(), LensSettings)
 
     def task(printer: Printer, others: list[Printer]) -> Task:
         imaging, pictures = with_objects(made, objects, held_out_objects)
@@ -129,7 +133,7 @@ def correct(
     Raises:
         InputError: what ``load_relief`` refuses, or ``design_hologram`` of models and folders.
     """
-    made = settings or relief_settings()
+    made = _of_kind(settings or relief_settings(), ReliefSettings)
 
     def task(printer: Printer, others: list[Printer]) -> Task:
         heights, record = load_relief(relief, made.layout, made.height_um)
@@ -166,13 +170,16 @@ def design(
     Raises:
         InputError: a task that is not registered, or what ``design_hologram`` refuses of models and folders.
     """
+    if isinstance(task, str):
+        hint = "design_hologram, design_lens and correct design what the package knows"
+        raise InputError("task", got=repr(task), wanted="a class derived from Task", hint=hint)
     registered_task(task.name)
     made = settings or DesignSettings()
 
-    def of_kind(printer: Printer, others: list[Printer]) -> Task:
+    def of_task(printer: Printer, others: list[Printer]) -> Task:
         return task(made, printer, inputs=inputs, ensemble=others)
 
-    return _designed(of_kind, made.layout, out, announce, model, ensemble, device, extrapolate)
+    return _designed(of_task, made.layout, out, announce, model, ensemble, device, extrapolate)
 
 
 def _designed(
@@ -189,3 +196,9 @@ def _designed(
     printer = load_printer(model, layout, device=device, extrapolate=extrapolate)
     others = load_printers(ensemble, layout, device=device, extrapolate=extrapolate)
     return run_design(make(printer, list(others.values())), out, write_design_report, announce=announce)
+
+
+def _of_kind(settings: S, kind: type[S]) -> S:
+    if not isinstance(settings, kind):
+        raise InputError("settings", got=type(settings).__name__, wanted=kind.__name__)
+    return settings

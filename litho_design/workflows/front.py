@@ -17,6 +17,7 @@ from litho_design.judging.front import FrontPoint, FrontResult
 from litho_design.printers.printer import Printer
 from litho_design.printers.source import Device, load_printer, load_printers
 from litho_design.reports.front import write_front_report
+from litho_design.tasks.design import DESIGNS
 from litho_design.workflows.design import design_hologram
 
 WEIGHTS = (0.0, 0.03, 0.1, 0.3, 1.0, 3.0)
@@ -52,7 +53,7 @@ def efficiency_front(
             "weights of the front", got=", ".join(f"{one:g}" for one in weights), wanted="two or more, from 0"
         )
     folder, made = Path(out), settings or hologram_settings()
-    require_own_folder(folder, FrontResult.FILE_NAME)
+    require_own_folder(folder, FrontResult.FILE_NAME, DESIGNS)
     fit: Any = {"device": device, "extrapolate": extrapolate}
     printer = load_printer(model, made.layout, **fit)
     others = list(load_printers(ensemble, made.layout, **fit).values())
@@ -60,7 +61,7 @@ def efficiency_front(
     found: list[tuple[float, str, float, float]] = []
     for weight in sorted(weights):
         loss = made.loss.model_copy(update={"efficiency_weight": weight})
-        place = Path("designs") / f"weight_{weight:g}"
+        place = Path(DESIGNS) / f"weight_{weight:g}"
         design = design_hologram(
             target, printer, folder / place, settings=made.model_copy(update={"loss": loss}),
             ensemble=others, announce=announce,

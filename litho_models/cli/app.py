@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 import litho_models
-from litho_data.foundation.commands import new_app, run_app
+from litho_data.foundation.app import new_app, run_app
 from litho_data.foundation.errors import InputError
 from litho_models.cli.check import check
 from litho_models.cli.loop import close_loop
@@ -21,6 +21,8 @@ app.command("close-loop")(close_loop)
 app.command("next-print")(next_print)
 app.command()(noise)
 app.command()(check)
+zoo = typer.Typer(help="The models that come with the package: list, or show NAME.", no_args_is_help=True)
+app.add_typer(zoo, name="zoo")
 
 StorePath = Annotated[Path, typer.Argument(help="dataset store made by `litho-data build`")]
 Out = Annotated[Path, typer.Option(help="folder of the result")]
@@ -85,7 +87,10 @@ def train(
         typer.Option("--use-lock-box", help="train on the locked scans too; nothing is left to judge by"),
     ] = False,
 ) -> None:
-    """Train a model on all scans but the locked ones; resumable."""
+    """Train a model on all scans but the locked ones; resumable.
+
+    Example: litho-models train prints.zarr --model pbl --out run
+    """
     from litho_models.frozen.readme import bounds_text
 
     settings = {"seed": seed, "weights": weights, **_given(steps=steps, precision=precision)}
@@ -116,7 +121,10 @@ def evaluate(
         ),
     ] = False,
 ) -> None:
-    """Score one frozen model on a store; on the dataset it was trained on, without the locked scans."""
+    """Score one frozen model on a store; on the dataset it was trained on, without the locked scans.
+
+    Example: litho-models evaluate zoo:pbl prints.zarr --out evaluation
+    """
     from litho_models.evaluation.reports import lock_box_text
 
     result = litho_models.evaluate(
@@ -164,7 +172,10 @@ def benchmark(
         typer.Option(min=0, help="of weights and crops alone, same split; --seed by default"),
     ] = None,
 ) -> None:
-    """Train every model per fold and score it on scans it has not seen; resumable."""
+    """Train every model per fold and score it on scans it has not seen; resumable.
+
+    Example: litho-models benchmark prints.zarr --models affine,physics,pbl --out benchmark
+    """
     from litho_models.evaluation.benchmark import DEFAULT_MODELS
     from litho_models.evaluation.tables import headline_table
     from litho_models.scoring.statistics import FEWEST_FOR_INTERVAL
@@ -233,22 +244,25 @@ def export(
     )
 
 
-@app.command("zoo")
-def show_zoo(
-    name: Annotated[str | None, typer.Argument(help="show the page of this model; list all without")] = None,
-) -> None:
-    """List the models that come with the package, or show the page of one.
+@zoo.command("list")
+def list_zoo() -> None:
+    """List the models that come with the package.
 
-    Example: litho-models zoo pbl
+    Example: litho-models zoo list
     """
-    zoo = litho_models.zoo
-    if name is not None:
-        page = (zoo.folder(name.removeprefix(zoo.PREFIX)) / "README.md").read_text(encoding="utf-8")
-        # Without the front matter, which is for machines.
-        typer.echo(page.split("---\n", 2)[-1].strip())
-        return
-    for known in zoo.list():
-        typer.echo(f"{zoo.PREFIX}{known:10} {zoo.load(known)}")
+    for name in litho_models.zoo.list():
+        typer.echo(f"{litho_models.zoo.PREFIX}{name:10} {litho_models.zoo.load(name)}")
+
+
+@zoo.command("show")
+def show_zoo(name: Annotated[str, typer.Argument(help="name of a model of the zoo")]) -> None:
+    """Show the page of a model that comes with the package.
+
+    Example: litho-models zoo show pbl
+    """
+    folder = litho_models.zoo.folder(name.removeprefix(litho_models.zoo.PREFIX))
+    # Without the front matter, which is for machines.
+    typer.echo((folder / "README.md").read_text(encoding="utf-8").split("---\n", 2)[-1].strip())
 
 
 @app.command()
@@ -256,7 +270,10 @@ def compare(
     first: Annotated[Path, typer.Argument(help="benchmark.json or evaluation.json")],
     second: Annotated[Path, typer.Argument(help="another one, of the same protocol")],
 ) -> None:
-    """Difference of two results, paired by scan; refuses different data, folds or nuisances."""
+    """Difference of two results, paired by scan; refuses different data, folds or nuisances.
+
+    Example: litho-models compare one/benchmark.json other/benchmark.json
+    """
     typer.echo(litho_models.compare(first, second).round(3).to_string(index=False))
 
 
@@ -275,7 +292,10 @@ def freeze(
     ] = None,
     declare_process: Annotated[list[str] | None, typer.Option(hidden=True)] = None,
 ) -> None:
-    """Write the process model only: weights, card and a page for people."""
+    """Write the process model only: weights, card and a page for people.
+
+    Example: litho-models freeze run --out printer
+    """
     if declare_process:
         raise InputError(
             "option",

@@ -73,7 +73,10 @@ def close_loop(
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="folds and bootstrap, not the lock box")] = 0,
 ) -> None:
-    """Find what a model lacks on measured prints, add it, and report the error on held-out scans (nm)."""
+    """Find what a model lacks on measured prints, add it, and report the error on held-out scans (nm).
+
+    Example: litho-models close-loop prints.zarr --base physics --out loop
+    """
     from litho_models.loop import LoopConfig, parse_priors
     from litho_models.loop.report.wording import error_lines, verdict_text
 

@@ -22,7 +22,10 @@ def next_print(
     seed: Annotated[int, typer.Option("--seed", min=0, help="of the random layouts to start from")] = 0,
     steps: Annotated[int, typer.Option("--steps", min=0, help="of the ascent of each tile")] = 40,
 ) -> None:
-    """Plan the prints and scans that decide what a closed loop left open; resumes after a kill."""
+    """Plan the prints and scans that decide what a closed loop left open; resumes after a kill.
+
+    Example: litho-models next-print loop --out plan
+    """
     from litho_models.planning.run import next_print as plan_next_print
 
     plan = plan_next_print(

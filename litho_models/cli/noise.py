@@ -44,7 +44,10 @@ def noise(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="seed of the pixels drawn")] = 0,
 ) -> None:
-    """Roughness, dose matrix, noise budget, σ(x) and its calibration; lengths in µm, noise in nm."""
+    """Roughness, dose matrix, noise budget, σ(x) and its calibration; lengths in µm, noise in nm.
+
+    Example: litho-models noise prints.zarr --residuals benchmark --out noise
+    """
     from litho_models.noise import analyse_noise_of_files
 
     _check_given(context)

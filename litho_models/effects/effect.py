@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, unknown_name
 
 Stage = Literal["exposure", "resist", "development", "measurement"]
 Role = Literal["process", "measurement", "nuisance", "undetermined"]
@@ -206,11 +206,9 @@ class Effect:
         Raises:
             InputError: a name this effect does not have.
         """
-        unknown = set(values) - set(self.parameters)
-        if unknown:
-            raise InputError(
-                f"parameter of {self.name}", got=", ".join(sorted(unknown)), wanted=", ".join(self.parameters)
-            )
+        for name in values:
+            if name not in self.parameters:
+                raise unknown_name(f"parameter of {self.name}", name, self.parameters)
         return {**self.off_values(), **values}
 
     def require_in_range(self, values: Mapping[str, float]) -> None:

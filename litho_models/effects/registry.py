@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, unknown_name
 from litho_models.effects import (
     development,
     exposure_field,
@@ -106,7 +106,7 @@ def get_effect(name: str) -> Effect:
         InputError: no such effect.
     """
     if name not in CATALOGUE:
-        raise InputError("effect", got=repr(name), wanted=f"one of {', '.join(CATALOGUE)}")
+        raise unknown_name("effect", name, CATALOGUE)
     return CATALOGUE[name]
 
 

@@ -6,13 +6,15 @@ An interrupted benchmark resumes, and an unchanged fit is never repeated.
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from litho_data.foundation.commands import progress
+from litho_data.foundation.commands import progress, say_estimate
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.outputs import require_own_folder
 from litho_data.foundation.run_facts import run_info
 from litho_data.store import PrintedScan, open_store
 from litho_data.store.lock_box import ids_sha256
@@ -30,6 +32,7 @@ from litho_models.scoring.records import ModelScores, Prediction
 from litho_models.scoring.scores import score_model
 from litho_models.splits.folds import GROUPED_FOLDS, ScoredSplit, SplitKind, plan_folds
 
+CACHE_FOLDER = "cache"
 BASELINES = ("identity", "affine", "affine-mtf", "blur-table", "linear", "features")
 DEFAULT_MODELS = (*BASELINES, "random-features", "physics", "pbl", "fno")
 
@@ -82,8 +85,12 @@ def benchmark(
     fits: list[FitRecord] = []
     predicted: dict[tuple[str, bool], dict[str, Prediction]] = {}
     jobs = [(name, fold) for name in models for fold in plan]
-    for name, fold in progress(jobs, f"benchmark of {dataset.name}"):
-        record, heights = fit_or_load(name, fold, configs[name], Path(out) / "cache")
+    for name, fold in progress(jobs, f"benchmark of {dataset.name}", estimate_of=0):
+        started = time.monotonic()
+        record, heights = fit_or_load(name, fold, configs[name], Path(out) / CACHE_FOLDER)
+        if fold is plan[0]:
+            rest = (len(plan) - 1) * (time.monotonic() - started)
+            say_estimate(f"{name} on the other {len(plan) - 1} folds", rest)
         fits.append(record)
         assert record.diagnostics is not None
         learned = record.diagnostics.background if background == "training" else None
@@ -149,6 +156,7 @@ def _require_same_benchmark(
     out: Path, dataset: str, models: Sequence[str], split: SplitKind, seed: int
 ) -> None:
     """A result may be made again or extended; one of something else is not replaced."""
+    require_own_folder(out, Benchmark.FILE_NAME, CACHE_FOLDER)
     if not (out / Benchmark.FILE_NAME).exists():
         return
     old = Benchmark.read(out)

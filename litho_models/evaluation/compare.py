@@ -42,7 +42,7 @@ def compare(first: str | Path, second: str | Path) -> pd.DataFrame:
         if right.protocol[key] != value:
             raise InputError(
                 f"cannot compare {left.path} with {right.path}: {key} differs",
-                got=f"{value} and {right.protocol[key]}",
+                got=f"{_short(value)} and {_short(right.protocol[key])}",
                 wanted="the same protocol in both",
             )
     common = [name for name in left.scores if name in right.scores]
@@ -104,3 +104,9 @@ def _row(first: ModelScores, second: ModelScores) -> dict[str, object]:
         "p": paired.p,
         "first_better": f"{paired.first_better}/{paired.scans}",
     }
+
+
+def _short(value: object) -> str:
+    """A hash by its first digits, which are enough to see that it differs."""
+    text = str(value)
+    return f"{text[:12]}…" if len(text) == 64 and " " not in text else text

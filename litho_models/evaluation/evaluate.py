@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.outputs import require_own_folder
 from litho_data.foundation.run_facts import run_info
 from litho_data.store import open_store
 from litho_data.store.lock_box import ids_sha256
@@ -69,6 +70,8 @@ def evaluate(
     floor = stated_floor(dataset.name, noise)
     frozen = load_frozen(zoo.model_folder(model), device=device, extrapolate=extrapolate)
     frozen.check_geometry(dataset.pitch_um, dataset.level_height_um)
+    subject = {"dataset.name": dataset.name, "model.name": frozen.name}
+    require_own_folder(out, Evaluation.FILE_NAME, subject=subject)
     every = dataset.scans()
     kept = locked_by_the_card(frozen, dataset)
     locked = sorted({*dataset.locked_ids, *kept})

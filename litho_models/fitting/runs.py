@@ -9,10 +9,12 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import Field, ValidationError
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.files import atomic_file
-from litho_data.foundation.results import Result, first_error
+from litho_data.foundation.outputs import require_own_folder
+from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import RunInfo, run_info
+from litho_data.foundation.settings import refused
 from litho_data.store import PrintedScan, open_store
 from litho_data.store.lock_box import ids_sha256
 from litho_data.store.schema import DatasetId
@@ -79,6 +81,7 @@ def train(
     used = [scan for scan in scans if scan.id not in locked]
     folder = Path(out)
     named = dataset.dataset_id
+    require_own_folder(folder, TrainingRun.FILE_NAME, CHECKPOINT_FOLDER, MODEL_FOLDER)
     _require_same_run(folder, {"dataset": named, "model": model, "config": config, "lock_box": locked})
     fitted = fit_with_record(model, used, config, checkpoint=folder / CHECKPOINT_FOLDER)
     record = TrainingRun(
@@ -131,7 +134,11 @@ def _require_same_run(folder: Path, facts: dict[str, Any]) -> None:
     if not (folder / TrainingRun.FILE_NAME).exists():
         return
     held = TrainingRun.read(folder)
-    differing = [name for name, fact in facts.items() if getattr(held, name) != fact]
+    then, now = (
+        {name: fact for name, fact in one.items() if name != "config"} | one["config"].model_dump()
+        for one in ({name: getattr(held, name) for name in facts}, facts)
+    )
+    differing = [name for name in now if then[name] != now[name]]
     if differing:
         raise InputError(
             f"{folder} holds another run",
@@ -147,12 +154,13 @@ def training_config(recipe: Recipe, model: str, settings: dict[str, Any]) -> Tra
     Raises:
         InputError: unknown recipe, unknown field, or a value out of range.
     """
+    for name in settings:
+        if name not in TrainingConfig.model_fields:
+            raise unknown_name("training setting", name, TrainingConfig.model_fields)
     try:
         return TrainingConfig.of_recipe(recipe, model, **settings)
     except ValidationError as error:
-        raise InputError(
-            "training settings", got=first_error(error), wanted="fields of TrainingConfig"
-        ) from error
+        raise refused(error) from None
 
 
 def level_share(scans: Sequence[PrintedScan]) -> list[float]:

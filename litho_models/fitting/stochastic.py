@@ -64,6 +64,7 @@ def train_network(
         checkpoints.load(state)
     bounds = np.linspace(0, config.steps, config.rounds + 1).astype(int)
     bounds = bounds[np.diff(bounds, prepend=-1) > 0]
+    begun = state.step
     for first, last in pairwise(bounds.tolist()):
         if last <= state.step:
             continue
@@ -73,7 +74,9 @@ def train_network(
         added = estimate_scan_terms(training, predictions, terms)
         targets = _Targets(training, added, _overhang_px(model, training, config), config.weights)
         losses = []
-        for step in progress(range(first, last), f"training {model.name} to step {config.steps}"):
+        left = config.steps - first if first == begun else 0
+        what = f"training {model.name} to step {config.steps}"
+        for step in progress(range(first, last), what, estimate_of=left):
             losses.append(_step(fabric, module, optimiser, targets, config, step))
         state.record(
             RoundRecord(

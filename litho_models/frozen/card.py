@@ -101,6 +101,10 @@ class ModelCard(RunFacts, Result):
         Raises:
             InputError: no card there, or one that is damaged or of another schema.
         """
+        if not Path(path).exists():
+            raise InputError(
+                "model", got=f"{path}, which does not exist", wanted="the folder of a frozen model"
+            )
         folder = Path(path) if Path(path).is_dir() else Path(path).parent
         if not (folder / CARD_FILE).exists():
             inside = sorted(card.parent for card in folder.glob(f"*/{CARD_FILE}"))

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import builtins
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import unknown_name
 
 if TYPE_CHECKING:
     import torch
@@ -32,22 +33,17 @@ def folder(name: str, root: str | Path = ZOO_FOLDER) -> Path:
     """
     known = list(root)
     if name not in known:
-        raise InputError(
-            "zoo model",
-            got=repr(name),
-            wanted=", ".join(known) or "one of a zoo that has models",
-            hint="" if known else "examples/make_zoo.py trains it",
-        )
+        raise unknown_name("zoo model", name, known, "" if known else "examples/make_zoo.py trains it")
     return Path(root) / name
 
 
-def model_folder(source: str | Path, root: str | Path = ZOO_FOLDER, other: str = "") -> Path:
+def model_folder(source: str | Path, root: str | Path = ZOO_FOLDER, other: Iterable[str] = ()) -> Path:
     """The folder of a model as a command is given it: a path, or ``zoo:NAME`` for a model of the zoo.
 
     Args:
         source: what the user typed.
         root: the zoo.
-        other: what else the caller takes, for the message.
+        other: names that the caller takes besides, for the message.
 
     Raises:
         InputError: no such folder, or no such model in the zoo.
@@ -56,12 +52,8 @@ def model_folder(source: str | Path, root: str | Path = ZOO_FOLDER, other: str =
     if text.startswith(PREFIX):
         return folder(text.removeprefix(PREFIX), root)
     if not Path(source).is_dir():
-        raise InputError(
-            "model",
-            got=f"{text!r}, which is no folder",
-            wanted=", ".join(["the folder of a model", f"{PREFIX}NAME", *([other] if other else [])]),
-            hint=f"{PREFIX}{text} comes with the package" if text in list(root) else "",
-        )
+        known = [*(f"{PREFIX}{name}" for name in list(root)), *other]
+        raise unknown_name("model", text, known, also="the folder of a model")
     return Path(source)
 
 

@@ -59,7 +59,9 @@ def close_loop(
         InputError: fewer than two usable scans outside the lock box, an unknown effect among the prior
             hypotheses, or a nested selection for a base that is not refitted.
     """
-    config = config or LoopConfig.model_validate({})
+    config = LoopConfig() if config is None else config
+    if not isinstance(config, LoopConfig):
+        raise InputError("config", got=type(config).__name__, wanted="a LoopConfig")
     for name in config.prior_hypotheses:
         get_effect(name)
     for text in config.inject:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic import Field as Setting
 
+from litho_data.foundation.settings import refused
 from litho_models.effects.chain import EffectChain
 from litho_models.fitting.least_squares import Loss
 from litho_models.fitting.pixel_weights import Weights
@@ -46,6 +48,17 @@ class LoopConfig(BaseModel):
     open_lock_box: bool = False
     prior_hypotheses: tuple[str, ...] = ()
     inject: tuple[str, ...] = ()
+
+    def __init__(self, **settings: Any):
+        """Check the settings.
+
+        Raises:
+            InputError: an unknown one, or a value out of range.
+        """
+        try:
+            super().__init__(**settings)
+        except ValidationError as error:
+            raise refused(error) from None
 
 
 @dataclass(frozen=True)

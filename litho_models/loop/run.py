@@ -175,7 +175,7 @@ def _base_model(base: str, store: Store) -> tuple[Simulator, str]:
             base, pitch_um=store.pitch_um, level_height_um=store.level_height_um, levels=store.levels
         )
         return model, base
-    folder = zoo.model_folder(base, other=f"or one of {', '.join(MODELS)}")
+    folder = zoo.model_folder(base, other=MODELS)
     from litho_models.frozen.card import ModelCard
     from litho_models.frozen.files import load_simulator
 

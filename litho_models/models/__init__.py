@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, unknown_name
 from litho_models.models.affine import Affine
 from litho_models.models.affine_mtf import AffineMtf
 from litho_models.models.blur_table import BlurTable
@@ -35,7 +35,7 @@ def model_class(name: str) -> type[Simulator]:
         InputError: unknown name.
     """
     if name not in MODELS:
-        raise InputError("model", got=repr(name), wanted=", ".join(MODELS))
+        raise unknown_name("model", name, MODELS)
     return MODELS[name]
 
 
@@ -45,6 +45,8 @@ def require_models(names: Sequence[str]) -> None:
     Raises:
         InputError: no name, one twice, or an unknown one.
     """
+    if isinstance(names, str):
+        raise InputError("models", got=repr(names), wanted="a list of names", hint=f"such as [{names!r}]")
     for name in names:
         model_class(name)
     if not names or len(set(names)) < len(names):

@@ -39,6 +39,9 @@ def model_of_authors(weights: Mapping[str, Any], **fields: Any) -> Simulator:
     Raises:
         InputError: weights of no class of theirs, or some that are missing, unknown or of another shape.
     """
+    if not isinstance(weights, Mapping):
+        hint = "torch.load reads their file"
+        raise InputError("weights", got=type(weights).__name__, wanted="a state_dict", hint=hint)
     own = {name: _as_real(value) for name, value in weights.items()}
     model: Simulator
     if "fc0.weight" in own:

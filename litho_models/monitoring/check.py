@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.outputs import require_own_folder
 from litho_data.foundation.run_facts import run_info
 from litho_data.store import open_store
 from litho_models.frozen import zoo
@@ -53,6 +54,8 @@ def check(
         raise InputError("tolerance", got=tolerance, wanted="between 0 and 1: 0.05 is 5 %")
     dataset = open_store(store)
     frozen = load_frozen(zoo.model_folder(model), device=device)
+    subject = {"dataset.name": dataset.name, "model.name": frozen.name}
+    require_own_folder(out, Check.FILE_NAME, subject=subject)
     found = gather(frozen, dataset, reference, new, residuals)
     figures, limits = list(FIGURES), []
     if wording.too_optimistic(found.reference, frozen.card["parameters"]):

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.outputs import require_own_folder
 from litho_data.foundation.run_facts import run_info
 from litho_data.readers import read_scan
 from litho_data.store import open_store
@@ -44,6 +45,7 @@ def analyse_noise(
     if model is not None and not residuals:
         raise InputError("model", got=f"{model} and no residuals", wanted="a benchmark to choose it from")
     dataset = open_store(store)
+    require_own_folder(out, NoiseAnalysis.FILE_NAME, subject={"dataset.name": dataset.name})
     every = dataset.scans()
     locked = dataset.locked_ids
     scans = [scan for scan in every if scan.id not in locked]
@@ -99,6 +101,7 @@ def analyse_noise_of_files(
     Raises:
         InputError: a file that cannot be read, or without a known pitch.
     """
+    require_own_folder(out, NoiseAnalysis.FILE_NAME)
     references = []
     for use, file in (("substrate", substrate), ("flat", flat), ("steps", steps)):
         if file is not None:

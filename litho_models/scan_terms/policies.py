@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal, get_args
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import unknown_name
 from litho_data.foundation.results import Record
 from litho_models.scan_terms.blocks import Blocks
 from litho_models.scan_terms.term import Terms, chosen_terms
@@ -31,7 +31,7 @@ def policy_terms(policy: str) -> Terms:
     for known, terms in POLICIES.items():
         if policy == known:
             return terms
-    raise InputError("nuisance policy", got=repr(policy), wanted=", ".join(POLICIES))
+    raise unknown_name("nuisance policy", policy, POLICIES)
 
 
 class NuisanceProtocol(Record):

@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, unknown_name
 
 FloatMap = NDArray[np.float64]
 LineIndex = NDArray[np.intp]
@@ -117,8 +117,8 @@ def chosen_terms(names: Iterable[str]) -> list[ScanTerm]:
         InputError: a name that is not in the catalogue.
     """
     wanted = set(names)
-    if unknown := wanted - SCAN_TERMS.keys():
-        raise InputError("scan terms", got=", ".join(sorted(unknown)), wanted=", ".join(SCAN_TERMS))
+    for name in sorted(wanted - SCAN_TERMS.keys()):
+        raise unknown_name("scan term", name, SCAN_TERMS)
     return [term for name, term in SCAN_TERMS.items() if name in wanted]
 
 

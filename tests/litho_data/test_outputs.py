@@ -68,22 +68,36 @@ def test_a_place_that_cannot_be_written_is_bad_input(campaign: Path, tmp_path: P
 
 
 @pytest.mark.parametrize(
-    ("name", "schema", "is_a_record"),
+    ("name", "schema", "is_taken"),
     [
-        ("design.json", "litho-design/design/1", True),
-        ("close_loop.json", "litho-models/close-loop/1", True),
-        ("gap.json", "litho-design/gap/1", False),  # an older result of the same kind
-        ("layout.json", "litho-design/export/1", False),  # a sidecar, no result of its own
+        ("gap.json", "litho-design/gap/1", True),  # an older result of the same kind
+        ("design.json", "litho-design/design/1", False),
+        ("close_loop.json", "litho-models/close-loop/1", False),
         ("notes.json", "somebody/else/1", False),
     ],
 )
 def test_a_result_is_not_written_over_one_of_another_kind(
-    name: str, schema: str, is_a_record: bool, tmp_path: Path
+    name: str, schema: str, is_taken: bool, tmp_path: Path
 ) -> None:
-    (tmp_path / name).write_text(json.dumps({"schema": schema}))
-    (tmp_path / "broken.json").write_text("{")
-    if not is_a_record:
-        require_own_folder(tmp_path, "gap.json")
+    (tmp_path / name).write_text(json.dumps({"schema": schema, "dataset": {"name": "prints"}}))
+    (tmp_path / "written_beside.json").write_text("{")
+    if is_taken:
+        require_own_folder(tmp_path, "gap.json", subject={"dataset.name": "prints", "model": "in no record"})
+        with pytest.raises(InputError, match="a result of dataset prints, wanted a folder for"):
+            require_own_folder(tmp_path, "gap.json", subject={"dataset.name": "others"})
         return
     with pytest.raises(InputError, match=f"which holds {name}"):
         require_own_folder(tmp_path, "gap.json")
+
+
+def test_an_interrupted_run_finds_its_folder_and_a_dataset_is_no_folder(tmp_path: Path) -> None:
+    require_own_folder(tmp_path, "run.json")
+    (tmp_path / ".hidden").touch()
+    require_own_folder(tmp_path, "run.json")
+    (tmp_path / "checkpoint").mkdir()
+    require_own_folder(tmp_path, "run.json", "checkpoint")
+    with pytest.raises(InputError, match="which holds checkpoint"):
+        require_own_folder(tmp_path, "run.json")
+    (tmp_path / "zarr.json").touch()
+    with pytest.raises(InputError, match="is a dataset store"):
+        require_own_folder(tmp_path, "run.json")

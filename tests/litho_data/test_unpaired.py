@@ -26,7 +26,7 @@ def test_a_scan_without_layout_is_counted_and_refused_under_strict(tmp_path):
 def test_a_card_that_is_not_there_or_has_one_size_says_so_in_words(tmp_path):
     with pytest.raises(InputError) as missing:
         litho_data.build_dataset(tmp_path / "no.toml", tmp_path / "s.zarr")
-    assert "No such file or directory, wanted a TOML file" in str(missing.value)
+    assert "no such file or directory, wanted a TOML file" in str(missing.value)
     assert "Errno" not in str(missing.value)
     card = litho_data.simulate(tmp_path / "fab", count=1, size_px=128)
     card.write_text(re.sub(r"^size_um = .*$", "size_um = 54", card.read_text(), flags=re.MULTILINE))

@@ -103,7 +103,7 @@ def test_models_of_the_package_have_a_short_name():
     (name, *_) = zoo.list()
     printer = load_printer(f"zoo:{name}", layout)
     assert printer.weights_sha256() == load_printer(str(zoo.folder(name)), layout).weights_sha256()
-    with pytest.raises(InputError, match=f"zoo:{name} comes with the package"):
+    with pytest.raises(InputError, match=f"did you mean zoo:{name}"):
         load_printer(name, layout)
     with pytest.raises(InputError, match="zoo model"):
         load_printer("zoo:nothing", layout)

@@ -164,8 +164,8 @@ def test_python_takes_the_same_changes():
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (("hoe", "--set", "loss.weight=0.2"), "got an unknown name, wanted one of loss.scale"),
-        (("hoe", "--set", "los.weight=0.2"), "wanted one of variant, layout, optics, search"),
+        (("hoe", "--set", "loss.weight=0.2"), "got 'loss.weight', wanted loss.scale"),
+        (("hoe", "--set", "los.weight=0.2"), "got 'los.weight', wanted variant, layout, optics, search"),
         (("hoe", "--set", "loss=0.2"), "wanted one of loss.scale"),
         (("hoe", "--set", "layout.levels.top=2"), "layout.levels, which is a value"),
         (("hoe", "--set", "layout.levels"), "PATH=VALUE"),
@@ -174,7 +174,7 @@ def test_python_takes_the_same_changes():
         (("hoe", "--set", "optics.distance_um=Infinity"), "wanted a finite number"),
         (("hoe", "--set", "layout.levels=5", "--set", "layout.levels=6"), "layout.levels twice"),
         (("hoe", "--levels", "5", "--set", "layout.levels=6"), "an option sets too"),
-        (("hoe", "--config", "unknown.toml"), "unknown.toml: layout.size, got an unknown name"),
+        (("hoe", "--config", "unknown.toml"), "setting of unknown.toml, got 'layout.size'"),
         (("hoe", "--config", "broken.toml"), "broken.toml"),
         (("hoe", "--config", "list.json"), "wanted settings by name"),
         (("hoe", "--config", "value.toml"), "layout, got 5"),

@@ -83,7 +83,7 @@ def test_seconds_of_a_killed_fit_hold_those_of_before(tmp_path, monkeypatch):
     ("before", "now", "differs"),
     [
         ("affine", {"model": "linear"}, "model"),
-        ("affine", {"settings": {"seed": 1}}, "config"),
+        ("affine", {"settings": {"seed": 1}}, "seed"),
         ("affine", {"use_lock_box": True}, "lock_box"),
         ("pbl", {"model": "affine"}, "model"),
     ],

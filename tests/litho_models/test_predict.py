@@ -90,10 +90,10 @@ def test_a_file_of_levels_becomes_a_height_map_that_can_be_read_again(folder, mo
 
 
 def test_the_zoo_is_listed_and_shown():
-    listed = CliRunner().invoke(app, ["zoo"], catch_exceptions=False).output
+    listed = CliRunner().invoke(app, ["zoo", "list"], catch_exceptions=False).output
     assert [line.split()[0] for line in listed.splitlines()] == ["zoo:fno", "zoo:pbl", "zoo:physics"]
     assert "82,724 parameters" in listed
-    page = CliRunner().invoke(app, ["zoo", "pbl"], catch_exceptions=False).output
+    page = CliRunner().invoke(app, ["zoo", "show", "pbl"], catch_exceptions=False).output
     assert page.startswith("# pbl")
     with pytest.raises(InputError, match="zoo model, got 'nothing'"):
-        CliRunner().invoke(app, ["zoo", "nothing"], catch_exceptions=False)
+        CliRunner().invoke(app, ["zoo", "show", "nothing"], catch_exceptions=False)

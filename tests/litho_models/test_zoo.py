@@ -125,7 +125,7 @@ def test_every_command_that_takes_a_frozen_model_takes_it_from_the_zoo(store, tm
     assert freeze(named, tmp_path / "frozen").weights_sha256 == ModelCard.read(there).weights_sha256
     assert _base_model(named, open_store(store))[1] == name
     assert read_residuals(open_store(store), [named]).model == name
-    for wrong, said in (("zoo:resnet", name), (name, f"{named} comes with the package")):
+    for wrong, said in (("zoo:resnet", name), (name, f"did you mean {named}")):
         with pytest.raises(InputError, match=said):
             zoo.model_folder(wrong)
 

@@ -1,0 +1,108 @@
+"""What the three command lines share: their settings, exit codes, and errors of one line."""
+
+from __future__ import annotations
+
+import errno
+import re
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import typer
+
+from litho_data.foundation.commands import command_line
+from litho_data.foundation.errors import InputError, unknown_name
+from litho_data.foundation.run_facts import running_command
+
+# Typer does not export it under a name of its own: what its errors of usage are derived from.
+UsageError: type[Exception] = typer.BadParameter.__mro__[1]
+_CHOICE = re.compile(r"(?:Value error, )?'(.*)' is not one of (.*?)\.?$", re.DOTALL)
+_LIMIT = re.compile(r"Input should be (?:a valid )?([^,]*)")
+
+
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+
+
+def new_app(help_text: str) -> typer.Typer:
+    """A typer application with the settings of this project."""
+
+    def options(
+        context: typer.Context,
+        version: bool = typer.Option(False, "--version", help="Print the version and exit.", is_eager=True),
+    ) -> None:
+        if version:
+            from litho_data import __version__
+
+            typer.echo(__version__)
+            raise typer.Exit()
+        if context.invoked_subcommand is None:
+            typer.echo(context.get_help())
+            raise typer.Exit(2)
+
+    # Without invoke_without_command, --version alone would be asked for a command.
+    return typer.Typer(
+        help=help_text, callback=options, invoke_without_command=True, pretty_exceptions_enable=False
+    )
+
+
+def run_app(app: typer.Typer, name: str) -> None:
+    """Run a typer application; bad input and a full disk become one line on stderr and exit code 2."""
+    try:
+        with running_command(command_line(name)):
+            code = app(prog_name=name, standalone_mode=False)
+    except InputError as error:
+        said = f"{name}: {error}"
+    except UsageError as error:
+        said = _in_one_line(error, name, sys.argv[1:])
+    except MemoryError as error:
+        said = f"{name}: {InputError('not enough memory', got=error, wanted='a smaller field')}"
+    except OSError as error:
+        if error.errno not in _NO_ROOM:
+            raise
+        where = f" {error.filename}" if error.filename else ""
+        hint = "a build goes on from here once there is room"
+        said = f"{name}: cannot write{where}, got {error.strerror}; {hint}"
+    else:
+        if isinstance(code, int) and code:
+            raise SystemExit(code)
+        return
+    print(said, file=sys.stderr)
+    raise SystemExit(2)
+
+
+def _in_one_line(error: Any, name: str, words: Sequence[str]) -> str:
+    """What typer has to say about words that it cannot parse, as this project says it.
+
+    Args:
+        error: a ``UsageError``.
+        name: of the program.
+        words: its arguments.
+    """
+    command = error.ctx.command_path if error.ctx else " ".join([name, *words[:1]])
+    parameter = getattr(error, "param", None)
+    help_line = f"`{command} --help` shows what it takes"
+    if parameter is None:
+        near = getattr(error, "possibilities", None)
+        text = re.sub(r"\.? Did you mean (.*)\?$", r"; did you mean \1?", error.message.rstrip("."))
+        hint = f"did you mean {' or '.join(near)}?" if near else "" if "; did" in text else help_line
+        return f"{command}: {InputError(text[:1].lower() + text[1:], hint=hint)}"
+    option = parameter.opts[0] if parameter.opts[0].startswith("-") else parameter.name.upper()
+    if type(error).__name__ == "MissingParameter":
+        wanted = re.split(r"\.(?: (?=[A-Z])|$)", parameter.help)[0]
+        wanted = wanted[:1].lower() + wanted[1:] if wanted[1:2].islower() else wanted
+        return f"{command}: {InputError(option, got='none', wanted=wanted, hint=help_line)}"
+    if choice := _CHOICE.match(error.message):
+        known = re.findall(r"'([^']*)'", choice[2])
+        return f"{command}: {unknown_name(option, choice[1], known, help_line)}"
+    limit = _LIMIT.match(error.message)
+    wanted = f"a number ({limit[1]})" if limit else error.message
+    return f"{command}: {InputError(option, got=_given(parameter.opts, words), wanted=wanted)}"
+
+
+def _given(options: Sequence[str], words: Sequence[str]) -> str | None:
+    """What stands behind an option on the command line; None for an argument."""
+    for word, value in zip(words, [*words[1:], None], strict=True):
+        name, equals, rest = word.partition("=")
+        if name in options:
+            return repr(rest) if equals else value and repr(value)
+    return None

@@ -1,0 +1,41 @@
+"""Typical mistakes are answered in one line with the way out, and docs/mistakes.md has what is said."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.mistakes import MISTAKES, PAGE, answer, page_row, world
+
+ALL = [(did, mistake) for mistakes in MISTAKES.values() for did, mistake in mistakes.items()]
+
+
+@pytest.fixture(scope="module")
+def files():
+    with world() as folder:
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def page():
+    return PAGE.read_text("utf-8").splitlines()
+
+
+@pytest.mark.parametrize(("did", "mistake"), ALL, ids=[did for did, _ in ALL])
+def test_a_mistake_is_answered_in_one_line(did, mistake, files, page):
+    before = sorted(path.name for path in files.iterdir())
+    code, said = answer(mistake)
+    *skipped, last = said.strip().splitlines()
+    assert code == (2 if mistake.startswith("litho-") else "InputError"), said
+    # A build names the scans that it skips as it goes, and once more at its end.
+    assert [line for line in skipped if not line.startswith("skipped ")] == []
+    # What was found and wanted, or what to do: never Python's own words.
+    assert any(word in last for word in ("wanted", ";", ": no ")), last
+    assert not any(word in last for word in ("Errno", "PosixPath", "Traceback", "codec")), last
+    assert sorted(path.name for path in files.iterdir()) == before
+    assert page_row(did, mistake, last) in page
+
+
+def test_the_page_has_no_other_rows(page):
+    rows = [line for line in page if line.startswith("| ") and "`litho" in line]
+    assert len(rows) == len(ALL)
+    assert len(rows) >= 50
