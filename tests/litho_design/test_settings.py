@@ -107,7 +107,7 @@ def test_help_shows_default_and_unit_of_every_option(command, monkeypatch):
         assert leaf.options[0] in shown
         value = f"{leaf.value:g}" if isinstance(leaf.value, float) else str(leaf.value)
         assert value in shown
-    assert ", µm." in shown
+    assert ", µm" in shown
 
 
 def options_of(command):
