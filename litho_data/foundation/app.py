@@ -10,7 +10,7 @@ from typing import Any
 
 import typer
 
-from litho_data.foundation.commands import command_line
+from litho_data.foundation.commands import command_line, given_words
 from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.run_facts import running_command
 
@@ -53,7 +53,7 @@ def run_app(app: typer.Typer, name: str) -> None:
     except InputError as error:
         said = f"{name}: {error}"
     except UsageError as error:
-        said = _in_one_line(error, name, sys.argv[1:])
+        said = _in_one_line(error, name, given_words())
     except MemoryError as error:
         said = f"{name}: {InputError('not enough memory', got=error, wanted='a smaller field')}"
     except OSError as error:

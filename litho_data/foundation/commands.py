@@ -22,6 +22,11 @@ def run_script(main: Callable[[], T]) -> T:
         return main()
 
 
+def given_words() -> list[str]:
+    """What stands behind the program's name on the command line."""
+    return sys.argv[1:]
+
+
 def command_line(program: str | None = None) -> str:
     """The command that this process was started with; ``program`` by default the script or module."""
     if program is None:
@@ -31,7 +36,7 @@ def command_line(program: str | None = None) -> str:
         )
     else:
         started = [program]
-    return shlex.join([*started, *sys.argv[1:]])
+    return shlex.join([*started, *given_words()])
 
 
 def progress(

@@ -80,7 +80,7 @@ def score(
     stream: Annotated[
         bool,
         typer.Option(
-            "--stream", help="Hologram of any size: printed and scored band by band, the rest on disk."
+            "--stream", help="hologram of any size: printed and scored band by band, the rest on disk"
         ),
     ] = False,
     band_px: BandPx = 512,

@@ -169,7 +169,7 @@ def lens(
     roughness_of: RoughnessOf = None,
     ensemble: Ensemble = None,
     large: Annotated[
-        bool, typer.Option("--large", help="Ring by ring, for a lens of any size that focuses light.")
+        bool, typer.Option("--large", help="ring by ring, for a lens of any size that focuses light")
     ] = False,
     band_px: BandPx = 512,
     device: Device = "cpu",
@@ -250,15 +250,18 @@ def compare(
 def estimate(
     model: Model,
     given: Given,
-    ranks: Annotated[int, typer.Option(help="Processes that would share the element.", min=1)] = 1,
+    ranks: Annotated[int, typer.Option(help="processes that would share the element", min=1)] = 1,
     measure_px: Annotated[
-        str, typer.Option(help="Sides of the elements to be measured, at least two, px.")
+        str, typer.Option(help="sides of the elements to be measured, at least two, px")
     ] = "1024,2048",
     band_px: BandPx = 512,
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
-    """Measure small holograms here, and print what `hoe --large` with these settings would take."""
+    """Measure small holograms here, and print what `hoe --large` with these settings would take.
+
+    Example: litho-design estimate --model zoo:physics --size-px 10000
+    """
     from litho_design.workflows.large import estimate_large
 
     made = _settings(given, _hologram, "estimate")

@@ -27,7 +27,7 @@ Extrapolate = Annotated[
 BandPx = Annotated[
     int,
     typer.Option(
-        help="Rows of a band at most, px: with --large or --stream memory grows with its square.", min=8
+        help="rows of a band at most, px: with --large or --stream memory grows with its square", min=8
     ),
 ]
 _Config = Annotated[
