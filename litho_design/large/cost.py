@@ -6,11 +6,11 @@ import math
 import time
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import torch
 
 from litho_data.foundation.results import Record
 from litho_design.holograms.settings import HologramSettings
-from litho_design.images.targets import draw_target
 from litho_design.large.bands import Bands
 from litho_design.large.hologram import BandedHologram
 from litho_design.optics.sampling import fast_length
@@ -97,9 +97,9 @@ def measure_size(
     """
     layout = settings.layout.model_copy(update={"size_px": size_px})
     bands = Bands(size_px, band_px, cell_px=layout.cell_px)
-    hologram = BandedHologram(
-        settings.model_copy(update={"layout": layout}), printer, draw_target("ring", size_px), bands
-    )
+    square = np.zeros((size_px, size_px), np.float32)
+    square[size_px // 4 : size_px // 2, size_px // 4 : size_px // 2] = 1
+    hologram = BandedHologram(settings.model_copy(update={"layout": layout}), printer, square, bands)
     parameters = DirectLevels(layout).to(printer.device)
     parameters.start_random(0)
     budget = measure_budget(parameters, hologram.objective, settings.search, clock)
