@@ -63,9 +63,7 @@ def run_app(app: typer.Typer, name: str) -> None:
         hint = "a build goes on from here once there is room"
         said = f"{name}: cannot write{where}, got {error.strerror}; {hint}"
     else:
-        if isinstance(code, int) and code:
-            raise SystemExit(code)
-        return
+        raise SystemExit(code if isinstance(code, int) else 0)
     print(said, file=sys.stderr)
     raise SystemExit(2)
 

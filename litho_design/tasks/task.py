@@ -271,7 +271,7 @@ def registered_task(name: str) -> type[Task]:
             "task",
             name,
             sorted(_TASKS),
-            hint="run the code that registers it (register_task), or give its file: --task-file",
+            also="one of your own, whose file --task-file names",
         )
     return _TASKS[name]
 

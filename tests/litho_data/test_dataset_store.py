@@ -92,7 +92,7 @@ def test_one_chunk_is_one_scan(campaign: Path) -> None:
 
 def test_broken_contracts_are_named(own_campaign: Path, tmp_path: Path) -> None:
     path = own_campaign / "prints.zarr"
-    with pytest.raises(InputError, match="one of P11, P12, P21"):
+    with pytest.raises(InputError, match="wanted P11, P12, P21"):
         open_store(path).scan("P99")
     with pytest.raises(InputError, match="does not exist"):
         open_store(tmp_path / "absent.zarr")

@@ -167,7 +167,7 @@ def test_replay_measures_what_was_changed(own_campaign: Path) -> None:
 
 def test_replay_refuses_other_raw_files_and_unknown_names(own_campaign: Path) -> None:
     path = own_campaign / "prints.zarr"
-    with pytest.raises(InputError, match="one of P11, P12, P21"):
+    with pytest.raises(InputError, match="wanted P11, P12, P21"):
         replay(path, ["P99"])
     with pytest.raises(InputError, match="array, got colour"):
         replay(path, arrays=["colour"])
