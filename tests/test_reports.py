@@ -89,7 +89,8 @@ def reports(tmp_path_factory) -> dict[str, Path]:
 
 
 def every_part() -> Page:
-    page = Page("Every part", "a lead", facts={"dataset": "0123456789abcdef" * 4})
+    words = {"mae_abs_nm": ("error (nm)", "how far off it is")}
+    page = Page("Every part", "a lead", facts={"dataset": "0123456789abcdef" * 4}, words=words)
     page.verdict("pbl is best.")
     page.tiles([("1 nm", "error"), ("2", "scans")])
     page.note("Do not overlook this.")
@@ -100,7 +101,7 @@ def every_part() -> Page:
         {"model": ["pbl", "fno", "linear", "own"], "mae_abs_nm": values}
         | {f"a_column_of_many_{n}": ["some words"] * 4 for n in range(12)}
     )
-    page.table(frame, "numbers", "table.csv", words={"mae_abs_nm": ("error (nm)", "how far off it is")})
+    page.table(frame, "numbers", "table.csv")
     image = np.add.outer(np.arange(20.0), np.arange(20.0))
     picture = coloured_png(image, "viridis", 0, 38)
     page.gallery([("height", colour_bar_png("viridis"))] * 5, [("P1", [picture] * 5)], "gallery")

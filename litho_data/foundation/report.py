@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from pydantic import BaseModel
 
 from litho_data.foundation.files import atomic_file
 from litho_data.foundation.report_pictures import DARK, LIGHT, model_colour, wide_and_narrow
@@ -16,6 +18,8 @@ if TYPE_CHECKING:
     import jinja2
     import pandas as pd
     from matplotlib.figure import Figure
+
+    Table = pd.DataFrame | Mapping[str, Any] | Iterable[Mapping[str, Any] | BaseModel]
 
 # Column of a table to its name for people and what it is; the CSV keeps the key.
 Words = Mapping[str, tuple[str, str]]
@@ -56,6 +60,7 @@ class Page:
         lead: one line below it.
         run: the run that made the result; by default the one that writes the page.
         facts: what else identifies it, such as hashes and seeds, by name.
+        words: what columns of its tables are called, and what they mean; others are spelt out from their key.
     """
 
     def __init__(
@@ -64,11 +69,13 @@ class Page:
         lead: str = "",
         run: RunFacts | None = None,
         facts: Mapping[str, object] | None = None,
+        words: Words | None = None,
     ):
         self.title = title
         self.lead = lead
         self._run = run
         self._facts = dict(facts or {})
+        self._words = words or {}
         self._sections: list[dict[str, Any]] = [{"title": "", "folded": False, "parts": []}]
         self._tables: list[tuple[str, pd.DataFrame]] = []
 
@@ -100,24 +107,18 @@ class Page:
         """Relative links: (target, text)."""
         self._add("links", links=list(links))
 
-    def table(
-        self, frame: pd.DataFrame, caption: str, csv_name: str, digits: int = 2, words: Words | None = None
-    ) -> None:
+    def table(self, table: Table, caption: str, csv_name: str, digits: int = 2) -> None:
         """A table that sorts; ``write`` also saves it at full precision as ``csv_name`` beside the page.
 
         Args:
+            table: a frame, columns by name, or its rows: mappings or records.
             digits: places after the point; a smaller number keeps two figures.
-            words: what columns are called, and what they mean; others are spelt out from their key.
         """
-        known = words or {}
-        columns = [
-            {
-                "name": known[str(key)][0] if str(key) in known else spelt_out(str(key)),
-                "meaning": known[str(key)][1] if str(key) in known else "",
-                "numeric": frame[key].dtype.kind in "iufb",
-            }
-            for key in frame.columns
-        ]
+        frame = _frame(table)
+        columns = []
+        for key in map(str, frame.columns):
+            name, meaning = self._words.get(key, (spelt_out(key), ""))
+            columns.append({"name": name, "meaning": meaning, "numeric": frame[key].dtype.kind in "iufb"})
         rows = [
             [_cell(value, digits, str(key)) for key, value in zip(frame.columns, row, strict=True)]
             for row in frame.itertuples(index=False)
@@ -167,6 +168,14 @@ class Page:
 
     def _add(self, kind: str, **part: Any) -> None:
         self._sections[-1]["parts"].append({"kind": kind, **part})
+
+
+def _frame(table: Table) -> pd.DataFrame:
+    import pandas as pd
+
+    if isinstance(table, (pd.DataFrame, Mapping)):
+        return pd.DataFrame(table)
+    return pd.DataFrame([row.model_dump() if isinstance(row, BaseModel) else row for row in table])
 
 
 @cache

@@ -18,8 +18,6 @@ _LEAST_SHARE = 1e-6
 
 def statistics_page(statistics: LayoutStatistics, files: Sequence[Path]) -> Page:
     """Pictures of the first layouts, level and jump shares, spectrum and autocorrelation."""
-    import pandas as pd
-
     from litho_data.readers import read_layout
 
     page = Page(
@@ -60,7 +58,7 @@ def statistics_page(statistics: LayoutStatistics, files: Sequence[Path]) -> Page
         "share of pixels": statistics.level_share,
         "share of pairs": statistics.jump_share,
     }
-    page.table(pd.DataFrame(shares), "Level and jump shares.", "levels.csv", digits=4)
+    page.table(shares, "Level and jump shares.", "levels.csv", digits=4)
     return page
 
 

@@ -23,8 +23,6 @@ _NAMES = {WITHOUT: "designed without the model", DESIGNER: "designed with the mo
 
 def write_first_report(folder: Path, result: GapResult, printers: Mapping[str, Printer]) -> Path:
     """Write ``report.html`` and its table."""
-    import pandas as pd
-
     designs = {
         arm: LoadedDesign(design_folder(folder, arm, result.seeds[0]), device=printers[arm].device)
         for arm in _NAMES
@@ -68,9 +66,7 @@ def write_first_report(folder: Path, result: GapResult, printers: Mapping[str, P
         {"hologram": name} | {f"printed by {judge}, dB": scores[arm, judge] for judge in printers}
         for arm, name in _NAMES.items()
     ]
-    page.table(
-        pd.DataFrame(rows), "none: a perfect printer, which prints every level at its height", "scores.csv"
-    )
+    page.table(rows, "none: a perfect printer, which prints every level at its height", "scores.csv")
     places = {arm: design_folder(Path(), arm, result.seeds[0]) / "report.html" for arm in _NAMES}
     page.heading("Reports of the two holograms")
     page.links([(places[arm].as_posix(), f"Report of the hologram {name}") for arm, name in _NAMES.items()])

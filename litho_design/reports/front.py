@@ -11,8 +11,6 @@ from litho_design.judging.front import FrontResult
 
 def write_front_report(folder: Path, result: FrontResult, printer: str) -> Path:
     """Write ``report.html`` and ``front.csv``."""
-    import pandas as pd
-
     page = Page(
         "Efficiency against likeness",
         f"One hologram designed through “{printer}” with several weights of the light that misses the "
@@ -30,6 +28,6 @@ def write_front_report(folder: Path, result: FrontResult, printer: str) -> Path:
     axis.set_xlabel("power on the signal, share of incident")
     axis.set_ylabel(f"{result.figure.replace('_', ' ')}")
     page.figure(figure, "Each point is a design, with the weight of the light that misses.")
-    page.table(pd.DataFrame([p.model_dump() for p in result.points]), "The designs", "front.csv", digits=3)
+    page.table([p.model_dump() for p in result.points], "The designs", "front.csv", digits=3)
     page.links([(f"{p.folder}/report.html", f"weight {p.efficiency_weight:g}") for p in result.points])
     return page.write(folder)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
@@ -19,9 +19,6 @@ from litho_design.printers.printer import Printer
 from litho_design.reports.advice import baseline_line, less_is_better
 from litho_design.reports.parts import image_grid, meanings
 from litho_design.tasks.design import Design
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 # Side of the cut-out that shows layout against print; features of some pixels must stay visible.
 _DETAIL_PX = 160
@@ -88,8 +85,8 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
     page.paragraph(
         "Differences under the same judge, paired by seed. Where the interval includes 0, the order is open."
     )
-    page.table(_paired_frame(result), "Paired differences", "paired.csv", digits=3)
-    page.table(_long_frame(result), "All means", "summary.csv", digits=4)
+    page.table(_paired_columns(result), "Paired differences", "paired.csv", digits=3)
+    page.table(_all_means(result), "All means", "summary.csv", digits=4)
     return page.write(folder)
 
 
@@ -128,9 +125,7 @@ def _caption(figure: str) -> str:
     return f"{_LABELS.get(figure, figure)}: mean over seeds [95 % interval]; {better} is better."
 
 
-def _matrix(result: GapResult, figure: str) -> pd.DataFrame:
-    import pandas as pd
-
+def _matrix(result: GapResult, figure: str) -> list[dict[str, Any]]:
     rows = []
     for arm in result.arms:
         row: dict[str, str] = {"designed with": arm}
@@ -139,7 +134,7 @@ def _matrix(result: GapResult, figure: str) -> pd.DataFrame:
                 interval = "" if item.judged_ci95 is None else " [{:.3f}, {:.3f}]".format(*item.judged_ci95)
                 row[f"printed by {item.judge}"] = f"{item.judged_mean:.3f}{interval}"
         rows.append(row)
-    return pd.DataFrame(rows)
+    return rows
 
 
 def _judged(
@@ -243,36 +238,28 @@ def _bars(result: GapResult, name: str):
     return figure
 
 
-def _paired_frame(result: GapResult) -> pd.DataFrame:
-    import pandas as pd
+def _paired_columns(result: GapResult) -> dict[str, list[Any]]:
+    unknown = float("nan"), float("nan")
+    # By column: with a single arm there is no pair, and the table keeps its names.
+    return {
+        "judge": [item.judge for item in result.paired],
+        "figure": [item.figure for item in result.paired],
+        "difference": [f"{item.arm} − {item.against}" for item in result.paired],
+        "mean": [item.mean for item in result.paired],
+        "95 % from": [(item.ci95 or unknown)[0] for item in result.paired],
+        "to": [(item.ci95 or unknown)[1] for item in result.paired],
+    }
 
-    rows = [
+
+def _all_means(result: GapResult) -> list[dict[str, Any]]:
+    return [
         {
+            "arm": item.arm,
             "judge": item.judge,
             "figure": item.figure,
-            "difference": f"{item.arm} − {item.against}",
-            "mean": item.mean,
-            "95 % from": float("nan") if item.ci95 is None else item.ci95[0],
-            "to": float("nan") if item.ci95 is None else item.ci95[1],
+            "in design": item.designed_mean,
+            "after printing": item.judged_mean,
+            "gap": item.gap_mean,
         }
-        for item in result.paired
+        for item in result.summary
     ]
-    return pd.DataFrame(rows, columns=["judge", "figure", "difference", "mean", "95 % from", "to"])
-
-
-def _long_frame(result: GapResult) -> pd.DataFrame:
-    import pandas as pd
-
-    return pd.DataFrame(
-        [
-            {
-                "arm": item.arm,
-                "judge": item.judge,
-                "figure": item.figure,
-                "in design": item.designed_mean,
-                "after printing": item.judged_mean,
-                "gap": item.gap_mean,
-            }
-            for item in result.summary
-        ]
-    )

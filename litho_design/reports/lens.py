@@ -64,8 +64,6 @@ def _curves(design: Design, height: np.ndarray, psf: np.ndarray, ideal: np.ndarr
 
 def add_lens_window(page: Page, bench: LensBench, height_um: Tensor) -> None:
     """Bossung curves of FWHM and peak, and the map of the peak."""
-    import pandas as pd
-
     window = focus_window(bench, height_um)
     page.heading("Focus and dose", folded=True)
     page.paragraph(
@@ -95,4 +93,4 @@ def add_lens_window(page: Page, bench: LensBench, height_um: Tensor) -> None:
         for row, gain in enumerate(window.gain)
         for column, shift in enumerate(window.defocus_um)
     ]
-    page.table(pd.DataFrame(rows), "Sweep", "focus_window.csv", digits=3)
+    page.table(rows, "Sweep", "focus_window.csv", digits=3)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,7 +15,6 @@ from litho_design.reports.advice import distribution_warning, thickness_warning
 from litho_design.tasks.design import Design
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.figure import Figure
 
 # Brightest intensity shown, in units of the target's white; speckle beyond it is clipped.
@@ -66,8 +65,6 @@ def add_yield(
         figures: name to value of the print as modelled, and label.
         passed: how many draws pass.
     """
-    import pandas as pd
-
     page.heading("Process window", folded=True)
     designed = "in the loss" if window.samples else "not in the loss"
     page.paragraph(
@@ -90,7 +87,7 @@ def add_yield(
         axis.set_xlabel(label)
     axes[0].set_ylabel("yield")
     page.figure(figure, "Yield curves; the dashed line is the print as modelled.")
-    page.table(pd.DataFrame(draws), "Single draws", "window.csv", digits=3)
+    page.table(draws, "Single draws", "window.csv", digits=3)
 
 
 def meanings(score: type[Record]) -> dict[str, str]:
@@ -98,20 +95,17 @@ def meanings(score: type[Record]) -> dict[str, str]:
     return {name: field.description or "" for name, field in score.model_fields.items()}
 
 
-def score_table(columns: Mapping[str, Mapping[str, float]], labels: Mapping[str, str]) -> pd.DataFrame:
+def score_table(
+    columns: Mapping[str, Mapping[str, float]], labels: Mapping[str, str]
+) -> list[dict[str, Any]]:
     """One row per figure, one column per print or baseline, and the meaning of each figure."""
-    import pandas as pd
-
-    names = [
-        name for name in dict.fromkeys(n for figures in columns.values() for n in figures) if name in labels
-    ]
-    rows = [
-        {"name": name, **{title: figures.get(name, np.nan) for title, figures in columns.items()}}
+    names = dict.fromkeys(name for figures in columns.values() for name in figures if name in labels)
+    return [
+        {"name": name}
+        | {title: figures.get(name, np.nan) for title, figures in columns.items()}
+        | {"meaning": labels[name]}
         for name in names
     ]
-    table = pd.DataFrame(rows)
-    table["meaning"] = [labels.get(name, "") for name in names]
-    return table
 
 
 def add_scores(page: Page, design: Design, labels: Mapping[str, str]) -> None:
@@ -134,26 +128,20 @@ def add_scores(page: Page, design: Design, labels: Mapping[str, str]) -> None:
         )
 
 
-def level_table(design: Design) -> pd.DataFrame:
+def level_table(design: Design) -> dict[str, Any]:
     """Level, nominal and printed height, and printed waves above level 0."""
-    import pandas as pd
-
     printed, step_um = design.stroke.printed_height_um, design.layout.level_height_um
     wave_um = design.optics.wave_height_um
-    return pd.DataFrame(
-        {
-            "level": range(len(printed)),
-            "nominal_um": [level * step_um for level in range(len(printed))],
-            "printed_um": printed,
-            "printed_waves": [(height - printed[0]) / wave_um for height in printed],
-        }
-    )
+    return {
+        "level": range(len(printed)),
+        "nominal_um": [level * step_um for level in range(len(printed))],
+        "printed_um": printed,
+        "printed_waves": [(height - printed[0]) / wave_um for height in printed],
+    }
 
 
 def add_gauge(page: Page, design: Design) -> None:
     """What a printer must resolve, and the distance from the model's training layouts."""
-    import pandas as pd
-
     page.heading("What the printer must resolve", folded=True)
     gauge = design.out_of_distribution
     tiling, ensemble = design.tiling, design.ensemble
@@ -170,7 +158,7 @@ def add_gauge(page: Page, design: Design) -> None:
         )
     figures = design.printability.model_dump() | (gauge.model_dump() if gauge else {})
     given = {name: float(value) for name, value in figures.items() if isinstance(value, (int, float))}
-    frame = pd.DataFrame({"name": list(given), "value": list(given.values())})
+    frame = {"name": list(given), "value": list(given.values())}
     page.table(frame, "Lengths in µm; shares of pixel pairs or runs", "printability.csv", digits=3)
 
 

@@ -28,8 +28,6 @@ def write_score_report(
         pictures: image or PSF (m, m) behind each print, ``side_um`` wide.
         photos: object, photograph and reconstructions of a lens (n, n), ``frame_um`` wide.
     """
-    import pandas as pd
-
     page = Page(
         "Score of a printable layout",
         f"Designed through “{result.designed_with.name}”, printed by {len(result.scores)} judge(s).",
@@ -58,21 +56,21 @@ def write_score_report(
         if score.uncertainty is not None:
             columns[f"± {score.judge.name}"] = score.uncertainty
     labels = meanings(task_named(result.task).score_type) | meanings(LensPhotoScore)
-    table = score_table(columns | (result.baselines or {}), labels)
     page.table(
-        table, "Figures by judge, ± one standard deviation, and their baselines", "scores.csv", digits=3
+        score_table(columns | (result.baselines or {}), labels),
+        "Figures by judge, ± one standard deviation, and their baselines",
+        "scores.csv",
+        digits=3,
     )
-    heights = pd.DataFrame(
-        [
-            {
-                "printed by": score.judge.name,
-                "mean difference to the designed print, nm": 1000 * score.mean_height_difference_um,
-                "rms difference, nm": 1000 * score.rms_height_difference_um,
-            }
-            for score in result.scores
-            if score.mean_height_difference_um is not None and score.rms_height_difference_um is not None
-        ]
-    )
+    heights = [
+        {
+            "printed by": score.judge.name,
+            "mean difference to the designed print, nm": 1000 * score.mean_height_difference_um,
+            "rms difference, nm": 1000 * score.rms_height_difference_um,
+        }
+        for score in result.scores
+        if score.mean_height_difference_um is not None and score.rms_height_difference_um is not None
+    ]
     page.table(heights, "Heights against the print that the design expected", "heights.csv", digits=1)
     return page.write(folder)
 

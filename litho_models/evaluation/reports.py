@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,9 +16,6 @@ from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.noise_floor import NoiseFloor
 from litho_models.scoring.records import ModelScores, ScanRow
 from litho_models.splits.folds import ScoredSplit
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 _PAPER_DATASET = "neural-lithography"
 _SPLIT_TEXT = {
@@ -35,7 +31,8 @@ def write_evaluation_report(
 ) -> Path:
     """Render the result into ``out``; returns the page."""
     scores = result.scores
-    page = Page(f"{result.model.name} on {result.dataset.name}", run=result.run, facts=_facts(result))
+    title = f"{result.model.name} on {result.dataset.name}"
+    page = Page(title, run=result.run, facts=_facts(result), words=COLUMNS)
     page.verdict(evaluation_verdict(result))
     if result.trained_on_scored_scans:
         count = len(result.trained_on_scored_scans)
@@ -60,7 +57,6 @@ def write_evaluation_report(
         _model(result.model),
         "The same pixels in another crop; what predicting a scan costs on the machine that made this.",
         "model.csv",
-        words=COLUMNS,
     )
     _by_level_and_frequency(page, [scores])
     _all_numbers(page, [scores], "By scan.", "By level.")
@@ -77,7 +73,7 @@ def write_benchmark_report(
     scores = sorted(result.scores, key=lambda s: -s.mae_datum_free_nm)
     best = scores[-1]
     on_paper_data = result.dataset.name == _PAPER_DATASET
-    page = Page(f"Benchmark on {result.dataset.name}", run=result.run, facts=_facts(result))
+    page = Page(f"Benchmark on {result.dataset.name}", run=result.run, facts=_facts(result), words=COLUMNS)
     page.verdict(benchmark_verdict(result))
     if len(best.scans) < 8:
         page.note(f"Only {len(best.scans)} scans: intervals over scans are rough.")
@@ -94,7 +90,6 @@ def write_benchmark_report(
         "Error of one model minus that of another over the same scans, with the same terms fitted.",
         "pairs.csv",
         digits=3,
-        words=COLUMNS,
     )
     if result.locked_scores:
         page.heading("Lock box", folded=True)
@@ -133,7 +128,6 @@ def write_benchmark_report(
         "difference of the same pixels in another crop; what training and predicting cost here.",
         "fits.csv",
         digits=3,
-        words=COLUMNS,
     )
     curves = [fit for fit in result.fits if len(fit.steps) > 1]
     if curves:
@@ -153,13 +147,11 @@ def _facts(result: Evaluation | Benchmark) -> dict[str, object]:
 def _headline(
     page: Page, scores: Sequence[ModelScores], result: Evaluation | Benchmark, caption: str, csv_name: str
 ) -> None:
-    page.table(
-        tables.headline_table(scores, result.nuisance, result.noise_floor), caption, csv_name, words=COLUMNS
-    )
+    page.table(tables.headline_table(scores, result.nuisance, result.noise_floor), caption, csv_name)
 
 
 def _metrics(page: Page, scores: Sequence[ModelScores], caption: str) -> None:
-    page.table(tables.metric_table(scores), caption, "metrics.csv", digits=3, words=COLUMNS)
+    page.table(tables.metric_table(scores), caption, "metrics.csv", digits=3)
     page.paragraph(tables.metric_text())
 
 
@@ -197,7 +189,6 @@ def _policies(
         tables.policy_table(scores, protocol, floor),
         "Mean absolute error by what is fitted to each scan, with and without the background, nm.",
         "policies.csv",
-        words=COLUMNS,
     )
     page.paragraph(tables.protocol_text(protocol))
     page.paragraph(tables.floor_text(floor))
@@ -211,31 +202,26 @@ def _by_level_and_frequency(page: Page, scores: Sequence[ModelScores]) -> None:
         tables.band_table(scores),
         "How far up in frequency the prediction follows the measurement, cycles/µm.",
         "bands.csv",
-        words=COLUMNS,
     )
     page.paragraph(tables.band_text())
 
 
 def _all_numbers(page: Page, scores: Sequence[ModelScores], by_scan: str, by_level: str) -> None:
     page.heading("By scan and by level", folded=True)
-    page.table(tables.scan_table(scores), by_scan, "scans.csv", words=COLUMNS)
-    page.table(tables.level_table(scores), by_level, "levels.csv", words=COLUMNS)
+    page.table(tables.scan_table(scores), by_scan, "scans.csv")
+    page.table(tables.level_table(scores), by_level, "levels.csv")
     page.heading("Notes on these numbers", folded=True)
     for note in tables.caveats(scores):
         page.paragraph(note)
 
 
-def _model(model: ModelRecord) -> pd.DataFrame:
-    import pandas as pd
-
+def _model(model: ModelRecord) -> tables.Rows:
     assert model.cost is not None, "an evaluation measures its predictions"
     columns = tables.prediction_columns(model.tiles, model.cost)
-    return pd.DataFrame([{"model": model.name, "parameters": model.parameters, **columns}])
+    return [{"model": model.name, "parameters": model.parameters, **columns}]
 
 
-def _pairs(result: Benchmark) -> pd.DataFrame:
-    import pandas as pd
-
+def _pairs(result: Benchmark) -> tables.Rows:
     rows = []
     for pair in result.paired:
         row = pair.model_dump(exclude={"ci95_nm", "over_prints"})
@@ -246,12 +232,10 @@ def _pairs(result: Benchmark) -> pd.DataFrame:
             row["p_over_prints"] = pair.over_prints.p
             row["smallest_p_over_prints"] = pair.over_prints.smallest_p
         rows.append(row)
-    return pd.DataFrame(rows)
+    return rows
 
 
-def _fits(result: Benchmark) -> pd.DataFrame:
-    import pandas as pd
-
+def _fits(result: Benchmark) -> tables.Rows:
     rows = []
     for fit in result.fits:
         found = fit.diagnostics
@@ -268,7 +252,7 @@ def _fits(result: Benchmark) -> pd.DataFrame:
                 **tables.prediction_columns(found.tiles, found.cost),
             }
         )
-    return pd.DataFrame(rows)
+    return rows
 
 
 def _median_scan(rows: Sequence[ScanRow]) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.metric_registry import metrics_text, registered_metrics
@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 
     from litho_models.evaluation.diagnostics import TileConsistency
     from litho_models.prediction.cost import PredictionCost
+
+# One mapping a row, column to value.
+Rows = list[dict[str, Any]]
 
 
 def headline_table(
@@ -54,15 +57,11 @@ def headline_table(
     return pd.DataFrame([*rows, known])
 
 
-def policy_table(
-    scores: Sequence[ModelScores], protocol: NuisanceProtocol, floor: NoiseFloor
-) -> pd.DataFrame:
+def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol, floor: NoiseFloor) -> Rows:
     """One row per model and background, one column per policy; for line offsets the effective number.
 
     The last row is the noise floor under each.
     """
-    import pandas as pd
-
     rows = []
     for s in scores:
         for background, errors in ((protocol.background, s.by_policy), ("none", s.without_background)):
@@ -73,60 +72,46 @@ def policy_table(
     if floor.by_policy:
         below = {f"{row.policy}_mae_nm": row.mae_nm for row in floor.by_policy}
         rows.append({"model": f"noise floor ({floor.kind})", "background": protocol.background, **below})
-    return pd.DataFrame(rows)
+    return rows
 
 
-def metric_table(scores: Sequence[ModelScores]) -> pd.DataFrame:
+def metric_table(scores: Sequence[ModelScores]) -> Rows:
     """One row per model: phase error, and all metrics of ``metric_registry``."""
-    import pandas as pd
-
     keys = [metric.key for metric in registered_metrics()]
-    return pd.DataFrame(
-        [
-            {
-                "model": s.model,
-                "phase_rms_waves": s.phase_rms_waves,
-                **{key: s.metric(key) for key in keys},
-            }
-            for s in scores
-        ]
-    )
+    return [
+        {
+            "model": s.model,
+            "phase_rms_waves": s.phase_rms_waves,
+            **{key: s.metric(key) for key in keys},
+        }
+        for s in scores
+    ]
 
 
-def band_table(scores: Sequence[ModelScores]) -> pd.DataFrame:
+def band_table(scores: Sequence[ModelScores]) -> Rows:
     """One row per model: how far up in frequency the prediction follows the measurement, along x and y."""
-    import pandas as pd
-
     names = [f"{figure}_{axis}_per_um" for figure in ("half_power", "noise_band") for axis in "xy"]
-    return pd.DataFrame(
-        [{"model": s.model, **{name: getattr(s.transfer, name) for name in names}} for s in scores]
-    )
+    return [{"model": s.model, **{name: getattr(s.transfer, name) for name in names}} for s in scores]
 
 
-def scan_table(scores: Sequence[ModelScores]) -> pd.DataFrame:
+def scan_table(scores: Sequence[ModelScores]) -> Rows:
     """One row per model and scan."""
-    import pandas as pd
-
-    return pd.DataFrame(
-        [
-            {
-                "model": s.model,
-                "scan": row.scan,
-                "print": row.print,
-                **row.model_dump(exclude={"metrics", "scan", "print"}),
-                **row.metrics,
-            }
-            for s in scores
-            for row in s.scans
-        ]
-    )
+    return [
+        {
+            "model": s.model,
+            "scan": row.scan,
+            "print": row.print,
+            **row.model_dump(exclude={"metrics", "scan", "print"}),
+            **row.metrics,
+        }
+        for s in scores
+        for row in s.scans
+    ]
 
 
-def level_table(scores: Sequence[ModelScores]) -> pd.DataFrame:
+def level_table(scores: Sequence[ModelScores]) -> Rows:
     """One row per model and printed level."""
-    import pandas as pd
-
-    return pd.DataFrame([{"model": s.model, **entry.model_dump()} for s in scores for entry in s.by_level])
+    return [{"model": s.model, **entry.model_dump()} for s in scores for entry in s.by_level]
 
 
 def prediction_columns(tiles: TileConsistency | None, cost: PredictionCost) -> dict[str, float | None]:

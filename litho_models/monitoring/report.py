@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from litho_models.monitoring.result import Check, FigureCheck
 from litho_models.monitoring.wording import figure_of
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.figure import Figure
 
 
@@ -86,9 +85,7 @@ def _chart_text(one: FigureCheck) -> str:
     )
 
 
-def _figures_table(result: Check) -> pd.DataFrame:
-    import pandas as pd
-
+def _figures_table(result: Check) -> list[dict[str, Any]]:
     rows = []
     for one in result.figures:
         alarm = one.alarm
@@ -109,16 +106,12 @@ def _figures_table(result: Check) -> pd.DataFrame:
                 "measure_again_in": one.measure_again_in,
             }
         )
-    return pd.DataFrame(rows)
+    return rows
 
 
-def _scans_table(result: Check) -> pd.DataFrame:
-    import pandas as pd
-
-    return pd.DataFrame(
-        [
-            {"set": name, **row.model_dump()}
-            for name, rows in (("reference", result.reference_scans), ("new", result.new_scans))
-            for row in rows
-        ]
-    )
+def _scans_table(result: Check) -> list[dict[str, Any]]:
+    return [
+        {"set": name, **row.model_dump()}
+        for name, rows in (("reference", result.reference_scans), ("new", result.new_scans))
+        for row in rows
+    ]

@@ -27,7 +27,8 @@ def write_noise_report(result: NoiseAnalysis, references: Sequence[Reference], o
     floor = result.noise_floor
     title = f"Noise of {result.dataset.name}" if result.dataset else "Noise of single scans"
     hashes = {"dataset": result.dataset.sha256} if result.dataset else {}
-    page = Page(title, run=result.run, facts=hashes | {"seeds": ", ".join(map(str, result.run.seeds))})
+    facts = hashes | {"seeds": ", ".join(map(str, result.run.seeds))}
+    page = Page(title, run=result.run, facts=facts, words=COLUMNS)
     page.verdict(_verdict(floor))
     for note in result.notes:
         page.note(note)
@@ -61,8 +62,6 @@ def _verdict(floor: NoiseFloor) -> str:
 
 
 def _references(page: Page, result: NoiseAnalysis, references: Sequence[Reference]) -> None:
-    import pandas as pd
-
     found = result.references
     page.heading("Reference prints")
     page.figure(plots.surfaces(references), "Heights about their mean; substrate and flat share a scale.")
@@ -74,17 +73,15 @@ def _references(page: Page, result: NoiseAnalysis, references: Sequence[Referenc
     ]
     if rows:
         page.table(
-            pd.DataFrame(rows),
+            rows,
             "Roughness. MAE is measured about the median; 0.798 σ is what a Gaussian would have.",
             "surfaces.csv",
-            words=COLUMNS,
         )
     if found.print_noise:
         page.table(
-            pd.DataFrame([one.model_dump() for one in found.print_noise]),
+            found.print_noise,
             "What the print adds to substrate and microscope, in quadrature.",
             "print_noise.csv",
-            words=COLUMNS,
         )
     for one in found.textures:
         _texture(page, one)
@@ -93,8 +90,6 @@ def _references(page: Page, result: NoiseAnalysis, references: Sequence[Referenc
 
 
 def _texture(page: Page, found: Texture) -> None:
-    import pandas as pd
-
     page.paragraph(f"Texture of {found.id}: {found.verdict}.")
     rows = [
         {
@@ -105,35 +100,29 @@ def _texture(page: Page, found: Texture) -> None:
         for one in found.lines
     ]
     page.table(
-        pd.DataFrame(rows),
+        rows,
         f"Strength of the direction {found.strength:.2f}: 0 where all directions are alike (chance of as "
         f"much: {found.isotropic_p:.1g}), 1 for lines of one direction. Share: of the variance, in the means "
         "of the lines along each axis; of their squares, in the strongest period. p: chance of such a peak "
         "in a smooth spectrum. Coherence: 1 if the surfaces have one phase.",
         f"texture_{found.id.replace(' ', '_')}.csv",
         digits=3,
-        words=COLUMNS,
     )
 
 
 def _steps(page: Page, found: StepPrint) -> None:
-    import pandas as pd
-
     page.heading(f"Steps of {found.id}", folded=True)
     page.figure(plots.steps(found), "Step heights and the smallest step that can be told from none.")
     page.table(
-        pd.DataFrame([{"step": n + 1, **step.model_dump()} for n, step in enumerate(found.steps)]),
+        [{"step": n + 1, **step.model_dump()} for n, step in enumerate(found.steps)],
         f"Steps along {found.axis}; tread σ {found.tread_sigma_nm:.2f} nm. Readability is height over σ; "
         "misread pixels are nearer to the other tread.",
         f"steps_{found.id}.csv",
         digits=3,
-        words=COLUMNS,
     )
 
 
 def _dose(page: Page, found: DoseMatrix) -> None:
-    import pandas as pd
-
     page.heading("Dose matrix")
     page.paragraph(f"Recommended dose: {found.recommended_dose:g}. Reason: {found.reason}.")
     page.figure(
@@ -143,19 +132,16 @@ def _dose(page: Page, found: DoseMatrix) -> None:
     page.heading("The doses in numbers", folded=True)
     rows = [{**row.model_dump(exclude={"levels", "scans"}), "scans": len(row.scans)} for row in found.rows]
     page.table(
-        pd.DataFrame(rows),
+        rows,
         f"Measured farther than {found.guard_um:g} µm from every edge. Gain is printed over nominal height.",
         "doses.csv",
         digits=3,
-        words=COLUMNS,
     )
     levels = [{"dose": row.dose, **level.model_dump()} for row in found.rows for level in row.levels]
-    page.table(pd.DataFrame(levels), "Height of every level.", "dose_levels.csv", words=COLUMNS)
+    page.table(levels, "Height of every level.", "dose_levels.csv")
 
 
 def _spread(page: Page, found: SpreadAnalysis) -> None:
-    import pandas as pd
-
     page.heading(f"Uncertainty of {found.model}")
     origin = "out of fold" if found.held_out else "of scans that the model was trained on: too small"
     shared = "with" if found.nuisance.background == "training" else "without"
@@ -194,11 +180,10 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
         for one in found.calibrations
     ]
     page.table(
-        pd.DataFrame(rows),
+        rows,
         "Means over scans; NLL in nats of nm, ENCE and AUSE as shares (0 is best).",
         "calibration.csv",
         digits=3,
-        words=COLUMNS,
     )
     scans = [
         {
@@ -212,15 +197,12 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
         for one in found.calibrations
         for row in one.scans
     ]
-    page.table(pd.DataFrame(scans), "By scan.", "calibration_scans.csv", digits=3, words=COLUMNS)
+    page.table(scans, "By scan.", "calibration_scans.csv", digits=3)
     page.table(
-        pd.DataFrame(
-            {"covariate": found.variance.covariates, "coefficient of ln s²": found.variance.coefficients}
-        ),
+        {"covariate": found.variance.covariates, "coefficient of ln s²": found.variance.coefficients},
         "The scale fitted on all scans.",
         "variance.csv",
         digits=4,
-        words=COLUMNS,
     )
     bins = [
         {
@@ -231,17 +213,14 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
         for row in found.bins
     ]
     page.table(
-        pd.DataFrame(bins),
+        bins,
         "By level, and in ranges of equal count of what else σ depends on; intervals over prints.",
         "spread.csv",
         digits=3,
-        words=COLUMNS,
     )
 
 
 def _budget(page: Page, found: NoiseBudget) -> None:
-    import pandas as pd
-
     page.heading("Noise budget", folded=True)
     page.paragraph(
         f"From residuals of {found.model} on scans that it had not seen. Both estimates are upper ones: what "
@@ -261,22 +240,20 @@ def _budget(page: Page, found: NoiseBudget) -> None:
             for row in found.floor.by_policy
         ]
         page.table(
-            pd.DataFrame(rows),
+            rows,
             "Noise by the scan terms that are set free (k per scan), from like layout surroundings in "
             "different scans; 95 % intervals over prints.",
             "budget.csv",
-            words=COLUMNS,
         )
     flat = [
         {**row.model_dump(exclude={"ci95_nm"}), "sigma_ci95_nm": interval_text(row.ci95_nm)}
         for row in found.flat_levels
     ]
     page.table(
-        pd.DataFrame(flat),
+        flat,
         f"Where the layout is flat (slope at most {found.flat_slope:.3f}, a quarter of the pixels); tilt, "
         "bow, gain and line offsets of each scan are free.",
         "flat_levels.csv",
-        words=COLUMNS,
     )
     if found.flat_length_um is not None:
         y_um, x_um = found.flat_length_um

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 import torch
 
 from litho_data.foundation.report import Page
@@ -71,28 +70,24 @@ def write_report(
                 _power_figure(question), "Probability of a right decision; grey: with random layouts."
             )
     page.heading("Scans", folded=True)
-    page.table(
-        pd.DataFrame([scan.model_dump() for scan in plan.scans]), "In the order of scanning.", "order.csv"
-    )
+    page.table(plan.scans, "In the order of scanning.", "order.csv")
     return page.write(folder)
 
 
-def _table(plan: NextPrint) -> pd.DataFrame:
-    return pd.DataFrame(
-        [
-            {
-                "question": q.name,
-                "rivals": ", ".join(q.rivals),
-                "difference, nm rms": np.nan if q.difference_nm is None else q.difference_nm,
-                "noise along it, nm": np.nan if q.noise_nm is None else q.noise_nm,
-                f"power with {plan.prints} prints": q.power[plan.prints - 1],
-                "power of random layouts": q.random_power[plan.prints - 1],
-                "prints needed": "more" if q.prints_needed is None else str(q.prints_needed),
-                "status": q.status,
-            }
-            for q in plan.questions
-        ]
-    )
+def _table(plan: NextPrint) -> list[dict[str, Any]]:
+    return [
+        {
+            "question": q.name,
+            "rivals": ", ".join(q.rivals),
+            "difference, nm rms": np.nan if q.difference_nm is None else q.difference_nm,
+            "noise along it, nm": np.nan if q.noise_nm is None else q.noise_nm,
+            f"power with {plan.prints} prints": q.power[plan.prints - 1],
+            "power of random layouts": q.random_power[plan.prints - 1],
+            "prints needed": "more" if q.prints_needed is None else str(q.prints_needed),
+            "status": q.status,
+        }
+        for q in plan.questions
+    ]
 
 
 def _layouts_figure(levels: Sequence[np.ndarray], plan: NextPrint) -> Figure:

@@ -103,13 +103,13 @@ def _decision_section(page: Page, result: CloseLoop) -> None:
         }
         for one in result.decisions
     ]
-    page.table(pd.DataFrame(rows), "Declared questions on the new prints.", "decisions.csv")
+    page.table(rows, "Declared questions on the new prints.", "decisions.csv")
 
 
 def _error_section(page: Page, findings: LoopFindings, result: CloseLoop) -> None:
     page.heading("Error before and after, with the same terms per scan", folded=True)
     page.table(
-        pd.DataFrame([_equal_row(row, result.noise_floor) for row in result.equal_terms or []]),
+        [_equal_row(row, result.noise_floor) for row in result.equal_terms or []],
         "Held-out mean absolute error on the benchmark's pixels; terms are fitted on pixels that are not "
         f"scored. {_BACKGROUND[result.nuisance.background]} Intervals (95 %) resample whole scans, or whole "
         "prints; p by flipping their signs, and what so many can show at best.",
@@ -118,13 +118,13 @@ def _error_section(page: Page, findings: LoopFindings, result: CloseLoop) -> Non
     if result.nested is not None:
         page.heading("The same where the choice itself has not seen the scans", folded=True)
         page.table(
-            pd.DataFrame([_equal_row(row, result.noise_floor) for row in result.nested.equal_terms]),
+            [_equal_row(row, result.noise_floor) for row in result.nested.equal_terms],
             f"Named effects, generic terms and terms of single scans were chosen anew without each of the "
             f"{result.nested.selections} {result.nested.held_out}, and judged there.",
             "nested.csv",
         )
         page.table(
-            pd.DataFrame([one.model_dump() for one in result.nested.chosen]),
+            result.nested.chosen,
             f"In how many of the {result.nested.selections} selections each was chosen.",
             "nested_chosen.csv",
         )
@@ -132,20 +132,18 @@ def _error_section(page: Page, findings: LoopFindings, result: CloseLoop) -> Non
         page.heading("Whose the gain is", folded=True)
         page.paragraph(f"{parts_text(result).capitalize()}.")
         page.table(
-            pd.DataFrame(
-                [
-                    {
-                        "step": step.name,
-                        "part": step.part,
-                        "terms per scan": step.k,
-                        "gain in order (nm)": step.in_order_nm,
-                        "in order, k = 1 (nm)": step.in_order_k1_nm,
-                        "lost if left out (nm)": step.left_out_nm,
-                        "lost if left out, k = 1 (nm)": step.left_out_k1_nm,
-                    }
-                    for step in result.gain_split
-                ]
-            ),
+            [
+                {
+                    "step": step.name,
+                    "part": step.part,
+                    "terms per scan": step.k,
+                    "gain in order (nm)": step.in_order_nm,
+                    "in order, k = 1 (nm)": step.in_order_k1_nm,
+                    "lost if left out (nm)": step.left_out_nm,
+                    "lost if left out, k = 1 (nm)": step.left_out_k1_nm,
+                }
+                for step in result.gain_split
+            ],
             "Held-out MAE. In the order added, with the terms of single scans accepted so far, and with one "
             "term per scan throughout. Left out: the final set without it, the rest fitted again, with all "
             "accepted terms and with one. Only what is called process goes into the exported model.",
@@ -159,7 +157,7 @@ def _error_section(page: Page, findings: LoopFindings, result: CloseLoop) -> Non
     )
     shares = result.shares.model_dump()
     page.table(
-        pd.DataFrame({"share of the squared error": list(shares), "%": [100 * v for v in shares.values()]}),
+        {"share of the squared error": list(shares), "%": [100 * v for v in shares.values()]},
         "Where the squared error of the base model goes. The noise floor is a lower bound without correlated "
         "roughness; what lies above it is counted as unexplained, structured or not.",
         "shares.csv",
@@ -168,19 +166,12 @@ def _error_section(page: Page, findings: LoopFindings, result: CloseLoop) -> Non
 
 
 def _steps_frame(findings: LoopFindings) -> pd.DataFrame:
-    return pd.DataFrame(
-        [
-            {
-                "model": label,
-                "terms per scan": s.degrees_of_freedom,
-                "MAE (nm)": s.mean_mae_nm,
-                "low": s.interval_nm(findings.config.seed)[0],
-                "high": s.interval_nm(findings.config.seed)[1],
-                "RMSE (nm)": s.rmse_nm,
-            }
-            for label, s in _staircase(findings)
-        ]
-    )
+    rows = []
+    for label, s in _staircase(findings):
+        low, high = s.interval_nm(findings.config.seed)
+        errors = {"MAE (nm)": s.mean_mae_nm, "low": low, "high": high, "RMSE (nm)": s.rmse_nm}
+        rows.append({"model": label, "terms per scan": s.degrees_of_freedom, **errors})
+    return pd.DataFrame(rows)
 
 
 def _equal_row(row: EqualTerms, floor: NoiseFloor) -> dict[str, object]:
@@ -218,44 +209,40 @@ def _effect_section(page: Page, result: CloseLoop) -> None:
         page.paragraph("None.")
         return
     page.table(
-        pd.DataFrame(
-            [
-                {
-                    "effect": e.name + (" (known before)" if e.prior_hypothesis else ""),
-                    "role": e.role,
-                    "verdict": e.verdict,
-                    "share of the best rival (%)": np.nan if e.share is None else 100 * e.share,
-                    "or": ", ".join(e.confusable_with),
-                    "terms per scan": " / ".join(f"{k:.0f}" for k in e.terms_per_scan or ()),
-                    "before (nm)": e.before_nm,
-                    "after (nm)": e.after_nm,
-                    "gain, 95 % over scans": interval_text(e.gain_ci95_nm),
-                    "over prints": interval_text(e.over_prints.ci95_nm) if e.over_prints else "–",
-                    "scans better": f"{e.scans_improved[0]} of {e.scans_improved[1]}",
-                    "p confirm": f"{e.p_confirm:.1e}",
-                    "to separate": e.separating_experiment,
-                }
-                for e in result.effects
-            ]
-        ),
+        [
+            {
+                "effect": e.name + (" (known before)" if e.prior_hypothesis else ""),
+                "role": e.role,
+                "verdict": e.verdict,
+                "share of the best rival (%)": np.nan if e.share is None else 100 * e.share,
+                "or": ", ".join(e.confusable_with),
+                "terms per scan": " / ".join(f"{k:.0f}" for k in e.terms_per_scan or ()),
+                "before (nm)": e.before_nm,
+                "after (nm)": e.after_nm,
+                "gain, 95 % over scans": interval_text(e.gain_ci95_nm),
+                "over prints": interval_text(e.over_prints.ci95_nm) if e.over_prints else "–",
+                "scans better": f"{e.scans_improved[0]} of {e.scans_improved[1]}",
+                "p confirm": f"{e.p_confirm:.1e}",
+                "to separate": e.separating_experiment,
+            }
+            for e in result.effects
+        ],
         "In the order added. Before and after: held-out MAE with the terms per scan that are given; they are "
         "the same on both sides but for what single scans add themselves.",
         "effects.csv",
     )
     page.table(
-        pd.DataFrame(
-            [
-                {
-                    "effect": e.name,
-                    "parameter": name,
-                    "value": f"{p.value:.4g}",
-                    "95 %": f"{p.ci95[0]:.4g} ... {p.ci95[1]:.4g}" if p.ci95 else "chosen, not fitted",
-                    "unit": p.unit,
-                }
-                for e in result.effects
-                for name, p in e.parameters.items()
-            ]
-        ),
+        [
+            {
+                "effect": e.name,
+                "parameter": name,
+                "value": f"{p.value:.4g}",
+                "95 %": f"{p.ci95[0]:.4g} ... {p.ci95[1]:.4g}" if p.ci95 else "chosen, not fitted",
+                "unit": p.unit,
+            }
+            for e in result.effects
+            for name, p in e.parameters.items()
+        ],
         "Parameters; intervals from the spread over scans. Per-scan terms: standard deviation between scans.",
         "parameters.csv",
     )
@@ -274,18 +261,16 @@ def _candidate_section(page: Page, result: CloseLoop) -> None:
         "not-testable",
     ]
     page.table(
-        pd.DataFrame(
-            [
-                {
-                    "effect": c.name,
-                    "verdict": c.verdict,
-                    "p screen": np.nan if c.p_screen is None else c.p_screen,
-                    "gain (nm)": np.nan if c.gain_nm is None else c.gain_nm,
-                    "reason": c.reason,
-                }
-                for c in sorted(result.candidates, key=lambda c: order.index(c.verdict))
-            ]
-        ),
+        [
+            {
+                "effect": c.name,
+                "verdict": c.verdict,
+                "p screen": np.nan if c.p_screen is None else c.p_screen,
+                "gain (nm)": np.nan if c.gain_nm is None else c.gain_nm,
+                "reason": c.reason,
+            }
+            for c in sorted(result.candidates, key=lambda c: order.index(c.verdict))
+        ],
         "p screen: family-wise over all candidates, by flipping the signs of whole scans, before "
         "anything was "
         "added. Gain: on held-out scans for what was added (MAE), else predicted by the score test (RMSE).",
@@ -305,9 +290,7 @@ def _probe_section(page: Page, findings: LoopFindings) -> None:
         )
     if probed.trends:
         page.table(
-            pd.DataFrame(
-                [vars(t) | {"left_out": " / ".join(f"{e:.3g}" for e in t.left_out)} for t in probed.trends]
-            ),
+            [vars(t) | {"left_out": " / ".join(f"{e:.3g}" for e in t.left_out)} for t in probed.trends],
             "Offset and gain of the scans against the order of printing: a line, or one step. p under "
             "permuted orders; left out: error on prints not used, for mean / line / step.",
             "order_trend.csv",
@@ -321,7 +304,7 @@ def _probe_section(page: Page, findings: LoopFindings) -> None:
         "residual. They are kept out of the generic terms, and count in every error."
     )
     if defects.blobs:
-        page.table(pd.DataFrame([vars(b) for b in defects.blobs]), "Every blob.", "defects.csv", digits=2)
+        page.table([vars(b) for b in defects.blobs], "Every blob.", "defects.csv", digits=2)
 
 
 def _rest_section(page: Page, findings: LoopFindings, result: CloseLoop) -> None:
@@ -334,17 +317,15 @@ def _rest_section(page: Page, findings: LoopFindings, result: CloseLoop) -> None
         "roughness alone does not count as structure."
     )
     page.table(
-        pd.DataFrame(
-            [
-                {
-                    "stage": one.stage,
-                    "squared error (nm²)": one.squared_error_nm2,
-                    "explained (nm²)": one.explained_nm2,
-                    "95 % over scans": interval_text(one.explained_ci95_nm2),
-                }
-                for one in result.explainable or []
-            ]
-        ),
+        [
+            {
+                "stage": one.stage,
+                "squared error (nm²)": one.squared_error_nm2,
+                "explained (nm²)": one.explained_nm2,
+                "95 % over scans": interval_text(one.explained_ci95_nm2),
+            }
+            for one in result.explainable or []
+        ],
         "What a ridge regression over features of layout, place, order and dose still explains, each scan by "
         "one that has not seen it; offset, gain, tilt, bow and affine registration of each scan are free "
         f"(k = {findings.rest.k}). It says that something could be learned, not what.",
@@ -352,12 +333,10 @@ def _rest_section(page: Page, findings: LoopFindings, result: CloseLoop) -> None
         digits=1,
     )
     page.table(
-        pd.DataFrame(
-            [
-                {"covariate": t.name, "p": t.p, "share of squared error (%)": 100 * t.share}
-                for t in findings.structure
-            ]
-        ),
+        [
+            {"covariate": t.name, "p": t.p, "share of squared error (%)": 100 * t.share}
+            for t in findings.structure
+        ],
         "Sign-flip p over scans (largest of the bins); part of the squared error that the mean curve "
         "carries.",
         "structure.csv",
@@ -380,20 +359,15 @@ def _scan_section(page: Page, findings: LoopFindings) -> None:
         for terms, name in shown.items()
         for at, when in enumerate(("before", "after"))
     }
-    frame = pd.DataFrame(
-        {
-            "scan": [f.id for f in findings.development],
-            "print": findings.prints,
-            "fold": findings.study.fold_of,
-            **errors,
-        }
-    )
     terms = findings.terms
     coefficients = scan_parameters(findings.development, findings.final.predictions, terms)
-    for name, values in zip(parameter_names(terms), coefficients.T, strict=True):
-        frame[name] = values * NM_PER_UM if name.endswith("(nm)") else values
+    own = {
+        name: values * NM_PER_UM if name.endswith("(nm)") else values
+        for name, values in zip(parameter_names(terms), coefficients.T, strict=True)
+    }
     page.table(
-        frame,
+        {"scan": [f.id for f in findings.development], "print": findings.prints}
+        | {"fold": findings.study.fold_of, **errors, **own},
         "Error of each held-out scan, before and after with the same terms, and its own terms: the "
         "measurement model, never in the design.",
         "scans.csv",

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pandas as pd
-
 from litho_data.foundation.report import Page
 from litho_models.loop.findings import LoopFindings
 from litho_models.loop.report.plots import profile_figure
@@ -23,7 +21,7 @@ def identifiability_section(page: Page, findings: LoopFindings) -> None:
         f"its own). The combination that the scans say least about: {weakest}.{bounds}"
     )
     page.table(
-        pd.DataFrame([{"number": n, "variance inflation": v} for n, v in found.inflation.items()]),
+        [{"number": n, "variance inflation": v} for n, v in found.inflation.items()],
         "By how much the variance of a number grows because the others are fitted too; above 10 it is known "
         "only together with them.",
         "identifiability.csv",
@@ -37,18 +35,11 @@ def identifiability_section(page: Page, findings: LoopFindings) -> None:
         "with the number held there and all others fitted again. Steep sides: determined; flat: not.",
     )
     page.table(
-        pd.concat(
-            pd.DataFrame(
-                {
-                    "effect": one.effect,
-                    "parameter": one.parameter,
-                    "unit": one.unit,
-                    "value": one.held,
-                    "RMSE (nm)": one.rmse_nm,
-                }
-            )
+        [
+            {"effect": one.effect, "parameter": one.parameter, "unit": one.unit, "value": v, "RMSE (nm)": e}
             for one in findings.profiles
-        ),
+            for v, e in zip(one.held, one.rmse_nm, strict=True)
+        ],
         "The same in numbers.",
         "profiles.csv",
         digits=5,
@@ -70,7 +61,7 @@ def power_section(page: Page, findings: LoopFindings) -> None:
             else f"{name}: not found at any of the planted amounts."
         )
     page.table(
-        pd.DataFrame([vars(p) for p in findings.planted]),
+        [vars(p) for p in findings.planted],
         "The effect planted in copies of the development scans. Power: share of the training sets whose best "
         "candidate it is, or one with the same signature.",
         "power.csv",
