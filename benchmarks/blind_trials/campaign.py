@@ -30,7 +30,7 @@ def make_draws(*, count: int | None, seed: int, n_scans: int, size_px: int) -> D
     """
     Plan(n_scans, (size_px, size_px))  # refuses fields that cannot be printed, before any trial fails by it
     trials = draw_board(seed) if count is None else draw_earlier(count, seed)
-    return Draws(schema=Draws.SCHEMA, seed=seed, n_scans=n_scans, size_px=size_px, trials=trials)
+    return Draws(seed=seed, n_scans=n_scans, size_px=size_px, trials=trials)
 
 
 def open_campaign(out: Path, draws: Draws) -> None:

@@ -40,7 +40,6 @@ def make_scoreboard(draws: Draws, trials: Sequence[Trial], command: str) -> Scor
     run = run_info([draws.seed], draws.n_scans)
     done = {trial.draw.number for trial in trials}
     return Scoreboard(
-        schema=Scoreboard.SCHEMA,
         command=command,
         commit=run.commit,
         versions=run.versions,

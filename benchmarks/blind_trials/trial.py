@@ -95,7 +95,6 @@ def failed(draw: Draw, planted: list[Planted], reason: str) -> Trial:
     """The result of a trial that did not come to an end."""
     effects = [(one.effect, one.rms_nm) for one in planted] or [(k.name, k.wanted_rms_nm) for k in draw.knobs]
     return Trial(
-        schema=Trial.SCHEMA,
         draw=draw,
         planted=planted,
         outcomes=[
@@ -125,7 +124,6 @@ def _judged(
     # The floor has the terms that the loop accepted, and so have the errors beside it.
     accepted = next(row for row in result.equal_terms or [] if row.terms == "accepted")
     return Trial(
-        schema=Trial.SCHEMA,
         draw=draw,
         planted=planted,
         outcomes=judge(draw.kind, planted, result, exported),

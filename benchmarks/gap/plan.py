@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import ClassVar, Literal
-
-from pydantic import Field
+from typing import ClassVar
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record, Result
@@ -74,9 +72,6 @@ class Plan(Result):
     SCHEMA: ClassVar[str] = "litho-design/benchmark-gap-plan/1"
     FILE_NAME: ClassVar[str] = "plan.json"
 
-    schema_: Literal["litho-design/benchmark-gap-plan/1"] = Field(
-        default="litho-design/benchmark-gap-plan/1", alias="schema"
-    )
     effort: Effort
     print_knobs: dict[str, float] = PRINT_KNOBS
     scan_knobs: dict[str, float] = SCAN_KNOBS

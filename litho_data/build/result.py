@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, ClassVar, Literal
-
-from pydantic import Field
+from typing import Any, ClassVar
 
 from litho_data.foundation.results import Record, Result
 from litho_data.store.schema import DatasetId
@@ -24,7 +22,6 @@ class BuildResult(Result):
     SCHEMA: ClassVar[str] = "litho-data/build/1"
     FILE_NAME: ClassVar[str] = "build.json"
 
-    schema_: Literal["litho-data/build/1"] = Field(default="litho-data/build/1", alias="schema")
     store: str
     dataset: DatasetId
     n_scans: int

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import glob
+import json
 import re
-from collections.abc import Mapping
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import cast
 
 from litho_data.cards.card import Card, Use, load_card
 from litho_data.cards.fetch import known_folders
-from litho_data.cards.prints import prints_of
 from litho_data.cards.tables import SAFE_ID, read_full_scales, read_table
 from litho_data.foundation.errors import InputError
 from litho_data.store.schema import OPTIONAL_COLUMNS
@@ -191,3 +193,43 @@ def _assumptions(card: Card, table: Mapping[str, Mapping[str, str]]) -> tuple[st
     if card.ids.print is None:
         assumed.append("every scan is a print of its own")
     return tuple(assumed)
+
+
+_LONGEST_S = 10.0
+_MATCH = """
+import json, re, sys
+pattern, ids = json.load(sys.stdin)
+json.dump([found and found["print"] for found in (re.fullmatch(pattern, one) for one in ids)], sys.stdout)
+"""
+
+
+def prints_of(ids: Sequence[str], pattern: str | None) -> list[str | None]:
+    """The group ``print`` of the expression for each whole id, None where it does not match.
+
+    Without an expression every id is a print of its own. Nothing stops an expression that tries all ways to
+    repeat repetitions, so one with any repetition runs in a process of its own.
+
+    Raises:
+        InputError: no result after 10 s.
+    """
+    if pattern is None:
+        return list(ids)
+    if not set("*+{?") & set(pattern.replace("(?", "(")):
+        return [found and found["print"] for found in (re.fullmatch(pattern, one) for one in ids)]
+    try:
+        # Isolated and without site packages, which would take ten times as long.
+        done = subprocess.run(
+            [sys.executable, "-ISc", _MATCH],
+            input=json.dumps([pattern, list(ids)]),
+            capture_output=True,
+            text=True,
+            timeout=_LONGEST_S,
+            check=True,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise InputError(
+            f"[ids] print = {pattern!r}",
+            got=f"no result after {_LONGEST_S:.0f} s",
+            wanted="an expression without repetitions inside repetitions",
+        ) from error
+    return json.loads(done.stdout)

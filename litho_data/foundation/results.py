@@ -7,7 +7,7 @@ import reprlib
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
@@ -31,7 +31,15 @@ class Result(Record):
     OLDER: ClassVar[tuple[str, ...]] = ()
     FILE_NAME: ClassVar[str]
 
-    schema_: str = Field(alias="schema")
+    schema_: str = Field(default="", alias="schema")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_this_schema(cls, content: Any) -> Any:
+        content = {"schema": cls.SCHEMA} | content if isinstance(content, dict) else content
+        if isinstance(content, dict) and content["schema"] not in (cls.SCHEMA, *cls.OLDER):
+            raise ValueError(f"schema {content['schema']!r} is not {cls.SCHEMA!r}")
+        return content
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {', '.join(f'{name}: {value}' for name, value in self._facts())}>"

@@ -114,7 +114,6 @@ def layout_statistics(
     power = np.mean(powers, axis=0)
     correlation = np.mean([one[:, :shortest] for one in correlations], axis=0)
     return LayoutStatistics(
-        schema=LayoutStatistics.SCHEMA,
         count=len(features),
         levels=levels,
         pitch_um=pitch_um,

@@ -69,7 +69,6 @@ def write_levelled(scan: Scan, recipe: Recipe, out: str | Path) -> LevelRecord:
     write_heights(target, levelled, pitch_um=scan.pitch_um, title=f"{scan.name} levelled")
     write_heights(removed_file, removed, pitch_um=scan.pitch_um, title=f"{scan.name} removed")
     record = LevelRecord(
-        schema=LevelRecord.SCHEMA,
         **run_facts(),
         source=scan.source,
         source_sha256=file_sha256(scan.source),

@@ -216,7 +216,6 @@ def _scan_truth(scan: FabScan) -> ScanTruth:
 
 def _truth(fab: Fab, scans: list[ScanTruth]) -> Truth:
     return Truth(
-        schema=Truth.SCHEMA,
         seed=fab.seed,
         printer=asdict(fab.printer),
         microscope=asdict(fab.microscope),

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
-
-from pydantic import Field
+from typing import ClassVar
 
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunFacts
@@ -26,7 +24,6 @@ class FrontResult(RunFacts, Result):
     SCHEMA: ClassVar[str] = "litho-design/front/1"
     FILE_NAME: ClassVar[str] = "front.json"
 
-    schema_: Literal["litho-design/front/1"] = Field(default="litho-design/front/1", alias="schema")
     figure: str
     points: list[FrontPoint]
     baselines: dict[str, dict[str, float]] | None

@@ -6,10 +6,9 @@ import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import numpy as np
-from pydantic import Field
 
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunFacts
@@ -73,7 +72,6 @@ class GapResult(RunFacts, Result):
     SCHEMA: ClassVar[str] = "litho-design/gap/1"
     FILE_NAME: ClassVar[str] = "gap.json"
 
-    schema_: Literal["litho-design/gap/1"] = Field(default="litho-design/gap/1", alias="schema")
     task: str
     # From the fewest fields to the most: a task of one's own has those of every design.
     settings: DesignSettings | ReliefSettings | HologramSettings | LensSettings

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import numpy as np
-from pydantic import Field
 from torch import Tensor
 
 from litho_data.foundation.errors import InputError
@@ -49,7 +48,6 @@ class ScoreResult(RunFacts, Result):
     SCHEMA: ClassVar[str] = "litho-design/score/1"
     FILE_NAME: ClassVar[str] = "score.json"
 
-    schema_: Literal["litho-design/score/1"] = Field(default="litho-design/score/1", alias="schema")
     design: str
     design_sha256: str
     layout_sha256: str

@@ -1,4 +1,4 @@
-"""Exposure: the shape and the background of the writing spot."""
+"""Exposure: shape and background of the writing spot, and slices that set one by one."""
 
 from __future__ import annotations
 
@@ -8,12 +8,16 @@ import torch
 from torch import Tensor
 
 from litho_models.effects.effect import Effect, FieldContext, Parameter, Values
-from litho_models.effects.filters import add_filtered
+from litho_models.effects.filters import add_blur, add_filtered
 
 # Below this difference of variances the spot is sharpened along one axis as much as it is widened
 # along the other; above it only widened, so that the filter never amplifies without bound.
 _SHARPENING_UM2 = 0.02
 _SPOT_REACH_UM = 2.0
+
+# The spot that sets the slices.
+_SLICED_VARIANCE_UM2 = 0.02
+_SLICED_REACH_UM = 0.8
 
 
 def elliptical_psf(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -46,6 +50,28 @@ def dose_exponent(layout: Tensor, values: Values, context: FieldContext) -> Tens
     relative = torch.clamp(layout / full, min=0) + foot
     top, bottom = (1 + foot) ** exponent, foot**exponent
     return layout + full * ((relative**exponent - bottom) / (top - bottom) - (relative - foot))
+
+
+def layer_stacking(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """(1 - w) G*M + w Σ t·step(G * 1[M >= k t]), as a change of M: slices of height t set one by one.
+
+    The step is logistic about the threshold and maps 0 to 0 and 1 to 1: a slice narrower than the
+    spot is lost, a gap narrower than it is filled, which a column of many slices would average out.
+    """
+    layout = context.layout_um
+    count = max(1, round(context.full_height_um / context.slice_um))
+    slices = torch.clamp(layout / context.slice_um - torch.arange(count).to(layout)[:, None, None], 0, 1)
+    variance = torch.as_tensor(_SLICED_VARIANCE_UM2, dtype=layout.dtype, device=layout.device)
+    exposed = add_blur(
+        slices.reshape(count, 1, *layout.shape[-2:]), variance, context.pitch_um, _SLICED_REACH_UM
+    )
+    gained = _step(exposed, values["threshold"], values["steepness"]) - exposed
+    return height + values["share"] * context.slice_um * gained.sum(dim=0, keepdim=True)
+
+
+def _step(dose: Tensor, threshold: Tensor, steepness: Tensor) -> Tensor:
+    low, high = (torch.sigmoid(steepness * (edge - threshold)) for edge in (0.0, 1.0))
+    return (torch.sigmoid(steepness * (dose - threshold)) - low) / (high - low)
 
 
 EFFECTS = (
@@ -99,5 +125,23 @@ EFFECTS = (
         trials=({"exponent": 1.15},),
         source="Schwarzschild exponent of the dose",
         separating="a wide staircase of all levels and a power sweep",
+    ),
+    Effect(
+        name="layer-stacking",
+        title="slices setting one by one",
+        stage="exposure",
+        role="process",
+        acts_on="height",
+        parameters={
+            "share": Parameter("1", 0.0, 1.0, 0.3),
+            "threshold": Parameter("1", 0.2, 0.8, 0.5, kind="shape"),
+            "steepness": Parameter("1", 4.0, 40.0, 12.0, kind="shape"),
+        },
+        apply=layer_stacking,
+        trials=tuple(
+            {"share": 0.3, "threshold": threshold, "steepness": 12.0} for threshold in (0.35, 0.5, 0.65)
+        ),
+        source="slicing of the paper, 0.1 µm; threshold per slice",
+        separating="pillars and pits of one width and several heights, one slice and many",
     ),
 )

@@ -9,7 +9,6 @@ from litho_data.foundation.errors import InputError, unknown_name
 from litho_models.effects import (
     development,
     exposure_field,
-    exposure_layers,
     exposure_scanning,
     exposure_spot,
     measurement_height,
@@ -55,7 +54,6 @@ _FORWARD_ORDER = (
 
 _FAMILIES = (
     exposure_spot,
-    exposure_layers,
     exposure_scanning,
     exposure_field,
     resist,

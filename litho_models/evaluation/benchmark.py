@@ -113,7 +113,6 @@ def benchmark(
         best = min(scores, key=lambda entry: entry.mae_datum_free_nm).model
         floor = estimated_floor(best, scored, list(maps[best].values()), protocol.blocks, seed)
     result = Benchmark(
-        schema="litho-models/benchmark/1",
         run=run_info([seed], len(scans)),
         dataset=dataset.dataset_id,
         split=ScoredSplit(

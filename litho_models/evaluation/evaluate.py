@@ -88,7 +88,6 @@ def evaluate(
     predictions = [Prediction.beside(learned, height) for height in heights]
     protocol = NuisanceProtocol.of_policy(policy, background="training" if learned else "none")
     result = Evaluation(
-        schema="litho-models/evaluation/1",
         run=run_info([protocol.seed], len(scans)),
         dataset=dataset.dataset_id,
         model=ModelRecord(

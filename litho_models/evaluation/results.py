@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 from pydantic import Field
 
@@ -36,7 +36,6 @@ class Evaluation(Result):
     SCHEMA: ClassVar[str] = "litho-models/evaluation/1"
     FILE_NAME: ClassVar[str] = "evaluation.json"
 
-    schema_: Literal["litho-models/evaluation/1"] = Field("litho-models/evaluation/1", alias="schema")
     run: RunInfo
     dataset: DatasetId
     model: ModelRecord
@@ -53,7 +52,6 @@ class Benchmark(Result):
     SCHEMA: ClassVar[str] = "litho-models/benchmark/1"
     FILE_NAME: ClassVar[str] = "benchmark.json"
 
-    schema_: Literal["litho-models/benchmark/1"] = Field("litho-models/benchmark/1", alias="schema")
     run: RunInfo
     dataset: DatasetId
     split: ScoredSplit

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 from pydantic import Field, ValidationError
 
@@ -37,7 +37,6 @@ class TrainingRun(Result):
     SCHEMA: ClassVar[str] = "litho-models/run/1"
     FILE_NAME: ClassVar[str] = "run.json"
 
-    schema_: Literal["litho-models/run/1"] = Field("litho-models/run/1", alias="schema")
     run: RunInfo
     dataset: DatasetId
     model: str
@@ -85,7 +84,6 @@ def train(
     _require_same_run(folder, {"dataset": named, "model": model, "config": config, "lock_box": locked})
     fitted = fit_with_record(model, used, config, checkpoint=folder / CHECKPOINT_FOLDER)
     record = TrainingRun(
-        schema="litho-models/run/1",
         run=run_info([config.seed], len(used)),
         dataset=named,
         model=model,

@@ -51,7 +51,6 @@ class ModelCard(RunFacts, Result):
     SCHEMA: ClassVar[str] = "litho-models/frozen/1"
     FILE_NAME: ClassVar[str] = CARD_FILE
 
-    schema_: Literal["litho-models/frozen/1"] = Field("litho-models/frozen/1", alias="schema")
     name: str
     model: str
     variant: str

@@ -12,12 +12,12 @@ from torch import nn
 from litho_data.store import PrintedScan
 from litho_models.effects import CATALOGUE, UNTESTABLE
 from litho_models.effects.chain import EffectChain
-from litho_models.loop.flexible import carry_over
 from litho_models.loop.fold_fits import predict
-from litho_models.loop.folded_base import Trainer, same_for_all, train_folds
-from litho_models.loop.parameters import is_refitted
+from litho_models.loop.folded_base import FoldedBase, Trainer, same_for_all, train_folds
+from litho_models.loop.parameters import effect_slots, is_refitted
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.probes import Probed, probe_residual
+from litho_models.loop.selection.contest import Entrant, judged
 from litho_models.loop.selection.search import Search, search_effects
 from litho_models.loop.single_scans.nested_tests import MeasurementTest, measurement_tests
 from litho_models.loop.structure import CovariateTest, covariate_tests
@@ -113,7 +113,7 @@ def choose(study: Study, base: nn.Module, trainer: Trainer | None = None) -> Cho
         folded = (
             train_folds(study.scans, study.fold_of, trainer) if trainer else same_for_all(base, study.scans)
         )
-        start, search = carry_over(search, folded, study, terms)
+        start, search = _carry_over(search, folded, study, terms)
         # What single scans add to the model that is reported, not to the guide.
         first_tests = measurement_tests(study, start.predictions)
     report("testing what is left for structure")
@@ -156,3 +156,42 @@ def _untestable(scans: Sequence[PreparedScan]) -> dict[str, str]:
         elif "order" in effect.needs and len({scan.context.order for scan in scans}) < 3:
             reasons[effect.name] = "the writing order of the scans is not known"
     return reasons
+
+
+def _carry_over(
+    found: Search,
+    base: FoldedBase,
+    study: Study,
+    terms: Terms,
+) -> tuple[State, Search]:
+    """Try the effects found on the small model on the network; returns its bare state and the search.
+
+    A network absorbs effects into its weights, so candidates are screened on a small model; here each effect
+    found there must also lower the network's held-out error, otherwise the network carries it.
+    """
+    guide = found.state.fits.chain
+    bare = fit_state(
+        EffectChain(base, {}, full_height_um=guide.full_height_um, pitch_um=guide.pitch_um), study
+    )
+    carried = Search(
+        bare, first=found.first, last=found.last, failures=dict(found.failures), dropped=dict(found.dropped)
+    )
+    for entry in found.added:
+        name = entry.effect.name
+        study.report(f"trying {name} on the network")
+        slots, common = effect_slots(guide), found.state.fits.common
+        values = guide.values()[name] | {
+            parameter: float(common[slot]) for (owner, parameter), slot in slots.items() if owner == name
+        }
+        chain = carried.state.fits.chain
+        extended = fit_state(chain.with_effects({**chain.values(), name: values}), study)
+        entrant = Entrant(found.first[name], extended)
+        added = judged(carried.state, entrant, entry.confusable_with, study, terms)
+        if added.confirmation.passed:
+            carried.state = extended
+            # It was screened where the small model chose it, after the effects added before it.
+            carried.added.append(replace(added, p_screen=entry.p_screen))
+        else:
+            reason = added.confirmation.reason
+            carried.absorbed[name] = f"confirmed on the small model, not on this one: {reason}"
+    return bare, carried

@@ -56,7 +56,6 @@ def open_questions(
         *_of_facts(findings),
     ]
     return OpenQuestions(
-        schema=OpenQuestions.SCHEMA,
         dataset=result.dataset,
         n_scans=len(findings.development),
         field_px=first.shape,

@@ -35,7 +35,7 @@ from litho_models.scan_terms.term import row_index
 
 Z_DECIDED = float(norm.isf(BINOMIAL_P))
 NONE = "none of them"
-PRINTER, MICROSCOPE = "the printer", "the microscope"
+BOTH = PRINTER, MICROSCOPE = "the printer", "the microscope"
 _BLOCK_PX = 32
 _SHARE = 0.9
 
@@ -154,17 +154,8 @@ def _decision(
     said = "; ".join(
         f"{one.better} better than {one.worse} by {one.gain_nm2:.1f} nm² (z = {one.z:.1f})" for one in evident
     )
-    return Decision(
-        question=question.name,
-        kind=question.kind,
-        declared=list(names),
-        left=left,
-        verdict=verdict,
-        evidence=said or "no rival is better than another",
-        prints=len({scan.stored.print_id for scan in new}),
-        scans=len(new),
-        comparisons=comparisons,
-    )
+    evidence = said or "no rival is better than another"
+    return _answer(question, new, evidence, left, verdict, names, comparisons)
 
 
 def _compare(
@@ -209,9 +200,8 @@ def _of_single_scans(findings: LoopFindings, question: Question, new: Sequence[P
     groups = [[i for i, p in enumerate(prints) if p == one] for one in dict.fromkeys(prints)]
     repeated = [group for group in groups if len(group) > 1]
     between, within = len(repeated) - 1, sum(len(group) - 1 for group in repeated)
-    declared = [PRINTER, MICROSCOPE]
     if between < 1 or within < 1:
-        return _without_answer(question, declared, new, "no print was scanned twice")
+        return _answer(question, new, "no print was scanned twice", BOTH, "not shown by these prints")
     data = values[:, columns]
     means = np.array([data[g].mean(axis=0) for g in repeated])
     sizes = np.array([len(g) for g in repeated])[:, None]
@@ -223,25 +213,15 @@ def _of_single_scans(findings: LoopFindings, question: Question, new: Sequence[P
     printer = f_distribution.sf(ratio, between, within) <= BINOMIAL_P
     share = 1 + scans * _SHARE / (1 - _SHARE)
     scanned = f_distribution.cdf(ratio / share, between, within) <= BINOMIAL_P
-    left = [PRINTER] if printer and not scanned else [MICROSCOPE] if scanned and not printer else declared
-    return Decision(
-        question=question.name,
-        kind=question.kind,
-        declared=declared,
-        left=left,
-        verdict="decided" if len(left) == 1 else "still open",
-        evidence=f"F({between}, {within}) = {ratio:.2f} of prints against repeats",
-        prints=len(groups),
-        scans=len(new),
-    )
+    left = [PRINTER] if printer and not scanned else [MICROSCOPE] if scanned and not printer else BOTH
+    return _answer(question, new, f"F({between}, {within}) = {ratio:.2f} of prints against repeats", left)
 
 
 def _of_lines(findings: LoopFindings, question: Question, new: Sequence[PreparedScan]) -> Decision:
     """Variance of line offsets along the layout's rows and along the scan lines of turned scans."""
-    declared = [PRINTER, MICROSCOPE]
     turned = [scan for scan in new if axis_along(scan.line) == 0]
     if not turned:
-        return _without_answer(question, declared, new, "no scan is turned")
+        return _answer(question, new, "no scan is turned", BOTH, "not shown by these prints")
     fits = findings.final.fits
     written, scanned, lines, own = 0.0, 0.0, 0, 0.0
     for scan in turned:
@@ -254,30 +234,32 @@ def _of_lines(findings: LoopFindings, question: Question, new: Sequence[Prepared
         own += float(residual[used].var()) / residual.shape[1]
         lines += residual.shape[0]
     z = (written - scanned) / ((written + scanned + own) * np.sqrt(2 / lines))
-    left = [PRINTER] if z >= Z_DECIDED else [MICROSCOPE] if z <= -Z_DECIDED else declared
-    return Decision(
-        question=question.name,
-        kind=question.kind,
-        declared=declared,
-        left=left,
-        verdict="decided" if len(left) == 1 else "still open",
-        evidence=f"offsets vary by {1e6 * written / len(turned):.1f} nm² along the layout's rows and by "
-        f"{1e6 * scanned / len(turned):.1f} nm² along the lines of the turned scans (z = {z:.1f})",
-        prints=len({scan.stored.print_id for scan in turned}),
-        scans=len(turned),
+    left = [PRINTER] if z >= Z_DECIDED else [MICROSCOPE] if z <= -Z_DECIDED else BOTH
+    evidence = (
+        f"offsets vary by {1e6 * written / len(turned):.1f} nm² along the layout's rows and by "
+        f"{1e6 * scanned / len(turned):.1f} nm² along the lines of the turned scans (z = {z:.1f})"
     )
+    return _answer(question, turned, evidence, left)
 
 
-def _without_answer(
-    question: Question, declared: list[str], new: Sequence[PreparedScan], why: str
+def _answer(
+    question: Question,
+    scans: Sequence[PreparedScan],
+    evidence: str,
+    left: Sequence[str],
+    verdict: Decided | None = None,
+    declared: Sequence[str] = BOTH,
+    comparisons: Sequence[Comparison] = (),
 ) -> Decision:
+    """What these scans say of a question; decided, unless stated otherwise, where one answer is left."""
     return Decision(
         question=question.name,
         kind=question.kind,
-        declared=declared,
-        left=declared,
-        verdict="not shown by these prints",
-        evidence=why,
-        prints=len({scan.stored.print_id for scan in new}),
-        scans=len(new),
+        declared=list(declared),
+        left=list(left),
+        verdict=verdict or ("decided" if len(left) == 1 else "still open"),
+        evidence=evidence,
+        prints=len({scan.stored.print_id for scan in scans}),
+        scans=len(scans),
+        comparisons=list(comparisons),
     )

@@ -6,13 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from litho_data.foundation.errors import InputError, unknown_name
-from litho_models.models.affine import Affine
-from litho_models.models.affine_mtf import AffineMtf
-from litho_models.models.blur_table import BlurTable
+from litho_models.models.baselines import Affine, AffineMtf, BlurTable, Identity, Linear
 from litho_models.models.features import Features, RandomFeatures
 from litho_models.models.fno import Fno
-from litho_models.models.identity import Identity
-from litho_models.models.linear import Linear
 from litho_models.models.pbl import Pbl
 from litho_models.models.physics import Physics
 from litho_models.simulator import Simulator, Variant

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from litho_models.layers.gaussian import kernel_radius_px
-from litho_models.models.affine_mtf import blurred_interior
+from litho_models.models.baselines import blurred_interior
 from litho_models.models.features import neighbours
 from litho_models.simulator import crop_border
 

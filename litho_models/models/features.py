@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from litho_models.layers.gaussian import kernel_radius_px
-from litho_models.models.affine_mtf import blurred_interior
+from litho_models.models.baselines import blurred_interior
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 
 # Relative height per µm below which the length of a slope is rounded off, so that it has a derivative.

@@ -74,7 +74,6 @@ def check(
         between=found.between,
     )
     result = Check(
-        schema="litho-models/check/1",
         run=run_info([], len(found.new), found.dropped),
         dataset=dataset.dataset_id,
         model=CheckedModel(name=frozen.name, sha256=frozen.sha256, dataset=frozen.card["dataset"]),

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
-
-from pydantic import Field
+from typing import ClassVar
 
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunInfo
@@ -70,7 +68,6 @@ class Check(Result):
     SCHEMA: ClassVar[str] = "litho-models/check/1"
     FILE_NAME: ClassVar[str] = "check.json"
 
-    schema_: Literal["litho-models/check/1"] = Field("litho-models/check/1", alias="schema")
     run: RunInfo
     dataset: DatasetId
     model: CheckedModel

@@ -13,8 +13,14 @@ from litho_data.store import open_store
 from litho_models.noise.budget import noise_budget
 from litho_models.noise.calibration import analyse_spread
 from litho_models.noise.dose import dose_matrix
-from litho_models.noise.references import Reference, ReferencePrints, reference_prints, store_references
-from litho_models.noise.repeats import RepeatedPrints, repeated_prints
+from litho_models.noise.references import (
+    Reference,
+    ReferencePrints,
+    RepeatedPrints,
+    reference_prints,
+    repeated_prints,
+    store_references,
+)
 from litho_models.noise.report import write_noise_report
 from litho_models.noise.residuals import read_residuals
 from litho_models.noise.result import NoiseAnalysis, floor_of
@@ -64,7 +70,6 @@ def analyse_noise(
     repeats = repeated_prints(scans)
     budget = noise_budget(spread, seed) if spread is not None and spread.held_out else None
     result = NoiseAnalysis(
-        schema="litho-models/noise/1",
         run=run_info([seed], len(scans), dropped),
         dataset=dataset.dataset_id,
         noise_floor=floor_of(found, repeats, budget),
@@ -109,7 +114,6 @@ def analyse_noise_of_files(
             references.append(Reference(Path(file).stem, use, scan.height_um, scan.require_pitch()))
     found = reference_prints(references, level_height_um)
     result = NoiseAnalysis(
-        schema="litho-models/noise/1",
         run=run_info([], len(references)),
         dataset=None,
         noise_floor=floor_of(found, None, None),

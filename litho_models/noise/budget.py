@@ -16,8 +16,7 @@ from litho_data.roughness.texture import FEWEST_LINES
 from litho_models.noise.residuals import Residuals
 from litho_models.noise.texture import Texture, texture
 from litho_models.noise.variance import layout_slope
-from litho_models.scan_terms import POLICIES, cross_fit
-from litho_models.scoring.noise_floor import NoiseFloor, estimated_floor
+from litho_models.scoring.noise_floor import NoiseFloor, floor_of_residuals, freed_by_policy
 from litho_models.scoring.statistics import pixel_interval
 
 FLAT_SHARE = 0.25
@@ -56,14 +55,14 @@ class NoiseBudget(Record):
 
 def noise_budget(found: Residuals, seed: int = 0) -> NoiseBudget:
     """Both estimates from the residuals of one model on scans that it had not seen."""
-    blocks = found.protocol.blocks
+    freed = freed_by_policy(found.scans, found.maps_um, found.protocol.blocks)
     slopes = [layout_slope(scan) for scan in found.scans]
     limit = float(np.quantile(np.concatenate([slope.ravel() for slope in slopes]), FLAT_SHARE))
     level, square, absolute, number = [], [], [], []
-    for at, (scan, expected, slope) in enumerate(zip(found.scans, found.maps_um, slopes, strict=True)):
-        fit = cross_fit(scan.height_um, expected, scan.valid, POLICIES["full+rows"], blocks)
-        flat = np.isfinite(fit.residual_um) & (slope <= limit)
-        residual = NM_PER_UM * fit.residual_um[flat]
+    lines_out = freed["full+rows"][1]
+    for at, (scan, residual_um, slope) in enumerate(zip(found.scans, lines_out, slopes, strict=True)):
+        flat = np.isfinite(residual_um) & (slope <= limit)
+        residual = NM_PER_UM * residual_um[flat]
         level.append(scan.mask_level[flat])
         square.append(residual**2)
         absolute.append(np.abs(residual))
@@ -85,26 +84,18 @@ def noise_budget(found: Residuals, seed: int = 0) -> NoiseBudget:
                 mae_nm=float(sizes[mine].mean()),
             )
         )
-    flats = _flat_residuals(found, slopes, limit)
+    left = zip(freed["full"][1], slopes, strict=True)
+    flats = [np.where(slope <= limit, residual_um, np.nan) for residual_um, slope in left]
     pitch_um = found.scans[0].pitch_um
     small = min(min(flat.shape) for flat in flats) < FEWEST_LINES
     return NoiseBudget(
         model=found.model,
         flat_texture=None if small else texture(f"residuals of {found.model}", flats, pitch_um),
         flat_length_um=(_length_um(flats, pitch_um, 0), _length_um(flats, pitch_um, 1)),
-        floor=estimated_floor(found.model, found.scans, found.maps_um, blocks, seed),
+        floor=floor_of_residuals(found.model, found.scans, freed, seed),
         flat_slope=limit,
         flat_levels=rows,
     )
-
-
-def _flat_residuals(found: Residuals, slopes: Sequence[np.ndarray], limit: float) -> list[np.ndarray]:
-    """What policy ``full`` leaves where the layout is flat, in its frame, µm; NaN elsewhere."""
-    flats = []
-    for scan, expected, slope in zip(found.scans, found.maps_um, slopes, strict=True):
-        fit = cross_fit(scan.height_um, expected, scan.valid, POLICIES["full"], found.protocol.blocks)
-        flats.append(np.where(slope <= limit, fit.residual_um, np.nan))
-    return flats
 
 
 def _length_um(maps_um: Sequence[np.ndarray], pitch_um: float, axis: int) -> float:

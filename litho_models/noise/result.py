@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 from pydantic import Field, JsonValue
 
@@ -12,8 +12,7 @@ from litho_data.store.schema import DatasetId
 from litho_models.noise.budget import NoiseBudget
 from litho_models.noise.calibration import SpreadAnalysis
 from litho_models.noise.dose import DoseMatrix
-from litho_models.noise.references import ReferencePrints
-from litho_models.noise.repeats import RepeatedPrints
+from litho_models.noise.references import ReferencePrints, RepeatedPrints
 from litho_models.noise.surface import pooled
 from litho_models.scoring.noise_floor import UNKNOWN_FLOOR, NoiseFloor
 
@@ -24,7 +23,6 @@ class NoiseAnalysis(Result):
     SCHEMA: ClassVar[str] = "litho-models/noise/1"
     FILE_NAME: ClassVar[str] = "noise.json"
 
-    schema_: Literal["litho-models/noise/1"] = Field("litho-models/noise/1", alias="schema")
     run: RunInfo
     dataset: DatasetId | None
     noise_floor: NoiseFloor

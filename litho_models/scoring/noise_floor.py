@@ -117,21 +117,20 @@ def estimated_floor(
         blocks: the pixels that terms are fitted on and scored, as for the errors that the floor stands under.
         seed: of the pixels drawn.
     """
-    fits = {
-        policy: [
-            cross_fit(scan.height_um, expected, scan.valid, terms, blocks)
-            for scan, expected in zip(scans, maps_um, strict=True)
-        ]
-        for policy, terms in POLICIES.items()
-    }
-    freed = {
-        policy: (
-            float(np.mean([fit.degrees_of_freedom for fit in own])),
-            [fit.residual_um for fit in own],
-        )
-        for policy, own in fits.items()
-    }
-    return floor_of_residuals(model, scans, freed, seed)
+    return floor_of_residuals(model, scans, freed_by_policy(scans, maps_um, blocks), seed)
+
+
+def freed_by_policy(
+    scans: Sequence[PrintedScan], maps_um: Sequence[np.ndarray], blocks: Blocks | None = None
+) -> dict[Policy, tuple[float, list[np.ndarray]]]:
+    """For each policy its terms per scan and the residual of each scan, (ny, nx) µm, NaN where not scored."""
+    freed: dict[Policy, tuple[float, list[np.ndarray]]] = {}
+    for policy, terms in POLICIES.items():
+        pairs = zip(scans, maps_um, strict=True)
+        fits = [cross_fit(scan.height_um, expected, scan.valid, terms, blocks) for scan, expected in pairs]
+        mean_k = float(np.mean([fit.degrees_of_freedom for fit in fits]))
+        freed[policy] = mean_k, [fit.residual_um for fit in fits]
+    return freed
 
 
 def floor_of_residuals(

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from litho_data.cards import prints
+from litho_data.cards import listing
 from litho_data.cards.listing import list_fields
 from litho_data.foundation.errors import InputError
 from tests.litho_data.campaigns import card_text
@@ -122,13 +122,13 @@ def test_no_pair_at_all(tmp_path: Path) -> None:
 
 
 def test_an_expression_that_never_ends_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(prints, "_LONGEST_S", 0.5)
+    monkeypatch.setattr(listing, "_LONGEST_S", 0.5)
     with pytest.raises(InputError, match="repetitions inside repetitions"):
-        prints.prints_of(["a" * 40], "(?P<print>(a+)+)b")
+        listing.prints_of(["a" * 40], "(?P<print>(a+)+)b")
     ids = ["A1", "B22", "c3", "ÄÖ4"]
     expected = ["A", "B", None, None]
-    monkeypatch.setattr(prints, "_LONGEST_S", 30)
-    assert prints.prints_of(ids, r"(?P<print>[A-Z])\d+") == expected
-    assert prints.prints_of(ids, r"(?P<print>[A-Z])\d") == ["A", None, None, None]
-    assert prints.prints_of(ids, r"(?P<print>\w+)\d") == ["A", "B2", "c", "ÄÖ"]
-    assert prints.prints_of(ids, None) == ids
+    monkeypatch.setattr(listing, "_LONGEST_S", 30)
+    assert listing.prints_of(ids, r"(?P<print>[A-Z])\d+") == expected
+    assert listing.prints_of(ids, r"(?P<print>[A-Z])\d") == ["A", None, None, None]
+    assert listing.prints_of(ids, r"(?P<print>\w+)\d") == ["A", "B2", "c", "ÄÖ"]
+    assert listing.prints_of(ids, None) == ids

@@ -23,7 +23,7 @@ from litho_models.monitoring.change_point import (
     noticeable_step,
     step_statistics,
 )
-from litho_models.monitoring.forecast import forecast
+from litho_models.monitoring.judging import forecast
 from litho_models.monitoring.prints import FIGURES, print_values, spread_of
 from litho_models.monitoring.result import Check
 from litho_models.scan_terms import POLICIES

@@ -17,7 +17,7 @@ from litho_data.store.lock_box import locked_ids
 from litho_models.noise.budget import noise_budget
 from litho_models.noise.calibration import analyse_spread, conformal_factor
 from litho_models.noise.dose import dose_matrix
-from litho_models.noise.repeats import repeated_prints
+from litho_models.noise.references import repeated_prints
 from litho_models.noise.residuals import Residuals, disagreement_um
 from litho_models.noise.spread_scores import (
     GAUSSIAN,

@@ -8,7 +8,7 @@ from scipy.stats import f_oneway
 
 from litho_models.effects import get_effect
 from litho_models.loop.single_scans.nested_tests import MeasurementTest
-from litho_models.scoring.variance_components import ByPrint, by_print
+from litho_models.scoring.statistics import ByPrint, by_print
 
 PRINTS = ["1"] * 4 + ["2"] * 3 + ["3"] * 4 + ["4"] * 3
 
@@ -44,7 +44,7 @@ def test_columns_count_alike_whatever_their_unit_and_nothing_to_tell_is_none():
 
 def test_a_gain_that_goes_with_the_print_is_not_called_the_microscopes():
     def role(name: str, p: float) -> str:
-        grouped = ByPrint(5.6, (5, 14), 0.58, p)
+        grouped = ByPrint(f=5.6, degrees=(5, 14), icc=0.58, p=p)
         return MeasurementTest(get_effect(name), None, None, None, 0.0, {}, "", by_print=grouped).role
 
     assert (role("z-gain", 0.003), role("z-gain", 0.3)) == ("undetermined", "measurement")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,6 +23,17 @@ _IDLE = 1e-6
 Summary = Callable[[np.ndarray], dict[str, tuple[float, str]]]
 ColumnsOf = Callable[[PreparedScan, np.ndarray], np.ndarray]
 Shuffle = Callable[[np.random.Generator, int], np.ndarray]
+
+
+class Left(NamedTuple):
+    """What is left of the scans: their held-out predictions (y, x) µm, and the sampled pixels in no defect.
+
+    ``kept``: bool (n,) per scan.
+    """
+
+    scans: Sequence[PreparedScan]
+    predictions: Sequence[np.ndarray]
+    kept: Sequence[np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -83,18 +95,11 @@ def linear_probe(
     penalty: np.ndarray,
     shuffle: Shuffle,
     summary: Summary,
-    scans: Sequence[PreparedScan],
-    predictions: Sequence[np.ndarray],
-    kept: Sequence[np.ndarray],
+    left: Left,
 ) -> LinearProbe:
-    """Measure a probe's inner products with the residual on the sampled pixels.
-
-    Args:
-        scans, predictions: scans and their held-out predictions (y, x) µm.
-        kept: bool (n,) per scan, sampled pixels to use: defects are left out.
-    """
+    """Measure a probe's inner products with the residual on the sampled pixels."""
     grams, rights = [], []
-    for scan, prediction, use in zip(scans, predictions, kept, strict=True):
+    for scan, prediction, use in zip(*left, strict=True):
         maps = columns_of(scan, prediction)
         columns = np.stack([scan.at_sample(m) for m in maps] + [scan.height - scan.at_sample(prediction)])
         columns = columns[:, use].T
@@ -103,7 +108,7 @@ def linear_probe(
         products = columns.T @ columns
         grams.append(products[:-1, :-1])
         rights.append(products[:-1, -1])
-    pixels = np.array([use.sum() for use in kept])
+    pixels = np.array([use.sum() for use in left.kept])
     return LinearProbe(name, columns_of, penalty, shuffle, summary, np.stack(grams), np.stack(rights), pixels)
 
 

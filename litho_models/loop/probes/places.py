@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Literal
 
@@ -11,7 +11,7 @@ from scipy.interpolate import BSpline
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.prepared import PreparedScan, sample_border_px
-from litho_models.loop.probes.linear import LinearProbe, linear_probe, second_differences
+from litho_models.loop.probes.linear import Left, LinearProbe, linear_probe, second_differences
 
 SPLINES = 5
 # One per µm in a scan of 25 µm: what is finer is one line's, not the scan's.
@@ -24,9 +24,7 @@ _FLIPS: tuple[Callable[[np.ndarray], np.ndarray], ...] = tuple(
 
 
 def position_map(
-    scans: Sequence[PreparedScan],
-    predictions: Sequence[np.ndarray],
-    kept: Sequence[np.ndarray],
+    left: Left,
     *,
     times_height: bool,
 ) -> LinearProbe:
@@ -40,16 +38,12 @@ def position_map(
         _roughness(SPLINES),
         _turned,
         partial(_size, times_height=times_height),
-        scans,
-        predictions,
-        kept,
+        left,
     )
 
 
 def profile(
-    scans: Sequence[PreparedScan],
-    predictions: Sequence[np.ndarray],
-    kept: Sequence[np.ndarray],
+    left: Left,
     *,
     along: Literal["row", "column"],
     times_height: bool,
@@ -61,9 +55,7 @@ def profile(
         second_differences(PROFILE_SPLINES) + 1e-2 * np.eye(PROFILE_SPLINES),
         _rolled,
         partial(_profile_size, times_height=times_height),
-        scans,
-        predictions,
-        kept,
+        left,
     )
 
 

@@ -12,6 +12,7 @@ from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.probes.defects import Defects, find_defects
 from litho_models.loop.probes.displaced import displaced_copy
 from litho_models.loop.probes.kernel import missing_kernel
+from litho_models.loop.probes.linear import Left
 from litho_models.loop.probes.places import position_map, profile
 from litho_models.loop.probes.probe import Estimate, Probe
 from litho_models.loop.probes.tables import (
@@ -125,7 +126,7 @@ def _on_samples(make: Callable[..., Probe | None], **settings: Any) -> Maker:
         scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray], masks: Sequence[np.ndarray]
     ) -> Probe | None:
         kept = [~mask.reshape(-1)[scan.sample] for mask, scan in zip(masks, scans, strict=True)]
-        return make(scans, predictions, kept, **settings)
+        return make(Left(scans, predictions, kept), **settings)
 
     return made
 

@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.prepared import PreparedScan
-from litho_models.loop.probes.linear import ColumnsOf, LinearProbe, linear_probe, second_differences
+from litho_models.loop.probes.linear import ColumnsOf, Left, LinearProbe, linear_probe, second_differences
 
 # The level that reaches a pixel is spread by the printer's spot.
 SPOT_UM = 0.2
@@ -29,20 +29,18 @@ _POWERS = (
 Steepness = Callable[[PreparedScan, np.ndarray], np.ndarray]
 
 
-def level_table(
-    scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray], kept: Sequence[np.ndarray]
-) -> LinearProbe | None:
+def level_table(left: Left) -> LinearProbe | None:
     """One height correction per printed level; None where fewer than four levels can be estimated.
 
     Offset and slope over the levels belong to each scan's datum and gain and are projected out with them.
     Levels in fewer than 5 scans or 1 % of the pixels are left alone.
     """
-    levels = estimated_levels(scans)
+    levels = estimated_levels(left.scans)
     if len(levels) < 4:
         return None
     entries = [f"level_{level}" for level in levels]
     columns_of = partial(_level_columns, levels=levels)
-    return _table("level-table", entries, columns_of, scans, predictions, kept)
+    return _table("level-table", entries, columns_of, left)
 
 
 def estimated_levels(scans: Sequence[PreparedScan]) -> list[int]:
@@ -56,20 +54,16 @@ def estimated_levels(scans: Sequence[PreparedScan]) -> list[int]:
     return [int(level) for level in np.flatnonzero(enough & (shares >= _SMALLEST_SHARE))]
 
 
-def slope_table(
-    scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray], kept: Sequence[np.ndarray]
-) -> LinearProbe:
+def slope_table(left: Left) -> LinearProbe:
     """One height correction per steepness of the predicted print, linear in between."""
-    knots = _slope_knots(_steepness, scans, predictions)
+    knots = _slope_knots(_steepness, left)
     entries = [f"slope_{knot:.2f}" for knot in knots]
     columns_of = partial(_slope_columns, steepness=_steepness, knots=knots)
-    return _table("slope-table", entries, columns_of, scans, predictions, kept)
+    return _table("slope-table", entries, columns_of, left)
 
 
 def directed_slope_table(
-    scans: Sequence[PreparedScan],
-    predictions: Sequence[np.ndarray],
-    kept: Sequence[np.ndarray],
+    left: Left,
     *,
     name: str,
     along: Sequence[str],
@@ -78,47 +72,41 @@ def directed_slope_table(
 
     What a slope does along one direction and not along another no table over the steepness can follow.
     """
-    knots = {one: _slope_knots(_ALONG[one], scans, predictions) for one in along}
+    knots = {one: _slope_knots(_ALONG[one], left) for one in along}
     entries = [f"along_{one}_{knot:.2f}" for one, places in knots.items() for knot in places]
     columns_of = partial(_directed_slope_columns, knots=knots)
-    return _table(name, entries, columns_of, scans, predictions, kept, blocks=len(knots))
+    return _table(name, entries, columns_of, left, blocks=len(knots))
 
 
-def shape_powers(
-    scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray], kept: Sequence[np.ndarray]
-) -> LinearProbe:
+def shape_powers(left: Left) -> LinearProbe:
     """Powers and products of height and slopes of the predicted print; no table over one follows them."""
     penalty = np.eye(len(_POWERS))
-    return _heights("shape-powers", _POWERS, _power_columns, penalty, scans, predictions, kept)
+    return _heights("shape-powers", _POWERS, _power_columns, penalty, left)
 
 
-def order_shapes(
-    scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray], kept: Sequence[np.ndarray]
-) -> LinearProbe | None:
+def order_shapes(left: Left) -> LinearProbe | None:
     """Height and slopes whose part in the error drifts or jumps over the writing order.
 
     None where the order is unknown. What acts as a gain of single scans is theirs, see ``order_trends``.
     """
-    if len({scan.context.order for scan in scans}) < FEWEST_ORDERS:
+    if len({scan.context.order for scan in left.scans}) < FEWEST_ORDERS:
         return None
     names = [f"{shape} {over}" for over in _OVER_ORDER for shape in _DRIFTING]
     penalty = np.eye(len(names))
-    return _heights("order-shapes", names, _order_columns, penalty, scans, predictions, kept)
+    return _heights("order-shapes", names, _order_columns, penalty, left)
 
 
 def _table(
     name: str,
     entries: Sequence[str],
     columns_of: ColumnsOf,
-    scans: Sequence[PreparedScan],
-    predictions: Sequence[np.ndarray],
-    kept: Sequence[np.ndarray],
+    left: Left,
     blocks: int = 1,
 ) -> LinearProbe:
     """One height per entry along an ordered covariate, or several of as many entries; bends kept small."""
     bends = np.kron(np.eye(blocks), second_differences(len(entries) // blocks))
     penalty = bends + 1e-3 * np.eye(len(entries))
-    return _heights(name, entries, columns_of, penalty, scans, predictions, kept)
+    return _heights(name, entries, columns_of, penalty, left)
 
 
 def _heights(
@@ -126,9 +114,7 @@ def _heights(
     entries: Sequence[str],
     columns_of: ColumnsOf,
     penalty: np.ndarray,
-    scans: Sequence[PreparedScan],
-    predictions: Sequence[np.ndarray],
-    kept: Sequence[np.ndarray],
+    left: Left,
 ) -> LinearProbe:
     """One height per entry, in nm for people; the control permutes the entries of each scan."""
     return linear_probe(
@@ -139,9 +125,7 @@ def _heights(
         lambda heights: {
             entry: (float(height) * NM_PER_UM, "nm") for entry, height in zip(entries, heights, strict=True)
         },
-        scans,
-        predictions,
-        kept,
+        left,
     )
 
 
@@ -196,11 +180,9 @@ _ALONG: Mapping[str, Steepness] = {
 }
 
 
-def _slope_knots(
-    steepness: Steepness, scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray]
-) -> np.ndarray:
+def _slope_knots(steepness: Steepness, left: Left) -> np.ndarray:
     """From flat to what 1 % of the pixels exceed, so that no knot rests on a few edges."""
-    sampled = [f.at_sample(steepness(f, p)) for f, p in zip(scans, predictions, strict=True)]
+    sampled = [f.at_sample(steepness(f, p)) for f, p in zip(left.scans, left.predictions, strict=True)]
     steepest = float(np.quantile(np.concatenate(sampled), 0.99))
     return np.linspace(0.0, max(steepest, np.finfo(float).tiny), SLOPE_KNOTS)
 

@@ -10,12 +10,11 @@ from litho_models.effects import Effect
 from litho_models.loop.findings import LoopFindings
 from litho_models.loop.parameters import effect_slots
 from litho_models.loop.probes import AddedProbe, with_intervals
-from litho_models.loop.result.record import AddedEffect, EffectVerdict, ParameterEstimate, VarianceByPrint
+from litho_models.loop.result.record import AddedEffect, EffectVerdict, ParameterEstimate
 from litho_models.loop.selection.contest import Added
 from litho_models.loop.selection.search import separating_experiment
 from litho_models.loop.single_scans.nested_tests import MeasurementTest
 from litho_models.loop.structure import LINEAR_RESPONSE, is_structured
-from litho_models.loop.study import Score
 from litho_models.scoring.pairs import over_prints
 
 # Verdicts on an effect that something without a name would do better: no design uses it.
@@ -41,7 +40,7 @@ def _added_measurement(findings: LoopFindings, test: MeasurementTest) -> AddedEf
         stage=effect.stage,
         role=test.role,
         verdict="confusable" if test.confusable_with else "explained",
-        by_print=None if test.by_print is None else VarianceByPrint(**vars(test.by_print)),
+        by_print=test.by_print,
         prior_hypothesis=effect.name in findings.config.prior_hypotheses,
         parameters={
             name if name.startswith("sd") else f"{name}_sd_between_scans": ParameterEstimate(
@@ -50,15 +49,10 @@ def _added_measurement(findings: LoopFindings, test: MeasurementTest) -> AddedEf
             for name, (value, interval, unit) in test.spread.items()
         },
         metric="mae_abs" if effect.name == "datum-offset" else "mae_datum_free",
-        before_nm=test.before.mean_mae_nm,
-        after_nm=test.after.mean_mae_nm,
-        gain_ci95_nm=test.confirmation.gain_ci95_nm,
         p_screen=test.p_screen,
-        p_confirm=test.confirmation.p,
-        scans_improved=test.confirmation.improved,
         confusable_with=list(test.confusable_with),
         separating_experiment=effect.separating,
-        **_beside(findings, test.before, test.after),
+        **_evidence(findings, test),
     )
 
 
@@ -110,16 +104,11 @@ def _added_process(findings: LoopFindings, entry: Added) -> AddedEffect:
         prior_hypothesis=effect.name in findings.config.prior_hypotheses,
         parameters=_parameter_estimates(findings, effect),
         metric="mae_datum_free",
-        before_nm=entry.before.mean_mae_nm,
-        after_nm=entry.after.mean_mae_nm,
-        gain_ci95_nm=entry.confirmation.gain_ci95_nm,
         p_screen=entry.p_screen,
-        p_confirm=entry.confirmation.p,
-        scans_improved=entry.confirmation.improved,
         confusable_with=entry.confusable_with,
         separating_experiment=separating_experiment([effect.name, *entry.confusable_with]),
         share=findings.weights[effect.name].share,
-        **_beside(findings, entry.before, entry.after),
+        **_evidence(findings, entry),
     )
 
 
@@ -136,22 +125,23 @@ def _added_probe(findings: LoopFindings, entry: AddedProbe) -> AddedEffect:
             for name, (value, unit, interval) in with_intervals(entry.probe, entry.estimate).items()
         },
         metric="mae_datum_free",
-        before_nm=entry.before.mean_mae_nm,
-        after_nm=entry.after.mean_mae_nm,
-        gain_ci95_nm=entry.confirmation.gain_ci95_nm,
         p_screen=entry.p_control,
-        p_confirm=entry.confirmation.p,
-        scans_improved=entry.confirmation.improved,
         confusable_with=[],
         separating_experiment="print and scan the same layouts turned by 90 degrees",
-        **_beside(findings, entry.before, entry.after),
+        **_evidence(findings, entry),
     )
 
 
-def _beside(findings: LoopFindings, before: Score, after: Score) -> dict[str, Any]:
-    """Terms per scan on both sides, and the gain over prints."""
+def _evidence(findings: LoopFindings, found: Added | MeasurementTest | AddedProbe) -> dict[str, Any]:
+    """Errors before and after, terms per scan on both sides, and the gain over scans and over prints."""
+    before, after, confirmation = found.before, found.after, found.confirmation
     gains = (before.mae_nm - after.mae_nm).tolist()
     return {
+        "before_nm": before.mean_mae_nm,
+        "after_nm": after.mean_mae_nm,
+        "gain_ci95_nm": confirmation.gain_ci95_nm,
+        "p_confirm": confirmation.p,
+        "scans_improved": confirmation.improved,
         "terms_per_scan": (before.degrees_of_freedom, after.degrees_of_freedom),
         "over_prints": over_prints(gains, findings.prints, findings.config.seed),
     }

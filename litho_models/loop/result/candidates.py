@@ -25,25 +25,10 @@ def all_candidates(findings: LoopFindings, added: set[str]) -> list[Candidate]:
         if name in tests and (name in added or seen is None or not seen.seen):
             rows.append(_measurement_candidate(findings, tests[name], name in added))
         elif seen is not None:
-            rows.append(
-                Candidate(
-                    name=name,
-                    verdict="explained" if seen.seen else "below-noise",
-                    reason=seen.evidence,
-                    p_screen=None,
-                    gain_nm=None,
-                )
-            )
+            verdict: CandidateVerdict = "explained" if seen.seen else "below-noise"
+            rows.append(Candidate(name=name, verdict=verdict, reason=seen.evidence))
         elif name in findings.untestable:
-            rows.append(
-                Candidate(
-                    name=name,
-                    verdict="not-testable",
-                    reason=findings.untestable[name],
-                    p_screen=None,
-                    gain_nm=None,
-                )
-            )
+            rows.append(Candidate(name=name, verdict="not-testable", reason=findings.untestable[name]))
         else:
             rows.append(_process_candidate(findings, name, added, sets))
     return rows + [_probe_candidate(findings, test) for test in findings.probed.tests]
@@ -64,9 +49,8 @@ def _probe_candidate(findings: LoopFindings, test: ProbeTest) -> Candidate:
             p_screen=entry.p_control,
             gain_nm=entry.confirmation.gain_nm,
         )
-    mse = float(findings.errors(findings.final, findings.terms).mse_nm2.mean())
-    gain = math.sqrt(mse) - math.sqrt(max(mse - test.gain_nm2, 0.0))
-    return Candidate(name=test.name, verdict="below-noise", reason=test.reason, p_screen=None, gain_nm=gain)
+    gain = _predicted_gain_nm(findings, test.gain_nm2)
+    return Candidate(name=test.name, verdict="below-noise", reason=test.reason, gain_nm=gain)
 
 
 def _measurement_candidate(findings: LoopFindings, test: MeasurementTest, added: bool) -> Candidate:
@@ -92,7 +76,7 @@ def _process_candidate(
     screened = search.last.get(name) or search.first.get(name)
     first = search.first.get(name)
     p = first.p if first else None
-    gain = _predicted_gain_nm(findings, screened) if screened else None
+    gain = _predicted_gain_nm(findings, screened.mean_gain_nm2) if screened else None
     verdict: CandidateVerdict
     if entry is not None:
         better, count = entry.confirmation.improved
@@ -140,10 +124,10 @@ def _why_not(findings: LoopFindings, name: str, screened: Screened) -> str:
     return f"no evidence (z = {screened.z:.1f}); {detectable}"
 
 
-def _predicted_gain_nm(findings: LoopFindings, screened: Screened) -> float:
-    """Gain in RMSE that the score test predicts for held-out scans, nm."""
+def _predicted_gain_nm(findings: LoopFindings, gain_nm2: float) -> float:
+    """Gain in RMSE on held-out scans, nm, from the predicted one in squared error."""
     mse = float(findings.errors(findings.final, findings.terms).mse_nm2.mean())
-    return math.sqrt(mse) - math.sqrt(max(mse - screened.mean_gain_nm2, 0.0))
+    return math.sqrt(mse) - math.sqrt(max(mse - gain_nm2, 0.0))
 
 
 def _values(screened: Screened) -> str:

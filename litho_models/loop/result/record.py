@@ -12,6 +12,7 @@ from litho_data.store.schema import DatasetId
 from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.noise_floor import NoiseFloor
 from litho_models.scoring.pairs import OverUnits
+from litho_models.scoring.statistics import ByPrint
 from litho_models.splits.folds import Split
 
 ChosenKind = Literal["named", "generic", "per-scan"]
@@ -111,15 +112,6 @@ class ParameterEstimate(Record):
     ci95: tuple[float, float] | None
 
 
-class VarianceByPrint(Record):
-    """One-way analysis of variance over prints of a term of single scans; ``p`` by permutation."""
-
-    f: float
-    degrees: tuple[int, int]
-    icc: float
-    p: float
-
-
 class AddedEffect(Record):
     """``terms_per_scan``: effective number before and after; ``over_prints``: as in ``EqualTerms``.
 
@@ -145,15 +137,15 @@ class AddedEffect(Record):
     terms_per_scan: tuple[float, float] | None = None
     over_prints: OverUnits | None = None
     share: float | None = None
-    by_print: VarianceByPrint | None = None
+    by_print: ByPrint | None = None
 
 
 class Candidate(Record):
     name: str
     verdict: CandidateVerdict
     reason: str
-    p_screen: float | None
-    gain_nm: float | None
+    p_screen: float | None = None
+    gain_nm: float | None = None
 
 
 class Shares(Record):

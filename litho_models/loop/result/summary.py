@@ -75,7 +75,6 @@ def summarise(findings: LoopFindings, *, dataset: DatasetId, base_name: str, dro
     elif len(findings.development) < fewest:
         verdict = "too-few-scans"
     return CloseLoop(
-        schema=CloseLoop.SCHEMA,
         run=run_info([findings.config.seed], len(findings.development) + len(findings.locked), dropped),
         dataset=dataset,
         base_model=base_name,

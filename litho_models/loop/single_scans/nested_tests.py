@@ -33,8 +33,13 @@ from litho_models.scan_terms import (
     term_maps,
     terms_of_effect,
 )
-from litho_models.scoring.statistics import bootstrap_interval, one_sided_flip_p, paired_difference
-from litho_models.scoring.variance_components import ByPrint, by_print
+from litho_models.scoring.statistics import (
+    ByPrint,
+    bootstrap_interval,
+    by_print,
+    one_sided_flip_p,
+    paired_difference,
+)
 
 # Of estimates that do not depend on the print, one set in twenty is called grouped.
 GROUPED_P = 0.05

@@ -1,0 +1,166 @@
+"""Baselines, from the layout itself to linear features in closed form: what every model must beat."""
+
+from __future__ import annotations
+
+import torch
+from pydantic import Field
+from torch import Tensor, nn
+
+from litho_models.layers.gaussian import blur_interior, kernel_radius_px
+from litho_models.layers.lookup import interpolate
+from litho_models.layers.ranges import Range
+from litho_models.simulator import Simulator, SimulatorConfig, crop_border
+
+
+class Identity(Simulator):
+    """H = M; nothing to fit."""
+
+    name = "identity"
+
+    @property
+    def reach_px(self) -> int:
+        return 0
+
+    def interior(self, layout_um: Tensor) -> Tensor:
+        return layout_um.clone()
+
+
+class Affine(Simulator):
+    """H = gain · M + offset."""
+
+    name = "affine"
+    is_linear = True
+
+    def __init__(self, config: SimulatorConfig):
+        super().__init__(config)
+        self.gain = nn.Parameter(torch.tensor(1.0))
+        self.offset_um = nn.Parameter(torch.tensor(0.0))
+
+    @property
+    def reach_px(self) -> int:
+        return 0
+
+    def interior(self, layout_um: Tensor) -> Tensor:
+        return self.gain * layout_um + self.offset_um
+
+
+class BlurTableConfig(SimulatorConfig):
+    sigma_max_um: float = Field(1.0, gt=0, description="upper bound of the blur, µm")
+    sigma_init_um: float = Field(0.25, gt=0, description="blur before fitting, µm")
+
+
+class BlurTable(Simulator):
+    """H = T(G_σ * M), T linear between one free height per level."""
+
+    name = "blur-table"
+    Config = BlurTableConfig
+    config: BlurTableConfig
+
+    def __init__(self, config: BlurTableConfig):
+        super().__init__(config)
+        self.tau = nn.Parameter(self.ranges["tau"].raw(config.sigma_init_um))
+        self.table_um = nn.Parameter(torch.arange(config.levels) * config.level_height_um)
+
+    @property
+    def ranges(self) -> dict[str, Range]:
+        return {"tau": Range("sigma_um", 0.0, self.config.sigma_max_um)}
+
+    @property
+    def sigma_um(self) -> Tensor:
+        """Blur, between 0 and ``sigma_max_um``."""
+        return self.ranges["tau"].value(self.tau)
+
+    @property
+    def reach_px(self) -> int:
+        return kernel_radius_px(float(self.sigma_um.detach()) / self.pitch_um)
+
+    def interior(self, layout_um: Tensor) -> Tensor:
+        dose = blur_interior(layout_um, self.sigma_um / self.pitch_um, self.reach_px)
+        return interpolate(dose, self.table_um, 0.0, self.config.full_height_um)
+
+
+class AffineMtfConfig(SimulatorConfig):
+    sigmas_um: tuple[float, ...] = Field((0.1, 0.2, 0.35, 0.6, 1.0, 1.8), min_length=1)
+
+
+class AffineMtf(Simulator):
+    """H = offset + Σ_j w_j (G_j * M): the transfer function is Σ_j w_j exp(-2π²σ_j²f²), its gain Σ_j w_j."""
+
+    name = "affine-mtf"
+    is_linear = True
+    Config = AffineMtfConfig
+    config: AffineMtfConfig
+
+    def __init__(self, config: AffineMtfConfig):
+        super().__init__(config)
+        weights = torch.zeros(len(config.sigmas_um))
+        weights[0] = 1.0
+        self.weights = nn.Parameter(weights)
+        self.offset_um = nn.Parameter(torch.tensor(0.0))
+
+    @property
+    def reach_px(self) -> int:
+        return kernel_radius_px(max(self.config.sigmas_um) / self.pitch_um)
+
+    def interior(self, layout_um: Tensor) -> Tensor:
+        blurred = [
+            blurred_interior(layout_um, sigma, self.pitch_um, self.reach_px)
+            for sigma in self.config.sigmas_um
+        ]
+        return self.offset_um + (self.weights * torch.stack(blurred, dim=-1)).sum(dim=-1)
+
+
+def blurred_interior(
+    layout_um: Tensor, sigma_um: float | tuple[float, float], pitch_um: float, reach_px: int
+) -> Tensor:
+    """One blur (a pair: along y, along x), cut to the pixels farther than ``reach_px`` from the edge."""
+    pair = sigma_um if isinstance(sigma_um, tuple) else (sigma_um, sigma_um)
+    radii = kernel_radius_px(pair[0] / pitch_um), kernel_radius_px(pair[1] / pitch_um)
+    rows, columns = (
+        slice(reach_px - radius, length - reach_px + radius)
+        for radius, length in zip(radii, layout_um.shape[-2:], strict=True)
+    )
+    y, x = (torch.tensor(sigma / pitch_um, device=layout_um.device) for sigma in pair)
+    return blur_interior(layout_um[..., rows, columns], (y, x), radii)
+
+
+class LinearConfig(SimulatorConfig):
+    sigmas_um: tuple[float, ...] = Field((0.1, 0.2, 0.35, 0.6, 1.0, 1.8, 3.0), min_length=1)
+    power_sigma_um: float = 0.25
+    power_reference_um: float = 0.5
+
+
+class Linear(Simulator):
+    """H = w · φ(M): Gaussian blurs, second to fourth power of one blur, its squared slopes, and 1.
+
+    The slopes along y and x have their own weights: the two axes of a print need not behave alike.
+    """
+
+    name = "linear"
+    is_linear = True
+    Config = LinearConfig
+    config: LinearConfig
+
+    def __init__(self, config: LinearConfig):
+        super().__init__(config)
+        weights = torch.zeros(len(config.sigmas_um) + 6)
+        weights[0] = 1.0
+        self.weights = nn.Parameter(weights)
+
+    @property
+    def reach_px(self) -> int:
+        return kernel_radius_px(max(self.config.sigmas_um) / self.pitch_um) + 1
+
+    def interior(self, layout_um: Tensor) -> Tensor:
+        return (self.weights * self.features(layout_um)).sum(dim=-1)
+
+    def features(self, layout_um: Tensor) -> Tensor:
+        """φ(M) of the interior, (b, 1, y, x, features)."""
+        config, reach = self.config, self.reach_px
+        blurs = [blurred_interior(layout_um, sigma, self.pitch_um, reach) for sigma in config.sigmas_um]
+        wide = blurred_interior(layout_um, config.power_sigma_um, self.pitch_um, reach - 1)
+        slope_y = (wide[..., 2:, 1:-1] - wide[..., :-2, 1:-1]) / (2 * self.pitch_um)
+        slope_x = (wide[..., 1:-1, 2:] - wide[..., 1:-1, :-2]) / (2 * self.pitch_um)
+        centred = crop_border(wide, 1) - config.power_reference_um
+        powers = [centred**2, centred**3, centred**4]
+        return torch.stack([*blurs, *powers, slope_y**2, slope_x**2, torch.ones_like(centred)], dim=-1)
