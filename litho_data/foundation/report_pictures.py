@@ -153,8 +153,7 @@ def _unfold_words(figure: Figure, shown: list[Axes], columns: int) -> float:
         axes.set_title(textwrap.fill(axes.get_title(), letters), fontsize=9)
         extra += 0.15 * axes.get_title().count("\n") / columns
         label = axes.get_ylabel() or (label if axes.get_shared_y_axes().get_siblings(axes)[1:] else "")
-        axes.set_ylabel(textwrap.fill(label, 40))
-        axes.set_xlabel(textwrap.fill(axes.get_xlabel(), letters))
+        axes.set(ylabel=textwrap.fill(label, 40), xlabel=textwrap.fill(axes.get_xlabel(), letters))
         if axes.xaxis.get_visible() and len(axes.get_xticks()):
             axes.tick_params(labelbottom=True, labelleft=True)
         if (old := axes.get_legend()) is not None and len(old.get_texts()) > 3:

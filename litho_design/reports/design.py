@@ -154,8 +154,6 @@ def _pictures(
         picture = axis.imshow(
             array, cmap=colours, vmin=low, vmax=high, extent=(0, extent, extent, 0), interpolation="nearest"
         )
-        axis.set_title(title)
-        axis.set_xlabel("x, µm")
-        axis.set_ylabel("y, µm")
+        axis.set(title=title, xlabel="x, µm", ylabel="y, µm")
         figure.colorbar(picture, ax=axis, label=unit, shrink=0.8)
     return figure

@@ -25,8 +25,7 @@ def write_front_report(folder: Path, result: FrontResult, printer: str) -> Path:
         axis.plot(shares, likeness, "o-" if on_front else "o", color=colour)
     for point in result.points:
         axis.annotate(f" {point.efficiency_weight:g}", (point.eff_signal, point.si_psnr_db))
-    axis.set_xlabel("power on the signal, share of incident")
-    axis.set_ylabel(f"{result.figure.replace('_', ' ')}")
+    axis.set(xlabel="power on the signal, share of incident", ylabel=f"{result.figure.replace('_', ' ')}")
     page.figure(figure, "Each point is a design, with the weight of the light that misses.")
     page.table([p.model_dump() for p in result.points], "The designs", "front.csv", digits=3)
     page.links([(f"{p.folder}/report.html", f"weight {p.efficiency_weight:g}") for p in result.points])

@@ -203,11 +203,9 @@ def _profiles(result: GapResult, judged: dict[str, tuple[LoadedDesign, dict[str,
             spectrum = np.abs(np.fft.rfft(psf.sum(0)))
             frequency = np.fft.rfftfreq(psf.shape[0], pitch)
             right.plot(frequency, spectrum, linewidth=width, color=model_colour(name))
-        left.set_xlim(-6, 6)
-        left.set_ylabel(f"designed with {arm}\nshare per pixel")
+        left.set(xlim=(-6, 6), ylabel=f"designed with {arm}\nshare per pixel")
         left.legend(fontsize=7)
-        right.set_xlim(0, 0.6)
-        right.set_ylabel("|spectrum|")
+        right.set(xlim=(0, 0.6), ylabel="|spectrum|")
     axes[-1, 0].set_xlabel("x, µm")
     axes[-1, 1].set_xlabel("cycles/µm")
     return figure

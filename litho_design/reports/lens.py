@@ -38,25 +38,19 @@ def _curves(design: Design, height: np.ndarray, psf: np.ndarray, ideal: np.ndarr
     axes[0].plot(x, height[middle, middle:], label="print")
     wanted = bench.ideal_height_um().cpu().numpy()[middle, middle:]
     axes[0].plot(x, wanted, color="#9aa7b5", linewidth=0.8, label="perfect lens", zorder=0)
-    axes[0].set_xlim(0, min(30, x[-1]))
-    axes[0].set_xlabel("distance from the centre, µm")
-    axes[0].set_ylabel("height, µm")
+    axes[0].set(xlim=(0, min(30, x[-1])), xlabel="distance from the centre, µm", ylabel="height, µm")
     across = bench.window.x_um
     row = psf.shape[0] // 2
     axes[1].plot(across, ideal[row] / ideal.max(), color="#9aa7b5", label="perfect lens")
     axes[1].plot(across, psf[row] / ideal.max(), label="print")
-    axes[1].set_xlim(-6, 6)
-    axes[1].set_xlabel("x, µm")
-    axes[1].set_ylabel("PSF over ideal peak")
+    axes[1].set(xlim=(-6, 6), xlabel="x, µm", ylabel="PSF over ideal peak")
     frequency = np.arange(psf.shape[0] // 2) / (psf.shape[0] * design.layout.pitch_um)
     for image, label, colour in ((ideal, "perfect lens", "#9aa7b5"), (psf, "print", "C0")):
         curve = mtf(torch.from_numpy(image))[0, : len(frequency)].numpy()
         axes[2].plot(frequency, curve, label=label, color=colour)
     cutoff = 2 * bench.numerical_aperture / design.optics.wavelength_um
     axes[2].axvline(cutoff, color="#9aa7b5", linewidth=0.8)
-    axes[2].set_xlim(0, 1.15 * cutoff)
-    axes[2].set_xlabel("cycles/µm")
-    axes[2].set_ylabel("MTF")
+    axes[2].set(xlim=(0, 1.15 * cutoff), xlabel="cycles/µm", ylabel="MTF")
     for axis in axes:
         axis.legend(fontsize=8)
     return figure

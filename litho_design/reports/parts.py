@@ -44,8 +44,7 @@ def progress_figure(history: list[dict[str, float]], design: Design):
     axis.plot(steps, [entry["sample_loss"] for entry in history], color="#9aa7b5", label="sampled layout")
     axis.plot(steps, [entry["argmax_loss"] for entry in history], color="#2f7fd0", label="printable layout")
     axis.axhline(design.polished_loss, color="#3a9142", linewidth=1, label="after polish")
-    axis.set_xlabel("iteration")
-    axis.set_ylabel("loss")
+    axis.set(xlabel="iteration", ylabel="loss")
     axis.legend()
     return figure
 

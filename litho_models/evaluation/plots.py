@@ -105,9 +105,7 @@ def line_profiles(
     for name, prediction in predictions_um.items():
         matched = scan.height_um[row] - residual_um(scan, prediction, protocol)[row]
         axes.plot(x_um, matched, lw=1, color=model_colour(name), label=name)
-    axes.set_xlabel("x, µm")
-    axes.set_ylabel("height, µm")
-    axes.set_xlim(0, min(x_um[-1], 30))
+    axes.set(xlabel="x, µm", ylabel="height, µm", xlim=(0, min(x_um[-1], 30)))
     axes.legend(ncols=4, fontsize=8)
     return figure
 
@@ -142,11 +140,9 @@ def transfer(scores: Sequence[ModelScores]) -> Figure:
             axes.plot(curves.frequency_per_um, along_y, color=colour, lw=1, ls="--")
     left, middle, right = panels
     left.axhline(1, color="#9aa7b5", lw=0.8)
-    left.set_ylim(0, 2)
-    left.set_ylabel("predicted over measured")
+    left.set(ylim=(0, 2), ylabel="predicted over measured")
     middle.set_ylabel("coherence γ²")
-    right.set_yscale("log")
-    right.set_ylabel("error, nm² per cycle/µm")
+    right.set(yscale="log", ylabel="error, nm² per cycle/µm")
     for axes in panels:
         axes.set_xlabel("spatial frequency, 1/µm (solid x, dashed y)")
     left.legend(fontsize=8)
@@ -165,8 +161,10 @@ def loss_curves(fits: Sequence[FitRecord]) -> Figure:
         axes.plot(fit.steps, fit.training_mae_nm, color=colour, lw=1.2, label=label)
         validation = [np.nan if value is None else value for value in fit.validation_mae_datum_free_nm]
         axes.plot(fit.steps, validation, color=colour, lw=1, ls="--")
-    axes.set_xlabel("optimiser steps")
-    axes.set_ylabel("MAE, nm (solid: training, nuisances out;\ndashed: inner validation, datum-free)")
+    axes.set(
+        xlabel="optimiser steps",
+        ylabel="MAE, nm (solid: training, nuisances out;\ndashed: inner validation, datum-free)",
+    )
     axes.legend(fontsize=8)
     return figure
 
@@ -201,7 +199,9 @@ def print_gains(score: ModelScores) -> Figure:
             axes.add_patch(Ellipse((gain, offset_nm), major, minor, angle=angle, fill=False, color=colour))
     axes.axvline(1.0, color="#9aa7b5", lw=0.8)
     axes.axhline(0.0, color="#9aa7b5", lw=0.8)
-    axes.set_xlabel(f"gain: measured height per height predicted by {score.model}")
-    axes.set_ylabel("offset at predicted height zero, nm")
+    axes.set(
+        xlabel=f"gain: measured height per height predicted by {score.model}",
+        ylabel="offset at predicted height zero, nm",
+    )
     axes.legend(title="print", fontsize=8)
     return figure

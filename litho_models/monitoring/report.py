@@ -64,8 +64,7 @@ def control_chart(result: Check, one: FigureCheck) -> Figure:
     for sign in (-1, 1):
         axes.axhline(sign * 100 * one.tolerance, color="#d99b00", ls="--", lw=1)
     axes.axvline(one.reference_prints - 0.5, color="#1c2430", lw=0.8, ls=":")
-    axes.set_xlabel("print, in printing order")
-    axes.set_ylabel("against the reference, %")
+    axes.set(xlabel="print, in printing order", ylabel="against the reference, %")
     axes.set_title(watched.words, fontsize=10)
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8, ncols=2)

@@ -70,8 +70,7 @@ def steps(found: StepPrint) -> Figure:
             label=f"by means over {found.area_um2:g} µm²: {found.resolvable_step_area_nm:.1f} nm",
         )
     axes.set_xticks(number)
-    axes.set_xlabel("step")
-    axes.set_ylabel("height, nm")
+    axes.set(xlabel="step", ylabel="height, nm")
     axes.legend(fontsize=8)
     return figure
 
@@ -91,8 +90,7 @@ def dose(found: DoseMatrix) -> Figure:
             lw=1,
             label=f"{row.dose:.3g}",
         )
-    left.set_xlabel("level")
-    left.set_ylabel("printed height above the lowest level, nm")
+    left.set(xlabel="level", ylabel="printed height above the lowest level, nm")
     left.legend(fontsize=7, title="dose", title_fontsize=7)
     middle.plot(doses, [row.roughness_nm for row in found.rows], "o-", color="#c23b22", ms=4)
     middle.set_ylabel("roughness, nm")
@@ -143,6 +141,5 @@ def calibration(found: SpreadAnalysis) -> Figure:
     left.set_ylabel("pixels inside the 90 % interval, %")
     left.legend(fontsize=8)
     right.axhline(1, color="#9aa7b5", lw=1)
-    right.set_xlabel("Φ(residual / σ)")
-    right.set_ylabel("density (flat where σ is right)")
+    right.set(xlabel="Φ(residual / σ)", ylabel="density (flat where σ is right)")
     return figure

@@ -47,8 +47,7 @@ def staircase_figure(frame: pd.DataFrame) -> Figure:
             f"{value:.1f}", (high, position), (5, 0), textcoords="offset points", va="center", fontsize=9
         )
     axes.set_yticks(y, frame["model"])
-    axes.set_xlim(0, 1.12 * float(frame["high"].max()))
-    axes.set_xlabel("mean absolute error on held-out scans (nm)")
+    axes.set(xlim=(0, 1.12 * float(frame["high"].max())), xlabel="mean absolute error on held-out scans (nm)")
     axes.spines[["top", "right"]].set_visible(False)
     return figure
 
@@ -75,8 +74,7 @@ def map_figure(findings: LoopFindings, before: Score, after: Score) -> Figure:
                 interpolation="nearest",
             )  # fmt: skip
             panel.set_title(f"{scan.id} {label}: {s.mae_nm[at]:.1f} nm", fontsize=10)
-            panel.set_xlabel("x (µm)" if row else "")
-            panel.set_ylabel("" if column else "y (µm)")
+            panel.set(xlabel="x (µm)" if row else "", ylabel="" if column else "y (µm)")
     figure.colorbar(axes[0, 0].images[0], ax=axes, label="measured - predicted (nm)", shrink=0.6)
     return figure
 
@@ -131,8 +129,7 @@ def _copy_figure(probe: DisplacedCopy, common: np.ndarray) -> Figure:
     figure.colorbar(points, ax=axes, label="gain of one copy (nm²)")
     axes.set_aspect("equal")
     axes.invert_yaxis()
-    axes.set_xlabel("displaced along x (µm)")
-    axes.set_ylabel("displaced along y (µm)")
+    axes.set(xlabel="displaced along x (µm)", ylabel="displaced along y (µm)")
     return figure
 
 
@@ -171,8 +168,7 @@ def _table_figure(entry: AddedProbe) -> Figure:
         axes.errorbar(places, table["height"], errors, fmt="o-", color=colour, ms=4, capsize=2, label=label)
     if len(axes.containers) > 1:
         axes.legend(frameon=False)
-    axes.set_xlabel(_TABLES[entry.probe.name])
-    axes.set_ylabel("missing height (nm)")
+    axes.set(xlabel=_TABLES[entry.probe.name], ylabel="missing height (nm)")
     axes.spines[["top", "right"]].set_visible(False)
     return figure
 
@@ -182,8 +178,7 @@ def _profile_figure(values: np.ndarray, along: str, unit: str) -> Figure:
     axes = figure.subplots()
     axes.axhline(0, color=LIGHT["ink"], lw=0.6)
     axes.plot(np.linspace(0, 1, len(values)), values, color=_AFTER)
-    axes.set_xlabel(f"{along}s, from the first to the last")
-    axes.set_ylabel(unit)
+    axes.set(xlabel=f"{along}s, from the first to the last", ylabel=unit)
     axes.spines[["top", "right"]].set_visible(False)
     return figure
 
@@ -200,8 +195,7 @@ def _image(values: np.ndarray, half: tuple[float, float], label: str, shown: flo
         values, cmap="RdBu_r", vmin=-limit, vmax=limit,
         extent=(-half[1], half[1], half[0], -half[0]),
     )  # fmt: skip
-    axes.set_xlim(-shown, shown)
-    axes.set_ylim(shown, -shown)
+    axes.set(xlim=(-shown, shown), ylim=(shown, -shown))
     figure.colorbar(picture, ax=axes, label=label)
     return figure
 
