@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.units import is_length, um_per
-from litho_data.readers.reader import Channel, Reader
+from litho_data.readers.reader import Channel, Reader, extent_um
 
 _MAGIC = b"Gwyddion Simple Field 1.0\n"
 _ITEM = 4
@@ -69,14 +68,10 @@ def _count(path: Path, header: dict[str, str], key: str) -> int:
 
 
 def _size_um(header: dict[str, str]) -> tuple[float, float] | None:
-    unit = header.get("XYUnits", "")
-    if not is_length(unit):
-        return None
     try:
-        size = float(header["YReal"]) * um_per(unit), float(header["XReal"]) * um_per(unit)
+        return extent_um(float(header["YReal"]), float(header["XReal"]), header.get("XYUnits"))
     except (KeyError, ValueError):
         return None
-    return size if all(np.isfinite(size)) and min(size) > 0 else None
 
 
 def gsf_bytes(height_um: np.ndarray, pitch_um: tuple[float, float] | None, title: str = "") -> bytes:

@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.units import is_length, um_per
 from litho_data.readers.confined import confined
-from litho_data.readers.reader import Channel, Loaded, Reader, foreign_parser, with_unique_names
+from litho_data.readers.reader import Channel, Loaded, Reader, extent_um, foreign_parser, with_unique_names
 
 _MAGIC = b"GWYP"
 _SCALAR_BYTES = {"b": 1, "c": 1, "i": 4, "q": 8, "d": 8}
@@ -49,7 +48,7 @@ def _channel(path: Path, container: Any, key: str) -> Channel:
         name=str(container.get(f"{key}/title", f"channel {number}")),
         shape=shape,
         unit=_unit(field, "si_unit_z"),
-        size_um=_size_um(field),
+        size_um=extent_um(field["yreal"], field["xreal"], _unit(field, "si_unit_xy")),
         load=partial(_load, path, key, shape),
         header=_header(container.get(f"/{number}/meta")),
     )
@@ -79,14 +78,6 @@ def _unit(field: Any, key: str) -> str | None:
     """None if Gwyddion states no unit, as it does for pure numbers."""
     unit = field.get(key)
     return None if unit is None else str(unit.get("unitstr", "")) or None
-
-
-def _size_um(field: Any) -> tuple[float, float] | None:
-    unit = _unit(field, "si_unit_xy")
-    if unit is None or not is_length(unit):
-        return None
-    size = float(field["yreal"]) * um_per(unit), float(field["xreal"]) * um_per(unit)
-    return size if all(np.isfinite(size)) and min(size) > 0 else None
 
 
 def _header(meta: Any) -> dict[str, str]:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.units import is_length
+from litho_data.foundation.units import is_length, um_per
 from litho_data.scan import Axis
 
 # 2 GiB as float64: beyond it, a damaged header is far more likely than a scan.
@@ -85,6 +85,14 @@ class Reader:
     recognises: Callable[[Path, bytes], bool]
     read_channels: Callable[[Path], list[Channel]]
     self_describing: bool = True
+
+
+def extent_um(y: float, x: float, unit: str | None) -> tuple[float, float] | None:
+    """(y, x) in µm of an extent as a file states it; None without a length of two positive numbers."""
+    if unit is None or not is_length(unit):
+        return None
+    size = float(y) * um_per(unit), float(x) * um_per(unit)
+    return size if all(np.isfinite(size)) and min(size) > 0 else None
 
 
 def with_unique_names(channels: list[Channel]) -> list[Channel]:

@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.units import is_length, um_per
 from litho_data.readers.confined import confined
-from litho_data.readers.reader import Channel, Loaded, Reader, foreign_parser, with_unique_names
+from litho_data.readers.reader import Channel, Loaded, Reader, extent_um, foreign_parser, with_unique_names
 from litho_data.scan import Axis
 
 # Left out: formats with readers of our own, plain text, and two without a signature, which would accept
@@ -127,18 +126,11 @@ def _channel(path: Path, kind: str, info: Any, header: dict[str, str]) -> Channe
         name=str(info.name),
         shape=(int(ny), int(nx)),
         unit=unit,
-        size_um=_size_um(sizes, lateral_unit),
+        size_um=None if sizes is None else extent_um(sizes[1], sizes[0], lateral_unit),
         load=partial(_load, path, kind, info.index, sizes is None),
         fast_axis=_fast_axis(header),
         header=header or dict(_flatten(info.info.get("raw_metadata", info.info))),
     )
-
-
-def _size_um(sizes: Any, unit: str | None) -> tuple[float, float] | None:
-    if sizes is None or unit is None or not is_length(unit):
-        return None
-    size = float(sizes[1]) * um_per(unit), float(sizes[0]) * um_per(unit)
-    return size if all(np.isfinite(size)) and min(size) > 0 else None
 
 
 def _load(path: Path, kind: str, index: int, without_size: bool) -> Loaded:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 from zipfile import BadZipFile
 
 import numpy as np
@@ -13,6 +13,8 @@ from litho_data.foundation.errors import InputError
 if TYPE_CHECKING:
     import pandas as pd
     import zarr
+
+T = TypeVar("T")
 
 
 def open_root(path: str | Path) -> zarr.Group:
@@ -48,12 +50,7 @@ def group_of(parent: zarr.Group, name: str) -> zarr.Group:
     """
     import zarr
 
-    child = _child(parent, name)
-    if not isinstance(child, zarr.Group):
-        raise InputError(
-            f"group {name} of {parent.store_path}", got="none", wanted="a store made by litho-data"
-        )
-    return child
+    return _of_kind(parent, name, zarr.Group, "group")
 
 
 def array_of(parent: zarr.Group, name: str) -> zarr.Array:
@@ -64,12 +61,7 @@ def array_of(parent: zarr.Group, name: str) -> zarr.Array:
     """
     import zarr
 
-    child = _child(parent, name)
-    if not isinstance(child, zarr.Array):
-        raise InputError(
-            f"array {name} of {parent.store_path}", got="none", wanted="a store made by litho-data"
-        )
-    return child
+    return _of_kind(parent, name, zarr.Array, "array")
 
 
 def has_child(parent: zarr.Group, name: str) -> bool:
@@ -143,6 +135,14 @@ def _child(parent: zarr.Group, name: str) -> Any:
         return parent.get(name)
     except Exception as error:  # zarr lets the errors of its metadata parsers through
         raise InputError(f"metadata of {name} in {parent.store_path} is damaged", got=str(error)) from error
+
+
+def _of_kind(parent: zarr.Group, name: str, kind: type[T], what: str) -> T:
+    child = _child(parent, name)
+    if not isinstance(child, kind):
+        wanted = "a store made by litho-data"
+        raise InputError(f"{what} {name} of {parent.store_path}", got="none", wanted=wanted)
+    return child
 
 
 def _plain(values: np.ndarray) -> np.ndarray:

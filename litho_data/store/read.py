@@ -103,6 +103,11 @@ class PrintedScan:
         return round(math.atan2(along[1], along[0]) / (math.pi / 2)) % 4
 
     @property
+    def usable(self) -> np.ndarray:
+        """Measured pixels, bool (ny, nx)."""
+        return np.asarray(self.valid, bool) & np.isfinite(self.height_um)
+
+    @property
     def layout_um(self) -> np.ndarray:
         """Nominal height, float32 (ny, nx), µm."""
         return self.mask_level.astype(np.float32) * np.float32(self.level_height_um)

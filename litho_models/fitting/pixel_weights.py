@@ -23,7 +23,7 @@ def pixel_weights(scan: PrintedScan, weights: Weights) -> np.ndarray:
     Raises:
         InputError: ``sigma`` for a scan without σ.
     """
-    usable = scan.valid & np.isfinite(scan.height_um)
+    usable = scan.usable
     if weights == "uniform":
         return usable.astype(np.float32)
     sigma_um = scan.height_sigma_um
@@ -37,6 +37,14 @@ def pixel_weights(scan: PrintedScan, weights: Weights) -> np.ndarray:
         )
     inverse = np.divide(1.0, sigma_um, out=np.zeros(scan.shape), where=known)
     return (inverse / inverse[known].mean()).astype(np.float32)
+
+
+def grid_pixels(scan: PrintedScan, count: int) -> np.ndarray:
+    """Flat indices of the measured pixels on a square grid of about ``count`` pixels."""
+    step = max(1, round((scan.usable.size / count) ** 0.5))
+    grid = np.zeros_like(scan.usable)
+    grid[::step, ::step] = True
+    return np.flatnonzero(scan.usable & grid)
 
 
 class Weighted:

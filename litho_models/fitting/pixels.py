@@ -15,12 +15,12 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.fitting.checkpoint import RoundRecord
 from litho_models.fitting.config import TrainingConfig
-from litho_models.fitting.pixel_weights import Weights, pixel_weights
+from litho_models.fitting.pixel_weights import Weights, grid_pixels, pixel_weights
 from litho_models.fitting.stochastic import learning_rate, validation_error
 from litho_models.layers.gaussian import pad_field
 from litho_models.models.pbl import Pbl
-from litho_models.scan_terms import FloatMap, TermPixels, Terms, least_squares, line_terms, term_maps
-from litho_models.scan_terms.training import PINNED, training_terms
+from litho_models.scan_terms import FloatMap, TermPixels, Terms, least_squares, term_maps
+from litho_models.scan_terms.training import PINNED, smooth_training_terms
 
 # Pixels of all scans together, on a square grid in each: 100 MB of features.
 FITTED_PX = 2**18
@@ -52,8 +52,7 @@ def fit_feature_networks(
         nothing.
     """
     started = time.monotonic()
-    terms = training_terms(config.nuisance, config.free_gain)
-    terms -= {term.name for term in line_terms(terms)}
+    terms = smooth_training_terms(config.nuisance, config.free_gain)
     count = FITTED_PX // len(scans)
     parts = [
         _pixels(model, scan, terms, count, config.weights) for scan in progress(scans, "features of pixels")
@@ -114,11 +113,7 @@ def _targets(parts: Sequence[_Pixels], heights: Callable[[Tensor], Tensor], pinn
 
 
 def _pixels(model: Pbl, scan: PrintedScan, terms: Terms, count: int, weights: Weights) -> _Pixels:
-    usable = scan.valid & np.isfinite(scan.height_um)
-    step = max(1, round((usable.size / count) ** 0.5))
-    grid = np.zeros_like(usable)
-    grid[::step, ::step] = True
-    at = np.flatnonzero(usable & grid)
+    at = grid_pixels(scan, count)
     chosen = torch.from_numpy(at)
     with torch.no_grad():
         layout = pad_field(torch.from_numpy(scan.layout_um)[None, None], model.reach_px, model.reach_px)

@@ -10,11 +10,11 @@ import torch
 from litho_data.foundation.commands import progress
 from litho_data.store import PrintedScan
 from litho_models.fitting.least_squares import ABSOLUTE_WIDTH_UM, Linearised, eliminated, orthonormal
-from litho_models.fitting.pixel_weights import Weights, pixel_weights
+from litho_models.fitting.pixel_weights import Weights, grid_pixels, pixel_weights
 from litho_models.layers.gaussian import pad_field
 from litho_models.models.features import Features, RandomFeatures
-from litho_models.scan_terms import FloatMap, Policy, TermPixels, Terms, least_squares, line_terms, term_maps
-from litho_models.scan_terms.training import training_terms
+from litho_models.scan_terms import FloatMap, Policy, TermPixels, Terms, least_squares, term_maps
+from litho_models.scan_terms.training import smooth_training_terms
 
 # Relative to the mean square of each feature, what scans may add taken out: only what the scans cannot tell
 # apart feels it. On the measured prints nothing changes from 1e-6 to 1e-4.
@@ -48,8 +48,7 @@ def fit_ridge(
     Returns:
         mean absolute residual before the last pass, µm, the terms of the scans taken out.
     """
-    terms = training_terms(policy, free_gain)
-    terms -= {term.name for term in line_terms(terms)}
+    terms = smooth_training_terms(policy, free_gain)
     if isinstance(model, RandomFeatures):
         _standardise(model, scans)
     solved: FloatMap | None = None
@@ -90,7 +89,7 @@ def _rows(
     model: Features, scan: PrintedScan, terms: Terms, weights: Weights
 ) -> tuple[FloatMap, FloatMap, FloatMap]:
     """Features (k, n), measured height (n,) µm and the scan's own terms (m, n), fitted pixels, weighted."""
-    at = _fitted_pixels(scan)
+    at = grid_pixels(scan, FITTED_PX)
     height = scan.height_um.reshape(-1)[at].astype(np.float64)
     own = pixel_weights(scan, weights).reshape(-1)[at].astype(np.float64)
     basis = term_maps(TermPixels(scan.layout_um, at=at), terms)
@@ -116,18 +115,10 @@ def feature_rows(model: Features, scan: PrintedScan, at: np.ndarray) -> FloatMap
     return found
 
 
-def _fitted_pixels(scan: PrintedScan) -> np.ndarray:
-    usable = scan.valid & np.isfinite(scan.height_um)
-    step = max(1, round((usable.size / FITTED_PX) ** 0.5))
-    grid = np.zeros_like(usable)
-    grid[::step, ::step] = True
-    return np.flatnonzero(usable & grid)
-
-
 def _standardise(model: RandomFeatures, scans: Sequence[PrintedScan]) -> None:
     """Measure what the random features see: mean over all scans, spread within them."""
     count = len(model.centre)
-    seen = [feature_rows(model, scan, _fitted_pixels(scan))[:count] for scan in scans]
+    seen = [feature_rows(model, scan, grid_pixels(scan, FITTED_PX))[:count] for scan in scans]
     centre = np.mean([one.mean(axis=1) for one in seen], axis=0)
     spread = np.sqrt(np.mean([one.var(axis=1) for one in seen], axis=0))
     model.standardise(

@@ -14,8 +14,8 @@ from litho_data.store import PrintedScan
 from litho_models.fitting.crops import Window, cut, stack
 from litho_models.fitting.least_squares import Linearised, Problem, Room, Rules, fit_least_squares
 from litho_models.fitting.pixel_weights import Weighted, Weights, pixel_weights
-from litho_models.scan_terms import Policy, TermPixels, Terms, line_terms, term_maps
-from litho_models.scan_terms.training import PINNED, training_terms
+from litho_models.scan_terms import Policy, TermPixels, Terms, term_maps
+from litho_models.scan_terms.training import PINNED, smooth_training_terms
 from litho_models.simulator import Simulator
 
 # A small model needs no more than a quarter of each scan: another quadrant from scan to scan.
@@ -44,8 +44,7 @@ def fit_small_model(
     parameters = list(model.parameters())
     if not parameters:
         return []
-    terms = training_terms(policy, free_gain)
-    terms -= {term.name for term in line_terms(terms)}
+    terms = smooth_training_terms(policy, free_gain)
     rules = replace(RULES, pinned=len(PINNED & terms))
     problem: Problem = ModelProblem(model, scans, terms)
     if weights != "uniform":

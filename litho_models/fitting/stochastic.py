@@ -108,7 +108,7 @@ class _Targets:
     ):
         self.layouts_um = [np.pad(scan.layout_um, overhang_px, mode="edge") for scan in scans]
         self.shapes = [layout.shape for layout in self.layouts_um]
-        usable = [scan.valid & np.isfinite(scan.height_um) for scan in scans]
+        usable = [scan.usable for scan in scans]
         self.weights = [np.pad(pixel_weights(scan, weights), overhang_px) for scan in scans]
         heights = [
             np.where(mask, scan.height_um - added, 0).astype(np.float32)

@@ -106,8 +106,7 @@ def _prepare(scan: PrintedScan, order: float) -> PreparedScan:
         backward=scan.direction == -1,
         new_tip=scan.tip not in (None, 1),
     )
-    usable = np.asarray(scan.valid, bool) & np.isfinite(scan.height_um)
-    return _thinned(scan, context, usable, usable & _inner(scan.shape), line)
+    return _thinned(scan, context, scan.usable, scan.usable & _inner(scan.shape), line)
 
 
 def _with_quadrant(scan: PreparedScan, number: int) -> PreparedScan:

@@ -74,7 +74,7 @@ def close_loop_on_store(
     new = [scan for path in new_prints for scan in _new_scans(opened, open_store(path))]
     simulator, name = _base_model(base, opened)
     scans = opened.scans()
-    usable = [scan for scan in scans if np.count_nonzero(scan.valid & np.isfinite(scan.height_um)) >= 1024]
+    usable = [scan for scan in scans if np.count_nonzero(scan.usable) >= 1024]
     kept = {scan.id for scan in usable}
     dropped = [f"{scan.id}: fewer than 1024 measured pixels" for scan in scans if scan.id not in kept]
     trainer, kept_in = None, Path(cache or f"{out}-cache")

@@ -182,7 +182,7 @@ def _plateaus(scan: PrintedScan, guard_um: float) -> np.ndarray:
 
     size = 2 * round(guard_um / scan.pitch_um) + 1
     even = maximum_filter(scan.mask_level, size) == minimum_filter(scan.mask_level, size)
-    return even & scan.valid & np.isfinite(scan.height_um)
+    return even & scan.usable
 
 
 def _pooled_sd(parts: Sequence[np.ndarray]) -> float:

@@ -65,9 +65,7 @@ def learn_background(scans: Sequence[PrintedScan], predictions_um: Sequence[np.n
         scans: the scans that the model was fitted to, of one size; ``predictions_um``: its heights (ny, nx).
     """
     coefficients = [
-        fitted_terms(scan.height_um, prediction, scan.valid & np.isfinite(scan.height_um), POLICIES["full"])[
-            0
-        ]
+        fitted_terms(scan.height_um, prediction, scan.usable, POLICIES["full"])[0]
         for scan, prediction in zip(scans, predictions_um, strict=True)
     ]
     x, y, xx, xy, yy = (NM_PER_UM * np.mean(coefficients, axis=0)[2:]).tolist()

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from litho_data.store import PrintedScan
-from litho_models.scan_terms.blocks import Blocks, BoolMap
+from litho_models.scan_terms.blocks import Blocks
 from litho_models.scan_terms.cross_fit import fitted_terms
 from litho_models.scan_terms.lines import shrunk_line_offsets
 from litho_models.scan_terms.policies import Policy, policy_terms
@@ -26,6 +26,12 @@ def training_terms(policy: Policy, free_gain: bool = False) -> Terms:
     return policy_terms(policy) - (frozenset() if free_gain else {"gain"})
 
 
+def smooth_training_terms(policy: Policy, free_gain: bool = False) -> Terms:
+    """Those without offsets of lines, which average out over a scan and cannot move a small model."""
+    terms = training_terms(policy, free_gain)
+    return terms - {term.name for term in line_terms(terms)}
+
+
 def estimate_scan_terms(
     scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray], terms: Terms
 ) -> list[np.ndarray]:
@@ -34,7 +40,7 @@ def estimate_scan_terms(
     For training only: a reported error takes its terms from ``cross_fit``.
     """
     fitted = [
-        fitted_terms(scan.height_um, prediction, _usable(scan), terms)[0]
+        fitted_terms(scan.height_um, prediction, scan.usable, terms)[0]
         for scan, prediction in zip(scans, predictions_um, strict=True)
     ]
     coefficients = np.array(fitted)
@@ -52,12 +58,7 @@ def estimate_scan_terms(
 
 
 def _row_offsets(scan: PrintedScan, prediction: np.ndarray, smooth: np.ndarray) -> np.ndarray:
-    usable = _usable(scan)
-    residual = np.where(usable, scan.height_um - prediction - smooth, 0.0)
+    residual = np.where(scan.usable, scan.height_um - prediction - smooth, 0.0)
     rows = row_index(scan.shape)
-    offsets, _, _ = shrunk_line_offsets(residual, usable, rows, Blocks().block_px)
+    offsets, _, _ = shrunk_line_offsets(residual, scan.usable, rows, Blocks().block_px)
     return offsets[rows]
-
-
-def _usable(scan: PrintedScan) -> BoolMap:
-    return scan.valid & np.isfinite(scan.height_um)

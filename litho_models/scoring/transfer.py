@@ -81,7 +81,7 @@ def transfer_curves(scans: Sequence[PrintedScan], predictions_um: Sequence[np.nd
     frequency = (edges[1:] + edges[:-1]) / 2
     along_x, along_y = np.zeros((5, TRANSFER_BANDS)), np.zeros((5, TRANSFER_BANDS))
     for scan, prediction in zip(scans, predictions_um, strict=True):
-        usable = scan.valid & np.isfinite(scan.height_um)
+        usable = scan.usable
         height = np.where(usable, scan.height_um, prediction)
         along_x += _band_powers(height, prediction, pitch, edges)
         along_y += _band_powers(height.T, prediction.T, pitch, edges)
