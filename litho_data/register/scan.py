@@ -16,9 +16,8 @@ from litho_data.register.evidence import BlockShifts, height_correlation, mutual
 from litho_data.register.figures import figures_of_evidence, figures_of_fit, figures_of_warp
 from litho_data.register.flows import Model
 from litho_data.register.geometry import apply_transform, index_to_um, orient, orientation_matrix, slow_axis
-from litho_data.register.ladder import climb
 from litho_data.register.orientation import rival_alignment
-from litho_data.register.pyramid import FineFit, refine_bent, refine_pyramid
+from litho_data.register.pyramid import FineFit, climb, refine_bent, refine_pyramid
 from litho_data.register.quality import RegistrationQuality, Thresholds, judge, unregistered_quality
 from litho_data.register.refine import Refinement
 from litho_data.register.resample import Resampler, noise_variance_factor, resample_to_layout

@@ -19,13 +19,12 @@ from litho_models.frozen.files import load_simulator
 from litho_models.loop.result.questions import OpenQuestions
 from litho_models.loop.run import MODEL_FOLDER
 from litho_models.planning import answers
-from litho_models.planning.designer import Designer, as_tensor, random_level
+from litho_models.planning.designer import WORDS, Designer, as_tensor, random_level, ways_without_rivals
 from litho_models.planning.folder import HOLDS, write_plan
 from litho_models.planning.layouts import STEPS, Limits, assemble
 from litho_models.planning.record import NextPrint, PlannedQuestion, PlannedScan
 from litho_models.planning.report import write_report
 from litho_models.planning.rivalry import PlannedPrint, Printing, Rivalry, Way
-from litho_models.planning.ways import WORDS, ways_without_rivals
 
 # Prints on which the rivals are compared at last; the others are made of the same tiles.
 _JUDGED = 2

@@ -13,7 +13,7 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.scan_terms import POLICIES, Blocks, cross_fit
 from litho_models.scan_terms.cross_fit import fitted_terms
-from litho_models.scoring.print_gain import print_gain
+from litho_models.scoring.metrics import print_gain
 
 _SURFACE = frozenset({"offset", "bow"})
 

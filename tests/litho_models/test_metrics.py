@@ -7,8 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 from litho_data.foundation.errors import InputError
-from litho_models.scoring.metrics import score_scan
-from litho_models.scoring.print_gain import print_gain
+from litho_models.scoring.metrics import print_gain, score_scan
 from litho_models.scoring.statistics import bootstrap_interval, paired_difference, smallest_flip_p
 
 VALID = np.ones((256, 256), bool)
