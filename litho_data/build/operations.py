@@ -5,14 +5,14 @@ A build runs them, ``replay`` runs them again from the record; nothing else make
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from litho_data.build.step import Arrays, Facts, Operation
+from litho_data.build.step import Facts, Files, Function, Inputs, Made, Operation, Params
 from litho_data.foundation.errors import InputError
 
 if TYPE_CHECKING:
@@ -23,6 +23,19 @@ UNREGISTERED = "registration failed"
 _OBLONG = 0.01
 
 
+OPERATIONS: dict[str, Operation] = {}
+
+
+def _operation(name: str, *code: str) -> Callable[[Function], Function]:
+    """Make a function the operation of that name; its result depends on ``code`` and this file."""
+
+    def made(function: Function) -> Function:
+        OPERATIONS[name] = Operation(name, "1", function, (*code, "build/operations.py"))
+        return function
+
+    return made
+
+
 def load_recipe(path: Path | None) -> dict[str, Any]:
     """A levelling recipe in canonical form; without a file, the empty one."""
     from litho_data.level import Recipe
@@ -30,9 +43,8 @@ def load_recipe(path: Path | None) -> dict[str, Any]:
     return (Recipe() if path is None else Recipe.from_toml(path)).canonical()
 
 
-def _read_layout(
-    params: Mapping[str, Any], files: Sequence[Path], _: Mapping[str, np.ndarray]
-) -> tuple[Arrays, Facts]:
+@_operation("read-layout", "readers")
+def _read_layout(params: Params, files: Files, _: Inputs) -> Made:
     from litho_data.readers import read_layout
 
     level = read_layout(files[0])
@@ -42,9 +54,8 @@ def _read_layout(
     return {"mask_level": level}, {}
 
 
-def _read_scan(
-    params: Mapping[str, Any], files: Sequence[Path], _: Mapping[str, np.ndarray]
-) -> tuple[Arrays, Facts]:
+@_operation("read-scan", "readers", "scan.py", "foundation/units.py")
+def _read_scan(params: Params, files: Files, _: Inputs) -> Made:
     from litho_data.readers import read_scan
 
     size = params["size_um"]
@@ -63,9 +74,8 @@ def _read_scan(
     return arrays, facts
 
 
-def _calibrate(
-    params: Mapping[str, Any], files: Sequence[Path], _: Mapping[str, np.ndarray]
-) -> tuple[Arrays, Facts]:
+@_operation("calibrate", "readers", "roughness", "build/calibration.py")
+def _calibrate(params: Params, files: Files, _: Inputs) -> Made:
     """Scales of the microscope, from scans of what has a known size."""
     from litho_data.build.calibration import SCALES, measure_scales
 
@@ -84,9 +94,8 @@ def _z_scale(arrays: Mapping[str, np.ndarray]) -> tuple[float, float]:
     return factor, uncertainty / factor
 
 
-def _locate(
-    params: Mapping[str, Any], _: Sequence[Path], arrays: Mapping[str, np.ndarray]
-) -> tuple[Arrays, Facts]:
+@_operation("locate", "register", "level")
+def _locate(params: Params, _: Files, arrays: Inputs) -> Made:
     """Where the layout lies in the scan before levelling, for layout-aware levelling."""
     from litho_data.level import layout_in_scan_frame
 
@@ -101,9 +110,8 @@ def _locate(
     return {"layout_in_scan": level.astype(np.float32)}, {}
 
 
-def _level(
-    params: Mapping[str, Any], _: Sequence[Path], arrays: Mapping[str, np.ndarray]
-) -> tuple[Arrays, Facts]:
+@_operation("level", "level")
+def _level(params: Params, _: Files, arrays: Inputs) -> Made:
     from litho_data.level import Recipe
 
     levelled = Recipe.from_dict(params["recipe"]).apply(
@@ -116,9 +124,8 @@ def _level(
     return {name: array.astype(np.float32) for name, array in named.items()}, {}
 
 
-def _register(
-    params: Mapping[str, Any], _: Sequence[Path], arrays: Mapping[str, np.ndarray]
-) -> tuple[Arrays, Facts]:
+@_operation("register", "register")
+def _register(params: Params, _: Files, arrays: Inputs) -> Made:
     found = _registration(arrays["levelled_height_um"], arrays["mask_level"], params)
     if not found.quality.passed:
         pitch_y_um, pitch_x_um = params["scan_pitch_um"]
@@ -148,9 +155,8 @@ def _registration(height_um: np.ndarray, layout_level: np.ndarray, params: Mappi
     )
 
 
-def _tip(
-    params: Mapping[str, Any], _: Sequence[Path], arrays: Mapping[str, np.ndarray]
-) -> tuple[Arrays, Facts]:
+@_operation("tip", "tip", "register/topography.py")
+def _tip(params: Params, _: Files, arrays: Inputs) -> Made:
     from litho_data.tip import lateral_resolution_um, tip_certain
 
     height, pitch_um = arrays["levelled_height_um"].astype(np.float64), tuple(params["scan_pitch_um"])
@@ -164,9 +170,8 @@ def _tip(
     return {"tip_certain": certain}, facts
 
 
-def _resample(
-    params: Mapping[str, Any], _: Sequence[Path], arrays: Mapping[str, np.ndarray]
-) -> tuple[Arrays, Facts]:
+@_operation("resample", "register")
+def _resample(params: Params, _: Files, arrays: Inputs) -> Made:
     from litho_data.register import Bend, resample_to_layout
 
     levelled, pitch_um = arrays["levelled_height_um"], tuple(params["scan_pitch_um"])
@@ -190,9 +195,8 @@ def _resample(
     return {"height_um": np.where(valid, height, np.float32(np.nan)), "valid": valid}, {}
 
 
-def _uncertainty(
-    params: Mapping[str, Any], _: Sequence[Path], arrays: Mapping[str, np.ndarray]
-) -> tuple[Arrays, Facts]:
+@_operation("uncertainty", "register", "roughness", "build/height_sigma.py")
+def _uncertainty(params: Params, _: Files, arrays: Inputs) -> Made:
     from litho_data.build.height_sigma import height_sigma
 
     sigma_um, budget = height_sigma(
@@ -210,38 +214,8 @@ def _uncertainty(
     return {"height_sigma_um": sigma_um}, dict(budget)
 
 
-def _stitch_pairs(
-    params: Mapping[str, Any], files: Sequence[Path], _: Mapping[str, np.ndarray]
-) -> tuple[Arrays, Facts]:
+@_operation("stitch-pairs", "readers")
+def _stitch_pairs(params: Params, files: Files, _: Inputs) -> Made:
     from litho_data.readers.pairs import stitch_field
 
     return stitch_field(files, params["quadrants"], params["full_scale_um"], params["levels"]), {}
-
-
-OPERATIONS = {
-    operation.name: operation
-    for operation in (
-        Operation("read-layout", "1", _read_layout, ("readers", "build/operations.py")),
-        Operation(
-            "read-scan", "1", _read_scan, ("readers", "scan.py", "foundation/units.py", "build/operations.py")
-        ),
-        Operation(
-            "calibrate",
-            "1",
-            _calibrate,
-            ("readers", "roughness", "build/calibration.py", "build/operations.py"),
-        ),
-        Operation("locate", "1", _locate, ("register", "level", "build/operations.py")),
-        Operation("level", "1", _level, ("level", "build/operations.py")),
-        Operation("register", "1", _register, ("register", "build/operations.py")),
-        Operation("tip", "1", _tip, ("tip", "register/topography.py", "build/operations.py")),
-        Operation("resample", "1", _resample, ("register", "build/operations.py")),
-        Operation(
-            "uncertainty",
-            "1",
-            _uncertainty,
-            ("register", "roughness", "build/height_sigma.py", "build/operations.py"),
-        ),
-        Operation("stitch-pairs", "1", _stitch_pairs, ("readers", "build/operations.py")),
-    )
-}

@@ -18,6 +18,12 @@ from litho_data.store.schema import VARIABLES
 PACKAGE = Path(__file__).parents[1]
 Arrays = dict[str, np.ndarray]
 Facts = dict[str, Any]
+# An operation: (parameters, raw files, input arrays by name) to arrays and facts.
+Params = Mapping[str, Any]
+Files = Sequence[Path]
+Inputs = Mapping[str, np.ndarray]
+Made = tuple[Arrays, Facts]
+Function = Callable[[Params, Files, Inputs], Made]
 
 
 @dataclass(frozen=True)
@@ -75,7 +81,7 @@ class Operation:
 
     name: str
     version: str
-    function: Callable[[Mapping[str, Any], Sequence[Path], Mapping[str, np.ndarray]], tuple[Arrays, Facts]]
+    function: Function
     code: tuple[str, ...]
 
     @property

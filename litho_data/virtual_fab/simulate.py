@@ -121,7 +121,14 @@ def simulate(
             rows.append(_row(job, len(rows)))
             scans.append(_scan_truth(scan))
         _write_card(raw, fab, name, size_um, rows, metadata, write_field_um, plan_of, print_pattern)
-        _truth(fab, scans).write(hidden)
+        Truth(
+            seed=seed,
+            printer=asdict(fab.printer),
+            microscope=asdict(fab.microscope),
+            noise=asdict(fab.noise),
+            knobs=[KnobTruth.of(setting, seed) for setting in fab.knobs.settings],
+            scans=scans,
+        ).write(hidden)
     return Path(out) / "raw" / "card.toml"
 
 
@@ -211,15 +218,4 @@ def _scan_truth(scan: FabScan) -> ScanTruth:
         scan_shape=scan.frame.shape,
         scan_to_layout=[[float(value) for value in row] for row in scan.frame.scan_to_layout],
         **noise_floor(scan.height_um - scan.noiseless_um),
-    )
-
-
-def _truth(fab: Fab, scans: list[ScanTruth]) -> Truth:
-    return Truth(
-        seed=fab.seed,
-        printer=asdict(fab.printer),
-        microscope=asdict(fab.microscope),
-        noise=asdict(fab.noise),
-        knobs=[KnobTruth.of(setting, fab.seed) for setting in fab.knobs.settings],
-        scans=scans,
     )
