@@ -52,7 +52,7 @@ def assemble(
         load: the arrays of an id on the layout grid.
         campaign: the rest.
     """
-    scans = [_row(record) for record in records if record["use"] == "dataset"]
+    scans = [_row(record) for record in records_of_use(records)]
     write_samples(root, scans, load, campaign.card.layout.pitch_um)
     quality, provenance = quality_table(records), provenance_table(records)
     write_table(root, "quality", quality, "scan")
@@ -68,9 +68,9 @@ def assemble(
     return sha256
 
 
-def records_of_use(records: Sequence[Record], use: str = "dataset") -> list[Record]:
-    """The records of one use, in order."""
-    return [record for record in records if record["use"] == use]
+def records_of_use(records: Sequence[Record]) -> list[Record]:
+    """The records of the dataset's own scans, references left out, in order."""
+    return [record for record in records if record["use"] == "dataset"]
 
 
 def dataset_facts(card: Card) -> dict[str, Any]:

@@ -80,7 +80,7 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
     layouts = _files_by_id(folder, card.layout.files)
     scans = _files_by_id(folder, card.scan.files)
     table = _table(card, folder, file.parent)
-    scales = _read_full_scales(card, folder)
+    scales = read_full_scales(folder / name) if (name := card.scan.full_scale_file) else None
 
     fields: list[PrintedField] = []
     aside: list[LeftAside] = []
@@ -95,7 +95,7 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
             aside.append(LeftAside(scan_id, files, True, f"no file {missing.replace('{id}', scan_id)}"))
             continue
         print_id = print_ids[scan_id]
-        scale = _full_scale(scales, scan_id, scans[scan_id])
+        scale = None if scales is None else scales.get(scan_id, scales.get(scans[scan_id].name))
         reason = _refusal(scan_id, print_id, use, table, card) or leads_out(files, folder)
         if not reason and scales is not None and scale is None:
             reason = f"no full scale in {card.scan.full_scale_file}"
@@ -171,16 +171,6 @@ def _table(card: Card, *folders: Path) -> dict[str, dict[str, str]]:
             "table of the card", got=f"no file {card.ids.table}", wanted="a CSV file beside the card"
         )
     return read_table(path)
-
-
-def _read_full_scales(card: Card, folder: Path) -> dict[str, float] | None:
-    if card.scan.full_scale_file is None:
-        return None
-    return read_full_scales(folder / card.scan.full_scale_file)
-
-
-def _full_scale(scales: Mapping[str, float] | None, scan_id: str, scan: Path) -> float | None:
-    return None if scales is None else scales.get(scan_id, scales.get(scan.name))
 
 
 def _assumptions(card: Card, table: Mapping[str, Mapping[str, str]]) -> tuple[str, ...]:

@@ -80,7 +80,9 @@ def benchmark(
     floor = stated_floor(dataset.name, noise)
     locked = dataset.locked_ids
     plan = plan_folds(scans, locked, split, folds=folds, seed=seed, open_lock_box=open_lock_box)
-    _say_fewer_folds(folds, sum(not fold.locked for fold in plan), split)
+    made = sum(not fold.locked for fold in plan)
+    if split == "grouped" and made < folds:
+        print(f"{made} folds instead of {folds}: one for each scan that is not locked", file=sys.stderr)
     configs = {name: _config(name, settings, seed) for name in models}
     fits: list[FitRecord] = []
     predicted: dict[tuple[str, bool], dict[str, Prediction]] = {}
@@ -117,7 +119,7 @@ def benchmark(
         dataset=dataset.dataset_id,
         split=ScoredSplit(
             kind=split,
-            folds=sum(not fold.locked for fold in plan),
+            folds=made,
             seed=seed,
             scored_ids=ids,
             scored_ids_sha256=ids_sha256(ids),
@@ -144,11 +146,6 @@ def _config(name: str, settings: dict[str, Any] | None, seed: int) -> TrainingCo
 
 def _settings(name: str, config: TrainingConfig, scans: Sequence[PrintedScan]) -> dict[str, Any]:
     return config.used_by(build_model(name, config.variant, **common_geometry(scans)))
-
-
-def _say_fewer_folds(asked: int, made: int, split: SplitKind) -> None:
-    if split == "grouped" and made < asked:
-        print(f"{made} folds instead of {asked}: one for each scan that is not locked", file=sys.stderr)
 
 
 def _require_same_benchmark(

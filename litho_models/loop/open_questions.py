@@ -13,18 +13,17 @@ import numpy as np
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import CATALOGUE, get_effect
-from litho_models.effects.chain import EffectChain
 from litho_models.fitting.least_squares import eliminated_sum, fit_least_squares
 from litho_models.loop.findings import LoopFindings
 from litho_models.loop.fold_fits import RULES, TERM_WEIGHT, ChainProblem
 from litho_models.loop.linear import ALL_FREE, without_scan_terms
-from litho_models.loop.parameters import get_vector
+from litho_models.loop.parameters import chain_at, get_vector
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.probes import AddedProbe
 from litho_models.loop.probes.probe import Probe
 from litho_models.loop.residual_spectrum import NoiseSpectrum, residual_spectrum
 from litho_models.loop.result.questions import IN_SCAN, Doing, OpenQuestions, Question, Rival, Turning
-from litho_models.loop.result.record import AddedEffect, CloseLoop
+from litho_models.loop.result.record import CloseLoop
 from litho_models.loop.screening.score_test import FAMILY_P, Screened
 from litho_models.loop.selection.contest import fitting_start
 from litho_models.loop.study import Score
@@ -151,7 +150,7 @@ def _rivals(findings: LoopFindings, replaced: str | None, names: Sequence[str]) 
         frames: list[list[str]] = [[]]
         if get_effect(name).role == "undetermined":
             frames.append([name])
-        values = _values_at(started, fit.vector)
+        values = chain_at(started, fit.vector).values()
         rivals += [
             Rival(
                 name=name + IN_SCAN * bool(frame),
@@ -163,12 +162,6 @@ def _rivals(findings: LoopFindings, replaced: str | None, names: Sequence[str]) 
             for frame in frames
         ]
     return rivals
-
-
-def _values_at(chain: EffectChain, vector: np.ndarray) -> dict[str, dict[str, float]]:
-    from litho_models.loop.parameters import chain_at
-
-    return chain_at(chain, vector).values()
 
 
 def _screened(findings: LoopFindings, name: str) -> Screened:
@@ -282,14 +275,10 @@ def _of_single_scans(result: CloseLoop) -> list[Question]:
                 if lines
                 else "differs between prints: the printer's or the microscope's",
                 experiment=effect.separating_experiment,
-                sizes=_sizes(effect),
+                sizes={name: own.value for name, own in effect.parameters.items()},
             )
         )
     return found
-
-
-def _sizes(effect: AddedEffect) -> dict[str, float]:
-    return {name: own.value for name, own in effect.parameters.items()}
 
 
 def _of_facts(findings: LoopFindings) -> list[Question]:

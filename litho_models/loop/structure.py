@@ -53,7 +53,9 @@ def covariate_tests(scans: Sequence[PreparedScan], predictions: Sequence[np.ndar
     tests = []
     for name in covariates[0] if covariates else ():
         values = [c[name] for c in covariates]
-        tests.append(_binned(name, values, _quantiles(values), cleaned))
+        # Bins that hold about as many pixels each.
+        edges = np.unique(np.quantile(np.concatenate(values), np.linspace(0, 1, BINS + 1)))
+        tests.append(_binned(name, values, edges, cleaned))
     tests.append(_binned(PLACE, [_cell(f) for f in scans], np.arange(_CELLS**2 + 1) - 0.5, cleaned))
     tests.append(_stencil(scans, cleaned, predictions))
     return tests
@@ -93,11 +95,6 @@ def _cell(scan: PreparedScan) -> np.ndarray:
     """Number of the cell of the scan that holds each sampled pixel, row by row."""
     row, column = np.floor((scan.position + 1) / 2 * _CELLS).clip(0, _CELLS - 1)
     return row * _CELLS + column
-
-
-def _quantiles(covariate: list[np.ndarray]) -> np.ndarray:
-    """Edges of bins that hold about as many pixels each."""
-    return np.unique(np.quantile(np.concatenate(covariate), np.linspace(0, 1, BINS + 1)))
 
 
 def _binned(

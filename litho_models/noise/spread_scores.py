@@ -79,7 +79,7 @@ class Tails:
 GAUSSIAN = Tails()
 
 
-def normalised_calibration_error(residual: np.ndarray, sigma: np.ndarray, bins: int = _BINS) -> float:
+def normalised_calibration_error(residual: np.ndarray, sigma: np.ndarray) -> float:
     """ENCE: mean over bins of σ of ``|rms σ − rms r| / rms σ``.
 
     Levi, Gispan, Giladi and Fetaya 2022, doi:10.3390/s22155540. Bins hold equal counts; pixels of one σ stay
@@ -88,7 +88,7 @@ def normalised_calibration_error(residual: np.ndarray, sigma: np.ndarray, bins: 
     Args:
         residual, sigma: (pixels,), one unit.
     """
-    limits = np.unique(np.quantile(sigma, np.linspace(0, 1, bins + 1)))
+    limits = np.unique(np.quantile(sigma, np.linspace(0, 1, _BINS + 1)))
     number = np.searchsorted(limits[1:-1], sigma, side="right")
     count = np.bincount(number)
     used = count > 0

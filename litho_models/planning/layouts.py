@@ -7,7 +7,7 @@ that it stays among what the printer has printed and the models know.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -123,11 +123,9 @@ def starts(size_px: int, limits: Limits, seed: int) -> Iterator[tuple[str, np.nd
         yield name, whole
 
 
-def score(
-    rivalry: Rivalry, level: np.ndarray, ways: tuple[Way, ...], place: Place = "centre", order: float = 0.0
-) -> float:
+def score(rivalry: Rivalry, level: np.ndarray, ways: tuple[Way, ...], place: Place = "centre") -> float:
     """Separation of the nearest pair by one print of this layout, standard deviations."""
-    printed = PlannedPrint(torch.from_numpy(level.astype(np.float32)), ways, place, order)
+    printed = PlannedPrint(torch.from_numpy(level.astype(np.float32)), ways, place)
     refitted = rivalry.refitted([printed])
     with torch.no_grad():
         return float(rivalry.separations([printed], refitted).min())
@@ -140,9 +138,7 @@ def climb(
     limits: Limits,
     *,
     place: Place = "centre",
-    order: float = 0.0,
     steps: int = STEPS,
-    tick: Callable[[], None] = lambda: None,
 ) -> np.ndarray:
     """Soft levels (y, x) at the top of the way up from ``start``."""
     free = torch.from_numpy(start.astype(np.float32)).requires_grad_()
@@ -153,7 +149,7 @@ def climb(
     for step in range(steps + 1):
         soft = limits.soft(free)
         if step % _REFIT_EVERY == 0 or step == steps:
-            here = [PlannedPrint(soft.detach(), ways, place, order)]
+            here = [PlannedPrint(soft.detach(), ways, place)]
             refitted = rivalry.refitted(here)
             with torch.no_grad():
                 apart = rivalry.separations(here, refitted)
@@ -164,12 +160,11 @@ def climb(
         if step == steps:
             break
         # The nearest pair, softly: with the hard minimum two pairs would take turns.
-        apart = rivalry.separations([PlannedPrint(soft, ways, place, order)], refitted, nearest)
+        apart = rivalry.separations([PlannedPrint(soft, ways, place)], refitted, nearest)
         height = -torch.logsumexp(-apart, 0)
         climber.zero_grad()
         (limits.price(soft) - height).backward()
         climber.step()
-        tick()
     return best
 
 

@@ -1,7 +1,7 @@
 """What a scan adds to the height, and how it is taken out on pixels that are not scored."""
 
 from litho_models.scan_terms.blocks import Blocks
-from litho_models.scan_terms.cross_fit import CrossFit, cross_fit, fitted_terms, least_squares
+from litho_models.scan_terms.cross_fit import CrossFit, cross_fit, fitted_terms, freed_um, least_squares
 from litho_models.scan_terms.lines import scan_line_index, shrunk_line_offsets
 from litho_models.scan_terms.policies import (
     POLICIES,
@@ -42,6 +42,7 @@ __all__ = [
     "chosen_terms",
     "cross_fit",
     "fitted_terms",
+    "freed_um",
     "least_squares",
     "line_terms",
     "parameter_names",

@@ -108,16 +108,21 @@ def fitted_terms(
     prediction_um: np.ndarray,
     used: BoolMap,
     terms: Terms,
-    scan_line: LineIndex | None = None,
 ) -> tuple[FloatMap, FloatMap]:
     """Smooth terms fitted to all used pixels: coefficients (k,) and the map that they add, (ny, nx) µm.
 
     For training, pictures and defects; a reported error takes its terms from ``cross_fit``.
     """
-    basis = term_maps(TermPixels(prediction_um, scan_line), terms).reshape(-1, *prediction_um.shape)
+    basis = term_maps(TermPixels(prediction_um), terms).reshape(-1, *prediction_um.shape)
     target = (height_um - prediction_um)[used].astype(np.float64)
     coefficients = least_squares(basis[:, used], target) if len(basis) else np.zeros(0)
     return coefficients, np.tensordot(coefficients, basis, axes=1)
+
+
+def freed_um(height_um: np.ndarray, prediction_um: np.ndarray, used: BoolMap, terms: Terms) -> FloatMap:
+    """Measured minus predicted without its ``fitted_terms``, (ny, nx) µm; 0 at pixels that are not used."""
+    _, own = fitted_terms(height_um, prediction_um, used, terms)
+    return np.where(used, height_um - prediction_um - own, 0.0)
 
 
 def least_squares(design: FloatMap, target: FloatMap) -> FloatMap:

@@ -9,7 +9,7 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
-from litho_models.scan_terms import Blocks, LineIndex, Policy, cross_fit, policy_terms
+from litho_models.scan_terms import Blocks, Policy, cross_fit, policy_terms
 
 
 class PrintGain(NamedTuple):
@@ -82,7 +82,6 @@ class ScanScore:
     degrees_of_freedom: float
     pixels: int
     mae_abs_nm: float
-    rmse_abs_nm: float
     bias_nm: float
     mae_datum_free_nm: float
     rmse_datum_free_nm: float
@@ -102,8 +101,6 @@ def score_scan(
     valid: np.ndarray,
     policy: Policy = "offset",
     blocks: Blocks | None = None,
-    *,
-    scan_line: LineIndex | None = None,
 ) -> ScanScore:
     """Score one prediction against one scan; arrays (ny, nx) in µm, the rest as in ``cross_fit``.
 
@@ -112,7 +109,7 @@ def score_scan(
     Raises:
         InputError: what ``cross_fit`` refuses, or no valid pixel.
     """
-    free = cross_fit(height_um, prediction_um, valid, policy_terms(policy), blocks, scan_line=scan_line)
+    free = cross_fit(height_um, prediction_um, valid, policy_terms(policy), blocks)
     scored = np.isfinite(free.residual_um)
     if not scored.any():
         raise InputError(f"scan {scan_id}", got="no valid pixel", wanted="at least one to score")
@@ -126,7 +123,6 @@ def score_scan(
         degrees_of_freedom=free.degrees_of_freedom,
         pixels=int(scored.sum()),
         mae_abs_nm=float(np.abs(plain).mean()),
-        rmse_abs_nm=float(np.sqrt((plain**2).mean())),
         bias_nm=float(plain.mean()),
         mae_datum_free_nm=float(error.mean()),
         rmse_datum_free_nm=float(np.sqrt((error**2).mean())),

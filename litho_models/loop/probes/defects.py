@@ -10,7 +10,7 @@ from scipy.ndimage import find_objects, label
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.prepared import PreparedScan
-from litho_models.scan_terms import POLICIES, fitted_terms
+from litho_models.scan_terms import POLICIES, freed_um
 
 FAR_SD = 5.0
 FEWEST_PX = 9
@@ -56,7 +56,7 @@ def find_defects(scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray
     blobs, masks, shares = [], [], []
     inside = total = 0.0
     for scan, prediction in zip(scans, predictions, strict=True):
-        residual = _freed(scan, prediction)
+        residual = freed_um(scan.stored.height_um, prediction, scan.usable, POLICIES["full"])
         seen = residual[scan.usable]
         spread = 1.4826 * float(np.median(np.abs(seen - np.median(seen))))
         numbered, count = label(scan.usable & (np.abs(residual) > FAR_SD * spread))
@@ -71,11 +71,6 @@ def find_defects(scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray
         inside += float((residual[mask] ** 2).sum())
         total += float((seen**2).sum())
     return Defects(blobs, masks, shares, inside / max(total, np.finfo(float).tiny))
-
-
-def _freed(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
-    _, own = fitted_terms(scan.stored.height_um, prediction, scan.usable, POLICIES["full"])
-    return np.where(scan.usable, scan.stored.height_um - prediction - own, 0.0)
 
 
 def _describe(

@@ -18,7 +18,7 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.probes.kernel import reach_um
 from litho_models.loop.probes.probe import Estimate
-from litho_models.scan_terms import POLICIES, Terms, fitted_terms
+from litho_models.scan_terms import POLICIES, Terms, freed_um
 
 FARTHEST_UM = 20.0
 # What is printed is no finer, and a quarter of the pixels is enough to find it.
@@ -132,8 +132,7 @@ def displaced_copy(
     scores, information, pixels = [], [], []
     for scan, prediction, defect in zip(scans, predictions, defects, strict=True):
         usable = scan.usable & ~defect
-        _, own = fitted_terms(scan.stored.height_um, prediction, usable, POLICIES["full"])
-        residual = np.where(usable, scan.stored.height_um - prediction - own, 0.0)[::stride, ::stride]
+        residual = freed_um(scan.stored.height_um, prediction, usable, POLICIES["full"])[::stride, ::stride]
         layout, seen = _layout(scan)[::stride, ::stride], usable[::stride, ::stride].astype(float)
         scores.append(_correlation(residual, layout, reach)[y, x])
         information.append(_correlation(seen, layout**2, reach)[y, x])

@@ -104,7 +104,7 @@ def probe_figure(entry: AddedProbe) -> Figure:
     probe, common = entry.probe, entry.estimate.common
     if isinstance(probe, MissingKernel):
         kernel = probe.kernel_map(common) / probe.pitch_um**2
-        shown = _half_um(probe.size, probe.pitch_um)
+        shown = probe.size[0] * probe.pitch_um / 2, probe.size[1] * probe.pitch_um / 2
         return _image(kernel, shown, "height per layout height and µm²", min(5.5, shown[0]))
     if isinstance(probe, DisplacedCopy):
         return _copy_figure(probe, common)
@@ -181,10 +181,6 @@ def _profile_figure(values: np.ndarray, along: str, unit: str) -> Figure:
     axes.set(xlabel=f"{along}s, from the first to the last", ylabel=unit)
     axes.spines[["top", "right"]].set_visible(False)
     return figure
-
-
-def _half_um(size: tuple[int, int], pitch_um: float) -> tuple[float, float]:
-    return size[0] * pitch_um / 2, size[1] * pitch_um / 2
 
 
 def _image(values: np.ndarray, half: tuple[float, float], label: str, shown: float) -> Figure:

@@ -139,9 +139,10 @@ def plain_words(findings: LoopFindings, result: CloseLoop) -> str:
     if written:
         parts.append(f"Different in every print, so no model can predict it: {', '.join(written)}.")
     for e in causes:
+        title = get_effect(e.name).title
         alike = f" (or {', '.join(e.confusable_with)}: these data cannot tell)" if e.confusable_with else ""
         parts.append(
-            f"{_sentence_case(get_effect(e.name).title)} [{e.name}]{alike}: {_estimate_text(e)}; with it the "
+            f"{title[:1].upper()}{title[1:]} [{e.name}]{alike}: {_estimate_text(e)}; with it the "
             f"held-out error falls from {e.before_nm:.2f} to {e.after_nm:.2f} nm, in "
             f"{e.scans_improved[0]} of "
             f"{e.scans_improved[1]} scans."
@@ -206,10 +207,6 @@ def warnings_for(findings: LoopFindings, result: CloseLoop) -> list[str]:
             "of the exported process model."
         )
     return warnings
-
-
-def _sentence_case(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def _estimate_text(effect: AddedEffect) -> str:

@@ -64,7 +64,7 @@ def summarise(findings: LoopFindings, *, dataset: DatasetId, base_name: str, dro
     found, locked = equal_terms.scores(findings), findings.locked_scores
     elsewhere = [scan.stored.print_id for scan in findings.locked]
     effects = added_effects(findings)
-    tested = [e for e in effects if e.name not in _span_names()]
+    tested = [e for e in effects if e.name not in CATALOGUE or not CATALOGUE[e.name].per_scan]
     unexplained = _signature(findings)
     fewest = max(FEWEST_SCANS, fewest_scans_for_structure(len(findings.structure)))
     verdict: Verdict = "nothing-missing"
@@ -141,10 +141,6 @@ def _noise_floor(findings: LoopFindings, found: Mapping[TermSet, BeforeAfter]) -
         kind="lower-bound",
         source="second differences along x of the held-out residual: blind to correlated roughness",
     )
-
-
-def _span_names() -> set[str]:
-    return {name for name, effect in CATALOGUE.items() if effect.per_scan}
 
 
 def _errors(found: Mapping[TermSet, BeforeAfter], which: int, seed: int) -> Errors:

@@ -27,7 +27,6 @@ class Confirmation:
         passed: all rules hold; ``reason`` names those that do not.
         p: one-sided binomial over scans; ``improved``: (better scans, all scans).
         gain_nm: mean error before minus after; ``gain_ci95_nm``: its bootstrap interval over scans.
-        rmse_gain_nm: the same for the root of the mean square.
     """
 
     passed: bool
@@ -36,7 +35,6 @@ class Confirmation:
     improved: tuple[int, int]
     gain_nm: float
     gain_ci95_nm: tuple[float, float]
-    rmse_gain_nm: float
 
 
 def confirm(
@@ -88,7 +86,6 @@ def confirm(
         improved=(better, count),
         gain_nm=float(mae_gain.mean()),
         gain_ci95_nm=(low_nm, high_nm),
-        rmse_gain_nm=rmse_gain,
     )
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from litho_data.roughness import LinePeriod, line_period
 from litho_models.loop.prepared import PreparedScan
-from litho_models.scan_terms import LineIndex, fitted_terms
+from litho_models.scan_terms import LineIndex, freed_um
 
 LARGEST_P = 1e-3
 
@@ -29,8 +29,7 @@ def period_of_lines(
 
 def _line_means(scan: PreparedScan, prediction: np.ndarray, line: LineIndex) -> np.ndarray:
     """Mean residual of each line, datum and bow of the scan taken out, µm."""
-    _, own = fitted_terms(scan.stored.height_um, prediction, scan.usable, frozenset({"offset", "bow"}))
     use = scan.usable
-    count = np.bincount(line[use])
-    total = np.bincount(line[use], (scan.stored.height_um - prediction - own)[use])
+    residual = freed_um(scan.stored.height_um, prediction, use, frozenset({"offset", "bow"}))
+    count, total = np.bincount(line[use]), np.bincount(line[use], residual[use])
     return total / np.maximum(count, 1)

@@ -26,7 +26,7 @@ from litho_models.scan_terms import (
     TermPixels,
     Terms,
     chosen_terms,
-    fitted_terms,
+    freed_um,
     least_squares,
     line_terms,
     parameter_names,
@@ -222,10 +222,9 @@ def _with_shared_profile(study: Study, predictions: Sequence[np.ndarray], axis: 
         return list(predictions)
     sums, counts = [], []
     for scan, prediction in zip(study.scans, predictions, strict=True):
-        height, use = scan.stored.height_um, scan.usable
-        _, own = fitted_terms(height, prediction, use, frozenset({"offset", "bow"}))
-        sums.append(np.where(use, height - prediction - own, 0.0).sum(axis=axis))
-        counts.append(use.sum(axis=axis))
+        residual = freed_um(scan.stored.height_um, prediction, scan.usable, frozenset({"offset", "bow"}))
+        sums.append(residual.sum(axis=axis))
+        counts.append(scan.usable.sum(axis=axis))
     totals, seen = np.stack(sums), np.stack(counts)
     shared = []
     for fold, prediction in zip(study.fold_of, predictions, strict=True):
