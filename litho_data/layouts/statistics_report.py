@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from litho_data.foundation.report import Page
 from litho_data.foundation.report_pictures import new_figure
 from litho_data.layouts.statistics import LayoutStatistics
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _SHOWN = 4
 # Lower limit of the logarithmic axes: smaller shares are rounding.
@@ -24,14 +28,8 @@ def statistics_page(statistics: LayoutStatistics, files: Sequence[Path]) -> Page
         f"{statistics.count} layouts", f"{statistics.levels} levels, pitch {statistics.pitch_um:g} µm"
     )
     page.verdict(_verdict(statistics))
-    pictures = new_figure(11, 3)
-    shown = files[:_SHOWN]
-    for place, file in enumerate(shown, start=1):
-        axes = pictures.add_subplot(1, len(shown), place)
-        axes.imshow(read_layout(file), vmin=0, vmax=statistics.levels - 1, cmap="viridis")
-        axes.set_title(file.stem)
-        axes.set_axis_off()
-    page.figure(pictures, "The first layouts, level by colour.")
+    first = {file.stem: read_layout(file) for file in files[:_SHOWN]}
+    page.figure(layouts_figure(first, (0, statistics.levels - 1)), "The first layouts, level by colour.")
 
     graphs = new_figure(11, 6)
     levels = np.arange(statistics.levels)
@@ -60,6 +58,17 @@ def statistics_page(statistics: LayoutStatistics, files: Sequence[Path]) -> Page
     }
     page.table(shares, "Level and jump shares.", "levels.csv", digits=4)
     return page
+
+
+def layouts_figure(levels: Mapping[str, np.ndarray], between: tuple[int, int]) -> Figure:
+    """Layouts (ny, nx) side by side, by title, their levels on one scale."""
+    figure = new_figure(11, 3)
+    for place, (title, level) in enumerate(levels.items(), start=1):
+        axes = figure.add_subplot(1, len(levels), place)
+        axes.imshow(level, vmin=between[0], vmax=between[1], cmap="viridis")
+        axes.set_title(title)
+        axes.set_axis_off()
+    return figure
 
 
 def _verdict(statistics: LayoutStatistics) -> str:

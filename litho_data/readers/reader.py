@@ -106,19 +106,30 @@ def with_unique_names(channels: list[Channel]) -> list[Channel]:
 
 
 @contextmanager
+def quiet(*loggers: str, above: int = logging.CRITICAL) -> Iterator[None]:
+    """Without warnings, and with nothing from these loggers up to a level."""
+    named = [logging.getLogger(name) for name in loggers]
+    levels = [logger.level for logger in named]
+    try:
+        for logger in named:
+            logger.setLevel(above + 1)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        for logger, level in zip(named, levels, strict=True):
+            logger.setLevel(level)
+
+
+@contextmanager
 def foreign_parser(path: Path, kind: str) -> Iterator[None]:
     """Run another project's parser; any exception becomes one InputError about the file.
 
     On damaged files such parsers raise struct, index, key, value, memory, decode, assertion and their own
     errors, and log to stderr; a caller can do nothing with these.
     """
-    loggers = [logging.getLogger(name) for name in _LOGGERS]
-    levels = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.CRITICAL + 1)
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with quiet(*_LOGGERS):
             yield
     except InputError:
         raise
@@ -127,6 +138,3 @@ def foreign_parser(path: Path, kind: str) -> Iterator[None]:
         raise InputError(
             f"cannot read {path} as {kind}", got=reason, hint="the file may be damaged"
         ) from error
-    finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)

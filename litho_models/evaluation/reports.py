@@ -11,7 +11,7 @@ from litho_data.foundation.report import Page
 from litho_data.store import PrintedScan
 from litho_models.evaluation import plots, tables
 from litho_models.evaluation.results import Benchmark, Evaluation, ModelRecord
-from litho_models.evaluation.words import COLUMNS, benchmark_verdict, evaluation_verdict
+from litho_models.evaluation.wording import COLUMNS, benchmark_verdict, evaluation_verdict
 from litho_models.scan_terms import NuisanceProtocol
 from litho_models.scoring.noise_floor import NoiseFloor
 from litho_models.scoring.records import ModelScores, ScanRow

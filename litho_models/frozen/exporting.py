@@ -5,9 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import logging
-import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -18,6 +16,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
+from litho_data.readers.reader import quiet
 from litho_models.frozen.simulator import FrozenSimulator
 
 if TYPE_CHECKING:
@@ -161,7 +160,8 @@ def _write_onnx(program: ExportedProgram, file: Path, layout_um: Tensor, facts: 
         raise InputError(
             "export to ONNX", got=f"no {error.name}", hint="pip install 'litholoop[onnx]'"
         ) from None
-    with _quiet():
+    # The exporter warns of packages that no model here needs.
+    with quiet("torch.onnx", "onnxscript", "onnx_ir", above=logging.WARNING):
         try:
             written = torch.onnx.export(program, (layout_um,), dynamo=True, verbose=False)
         except torch.onnx.errors.OnnxExporterError as error:
@@ -179,19 +179,3 @@ def _write_onnx(program: ExportedProgram, file: Path, layout_um: Tensor, facts: 
     session = onnxruntime.InferenceSession(str(file), providers=["CPUExecutionProvider"])
     (given,) = session.get_inputs()
     return torch.from_numpy(session.run(None, {given.name: layout_um.numpy()})[0])
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """The exporter warns of packages that no model here needs."""
-    loggers = [logging.getLogger(name) for name in ("torch.onnx", "onnxscript", "onnx_ir")]
-    levels = [logger.level for logger in loggers]
-    try:
-        for logger in loggers:
-            logger.setLevel(logging.ERROR)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)

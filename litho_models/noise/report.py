@@ -14,7 +14,7 @@ from litho_models.noise.calibration import SpreadAnalysis
 from litho_models.noise.dose import DoseMatrix
 from litho_models.noise.staircase import StepPrint
 from litho_models.noise.texture import Texture
-from litho_models.noise.words import COLUMNS
+from litho_models.noise.wording import COLUMNS
 from litho_models.scoring.noise_floor import NoiseFloor
 
 if TYPE_CHECKING:

@@ -12,6 +12,7 @@ import torch
 from litho_data.foundation.report import Page
 from litho_data.foundation.report_pictures import new_figure
 from litho_data.foundation.units import NM_PER_UM
+from litho_data.layouts.statistics_report import layouts_figure
 from litho_models.planning.power import ENOUGH
 from litho_models.planning.record import NextPrint, PlannedQuestion
 from litho_models.planning.rivalry import PlannedPrint, Rivalry
@@ -50,8 +51,9 @@ def write_report(
     )
     page.table(_table(plan), "Open questions, and what the plan makes of them.", "questions.csv")
     page.heading("Layouts")
+    first = {f"print {place}": level for place, level in enumerate(levels[:_SHOWN_LAYOUTS], start=1)}
     page.figure(
-        _layouts_figure(levels, plan), "Levels of the first prints; tiles come in another order in each."
+        layouts_figure(first, plan.levels), "Levels of the first prints; tiles come in another order in each."
     )
     for question in plan.questions:
         page.heading(f"{question.name}: {question.status}", folded=True)
@@ -88,17 +90,6 @@ def _table(plan: NextPrint) -> list[dict[str, Any]]:
         }
         for q in plan.questions
     ]
-
-
-def _layouts_figure(levels: Sequence[np.ndarray], plan: NextPrint) -> Figure:
-    figure = new_figure(11, 3)
-    shown = levels[:_SHOWN_LAYOUTS]
-    for place, level in enumerate(shown, start=1):
-        axes = figure.add_subplot(1, len(shown), place)
-        axes.imshow(level, vmin=plan.levels[0], vmax=plan.levels[1], cmap="viridis")
-        axes.set_title(f"print {place}")
-        axes.set_axis_off()
-    return figure
 
 
 def _prints_figure(rivalry: Rivalry, shown: PlannedPrint) -> Figure:
