@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from litho_data.build.jobs import Job
+from litho_data.build.operations import load_recipe
 from litho_data.cards.card import Card
 from litho_data.foundation.hashes import array_sha256, canonical_json, file_sha256, record_sha256
 from litho_data.store.schema import SAMPLE_VARIABLES, STORE_SCHEMA, dataset_sha256
@@ -23,26 +25,32 @@ Record = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class Campaign:
-    """What a store is made of besides its scans.
+class Source:
+    """Everything that a store is made from, with the raw files by id for the manifest.
 
-    ``recipe`` is the levelling recipe in canonical form, ``files`` the table of :func:`files_table`, and
-    ``build`` what must not be part of a hash: time, folder, software.
+    ``files`` maps each id to its raw files by recorded name, ``standards`` holds those of the calibration;
+    ``unpaired`` and ``refused`` map ids to reasons.
     """
 
     card: Card
-    recipe: Record
-    seed: int
-    assumptions: Sequence[str]
-    files: pd.DataFrame
-    build: Record
+    jobs: Sequence[Job]
+    data_dir: Path
+    files: Mapping[str, Mapping[str, Path]]
+    recipe: Mapping[str, Any] = field(default_factory=lambda: load_recipe(None))
+    seed: int = 0
+    standards: Mapping[str, Path] = field(default_factory=dict)
+    assumptions: Sequence[str] = ()
+    unpaired: Mapping[str, str] = field(default_factory=dict)
+    refused: Mapping[str, str] = field(default_factory=dict)
 
 
 def assemble(
     root: zarr.Group,
     records: Sequence[Record],
     load: Callable[[str], Mapping[str, np.ndarray]],
-    campaign: Campaign,
+    source: Source,
+    skipped: Mapping[str, str],
+    build: Record,
 ) -> str:
     """Write everything except the groups ``scans/<id>``, which exist; returns the dataset's hash.
 
@@ -50,19 +58,22 @@ def assemble(
         root: the growing group.
         records: of the finished scans, sorted by id, including references (``use`` other than dataset).
         load: the arrays of an id on the layout grid.
-        campaign: the rest.
+        source: what the records were made from.
+        skipped: per id, why it is not in the store.
+        build: what must not be part of a hash: time, folder, software.
     """
     scans = [_row(record) for record in records_of_use(records)]
-    write_samples(root, scans, load, campaign.card.layout.pitch_um)
+    write_samples(root, scans, load, source.card.layout.pitch_um)
     quality, provenance = quality_table(records), provenance_table(records)
     write_table(root, "quality", quality, "scan")
     write_table(root, "provenance", provenance, "step")
-    manifest = manifest_attributes(campaign, quality, provenance)
-    write_table(root, "manifest", campaign.files, "file", {**manifest, "build": dict(campaign.build)})
+    manifest = manifest_attributes(source, quality, provenance)
+    files = files_table(source, {record["id"]: record for record in records}, skipped)
+    write_table(root, "manifest", files, "file", {**manifest, "build": dict(build)})
     sha256 = dataset_sha256(
-        dataset_facts(campaign.card), [_identity(record) for record in records_of_use(records)]
+        dataset_facts(source.card), [_identity(record) for record in records_of_use(records)]
     )
-    manifest_sha256 = record_sha256([manifest, table_sha256(campaign.files)])
+    manifest_sha256 = record_sha256([manifest, table_sha256(files)])
     root.attrs.update(root_attributes(manifest, sha256, manifest_sha256))
     consolidate(root)
     return sha256
@@ -100,15 +111,13 @@ def root_attributes(manifest: Record, dataset_hash: str, manifest_hash: str) -> 
     }
 
 
-def manifest_attributes(
-    campaign: Campaign, quality: pd.DataFrame, provenance: pd.DataFrame
-) -> dict[str, Any]:
+def manifest_attributes(source: Source, quality: pd.DataFrame, provenance: pd.DataFrame) -> dict[str, Any]:
     """The manifest without its table of files: the card as it was understood, and hashes of the tables."""
     content = {
-        "card": campaign.card.model_dump(mode="json", exclude_none=True),
-        "recipe": dict(campaign.recipe),
-        "seed": campaign.seed,
-        "assumptions": list(campaign.assumptions),
+        "card": source.card.model_dump(mode="json", exclude_none=True),
+        "recipe": dict(source.recipe),
+        "seed": source.seed,
+        "assumptions": list(source.assumptions),
         "quality_sha256": table_sha256(quality),
         "provenance_sha256": table_sha256(provenance),
     }
@@ -179,19 +188,13 @@ def _shape_of(record: Record, name: str) -> tuple[int, int]:
     return int(shape[0]), int(shape[1])
 
 
-def files_table(
-    files: Mapping[str, Mapping[str, Path]],
-    standards: Mapping[str, Path],
-    records: Mapping[str, Mapping[str, Any]],
-    skipped: Mapping[str, str],
-    unpaired: Mapping[str, str],
-) -> pd.DataFrame:
+def files_table(source: Source, records: Mapping[str, Record], skipped: Mapping[str, str]) -> pd.DataFrame:
     """One row per raw file, sorted by id.
 
     Args:
-        files: per id, the files by their recorded name; ``standards``: those of the calibration.
-        records: of the finished scans.
-        skipped: per id, why it is not in the store; ``unpaired``: per id, which file is missing.
+        source: the files by id and recorded name, and which have no partner.
+        records: of the finished scans, by id.
+        skipped: per id, why it is not in the store.
 
     Returns:
         Columns ``path``, ``scan``, ``status`` (ok, skipped, unpaired), ``reason``, ``use``, ``sha256`` of the
@@ -201,19 +204,19 @@ def files_table(
     import pandas as pd
 
     rows = []
-    for scan_id in sorted(files):
+    for scan_id in sorted(source.files):
         record = records.get(scan_id)
         status = "ok" if record else "skipped" if scan_id in skipped else "unpaired"
-        for name, path in files[scan_id].items():
+        for name, path in source.files[scan_id].items():
             sha256, size = _file_identity(path)
             row = {"path": name, "scan": scan_id, "status": status}
-            row["reason"] = skipped.get(scan_id, unpaired.get(scan_id, ""))
+            row["reason"] = skipped.get(scan_id, source.unpaired.get(scan_id, ""))
             row["use"] = record["use"] if record else ""
             row["sha256"] = (_used_sha256(record, name) if record else "") or sha256
             rows.append(
                 {**row, "size_bytes": size, "read": json.dumps(_facts(record, name), ensure_ascii=False)}
             )
-    for name, path in standards.items():
+    for name, path in source.standards.items():
         sha256, size = _file_identity(path)
         row = {"path": name, "scan": "", "status": "ok", "reason": "", "use": "calibration"}
         rows.append({**row, "sha256": sha256, "size_bytes": size, "read": "{}"})

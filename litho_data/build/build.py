@@ -7,12 +7,12 @@ import shutil
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from litho_data.build.assemble import Campaign, assemble, files_table, records_of_use
+from litho_data.build.assemble import Source, assemble, records_of_use
 from litho_data.build.calibration import measure_scales, standards_of
 from litho_data.build.day_tip import with_tip_found
 from litho_data.build.jobs import FieldJob, Job, Skipped, attempt, field_jobs
@@ -102,26 +102,6 @@ def _source(listing: Listing, recipe: Mapping[str, Any], seed: int, jobs: Sequen
     )
 
 
-@dataclass(frozen=True)
-class Source:
-    """Everything that a store is made from, with the raw files by id for the manifest.
-
-    ``files`` maps each id to its raw files by recorded name, ``standards`` holds those of the calibration;
-    ``unpaired`` and ``refused`` map ids to reasons.
-    """
-
-    card: Card
-    jobs: Sequence[Job]
-    data_dir: Path
-    files: Mapping[str, Mapping[str, Path]]
-    recipe: Mapping[str, Any] = field(default_factory=lambda: load_recipe(None))
-    seed: int = 0
-    standards: Mapping[str, Path] = field(default_factory=dict)
-    assumptions: Sequence[str] = ()
-    unpaired: Mapping[str, str] = field(default_factory=dict)
-    refused: Mapping[str, str] = field(default_factory=dict)
-
-
 def make_store(
     source: Source, out: Path, *, workers: int = 1, dask: str | None = None, strict: bool = False
 ) -> BuildResult:
@@ -161,19 +141,12 @@ def make_store(
             quality["warning"] = "; ".join(filter(None, (quality["warning"], doubt)))
             records[scan_id]["quality"] = quality
         kept = [records[scan_id] for scan_id in sorted(records)]
-        campaign = Campaign(
-            card=source.card,
-            recipe=source.recipe,
-            seed=source.seed,
-            assumptions=source.assumptions,
-            files=files_table(source.files, source.standards, records, skipped, source.unpaired),
-            build={
-                "started": started.isoformat(),
-                "data_dir": _relative(source.data_dir, out.parent),
-                "software": software_record(),
-            },
-        )
-        sha256 = assemble(root, kept, partial.samples, campaign)
+        build = {
+            "started": started.isoformat(),
+            "data_dir": _relative(source.data_dir, out.parent),
+            "software": software_record(),
+        }
+        sha256 = assemble(root, kept, partial.samples, source, skipped, build)
         result = BuildResult(
             store=out.name,
             dataset=DatasetId(name=source.card.name, sha256=sha256),

@@ -15,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.build.build import Source, make_store
+from litho_data.build.assemble import Source
+from litho_data.build.build import make_store
 from litho_data.build.operations import OPERATIONS
 from litho_data.build.quality import noise_figures
 from litho_data.build.result import BuildResult
