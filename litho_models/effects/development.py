@@ -60,6 +60,10 @@ def slope_thinning(height: Tensor, values: Values, context: FieldContext) -> Ten
     return height - values["along_x_um"] * along_x**2 - values["along_y_um"] * along_y**2
 
 
+_OF_NARROW = {
+    "fraction": Parameter("1", 0.0, 0.9, 0.1),
+    "width_um": Parameter("µm", 0.2, 3.0, 0.6, kind="choice"),
+}
 _NARROW = tuple({"fraction": 0.1, "width_um": width} for width in (0.4, 0.8, 1.4))
 
 EFFECTS = (
@@ -109,10 +113,7 @@ EFFECTS = (
         stage="development",
         role="process",
         acts_on="height",
-        parameters={
-            "fraction": Parameter("1", 0.0, 0.9, 0.1),
-            "width_um": Parameter("µm", 0.2, 3.0, 0.6, kind="choice"),
-        },
+        parameters=_OF_NARROW,
         apply=feature_collapse,
         trials=_NARROW,
         source="capillary force while drying; opening of the surface by a square of width w",
@@ -124,10 +125,7 @@ EFFECTS = (
         stage="development",
         role="process",
         acts_on="height",
-        parameters={
-            "fraction": Parameter("1", 0.0, 0.9, 0.1),
-            "width_um": Parameter("µm", 0.2, 3.0, 0.6, kind="choice"),
-        },
+        parameters=_OF_NARROW,
         apply=trench_residue,
         trials=_NARROW,
         source="closing of the surface by a square of width w",

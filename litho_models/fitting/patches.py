@@ -70,13 +70,8 @@ class PatchDataset(Dataset[Patch]):
         if margin_px < 0 or per_scan < 1:
             got = f"margin_px {margin_px}, per_scan {per_scan}"
             raise InputError("patches", got=got, wanted="a margin of 0 or more and at least one a scan")
-        self.size_px, self.margin_px, self.per_scan, self.flips, self.seed = (
-            size_px,
-            margin_px,
-            per_scan,
-            flips,
-            seed,
-        )
+        self.size_px, self.margin_px, self.per_scan = size_px, margin_px, per_scan
+        self.flips, self.seed = flips, seed
 
     @property
     def ids(self) -> list[str]:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 from pydantic import Field, ValidationError
 
 from litho_data.foundation.errors import InputError, unknown_name
@@ -163,16 +164,12 @@ def training_config(recipe: Recipe, model: str, settings: dict[str, Any]) -> Tra
 
 def level_share(scans: Sequence[PrintedScan]) -> list[float]:
     """Share of pixels printed with each level."""
-    import numpy as np
-
     levels = np.concatenate([scan.mask_level.ravel() for scan in scans])
     return (np.bincount(levels, minlength=scans[0].levels) / levels.size).tolist()
 
 
 def step_share(scans: Sequence[PrintedScan]) -> list[float]:
     """Share of neighbouring pixels, along rows and columns, whose levels differ by 0, 1, …"""
-    import numpy as np
-
     steps = np.concatenate(
         [np.abs(np.diff(scan.mask_level.astype(int), axis=axis)).ravel() for scan in scans for axis in (0, 1)]
     )

@@ -23,9 +23,10 @@ model-index:
 
 _RESULT = """
   - task: {{type: image-to-image, name: layout to printed height}}
-    dataset: {{name: {dataset}, type: {dataset}, split: "{split}", revision: {revision}}}
+    dataset: {{name: {dataset}, type: {dataset}, split: "{of.split}", revision: {revision}}}
     metrics:
-    - {{type: {metric}, value: {value:.4f}, config: "nuisance policy {policy}, background {background}"}}"""
+    - {{type: {of.name}, value: {of.value:.4f}, \
+config: "nuisance policy {of.policy}, background {of.background}"}}"""
 
 _INSIDE = (
     "Inside, beside them: `scan-axis`, what the height along x adds to a measured map. `litho-models freeze` "
@@ -38,16 +39,7 @@ def model_readme(card: ModelCard) -> str:
     dataset = card.dataset.name if card.dataset else "unknown"
     revision = card.dataset.sha256 if card.dataset else "unknown"
     results = "".join(
-        _RESULT.format(
-            dataset=dataset,
-            revision=revision,
-            split=metric.split,
-            metric=metric.name,
-            value=metric.value,
-            policy=metric.policy,
-            background=metric.background,
-        )
-        for metric in card.metrics
+        _RESULT.format(dataset=dataset, revision=revision, of=metric) for metric in card.metrics
     )
     header = _HEADER.format(model=card.model, dataset=dataset, name=card.name, results=results or " []")
     low, high = card.calibrated_range_um

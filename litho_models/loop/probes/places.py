@@ -37,7 +37,7 @@ def position_map(
         partial(_map_columns, times_height=times_height),
         _roughness(SPLINES),
         _turned,
-        partial(_size, times_height=times_height),
+        partial(_spread, drawn, times_height=times_height),
         left,
     )
 
@@ -54,7 +54,7 @@ def profile(
         partial(_profile_columns, along=along, times_height=times_height),
         second_differences(PROFILE_SPLINES) + 1e-2 * np.eye(PROFILE_SPLINES),
         _rolled,
-        partial(_profile_size, times_height=times_height),
+        partial(_spread, drawn_profile, times_height=times_height),
         left,
     )
 
@@ -70,15 +70,10 @@ def drawn(coefficients: np.ndarray, size: int = 101) -> np.ndarray:
     return splines.T @ coefficients.reshape(SPLINES, SPLINES) @ splines
 
 
-def _size(coefficients: np.ndarray, times_height: bool) -> dict[str, tuple[float, str]]:
-    return _spread(drawn(coefficients), times_height)
-
-
-def _profile_size(coefficients: np.ndarray, times_height: bool) -> dict[str, tuple[float, str]]:
-    return _spread(drawn_profile(coefficients), times_height)
-
-
-def _spread(values: np.ndarray, times_height: bool) -> dict[str, tuple[float, str]]:
+def _spread(
+    drawing: Callable[[np.ndarray], np.ndarray], coefficients: np.ndarray, times_height: bool
+) -> dict[str, tuple[float, str]]:
+    values = drawing(coefficients)
     scale, unit = (1.0, "1") if times_height else (NM_PER_UM, "nm")
     return {
         "rms": (float(values.std()) * scale, unit),
