@@ -202,7 +202,9 @@ def test_the_estimate_follows_its_laws(tmp_path, capsys, monkeypatch):
         "64",
     ]
     monkeypatch.setattr("sys.argv", ["litho-design", "estimate", *given])
-    main()
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 0
     first, second, told, shared = capsys.readouterr().out.splitlines()
     assert "64 px" in first
     assert "128 px" in second
