@@ -43,6 +43,8 @@ def other(leaf: Leaf):
     if get_origin(leaf.kind) is Literal:
         return next(choice for choice in get_args(leaf.kind) if choice != leaf.value)
     if isinstance(leaf.value, tuple):
+        if all(isinstance(value, float) for value in leaf.value):
+            return tuple(value / 2 for value in leaf.value) or (0.25,)
         return leaf.value[::-1]
     if leaf.kind is float:
         return leaf.value / 2 if leaf.value else 0.25
