@@ -25,7 +25,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@touch $@
 
 demo: $(STAMP)     ## run the whole path: make demo, or make demo DATASET=neural-lithography
-	$(BIN)/python examples/demo.py --out $(OUT) $(if $(DATASET),--dataset $(DATASET))
+	$(BIN)/python -m examples.demo --out $(OUT) $(if $(DATASET),--dataset $(DATASET))
 
 trials: $(STAMP)   ## blind trials of the closed loop: make trials WORKERS=2, PUBLISH=1 writes them into docs/
 	$(BIN)/python -m benchmarks.blind_trials --out $(OUT)/blind-trials --workers $(WORKERS) $(if $(PUBLISH),--publish)

@@ -18,8 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from demo_story import FAB, tell
-
+from examples.demo_story import FAB, tell
 from litho_data.foundation.report import Page
 
 BIN = Path(sys.executable).parent

@@ -9,6 +9,7 @@ from pathlib import Path
 import litho_data
 import litho_design
 import litho_models
+from examples.demo_story import FAB, tell
 from litho_data.foundation.report import Page
 from tests.litho_models.prints import make_scans, write_store
 
@@ -16,10 +17,7 @@ ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results" / "neural-lithography"
 
 
-def test_the_story_has_six_cards_with_pictures_and_links(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(ROOT / "examples")
-    from demo_story import FAB, tell
-
+def test_the_story_has_six_cards_with_pictures_and_links(tmp_path):
     knobs = ["tilt-bow=15", "write-order-memory=0.15"]
     litho_data.simulate(tmp_path / "fab", count=1, size_px=64, knobs=knobs)
     write_store(tmp_path / "store.zarr", make_scans(2, 32))

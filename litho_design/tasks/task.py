@@ -271,7 +271,7 @@ def registered_task(name: str) -> type[Task]:
             "task",
             name,
             sorted(_TASKS),
-            also="one of your own, whose file --task-file names",
+            also="one of your own, made known by register_task (--task-file names its file)",
         )
     return _TASKS[name]
 

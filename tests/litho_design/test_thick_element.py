@@ -58,7 +58,9 @@ def test_an_element_is_thick_where_its_optics_say_so():
 
 
 def test_gradients_flow_through_the_relief():
-    height = (0.3 * torch.rand(8, 8, dtype=torch.float64)).requires_grad_()
+    # No place is as high as the highest or on the border of a slice: there the slope has a corner.
+    height = 0.3 * torch.rand(8, 8, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    height.requires_grad_()
     grid = centred_grid((8, 8), 0.1)
 
     def power(relief):

@@ -218,5 +218,6 @@ def test_memory_held_for_a_moment_is_seen(mib):
     if cost.peak_memory_mib is None:
         pytest.skip("the peak of resident memory cannot be reset here")
     # Parts of 1 MiB of float32. NumPy asks for pages of 2 MiB for its large arrays, and the allocator hands
-    # such addresses out again after them: then resident memory grows by 2 MiB at a time, once at either end.
-    assert cost.peak_memory_mib == pytest.approx(mib, abs=2 * 2)
+    # such addresses out again after them: then resident memory grows by 2 MiB at a time, once at either end;
+    # the list and whatever else the process does meanwhile are below 1 MiB.
+    assert cost.peak_memory_mib == pytest.approx(mib, abs=2 * 2 + 1)
