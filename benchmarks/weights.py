@@ -1,7 +1,7 @@
 """Does it help to weigh pixels by their uncertainty? Two benchmarks of the measured prints, side by side.
 
-    litho-models benchmark STORE --models linear,features --out UNIFORM
-    litho-models benchmark STORE --models linear,features --weights sigma --out SIGMA
+    litho-models benchmark STORE --models linear,features,physics --out UNIFORM
+    litho-models benchmark STORE --models linear,features,physics --weights sigma --out SIGMA
     python -m benchmarks.weights UNIFORM SIGMA [--publish]
 
 Both judge all pixels alike. --publish also writes the table into docs/evaluation.md.
