@@ -30,7 +30,8 @@ def tell(page: Page, out: Path, model: str = "pbl") -> None:
     truth = Truth.read(out / "fab" / "truth")
     loop = CloseLoop.read(out / "close-loop")
     gap = GapResult.read(out / "compare")
-    planted = {knob.effect: f"{knob.name}, {knob.strength:g} {knob.unit}".strip() for knob in truth.knobs}
+    units = {knob.name: "" if knob.unit == "1" else f" {knob.unit}" for knob in truth.knobs}
+    planted = {knob.effect: f"{knob.name}, {knob.strength:g}{units[knob.name]}" for knob in truth.knobs}
     found = [effect.name for effect in loop.effects]
     hit = [name for name in planted if name in found]
     psnr = {
