@@ -15,6 +15,7 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.record import write_record
 from litho_data.foundation.commands import run_script
 from litho_data.foundation.run_facts import run_facts
 from litho_design.holograms.settings import hologram_settings
@@ -56,11 +57,9 @@ def main() -> None:
         "error": {name: value / getattr(left_out, name) - 1 for name, value in predicted.items()},
         "iteration_ns_per_px": [1e9 * one.iteration_s / one.size_px**2 for one in measured],
     }
-    text = json.dumps(content, indent=1) + "\n"
-    print(text)
+    print(json.dumps(content, indent=1))
     if given.out:
-        given.out.parent.mkdir(parents=True, exist_ok=True)
-        given.out.write_text(text)
+        write_record(given.out, content)
 
 
 if __name__ == "__main__":

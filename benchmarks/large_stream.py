@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from benchmarks.record import write_record
 from litho_data.foundation.commands import run_script
 from litho_data.foundation.run_facts import run_facts
 from litho_design.holograms.settings import hologram_settings
@@ -51,11 +52,9 @@ def main() -> None:
         "peak_memory_gib": peak_memory_gib(),
         "figures": score.figures,
     }
-    text = json.dumps(content, indent=1) + "\n"
-    print(text)
+    print(json.dumps(content, indent=1))
     if given.out:
-        given.out.parent.mkdir(parents=True, exist_ok=True)
-        given.out.write_text(text)
+        write_record(given.out, content)
 
 
 def _layout(folder: Path, size_px: int) -> None:

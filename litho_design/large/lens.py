@@ -19,7 +19,6 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import writable
 from litho_data.foundation.hashes import record_sha256
 from litho_data.foundation.outputs import require_own_folder
-from litho_data.foundation.run_facts import run_facts
 from litho_design.large.bands import Bands
 from litho_design.large.printing import check_printer
 from litho_design.lenses.bench import RadialLensBench, centre_to_background
@@ -27,7 +26,7 @@ from litho_design.lenses.score import LensScore, lens_score
 from litho_design.lenses.settings import LensSettings
 from litho_design.lenses.task import strip_rings
 from litho_design.optics.stroke import measure_stroke
-from litho_design.optimisation.budget import measure_budget, peak_memory_gib
+from litho_design.optimisation.budget import measure_budget
 from litho_design.optimisation.parameters import CellMap, DirectLevels
 from litho_design.optimisation.phases import focusing_levels, printed_phase
 from litho_design.optimisation.search import (
@@ -184,14 +183,7 @@ def design_in_rings(
         task="lens-direct",
         variant=settings.variant,
         fingerprint=fingerprint,
-        run=RunRecord(
-            **run_facts(),
-            device=str(printer.device),
-            threads=torch.get_num_threads(),
-            seconds=time.monotonic() - started,
-            seconds_per_iteration=budget.seconds_per_iteration,
-            peak_memory_gib=peak_memory_gib(printer.device),
-        ),
+        run=RunRecord.of(printer.device, time.monotonic() - started, budget.seconds_per_iteration),
         settings=settings.model_dump(mode="json"),
         layout=layout,
         optics=settings.optics,

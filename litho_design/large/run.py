@@ -14,7 +14,6 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import writable
 from litho_data.foundation.hashes import file_sha256, record_sha256
 from litho_data.foundation.outputs import require_own_folder
-from litho_data.foundation.run_facts import run_facts
 from litho_design.holograms.settings import HologramSettings
 from litho_design.images.targets import Target
 from litho_design.large.bands import Bands
@@ -22,7 +21,7 @@ from litho_design.large.hologram import BandedHologram
 from litho_design.large.printing import print_bands
 from litho_design.large.score import image_figures
 from litho_design.optics.stroke import measure_stroke
-from litho_design.optimisation.budget import measure_budget, peak_memory_gib
+from litho_design.optimisation.budget import measure_budget
 from litho_design.optimisation.parameters import DirectLevels
 from litho_design.optimisation.phases import printed_phase
 from litho_design.optimisation.search import (
@@ -109,14 +108,7 @@ def design_in_bands(
             task="hoe",
             variant=settings.variant,
             fingerprint=fingerprint,
-            run=RunRecord(
-                **run_facts(),
-                device=str(printer.device),
-                threads=torch.get_num_threads(),
-                seconds=seconds,
-                seconds_per_iteration=budget.seconds_per_iteration,
-                peak_memory_gib=peak_memory_gib(printer.device),
-            ),
+            run=RunRecord.of(printer.device, seconds, budget.seconds_per_iteration),
             settings=settings.model_dump(mode="json"),
             layout=layout,
             optics=settings.optics,

@@ -6,16 +6,18 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+import torch
 from pydantic import Field
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
 from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Result
-from litho_data.foundation.run_facts import RunFacts
+from litho_data.foundation.run_facts import RunFacts, run_facts
 from litho_design.images.targets import TargetRecord
 from litho_design.optics import Optics
 from litho_design.optics.stroke import Stroke
+from litho_design.optimisation.budget import peak_memory_gib
 from litho_design.optimisation.robust import EnsembleRecord
 from litho_design.printers.layout import LayoutSettings, Printability
 from litho_design.printers.printer import PrinterRecord, TilingCheck
@@ -37,6 +39,18 @@ class RunRecord(RunFacts):
     seconds: float
     seconds_per_iteration: float
     peak_memory_gib: float
+
+    @classmethod
+    def of(cls, device: torch.device, seconds: float, seconds_per_iteration: float) -> RunRecord:
+        """The record of the run that this process ends now."""
+        return cls(
+            **run_facts(),
+            device=str(device),
+            threads=torch.get_num_threads(),
+            seconds=seconds,
+            seconds_per_iteration=seconds_per_iteration,
+            peak_memory_gib=peak_memory_gib(device),
+        )
 
 
 class Design(Result):

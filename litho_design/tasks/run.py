@@ -18,9 +18,8 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import writable
 from litho_data.foundation.hashes import record_sha256
 from litho_data.foundation.outputs import require_own_folder
-from litho_data.foundation.run_facts import run_facts
 from litho_design.optics.stroke import measure_stroke
-from litho_design.optimisation.budget import Budget, measure_budget, peak_memory_gib
+from litho_design.optimisation.budget import Budget, measure_budget
 from litho_design.optimisation.fabrication import outside
 from litho_design.optimisation.polish import polish_levels
 from litho_design.optimisation.robust import measure_disagreement
@@ -125,14 +124,7 @@ def run_design(
         task=task.name,
         variant=settings.variant,
         fingerprint=fingerprint,
-        run=RunRecord(
-            **run_facts(),
-            device=str(height.device),
-            threads=torch.get_num_threads(),
-            seconds=outcome.seconds,
-            seconds_per_iteration=outcome.budget.seconds_per_iteration,
-            peak_memory_gib=peak_memory_gib(height.device),
-        ),
+        run=RunRecord.of(height.device, outcome.seconds, outcome.budget.seconds_per_iteration),
         settings=settings.model_dump(mode="json"),
         layout=settings.layout,
         optics=settings.optics,

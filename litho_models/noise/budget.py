@@ -100,15 +100,15 @@ def noise_budget(found: Residuals, seed: int = 0) -> NoiseBudget:
 
 def _length_um(maps_um: Sequence[np.ndarray], pitch_um: float, axis: int) -> float:
     """Distance along an axis over which the correlation of maps with gaps falls to 1/e, at most 40 px."""
+    variances = sum(float(np.nanmean(one**2)) for one in maps_um)
     correlation = [1.0]
     while correlation[-1] > np.exp(-1) and len(correlation) <= _FARTHEST_PX:
         lag = len(correlation)
-        products = variances = 0.0
+        products = 0.0
         for one in maps_um:
             rows = np.moveaxis(one, axis, 0)
             both = rows[lag:] * rows[:-lag]
             products += float(np.nanmean(both))
-            variances += float(np.nanmean(one**2))
         correlation.append(products / variances)
     before, after = correlation[-2:]
     if after > np.exp(-1):
