@@ -8,6 +8,7 @@ S. Baker, I. Matthews, IJCV 56 (2004), doi:10.1023/B:VISI.0000011205.11775.fd.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -135,14 +136,18 @@ def refine(
     return Refinement(model, matrix, warped, _cell_grams(regressors, warped, inside), converged, bend)
 
 
-def aligned_gram(aligned: np.ndarray, topography: np.ndarray, count: int) -> np.ndarray:
+def aligned_gram(
+    aligned: np.ndarray, topography: np.ndarray, count: int, further: Sequence[np.ndarray] = ()
+) -> np.ndarray:
     """``gram`` of a scan that lies on the topography (ny, nx) already, NaN where not measured.
 
-    ``count``: number of flows of a warp, see ``LADDER`` and ``BENT_COUNT``.
+    ``count``: number of flows of a warp, see ``LADDER`` and ``BENT_COUNT``; ``further`` regressors (ny, nx)
+    stand behind these.
     """
     shape = (topography.shape[0], topography.shape[1])
     inside = _interior(shape) & np.isfinite(aligned)
-    return _cell_grams(_regressors(topography, count), np.where(inside, aligned, 0.0), inside)
+    regressors = np.concatenate([_regressors(topography, count), *(one[None] for one in further)])
+    return _cell_grams(regressors, np.where(inside, aligned, 0.0), inside)
 
 
 def in_blocks(gram: np.ndarray) -> np.ndarray:
