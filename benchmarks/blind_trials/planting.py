@@ -20,15 +20,13 @@ from litho_data.virtual_fab.fab import Fab, scan_job
 from litho_data.virtual_fab.jobs import Plan, random_jobs
 from litho_data.virtual_fab.knobs import OFF_CATALOGUE, KnobBoard
 from litho_data.virtual_fab.settings import Microscope, Noise
-from litho_data.virtual_fab.strength import search_strength
+from litho_data.virtual_fab.strength import NOISE_KNOB, search_strength
 from litho_models.fitting.least_squares import Linearised, Rules, fit_least_squares, gram, orthonormal
 from litho_models.fitting.small_models import ModelProblem
 from litho_models.models import build_model
 from litho_models.scan_terms import POLICIES
 from litho_models.simulator import Simulator
 
-# Noise by nature: no noise-free scan shows it, its strength is its rms.
-_NOISE_KNOB = "line-roughness"
 # strength_for_rms refuses a knob that leaves less than this under the policy.
 _TRACE_NM = 1e-3
 _SCAN_TERMS = POLICIES["full"] | {"warp"}
@@ -168,11 +166,10 @@ def _sized_by_scan_terms(drawn: KnobDraw, jobs: Sequence[Job], draw: Draw) -> Pl
     """The size of the noise-free scans with minus without the knob, freed of the scans' own terms only."""
     wanted, printer = drawn.wanted_rms_nm, printer_of(draw)
     highest = KnobSetting(drawn.name, _limit(drawn.name), draw.seed)
-    if drawn.name == _NOISE_KNOB:
-        strength = min(wanted, highest.strength)
-        return _planted(drawn, strength, strength)
-    if (reached := knob_rms_nm(highest, jobs, printer=printer)) <= max(wanted, _TRACE_NM):
-        return _planted(drawn, highest.strength, reached)
+    if drawn.name != NOISE_KNOB:
+        reached = knob_rms_nm(highest, jobs, printer=printer)
+        if reached <= max(wanted, _TRACE_NM):
+            return _planted(drawn, highest.strength, reached)
     found = strength_for_rms(drawn.name, wanted, jobs=jobs, seed=draw.seed, printer=printer)
     return _planted(drawn, found.setting.strength, found.rms_nm)
 

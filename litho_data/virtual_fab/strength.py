@@ -17,6 +17,8 @@ from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 
 Policy = Literal["none", "offset", "full"]
 
+# Noise by nature: no noise-free scan shows it, its strength is its rms.
+NOISE_KNOB = "line-roughness"
 _RELATIVE_PRECISION = 0.01
 _MAX_STEPS = 40
 
@@ -64,6 +66,9 @@ def strength_for_rms(
     if name not in KNOBS:
         KnobSetting.parse(f"{name}=0")
     highest = KNOBS[name].limit
+    if name == NOISE_KNOB:
+        strength = min(rms_nm, highest)
+        return KnobStrength(KnobSetting(name, strength, seed), strength)
     at_limit = measured(highest)
     # Remainders of float32 size are no trace of the effect.
     if at_limit < 1e-3:

@@ -165,6 +165,11 @@ class TestStrengthForRms:
         assert found.setting.strength == KNOBS["long-range-proximity"].limit
         assert found.rms_nm < 500
 
+    def test_of_noise_the_strength_is_the_rms(self, jobs):
+        assert strength_for_rms("line-roughness", 5.0, jobs=jobs).setting.strength == 5.0
+        highest = KNOBS["line-roughness"].limit
+        assert strength_for_rms("line-roughness", 2 * highest, jobs=jobs).rms_nm == highest
+
     def test_knobs_within_the_nuisance_span_are_refused_under_full(self, jobs):
         for name in ("tilt-bow", "z-gain", "vertical-shrinkage", "datum-offset"):
             with pytest.raises(InputError, match="no trace"):
