@@ -270,7 +270,8 @@ def texture_table(textures: Sequence[dict[str, Any]], *notes: str) -> str:
                 (
                     one["id"],
                     str(one["surfaces"]),
-                    f"{one['angle_deg']:.1f}°, strength {one['strength']:.2f} (p = {one['isotropic_p']:.0e})",
+                    f"{one['angle_deg']:.1f}°, strength {one['strength']:.2f} "
+                    f"({_chance(one['isotropic_p'])})",
                     f"along {lines['along']}: {100 * lines['share']:.0f} %",
                     f"{period['period_um']:.3g} µm, {period['amplitude_nm']:.1f} nm, "
                     f"{100 * period['share']:.0f} %",
@@ -291,6 +292,11 @@ def texture_table(textures: Sequence[dict[str, Any]], *notes: str) -> str:
         rows,
         *notes,
     )
+
+
+def _chance(p: float) -> str:
+    """A p that is 0 in double precision is below the smallest number there."""
+    return f"p = {p:.0e}" if p else "p < 1e-300"
 
 
 def coverage_table(noise: dict[str, Any]) -> str:

@@ -45,8 +45,13 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
 
 
 def on_page_content(html: str, page: Any, config: Any, files: Files) -> str:
-    """Sphinx's roles in docstrings are only code here."""
-    return re.sub(r":(?:func|class|mod|meth|data):<code>~?", "<code>", html)
+    """Sphinx's roles in docstrings are only code here; long names may break after / and _."""
+    html = re.sub(r":(?:func|class|mod|meth|data):<code>~?", "<code>", html)
+    return re.sub(r"(?<=<code>)[^<]+(?=</code>)", _breakable, html)
+
+
+def _breakable(code: re.Match[str]) -> str:
+    return re.sub(r"(?<=\w)([/_])(?=\w)", r"\1<wbr>", code[0])
 
 
 def _outside(page: str, text: str) -> set[str]:

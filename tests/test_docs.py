@@ -63,6 +63,13 @@ def test_a_broken_link_and_a_wrong_anchor_are_found(tmp_path):
     assert broken(tmp_path / "a.md") == ["a.md#other", "b.md"]
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_a_list_stands_apart_from_the_text_before_it(page):
+    """The site's Markdown, unlike GitHub's, otherwise runs its points together in one paragraph."""
+    text = _FENCED.sub("", page.read_text("utf-8"))
+    assert re.findall(r"^(?![-*|#<]|\d+\. | |$).*\n(?:[-*]|\d+\.) .*$", text, re.MULTILINE) == []
+
+
 def test_every_page_is_on_the_site():
     nav = (ROOT / "mkdocs.yml").read_text("utf-8").partition("\nnav:\n")[2]
     named = re.findall(r": (\S+\.md)$", nav, re.MULTILINE)

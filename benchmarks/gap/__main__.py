@@ -107,7 +107,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--tasks", metavar="NAMES", help="only these, separated by commas; all by default")
     parser.add_argument("--estimate", action="store_true", help="trial iterations and estimate only")
     parser.add_argument("--proof", action="store_true", help="then one hologram with 1,000 iterations of PBL")
-    parser.add_argument("--publish", action="store_true", help="write tables and figures into docs/optics.md")
+    parser.add_argument("--publish", action="store_true", help="write tables and figures into docs/gap.md")
     parser.add_argument("--trial", help=argparse.SUPPRESS)
     return parser.parse_args()
 

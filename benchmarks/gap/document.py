@@ -21,7 +21,7 @@ from litho_design.judging.score import ScoreResult
 from litho_design.tasks.design import Design
 
 DOCS = Path(__file__).parents[2] / "docs"
-PAGE, RESULTS = DOCS / "optics.md", DOCS / "results" / "gap"
+PAGE, RESULTS = DOCS / "gap.md", DOCS / "results" / "gap"
 NAME = "gap"
 RESULT_FILE, TABLE_FILE = "gap.json", "gap.csv"
 

@@ -78,7 +78,8 @@ def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, A
         cells = [_cell(values[arm, judge, figure], _digits(figure)) for judge in judges for figure in shown]
         lines.append(f"| {arm} | {' | '.join(cells)} |")
     seeds = len(task["seeds"])
-    head = f"### {_TITLES[name]}\n\n{task['iterations']} iterations for every arm, {seeds} seed(s).\n\n"
+    told = f"{seeds} seed{'s' * (seeds > 1)}"
+    head = f"### {_TITLES[name]}\n\n{task['iterations']} iterations for every arm, {told}.\n\n"
     verdict = ""
     # Among printers that are arms themselves each prefers its own design: nobody wins.
     if seeds > 1 and independent:

@@ -55,4 +55,4 @@ print(litho_design.export("with", "png16", "to-printer").name)
 
 # %% [markdown]
 # Next: [what the scores mean, lenses, process windows](../optics.md), [comparing models as
-# designers](../optics.md#the-design-to-manufacturing-gap).
+# designers](../gap.md).
