@@ -9,7 +9,7 @@ import numpy as np
 
 from litho_data import open_store
 from litho_data.foundation.report import Page
-from litho_data.foundation.report_pictures import new_figure
+from litho_data.foundation.report_pictures import model_colour, new_figure
 from litho_data.virtual_fab import Truth
 from litho_design import load_printer
 from litho_design.judging.gap import GapResult, design_folder
@@ -70,7 +70,11 @@ def tell(page: Page, out: Path, model: str = "pbl") -> None:
     page.heading("4. Which model predicts best")
     scores = {one.model: one.mae_datum_free_nm for one in Benchmark.read(out / "benchmark").scores}
     page.paragraph(f"On scans that no fit had seen, {min(scores, key=lambda name: scores[name])} does.")
-    page.figure(_bars(scores, "error, nm"), "Errors of the models on held-out scans, zero of each scan free.")
+    colours = [model_colour(name) for name in scores]
+    page.figure(
+        _bars(scores, "error, nm", colours),
+        "Errors of the models on held-out scans, zero of each scan free.",
+    )
     page.links(
         [("benchmark/report.html", "The benchmark"), ("compare/report.html", "Designed × judged with")]
     )
@@ -108,10 +112,10 @@ def _gains(loop: CloseLoop, planted: set[str]) -> Figure:
     return figure
 
 
-def _bars(values: dict[str, float], label: str) -> Figure:
+def _bars(values: dict[str, float], label: str, colours: str | list[str] = PLANTED) -> Figure:
     figure = new_figure(8.0, 0.6 + 0.45 * len(values))
     axis = figure.subplots()
-    drawn = axis.barh(list(values), list(values.values()), color=PLANTED)
+    drawn = axis.barh(list(values), list(values.values()), color=colours)
     axis.bar_label(drawn, fmt="%.2f", padding=3)
     axis.invert_yaxis()
     axis.margins(x=0.12)

@@ -30,7 +30,7 @@ _STAGES = {
 }
 _TABLE = {
     "scan": "scan",
-    "model": "model",
+    "model": "transform",
     "ncc_before": "correlation, centred",
     "ncc_after": "correlation, registered",
     "reprojection_px": "reprojection (px)",
@@ -39,7 +39,7 @@ _TABLE = {
     "corner_sd_nm": "corner spread (nm)",
     "overlap": "overlap",
     "bend_um": "bend (µm)",
-    "rotation_deg": "rotation (deg)",
+    "rotation_deg": "rotation (°)",
     "singular_min": "scale, smallest",
     "singular_max": "scale, largest",
     "noise_x_nm": "noise along x (nm)",
@@ -93,8 +93,8 @@ def _summary(page: Page, result: BuildResult, store: Store) -> None:
         "The hash of the dataset, below, covers layouts, heights, validity and transforms of all scans; "
         "building again gives the same."
     )
-    for assumption in store.manifest["assumptions"]:
-        page.note(f"Assumed, because the card does not say: {assumption}.")
+    assumed = store.manifest["assumptions"]
+    page.note(*(f"Assumed, because the card does not say: {assumption}." for assumption in assumed))
 
 
 def _verdict(result: BuildResult, quality: pd.DataFrame) -> str:

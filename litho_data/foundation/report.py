@@ -26,6 +26,8 @@ Words = Mapping[str, tuple[str, str]]
 
 _UNITS = {
     "per_um": "1/µm",
+    "um2": "µm²",
+    "deg": "°",
     "um": "µm",
     "nm": "nm",
     "px": "px",
@@ -91,9 +93,14 @@ class Page:
         """Plain prose."""
         self._add("paragraph", text=text)
 
-    def note(self, text: str) -> None:
-        """Something the reader must not overlook."""
-        self._add("note", text=text)
+    def note(self, *texts: str) -> None:
+        """What the reader must not overlook, in one box; without texts, none."""
+        if texts:
+            self._add("note", texts=texts)
+
+    def points(self, texts: Sequence[str]) -> None:
+        """A list of sentences."""
+        self._add("points", texts=list(texts))
 
     def code(self, text: str) -> None:
         """A fixed-width text."""
@@ -120,7 +127,7 @@ class Page:
             name, meaning = self._words.get(key, (spelt_out(key), ""))
             columns.append({"name": name, "meaning": meaning, "numeric": frame[key].dtype.kind in "iufb"})
         rows = [
-            [_cell(value, digits, str(key)) for key, value in zip(frame.columns, row, strict=True)]
+            [self._cell(value, digits, str(key)) for key, value in zip(frame.columns, row, strict=True)]
             for row in frame.itertuples(index=False)
         ]
         meanings = [(column["name"], column["meaning"]) for column in columns if column["meaning"]]
@@ -166,6 +173,14 @@ class Page:
             temporary.write_text(text, encoding="utf-8")
         return target / name
 
+    def _cell(self, value: Any, digits: int, column: str) -> dict[str, Any]:
+        if isinstance(value, str):
+            colour = model_colour(value) if column in _OF_MODELS and " " not in value else None
+            name = self._words.get(value, (spelt_out(value), ""))[0] if column in _OF_KEYS else value
+            return {"text": name, "value": None, "colour": colour}
+        number = isinstance(value, (int, float)) and value == value and not isinstance(value, bool)
+        return {"text": _text(value, digits), "value": value if number else None, "colour": None}
+
     def _add(self, kind: str, **part: Any) -> None:
         self._sections[-1]["parts"].append({"kind": kind, **part})
 
@@ -196,14 +211,6 @@ def spelt_out(key: str) -> str:
             words, unit = key.removesuffix(f"_{suffix}"), f" ({text})"
             break
     return " ".join(_SHORT.get(word, word) for word in re.split("_+", words)) + unit
-
-
-def _cell(value: Any, digits: int, column: str) -> dict[str, Any]:
-    if isinstance(value, str):
-        colour = model_colour(value) if column in _OF_MODELS and " " not in value else None
-        return {"text": spelt_out(value) if column in _OF_KEYS else value, "value": None, "colour": colour}
-    number = isinstance(value, (int, float)) and value == value and not isinstance(value, bool)
-    return {"text": _text(value, digits), "value": value if number else None, "colour": None}
 
 
 def _text(value: Any, digits: int) -> str:

@@ -102,7 +102,7 @@ def _svg(figure: Figure) -> str:
 
 
 def _stack(figure: Figure) -> None:
-    """Give every panel the whole width; small pictures, from four on, half of it. Scales go below."""
+    """Give every panel the whole width; pictures, from three on, half of it. Scales go below."""
     from matplotlib.gridspec import GridSpec
 
     bars = [axes._colorbar for axes in figure.axes if hasattr(axes, "_colorbar")]
@@ -110,13 +110,13 @@ def _stack(figure: Figure) -> None:
     shown = [axes for axes in panels if axes.get_visible() and (axes.axison or axes.images)]
     for axes in set(panels) - set(shown):
         axes.remove()
-    columns = 2 if len(shown) > 3 and all(axes.images for axes in shown) else 1
+    columns = 2 if len(shown) > 2 and all(axes.images for axes in shown) else 1
     rows = -(-len(shown) // columns)
     width = _NARROW_INCH / columns
     high = float(figure.get_size_inches()[1])
     heights = [_narrow_height(axes, width, high) for axes in shown]
     by_row = [max(heights[row * columns : (row + 1) * columns]) for row in range(rows)]
-    under = _lay_down(figure, bars) / columns
+    under = _lay_down(figure, bars, columns)
     figure.set_size_inches(_NARROW_INCH, sum(by_row) + under + _unfold_words(figure, shown, columns))
     grid = GridSpec(rows, columns, figure=figure, height_ratios=by_row)
     for place, axes in enumerate(shown):
@@ -134,15 +134,17 @@ def _narrow_height(axes: Axes, width: float, figure_height: float) -> float:
     return max(min(before, 0.8 * _NARROW_INCH), 0.6 * width, 0.3 * names)
 
 
-def _lay_down(figure: Figure, bars: list[Any]) -> float:
+def _lay_down(figure: Figure, bars: list[Any], columns: int) -> float:
     """Put the colour bars below their panels; returns the inches they need."""
+    inches = 0.0
     for bar in bars:
         parents, label = bar.ax._colorbar_info["parents"], bar.ax.get_ylabel()
         picture = bar.mappable
         bar.remove()
         new = figure.colorbar(picture, ax=parents, location="bottom", label=label, aspect=35, pad=0.02)
-        new.ax.locator_params(nbins=5)
-    return 0.55 * len(bars)
+        new.ax.locator_params(nbins=5 if len(parents) > 1 else 6 - columns)
+        inches += 0.55 / (columns if len(parents) == 1 else 1)
+    return inches
 
 
 def _unfold_words(figure: Figure, shown: list[Axes], columns: int) -> float:
@@ -151,9 +153,9 @@ def _unfold_words(figure: Figure, shown: list[Axes], columns: int) -> float:
     extra, label = 0.1, ""
     for axes in shown:
         axes.set_title(textwrap.fill(axes.get_title(), letters), fontsize=9)
-        extra += 0.15 * axes.get_title().count("\n") / columns
+        extra += (0.2 + 0.15 * axes.get_title().count("\n")) / columns if axes.get_title() else 0.0
         label = axes.get_ylabel() or (label if axes.get_shared_y_axes().get_siblings(axes)[1:] else "")
-        axes.set(ylabel=textwrap.fill(label, 40), xlabel=textwrap.fill(axes.get_xlabel(), letters))
+        axes.set(ylabel=textwrap.fill(label, 40), xlabel=textwrap.fill(axes.get_xlabel(), letters - 10))
         if axes.xaxis.get_visible() and len(axes.get_xticks()):
             axes.tick_params(labelbottom=True, labelleft=True)
         if (old := axes.get_legend()) is not None and len(old.get_texts()) > 3:

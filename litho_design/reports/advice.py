@@ -5,8 +5,25 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
+from litho_data.foundation.report import Words, spelt_out
 from litho_design.tasks.design import LEVELS_FILE, Design
 
+# Figures whose key, spelt out, says too little; what each is, the descriptions of the scores say.
+WORDS: Words = {
+    key: (name, "")
+    for key, name in {
+        "eff_signal": "power on the signal",
+        "eff_paper": "power where T > 0",
+        "eff_window": "power in the window",
+        "rmse_paper": "RMSE, the paper's scale",
+        "strehl": "Strehl ratio",
+        "cbr": "centre-to-background ratio",
+        "cbr_ceiling": "centre-to-background ratio, perfect lens",
+        "mae_direct": "MAE, sensor image",
+        "mae_design": "MAE, designed PSF",
+        "mae_calibrated": "MAE, print's own PSF",
+    }.items()
+}
 # Figures whose loss is told in dB: already in dB (0), shares of power (10), lengths (20).
 _IN_DB = {"si_psnr_db": 0, "eff_signal": 10, "focusing_efficiency": 10, "rms_nm": -20}
 _EFFICIENCIES = ("eff_signal", "focusing_efficiency")
@@ -16,6 +33,11 @@ _THICK_SHARE = 0.1
 _SEEN_SHARE = 0.02
 # Figures that are errors or widths, by how their names begin; of all others more is better.
 _LESS_IS_BETTER = ("mae", "rms", "p95", "fwhm", "speckle", "zero_order", "loss")
+
+
+def named(figure: str) -> str:
+    """The name of a score's figure for people."""
+    return WORDS.get(figure, (spelt_out(figure), ""))[0]
 
 
 def less_is_better(figure: str) -> bool:
@@ -52,11 +74,13 @@ def _cost_of_staying_inside(design: Design) -> str:
     for name, scale in _IN_DB.items():
         now, then = design.predicted.get(name, 0.0), gauge.inside.get(name, 0.0)
         if min(now, then) > 0:
-            told.append(f"{now - then if scale == 0 else scale * math.log10(now / then):.2f} dB of {name}")
+            lost = now - then if scale == 0 else scale * math.log10(now / then)
+            told.append(f"{lost:.2f} dB of {named(name).removesuffix(' (dB)')}")
     if not told:
-        told = [f"{name} {now:.4g}, not {design.predicted[name]:.4g}" for name, now in gauge.inside.items()][
-            :2
+        told = [
+            f"{named(key)} {now:.4g}, not {design.predicted[key]:.4g}" for key, now in gauge.inside.items()
         ]
+        told = told[:2]
     return (
         f". A short search that stays closer ({100 * gauge.inside_distance:.0f} % of the pixels) ends at a "
         f"cost of {', '.join(told)}, as the model prints both (--inside-weight searches so from the start)"
@@ -122,7 +146,7 @@ def headline(score: Mapping[str, float], uncertainty: Mapping[str, float] | None
         return f"{told('rms_nm', 1)} nm rms from the relief"
     names = [name for name in ("direct", "design", "calibrated") if f"mae_{name}" in score]
     if not names:
-        return ", ".join(f"{name} {told(name, 4)}" for name in score)
+        return ", ".join(f"{named(name)} {told(name, 4)}" for name in score)
     return "MAE " + ", ".join(f"{name} {told(f'mae_{name}', 4)}" for name in names)
 
 
@@ -142,5 +166,5 @@ def baseline_line(baselines: Mapping[str, Mapping[str, float]]) -> str:
         ]
         shown += [f"SSIM {figures['ssim']:.3f}"] if "ssim" in figures else []
         shown += [f"MAE {figures['mae_calibrated']:.4f}"] if "mae_calibrated" in figures else []
-        found.append(f"{name} {', '.join(shown)}")
+        found.append(f"{name} {', '.join(shown or [f'{named(key)} {v:.4g}' for key, v in figures.items()])}")
     return f"for comparison: {'; '.join(found)}"

@@ -13,7 +13,7 @@ from litho_design.holograms.task import HologramTask
 from litho_design.lenses.task import LensTask
 from litho_design.optimisation.process_window import measure_yield
 from litho_design.reliefs.task import UNPRINTABLE_FILE, ReliefTask
-from litho_design.reports.advice import baseline_line, headline, stroke_advice
+from litho_design.reports.advice import WORDS, baseline_line, headline, named, stroke_advice
 from litho_design.reports.lens import add_lens_curves, add_lens_window, decibels
 from litho_design.reports.parts import (
     BRIGHTEST,
@@ -49,6 +49,7 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
         "all scores are of the printable layout.",
         run=design.run,
         facts=identity(design),
+        words=WORDS,
     )
     page.verdict(
         f"As {design.printer.name} prints it: {headline(design.predicted)}. This is what the model that the "
@@ -76,7 +77,7 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
     page.paragraph(
         f"Loss of the printable layout: {design.start_loss:.4f} at the start, {design.argmax_loss:.4f} after "
         f"{design.iterations} iterations, {design.polished_loss:.4f} after the polish; the last sample had "
-        f"{design.sample_loss:.4f} (soft-to-hard gap {design.argmax_loss - design.sample_loss:+.4f})."
+        f"{design.sample_loss:.4f} (soft-to-hard gap {design.argmax_loss - design.sample_loss:+.2g})."
     )
     import torch
 
@@ -85,7 +86,7 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
     draws = task.window_scores(print_um, window.yield_draws)
     shown = [name for name in draws[0] if name in design.predicted]
     chosen = [name for name in task.headline if name in shown][:2] or shown[:2]
-    figures = {name: (design.predicted[name], labels.get(name, name)) for name in chosen}
+    figures = {name: (design.predicted[name], labels.get(name, named(name))) for name in chosen}
     add_yield(page, draws, window, figures, measure_yield(draws, design.predicted, window))
     if isinstance(task, LensTask):
         add_lens_window(page, task.bench, print_um)
@@ -104,7 +105,7 @@ def _tiles(design: Design, task: Task) -> list[tuple[str, str]]:
     black = (design.baselines or {}).get("black image", {})
     tiles = []
     for name in (task.headline or tuple(design.predicted))[:5]:
-        value, label = design.predicted[name], labels.get(name, name)
+        value, label = design.predicted[name], labels.get(name, named(name))
         more = f" (black image {black[name]:.3f})" if name in black and name.startswith("ssim") else ""
         ceiling = design.predicted.get(f"{name}_ceiling")
         more += f" (ceiling {ceiling:.0f})" if ceiling else ""

@@ -43,8 +43,7 @@ def write_first_report(folder: Path, result: GapResult, printers: Mapping[str, P
         f"{DESIGNER} expects of its own design; {JUDGE}, a model that had no part in it, finds it "
         f"{abs(judged):.1f} dB {doubt}. One hologram, so nothing is said about chance."
     )
-    for note in designs[WITHOUT].record.notes:
-        page.note(note[0].upper() + note[1:] + ".")
+    page.note(*(note[0].upper() + note[1:] + "." for note in designs[WITHOUT].record.notes))
     page.figure(
         draw_images(designs, printers[DESIGNER], scores),
         "Left: the wanted image. Middle and right: what the printed holograms would show, at matched scale.",

@@ -16,7 +16,7 @@ from litho_design.judging.gap import GapResult, PairedDifference, design_folder,
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.lenses.score import ImagingLensScore
 from litho_design.printers.printer import Printer
-from litho_design.reports.advice import baseline_line, less_is_better
+from litho_design.reports.advice import WORDS, baseline_line, less_is_better
 from litho_design.reports.parts import image_grid, meanings
 from litho_design.tasks.design import Design
 
@@ -33,17 +33,17 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
     shown = headline(result.task)
     page = Page(
         "The design-to-manufacturing gap",
-        f"{what}: {len(result.arms)} arms, {len(result.seeds)} seed(s), {result.settings.search.iterations} "
-        "iterations each; layouts are scored as they would be printed.",
+        f"{what[0].upper()}{what[1:]}: {len(result.arms)} arms, seeds {', '.join(map(str, result.seeds))}, "
+        f"{result.settings.search.iterations} iterations each; layouts are scored as they would be printed.",
         run=result,
         facts={"seeds": ", ".join(map(str, result.seeds))}
         | {f"{name}, SHA-256": one.sha256 for name, one in result.judges.items() if one.sha256},
+        words=WORDS,
     )
     own = Design.read(design_folder(folder, next(iter(result.arms)), result.seeds[0]))
     shown = shown or tuple(own.predicted)
     page.verdict(_verdict(result, shown[0]))
-    for note in own.notes:
-        page.note(note[0].upper() + note[1:] + ".")
+    page.note(*(note[0].upper() + note[1:] + "." for note in own.notes))
     judged = _judged(folder, result, printers)
     page.figure(
         _pictures(result, judged),
@@ -98,14 +98,14 @@ def _verdict(result: GapResult, figure: str) -> str:
     for judge in judges:
         found = {i.arm: i.judged_mean for i in result.summary if (i.judge, i.figure) == (judge, figure)}
         ranking = sorted(found, key=lambda arm: -sign * found[arm])
-        text = f"Printed by {judge}, layouts designed with {ranking[0]} are best: {found[ranking[0]]:.3g}"
+        text = f"Printed by {judge}, layouts designed with {ranking[0]} are best: {found[ranking[0]]:.4g}"
         if len(ranking) > 1:
             pair = next(
                 i
                 for i in result.paired
                 if (i.judge, i.figure) == (judge, figure) and {i.arm, i.against} == set(ranking[:2])
             )
-            text += f", against {found[ranking[1]]:.3g} with {ranking[1]}; " + _chance(
+            text += f", against {found[ranking[1]]:.4g} with {ranking[1]}; " + _chance(
                 pair, len(result.seeds)
             )
         told.append(f"{text}.")
@@ -158,7 +158,7 @@ def _pictures(result: GapResult, judged: dict[str, tuple[LoadedDesign, dict[str,
     for arm, (loaded, by_judge) in judged.items():
         images.append([loaded.display(image) for image in by_judge.values()])
         titles.append(
-            [f"{arm}: in design" if name == arm else f"{arm}: printed by {name}" for name in by_judge]
+            [f"{arm}:\nin design" if name == arm else f"{arm}:\nprinted by {name}" for name in by_judge]
         )
         side_um = loaded.window_um
     return image_grid(images, titles, list(judged), side_um)
@@ -183,9 +183,9 @@ def _prints(
         highest = max(float(height[middle].max()) for height in maps.values())
         for axis, (name, height) in zip(row, maps.items(), strict=True):
             shown = axis.imshow(height[middle], cmap="viridis", vmin=0, vmax=highest, extent=extent)
-            axis.set_title(name, fontsize=8)
-            axis.tick_params(labelsize=6)
-        row[0].set_ylabel(f"designed with {arm}", fontsize=8)
+            axis.set_title(name, fontsize=10)
+            axis.tick_params(labelsize=8)
+        row[0].set_ylabel(f"designed with {arm}", fontsize=10)
         figure.colorbar(shown, ax=row.tolist(), label="µm", shrink=0.8)
     return figure
 

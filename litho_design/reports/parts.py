@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from litho_data.foundation.report import Page, spelt_out
+from litho_data.foundation.report import Page
 from litho_data.foundation.report_pictures import new_figure
 from litho_data.foundation.results import Record
 from litho_design.optimisation.process_window import ProcessWindow, Yield, spreads
-from litho_design.reports.advice import distribution_warning, thickness_warning
+from litho_design.reports.advice import distribution_warning, named, thickness_warning
 from litho_design.tasks.design import Design
 
 if TYPE_CHECKING:
@@ -23,8 +23,8 @@ BRIGHTEST = 1.5
 
 def add_notes(page: Page, design: Design) -> None:
     """The remarks of the record, and where layout or element lie beyond what the scores can tell."""
-    for note in filter(None, (distribution_warning(design), thickness_warning(design), *design.notes)):
-        page.note(note[0].upper() + note[1:] + ".")
+    notes = filter(None, (distribution_warning(design), thickness_warning(design), *design.notes))
+    page.note(*(note[0].upper() + note[1:] + "." for note in notes))
 
 
 def identity(design: Design) -> dict[str, object]:
@@ -75,7 +75,7 @@ def add_yield(
     page.paragraph(
         f"{passed.passed} of {passed.draws} prints pass ({low} to {high} %, 95 % interval): no figure in dB "
         f"is more than {window.pass_drop_db:g} dB below the print as modelled, every other one keeps "
-        f"{100 * window.pass_share:g} % of it. Judged by {', '.join(map(spelt_out, passed.figures))}."
+        f"{100 * window.pass_share:g} % of it. Judged by {', '.join(map(named, passed.figures))}."
     )
     figure = new_figure(8, 3)
     (axes,) = figure.subplots(1, len(figures), sharey=True, squeeze=False)
@@ -98,11 +98,14 @@ def score_table(
     columns: Mapping[str, Mapping[str, float]], labels: Mapping[str, str]
 ) -> list[dict[str, Any]]:
     """One row per figure, one column per print or baseline, and the meaning of each figure."""
-    names = dict.fromkeys(name for figures in columns.values() for name in figures if name in labels)
+    # A task of one's own need not describe its figures.
+    names = dict.fromkeys(
+        name for figures in columns.values() for name in figures if name in labels or not labels
+    )
     return [
         {"name": name}
         | {title: figures.get(name, np.nan) for title, figures in columns.items()}
-        | {"meaning": labels[name]}
+        | ({"meaning": labels[name]} if labels else {})
         for name in names
     ]
 
@@ -156,8 +159,9 @@ def add_gauge(page: Page, design: Design) -> None:
             f"{ensemble.disagreement_nm:.1f} nm ({ensemble.disagreement_waves:.3f} waves) rms."
         )
     figures = design.printability.model_dump() | (gauge.model_dump() if gauge else {})
-    given = {name: float(value) for name, value in figures.items() if isinstance(value, (int, float))}
-    frame = {"name": list(given), "value": list(given.values())}
+    given = {name: value for name, value in figures.items() if isinstance(value, (int, float))}
+    # Kept apart from each other, so that a count stays a whole number.
+    frame = {"name": list(given), "value": np.array(list(given.values()), dtype=object)}
     page.table(frame, "Lengths in µm; shares of pixel pairs or runs", "printability.csv", digits=3)
 
 
@@ -173,7 +177,8 @@ def image_grid(
         side_um: extent of every image, µm.
     """
     rows, columns = len(images), max(len(row) for row in images)
-    figure = new_figure(2.3 * columns + 0.6, 2.45 * rows)
+    two_lines = any("\n" in name for names in titles for name in names)
+    figure = new_figure(2.3 * columns + 0.6, (2.6 if two_lines else 2.45) * rows)
     axes = figure.subplots(rows, columns, squeeze=False)
     for axis in axes.flat:
         axis.set_xticks([])
@@ -184,6 +189,6 @@ def image_grid(
             axis = axes[row, column]
             axis.axis("on")
             axis.imshow(picture, cmap="inferno", vmin=0, vmax=BRIGHTEST, extent=(0, side_um, side_um, 0))
-            axis.set_title(name, fontsize=8)
+            axis.set_title(name, fontsize=10)
         axes[row, 0].set_ylabel(row_labels[row], fontsize=10)
     return figure

@@ -10,7 +10,7 @@ from litho_data.foundation.report import Page
 from litho_design.judging.loaded import task_named
 from litho_design.judging.photographs import LensPhotoScore
 from litho_design.judging.score import ScoreResult
-from litho_design.reports.advice import headline
+from litho_design.reports.advice import WORDS, headline
 from litho_design.reports.parts import image_grid, meanings, score_table
 
 
@@ -30,9 +30,11 @@ def write_score_report(
     """
     page = Page(
         "Score of a printable layout",
-        f"Designed through “{result.designed_with.name}”, printed by {len(result.scores)} judge(s).",
+        f"Designed through “{result.designed_with.name}”, printed by "
+        f"{', '.join(score.judge.name for score in result.scores)}.",
         run=result,
         facts={"layout, SHA-256": result.layout_sha256, "seeds": ", ".join(map(str, result.seeds))},
+        words=WORDS,
     )
     page.verdict(_verdict(result))
     page.figure(

@@ -174,11 +174,11 @@ def paper_sentence(split: str) -> str:
     if split == "paper":
         return shared + (
             "This split is of the same kind, but heights are floating point and the checkpoint is not chosen "
-            "on the scored quadrants: its mae_abs is close to comparable, and leaks."
+            "on the scored quadrants: the error with nothing fitted is close to comparable, and leaks."
         )
     return shared + (
-        "Here whole scans are held out and nothing is chosen on them; mae_abs carries the unknown datum of "
-        "each new scan and mae_datum_free does not. Neither is comparable with the paper's as a number."
+        "Here whole scans are held out and nothing is chosen on them. The error with nothing fitted carries "
+        "the unknown zero of each new scan, the other does not; neither can be compared with the paper's."
     )
 
 

@@ -133,12 +133,13 @@ def protocol_text(protocol: NuisanceProtocol) -> str:
     """How the datum-free error was obtained, in one paragraph."""
     lines = " and its line offsets" if protocol.policy == "full+rows" else ""
     return (
-        "The error with nothing fitted (mae_abs) has no fit at test time. The other (mae_datum_free) first "
-        f"frees each scan of the terms of policy "
+        "For the error with nothing fitted, predictions stay as they are. For the other, each scan is first "
+        f"freed of the terms of policy "
         f"'{protocol.policy}' (k = {protocol.k:g} per scan{lines}), fitted on one half of a checkerboard of "
         f"{protocol.block_px} px blocks shrunk by {protocol.buffer_px} px and scored on the other half, "
-        "both halves swapped; 'full+rows' uses stripes of columns instead. Means are per scan first, then "
-        f"over scans; intervals resample whole scans (2,000 draws). {_BACKGROUND_TEXT[protocol.background]}"
+        "then the other way round; line offsets come from the other side of the scan. Means are per scan "
+        "first, then over scans; intervals resample whole scans (2,000 draws). "
+        f"{_BACKGROUND_TEXT[protocol.background]}"
     )
 
 

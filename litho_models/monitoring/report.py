@@ -19,13 +19,14 @@ if TYPE_CHECKING:
 
 def write_check_report(result: Check, out: str | Path) -> Path:
     """Render the result into ``out``; returns the page."""
-    page = Page(f"Check of {result.model.name} on {result.dataset.name}", result.verdict[0])
+    page = Page(f"Check of {result.model.name} on {result.dataset.name}", run=result.run)
+    page.verdict(result.verdict[0])
     for sentence in result.verdict[1:]:
         page.paragraph(sentence)
-    for note in result.notes:
-        page.note(note)
+    page.note(*result.notes)
     for one in result.figures:
         page.figure(control_chart(result, one), _chart_text(one))
+    page.heading("In numbers", folded=True)
     page.table(
         _figures_table(result),
         "Relative figures: 0.01 is 1 %. p: two-sided chance at one given print, at most the threshold for an "
@@ -35,7 +36,6 @@ def write_check_report(result: Check, out: str | Path) -> Path:
         digits=4,
     )
     page.table(_scans_table(result), f"Every scan; reference: {result.reference}.", "scans.csv", digits=4)
-    page.code(result.run.command)
     return page.write(out)
 
 

@@ -30,8 +30,7 @@ def write_noise_report(result: NoiseAnalysis, references: Sequence[Reference], o
     facts = hashes | {"seeds": ", ".join(map(str, result.run.seeds))}
     page = Page(title, run=result.run, facts=facts, words=COLUMNS)
     page.verdict(_verdict(floor))
-    for note in result.notes:
-        page.note(note)
+    page.note(*result.notes)
     if references:
         _references(page, result, references)
     if result.dose is not None:
@@ -258,7 +257,7 @@ def _budget(page: Page, found: NoiseBudget) -> None:
     if found.flat_length_um is not None:
         y_um, x_um = found.flat_length_um
         page.paragraph(
-            f"There heights hang together over {y_um:.2f} µm along y and {x_um:.2f} µm along x (to 1/e)."
+            f"Heights there are correlated over {y_um:.2f} µm along y and {x_um:.2f} µm along x (to 1/e)."
         )
     if found.flat_texture is not None:
         _texture(page, found.flat_texture)

@@ -57,9 +57,8 @@ def write_report(
     )
     for question in plan.questions:
         page.heading(f"{question.name}: {question.status}", folded=True)
-        page.paragraph(f"{question.text}. {question.why}.")
-        for outcome in question.outcomes:
-            page.paragraph(f"– {outcome}.")
+        page.paragraph(f"{_sentence(question.text)} {_sentence(question.why)}")
+        page.points([_sentence(outcome) for outcome in question.outcomes])
         rivalry = next((r for r in rivalries if r.question.name == question.name), None)
         if rivalry is not None:
             page.figure(
@@ -74,6 +73,10 @@ def write_report(
     page.heading("Scans", folded=True)
     page.table(plan.scans, "In the order of scanning.", "order.csv")
     return page.write(folder)
+
+
+def _sentence(text: str) -> str:
+    return f"{text[:1].upper()}{text[1:]}."
 
 
 def _table(plan: NextPrint) -> list[dict[str, Any]]:

@@ -110,7 +110,7 @@ def test_an_effect_that_is_only_a_part_is_not_exported_and_traces_nothing(plante
     assert verdicts(found)[name] == "partial"
     assert found.verdict == "unexplained"
     assert list(exported_effects(findings.final.fits.chain, found)["undetermined"]) == [name]
-    assert "a part of what is missing, 33 %" in plain_words(findings, found)
+    assert "a part of what is missing, 33 %" in " ".join(plain_words(findings, found))
 
 
 def test_where_nothing_is_added_the_errors_with_the_same_terms_are_the_same(null) -> None:

@@ -56,16 +56,15 @@ def write_report(findings: LoopFindings, result: CloseLoop, folder: Path) -> Pat
             (noise, f"noise that no model predicts: {result.noise_floor.kind.replace('-', ' ')}"),
         ]
     )
-    for warning in warnings_for(findings, result):
-        page.note(warning)
     page.figure(
         staircase_figure(_steps_frame(findings)),
         "Held-out mean absolute error, step by step; bars are 95 % bootstrap intervals over scans. Pale: "
         "terms of each scan on the base model. Full: with the effects added.",
     )
     _decision_section(page, result)
+    page.note(*warnings_for(findings, result))
     page.heading("In words", folded=True)
-    page.paragraph(plain_words(findings, result))
+    page.points(plain_words(findings, result))
     page.heading("Residual maps", folded=True)
     page.figure(
         map_figure(findings, *equal_terms.scores(findings)["accepted"]),
@@ -311,10 +310,9 @@ def _rest_section(page: Page, findings: LoopFindings, result: CloseLoop) -> None
     page.heading("What is left", folded=True)
     state = result.residual.state
     page.paragraph(
-        f"State: {state}. {result.residual.signature or 'No covariate carries a shared structure.'} The "
-        "tests "
-        "ask whether the residual follows the layout or the place in the same way in many scans; correlated "
-        "roughness alone does not count as structure."
+        f"State: {state}: {result.residual.signature or 'no covariate carries a shared structure'}. The "
+        "tests ask whether the residual follows the layout or the place in the same way in many scans; "
+        "correlated roughness alone does not count as structure."
     )
     page.table(
         [

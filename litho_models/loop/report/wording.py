@@ -102,7 +102,7 @@ def headline_words(result: CloseLoop) -> str:
         return f"Nothing was found to add, {missing}: the held-out error stays at {before:.2f} nm."
     named = [e for e in result.effects if e.verdict != "traced-to-covariate"]
     names = ", ".join(get_effect(e.name).title for e in named) or "no named effect, only generic terms"
-    text = f"{result.base_model} lacks: {names}. "
+    text = f"{result.base_model[:1].upper()}{result.base_model[1:]} lacks: {names}. "
     if len(named) < len(result.effects) and named:
         text += f"Generic terms without a name were added as well ({len(result.effects) - len(named)}). "
     text += f"With all of it the held-out error goes from {before:.2f} to {after:.2f} nm"
@@ -116,8 +116,8 @@ def headline_words(result: CloseLoop) -> str:
     return f"{text}, {sure} (p = {over.p:.2g} over {over.count} {unit})."
 
 
-def plain_words(findings: LoopFindings, result: CloseLoop) -> str:
-    """One paragraph for a process engineer."""
+def plain_words(findings: LoopFindings, result: CloseLoop) -> list[str]:
+    """What was found, point by point, for a process engineer."""
     traced = [e for e in result.effects if e.verdict == "traced-to-covariate"]
     named = [e for e in result.effects if e.verdict != "traced-to-covariate"]
     scan_terms = [e for e in named if get_effect(e.name).per_scan]
@@ -171,7 +171,7 @@ def plain_words(findings: LoopFindings, result: CloseLoop) -> str:
         parts.append(f"What is left is still structured: {result.residual.signature}.")
     elif result.verdict != "too-few-scans":
         parts.append("What is left shows no structure that is shared between scans.")
-    return " ".join(parts)
+    return parts
 
 
 def warnings_for(findings: LoopFindings, result: CloseLoop) -> list[str]:
