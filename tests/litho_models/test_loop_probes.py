@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from scipy.ndimage import gaussian_filter
+from scipy.ndimage import gaussian_filter, map_coordinates, shift
 
 from litho_models.loop.fold_fits import FoldFits
 from litho_models.loop.linear import ALL_FREE
@@ -18,7 +18,7 @@ from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.loop.probes import Probed, probe_residual, with_intervals
 from litho_models.loop.probes.defects import find_defects
 from litho_models.loop.probes.kernel import missing_kernel, off_centre_peak, resampled
-from litho_models.loop.probes.places import PROFILE_SPLINES, SPLINES, _over, drawn, drawn_profile
+from litho_models.loop.probes.places import PROFILE_SPLINES, SPLINES, _over, drawn, drawn_profile, shifts
 from litho_models.loop.probes.selection import GENERIC, SMALLEST_AGREEMENT, _anchor, _corrected, generic_terms
 from litho_models.loop.probes.tables import SPOT_UM
 from litho_models.loop.probes.trend import order_trends
@@ -119,14 +119,13 @@ def test_a_response_displaced_from_the_layout_comes_back_in_place_and_size() -> 
 
 def test_a_copy_far_from_the_layout_comes_back_in_place_and_size() -> None:
     """3 % of the layout again 5 µm away: the kernel reaches 1.6 µm on fields of 12.8 µm."""
-    found = probed(*scene(lambda f: 0.03 * np.roll(f.stored.layout_um, (40, -30), (0, 1))))
+    found = probed(*scene(lambda f: 0.03 * shift(f.stored.layout_um, (40, -30), order=0, mode="nearest")))
     entry = found.added[0]
     assert entry.probe.name == "displaced-copy"
     values = {name: value for name, (value, _, _) in with_intervals(entry.probe, entry.estimate).items()}
     # Places are 0.2 µm apart.
     assert values["shift_y"] == pytest.approx(4.0, abs=0.1)
     assert values["shift_x"] == pytest.approx(-3.0, abs=0.1)
-    # What np.roll brings in from the other side is no copy: it is not fitted, and does not move the amount.
     assert values["amount"] == pytest.approx(0.03, rel=0.2)
     assert probe_figure(entry).axes
 
@@ -303,6 +302,43 @@ def test_a_profile_of_the_dose_over_one_axis_is_found_and_drawn(along: str) -> N
     # The cubic splines alone leave (π/8)⁴/384 of a wave of 8 knots per period: nothing.
     assert np.corrcoef(estimate, planted)[0, 1] > 0.95
     assert estimate.std() == pytest.approx(planted.std(), rel=0.15)
+
+
+@pytest.mark.parametrize("along", ["row", "column"])
+def test_where_the_print_lies_over_one_axis_is_found_and_drawn(along: str) -> None:
+    """A stage that wanders by 0.08 µm along the axis that it steps along, in every print alike."""
+
+    def wave_um(count: int, first: float = 0.0) -> np.ndarray:
+        return 0.08 * np.sin(6 * np.pi * np.linspace(first, 1 - first, count) + 0.5)
+
+    def fine(values: np.ndarray) -> np.ndarray:
+        """Freed of what the warp of a scan may have: a parabola along the axis."""
+        at = np.linspace(-1, 1, len(values))
+        return values - np.polyval(np.polyfit(at, values, 2), at)
+
+    scans, predictions = scene()
+    by_scan = {f.id: p for f, p in zip(scans, predictions, strict=True)}
+    axis = 0 if along == "row" else 1
+
+    def moved(scan: PreparedScan) -> np.ndarray:
+        at = np.indices(scan.stored.shape, dtype=float)
+        at[axis] -= np.moveaxis(np.broadcast_to(wave_um(SIZE_PX), scan.stored.shape), 1, axis) / 0.1
+        print_um = by_scan[scan.id].astype(float)
+        return map_coordinates(print_um, at, order=3, mode="nearest") - print_um
+
+    scans, _ = scene(moved)
+    [probe] = generic_terms(scans, predictions, find_defects(scans, predictions), [f"{along}-shift-profile"])
+    estimate = probe.held_out(FOLD_OF)
+    parts_um = [fine(drawn_profile(one)) for one in shifts(estimate.common)]
+    planted_um = fine(wave_um(201, 8 / (SIZE_PX - 1)))
+    # Slopes change within a step of 0.08 µm: a first-order estimate is short by some part of it.
+    assert np.corrcoef(parts_um[axis], planted_um)[0, 1] > 0.95
+    assert parts_um[axis].std() == pytest.approx(planted_um.std(), rel=0.25)
+    # Across it nothing moves.
+    assert parts_um[1 - axis].std() < 0.1 * planted_um.std()
+    assert estimate.mean_gain_nm2 > 0
+    drawing: Any = SimpleNamespace(probe=probe, estimate=estimate)
+    assert probe_figure(drawing).axes
 
 
 def test_blobs_are_found_and_their_place_is_told() -> None:

@@ -2,7 +2,8 @@
 
 For every displacement the best amount of one copy follows from two correlations, of the layout with the
 residual and of its square with the measured pixels. The displacement is chosen, and its amount estimated, on
-training scans; both are judged on the scans left out.
+training scans; both are judged on the scans left out. Beyond its edge a layout goes on as it does for the
+base models: with its outermost levels.
 """
 
 from __future__ import annotations
@@ -20,11 +21,10 @@ from litho_models.loop.probes.kernel import reach_um
 from litho_models.loop.probes.probe import Estimate
 from litho_models.scan_terms import POLICIES, Terms, freed_um
 
-FARTHEST_UM = 20.0
+# Beyond two thirds of the field too few pixels see a copy of something printed.
+FARTHEST_UM, _FARTHEST_SHARE = 20.0, 2 / 3
 # What is printed is no finer, and a quarter of the pixels is enough to find it.
 _STEP_UM = 0.2
-# Of the squared layout of all scans, what a displacement must leave on measured pixels.
-_SMALLEST_OVERLAP = 0.1
 _SAME_PLACE_UM = 0.5
 
 
@@ -73,10 +73,10 @@ class DisplacedCopy:
         return {"shift_y": (y, "µm"), "shift_x": (x, "µm"), "amount": (amount, "1")}
 
     def correction(self, parameters: np.ndarray, scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
-        """The displaced layout, freed of its mean, (y, x) µm; nothing comes from beyond the field."""
+        """The displaced layout, freed of its mean, (y, x) µm."""
         y, x, amount = parameters.tolist()
-        layout = _layout(scan)
-        return (amount * shift(layout, np.array([y, x]) / scan.stored.pitch_um, order=1)).astype(np.float32)
+        apart_px = np.array([y, x]) / scan.stored.pitch_um
+        return (amount * shift(_layout(scan), apart_px, order=1, mode="nearest")).astype(np.float32)
 
     def gain_nm2(self) -> np.ndarray:
         """Gain of one copy at each place with its best amount there, nm² in the mean over pixels."""
@@ -104,8 +104,7 @@ class DisplacedCopy:
         return at, float(score[at] / max(information[at], np.finfo(float).tiny))
 
     def _gain(self, score: np.ndarray, information: np.ndarray) -> np.ndarray:
-        known = information > _SMALLEST_OVERLAP * information.max()
-        return np.where(known, score**2 / np.where(known, information, 1.0), 0.0)
+        return score**2 / np.maximum(information, np.finfo(float).tiny)
 
 
 def displaced_copy(
@@ -118,7 +117,7 @@ def displaced_copy(
     """
     pitch_um = scans[0].stored.pitch_um
     ny, nx = (min(scan.stored.shape[axis] for scan in scans) for axis in (0, 1))
-    farthest_um = min(FARTHEST_UM, min(ny, nx) * pitch_um / 2)
+    farthest_um = min(FARTHEST_UM, _FARTHEST_SHARE * min(ny, nx) * pitch_um)
     stride = max(1, round(_STEP_UM / pitch_um))
     step_um = stride * pitch_um
     reach = int(farthest_um / step_um)
@@ -134,16 +133,17 @@ def displaced_copy(
         usable = scan.usable & ~defect
         residual = freed_um(scan.stored.height_um, prediction, usable, POLICIES["full"])[::stride, ::stride]
         layout, seen = _layout(scan)[::stride, ::stride], usable[::stride, ::stride].astype(float)
-        scores.append(_correlation(residual, layout, reach)[y, x])
-        information.append(_correlation(seen, layout**2, reach)[y, x])
+        continued = np.pad(layout, reach, mode="edge")
+        scores.append(_correlation(residual, continued)[y - reach, x - reach])
+        information.append(_correlation(seen, continued**2)[y - reach, x - reach])
         pixels.append(seen.sum())
     places = np.column_stack([y, x]) * step_um
     return DisplacedCopy(np.stack(scores), np.stack(information), places, np.array(pixels))
 
 
-def _correlation(target: np.ndarray, source: np.ndarray, reach: int) -> np.ndarray:
-    """Sum of target · (source displaced by d) at [d], negative d from the end; zeros beyond the fields."""
-    shape = [next_fast_len(length + reach, real=True) for length in target.shape]
+def _correlation(target: np.ndarray, source: np.ndarray) -> np.ndarray:
+    """Sum of target · (source displaced by d) at [d], negative d from the end; zeros beyond both."""
+    shape = [next_fast_len(a + b, real=True) for a, b in zip(target.shape, source.shape, strict=True)]
     return irfft2(rfft2(target, shape) * np.conj(rfft2(source, shape)), shape)
 
 

@@ -1,4 +1,4 @@
-"""Places: a smooth map over the scan, or a profile over its rows or columns, added or times the height."""
+"""Places: a map over the scan, or a profile over its rows or columns, of height, gain or displacement."""
 
 from __future__ import annotations
 
@@ -11,11 +11,20 @@ from scipy.interpolate import BSpline
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.prepared import PreparedScan, sample_border_px
-from litho_models.loop.probes.linear import Left, LinearProbe, linear_probe, second_differences
+from litho_models.loop.probes.linear import (
+    Left,
+    LinearProbe,
+    Shuffle,
+    linear_probe,
+    second_differences,
+)
 
+# What goes with the place: an added height, a share of the height, or where the height lies along y and x.
+Moved = Literal["height", "gain", "shift"]
 SPLINES = 5
 # One per µm in a scan of 25 µm: what is finer is one line's, not the scan's.
 PROFILE_SPLINES = 24
+Splines = Callable[[int, int], np.ndarray]
 _FLIPS: tuple[Callable[[np.ndarray], np.ndarray], ...] = tuple(
     partial(lambda grid, turns, mirror: np.rot90(grid.T if mirror else grid, turns), turns=t, mirror=m)
     for t in range(4)
@@ -23,40 +32,19 @@ _FLIPS: tuple[Callable[[np.ndarray], np.ndarray], ...] = tuple(
 )
 
 
-def position_map(
-    left: Left,
-    *,
-    times_height: bool,
-) -> LinearProbe:
-    """A smooth map over the scan, 5 × 5 cubic splines, added or multiplied by the height.
+def position_map(left: Left, *, of: Moved) -> LinearProbe:
+    """A smooth map over the scan, 5 × 5 cubic splines; for a shift one along y and one along x.
 
-    Each scan's plane and bow are projected out, so only what is finer can be found.
+    What each scan may have by itself is projected out, so only what is finer can be found.
     """
-    return linear_probe(
-        "position-gain-map" if times_height else "position-map",
-        partial(_map_columns, times_height=times_height),
-        _roughness(SPLINES),
-        _turned,
-        partial(_spread, drawn, times_height=times_height),
-        left,
-    )
+    return _probe(_name("position", of, "map"), of, _grid, _roughness(SPLINES), _turned, drawn, left)
 
 
-def profile(
-    left: Left,
-    *,
-    along: Literal["row", "column"],
-    times_height: bool,
-) -> LinearProbe:
+def profile(left: Left, *, along: Literal["row", "column"], of: Moved) -> LinearProbe:
     """A profile over the rows, or the columns, that all scans share, finer than a map can be."""
-    return linear_probe(
-        f"{along}-gain-profile" if times_height else f"{along}-profile",
-        partial(_profile_columns, along=along, times_height=times_height),
-        second_differences(PROFILE_SPLINES) + 1e-2 * np.eye(PROFILE_SPLINES),
-        _rolled,
-        partial(_spread, drawn_profile, times_height=times_height),
-        left,
-    )
+    penalty = second_differences(PROFILE_SPLINES) + 1e-2 * np.eye(PROFILE_SPLINES)
+    splines = _rows if along == "row" else _columns
+    return _probe(_name(along, of, "profile"), of, splines, penalty, _rolled, drawn_profile, left)
 
 
 def drawn_profile(coefficients: np.ndarray, size: int = 201) -> np.ndarray:
@@ -70,38 +58,87 @@ def drawn(coefficients: np.ndarray, size: int = 101) -> np.ndarray:
     return splines.T @ coefficients.reshape(SPLINES, SPLINES) @ splines
 
 
+def shifts(coefficients: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The coefficients of a shift along y and of one along x."""
+    along_y, along_x = np.split(coefficients, 2)
+    return along_y, along_x
+
+
+def _name(over: str, of: Moved, kind: str) -> str:
+    return f"{over}-{kind}" if of == "height" else f"{over}-{of}-{kind}"
+
+
+def _probe(
+    name: str,
+    of: Moved,
+    splines: Splines,
+    penalty: np.ndarray,
+    shuffle: Shuffle,
+    drawing: Callable[[np.ndarray], np.ndarray],
+    left: Left,
+) -> LinearProbe:
+    if of == "shift":
+        penalty, shuffle = np.kron(np.eye(2), penalty), partial(_both, shuffle=shuffle)
+    return linear_probe(
+        name,
+        partial(_moved, of=of, splines=splines),
+        penalty,
+        shuffle,
+        partial(_spread, of=of, drawing=drawing),
+        left,
+    )
+
+
+def _moved(scan: PreparedScan, prediction: np.ndarray, of: Moved, splines: Splines) -> np.ndarray:
+    """What each spline does to the print, (m, y, x); to first order in a shift, (2 m, y, x)."""
+    maps = splines(*scan.stored.shape)
+    if of == "height":
+        return np.broadcast_to(maps, (len(maps), *scan.stored.shape))
+    if of == "gain":
+        return maps * prediction
+    slopes = np.gradient(prediction.astype(np.float64), scan.stored.pitch_um)
+    return np.concatenate([-maps * slope for slope in slopes])
+
+
 def _spread(
-    drawing: Callable[[np.ndarray], np.ndarray], coefficients: np.ndarray, times_height: bool
+    coefficients: np.ndarray, of: Moved, drawing: Callable[[np.ndarray], np.ndarray]
 ) -> dict[str, tuple[float, str]]:
-    values = drawing(coefficients)
-    scale, unit = (1.0, "1") if times_height else (NM_PER_UM, "nm")
+    """Root mean square and range over the scan."""
+    if of == "shift":
+        parts = {f"{axis}_": drawing(one) for axis, one in zip("yx", shifts(coefficients), strict=True)}
+        scale, unit = 1.0, "µm"
+    else:
+        parts = {"": drawing(coefficients)}
+        scale, unit = (1.0, "1") if of == "gain" else (NM_PER_UM, "nm")
     return {
-        "rms": (float(values.std()) * scale, unit),
-        "peak_to_valley": (float(np.ptp(values)) * scale, unit),
+        name: (value * scale, unit)
+        for axis, values in parts.items()
+        for name, value in (
+            (f"{axis}rms", float(values.std())),
+            (f"{axis}peak_to_valley", float(np.ptp(values))),
+        )
     }
 
 
-def _map_columns(scan: PreparedScan, prediction: np.ndarray, times_height: bool) -> np.ndarray:
-    """Products of splines along y and x over the scan (25, y, x)."""
-    along_y, along_x = (_over(n) for n in scan.stored.shape)
-    maps = np.einsum("iy,jx->ijyx", along_y, along_x).reshape(-1, *scan.stored.shape)
-    return maps * prediction if times_height else maps
+def _grid(ny: int, nx: int) -> np.ndarray:
+    """Products of splines along y and x over a scan (25, y, x)."""
+    return np.einsum("iy,jx->ijyx", _over(ny), _over(nx)).reshape(-1, ny, nx)
+
+
+def _rows(ny: int, nx: int) -> np.ndarray:
+    """Splines over the rows (24, y, 1)."""
+    return _over(ny, PROFILE_SPLINES)[:, :, None]
+
+
+def _columns(ny: int, nx: int) -> np.ndarray:
+    """Splines over the columns (24, 1, x)."""
+    return _over(nx, PROFILE_SPLINES)[:, None, :]
 
 
 def map_columns_at(scan: PreparedScan, at: np.ndarray) -> np.ndarray:
     """The splines of ``position_map`` at flat indices of a scan, (25, n)."""
     (ny, nx), (y, x) = scan.stored.shape, np.divmod(at, scan.stored.shape[1])
     return (_over(ny)[:, None, y] * _over(nx)[None, :, x]).reshape(-1, len(at))
-
-
-def _profile_columns(
-    scan: PreparedScan, prediction: np.ndarray, along: Literal["row", "column"], times_height: bool
-) -> np.ndarray:
-    """Splines over the rows or the columns (24, y, x)."""
-    ny, nx = scan.stored.shape
-    splines = _over(ny if along == "row" else nx, PROFILE_SPLINES)
-    maps = splines[:, :, None] if along == "row" else splines[:, None, :]
-    return np.broadcast_to(maps, (PROFILE_SPLINES, ny, nx)) * (prediction if times_height else 1.0)
 
 
 def _over(size: int, count: int = SPLINES) -> np.ndarray:
@@ -137,3 +174,9 @@ def _rolled(random: np.random.Generator, count: int) -> np.ndarray:
     """Order of the coefficients after a random shift, and half of the time a reversal, of the profile."""
     order = np.roll(np.arange(count), int(random.integers(count)))
     return order[::-1] if random.random() < 0.5 else order
+
+
+def _both(random: np.random.Generator, count: int, shuffle: Shuffle) -> np.ndarray:
+    """One order for the coefficients of both axes."""
+    order = shuffle(random, count // 2)
+    return np.concatenate([order, order + count // 2])

@@ -15,14 +15,14 @@ from litho_models.loop.identifiability import Profile
 from litho_models.loop.probes import AddedProbe, with_intervals
 from litho_models.loop.probes.displaced import DisplacedCopy
 from litho_models.loop.probes.kernel import MissingKernel
-from litho_models.loop.probes.places import drawn, drawn_profile
+from litho_models.loop.probes.places import drawn, drawn_profile, shifts
 from litho_models.loop.structure import CovariateTest
 from litho_models.loop.study import Score
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_MAPS = 3
+_MAPS, _ARROWS = 3, 11
 # Probes that are tables, and what they run along.
 _TABLES = {
     "level-table": "printed level",
@@ -112,6 +112,8 @@ def probe_figure(entry: AddedProbe) -> Figure:
         return _bars_figure(entry)
     if probe.name in _TABLES:
         return _table_figure(entry)
+    if "-shift-" in probe.name:
+        return _shift_figure(probe.name, common)
     unit = "relative height" if "-gain-" in probe.name else "nm"
     scale = 1.0 if unit == "relative height" else NM_PER_UM
     if probe.name.endswith("profile"):
@@ -180,6 +182,30 @@ def _profile_figure(values: np.ndarray, along: str, unit: str) -> Figure:
     axes.plot(np.linspace(0, 1, len(values)), values, color=_AFTER)
     axes.set(xlabel=f"{along}s, from the first to the last", ylabel=unit)
     axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def _shift_figure(name: str, common: np.ndarray) -> Figure:
+    """Where the print lies: arrows over the scan, or one line for each axis."""
+    along_y, along_x = shifts(common)
+    figure = new_figure(5, 4)
+    axes = figure.subplots()
+    if name.endswith("profile"):
+        axes.axhline(0, color=LIGHT["ink"], lw=0.6)
+        for axis, one, colour in (("y", along_y, _AFTER), ("x", along_x, "#c05621")):
+            values = drawn_profile(one)
+            axes.plot(np.linspace(0, 1, len(values)), values, color=colour, label=f"along {axis}")
+        axes.legend(frameon=False)
+        axes.set(xlabel=f"{name.partition('-')[0]}s, from the first to the last", ylabel="displaced (µm)")
+        axes.spines[["top", "right"]].set_visible(False)
+        return figure
+    y, x = (drawn(one, _ARROWS) for one in (along_y, along_x))
+    at = np.linspace(-1, 1, _ARROWS)
+    longest_um = float(np.hypot(y, x).max())
+    arrows = axes.quiver(at, at, x, y, angles="xy", color=_AFTER)
+    axes.quiverkey(arrows, 0.8, 1.04, longest_um, f"{longest_um:.2f} µm", labelpos="E")
+    axes.set_aspect("equal")
+    axes.invert_yaxis()
     return figure
 
 
