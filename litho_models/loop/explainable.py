@@ -28,9 +28,10 @@ from litho_models.scan_terms import Terms
 from litho_models.scoring.statistics import interval
 
 # All rows of all scans; with more scans each is thinned.
-_KEPT_BYTES, _MOST_ROWS = 512 * 2**20, 320
-# Features whose strength may follow order or dose: height, |∂y| and |∂x| at 0.3 µm, surroundings of 1.6 µm.
-_HEIGHT, _VARYING = 18, (18, 21, 22, 7)
+_KEPT_BYTES, _MOST_ROWS = 512 * 2**20, 360
+# Features whose strength may follow the place: height, ∂y and ∂x at 0.3 µm (a gain and a displacement); and
+# order or dose: height, |∂y| and |∂x|, surroundings of 1.6 µm.
+_PLACED, _VARYING = (18, 19, 20), (18, 21, 22, 7)
 
 
 @dataclass(frozen=True)
@@ -130,9 +131,8 @@ class Learner:
         """Features of layout and place, and some times order and dose, (m, n)."""
         at = scan.sample[:: self._every]
         of_layout, of_place = feature_rows(model, scan.stored, at), map_columns_at(scan, at)
-        height = of_layout[_HEIGHT]
-        varying = np.stack([*of_layout[list(_VARYING)], height**2])
-        columns = [of_layout, of_place, of_place * height]
+        varying = np.stack([*of_layout[list(_VARYING)], of_layout[_VARYING[0]] ** 2])
+        columns = [of_layout, of_place, *(of_place * of_layout[one] for one in _PLACED)]
         for of in varied:
             value = of(scan)
             columns += [value * varying, *((value > step) * varying for step in ORDER_STEPS)]

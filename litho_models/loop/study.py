@@ -99,9 +99,14 @@ class Study:
         return score(self.scans, predictions, terms, self.blocks)
 
     def confirm(
-        self, before: Score, after: Score, amplitudes: Mapping[str, np.ndarray] | None = None
+        self,
+        before: Score,
+        after: Score,
+        amplitudes: Mapping[str, np.ndarray] | None = None,
+        *,
+        counted: bool = True,
     ) -> Confirmation:
-        """Whether a change is confirmed on scans that it was not fitted on."""
+        """Whether a change is confirmed on scans that it was not fitted on, see ``confirm``."""
         return confirm(
             before.mse_nm2,
             after.mse_nm2,
@@ -109,6 +114,7 @@ class Study:
             after.mae_nm,
             floor_nm2=self.floor_nm2,
             amplitudes=amplitudes,
+            counted=counted,
             seed=self.seed,
         )
 

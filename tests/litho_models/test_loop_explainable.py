@@ -51,6 +51,13 @@ def placed(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
     return 0.01 * prediction * np.sin(3 * x + 1) * np.cos(3.5 * y)
 
 
+def displaced(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
+    """What lies at the upper right comes 0.1 µm too low, fading to the other sides."""
+    ny, nx = prediction.shape
+    y, x = np.meshgrid(np.linspace(-1, 1, ny), np.linspace(-1, 1, nx), indexing="ij")
+    return 0.1 * np.exp(-2 * (y + 0.4) ** 2 - 2 * (x - 0.4) ** 2) * np.gradient(prediction, 0.1, axis=0)
+
+
 def test_where_nothing_is_missing_nothing_can_be_learned(scene) -> None:
     scans, predictions = scene
     rest = Learner(Study(scans, FOLD_OF), predictions).rest(predictions)
@@ -60,7 +67,7 @@ def test_where_nothing_is_missing_nothing_can_be_learned(scene) -> None:
     assert rest.k == 13
 
 
-@pytest.mark.parametrize("change", [bead, later, placed])
+@pytest.mark.parametrize("change", [bead, later, placed, displaced])
 def test_what_follows_layout_order_or_place_is_measured_in_its_size(scene, change) -> None:
     scans, predictions = scene
     learner = Learner(Study(scans, FOLD_OF), predictions)

@@ -182,7 +182,7 @@ def _best(
         agreement = probe.agreement()
         extended = _with_probe(state, study, probe, estimate)
         after = extended.score(study, terms)
-        confirmation = study.confirm(before, after)
+        confirmation = study.confirm(before, after, counted=False)
         reasons = [confirmation.reason] if confirmation.reason else []
         if gain <= limit:
             reasons.append("gains no more than its control")
