@@ -134,7 +134,7 @@ def fit_folds(
             linear = ChainProblem(chain, windows).linearise(common)
     free = within_bounds(chain, common)
     linear = [replace(part, jacobian=part.jacobian * free[:, None]) for part in linear]
-    return FoldFits(chain_at(chain, common), common, per_fold, errors, _robust_covariance(linear), linear)
+    return FoldFits(chain_at(chain, common), common, per_fold, errors, robust_covariance(linear), linear)
 
 
 def predict(
@@ -268,7 +268,8 @@ def with_residuals(linear: Sequence[Linearised], residuals: Sequence[np.ndarray]
     return [replace(part, residual=own) for part, own in zip(linear, residuals, strict=True)]
 
 
-def _robust_covariance(linear: Sequence[Linearised]) -> np.ndarray:
+def robust_covariance(linear: Sequence[Linearised]) -> np.ndarray:
+    """Covariance (p, p) of fitted numbers, by what each scan asks for at the optimum."""
     if not len(linear[0].jacobian):
         return np.empty((0, 0))
     parts = [eliminated(part, TERM_WEIGHT) for part in linear]

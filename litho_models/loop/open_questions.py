@@ -15,7 +15,7 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import CATALOGUE, get_effect
 from litho_models.fitting.least_squares import eliminated_sum, fit_least_squares
 from litho_models.loop.findings import LoopFindings
-from litho_models.loop.fold_fits import RULES, TERM_WEIGHT, ChainProblem
+from litho_models.loop.fold_fits import RULES, TERM_WEIGHT, ChainProblem, robust_covariance
 from litho_models.loop.linear import ALL_FREE, without_scan_terms
 from litho_models.loop.parameters import chain_at, get_vector
 from litho_models.loop.prepared import PreparedScan
@@ -158,6 +158,7 @@ def _rivals(findings: LoopFindings, replaced: str | None, names: Sequence[str]) 
                 scan_frame=frame,
                 vector=fit.vector.tolist(),
                 information=normal.tolist(),
+                covariance=robust_covariance(fit.linear).tolist(),
             )
             for frame in frames
         ]

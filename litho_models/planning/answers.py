@@ -9,9 +9,11 @@ import numpy as np
 from litho_models.loop.result.questions import OpenQuestions, Question
 from litho_models.planning import power
 from litho_models.planning.record import PlannedPair, PlannedQuestion, Status
-from litho_models.planning.rivalry import Contrast, PlannedPrint, Rivalry
+from litho_models.planning.rivalry import PlannedPrint, Rivalry
 
 _COUNTS = range(1, power.MOST_PRINTS + 1)
+# What the rivals' numbers could be as well: a difference that rests on one of them may not be there.
+_DRAWS = 8
 
 
 def of_rivals(
@@ -23,8 +25,7 @@ def of_rivals(
 ) -> PlannedQuestion:
     """A question whose rivals are models: judged on the planned prints, and on as many random layouts."""
     question, spread = rivalry.question, rivalry.question.spread
-    pairs = _pairs(rivalry, rivalry.contrasts(planned))
-    control = _pairs(rivalry, rivalry.contrasts(random))
+    pairs, control = _pairs(rivalry, planned), _pairs(rivalry, random)
     hardest = min(pairs, key=lambda pair: (pair.power[prints - 1], pair.difference_nm))
     names = [rival.name for rival in question.rivals]
     status = _status(hardest.power, prints)
@@ -53,16 +54,19 @@ def of_rivals(
     )
 
 
-def _pairs(rivalry: Rivalry, contrasts: Sequence[Contrast]) -> list[PlannedPair]:
-    """Unordered pairs, each in the direction in which the refitted rival comes nearer."""
+def _pairs(rivalry: Rivalry, prints: Sequence[PlannedPrint]) -> list[PlannedPair]:
+    """Unordered pairs, each in the direction with less power; a power is the mean over the draws."""
     names = [rival.name for rival in rivalry.question.rivals]
-    directed = {
-        pair: (contrast, [power.of_contrast(contrast, rivalry.question.spread, n) for n in _COUNTS])
-        for pair, contrast in zip(rivalry.pairs, contrasts, strict=True)
-    }
+    random, first = np.random.default_rng(0), rivalry.linearised(prints)
+    drawn = [rivalry.drawn(random) for _ in range(_DRAWS)]
+    contrasts = [one.contrasts(prints, one.refitted(prints, first=first)) for one in drawn]
+    directed = {}
+    for pair, fitted, *others in zip(rivalry.pairs, rivalry.contrasts(prints), *contrasts, strict=True):
+        powers = [[power.of_contrast(one, rivalry.question.spread, n) for n in _COUNTS] for one in others]
+        directed[pair] = fitted, np.mean(powers, axis=0).tolist()
     found = []
     for first, second in (pair for pair in directed if pair[0] < pair[1]):
-        contrast, powers = min(
+        contrast, mean = min(
             (directed[first, second], directed[second, first]), key=lambda one: tuple(one[1])
         )
         found.append(
@@ -70,7 +74,7 @@ def _pairs(rivalry: Rivalry, contrasts: Sequence[Contrast]) -> list[PlannedPair]
                 rivals=(names[first], names[second]),
                 difference_nm=contrast.rms_nm,
                 noise_nm=contrast.noise_nm,
-                power=powers,
+                power=mean,
             )
         )
     return found

@@ -9,6 +9,7 @@ far say about it, and to the ranges of its parameters.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -30,6 +31,8 @@ from litho_models.scan_terms import TermPixels, term_maps
 from litho_models.simulator import Simulator
 
 Place = Literal["centre", "edge"]
+# Of each scan: prediction (y, x), derivatives (n, p) on the inner pixels, free basis (n, k).
+Linear = list[tuple[Tensor, np.ndarray, np.ndarray]]
 _DAMPING = 1e-6
 _BORDER_PX = 8
 _SMALLEST = 1e-12
@@ -133,6 +136,8 @@ class Rivalry:
         self.printing = printing
         self.noise = noise
         self.chains = [self._chain(rival, base) for rival in question.rivals]
+        # What is true, if a rival is; refits start from ``chains``.
+        self.true = self.chains
         self._power: dict[tuple[int, int], Tensor] = {}
         self.prior = [np.array(rival.information) for rival in question.rivals]
 
@@ -142,17 +147,34 @@ class Rivalry:
         every = range(len(self.chains))
         return [(a, b) for a in every for b in every if a != b]
 
-    def refitted(self, prints: Sequence[PlannedPrint], *, rounds: int = 1) -> list[EffectChain]:
+    def drawn(self, random: np.random.Generator) -> Rivalry:
+        """The same rivals, each as true with numbers that the prints so far allow as well.
+
+        Without a covariance the fitted numbers stay.
+        """
+        other = copy.copy(self)
+        other.true = []
+        for chain, rival in zip(self.chains, self.question.rivals, strict=True):
+            vector = get_vector(chain)
+            if rival.covariance:
+                spread = random.multivariate_normal(np.zeros(len(vector)), np.array(rival.covariance))
+                vector = vector + np.clip(spread, *room(chain, vector))
+            other.true.append(chain_at(chain, vector))
+        return other
+
+    def refitted(
+        self, prints: Sequence[PlannedPrint], *, rounds: int = 1, first: Sequence[Linear] | None = None
+    ) -> list[EffectChain]:
         """For each directed pair the second model, fitted to what the first predicts.
 
         Args:
             prints: levels are taken as they are, without derivatives.
             rounds: Gauss-Newton steps; one is the linearised refit.
+            first: the models on these prints, ``linearised``, if they are known.
         """
         with torch.no_grad():
-            predicted = [self._predict(chain, prints) for chain in self.chains]
-            # The first step of a model is taken from the same place whatever it is fitted to.
-            first = [self._linearise(chain, prints) for chain in self.chains]
+            predicted = [self._predict(chain, prints) for chain in self.true]
+            first = self.linearised(prints) if first is None else first
             found = []
             for true, other in self.pairs:
                 chain = self.chains[other]
@@ -165,6 +187,11 @@ class Rivalry:
                     )
                 found.append(chain_at(chain, vector))
             return found
+
+    def linearised(self, prints: Sequence[PlannedPrint]) -> list[Linear]:
+        """The models where a refit starts, whatever it is fitted to."""
+        with torch.no_grad():
+            return [self._linearise(chain, prints) for chain in self.chains]
 
     def contrasts(
         self, prints: Sequence[PlannedPrint], refitted: Sequence[EffectChain] | None = None
@@ -203,7 +230,7 @@ class Rivalry:
         """Per directed pair and print: squared distance, deviation by noise, pixels."""
         wanted = range(len(self.pairs)) if only is None else only
         firsts = {self.pairs[i][0] for i in wanted}
-        true = {first: self._predict(self.chains[first], prints) for first in firsts}
+        true = {first: self._predict(self.true[first], prints) for first in firsts}
         return [
             self._of_pair(true[self.pairs[i][0]], self._predict(partners[i], prints), prints) for i in wanted
         ]
@@ -239,10 +266,7 @@ class Rivalry:
     def _predict(self, chain: EffectChain, prints: Sequence[PlannedPrint]) -> list[Tensor]:
         return [self.printing.predict(chain, one, way) for one in prints for way in one.ways]
 
-    def _linearise(
-        self, chain: EffectChain, prints: Sequence[PlannedPrint]
-    ) -> list[tuple[Tensor, np.ndarray, np.ndarray]]:
-        """Of each scan: prediction (y, x), derivatives (n, p) on the inner pixels, free basis (n, k)."""
+    def _linearise(self, chain: EffectChain, prints: Sequence[PlannedPrint]) -> Linear:
         vector = get_vector(chain)
         steps = difference_steps(chain, vector)
         here = self._predict(chain, prints)
@@ -264,7 +288,7 @@ class Rivalry:
     def _step(
         self,
         chain: EffectChain,
-        linear: Sequence[tuple[Tensor, np.ndarray, np.ndarray]],
+        linear: Linear,
         target: Sequence[Tensor],
         prior: np.ndarray,
         moved: np.ndarray,

@@ -34,6 +34,8 @@ from litho_models.loop.result.record import AddedEffect, CloseLoop, Decision
 from litho_models.loop.run import _attributed, _new_scans
 from litho_models.loop.second_round import decide, with_decisions
 from litho_models.planning import power
+from litho_models.planning.answers import _pairs
+from litho_models.planning.designer import as_tensor
 from litho_models.planning.layouts import Limits, climb, score, starts
 from litho_models.planning.record import NextPrint, PlannedQuestion
 from litho_models.planning.rivalry import PlannedPrint, Printing, Rivalry, Way
@@ -232,6 +234,30 @@ def test_a_model_that_fades_to_nothing_explains_no_loss_on_slopes(rivalry: Rival
         heights = [rivalry.printing.predict(one, prints[0], Way()) for one in (chain, true_model({}))]
     # Gain, registration, tilt and bow take some of what is lost on slopes, not two thirds of it.
     assert found > 1e3 * float((heights[0] - heights[1]).std()) / 3
+
+
+def test_a_difference_that_rests_on_numbers_known_badly_is_no_sure_one(limits: Limits) -> None:
+    """Equal losses along both axes look the same turned; an inequality within its error decides little."""
+    nearly_equal = {"slope-thinning": {"along_x_um": 0.2, "along_y_um": 0.195}}
+    prints = [PlannedPrint(as_tensor(first_layout(limits)), TURNED)]
+
+    def powers(sd_um: float) -> list[float]:
+        question = slope_question()
+        covariance = np.zeros((len(question.rivals[0].vector),) * 2)
+        covariance[-1, -1] = sd_um**2
+        rivals = [
+            rival(name, nearly_equal, frame).model_copy(update={"covariance": covariance.tolist()})
+            for name, frame in (("slope-thinning", []), ("slope-thinning" + IN_SCAN, ["slope-thinning"]))
+        ]
+        asked = question.model_copy(update={"rivals": rivals})
+        [pair] = _pairs(Rivalry(asked, true_model({}).base, Printing(0.1, 0.1, 12), white()), prints)
+        return pair.power
+
+    sure, unsure = powers(0.0), powers(0.01)
+    count = next(n for n, power_ in enumerate(sure) if power_ > 0.99)
+    # In two of five draws the losses are closer than they were fitted.
+    assert unsure[count] < 0.9
+    assert unsure[0] > 0.1
 
 
 def test_layouts_climb_and_stay_printable(rivalry: Rivalry, limits: Limits) -> None:

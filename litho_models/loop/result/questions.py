@@ -19,7 +19,8 @@ class Rival(Record):
     """One answer to a question: the base with these effects, as fitted to the prints so far.
 
     ``vector``: all fitted numbers, ``loop.parameters.get_vector``; ``information``: (p, p), normal matrix of
-    the fit over all pixels that it stands for, µm². ``scan_frame``: effects that turn with the scan.
+    the fit over all pixels that it stands for, µm²; ``covariance``: (p, p) of the numbers, robust over scans,
+    empty in older files. ``scan_frame``: effects that turn with the scan.
     """
 
     name: str
@@ -27,6 +28,7 @@ class Rival(Record):
     scan_frame: list[str]
     vector: list[float]
     information: list[list[float]]
+    covariance: list[list[float]] = Field(default_factory=list)
 
 
 class Turning(Record):
