@@ -34,6 +34,8 @@ _PRINTER_RANGES = {
 # The plan of boards up to seed 20266: shares of the trials; what rounding leaves over goes to single effects.
 EARLIER_RMS_NM = (4.0, 60.0)
 FEWEST_TRIALS = 4
+# Knobs that came after the earlier boards, which are drawn as they were.
+_LATER = ("stitching",)
 _SHARES: dict[Kind, float] = {"two": 0.15, "none": 0.1, "off-catalogue": 0.15}
 
 
@@ -86,7 +88,9 @@ def draw_earlier(count: int, seed: int) -> list[Draw]:
     singles: list[Kind] = ["single"] * (count - len(some))
     kinds = [*some, *singles]
     catalogue = _deal([name for name, knob in KNOBS.items() if knob.effect != OFF_CATALOGUE], rng)
-    outside = _deal([name for name, knob in KNOBS.items() if knob.effect == OFF_CATALOGUE], rng)
+    outside = _deal(
+        [name for name, knob in KNOBS.items() if knob.effect == OFF_CATALOGUE and name not in _LATER], rng
+    )
     trials = []
     for number, place in enumerate(rng.permutation(count)):
         kind = kinds[place]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -105,6 +106,9 @@ def simulate(
     write_field_um: Annotated[
         float | None, typer.Option(help="side of a write field shared by a print's fields, µm")
     ] = None,
+    stitch_field_um: Annotated[
+        float | None, typer.Option(help="side of the fields that the knob stitching displaces, µm")
+    ] = None,
     references: Annotated[
         bool, typer.Option("--references", help="add scans of a bare substrate, a flat and a 5-step print")
     ] = False,
@@ -141,6 +145,12 @@ def simulate(
         wanted = "no --count, --size-px or --write-field-um: the card's layouts have them"
         raise InputError("options beside --layouts", wanted=wanted)
     chosen = named_preset(preset)
+    printer = chosen.printer
+    if stitch_field_um is not None:
+        if not stitch_field_um >= printer.pitch_um:
+            wanted = f"at least the pitch, {printer.pitch_um:g} µm"
+            raise InputError("--stitch-field-um", got=stitch_field_um, wanted=wanted)
+        printer = replace(printer, stitch_field_um=stitch_field_um)
     card = simulate(
         out,
         count=count or chosen.count,
@@ -150,10 +160,10 @@ def simulate(
         knobs=knob if knob is not None else chosen.knobs,
         noise=chosen.noise if noise == "default" else noise,
         microscope=chosen.microscope if microscope == "default" else microscope,
-        printer=chosen.printer,
+        printer=printer,
         write_field_um=write_field_um,
         references=references,
         metadata=metadata,
-        jobs=jobs_of_card(layouts, printer=chosen.printer) if layouts is not None else None,
+        jobs=jobs_of_card(layouts, printer=printer) if layouts is not None else None,
     )
     typer.echo(f"card   {card}\ntruth  {card.parent.parent / 'truth' / 'truth.json'}")

@@ -7,6 +7,7 @@ import scipy.signal
 
 from litho_data.layouts.random_layout import random_layout
 from litho_data.virtual_fab.canvas import (
+    GUARD_PX,
     Canvas,
     apply_transfer,
     blur,
@@ -57,6 +58,12 @@ def accumulate_dose(
     if strength := knobs["level-error"]:
         wrong_level = int(knobs.machine_rng("level-error").integers(3, max(4, printer.levels - 4)))
         nominal = nominal + (canvas.level == wrong_level) * (strength / printer.full_height_um)
+    if strength := knobs["stitching"]:
+        side_px = round(printer.stitch_field_um / canvas.pitch_um)
+        starts = [field_starts(size, side_px) for size in nominal.shape]
+        rng = knobs.scan_rng("stitching", scan_index)
+        offset_px = rng.standard_normal((len(starts[0]), len(starts[1]), 2)) * (strength / canvas.pitch_um)
+        nominal = write_in_fields(nominal, starts, offset_px)
     line_energy = relative_dose * (1 + knobs["laser-drift"] * order) * _field_response(canvas, knobs)
     spot = _spot_transfer(canvas, printer, knobs)
     dose = apply_transfer(nominal * line_energy, spot)
@@ -73,6 +80,45 @@ def accumulate_dose(
     if strength := knobs["dose-exponent"]:
         dose = dose ** (1 + strength)
     return dose
+
+
+def field_starts(size_px: int, side_px: int) -> list[int]:
+    """First canvas pixel of each write field of a layout along one axis, the guard frame in the outermost."""
+    return [0, *range(GUARD_PX + side_px, size_px - GUARD_PX, side_px)]
+
+
+def write_in_fields(nominal: np.ndarray, starts: list[list[int]], offset_px: np.ndarray) -> np.ndarray:
+    """Exposure (ny, nx) written field by field, each off its place: doses add up where fields overlap.
+
+    Args:
+        starts: first row, and first column, of every field.
+        offset_px: (y, x) of every field, (fields along y, along x, 2). A pixel that comes to lie across four
+            gives each the share that it covers.
+    """
+    written = np.zeros_like(nominal)
+    ends = [[*first[1:], size] for first, size in zip(starts, nominal.shape, strict=True)]
+    for index in np.ndindex(offset_px.shape[:2]):
+        whole = np.floor(offset_px[index]).astype(int)
+        share = offset_px[index] - whole
+        for step in np.ndindex(2, 2):
+            weight = float(np.prod(np.where(step, share, 1 - share)))
+            to, of = zip(
+                *(
+                    _overlap(first[i], last[i], by, size)
+                    for first, last, i, by, size in zip(
+                        starts, ends, index, whole + step, nominal.shape, strict=True
+                    )
+                ),
+                strict=True,
+            )
+            written[to] += weight * nominal[of]
+    return written
+
+
+def _overlap(start: int, stop: int, by: int, size: int) -> tuple[slice, slice]:
+    """Where pixels from ``start`` to ``stop`` come to lie within ``size``, and which of them do."""
+    low, high = min(max(start + by, 0), size), max(min(stop + by, size), 0)
+    return slice(low, high), slice(low - by, high - by)
 
 
 def _field_response(canvas: Canvas, knobs: KnobBoard) -> np.ndarray | float:

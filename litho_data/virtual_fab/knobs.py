@@ -204,6 +204,8 @@ _TABLE = (
          "rms of a smooth height map fixed to the layout's frame, the same in all scans; the seed draws it"),
     Knob("edge-bead", OFF_CATALOGUE, "development", "process", "µm", 3.0,
          "height gained per slope: steep flanks stand proud whichever way they face"),
+    Knob("stitching", OFF_CATALOGUE, "exposure", "process", "µm", 1.0,
+         "sd along each axis by which every write field of a print lies off its place: gaps and overlaps"),
     Knob("unseen-neighbours", OFF_CATALOGUE, "exposure", "nuisance", "1", 1.0,
          "1: beyond its edge the print goes on with another random layout; values between mix the doses"),
 )  # fmt: skip

@@ -23,6 +23,8 @@ class Printer:
         network_reach_um: sd of the neighbourhood whose conversion determines how much a column shrinks, µm.
         loose_retention: share of its height that an isolated, loose network keeps; a dense one keeps it all.
         base_um: height of the base layer's surface above the zero of the scans, µm.
+        stitch_field_um: side of the fields that a larger layout is written in one after the other, µm; the
+            knob ``stitching`` displaces them.
     """
 
     pitch_um: float = 0.1
@@ -34,6 +36,7 @@ class Printer:
     network_reach_um: float = 2.0
     loose_retention: float = 0.35
     base_um: float = 0.14
+    stitch_field_um: float = 100.0
 
     @property
     def full_height_um(self) -> float:

@@ -19,6 +19,7 @@ from litho_data.virtual_fab import (
     strength_for_rms,
 )
 from litho_data.virtual_fab.afm import scan_surface
+from litho_data.virtual_fab.exposure import write_in_fields
 from litho_data.virtual_fab.geometry import place_scan
 from litho_data.virtual_fab.jobs import Plan, random_jobs
 from litho_data.virtual_fab.knobs import KnobBoard
@@ -245,6 +246,35 @@ class TestSignatures:
         # Truncation loses half a step on average, between 0 and one step.
         assert lost_nm.min() > -1e-9
         assert lost_nm.mean() == pytest.approx(2.0, rel=0.05)
+
+    def test_a_displaced_write_field_shifts_its_grating_and_no_other(self):
+        # A grating of 16 px in fields of 96 px; the print lies off by what is drawn, field by field.
+        level = np.tile((6 + 4 * np.cos(2 * np.pi * np.arange(192) / 16)).round().astype(np.uint8), (96, 1))
+        fab = Fab(
+            Printer(stitch_field_um=9.6), Microscope.aligned(), Noise.off(),
+            KnobBoard([KnobSetting("stitching", 0.2)], 4), 4,
+        )  # fmt: skip
+        job = Job("a", level, index=3)
+        moved, plain = scan_job(fab, job).clean_um, scan(job).clean_um
+        offset_um = 0.2 * fab.knobs.scan_rng("stitching", 3).standard_normal((1, 2, 2))
+        wave = np.exp(-2j * np.pi * np.arange(64) / 16)
+        for number, left in enumerate((16, 112)):
+            # Middle rows and four periods, 1.6 µm from the seam: what the blur of 2 µm brings from there.
+            before, after = (one[40:56, left : left + 64].mean(0) @ wave for one in (plain, moved))
+            expected = -2 * np.pi * offset_um[0, number, 1] / 1.6
+            assert np.angle(after / before) == pytest.approx(expected, abs=0.03)
+        # Without the knob the size of a field means nothing.
+        off = Fab(Printer(stitch_field_um=9.6), Microscope.aligned(), Noise.off(), KnobBoard([], 4), 4)
+        assert np.array_equal(scan_job(off, job).clean_um, plain)
+
+    def test_seams_get_no_dose_or_twice_of_it(self):
+        exposure = np.ones((4, 12))
+        offset_px = np.array([[[0.0, -1.0], [0.0, 0.0], [0.0, -1.5]]])
+        written = write_in_fields(exposure, [[0], [0, 4, 8]], offset_px)
+        # A gap of one pixel, an overlap of one and a half, and the last field leaves as much of the frame.
+        assert written[2].tolist() == [1, 1, 1, 0, 1, 1, 1.5, 2, 1, 1, 0.5, 0]
+        # Beyond the frame one row of four is lost, else nothing.
+        assert write_in_fields(exposure, [[0], [0]], np.array([[[1.0, 0.0]]])).sum() == 36
 
     def test_vignetting_darkens_the_corners_of_the_write_field(self):
         level = np.full((96, 96), 6, np.uint8)
