@@ -73,6 +73,12 @@ def score(
             help="optics of the judges: thin, or thick (wave propagation method). As designed by default"
         ),
     ] = None,
+    stitch_field_um: Annotated[
+        float, typer.Option(help="side of the write fields that the judges' prints are made of, µm", min=1e-6)
+    ] = 100.0,
+    stitch_sigma_um: Annotated[
+        float, typer.Option(help="sd along each axis by which each of them lies off its place, µm", min=0)
+    ] = 0.0,
     task_file: Annotated[
         Path | None,
         typer.Option(help="Python file that registers the task of the design, one of your own; it is run"),
@@ -93,11 +99,13 @@ def score(
     """
     from litho_design.judging.measured import MeasuredSource
     from litho_design.judging.photographs import PhotoSource
+    from litho_design.optimisation.stitching import Stitching
     from litho_design.tasks.task import register_tasks_of
     from litho_design.workflows.score import score as score_design
 
     if not judge and scan is None and camera is None:
         raise InputError("score", got="nothing to judge with", wanted="--judge, --scan or --camera")
+    stitch = Stitching(field_um=stitch_field_um, sigma_um=stitch_sigma_um) if stitch_sigma_um else None
     if stream:
         if (
             scan is not None
@@ -110,7 +118,9 @@ def score(
         from litho_design.optimisation.budget import peak_memory_gib
         from litho_design.workflows.large import score_from_disk
 
-        result = score_from_disk(design, out, judges=judge or (), band_px=band_px, extrapolate=extrapolate)
+        result = score_from_disk(
+            design, out, judges=judge or (), band_px=band_px, stitch=stitch, extrapolate=extrapolate
+        )
         _print_scores(result, out)
         print(f"peak memory {peak_memory_gib():.2f} GiB")
         return
@@ -134,6 +144,7 @@ def score(
             camera, camera_pitch_um or 0.0, camera_dark_level, camera_object, camera_orientation, camera_power
         ),
         element=element,
+        stitch=stitch,
         device=device,
         extrapolate=extrapolate,
     )

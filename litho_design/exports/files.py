@@ -11,15 +11,20 @@ import numpy as np
 from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.files import writable
 from litho_data.foundation.outputs import require_replaceable_folder
-from litho_design.exports.gds import GdsLayers, read_gds_levels, write_gds
-from litho_design.exports.image import read_image_levels, write_bmp, write_png16, write_tiff
+from litho_design.exports.gds import GdsLayers, GdsRows, write_gds
+from litho_design.exports.image import TiffRows, read_image_levels, write_bmp, write_png16, write_tiff
 from litho_design.exports.marks import Marks, with_marks
 from litho_design.exports.sidecar import Format, Sidecar, make_sidecar, read_sidecar, sidecar_path
 from litho_design.exports.stl import read_stl_levels, write_stl
 from litho_design.judging.loaded import LoadedDesign
-from litho_design.tasks.design import LEVELS_FILE, Design, read_array
+from litho_design.large.rows import LevelRows, bands_of, layout_rows
+from litho_design.tasks.design import Design
 
 _SUFFIX: dict[str, str] = {"png16": ".png", "bmp": ".bmp", "tiff": ".tif", "stl": ".stl", "gds": ".gds"}
+_IN_PIECES = ("tiff", "gds")
+# What the other formats need of memory for it is some 3 GiB (images) and more (solids).
+_MOST_PX_WHOLE = 16384**2
+_BAND_PX = 128
 
 
 def export(
@@ -35,7 +40,8 @@ def export(
 ) -> Path:
     """Write the layout of a design for the printer, and ``<file>.json`` beside it.
 
-    The file is read back before the export counts as done.
+    The file is read back before the export counts as done. ``tiff`` and ``gds`` are written and read a band
+    of rows at a time, so that memory does not grow with the height of an element.
 
     Args:
         design: its folder, or what ``load_design`` gives.
@@ -49,8 +55,8 @@ def export(
         Path of the exported file.
 
     Raises:
-        InputError: an incomplete design, a format that cannot hold it, job settings below zero, an element
-            too small for marks, or a folder that holds something else.
+        InputError: an incomplete design, a format that cannot hold it or would need too much memory, job
+            settings below zero, an element too small for marks, or a folder that holds something else.
     """
     if format not in _SUFFIX:
         raise unknown_name("format", format, _SUFFIX)
@@ -62,7 +68,10 @@ def export(
             raise InputError(setting, got=f"{value:g} µm", wanted="a positive length")
     folder = design.folder if isinstance(design, LoadedDesign) else Path(design)
     record = Design.read(folder)
-    levels = written = read_array(folder, LEVELS_FILE)
+    levels = written = layout_rows(folder)
+    if format not in _IN_PIECES and levels.shape[0] * levels.shape[1] > _MOST_PX_WHOLE:
+        got = f"{format} of {levels.shape[0]} x {levels.shape[1]} px"
+        raise InputError("format of a large element", got=got, wanted="tiff or gds, written in pieces")
     found: Marks | None = None
     if marks:
         guard_um, heights = record.printer.guard_um, record.stroke.printed_height_um
@@ -70,7 +79,7 @@ def export(
     name = f"layout{_SUFFIX[format]}"
     require_replaceable_folder(out, "layout*")
     place = Path(out)
-    _require_same_layout(place, name, record.files[LEVELS_FILE])
+    _require_same_layout(place, name, record.layout_sha256)
     with writable(place):
         place.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix="layout.", suffix=".partial", dir=place) as temporary:
@@ -79,11 +88,11 @@ def export(
         sidecar = make_sidecar(
             folder, record, file, format, pedestal_um=pedestal_um, slicing_um=slicing_um,
             hatching_um=hatching_um, grey_per_level=step, gds_layers=gds_layers if format == "gds" else None,
-            shape_px=written.shape, marks=found,
+            shape_px=(written.shape[0], written.shape[1]), marks=found,
         )  # fmt: skip
         sidecar.write(temporary).rename(sidecar_path(file))
-        back, _ = import_levels(file)
-        if not np.array_equal(back, levels):
+        back = _rows(file, read_sidecar(file))
+        if not all(np.array_equal(back[rows], written[rows]) for rows in bands_of(written, _BAND_PX)):
             raise AssertionError(f"{format} export does not read back as it was written")
         # The sidecar last: without it, or with an older one, the file is refused.
         for part in sorted(Path(temporary).iterdir(), key=lambda part: part.suffix == ".json"):
@@ -99,15 +108,15 @@ def import_levels(file: str | Path) -> tuple[np.ndarray, Sidecar]:
     """
     path = Path(file)
     sidecar = read_sidecar(path)
-    levels = _read(path, sidecar)
+    levels = _rows(path, sidecar)[:]
     if sidecar.marks is not None:
         top, bottom, left, right = sidecar.marks.element_px
         levels = levels[top:bottom, left:right].copy()
     return levels, sidecar
 
 
-def _read(path: Path, sidecar: Sidecar) -> np.ndarray:
-    """The whole map of a file, marks included."""
+def _rows(path: Path, sidecar: Sidecar) -> LevelRows:
+    """The map of a file, marks included."""
     if sidecar.format == "stl":
         cell_px = _cell_px(sidecar)
         shape = (sidecar.shape_px[0] // cell_px, sidecar.shape_px[1] // cell_px)
@@ -117,7 +126,9 @@ def _read(path: Path, sidecar: Sidecar) -> np.ndarray:
         return cells.repeat(cell_px, 0).repeat(cell_px, 1)
     if sidecar.format == "gds":
         assert sidecar.gds_layers is not None
-        return read_gds_levels(path, sidecar.shape_px, sidecar.pitch_um, sidecar.gds_layers)
+        return GdsRows(path, sidecar.shape_px, sidecar.pitch_um, sidecar.gds_layers)
+    if sidecar.format == "tiff":
+        return TiffRows(path)
     assert sidecar.grey_per_level is not None
     return read_image_levels(path, sidecar.grey_per_level)
 
@@ -133,7 +144,7 @@ def _require_same_layout(place: Path, name: str, layout_sha256: str) -> None:
 def _write(
     file: Path,
     kind: Format,
-    levels: np.ndarray,
+    levels: LevelRows,
     design: Design,
     pedestal_um: float,
     gds_layers: GdsLayers,
@@ -142,14 +153,16 @@ def _write(
     layout = design.layout
     if kind == "stl":
         cell_px = 1 if layout.symmetry == "radial" else layout.cell_px
-        cells = levels[::cell_px, ::cell_px]
+        cells = levels[::cell_px][:, ::cell_px]
         write_stl(file, cells, cell_px * layout.pitch_um, layout.level_height_um, pedestal_um)
         return None
     if kind == "gds":
         parts = None if marks is None else marks.parts()
         write_gds(file, levels, layout.pitch_um, gds_layers, parts)
         return None
-    return {"png16": write_png16, "bmp": write_bmp, "tiff": write_tiff}[kind](file, levels, layout)
+    if kind == "tiff":
+        return write_tiff(file, levels, layout)
+    return {"png16": write_png16, "bmp": write_bmp}[kind](file, levels[:], layout)
 
 
 def _cell_px(sidecar: Sidecar) -> int:

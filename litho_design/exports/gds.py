@@ -1,14 +1,19 @@
-"""Layouts as GDSII, one layer per level in cells that repeat (extra ``gds``), and back."""
+"""Layouts as GDSII, one layer per level in cells that repeat, written and read a band of rows at a time.
+
+Records and numbers as in the GDSII Stream Format Manual, release 6.0 (Calma, 1987).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import hashlib
+import struct
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import BinaryIO, Literal
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
+from litho_design.large.rows import LevelRows
 
 _UNIT_M = 1e-6
 _PRECISION_M = 1e-9
@@ -17,99 +22,204 @@ _PRECISION_M = 1e-9
 _BLOCK_PX = 128
 
 GdsLayers = Literal["cumulative", "exclusive"]
+Box = tuple[int, int, int, int]
+
+_HEADER, _LIBRARY, _LIBRARY_NAME, _UNITS, _END_LIBRARY = 0x0002, 0x0102, 0x0206, 0x0305, 0x0400
+_CELL, _CELL_NAME, _END_CELL = 0x0502, 0x0606, 0x0700
+_REFERENCE, _REFERENCE_NAME, _PLACE, _END = 0x0A00, 0x1206, 0x1003, 0x1100
+# The same for equal layouts, whose files are equal then.
+_DATE = struct.pack(">12h", *(1970, 1, 1, 0, 0, 0) * 2)
+
+# One rectangle: the records BOUNDARY, LAYER, DATATYPE 0, XY of five corners, ENDEL, one after the other.
+_RECTANGLE = np.dtype(
+    [
+        ("start", ">u8"),
+        ("layer", ">i2"),
+        ("type", "S6"),
+        ("xy", ">u4"),
+        ("corners", ">i4", (5, 2)),
+        ("end", ">u4"),
+    ]
+)
+_START, _TYPE, _XY, _ENDED = 0x0004080000060D02, b"\0\x06\x0e\x02\0\0", 0x002C1003, 0x00041100
 
 
 def write_gds(
     path: Path,
-    levels: np.ndarray,
+    levels: LevelRows,
     pitch_um: float,
     layers: GdsLayers,
-    parts: Mapping[str, tuple[int, int, int, int]] | None = None,
+    parts: Mapping[str, Box] | None = None,
 ) -> int:
     """Write rectangles, unit 1 µm, grid 1 nm, y up; returns how many the file holds.
 
     Layer k holds {level >= k} (``cumulative``, k from 1) or {level == k} (``exclusive``, k from 0).
     Runs along rows are merged over equal rows below them, so every shape is a rectangle. The cell LAYOUT
-    refers to one cell for every part, and that to blocks of 128 pixels: equal blocks are one cell.
+    refers to one cell for every part, that to one for every 128 rows, and that to blocks of 128 pixels:
+    equal blocks are one cell. Of the shapes no more than one block is in memory.
 
     Args:
         parts: rows from, to, columns from, to, of each part by name; the whole map is ELEMENT by default.
-
-    Raises:
-        InputError: gdstk is not installed.
     """
-    gdstk = _gdstk()
-    library = gdstk.Library(unit=_UNIT_M, precision=_PRECISION_M)
-    layout = library.new_cell("LAYOUT")
-    blocks: dict[tuple[tuple[int, ...], bytes], Any] = {}
-    height = len(levels)
-    for name, (top, bottom, left, right) in (parts or {"ELEMENT": (0, height, 0, levels.shape[1])}).items():
-        part = library.new_cell(name)
-        for row in range(top, bottom, _BLOCK_PX):
-            for column in range(left, right, _BLOCK_PX):
-                block = levels[row : min(row + _BLOCK_PX, bottom), column : min(column + _BLOCK_PX, right)]
-                known = (block.shape, block.tobytes())
-                if known not in blocks:
-                    blocks[known] = library.new_cell(f"BLOCK_{len(blocks)}")
-                    blocks[known].add(*_shapes(gdstk, block, pitch_um, layers))
-                place = ((column - left) * pitch_um, (bottom - row - len(block)) * pitch_um)
-                part.add(gdstk.Reference(blocks[known], place))
-        layout.add(gdstk.Reference(part, (left * pitch_um, (height - bottom) * pitch_um)))
-    library.write_gds(path)
-    return sum(len(block.polygons) for block in blocks.values())
+    known: dict[bytes, str] = {}
+    height, width = levels.shape
+    step = pitch_um * _UNIT_M / _PRECISION_M
+    drawn, placed = 0, []
+    with open(path, "wb") as stream:
+        stream.write(_record(_HEADER, struct.pack(">h", 600)) + _record(_LIBRARY, _DATE))
+        units = _real(_PRECISION_M / _UNIT_M) + _real(_PRECISION_M)
+        stream.write(_text(_LIBRARY_NAME, "library") + _record(_UNITS, units))
+        for name, (top, bottom, left, right) in (parts or {"ELEMENT": (0, height, 0, width)}).items():
+            rows_of_part = []
+            for row in range(top, bottom, _BLOCK_PX):
+                band = levels[row : min(row + _BLOCK_PX, bottom)][:, left:right]
+                blocks = []
+                for column in range(0, right - left, _BLOCK_PX):
+                    block = np.ascontiguousarray(band[:, column : column + _BLOCK_PX])
+                    found = hashlib.blake2b(
+                        repr(block.shape).encode() + block.tobytes(), digest_size=16
+                    ).digest()
+                    if found not in known:
+                        known[found] = f"BLOCK_{len(known)}"
+                        shapes = _shapes(block, step, layers)
+                        drawn += len(shapes)
+                        _write_cell(stream, known[found], [shapes.tobytes()])
+                    blocks.append(_reference(known[found], column * step, 0.0))
+                cell = f"{name}_{row}"
+                _write_cell(stream, cell, blocks)
+                rows_of_part.append(_reference(cell, 0.0, (bottom - row - len(band)) * step))
+            _write_cell(stream, name, rows_of_part)
+            placed.append(_reference(name, left * step, (height - bottom) * step))
+        _write_cell(stream, "LAYOUT", placed)
+        stream.write(_record(_END_LIBRARY))
+    return drawn
 
 
-def _shapes(gdstk: Any, levels: np.ndarray, pitch_um: float, layers: GdsLayers) -> list[Any]:
-    """The rectangles of one block, its lower left corner at 0."""
+def _shapes(levels: np.ndarray, step: float, layers: GdsLayers) -> np.ndarray:
+    """The rectangles of one block, its lower left corner at 0; ``step``: a pixel in units of the file."""
     highest = int(levels.max())
-    masks = (
-        [(k, levels >= k) for k in range(1, highest + 1)]
-        if layers == "cumulative"
-        else [(k, levels == k) for k in range(highest + 1)]
+    wanted = np.arange(1, highest + 1) if layers == "cumulative" else np.arange(highest + 1)
+    masks = levels >= wanted[:, None, None] if layers == "cumulative" else levels == wanted[:, None, None]
+    layer, top, bottom, left, right = rectangles(masks).T
+    shapes = np.zeros(len(layer), _RECTANGLE)
+    shapes["start"], shapes["type"], shapes["xy"], shapes["end"] = _START, _TYPE, _XY, _ENDED
+    shapes["layer"] = wanted[layer]
+    x, y = (
+        np.stack([left, right, right, left, left]),
+        len(levels) - np.stack([bottom, bottom, top, top, bottom]),
     )
-    return [
-        gdstk.rectangle(
-            (left * pitch_um, (len(levels) - bottom) * pitch_um),
-            (right * pitch_um, (len(levels) - top) * pitch_um),
-            layer=layer,
-        )
-        for layer, mask in masks
-        for top, bottom, left, right in rectangles(mask)
-    ]
+    shapes["corners"] = np.rint(np.stack([x, y], -1) * step).swapaxes(0, 1)
+    return shapes
 
 
-def read_gds_levels(path: Path, shape: tuple[int, int], pitch_um: float, layers: GdsLayers) -> np.ndarray:
-    """Levels uint8 (ny, nx), row 0 on top, of a file written by ``write_gds``."""
-    (layout,) = _gdstk().read_gds(path).top_level()
-    levels = np.zeros(shape, np.uint8)
-    for polygon in layout.get_polygons():
-        (left, low), (right, high) = (
-            np.rint(np.asarray(corner) / pitch_um).astype(int) for corner in polygon.bounding_box()
-        )
-        block = levels[shape[0] - high : shape[0] - low, left:right]
-        block[...] = np.maximum(block, polygon.layer)
-    return levels
+def rectangles(masks: np.ndarray) -> np.ndarray:
+    """Disjoint rectangles that cover boolean masks (n, ny, nx): mask, top, bottom, left, right (m, 5).
+
+    Ends are excluded.
+    """
+    edges = np.diff(np.pad(masks.astype(np.int8), ((0, 0), (0, 0), (1, 1))), axis=2)
+    mask, row, left = np.nonzero(edges > 0)
+    right = np.nonzero(edges < 0)[2]
+    # Equal runs of one mask, from above to below: a rectangle goes on while no row is left out.
+    order = np.lexsort([row, right, left, mask])
+    mask, row, left, right = (one[order] for one in (mask, row, left, right))
+    new = np.ones(len(row) + 1, bool)
+    new[1:-1] = (np.diff(row) != 1) | np.any(np.diff([mask, left, right]), axis=0)
+    first, last = np.flatnonzero(new[:-1]), np.flatnonzero(new[1:])
+    return np.stack([mask[first], row[first], row[last] + 1, left[first], right[first]], axis=1)
 
 
-def rectangles(mask: np.ndarray) -> list[tuple[int, int, int, int]]:
-    """Disjoint rectangles (top, bottom, left, right), ends excluded, that cover a boolean mask."""
-    open_runs: dict[tuple[int, int], int] = {}
-    done = []
-    for row in range(len(mask) + 1):
-        runs = set()
-        if row < len(mask):
-            edges = np.flatnonzero(np.diff(np.pad(mask[row].astype(np.int8), 1)))
-            runs = {(int(a), int(b)) for a, b in edges.reshape(-1, 2)}
-        for run in [run for run in open_runs if run not in runs]:
-            done.append((open_runs.pop(run), row, *run))
-        for run in runs:
-            open_runs.setdefault(run, row)
-    return done
+class GdsRows:
+    """The levels of a file of ``write_gds``, uint8, row 0 on top; only the rows asked for are read."""
+
+    def __init__(self, path: Path, shape: tuple[int, int], pitch_um: float, layers: GdsLayers):
+        self.shape = shape
+        self._step, self._layers = pitch_um * _UNIT_M / _PRECISION_M, layers
+        self._data = np.memmap(path, np.uint8, "r")
+        self._shapes: dict[str, slice] = {}
+        self._references: dict[str, list[tuple[str, int, int]]] = {}
+        self._index()
+        # Every row of blocks by its lower left corner in pixels.
+        self._bands = [
+            (round((x + dx) / self._step), round((y + dy) / self._step), cell)
+            for name, x, y in self._references["LAYOUT"]
+            for cell, dx, dy in self._references[name]
+        ]
+
+    def __getitem__(self, rows: slice) -> np.ndarray:
+        top, bottom, _ = rows.indices(self.shape[0])
+        low, high = self.shape[0] - bottom, self.shape[0] - top
+        # Each corner of a rectangle adds to everything above and to the right of it.
+        steps = np.zeros((bottom - top + 1, self.shape[1] + 1), np.int16)
+        for x0, y0, cell in self._bands:
+            if y0 < high and y0 + _BLOCK_PX > low:
+                for name, dx, _ in self._references[cell]:
+                    shapes = self._data[self._shapes[name]].view(_RECTANGLE)
+                    corners = np.rint(shapes["corners"][:, [0, 2]] / self._step).astype(np.intp)
+                    x = corners[..., 0] + (x0 + round(dx / self._step))
+                    y = np.clip(corners[..., 1] + y0, low, high) - low
+                    weight = shapes["layer"].astype(np.int16) if self._layers == "exclusive" else np.int16(1)
+                    for one, other in ((0, 0), (0, 1), (1, 0), (1, 1)):
+                        np.add.at(steps, (y[:, one], x[:, other]), weight if one == other else -weight)
+        summed = steps.cumsum(0, dtype=np.int16).cumsum(1, dtype=np.int16)
+        return summed[-2::-1, :-1].astype(np.uint8)
+
+    def _index(self) -> None:
+        """Where the shapes of every cell lie in the file, and to which cells it refers."""
+        at, cell, name = 0, "", ""
+        while True:
+            length, kind = struct.unpack(">HH", self._data[at : at + 4].tobytes())
+            body = self._data[at + 4 : at + length].tobytes()
+            if kind == _CELL_NAME:
+                cell = body.rstrip(b"\0").decode()
+                end = at + length + self._shapes_from(at + length) * _RECTANGLE.itemsize
+                self._shapes[cell], self._references[cell] = slice(at + length, end), []
+                at = end
+                continue
+            if kind == _REFERENCE_NAME:
+                name = body.rstrip(b"\0").decode()
+            elif kind == _PLACE:
+                self._references[cell].append((name, *struct.unpack(">ii", body)))
+            elif kind == _END_LIBRARY:
+                return
+            at += length
+
+    def _shapes_from(self, at: int) -> int:
+        """How many rectangles follow in the file."""
+        count, chunk = 0, 1 << 10
+        while True:
+            start = at + count * _RECTANGLE.itemsize
+            size = min(chunk, (len(self._data) - start) // _RECTANGLE.itemsize)
+            part = self._data[start : start + size * _RECTANGLE.itemsize].view(_RECTANGLE)
+            other = np.flatnonzero(part["start"] != _START)
+            if other.size or size < chunk:
+                return count + (int(other[0]) if other.size else size)
+            count += size
 
 
-def _gdstk() -> Any:
-    try:
-        import gdstk
-    except ImportError:
-        raise InputError("GDS export", got="no gdstk", hint="install litholoop[gds]") from None
-    return gdstk
+def _write_cell(stream: BinaryIO, name: str, contents: Iterable[bytes]) -> None:
+    stream.write(_record(_CELL, _DATE) + _text(_CELL_NAME, name))
+    for content in contents:
+        stream.write(content)
+    stream.write(_record(_END_CELL))
+
+
+def _reference(name: str, x: float, y: float) -> bytes:
+    place = _record(_PLACE, struct.pack(">ii", round(x), round(y)))
+    return _record(_REFERENCE) + _text(_REFERENCE_NAME, name) + place + _record(_END)
+
+
+def _text(kind: int, text: str) -> bytes:
+    return _record(kind, text.encode() + b"\0" * (len(text) % 2))
+
+
+def _record(kind: int, body: bytes = b"") -> bytes:
+    return struct.pack(">HH", len(body) + 4, kind) + body
+
+
+def _real(value: float) -> bytes:
+    """A positive number below 1 as an eight-byte real: an exponent of 16 above 64, and 56 bits."""
+    exponent = 64
+    while value < 1 / 16:
+        value, exponent = 16 * value, exponent - 1
+    return struct.pack(">Q", exponent << 56 | round(value * 2**56))

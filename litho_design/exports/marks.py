@@ -8,6 +8,7 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
+from litho_design.large.rows import LevelRows, SideBySide
 from litho_design.printers.layout import LayoutSettings
 
 Box = tuple[int, int, int, int]
@@ -37,8 +38,8 @@ class Marks(Record):
 
 
 def with_marks(
-    levels: np.ndarray, layout: LayoutSettings, guard_um: float, level_heights_um: list[float]
-) -> tuple[np.ndarray, Marks]:
+    levels: LevelRows, layout: LayoutSettings, guard_um: float, level_heights_um: list[float]
+) -> tuple[SideBySide, Marks]:
     """The level map (size, size) with an F and a square of the highest level to the right of it.
 
     Both keep the reach of the printer from the element and from each other, so that none changes the print of
@@ -62,7 +63,7 @@ def with_marks(
     gap, stroke, side = cells(guard_um), cells(_STROKE_UM), cells(2 * guard_um + _FLAT_UM)
     gap = max(gap, stroke)
     letter = _LETTER.repeat(stroke, 0).repeat(stroke, 1)
-    size, high = len(levels), len(letter) + gap + side
+    size, high = levels.shape[0], len(letter) + gap + side
     if size < high:
         raise InputError(
             "marks",
@@ -70,11 +71,10 @@ def with_marks(
             wanted=f"at least {high * layout.pitch_um:g} µm, the height of mark and witness",
         )
     left, top_level = size + gap, layout.levels - 1
-    canvas = np.zeros((size, left + max(side, letter.shape[1])), np.uint8)
-    canvas[:, :size] = levels
-    canvas[: len(letter), left : left + letter.shape[1]] = top_level * letter
-    canvas[size - side :, left : left + side] = top_level
-    return canvas, Marks(
+    beside = np.zeros((size, gap + max(side, letter.shape[1])), np.uint8)
+    beside[: len(letter), gap : gap + letter.shape[1]] = top_level * letter
+    beside[size - side :, gap : gap + side] = top_level
+    return SideBySide(levels, beside), Marks(
         element_px=(0, size, 0, size),
         orientation_px=(0, len(letter), left, left + letter.shape[1]),
         witness_px=(size - side, size, left, left + side),

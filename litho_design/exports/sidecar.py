@@ -88,7 +88,7 @@ def make_sidecar(
         file_sha256=file_sha256(file),
         format=kind,
         design_sha256=file_sha256(design_folder / Design.FILE_NAME),
-        layout_sha256=design.files["layout_level.npy"],
+        layout_sha256=design.layout_sha256,
         model_name=design.printer.name,
         model_sha256=design.printer.sha256,
         extrapolated=design.printer.extrapolated,

@@ -4,29 +4,35 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
 from torch import Tensor
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Record, Result
-from litho_data.foundation.run_facts import RunFacts
-from litho_design.images.noise import uncertainties
+from litho_data.foundation.run_facts import RunFacts, run_facts
+from litho_design.images.noise import DRAWS, uncertainties
 from litho_design.images.photograph import CameraRecord
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.judging.measured import MeasuredRecord, MeasuredSource, as_it_might_be, measured_print
 from litho_design.judging.photographs import PhotoSource, score_hologram_photo, score_lens_photo
 from litho_design.lenses.task import LensTask
 from litho_design.optics import Optics
+from litho_design.optimisation.stitching import Stitching, in_fields
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer, PrinterRecord
+from litho_design.tasks.design import Design
 
 
 class JudgedScore(Record):
     """The figures of one judge: a model, a measured print, or a photographed image.
 
     ``uncertainty`` holds one standard deviation of a measured figure; None for models, and in older results.
+    With ``stitching`` the print is made of displaced write fields: figures are means over some draws of their
+    places, uncertainties the standard deviation of one.
     """
 
     kind: Literal["model", "scan", "camera"]
@@ -36,10 +42,15 @@ class JudgedScore(Record):
     rms_height_difference_um: float | None
     figures: dict[str, float]
     uncertainty: dict[str, float] | None = None
+    stitching: Stitching | None = None
 
     def remarks(self) -> list[str]:
         """What was done to a measurement, and what stays open about it, one phrase each."""
-        return [] if isinstance(self.judge, PrinterRecord) else self.judge.remarks()
+        found = [] if isinstance(self.judge, PrinterRecord) else self.judge.remarks()
+        if self.stitching is not None:
+            sigma_um, field_um = self.stitching.sigma_um, self.stitching.field_um
+            found.append(f"write fields of {field_um:g} µm lie off their places by {sigma_um:g} µm (sd)")
+        return found
 
 
 class ScoreResult(RunFacts, Result):
@@ -60,6 +71,25 @@ class ScoreResult(RunFacts, Result):
     designed: dict[str, float]
     baselines: dict[str, dict[str, float]] | None = None
     scores: list[JudgedScore]
+
+    @classmethod
+    def of(cls, folder: Path, record: Design, scores: list[JudgedScore]) -> ScoreResult:
+        """What this run found about the design in a folder."""
+        return cls(
+            **run_facts(),
+            design=str(folder),
+            design_sha256=file_sha256(folder / Design.FILE_NAME),
+            layout_sha256=record.layout_sha256,
+            task=record.task,
+            designed_with=record.printer,
+            layout=record.layout,
+            optics=record.optics,
+            seeds=[int(record.settings["search"]["seed"])],
+            reference_efficiency=record.reference_efficiency,
+            designed=record.predicted,
+            baselines=record.baselines,
+            scores=scores,
+        )
 
 
 @dataclass(frozen=True)
@@ -82,6 +112,7 @@ def judge_design(
     judges: Sequence[Printer],
     scan: MeasuredSource | None = None,
     camera: PhotoSource | None = None,
+    stitch: Stitching | None = None,
 ) -> Judgement:
     """Score the layout of a design as printed by models, as measured, and as photographed.
 
@@ -90,6 +121,7 @@ def judge_design(
         scan: a measured height map of the printed part.
         camera: a photograph of the printed hologram's image, or of an object through the printed lens;
             with ``scan`` it is deconvolved with the PSF of the measured print too.
+        stitch: write fields that the prints of the models are made of; in one piece by default.
 
     Raises:
         InputError: a measurement that does not match the design.
@@ -100,7 +132,18 @@ def judge_design(
     for judge in judges:
         height, record = loaded.printed_um(judge), judge.record()
         independent = record.sha256 != loaded.record.printer.sha256
-        scores.append(_height_score(loaded, "model", record, independent, height))
+        if stitch is not None:
+            pitch_um, side = loaded.record.layout.pitch_um, len(height)
+            drawn = [
+                in_fields(
+                    height, pitch_um, stitch.field_px(pitch_um), stitch.offsets_um(side, pitch_um, [seed])
+                )
+                for seed in range(DRAWS)
+            ]
+            scores.append(_stitched_score(loaded, record, independent, drawn, stitch))
+            height = drawn[0]
+        else:
+            scores.append(_height_score(loaded, "model", record, independent, height))
         pictures[f"printed by {record.name}"] = loaded.image(height)
     if scan is not None:
         printed_um, measured = measured_print(loaded, scan)
@@ -128,6 +171,26 @@ def judge_design(
             )
         )
     return Judgement(scores, pictures, photos)
+
+
+def _stitched_score(
+    loaded: LoadedDesign, judge: PrinterRecord, independent: bool, drawn: list[Tensor], stitch: Stitching
+) -> JudgedScore:
+    scores = [_height_score(loaded, "model", judge, independent, height) for height in drawn]
+    figures = {name: [score.figures[name] for score in scores] for name in scores[0].figures}
+    mean_um, rms_um = (
+        float(np.mean([getattr(score, f"{what}_height_difference_um") for score in scores]))
+        for what in ("mean", "rms")
+    )
+    return scores[0].model_copy(
+        update={
+            "figures": {name: float(np.mean(values)) for name, values in figures.items()},
+            "uncertainty": {name: float(np.std(values, ddof=1)) for name, values in figures.items()},
+            "mean_height_difference_um": mean_um,
+            "rms_height_difference_um": rms_um,
+            "stitching": stitch,
+        }
+    )
 
 
 def _height_score(

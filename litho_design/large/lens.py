@@ -8,9 +8,11 @@ from __future__ import annotations
 import math
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
@@ -19,6 +21,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import writable
 from litho_data.foundation.hashes import record_sha256
 from litho_data.foundation.outputs import require_own_folder
+from litho_design.judging.score import JudgedScore
 from litho_design.large.bands import Bands
 from litho_design.large.printing import check_printer
 from litho_design.lenses.bench import RadialLensBench, centre_to_background
@@ -37,10 +40,15 @@ from litho_design.optimisation.search import (
 )
 from litho_design.printers.layout import LayoutSettings, printability
 from litho_design.printers.printer import Printer
-from litho_design.tasks.design import Design, RunRecord, write_arrays
-
-RINGS_FILE = "ring_level.npy"
-RING_HEIGHT_FILE = "ring_height_um.npy"
+from litho_design.tasks.design import (
+    RING_HEIGHT_FILE,
+    RINGS_FILE,
+    Design,
+    RunRecord,
+    finished_design,
+    read_array,
+    write_arrays,
+)
 
 
 class RadiusMap(CellMap):
@@ -71,12 +79,15 @@ class RingLens:
         settings: of the lens, with rings, a circular aperture and a thin element.
         printer: a frozen model with a finite reach, or nominal heights.
         tile_px: length of the tiles in which the strip is printed.
+        bench: of another lens with these settings, whose matrix takes its time.
 
     Raises:
         InputError: settings or a printer that a lens of rings cannot have.
     """
 
-    def __init__(self, settings: LensSettings, printer: Printer, tile_px: int):
+    def __init__(
+        self, settings: LensSettings, printer: Printer, tile_px: int, bench: RadialLensBench | None = None
+    ):
         layout = settings.layout
         wanted: dict[str, tuple[Any, Any]] = {
             "task": (settings.task, "direct"),
@@ -92,7 +103,7 @@ class RingLens:
                 raise InputError(f"{name} of a large lens", got=repr(given), wanted=repr(only))
         check_printer(printer, Bands(layout.size_px, layout.size_px))
         self.settings, self.printer, self.tile_px = settings, printer, tile_px
-        self.bench = RadialLensBench(layout, settings.optics, settings.view).to(printer.device)
+        self.bench = bench or RadialLensBench(layout, settings.optics, settings.view).to(printer.device)
         self.cells = RadiusMap(layout)
         self._strip = strip_rings(layout, printer.halo_px, self.cells.cells[0]).to(printer.device)
 
@@ -155,11 +166,9 @@ def design_in_rings(
     require_own_folder(folder, Design.FILE_NAME, CHECKPOINTS)
     before = printer.weights_sha256()
     fingerprint = record_sha256(["lens in rings", settings.model_dump(mode="json"), before])
-    if (folder / Design.FILE_NAME).exists():
-        design = Design.read(folder)
-        if design.fingerprint != fingerprint:
-            raise InputError(f"folder {folder}", got="another design", wanted="the same settings and model")
-        return design
+    finished = finished_design(folder, fingerprint, settings)
+    if finished is not None:
+        return finished
     with writable(folder):
         folder.mkdir(parents=True, exist_ok=True)
     started = time.monotonic()
@@ -206,3 +215,44 @@ def design_in_rings(
     design.write(folder)
     remove_checkpoint(folder)
     return design
+
+
+@torch.no_grad()
+def judge_rings(
+    folder: Path, record: Design, judges: Sequence[Printer], tile_px: int
+) -> tuple[list[JudgedScore], dict[str, np.ndarray], float]:
+    """Print the rings of a design by models, and score them along the radius.
+
+    Returns:
+        A score for each judge, with the differences of heights over the plane; PSFs (m, m) by title, share of
+        the incident power per pixel; their side, µm.
+
+    Raises:
+        InputError: rings that changed after the design, or a judge without a finite reach.
+    """
+    settings, bench = LensSettings.model_validate(record.settings), None
+    rings, expected = (torch.from_numpy(read_array(folder, name)) for name in (RINGS_FILE, RING_HEIGHT_FILE))
+    scores: list[JudgedScore] = []
+    pictures: dict[str, np.ndarray] = {}
+    for printer in judges:
+        lens, judge = RingLens(settings, printer, tile_px, bench), printer.record()
+        bench = lens.bench
+        height = lens.printed_um(rings.to(printer.device).float()[None, None])
+        pictures |= {
+            title: bench(print_um.to(printer.device)).cpu().numpy()
+            for title, print_um in (("in design", expected), (f"printed by {judge.name}", height))
+        }
+        off, area = (height.cpu() - expected).double(), bench.propagator.ring_area_um2
+        share = area / area.sum()
+        scores.append(
+            JudgedScore(
+                kind="model",
+                judge=judge,
+                independent=judge.sha256 != record.printer.sha256,
+                mean_height_difference_um=float((off * share).sum()),
+                rms_height_difference_um=float((off.square() * share).sum().sqrt()),
+                figures=lens.score(height).model_dump(),
+            )
+        )
+    assert bench is not None
+    return scores, pictures, bench.window.size_um[0]

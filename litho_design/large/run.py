@@ -34,7 +34,15 @@ from litho_design.optimisation.starts import start_search
 from litho_design.printers.layout import printability
 from litho_design.printers.printer import Printer
 from litho_design.printers.training import out_of_distribution
-from litho_design.tasks.design import HEIGHT_FILE, IMAGE_FILE, LEVELS_FILE, TARGET_FILE, Design, RunRecord
+from litho_design.tasks.design import (
+    HEIGHT_FILE,
+    IMAGE_FILE,
+    LEVELS_FILE,
+    TARGET_FILE,
+    Design,
+    RunRecord,
+    finished_design,
+)
 
 _LEFT_OUT = (
     "a large element: without polish, process window, baselines, thick element and report; the figures that "
@@ -68,8 +76,9 @@ def design_in_bands(
         ["hoe in bands", settings.model_dump(mode="json"), before, target.record.sha256, bands.band_px]
     )
     require_own_folder(folder, Design.FILE_NAME, CHECKPOINTS)
-    if (folder / Design.FILE_NAME).exists():
-        return _finished(folder, fingerprint)
+    finished = finished_design(folder, fingerprint, settings)
+    if finished is not None:
+        return finished
     with writable(folder):
         folder.mkdir(parents=True, exist_ok=True)
     part = f"-{ranks.rank + 1}-of-{ranks.count}" if ranks.count > 1 else ""
@@ -154,14 +163,6 @@ def write_rows(folder: Path, arrays: dict[str, Tensor], bands: Bands) -> dict[st
 
 def _pixels(parameters: DirectLevels, levels: Tensor) -> Tensor:
     return parameters.cells(levels)[None, None].float()
-
-
-def _finished(folder: Path, fingerprint: str) -> Design:
-    design = Design.read(folder)
-    if design.fingerprint != fingerprint:
-        wanted = "the same settings, target, model and bands"
-        raise InputError(f"folder {folder}", got="another design", wanted=wanted, hint="choose another --out")
-    return design
 
 
 def _resumed(folder: Path, part: str, bands: Bands) -> int:

@@ -19,6 +19,7 @@ from litho_design.large.hologram import part_of_grid
 from litho_design.large.printing import check_printer, print_band
 from litho_design.large.propagator import BandedPropagator
 from litho_design.optics import Optics, element_field, intensity_share
+from litho_design.optimisation.stitching import Stitching, in_fields
 from litho_design.printers.printer import Printer
 
 _PREVIEW_PX = 1024
@@ -48,6 +49,22 @@ def print_from_disk(level: np.ndarray, printer: Printer, bands: Bands, height_um
         above = first - (band.start - halo)
         around[above : above + last - first] = torch.from_numpy(level[first:last].astype(np.float32))
         height_um[band] = print_band(around.to(printer.device), printer, bands.band_px).cpu().numpy()
+
+
+@torch.no_grad()
+def in_fields_from_disk(
+    height_um: np.ndarray, pitch_um: float, stitch: Stitching, bands: Bands, allocate: Allocate
+) -> Tensor:
+    """A print (size, size), µm, made of write fields that lie off their places, band by band."""
+    size, offsets_um = bands.size_px, stitch.offsets_um(bands.size_px, pitch_um, [0])
+    reach = math.ceil(np.abs(offsets_um[..., 0]).max() / pitch_um) + 1
+    moved = allocate((size, size), torch.float32)
+    for band in bands.own():
+        first, last = max(band.start - reach, 0), min(band.stop + reach, size)
+        part = torch.from_numpy(np.array(height_um[first:last]))
+        found = in_fields(part, pitch_um, stitch.field_px(pitch_um), offsets_um, first)
+        moved[band] = found[band.start - first : band.stop - first]
+    return moved
 
 
 @torch.no_grad()

@@ -247,9 +247,10 @@ def _check(settings: LensSettings) -> None:
         )
     if radial and (settings.optics.incidence_x or settings.optics.incidence_y):
         raise InputError("search path 'radial'", got="oblique incidence", wanted="light along the axis")
-    if radial and settings.window.samples and settings.window.roughness.sigma_um:
-        hint = "--set view.path=plane"
-        raise InputError("search path 'radial'", got="a rough surface", wanted="one of maps", hint=hint)
+    window = settings.window
+    if radial and window.samples and (window.roughness.sigma_um or window.stitch.sigma_um):
+        got, hint = "a rough surface or displaced write fields", "--set view.path=plane"
+        raise InputError("search path 'radial'", got=got, wanted="a spread of rings", hint=hint)
     if radial and settings.layout.size_px % 2:
         raise InputError("size_px for the radial path", got=settings.layout.size_px, wanted="an even number")
     if settings.task == "direct":

@@ -15,13 +15,14 @@ from litho_data.foundation.results import Record
 from litho_data.foundation.settings import leaves, setting
 from litho_design.optics import Optics, sampling_limit_um
 from litho_design.optimisation.roughness import Roughness
+from litho_design.optimisation.stitching import Stitching, in_fields
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 _NARROWEST_BLUR_PX = 0.2
-_UNSEEN_STREAM, _SURFACE_STREAM = 1, 2
-_SMOOTH = Roughness()
+_UNSEEN_STREAM, _SURFACE_STREAM, _STITCH_STREAM = 1, 2, 3
+_SMOOTH, _IN_PLACE = Roughness(), Stitching()
 # Figures that are better when lower.
 _ERRORS = ("loss", "mae_", "rms_", "rmse_", "p95_", "speckle_", "fwhm_")
 
@@ -47,6 +48,7 @@ class ProcessWindow(Record):
         0.0, "Spread of the wavelength", unit="µm", option="--wavelength-sd-um", ge=0
     )
     roughness: Roughness = setting(_SMOOTH, "Surface of a print")
+    stitch: Stitching = setting(_IN_PLACE, "Write fields of a print")
     samples: int = setting(
         0,
         "Draws of the process window in the loss; 0 designs for the print as modelled",
@@ -96,6 +98,8 @@ class Draw:
     optics: Optics
     roughness: Roughness = _SMOOTH
     surface_seed: tuple[int, ...] = ()
+    stitch: Stitching = _IN_PLACE
+    stitch_seed: tuple[int, ...] = ()
     _surfaces: dict[tuple[int, ...], Tensor] = field(default_factory=dict, compare=False, repr=False)
 
     def apply(self, height_um: Tensor, pitch_um: float) -> Tensor:
@@ -103,12 +107,16 @@ class Draw:
 
         A uniform offset changes no image, only the scores of heights.
         Rings are blurred along the radius only, which is exact where they are much wider than the blur
-        or far from the centre. A rough surface, of maps only, is laid on the blurred print.
+        or far from the centre. Of maps only, write fields are put off their places then, and a rough surface
+        is laid on the print.
         """
         changed = height_um * self.gain + self.offset_um
         sigma_px = self.blur_um / pitch_um
         if sigma_px >= _NARROWEST_BLUR_PX:
             changed = _blur(changed, sigma_px)
+        if self.stitch.sigma_um:
+            offsets_um = self.stitch.offsets_um(len(changed), pitch_um, list(self.stitch_seed))
+            changed = in_fields(changed, pitch_um, self.stitch.field_px(pitch_um), offsets_um)
         if not self.roughness.sigma_um:
             return changed
         shape = tuple(height_um.shape)
@@ -126,7 +134,7 @@ def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = F
     shared = window.gain_offset_correlation
     seed = [window.seed, _UNSEEN_STREAM] if unseen else window.seed
     # Five numbers a draw: a further spread needs a stream of its own, or all older draws change.
-    stream = (window.seed, _SURFACE_STREAM, int(unseen))
+    surface, fields = ((window.seed, stream, int(unseen)) for stream in (_SURFACE_STREAM, _STITCH_STREAM))
     normal = np.random.default_rng(seed).standard_normal((count, 5)).tolist()
     return [
         Draw(
@@ -137,7 +145,9 @@ def draws(window: ProcessWindow, optics: Optics, count: int, *, unseen: bool = F
                 optics.wavelength_um + window.wavelength_sd_um * wavelength
             ).model_copy(update={"distance_um": optics.distance_um + window.defocus_sd_um * defocus}),
             roughness=window.roughness,
-            surface_seed=(*stream, number),
+            surface_seed=(*surface, number),
+            stitch=window.stitch,
+            stitch_seed=(*fields, number),
         )
         for number, (gain, offset, blur, defocus, wavelength) in enumerate(normal)
     ]

@@ -19,6 +19,7 @@ from litho_design.optics import Optics
 from litho_design.optics.stroke import Stroke
 from litho_design.optimisation.budget import peak_memory_gib
 from litho_design.optimisation.robust import EnsembleRecord
+from litho_design.optimisation.settings import DesignSettings
 from litho_design.printers.layout import LayoutSettings, Printability
 from litho_design.printers.printer import PrinterRecord, TilingCheck
 from litho_design.printers.training import OutOfDistribution
@@ -27,6 +28,9 @@ LEVELS_FILE = "layout_level.npy"
 HEIGHT_FILE = "predicted_height_um.npy"
 IMAGE_FILE = "image_share.npy"
 TARGET_FILE = "target.npy"
+# Of a lens of rings, one value per pixel of the radius instead of levels and heights of a plane.
+RINGS_FILE = "ring_level.npy"
+RING_HEIGHT_FILE = "ring_height_um.npy"
 # Of a result that is made of several designs.
 DESIGNS = "designs"
 
@@ -88,6 +92,47 @@ class Design(Result):
     thick: dict[str, float] | None = None
     files: dict[str, str]
 
+    @property
+    def in_rings(self) -> bool:
+        """Whether it has levels and heights along one radius, and none of a plane."""
+        return RINGS_FILE in self.files
+
+    @property
+    def layout_sha256(self) -> str:
+        """Hash of the file of levels."""
+        return self.files[RINGS_FILE if self.in_rings else LEVELS_FILE]
+
+
+def finished_design(folder: Path, fingerprint: str, settings: DesignSettings) -> Design | None:
+    """The design that a folder holds already; None where there is none.
+
+    Raises:
+        InputError: one of other settings, another target or model.
+    """
+    if not (folder / Design.FILE_NAME).exists():
+        return None
+    design = Design.read(folder)
+    if design.fingerprint != fingerprint:
+        raise InputError(
+            f"folder {folder}",
+            got=f"a design with {_difference(design.settings, settings.model_dump(mode='json'))}",
+            wanted="the same settings, target and model",
+            hint="choose another --out",
+        )
+    return design
+
+
+def _difference(then: Any, now: Any, path: str = "") -> str:
+    """The first setting in which two dumps differ, in words."""
+    for name in now:
+        before, after = then.get(name), now[name]
+        if isinstance(before, dict) and before != after:
+            return _difference(before, after, f"{path}{name}.")
+        if before != after:
+            values = "" if isinstance(after, list) else f" = {before!r} where now {after!r} is asked"
+            return f"other settings, {path}{name}{values}"
+    return "another target or model, or other bands"
+
 
 def write_arrays(folder: Path, arrays: dict[str, np.ndarray]) -> dict[str, str]:
     """Save arrays by file name; returns their SHA-256."""
@@ -110,8 +155,8 @@ def write_level_image(folder: Path, levels: np.ndarray) -> dict[str, str]:
     return {name: file_sha256(folder / name)}
 
 
-def read_array(folder: str | Path, name: str) -> np.ndarray:
-    """One array of a design folder, checked against the hash in its record.
+def read_array(folder: str | Path, name: str, *, on_disk: bool = False) -> np.ndarray:
+    """One array of a design folder, checked against the hash in its record; ``on_disk`` leaves it there.
 
     Raises:
         InputError: no such file, or one that changed after the design.
@@ -122,4 +167,5 @@ def read_array(folder: str | Path, name: str) -> np.ndarray:
         raise InputError(f"array {name}", got=f"no such file in {folder}", wanted="a complete design folder")
     if file_sha256(path) != wanted:
         raise InputError(f"array {path}", got="a file changed after the design", wanted=f"SHA-256 {wanted}")
-    return np.load(path, allow_pickle=False)
+    found: np.ndarray = np.load(path, mmap_mode="r" if on_disk else None, allow_pickle=False)
+    return found

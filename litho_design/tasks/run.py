@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -40,6 +39,7 @@ from litho_design.tasks.design import (
     LEVELS_FILE,
     Design,
     RunRecord,
+    finished_design,
     write_arrays,
     write_level_image,
 )
@@ -93,7 +93,7 @@ def run_design(
     fingerprint = record_sha256(
         [task.name, settings.model_dump(mode="json"), hashes_before, target, task.inputs_sha256()]
     )
-    finished = _finished(folder, fingerprint, settings)
+    finished = finished_design(folder, fingerprint, settings)
     if finished is not None:
         return finished
     with writable(folder):
@@ -199,32 +199,6 @@ def _check_printers(printers: Sequence[Printer]) -> None:
                 wanted="a frozen model, or none",
                 hint="a fab can only judge: --judge",
             )
-
-
-def _finished(folder: Path, fingerprint: str, settings: DesignSettings) -> Design | None:
-    if not (folder / Design.FILE_NAME).exists():
-        return None
-    design = Design.read(folder)
-    if design.fingerprint != fingerprint:
-        raise InputError(
-            f"folder {folder}",
-            got=f"a design with {_difference(design.settings, settings.model_dump(mode='json'))}",
-            wanted="the same settings, target and model",
-            hint="choose another --out",
-        )
-    return design
-
-
-def _difference(then: Any, now: Any, path: str = "") -> str:
-    """The first setting in which two dumps differ, in words."""
-    for name in now:
-        before, after = then.get(name), now[name]
-        if isinstance(before, dict) and before != after:
-            return _difference(before, after, f"{path}{name}.")
-        if before != after:
-            values = "" if isinstance(after, list) else f" = {before!r} where now {after!r} is asked"
-            return f"other settings, {path}{name}{values}"
-    return "another target or model"
 
 
 def _optimise(

@@ -9,22 +9,35 @@ from pathlib import Path
 import numpy as np
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.outputs import require_own_folder
-from litho_data.foundation.run_facts import run_facts
 from litho_design.holograms.settings import HologramSettings, hologram_settings
 from litho_design.images.targets import Target, load_target
 from litho_design.judging.score import JudgedScore, ScoreResult
 from litho_design.large.bands import Bands, Ranks
 from litho_design.large.cost import disk_gib, fit_cost, measure_size, sent_gib
-from litho_design.large.lens import design_in_rings
+from litho_design.large.lens import design_in_rings, judge_rings
 from litho_design.large.run import design_in_bands
-from litho_design.large.score import image_figures, image_from_disk, on_disk, preview, print_from_disk
+from litho_design.large.score import (
+    image_figures,
+    image_from_disk,
+    in_fields_from_disk,
+    on_disk,
+    preview,
+    print_from_disk,
+)
 from litho_design.lenses.settings import LensSettings, lens_settings
+from litho_design.optimisation.stitching import Stitching
 from litho_design.printers.printer import Printer
 from litho_design.printers.source import Device, load_printer, load_printers
 from litho_design.reports.score import write_score_report
-from litho_design.tasks.design import HEIGHT_FILE, IMAGE_FILE, LEVELS_FILE, TARGET_FILE, Design
+from litho_design.tasks.design import (
+    HEIGHT_FILE,
+    IMAGE_FILE,
+    LEVELS_FILE,
+    TARGET_FILE,
+    Design,
+    read_array,
+)
 
 BAND_PX = 512
 
@@ -90,11 +103,15 @@ def score_from_disk(
     *,
     judges: Iterable[str | Printer],
     band_px: int = BAND_PX,
+    stitch: Stitching | None = None,
     extrapolate: bool = False,
 ) -> ScoreResult:
     """Score the layout of a hologram by models as ``score`` does, with everything large on disk.
 
-    Needs room in ``out`` for 50 bytes per pixel, for the time that it takes.
+    Needs room in ``out`` for 54 bytes per pixel, for the time that it takes.
+
+    Args:
+        stitch: write fields that the prints are made of; one draw of their places, as there are many.
 
     Raises:
         InputError: as ``score``; a design that is no hologram of a thin element, or a judge without a
@@ -107,7 +124,7 @@ def score_from_disk(
         got = f"{record.task}, {optics.element}"
         raise InputError("design to score from disk", got=got, wanted="a hologram, thin")
     level, expected, seen, target = (
-        _opened(folder, record, name) for name in (LEVELS_FILE, HEIGHT_FILE, IMAGE_FILE, TARGET_FILE)
+        read_array(folder, name, on_disk=True) for name in (LEVELS_FILE, HEIGHT_FILE, IMAGE_FILE, TARGET_FILE)
     )
     printers = load_printers(judges, layout, extrapolate=extrapolate)
     if not printers:
@@ -123,8 +140,11 @@ def score_from_disk(
                 np.memmap(room / file, np.float32, "w+", shape=level.shape) for file in ("height", "image")
             )
             print_from_disk(level, printer, bands, height)
-            zero_order = image_from_disk(height, layout.pitch_um, optics, bands, image, on_disk(room))
-            mean, rms = _difference(height, expected, bands)
+            printed: np.ndarray = height
+            if stitch is not None:
+                printed = in_fields_from_disk(height, layout.pitch_um, stitch, bands, on_disk(room)).numpy()
+            zero_order = image_from_disk(printed, layout.pitch_um, optics, bands, image, on_disk(room))
+            mean, rms = _difference(printed, expected, bands)
             figures = image_figures(image, target, bands) | {"zero_order_share": zero_order}
             pictures[f"printed by {judge.name}"] = preview(image, bands)
         scores.append(
@@ -135,25 +155,39 @@ def score_from_disk(
                 mean_height_difference_um=mean,
                 rms_height_difference_um=rms,
                 figures=figures,
+                stitching=stitch,
             )
         )
-    result = ScoreResult(
-        **run_facts(),
-        design=str(folder),
-        design_sha256=file_sha256(folder / Design.FILE_NAME),
-        layout_sha256=record.files[LEVELS_FILE],
-        task=record.task,
-        designed_with=record.printer,
-        layout=layout,
-        optics=optics,
-        seeds=[int(record.settings["search"]["seed"])],
-        reference_efficiency=record.reference_efficiency,
-        designed=record.predicted,
-        baselines=record.baselines,
-        scores=scores,
-    )
+    result = ScoreResult.of(folder, record, scores)
     brightest = {title: picture / picture.max() for title, picture in pictures.items()}
     write_score_report(Path(out), result, brightest, layout.size_um, {}, layout.size_um)
+    result.write(out)
+    return result
+
+
+def score_rings(
+    design: str | Path,
+    out: str | Path,
+    *,
+    judges: Iterable[str | Printer],
+    tile_px: int = BAND_PX,
+    device: Device = "cpu",
+    extrapolate: bool = False,
+) -> ScoreResult:
+    """Score the rings of ``design_large_lens`` as models print them, along the radius.
+
+    Raises:
+        InputError: as ``score``, or a judge without a finite reach.
+    """
+    require_own_folder(out, ScoreResult.FILE_NAME)
+    folder, record = Path(design), Design.read(design)
+    printers = load_printers(judges, record.layout, device=device, extrapolate=extrapolate)
+    if not printers:
+        raise InputError("score", got="nothing to judge with", wanted="a judge")
+    scores, pictures, side_um = judge_rings(folder, record, list(printers.values()), tile_px)
+    result = ScoreResult.of(folder, record, scores)
+    shown = {title: np.sqrt(psf / psf.max()) for title, psf in pictures.items()}
+    write_score_report(Path(out), result, shown, side_um, {}, side_um)
     result.write(out)
     return result
 
@@ -207,14 +241,6 @@ def estimate_large(
             f"{sent_gib(size, ranks):.3g} GiB per iteration, whose time is not in the estimate"
         )
     return lines
-
-
-def _opened(folder: Path, record: Design, name: str) -> np.ndarray:
-    """An array of a design on disk, checked against the hash in its record."""
-    if record.files.get(name) != file_sha256(folder / name):
-        raise InputError(f"array {folder / name}", got="a file changed after the design")
-    found: np.ndarray = np.load(folder / name, mmap_mode="r")
-    return found
 
 
 def _difference(height: np.ndarray, expected: np.ndarray, bands: Bands) -> tuple[float, float]:

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import json
 import struct
+import tracemalloc
 
 import cv2
 import numpy as np
 import pytest
 import tifffile
+from PIL import Image
 
 from litho_data.foundation.errors import InputError
 from litho_design.exports import marks
 from litho_design.exports.files import export as export_design
 from litho_design.exports.files import import_levels
-from litho_design.exports.gds import rectangles, write_gds
-from litho_design.exports.image import read_published_bmp, write_bmp, write_png16, write_tiff
+from litho_design.exports.gds import GdsRows, rectangles, write_gds
+from litho_design.exports.image import TiffRows, read_published_bmp, write_bmp, write_png16, write_tiff
 from litho_design.exports.sidecar import sidecar_path
 from litho_design.exports.stl import read_stl_levels, read_stl_triangles, write_stl
 from litho_design.images.targets import load_target
@@ -49,8 +51,6 @@ def design(tmp_path_factory):
 
 @pytest.mark.parametrize("kind", FORMATS)
 def test_round_trip_is_exact_and_has_its_size(tmp_path, design, kind):
-    if kind == "gds":
-        pytest.importorskip("gdstk")
     file = export_design(design, kind, tmp_path / kind)
     levels, sidecar = import_levels(file)
     assert np.array_equal(levels, np.load(design / "layout_level.npy"))
@@ -92,6 +92,7 @@ def test_gds_is_upright_and_has_its_size_for_another_reader(tmp_path, layers):
     # The F reaches all four sides; in ``exclusive`` level 0 fills the rest.
     corners = np.array(cell.bounding_box()) * library.unit
     assert corners == pytest.approx(np.array([[0, 0], [4 * 0.13e-6, 5 * 0.13e-6]]), abs=1e-9)
+    assert (library.unit, library.precision) == pytest.approx((1e-6, 1e-9), rel=1e-15)
     centres = [((x + 0.5) * 0.13, (4.5 - y) * 0.13) for y in range(5) for x in range(4)]
     highest = [polygon for polygon in cell.get_polygons() if polygon.layer == 2]
     assert np.array_equal(np.reshape(gdstk.inside(centres, highest), (5, 4)), LETTER > 0)
@@ -240,15 +241,15 @@ def test_gds_layers_have_the_area_of_their_levels(tmp_path, design, layers):
 
 def test_gds_blocks_that_are_equal_are_stored_once_and_read_by_another_parser(tmp_path):
     """Records by struct, references followed by hand: no code of gdstk or of the writer."""
-    pytest.importorskip("gdstk")
     tile = np.random.default_rng(0).integers(0, 4, (128, 128)).astype(np.uint8)
     levels = np.tile(tile, (3, 2))
     levels[300, 200] = 5
     assert write_gds(tmp_path / "f.gds", levels, 0.1, "exclusive") > 0
     cells = _gds_cells(tmp_path / "f.gds")
-    # Six blocks, of which five are equal.
-    assert [len(cells[name]["references"]) for name in ("LAYOUT", "ELEMENT")] == [1, 6]
-    assert len({name for name, _ in cells["ELEMENT"]["references"]}) == 2
+    # Three rows of two blocks; of the six five are equal.
+    rows = [name for name, _ in cells["ELEMENT"]["references"]]
+    assert [len(cells[name]["references"]) for name in ("LAYOUT", *rows)] == [1, 2, 2, 2]
+    assert len({name for row in rows for name, _ in cells[row]["references"]}) == 2
     seen = np.full(levels.shape, -1)
 
     def draw(name, x0, y0):
@@ -263,6 +264,59 @@ def test_gds_blocks_that_are_equal_are_stored_once_and_read_by_another_parser(tm
 
     draw("LAYOUT", 0, 0)
     assert np.array_equal(seen, levels)
+
+
+def test_a_bigtiff_is_written_in_strips_that_another_reader_knows(tmp_path, design, monkeypatch):
+    """Pillow and libtiff in place of tifffile, which wrote it."""
+    monkeypatch.setattr("litho_design.exports.image._CLASSIC_BYTES", 0)
+    levels = np.kron(LETTER * 7, np.ones((50, 50), np.uint8))
+    write_tiff(tmp_path / "f.tif", levels, LayoutSettings(pitch_um=0.13))
+    assert (tmp_path / "f.tif").read_bytes()[:4] == b"II" + struct.pack("<H", 43)
+    with Image.open(tmp_path / "f.tif") as pages:
+        assert np.array_equal(np.asarray(pages), levels)
+        # Pixels per centimetre, tag 282.
+        assert float(pages.tag_v2[282]) == pytest.approx(1e4 / 0.13, rel=1e-6)
+        pages.seek(1)
+        assert np.asarray(pages) == pytest.approx(levels * 0.1)
+    file = export_design(design, "tiff", tmp_path / "out", marks=False)
+    assert np.array_equal(import_levels(file)[0], np.load(design / "layout_level.npy"))
+
+
+class _Tall:
+    """Random levels 512 px wide, of which nothing but the rows asked for exists."""
+
+    def __init__(self, height):
+        self.shape = (height, 512)
+
+    def __getitem__(self, rows):
+        found = [
+            np.random.default_rng(row).integers(0, 4, (1, 512)) for row in range(*rows.indices(self.shape[0]))
+        ]
+        return np.concatenate(found).astype(np.uint8)
+
+
+@pytest.mark.parametrize("kind", ["tiff", "gds"])
+def test_memory_of_an_export_does_not_grow_with_its_rows(tmp_path, kind, monkeypatch):
+    monkeypatch.setattr("litho_design.exports.image._CLASSIC_BYTES", 0)
+    peaks, bands = [], 0
+    for height in (256, 512, 1536):
+        levels, file = _Tall(height), tmp_path / f"{height}.{kind}"
+        tracemalloc.start()
+        if kind == "tiff":
+            write_tiff(file, levels, LayoutSettings())
+            back = TiffRows(file)
+        else:
+            write_gds(file, levels, 0.1, "cumulative")
+            back = GdsRows(file, levels.shape, 0.1, "cumulative")
+        for top in range(0, height, 128):
+            assert np.array_equal(back[top : top + 128], levels[top : top + 128])
+            bands += 1
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert bands == 2 + 4 + 12
+    # The first has the modules that it imports. What grows are names of blocks, below 1 kB each, of 32 more;
+    # all levels would be 0.5 MB more, and their rectangles, 64 bytes for about two pixels, 16 MB.
+    assert peaks[2] - peaks[1] < 2e5
 
 
 def _gds_cells(file) -> dict[str, dict[str, list]]:
@@ -289,8 +343,6 @@ def _gds_cells(file) -> dict[str, dict[str, list]]:
 
 @pytest.mark.parametrize("kind", FORMATS)
 def test_a_mark_and_a_witness_stand_beside_the_element(tmp_path, design, kind, monkeypatch):
-    if kind == "gds":
-        pytest.importorskip("gdstk")
     # No printer, no reach: 6.4 µm hold an F of 0.8 µm strokes and a witness of 1.2 µm.
     monkeypatch.setattr(marks, "_STROKE_UM", 0.8)
     monkeypatch.setattr(marks, "_FLAT_UM", 1.2)
@@ -331,10 +383,13 @@ def test_marks_keep_the_reach_of_the_printer():
 
 
 def test_rectangles_cover_once():
-    cover = np.zeros(LETTER.shape, int)
-    for top, bottom, left, right in rectangles(LETTER > 0):
-        cover[top:bottom, left:right] += 1
-    assert np.array_equal(cover, LETTER)
+    masks = np.stack([LETTER > 0, LETTER == 0, LETTER < 0, np.random.default_rng(0).random((5, 4)) < 0.5])
+    cover = np.zeros(masks.shape, int)
+    for mask, top, bottom, left, right in rectangles(masks).tolist():
+        cover[mask, top:bottom, left:right] += 1
+    assert np.array_equal(cover, masks)
+    # Two bars, the stem between them, and two rows of stem below, which are one.
+    assert len(rectangles(masks[:1])) == 4
 
 
 def test_published_bmp_is_read_with_its_offset(tmp_path):

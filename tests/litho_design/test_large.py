@@ -13,22 +13,25 @@ import torch
 
 from litho_data.foundation.errors import InputError
 from litho_design.cli.app import main
+from litho_design.exports.files import export, import_levels
 from litho_design.holograms.task import HologramTask
 from litho_design.images.targets import load_target
 from litho_design.judging.loaded import load_design
 from litho_design.large.bands import Bands, Ranks
 from litho_design.large.cost import MeasuredSize, fit_cost, sent_gib
 from litho_design.large.hologram import BandedHologram
-from litho_design.large.lens import RING_HEIGHT_FILE, RINGS_FILE, RingLens, design_in_rings
+from litho_design.large.lens import RingLens, design_in_rings
 from litho_design.large.propagator import BandedPropagator
 from litho_design.large.run import design_in_bands
 from litho_design.lenses.settings import lens_settings
 from litho_design.lenses.task import lens_task
 from litho_design.optics import Optics, centred_grid, make_propagator
 from litho_design.optics.sampling import fast_length
+from litho_design.optimisation.parameters import CellMap
 from litho_design.optimisation.search import search_layout
+from litho_design.optimisation.stitching import Stitching, in_fields
 from litho_design.printers.printer import Printer
-from litho_design.tasks.design import LEVELS_FILE, Design
+from litho_design.tasks.design import LEVELS_FILE, RING_HEIGHT_FILE, RINGS_FILE, Design
 from litho_design.workflows.large import score_from_disk
 from litho_design.workflows.score import score
 from tests.litho_design import large_rank
@@ -157,6 +160,27 @@ def test_a_score_from_disk_is_that_of_the_whole(alone, tmp_path):
     assert predicted == pytest.approx({name: whole.figures[name] for name in predicted}, rel=1e-4, abs=1e-7)
 
 
+def test_displaced_write_fields_are_judged_alike_in_memory_and_from_disk(alone, tmp_path):
+    design, printer, stitch = alone / "design", large_rank.printer(), Stitching(field_um=4.0, sigma_um=0.15)
+    loaded = load_design(design)
+    plain = loaded.printed_um(printer)
+    moved = in_fields(plain, 0.1, 40, stitch.offsets_um(SIZE, 0.1, [0]))
+    wanted = loaded.score(moved).model_dump()
+    folders = (tmp_path / "disk", tmp_path / "whole")
+    (streamed,) = score_from_disk(design, folders[0], judges=[printer], band_px=48, stitch=stitch).scores
+    for name, value in streamed.figures.items():
+        # As without fields: rounding of waves, in figures that are sums of squares of them.
+        assert value == pytest.approx(wanted[name], rel=1e-4, abs=1e-7), name
+    assert streamed.rms_height_difference_um == pytest.approx(float((moved - plain).square().mean().sqrt()))
+    (judged,) = score(design, folders[1], judges=[printer], stitch=stitch).scores
+    assert judged.figures["eff_signal"] < loaded.score(plain).eff_signal
+    for name, value in streamed.figures.items():
+        # One draw of eight lies within 7 / sqrt(8) = 2.5 standard deviations of their mean, by algebra.
+        assert abs(value - judged.figures[name]) <= 2.5 * judged.uncertainty[name] + 1e-6, name
+    assert judged.stitching == streamed.stitching == stitch
+    assert "write fields of 4 µm lie off their places by 0.15 µm" in (folders[1] / "report.html").read_text()
+
+
 def test_what_a_large_element_cannot_have_is_refused():
     settings, printer, target = large_rank.settings(), large_rank.printer(), load_target("ring", SIZE)
     with pytest.raises(InputError, match="at most one per band"):
@@ -241,3 +265,25 @@ def test_a_lens_in_rings_is_the_lens_of_the_plane(tmp_path):
     again = rings.score(rings.printed_um(torch.from_numpy(level).float()[None, None])).model_dump()
     assert design.predicted == pytest.approx(again, rel=1e-6)
     assert 0.2 < design.predicted["strehl"] <= 1
+    # Its plane: what the map of a plane makes of the same rings, the last one in the corners.
+    cells = CellMap(settings.layout)
+    ring = torch.from_numpy(level[:: settings.layout.cell_px])
+    whole = cells(torch.cat([ring, ring[-1:].expand(cells.cells[0] - len(ring))])).numpy()
+    for kind in ("tiff", "gds", "png16"):
+        np.testing.assert_array_equal(import_levels(export(tmp_path, kind, tmp_path / kind))[0], whole)
+    # One's own model repeats the prediction; nominal heights are off by what the print loses.
+    own, nominal = score(tmp_path, tmp_path / "score", judges=[printer, "none"]).scores
+    assert own.figures == pytest.approx(design.predicted, rel=1e-6)
+    assert own.rms_height_difference_um < 1e-6
+    area = np.arange(128) + 0.5
+    off = settings.layout.level_height_um * level - height
+    rms = np.sqrt((off**2 * area).sum() / area.sum())
+    assert nominal.rms_height_difference_um == pytest.approx(rms, rel=1e-4)
+    changed = settings.model_copy(update={"search": settings.search.model_copy(update={"iterations": 7})})
+    with pytest.raises(InputError, match=r"got a design with other settings, search\.iterations"):
+        design_in_rings(changed, printer, tmp_path, tile_px=48, announce=False)
+    with pytest.raises(InputError, match="got a scan, a photograph, another element or write fields"):
+        score(tmp_path, tmp_path / "fields", judges=[printer], stitch=Stitching(sigma_um=0.1))
+    (tmp_path / RINGS_FILE).write_bytes(b"")
+    with pytest.raises(InputError, match="a file changed after the design"):
+        export(tmp_path, "tiff", tmp_path / "again")

@@ -1,0 +1,80 @@
+"""The levels of an element of any size, a band of rows at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from litho_design.tasks.design import LEVELS_FILE, RINGS_FILE, Design, read_array
+
+
+class LevelRows(Protocol):
+    """A level map (ny, nx), row 0 on top, whose rows are cut out as those of an array; it may be on disk."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(ny, nx)."""
+
+    def __getitem__(self, rows: slice, /) -> np.ndarray:
+        """These rows, all columns."""
+
+
+@dataclass(frozen=True)
+class RingRows:
+    """The plane of a lens of rings, of which no more is made than the rows that are asked for.
+
+    Args:
+        ring_level: level at each pixel of the radius, uint8; corners beyond the aperture take the last.
+    """
+
+    ring_level: np.ndarray
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(ny, nx)."""
+        return (2 * len(self.ring_level),) * 2
+
+    def __getitem__(self, rows: slice) -> np.ndarray:
+        radius = len(self.ring_level)
+        x = np.arange(radius) + 0.5
+        y = np.arange(2 * radius)[rows] + 0.5 - radius
+        ring = np.hypot(y[:, None], x).astype(np.intp)
+        right = self.ring_level[np.minimum(ring, radius - 1, out=ring)]
+        return np.concatenate([right[:, ::-1], right], axis=1)
+
+
+@dataclass(frozen=True)
+class SideBySide:
+    """Two maps of equal height, the second to the right of the first."""
+
+    left: LevelRows
+    right: LevelRows
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(ny, nx)."""
+        return self.left.shape[0], self.left.shape[1] + self.right.shape[1]
+
+    def __getitem__(self, rows: slice) -> np.ndarray:
+        return np.concatenate([self.left[rows], self.right[rows]], axis=1)
+
+
+def layout_rows(folder: str | Path) -> LevelRows:
+    """The layout of a design folder, checked against the hash in its record; it stays on disk.
+
+    Raises:
+        InputError: no design, or levels that changed after it.
+    """
+    if Design.read(folder).in_rings:
+        return RingRows(read_array(folder, RINGS_FILE))
+    return read_array(folder, LEVELS_FILE, on_disk=True)
+
+
+def bands_of(levels: LevelRows, band_px: int) -> Iterator[slice]:
+    """Rows of a map, ``band_px`` at a time; the last band may have fewer."""
+    height = levels.shape[0]
+    return (slice(top, min(top + band_px, height)) for top in range(0, height, band_px))

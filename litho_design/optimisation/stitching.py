@@ -1,0 +1,90 @@
+"""Prints that are made of write fields, each of which lies a little off its place."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from litho_data.foundation.results import Record
+from litho_data.foundation.settings import setting
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+class Stitching(Record):
+    """Write fields, counted from the corner of the element, and how far they lie off their places.
+
+    ``sigma_um`` is the standard deviation along each axis; none by default.
+    """
+
+    field_um: float = setting(
+        100.0, "Side of the write fields that an element is printed in", unit="µm",
+        option="--stitch-field-um", gt=0,
+    )  # fmt: skip
+    sigma_um: float = setting(
+        0.0, "Spread of the place of write fields, along each axis", unit="µm", option="--stitch-sigma-um",
+        ge=0,
+    )  # fmt: skip
+
+    def offsets_um(self, size_px: int, pitch_um: float, seed: list[int]) -> np.ndarray:
+        """Drawn (y, x) of each field of an element, (fields, fields, 2), µm; the same for the same seed."""
+        count = math.ceil(size_px / self.field_px(pitch_um))
+        return self.sigma_um * np.random.default_rng(seed).standard_normal((count, count, 2))
+
+    def field_px(self, pitch_um: float) -> int:
+        """Side of a field in pixels."""
+        return max(1, round(self.field_um / pitch_um))
+
+
+def in_fields(
+    height_um: Tensor, pitch_um: float, field_px: int, offsets_um: np.ndarray, first_row: int = 0
+) -> Tensor:
+    """A print whose write fields lie off their places, of the print as if in one piece; differentiable.
+
+    A gap between two fields is bare, and where fields overlap the height is their mean: what is written twice
+    grows no taller. A pixel that comes to lie across four gives each the share that it covers.
+
+    Args:
+        height_um: rows of a print (rows, size), µm.
+        field_px: side of a field; ``offsets_um``: (y, x) of every field, (fields, fields, 2), µm.
+        first_row: of the element, where the rows are a part of it. Near their ends fields from beyond are
+            missing: rows within the largest offset and one more are to be thrown away.
+
+    Returns:
+        Heights of the same shape.
+    """
+    import torch
+
+    shape = height_um.shape
+    summed, covered = (torch.zeros_like(height_um) for _ in range(2))
+    for index in np.ndindex(offsets_um.shape[:2]):
+        top, left = index[0] * field_px - first_row, index[1] * field_px
+        rows, columns = (max(top, 0), min(top + field_px, shape[0])), (left, min(left + field_px, shape[1]))
+        if rows[0] >= rows[1]:
+            continue
+        offset_px = offsets_um[index] / pitch_um
+        whole = np.floor(offset_px).astype(int)
+        share = offset_px - whole
+        for step in np.ndindex(2, 2):
+            weight = float(np.prod(np.where(step, share, 1 - share)))
+            by = (whole + step).tolist()
+            low = [
+                min(max(edge[0] + d, 0), size)
+                for edge, d, size in zip((rows, columns), by, shape, strict=True)
+            ]
+            high = [
+                max(min(edge[1] + d, size), 0)
+                for edge, d, size in zip((rows, columns), by, shape, strict=True)
+            ]
+            if weight == 0 or low[0] >= high[0] or low[1] >= high[1]:
+                continue
+            to, of = (
+                tuple(slice(a - d, b - d) for a, b, d in zip(low, high, moved, strict=True))
+                for moved in ((0, 0), by)
+            )
+            summed[to] += weight * height_um[of]
+            covered[to] += weight
+    return summed / covered.clamp(min=1)
