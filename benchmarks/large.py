@@ -1,26 +1,27 @@
 """Hologram iterations in bands at growing sizes, and how well a model of their cost meets a size left out.
 
-    python -m benchmarks.large [--model zoo:pbl] [--sizes 512 1024 2048] [--left-out 4096] [--out FILE]
+    python -m benchmarks.large [--model zoo:pbl] [--sizes 1024 2048] [--left-out 4096] [--publish]
 
-One process, one thread, seconds of the processor: the machine may do other work. The model is fitted to
-``--sizes`` and compared with ``--left-out``, which is measured last. Memory is the process's peak so far.
+One process, one thread, seconds of the processor: the machine may do other work. The model is fitted to the
+largest of ``--sizes`` and compared with ``--left-out``, which is measured last. Memory is the process's peak
+so far. ``--publish`` puts the table into docs/large.md.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from pathlib import Path
 
 import torch
 
-from benchmarks.record import write_record
+from benchmarks.record import conclude, origin
 from litho_data.foundation.commands import run_script
-from litho_data.foundation.run_facts import run_facts
 from litho_design.holograms.settings import hologram_settings
-from litho_design.large.cost import fit_cost, measure_size
+from litho_design.large.cost import CostModel, MeasuredSize, fit_cost, measure_size
 from litho_design.printers.source import load_printer
+
+_DOCS = Path(__file__).parents[1] / "docs"
 
 
 def main() -> None:
@@ -28,9 +29,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--model", default="zoo:pbl")
     parser.add_argument("--band-px", type=int, default=512)
-    parser.add_argument("--sizes", type=int, nargs="+", default=[512, 1024, 2048])
+    parser.add_argument("--sizes", type=int, nargs="+", default=[1024, 2048])
     parser.add_argument("--left-out", type=int, default=4096)
-    parser.add_argument("--out", type=Path)
+    parser.add_argument("--out", type=Path, help="JSON file; docs/results/large/MODEL.json by default")
+    parser.add_argument("--publish", action="store_true")
     given = parser.parse_args()
     torch.set_num_threads(1)
     settings = hologram_settings()
@@ -46,20 +48,35 @@ def main() -> None:
         "evaluation_s": model.evaluation_s(given.left_out),
         "peak_memory_gib": model.memory_of_rank_gib(given.left_out),
     }
+    error = {name: value / getattr(left_out, name) - 1 for name, value in predicted.items()}
     content = {
-        "schema": "litho-design/large-cost/1",
-        **run_facts(),
+        "schema": "litho-design/large-cost/2",
+        **origin(),
         "model": given.model,
         "band_px": given.band_px,
         "measured": [one.model_dump() for one in measured],
         "fit": model.model_dump(),
         "predicted": predicted,
-        "error": {name: value / getattr(left_out, name) - 1 for name, value in predicted.items()},
-        "iteration_ns_per_px": [1e9 * one.iteration_s / one.size_px**2 for one in measured],
+        "error": error,
     }
-    print(json.dumps(content, indent=1))
-    if given.out:
-        write_record(given.out, content)
+    out = given.out or _DOCS / "results" / "large" / f"{printer.name}.json"
+    text = _table(given.model, measured, model, error)
+    conclude(content, text, out, _DOCS / "large.md", f"large-{printer.name}", published=given.publish)
+
+
+def _table(name: str, measured: list[MeasuredSize], model: CostModel, error: dict[str, float]) -> str:
+    rows = [
+        f"| {one.size_px:,} | {one.iteration_s:.2f} s | {one.transforms_s:.2f} s | {one.evaluation_s:.2f} s "
+        f"| {one.peak_memory_gib:.2f} GiB |"
+        for one in measured
+    ]
+    off = [f"| foretold of the last | {100 * error['iteration_s']:+.0f} % | | "
+           f"{100 * error['evaluation_s']:+.0f} % | {100 * error['peak_memory_gib']:+.0f} % |"]  # fmt: skip
+    head = [
+        f"| `{name}`: side, px | iteration | transforms in it | evaluation | memory |",
+        "|---|---|---|---|---|",
+    ]
+    return "\n".join(head + rows + off)
 
 
 if __name__ == "__main__":

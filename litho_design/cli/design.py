@@ -252,7 +252,7 @@ def estimate(
     given: Given,
     ranks: Annotated[int, typer.Option(help="processes that would share the element", min=1)] = 1,
     measure_px: Annotated[
-        str, typer.Option(help="sides of the elements to be measured, at least two, px")
+        str, typer.Option(help="sides of the elements to be measured, px; the largest counts")
     ] = "1024,2048",
     band_px: BandPx = 512,
     device: Device = "cpu",

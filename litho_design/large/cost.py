@@ -19,6 +19,10 @@ from litho_design.optimisation.parameters import DirectLevels
 from litho_design.printers.printer import Printer
 
 _GIB = 2**30
+# In use at the peak of an iteration; 32 are the spectrum and half the transfer function, of twice the side.
+# Between small sizes the peak of a process grows by up to twice as much: the C library keeps freed arrays
+# below 32 MiB for later ones. That part, the interpreter, libraries, model and a band stay as they are.
+_IN_USE_BYTES_PER_PX = 64
 # A row of the spectrum is kept, sent and received: two complex64 of twice the length more than alone.
 _EXCHANGE_BYTES_PER_PX = 2 * 2 * 8
 _LEVEL, _HEIGHT, _IMAGE, _TARGET = 1, 4, 4, 4
@@ -35,13 +39,15 @@ class MeasuredSize(Record):
 
 
 class CostModel(Record):
-    """Transforms grow as K² log K, K being twice the side; all other time and memory as the pixels."""
+    """Transforms grow as K² log K, K being twice the side; all other time and memory as the pixels.
+
+    ``memory_gib`` is the constant part of the memory.
+    """
 
     transform_s_per_operation: float
     rest_s_per_px: float
     evaluation_s_per_px: float
     memory_gib: float
-    memory_gib_per_px: float
 
     def iteration_s(self, size_px: int, ranks: int = 1) -> float:
         """Time of one iteration of the search, with gradient, without what the network takes."""
@@ -57,8 +63,8 @@ class CostModel(Record):
     def memory_of_rank_gib(self, size_px: int, ranks: int = 1) -> float:
         """Peak memory of each process."""
         own = size_px**2 / ranks
-        exchange = _EXCHANGE_BYTES_PER_PX * own / _GIB if ranks > 1 else 0.0
-        return self.memory_gib + self.memory_gib_per_px * own + exchange
+        per_px = _IN_USE_BYTES_PER_PX + (_EXCHANGE_BYTES_PER_PX if ranks > 1 else 0)
+        return self.memory_gib + per_px * own / _GIB
 
     def search_s(self, size_px: int, settings: HologramSettings, ranks: int = 1) -> float:
         """Time of the start and the search."""
@@ -117,16 +123,14 @@ def measure_size(
 
 
 def fit_cost(measured: Sequence[MeasuredSize]) -> CostModel:
-    """The model that meets the largest size; memory grows from the second largest, which comes before it."""
-    before, last = sorted(measured, key=lambda one: one.size_px)[-2:]
+    """The model that meets the largest size."""
+    last = max(measured, key=lambda one: one.size_px)
     pixels, operations = last.size_px**2, _operations(last.size_px)
-    growth = (last.peak_memory_gib - before.peak_memory_gib) / (pixels - before.size_px**2)
     return CostModel(
         transform_s_per_operation=last.transforms_s / operations,
         rest_s_per_px=max(last.iteration_s - last.transforms_s, 0.0) / pixels,
         evaluation_s_per_px=max(last.evaluation_s - last.transforms_s / 2, 0.0) / pixels,
-        memory_gib=last.peak_memory_gib - growth * pixels,
-        memory_gib_per_px=growth,
+        memory_gib=last.peak_memory_gib - _IN_USE_BYTES_PER_PX * pixels / _GIB,
     )
 
 

@@ -205,19 +205,18 @@ def estimate_large(
     """What ``design_large_hologram`` would take with these settings, from small elements measured here.
 
     Args:
-        measure_px: sides of at least two elements, whose last two the model of the cost is fitted to.
+        measure_px: sides of elements, to the largest of which the model of the cost is fitted.
         ranks: processes that would share the element, each on a machine like this one.
 
     Returns:
         One sentence for each size that was measured, and those of the estimate.
 
     Raises:
-        InputError: fewer than two sizes, sizes that cells do not fill, or what ``design_large_hologram``
-            refuses.
+        InputError: no size, sizes that cells do not fill, or what ``design_large_hologram`` refuses.
     """
     sizes = sorted(set(measure_px))
-    if len(sizes) < 2:
-        raise InputError("sizes to measure", got=sizes, wanted="at least two")
+    if not sizes:
+        raise InputError("sizes to measure", got="none", wanted="at least one")
     layout, search = settings.layout, settings.search
     Bands(layout.size_px, band_px, Ranks(0, ranks), layout.cell_px)
     printer = load_printer(model, layout, device=device, extrapolate=extrapolate)

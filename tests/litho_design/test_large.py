@@ -203,10 +203,10 @@ def test_the_estimate_follows_its_laws(tmp_path, capsys, monkeypatch):
         transforms = 3e-9 * operations
         return MeasuredSize(
             size_px=size, iteration_s=transforms + 2e-6 * size**2, transforms_s=transforms,
-            evaluation_s=transforms / 2 + 1e-6 * size**2, peak_memory_gib=0.5 + 1e-7 * size**2,
+            evaluation_s=transforms / 2 + 1e-6 * size**2, peak_memory_gib=0.5 + 64 * size**2 / 2**30,
         )  # fmt: skip
 
-    cost, unused = fit_cost([known(512), known(1024)]), known(4096)
+    cost, unused = fit_cost([known(1024), known(512)]), known(4096)
     assert cost.iteration_s(4096) == pytest.approx(unused.iteration_s)
     assert cost.evaluation_s(4096) == pytest.approx(unused.evaluation_s)
     assert cost.memory_of_rank_gib(4096) == pytest.approx(unused.peak_memory_gib)
