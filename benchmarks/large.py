@@ -11,14 +11,16 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from benchmarks.record import conclude, origin
 from litho_data.foundation.commands import run_script
 from litho_design.holograms.settings import hologram_settings
-from litho_design.large.cost import CostModel, MeasuredSize, fit_cost, measure_size
+from litho_design.large.cost import fit_cost, measure_size
 from litho_design.printers.source import load_printer
 
 _DOCS = Path(__file__).parents[1] / "docs"
@@ -60,23 +62,29 @@ def main() -> None:
         "error": error,
     }
     out = given.out or _DOCS / "results" / "large" / f"{printer.name}.json"
-    text = _table(given.model, measured, model, error)
-    conclude(content, text, out, _DOCS / "large.md", f"large-{printer.name}", published=given.publish)
+    conclude(
+        content,
+        as_markdown(content),
+        out,
+        _DOCS / "large.md",
+        f"large-{printer.name}",
+        published=given.publish,
+    )
 
 
-def _table(name: str, measured: list[MeasuredSize], model: CostModel, error: dict[str, float]) -> str:
+def as_markdown(record: Mapping[str, Any]) -> str:
+    """The table of the page, of a record."""
     rows = [
-        f"| {one.size_px:,} | {one.iteration_s:.2f} s | {one.transforms_s:.2f} s | {one.evaluation_s:.2f} s "
-        f"| {one.peak_memory_gib:.2f} GiB |"
-        for one in measured
+        f"| {one['size_px']:,} | {one['iteration_s']:.2f} s | {one['transforms_s']:.2f} s "
+        f"| {one['evaluation_s']:.2f} s | {one['peak_memory_gib']:.2f} GiB |"
+        for one in record["measured"]
     ]
-    off = [f"| foretold of the last | {100 * error['iteration_s']:+.0f} % | | "
-           f"{100 * error['evaluation_s']:+.0f} % | {100 * error['peak_memory_gib']:+.0f} % |"]  # fmt: skip
-    head = [
-        f"| `{name}`: side, px | iteration | transforms in it | evaluation | memory |",
-        "|---|---|---|---|---|",
-    ]
-    return "\n".join(head + rows + off)
+    time_s, evaluation, memory = (
+        f"{100 * record['error'][name]:+.0f} %" for name in ("iteration_s", "evaluation_s", "peak_memory_gib")
+    )
+    head = f"| `{record['model']}`: side, px | iteration | transforms in it | evaluation | memory |"
+    last = f"| foretold of the last | {time_s} | | {evaluation} | {memory} |"
+    return "\n".join([head, "|---|---|---|---|---|", *rows, last])
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import multiprocessing
 import socket
@@ -11,6 +12,8 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.large import as_markdown
+from benchmarks.record import NOT_MEASURED, published
 from litho_data.foundation.errors import InputError
 from litho_design.cli.app import main
 from litho_design.exports.files import export, import_levels
@@ -234,6 +237,25 @@ def test_the_estimate_follows_its_laws(tmp_path, capsys, monkeypatch):
     assert "128 px" in second
     assert "2048 px (0.205 mm), 300 iterations" in told
     assert "0.0625 GiB per iteration" in shared
+
+
+@pytest.mark.parametrize("name", ["physics", "pbl"])
+def test_the_page_shows_what_was_measured_and_the_model_meets_the_size_left_out(name):
+    docs = Path(__file__).parents[2] / "docs"
+    text, file = published(docs / "large.md", f"large-{name}"), docs / "results" / "large" / f"{name}.json"
+    if not file.exists():
+        assert text == NOT_MEASURED
+        return
+    record = json.loads(file.read_text(encoding="utf-8"))
+    assert as_markdown(record) == text
+    *fitted, unused = [MeasuredSize.model_validate(one) for one in record["measured"]]
+    cost, size = fit_cost(fitted), unused.size_px
+    for foretold, found in (
+        (cost.iteration_s(size), unused.iteration_s),
+        (cost.evaluation_s(size), unused.evaluation_s),
+        (cost.memory_of_rank_gib(size), unused.peak_memory_gib),
+    ):
+        assert foretold == pytest.approx(found, rel=0.25)
 
 
 def test_a_lens_in_rings_is_the_lens_of_the_plane(tmp_path):
