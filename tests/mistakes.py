@@ -22,6 +22,8 @@ from unittest.mock import patch
 import numpy as np
 
 PAGE = Path(__file__).parents[1] / "docs" / "mistakes.md"
+# Asked where there is no torch, which `pip install litholoop` alone does not bring.
+NO_TORCH = "litho-models zoo list"
 # By theme, what was done: a command line, or a statement of Python.
 MISTAKES: dict[str, dict[str, str]] = {
     "Words of the command line": {
@@ -38,6 +40,7 @@ MISTAKES: dict[str, dict[str, str]] = {
         "half of what belongs together": "litho-data simulate --plan empty --out new",
         "two ways to say the same": "litho-models noise prints.zarr --flat raw/scans/P11.txt --out new",
         "nothing to work on": "litho-models noise --out new",
+        "an extra that was not installed": NO_TORCH,
     },
     "Files and folders": {
         "a card that is not there": "litho-data build nowhere.toml --out new.zarr",
@@ -67,6 +70,8 @@ MISTAKES: dict[str, dict[str, str]] = {
         "the result of another command": "litho-models evaluate printer prints.zarr --out run",
         "another run of the same command": "litho-models train prints.zarr --model affine --out run",
         "another design": "litho-design hoe --model printer --size-px 64 --out design",
+        "another set of layouts": "litho-data masks --count 1 --size-px 64 --seed 5 --out set",
+        "another run of the fab": "litho-data simulate --count 1 --size-px 64 --seed 5 --out fab",
         "the current folder": "litho-data masks --out .",
         "a folder with measured scans": "litho-data simulate --out raw",
         "no store": "litho-data build raw/card.toml --out thesis",
@@ -140,6 +145,8 @@ MISTAKES: dict[str, dict[str, str]] = {
 
 def build_world() -> None:
     """Files that the mistakes are made with, in the current folder: raw prints, stores, models, results."""
+    from litho_data import simulate
+    from litho_data.layouts import write_layout_set
     from litho_design import design_hologram, hologram_settings
     from litho_models import build_model, save_frozen, train
     from tests.litho_data.campaigns import write_campaign
@@ -166,6 +173,8 @@ def build_world() -> None:
         write_store(here / "other.zarr", [replace(scan, pitch_um=0.2) for scan in scans], name="other")
     save_frozen(build_model("identity"), "printer")
     train("prints.zarr", "identity", "run")
+    write_layout_set("set", count=1, size_px=64)
+    simulate("fab", count=1, size_px=64)
     small = {"layout.size_px": 32, "optics.distance_um": 10, "search.iterations": 1}
     small |= {"search.polish_rounds": 0, "window.yield_draws": 2}
     settings = hologram_settings(changes=small)
@@ -215,6 +224,9 @@ def answer(mistake: str) -> tuple[int | str, str]:
         patch.object(sys, "argv", words),
         contextlib.redirect_stdout(io.StringIO()),
         contextlib.redirect_stderr(told),
+        patch("importlib.util.find_spec", return_value=None)
+        if mistake == NO_TORCH
+        else contextlib.nullcontext(),
     ):
         try:
             main()

@@ -28,7 +28,7 @@ def _list_knobs(wanted: bool) -> None:
 
 
 def masks(
-    out: Annotated[Path, typer.Option(help="folder to write; an older result there is replaced")],
+    out: Annotated[Path, typer.Option(help="folder to write; an older set of these settings is replaced")],
     pattern: Annotated[
         str, typer.Option(help="random, or a calibration pattern: see --list-patterns")
     ] = "random",
@@ -78,7 +78,8 @@ def masks(
 
 def simulate(
     out: Annotated[
-        Path, typer.Option(help="folder to write (raw/ and truth/); an older result there is replaced")
+        Path,
+        typer.Option(help="folder to write (raw/ and truth/); an older run of these settings is replaced"),
     ],
     preset: Annotated[str, typer.Option(help="plain, demo, measured-like or second-printer")] = "plain",
     layouts: Annotated[

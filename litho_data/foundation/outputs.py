@@ -1,8 +1,8 @@
 """What ``--out`` may be, for every command: nothing but an older result of its own is ever replaced.
 
 A folder that is not there or empty is taken. In a folder with an earlier run of the same command on the same
-subject (dataset, model, design) the run resumes, or its result is made again. Anything else is refused, and
-nothing is changed.
+subject (dataset, model, design) with the same settings the run resumes, or its result is made again. Anything
+else is refused, and nothing is changed.
 """
 
 from __future__ import annotations
@@ -39,6 +39,46 @@ def require_replaceable_folder(path: str | Path, *holds: str) -> None:
             got=f"{folder}, which holds {strangers[0]}",
             wanted="a new folder, or one with nothing but an older result, which is replaced",
         )
+
+
+def require_same_settings(path: str | Path, record: str, settings: Mapping[str, Any]) -> None:
+    """Refuse a folder whose result, if there is one, was made with other settings.
+
+    Args:
+        path: where the result will be.
+        record: the file that a finished result holds.
+        settings: fields of that file, with the values that they will have now. What an older file lacks is
+            not compared.
+
+    Raises:
+        InputError: another value, which the message names.
+    """
+    held = _content(Path(path) / record)
+    now = json.loads(json.dumps(settings))
+    other = first_difference(held, now).removeprefix("settings.") if isinstance(held, dict) else ""
+    if other:
+        raise InputError(
+            "output",
+            got=f"{path}, which holds a result with other settings, {other}",
+            wanted="the same settings, or a folder of its own",
+            hint="choose another --out",
+        )
+
+
+def first_difference(then: Mapping[str, Any], now: Mapping[str, Any], path: str = "") -> str:
+    """The first setting of ``now`` that was another one then, in words; "" if there is none.
+
+    Names that ``then`` lacks, and groups of them that are None there, are passed over.
+    """
+    for name, after in now.items():
+        before = then.get(name, after)
+        if isinstance(after, dict):
+            if deeper := first_difference(before or {}, after, f"{path}{name}."):
+                return deeper
+        elif before != after:
+            values = "" if isinstance(after, list) else f" = {before!r} where now {after!r} is asked"
+            return f"{path}{name}{values}"
+    return ""
 
 
 def require_own_folder(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.files import atomic_folder
-from litho_data.foundation.outputs import require_replaceable_folder
+from litho_data.foundation.outputs import require_replaceable_folder, require_same_settings
 from litho_data.layouts.card_text import CARD_NAME, TABLE_NAME, CardText, write_layout, write_table
 from litho_data.layouts.patterns import (
     checkerboard,
@@ -96,7 +96,7 @@ def write_layout_set(
 
     Raises:
         InputError: an unknown pattern, one that does not fit the size, lengths that are not positive, or a
-            folder with something else in it, such as scans.
+            folder with a set of other settings or something else in it, such as scans.
     """
     if pattern not in PATTERNS:
         raise unknown_name("pattern", pattern, PATTERNS)
@@ -107,6 +107,8 @@ def write_layout_set(
     require_replaceable_folder(
         out, CARD_NAME, TABLE_NAME, "layouts", LayoutStatistics.FILE_NAME, "levels.csv", "report.html"
     )
+    made = {"pattern": pattern, **asdict(settings), "level_height_um": level_height_um}
+    require_same_settings(out, LayoutStatistics.FILE_NAME, {"settings": made})
     with atomic_folder(out) as folder:
         paths: list[Path] = []
         rows: list[tuple[object, ...]] = []
@@ -124,6 +126,7 @@ def write_layout_set(
             scan_size_um=(shape[0] * pitch_um, shape[1] * pitch_um),
         ).write(folder)
         statistics = layout_statistics(paths, levels=levels, pitch_um=pitch_um)
+        statistics = statistics.model_copy(update={"settings": made})
         statistics.write(folder)
         statistics_page(statistics, paths).write(folder)
     return Path(out) / CARD_NAME

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -31,6 +31,7 @@ class LayoutStatistics(Result):
         lag_um: lags of the autocorrelation, µm.
         autocorrelation_x, autocorrelation_y: of the level about the layout's mean, 1 at lag 0.
         windows: features of 64 × 64 px windows, for `departure`.
+        settings: of a set that was made here, None for any other.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/layouts/1"
@@ -47,6 +48,7 @@ class LayoutStatistics(Result):
     autocorrelation_x: list[float]
     autocorrelation_y: list[float]
     windows: WindowFeatures
+    settings: dict[str, Any] | None = None
 
 
 class WindowFeatures(Record):

@@ -6,14 +6,15 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_folder
-from litho_data.foundation.outputs import require_replaceable_folder
+from litho_data.foundation.hashes import array_sha256, record_sha256
+from litho_data.foundation.outputs import require_replaceable_folder, require_same_settings
 from litho_data.layouts.card_text import CardText, write_layout, write_table
 from litho_data.level.scan import write_heights
 from litho_data.readers.text_matrix import write_text_matrix
@@ -72,8 +73,8 @@ def simulate(
         metadata: ``files-only`` leaves print groups, order, positions and write axis out of the card.
 
     Raises:
-        InputError: an unknown knob, a strength out of range, an impossible plan, or a folder with
-            something else in it.
+        InputError: an unknown knob, a strength out of range, an impossible plan, or a folder with a run of
+            other settings or something else in it.
     """
     if metadata not in ("full", "files-only"):
         raise InputError("metadata", got=repr(metadata), wanted="full or files-only")
@@ -103,6 +104,16 @@ def simulate(
     source: Iterator[Job] = iter(jobs) if jobs is not None else random_jobs(plan, fab.printer, seed)
     total = len(jobs) if jobs is not None else plan.total
     require_replaceable_folder(out, "raw", "truth")
+    asked = asdict(plan) if jobs is None else {"jobs": record_sha256([_described(job) for job in jobs])}
+    facts: dict[str, Any] = {
+        "seed": seed,
+        "printer": asdict(fab.printer),
+        "microscope": asdict(fab.microscope),
+        "noise": asdict(fab.noise),
+        "knobs": [KnobTruth.of(setting, seed).model_dump() for setting in fab.knobs.settings],
+        "settings": {**asked, "metadata": metadata},
+    }
+    require_same_settings(out, f"truth/{Truth.FILE_NAME}", facts)
     with atomic_folder(out) as folder:
         raw, hidden = folder / "raw", folder / "truth"
         for part in (raw / "scans", hidden / "prints", hidden / "surfaces"):
@@ -121,14 +132,7 @@ def simulate(
             rows.append(_row(job, len(rows)))
             scans.append(_scan_truth(scan))
         _write_card(raw, fab, name, size_um, rows, metadata, write_field_um, plan_of, print_pattern)
-        Truth(
-            seed=seed,
-            printer=asdict(fab.printer),
-            microscope=asdict(fab.microscope),
-            noise=asdict(fab.noise),
-            knobs=[KnobTruth.of(setting, seed) for setting in fab.knobs.settings],
-            scans=scans,
-        ).write(hidden)
+        Truth(**facts, scans=scans).write(hidden)
     return Path(out) / "raw" / "card.toml"
 
 
@@ -156,6 +160,11 @@ def _named(value: T | str, what: str, known: dict[str, T]) -> T:
     if value not in known:
         raise InputError(what, got=repr(value), wanted=" or ".join(known))
     return known[value]
+
+
+def _described(job: Job) -> dict[str, Any]:
+    """All that a job says, its layout by its hash."""
+    return {**vars(job), "level": array_sha256(job.level, "level", ("y", "x"))}
 
 
 def _check_jobs(jobs: Sequence[Job], printer: Printer) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -56,7 +56,7 @@ class ScanTruth(Record):
 class Truth(Result):
     """`truth.json`; each print lies beside it, clean as ``prints/<id>.npy``, rough as ``surfaces/<id>.npy``.
 
-    Both are heights in µm on the layout grid.
+    Both are heights in µm on the layout grid. ``settings``: what else was asked for, None in older files.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/virtual-fab/1"
@@ -67,6 +67,7 @@ class Truth(Result):
     microscope: dict[str, float | str]
     noise: dict[str, float]
     knobs: list[KnobTruth]
+    settings: dict[str, Any] | None = None
     scans: list[ScanTruth]
 
 

@@ -12,6 +12,7 @@ from pydantic import Field
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
 from litho_data.foundation.hashes import file_sha256
+from litho_data.foundation.outputs import first_difference
 from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import RunFacts, run_facts
 from litho_design.images.targets import TargetRecord
@@ -113,25 +114,15 @@ def finished_design(folder: Path, fingerprint: str, settings: DesignSettings) ->
         return None
     design = Design.read(folder)
     if design.fingerprint != fingerprint:
+        setting = first_difference(design.settings, settings.model_dump(mode="json"))
+        other = f"other settings, {setting}" if setting else "another target or model, or other bands"
         raise InputError(
             f"folder {folder}",
-            got=f"a design with {_difference(design.settings, settings.model_dump(mode='json'))}",
+            got=f"a design with {other}",
             wanted="the same settings, target and model",
             hint="choose another --out",
         )
     return design
-
-
-def _difference(then: Any, now: Any, path: str = "") -> str:
-    """The first setting in which two dumps differ, in words."""
-    for name in now:
-        before, after = then.get(name), now[name]
-        if isinstance(before, dict) and before != after:
-            return _difference(before, after, f"{path}{name}.")
-        if before != after:
-            values = "" if isinstance(after, list) else f" = {before!r} where now {after!r} is asked"
-            return f"other settings, {path}{name}{values}"
-    return "another target or model, or other bands"
 
 
 def write_arrays(folder: Path, arrays: dict[str, np.ndarray]) -> dict[str, str]:

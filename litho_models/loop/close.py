@@ -15,7 +15,7 @@ from litho_models.effects import get_effect
 from litho_models.loop.choice import Choice, choose, passed
 from litho_models.loop.equal_terms import scores_elsewhere
 from litho_models.loop.explainable import Learner, Rest
-from litho_models.loop.findings import LoopConfig, LoopFindings
+from litho_models.loop.findings import LoopConfig, LoopFindings, loop_config
 from litho_models.loop.folded_base import Trainer
 from litho_models.loop.gain_split import split_gain
 from litho_models.loop.identifiability import identifiability, profiles
@@ -59,9 +59,7 @@ def close_loop(
         InputError: fewer than two usable scans outside the lock box, an unknown effect among the prior
             hypotheses, or a nested selection for a base that is not refitted.
     """
-    config = LoopConfig() if config is None else config
-    if not isinstance(config, LoopConfig):
-        raise InputError("config", got=type(config).__name__, wanted="a LoopConfig")
+    config = loop_config(config)
     for name in config.prior_hypotheses:
         get_effect(name)
     for text in config.inject:
@@ -85,7 +83,7 @@ def close_loop(
         )
     fold_of = deal(development, config.folds, config.seed)
     study = Study(development, fold_of, config.seed, config.loss, config.weights, report=report)
-    choice = choose(study, base, trainer)
+    choice = choose(study, base, trainer, announce=True)
     final, search = choice.final, choice.search
     terms = DATUM_FREE | names_to_terms(passed(choice.first_tests))
     planted = []

@@ -10,6 +10,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, ValidationError
 from pydantic import Field as Setting
 
+from litho_data.foundation.errors import InputError
 from litho_data.foundation.settings import refused
 from litho_models.effects.chain import EffectChain
 from litho_models.fitting.least_squares import Loss
@@ -59,6 +60,13 @@ class LoopConfig(BaseModel):
             super().__init__(**settings)
         except ValidationError as error:
             raise refused(error) from None
+
+
+def loop_config(given: LoopConfig | None) -> LoopConfig:
+    """The settings that were given, or the defaults; InputError for anything else."""
+    if given is not None and not isinstance(given, LoopConfig):
+        raise InputError("config", got=type(given).__name__, wanted="a LoopConfig")
+    return given or LoopConfig()
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from torch import nn
 
+from litho_data.foundation.commands import progress
 from litho_data.store import PrintedScan
 from litho_models.loop.prepared import PreparedScan
 
@@ -40,9 +41,10 @@ class FoldedBase(nn.Module):
 
 def train_folds(scans: Sequence[PreparedScan], fold_of: np.ndarray, trainer: Trainer) -> FoldedBase:
     """Train once without each fold and once on all development scans."""
+    count = int(fold_of.max()) + 1
     models = [
         trainer([scan.stored for scan, own in zip(scans, fold_of, strict=True) if own != fold])
-        for fold in range(int(fold_of.max()) + 1)
+        for fold in progress(range(count), "training the base model", count + 1)
     ]
     assigned = {scan.id: int(fold) for scan, fold in zip(scans, fold_of, strict=True)}
     return FoldedBase(models, assigned, trainer([scan.stored for scan in scans]))

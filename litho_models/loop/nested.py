@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 from torch import nn
 
+from litho_data.foundation.commands import progress
 from litho_data.foundation.files import atomic_folder
 from litho_models.effects import CATALOGUE
 from litho_models.fitting.checkpoint import reading_kept
@@ -80,7 +81,7 @@ def nest(study: Study, base: nn.Module, held_out: HeldOut, cache: Path | None = 
         else leave_one_print_out(ids, [scan.stored.print_id for scan in study.scans])
     )
     parts = []
-    for number, group in enumerate(groups, start=1):
+    for number, group in enumerate(progress(groups, "choosing anew"), start=1):
         others = [scan for scan in study.scans if scan.id not in group]
         inner = replace(
             study,

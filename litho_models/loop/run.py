@@ -10,14 +10,14 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_folder
-from litho_data.foundation.outputs import require_replaceable_folder
+from litho_data.foundation.outputs import require_replaceable_folder, require_same_settings
 from litho_data.store import PrintedScan, Store, open_store
 from litho_models.effects import get_effect
 from litho_models.fitting.runs import level_share, step_share
 from litho_models.frozen import zoo
 from litho_models.frozen.files import save_frozen
 from litho_models.loop.close import close_loop
-from litho_models.loop.findings import LoopConfig, LoopFindings, corrected_chain
+from litho_models.loop.findings import LoopConfig, LoopFindings, corrected_chain, loop_config
 from litho_models.loop.folded_base import Trainer
 from litho_models.loop.open_questions import open_questions
 from litho_models.loop.prepared import prepare_scans
@@ -58,8 +58,9 @@ def close_loop_on_store(
             default beside ``out``; that of a benchmark with the same folds and settings spares its trainings.
 
     Raises:
-        InputError: no store, no such base, a base of another pitch, too few usable scans, or further
-            stores of another printer or with a turned scan whose card does not say so.
+        InputError: no store, no such base, a base of another pitch, too few usable scans, further stores of
+            another printer or with a turned scan whose card does not say so, or a folder with a loop of
+            other settings.
     """
     require_replaceable_folder(
         out,
@@ -71,8 +72,14 @@ def close_loop_on_store(
         MEASUREMENT_FILE,
     )
     opened = open_store(store)
-    new = [scan for path in new_prints for scan in _new_scans(opened, open_store(path))]
+    further = [open_store(path) for path in new_prints]
+    new = [scan for one in further for scan in _new_scans(opened, one)]
     simulator, name = _base_model(base, opened)
+    config = loop_config(config)
+    settings = config.model_dump(mode="json")
+    settings |= {"steps": steps, "new_prints": [one.sha256 for one in further]}
+    facts = {"dataset": opened.dataset_id.model_dump(mode="json"), "base_model": name, "settings": settings}
+    require_same_settings(out, CloseLoop.FILE_NAME, facts)
     scans = opened.scans()
     usable = [scan for scan in scans if np.count_nonzero(scan.usable) >= 1024]
     kept = {scan.id for scan in usable}
@@ -91,6 +98,7 @@ def close_loop_on_store(
         report=report,
     )
     result = summarise(findings, dataset=opened.dataset_id, base_name=name, dropped=dropped)
+    result = result.model_copy(update={"settings": settings})
     shares = level_share([scan.stored for scan in findings.development])
     questions = open_questions(findings, result, shares, report)
     if new:
@@ -160,11 +168,11 @@ def _rounding_um(store: Store, scans: Sequence[PrintedScan]) -> dict[str, float]
         return None
 
 
-def _trainer(base: str, config: LoopConfig | None, steps: int | None, cache: Path) -> Trainer:
+def _trainer(base: str, config: LoopConfig, steps: int | None, cache: Path) -> Trainer:
     from litho_models.fitting import TrainingConfig, fit_in_cache
 
     given: dict[str, Any] = {} if steps is None else {"steps": steps}
-    given |= {"seed": config.seed, "weights": config.weights} if config else {"seed": 0}
+    given |= {"seed": config.seed, "weights": config.weights}
     settings = TrainingConfig.of_recipe("fast", base, **given)
     return lambda scans: fit_in_cache(base, scans, settings, cache).model
 

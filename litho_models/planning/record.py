@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from litho_data.cards.card import Use
 from litho_data.foundation.results import Record, Result
@@ -61,13 +61,14 @@ class PlannedQuestion(Record):
 
 
 class NextPrint(Result):
-    """A plan: what to print and scan, and what it will decide."""
+    """A plan: what to print and scan, and what it will decide; ``settings``: what was asked for."""
 
     SCHEMA: ClassVar[str] = "litho-models/next-print/1"
     FILE_NAME: ClassVar[str] = "plan.json"
 
     run: RunInfo
     dataset: DatasetId
+    settings: dict[str, Any] | None = None
     prints: int
     field_um: float
     levels: tuple[int, int]

@@ -11,7 +11,7 @@ import numpy as np
 from litho_data.cards.card import Use
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_folder
-from litho_data.foundation.outputs import require_replaceable_folder
+from litho_data.foundation.outputs import require_replaceable_folder, require_same_settings
 from litho_data.foundation.run_facts import run_info
 from litho_data.layouts.patterns import flat, framed_ladder
 from litho_models.frozen.card import ModelCard
@@ -56,7 +56,8 @@ def next_print(
         report: told what happens, a sentence at a time.
 
     Raises:
-        InputError: no closed loop, one from before questions were kept, or prints of an impossible size.
+        InputError: no closed loop, one from before questions were kept, prints of an impossible size, or a
+            folder with a plan of other settings.
     """
     require_replaceable_folder(out, *HOLDS)
     folder = Path(loop)
@@ -69,6 +70,9 @@ def next_print(
     open_ = OpenQuestions.read(folder)
     if not open_.questions:
         return None
+    asked = {"prints": prints, "field_um": field_um, "seed": seed, "steps": steps, "layouts": layouts}
+    facts = {"dataset": open_.dataset.model_dump(mode="json"), "settings": asked}
+    require_same_settings(out, NextPrint.FILE_NAME, facts)
     card = ModelCard.read(folder / MODEL_FOLDER)
     size_px = round(field_um / card.pitch_um)
     if size_px < _SMALLEST_PX or prints < 1:
@@ -80,8 +84,8 @@ def next_print(
     base = load_simulator(folder / MODEL_FOLDER, card)
     limits = Limits.of(open_, card.pitch_um)
     printing = Printing(card.pitch_um, card.level_height_um, card.levels - 1, open_.write_field_um)
-    asked = [q for q in open_.questions if len(q.rivals) > 1]
-    rivalries = [Rivalry(q, base, printing, open_.noise) for q in asked]
+    contested = [q for q in open_.questions if len(q.rivals) > 1]
+    rivalries = [Rivalry(q, base, printing, open_.noise) for q in contested]
     designer = Designer(rivalries, limits, size_px, seed, steps, Path(cache or f"{out}-cache"), report)
     can_move = open_.write_field_um is not None and open_.write_field_um > field_um
     designer.choose(ways_without_rivals(open_.questions), can_move)
@@ -111,6 +115,7 @@ def next_print(
     plan = NextPrint(
         run=run_info([seed], len(scans)),
         dataset=open_.dataset,
+        settings=asked,
         prints=count,
         field_um=field_um,
         levels=(limits.lowest, limits.highest),

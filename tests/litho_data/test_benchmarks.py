@@ -15,7 +15,9 @@ import pytest
 from benchmarks import build as build_benchmark
 from benchmarks import height_sigma as height_sigma_benchmark
 from benchmarks import levelling as levelling_benchmark
+from benchmarks import mixed_up as mixed_up_benchmark
 from benchmarks import readers as readers_benchmark
+from benchmarks import registration as registration_benchmark
 from benchmarks import tip as tip_benchmark
 from benchmarks.record import NOT_MEASURED, publish, published
 from litho_data.foundation.errors import InputError
@@ -24,7 +26,15 @@ from litho_data.foundation.run_facts import run_facts
 
 @pytest.mark.parametrize(
     "benchmark",
-    [build_benchmark, levelling_benchmark, height_sigma_benchmark, readers_benchmark, tip_benchmark],
+    [
+        build_benchmark,
+        levelling_benchmark,
+        height_sigma_benchmark,
+        mixed_up_benchmark,
+        readers_benchmark,
+        registration_benchmark,
+        tip_benchmark,
+    ],
 )
 def test_the_page_quotes_the_committed_measurement(benchmark):
     text = published(benchmark.PAGE, benchmark.NAME)

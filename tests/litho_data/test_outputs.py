@@ -12,7 +12,7 @@ from litho_data.exchange.pairs import export_pairs
 from litho_data.exchange.release import export_ro_crate
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file, atomic_folder
-from litho_data.foundation.outputs import require_own_folder
+from litho_data.foundation.outputs import require_own_folder, require_same_settings
 from litho_data.layouts import write_layout_set
 from litho_data.virtual_fab import simulate
 
@@ -46,6 +46,49 @@ def test_only_an_older_result_is_replaced(name: str, campaign: Path, tmp_path: P
     with pytest.raises(InputError, match="which is a file"):
         write(campaign, file)
     assert file.read_text() == "years of work"
+
+
+OTHERS: dict[str, tuple[Callable[[Path], object], str]] = {
+    "masks": (lambda out: write_layout_set(out, count=1, size_px=64, seed=1), "seed = 0 where now 1"),
+    "simulate": (
+        lambda out: simulate(out, count=1, size_px=64, knobs=["z-gain=0.1"]),
+        "settings, knobs",
+    ),
+    "simulate twice": (lambda out: simulate(out, count=2, size_px=64), "count = 1 where now 2"),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_a_result_of_other_settings_is_not_replaced(name: str, campaign: Path, tmp_path: Path) -> None:
+    WRITERS[name.split()[0]](campaign, tmp_path / "out")
+    held = {path: path.read_bytes() for path in (tmp_path / "out").rglob("*") if path.is_file()}
+    again, differs = OTHERS[name]
+    with pytest.raises(InputError, match=f"{differs}.*choose another --out"):
+        again(tmp_path / "out")
+    assert {path: path.read_bytes() for path in (tmp_path / "out").rglob("*") if path.is_file()} == held
+
+
+def test_settings_are_compared_where_an_older_result_has_them(tmp_path: Path) -> None:
+    record = tmp_path / "plan.json"
+    now = {"dataset": {"name": "a"}, "settings": {"prints": 4, "sizes": (1, 2), "cache": None}}
+    require_same_settings(tmp_path, "plan.json", now)
+    for settings, differs in (
+        ({"prints": 4, "sizes": [1, 2], "cache": None}, ""),
+        ({"prints": 4}, ""),
+        (None, ""),
+        ({"prints": 3, "sizes": [1, 2]}, "prints = 3 where now 4 is asked"),
+        ({"prints": 4, "sizes": [1, 3]}, "sizes, wanted"),
+        ({"prints": 4, "cache": 1}, "cache = 1 where now None"),
+    ):
+        record.write_text(json.dumps({"dataset": {"name": "a"}, "settings": settings}))
+        if not differs:
+            require_same_settings(tmp_path, "plan.json", now)
+            continue
+        with pytest.raises(InputError, match=differs):
+            require_same_settings(tmp_path, "plan.json", now)
+    record.write_text(json.dumps({"dataset": {"name": "b"}}))
+    with pytest.raises(InputError, match=r"dataset\.name = 'b' where now 'a'"):
+        require_same_settings(tmp_path, "plan.json", now)
 
 
 def test_the_current_folder_is_not_pulled_away(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,84 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import map_coordinates
 
+from benchmarks.register_phantoms import PITCH_UM, scan_of, true_scan_to_layout
+from benchmarks.registration import (
+    DEFECTS,
+    SCAN_SHAPE,
+    SHAPE,
+    creeping,
+    print_of,
+    register,
+    rms_error_px,
+)
 from litho_data.build.build import build_dataset
 from litho_data.provenance.replay import replay
 from litho_data.provenance.verify import verify
-from litho_data.register import Registration, apply_transform, register_scan
+from litho_data.register import apply_transform
 from litho_data.register.bend import CREEP_DEGREE, Bend, fit_bent_affine
 from litho_data.register.geometry import index_to_um
 from litho_data.store import open_store
 from tests.litho_data.campaigns import height_of, layout_of, write_campaign, write_scan
-from tests.litho_data.register_phantoms import (
-    PITCH_UM,
-    random_layout,
-    scan_of,
-    true_scan_to_layout,
-    warp_about_centre,
-)
-
-SHAPE, SCAN_SHAPE = (384, 384), (440, 440)
-BARE_UM = 0.005
-
-
-def register(scan: np.ndarray, layout: np.ndarray, **options) -> Registration:
-    return register_scan(scan, layout, scan_pitch_um=(PITCH_UM,) * 2, layout_pitch_um=PITCH_UM, **options)
-
-
-def print_of(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    layout = random_layout(SHAPE, seed, blob_px=7.0)
-    warp = warp_about_centre(
-        SHAPE, rotation_deg=0.6, scale=(1.015, 0.99), shift_px=(3.3, -2.2), margin_px=(28.0, 28.0)
-    )
-    return layout, warp
-
-
-def rms_error_px(found: Registration, warp: np.ndarray, seen: Callable | None = None) -> float:
-    """Over the layout, 8 px from its border; ``seen`` takes true points of the scan to where they appear."""
-    truth = true_scan_to_layout(warp, "identity", SCAN_SHAPE)
-    y, x = np.meshgrid(*(np.linspace(8, n - 8, 33) for n in SHAPE), indexing="ij")
-    points_um = PITCH_UM * np.stack([x.ravel(), y.ravel()], axis=1)
-    on_scan = apply_transform(np.linalg.inv(truth), points_um)
-    at = on_scan if seen is None else seen(on_scan)
-    at = at if found.bend_um is None else found.bend_um.straighten(at)
-    error_um = apply_transform(found.scan_to_layout, at) - points_um
-    return float(np.sqrt((error_um**2).sum(axis=1).mean()) / PITCH_UM)
-
-
-def dust(scan: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    y, x = np.mgrid[: scan.shape[0], : scan.shape[1]]
-    for _ in range(8):
-        middle, radius = rng.uniform(0.08, 0.92, 2) * scan.shape, rng.uniform(5, 16)
-        cap = np.clip(1 - ((y - middle[0]) ** 2 + (x - middle[1]) ** 2) / radius**2, 0, 1) ** 0.5
-        scan = scan + rng.uniform(1, 4) * cap
-    return scan
-
-
-def missing_corner(scan: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    scan, side = scan.copy(), 28 + SCAN_SHAPE[0] // 3
-    scan[:side, :side] = BARE_UM * rng.standard_normal((side, side))
-    return scan
-
-
-def delaminated(scan: np.ndarray, rng: np.random.Generator, lift_um: float) -> np.ndarray:
-    smooth = gaussian_filter(rng.standard_normal(scan.shape), 25)
-    off = smooth > np.quantile(smooth, 0.9)
-    return np.where(off, scan + lift_um if lift_um else BARE_UM * rng.standard_normal(scan.shape), scan)
-
-
-DEFECTS = {
-    "dust of 8 particles": dust,
-    "a third of both sides missing": missing_corner,
-    "a tenth gone": lambda scan, rng: delaminated(scan, rng, 0.0),
-    "a tenth lifted": lambda scan, rng: delaminated(scan, rng, 0.6),
-}
 
 
 @pytest.mark.parametrize("name", DEFECTS)
@@ -111,29 +57,6 @@ def test_a_clean_print_has_no_defects_and_keeps_its_warp(snr: float) -> None:
     found = register(scan_of(layout, warp, SCAN_SHAPE, snr=snr, seed=1), layout)
     assert (found.defects, found.bend_um, found.quality.defect_share) == (None, None, 0)
     assert rms_error_px(found, warp) < 0.02
-
-
-def creeping(
-    layout: np.ndarray, warp: np.ndarray, creep_um: float, slow: int
-) -> tuple[np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-    """A scan whose scanner settles within a quarter of it, and where its true points appear (µm)."""
-    place = np.arange(SCAN_SHAPE[0])
-    settling_px = creep_um / PITCH_UM * np.exp(-4 * place / SCAN_SHAPE[0])
-    amount = (1.0, 0.4)  # along x and y
-    y, x = np.mgrid[: SCAN_SHAPE[0], : SCAN_SHAPE[1]].astype(float)
-    along = np.interp(y if slow else x, place, settling_px)
-    whole = scan_of(layout, warp, SCAN_SHAPE)
-    scan = map_coordinates(whole, (y - amount[1] * along, x - amount[0] * along), order=5)
-
-    def seen(points_um: np.ndarray) -> np.ndarray:
-        true = points_um / PITCH_UM - 0.5
-        at = true.copy()
-        for _ in range(50):
-            shift = np.interp(at[:, slow], place, settling_px)
-            at = true + np.stack([amount[0] * shift, amount[1] * shift], axis=1)
-        return (at + 0.5) * PITCH_UM
-
-    return scan + 0.1 * scan.std() * np.random.default_rng(0).standard_normal(scan.shape), seen
 
 
 @pytest.mark.parametrize(("creep_um", "slow"), [(0.5, 1), (1.5, 1), (1.0, 0)])

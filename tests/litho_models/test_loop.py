@@ -364,7 +364,10 @@ def test_too_few_scans_confirm_nothing_and_say_so() -> None:
     assert np.isfinite(result.after.mae_datum_free_nm)
 
 
-def test_the_loop_locks_what_training_locks_whatever_its_seed_and_what_was_dropped(tmp_path) -> None:
+def test_the_loop_locks_what_training_locks_whatever_its_seed_and_what_was_dropped(
+    tmp_path, monkeypatch, capsys
+) -> None:
+    monkeypatch.setattr("litho_data.foundation.commands._MINUTE_S", 0.01)
     scans = printed_scans(count=6, size_px=48, seed=3)
     locked = locked_ids(scans)
     # Drawn with this seed, or from the scans that are left, the box would be another.
@@ -384,6 +387,9 @@ def test_the_loop_locks_what_training_locks_whatever_its_seed_and_what_was_dropp
         steps = np.abs(np.concatenate([np.diff(m, axis=a).ravel() for m in levels for a in (0, 1)]))
         shares = ModelCard.read(tmp_path / f"run{number}" / "model").training_step_share
         assert shares == pytest.approx(np.bincount(steps, minlength=len(shares)) / steps.size, abs=1e-12)
+    assert "estimate: closing the loop takes about" in capsys.readouterr().err
+    with pytest.raises(InputError, match=r"holds a result with other settings, folds = 2 where now 3"):
+        close_loop_on_store(store, tmp_path / "loop1", config=LoopConfig(seed=2, folds=3))
 
 
 def test_one_scan_is_refused() -> None:

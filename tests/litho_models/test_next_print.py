@@ -314,6 +314,8 @@ def test_a_plan_is_a_dataset_in_waiting_and_resumes(tmp_path: Path) -> None:
     assert "1 of 2 tiles are kept" in told[0]
     assert not any(text.startswith("tile 1") for text in told)
     assert NextPrint.read(tmp_path / "plan") == plan
+    with pytest.raises(InputError, match=r"seed = 0 where now 99 is asked"):
+        next_print(loop, tmp_path / "plan", **{**settings, "seed": 99})
     question = plan.questions[0]
     assert question.status == "decides"
     assert question.power[0] <= question.power[1]

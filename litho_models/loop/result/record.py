@@ -205,6 +205,7 @@ class CloseLoop(Result):
     """What the loop found.
 
     ``fewest_scans``: with fewer to work on the verdict is ``too-few-scans`` unless something is found.
+    ``settings``: what was asked for, None in older results.
     ``decisions``: what further stores decided about names and sets declared on the first, if there were any.
     ``gain_split``: what each step gains, in the order added; ``nested``: if asked for. ``equal_terms``,
     ``gain_split``, ``explainable``, ``fewest_scans`` and, where the lock box was opened,
@@ -218,6 +219,7 @@ class CloseLoop(Result):
     run: RunInfo
     dataset: DatasetId
     base_model: str
+    settings: dict[str, Any] | None = None
     at_bounds: dict[str, float] = Field(default_factory=dict)
     split: Split
     nuisance: NuisanceProtocol
