@@ -47,10 +47,12 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
 def on_page_content(html: str, page: Any, config: Any, files: Files) -> str:
     """Sphinx's roles in docstrings are only code here; long names may break after / and _."""
     html = re.sub(r":(?:func|class|mod|meth|data):<code>~?", "<code>", html)
-    return re.sub(r"(?<=<code>)[^<]+(?=</code>)", _breakable, html)
+    return re.sub(r"<pre>.*?</pre>|(?<=<code>)[^<]+(?=</code>)", _breakable, html, flags=re.DOTALL)
 
 
 def _breakable(code: re.Match[str]) -> str:
+    if code[0].startswith("<pre>"):
+        return code[0]
     return re.sub(r"(?<=\w)([/_])(?=\w)", r"\1<wbr>", code[0])
 
 
