@@ -117,6 +117,7 @@ def _bars(values: dict[str, float], label: str, colours: str | list[str] = PLANT
     axis = figure.subplots()
     drawn = axis.barh(list(values), list(values.values()), color=colours)
     axis.bar_label(drawn, fmt="%.2f", padding=3)
+    axis.margins(x=0.15)
     axis.invert_yaxis()
     axis.margins(x=0.12)
     axis.set_xlabel(label)

@@ -12,6 +12,7 @@ from benchmarks.blind_trials.scoreboard import (
     TOLERANCE_OTHER,
     figures_of,
     reaches_floor,
+    summarise,
     tolerance,
     trial_table,
 )
@@ -48,6 +49,12 @@ def write_report(scoreboard: Scoreboard, folder: Path) -> Path:
         "The virtual fab hides causes drawn from one seed; the loop sees scans and layouts only; "
         "a judge who knows the answer compares. All draws are shown, none was repeated.",
         facts={"seed": scoreboard.seed, "command": scoreboard.command},
+    )
+    s = scoreboard.summary or summarise(scoreboard.trials)
+    page.verdict(
+        f"Of causes whose law the loop knows it named {s.in_form}. Of causes of another form it noticed "
+        f"{s.noticed} without a name, gave {s.named} a name and overlooked {s.unnoticed}. Where nothing was "
+        f"planted it reported nothing in {s.clean}."
     )
     if scoreboard.pending:
         page.note(f"Not run yet: trials {', '.join(map(str, scoreboard.pending))}.")
@@ -114,7 +121,9 @@ def _errors(trials: list[Trial]) -> Figure:
     for y, (trial, errors) in enumerate(done):
         floor, before, after = errors.floor.mae_nm, errors.before.mae_nm, errors.after.mae_nm
         colour = _GOOD if reaches_floor(trial) else _BAD
-        axes.fill_betweenx([y - 0.35, y + 0.35], floor, tolerance(trial) * floor, color="0.85", linewidth=0)
+        axes.fill_betweenx(
+            [y - 0.35, y + 0.35], floor, tolerance(trial) * floor, color="#9aa7b5", alpha=0.35, lw=0
+        )
         axes.plot([before, after], [y, y], color=colour, linewidth=1.2)
         axes.scatter([before], [y], facecolors="white", edgecolors=colour, s=34, zorder=3)
         axes.scatter([after], [y], color=colour, s=34, zorder=3)

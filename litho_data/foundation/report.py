@@ -205,6 +205,9 @@ def spelt_out(key: str) -> str:
     """The key of a column in words: ``mae_abs_nm`` is "MAE abs (nm)"."""
     if "_" not in key:
         return _SHORT.get(key, key)
+    head, _, more = key.partition(" ")
+    if more and "_" in head:
+        return f"{spelt_out(head)}, {more}"
     words, unit = key, ""
     for suffix, text in _UNITS.items():
         if key.endswith(f"_{suffix}"):

@@ -121,6 +121,10 @@ def _stack(figure: Figure) -> None:
     grid = GridSpec(rows, columns, figure=figure, height_ratios=by_row)
     for place, axes in enumerate(shown):
         axes.set_subplotspec(grid[place // columns, place % columns])
+    if columns == 2 and (engine := figure.get_layout_engine()) is not None:
+        # Pictures keep their shape: room for their titles is found only once they are near their places.
+        for _ in range(3):
+            engine.execute(figure)
 
 
 def _narrow_height(axes: Axes, width: float, figure_height: float) -> float:
@@ -130,8 +134,9 @@ def _narrow_height(axes: Axes, width: float, figure_height: float) -> float:
     place = axes.get_subplotspec()
     assert place is not None
     before = figure_height / place.get_gridspec().nrows
-    names = len(axes.get_yticks()) if "Fixed" in type(axes.yaxis.get_major_formatter()).__name__ else 0
-    return max(min(before, 0.8 * _NARROW_INCH), 0.6 * width, 0.3 * names)
+    named = re.search("Fixed|Func|Category", type(axes.yaxis.get_major_formatter()).__name__)
+    names = len(axes.get_yticks()) if named else 0
+    return max(min(before, 0.8 * _NARROW_INCH), 0.6 * width, 0.22 * names)
 
 
 def _lay_down(figure: Figure, bars: list[Any], columns: int) -> float:

@@ -11,7 +11,12 @@ from litho_data.foundation.report import Page
 from litho_data.foundation.report_pictures import new_figure
 from litho_data.foundation.results import Record
 from litho_design.optimisation.process_window import ProcessWindow, Yield, spreads
-from litho_design.reports.advice import distribution_warning, named, thickness_warning
+from litho_design.reports.advice import (
+    distribution_warning,
+    less_is_better,
+    named,
+    thickness_warning,
+)
 from litho_design.tasks.design import Design
 
 if TYPE_CHECKING:
@@ -72,16 +77,22 @@ def add_yield(
         f"deviations: {'; '.join(spreads(window))}."
     )
     low, high = (round(100 * edge) for edge in passed.ci95)
+    error = any(map(less_is_better, passed.figures))
+    errors = f", an error grows to {100 / window.pass_share:.0f} % at most" if error else ""
     page.paragraph(
         f"{passed.passed} of {passed.draws} prints pass ({low} to {high} %, 95 % interval): no figure in dB "
         f"is more than {window.pass_drop_db:g} dB below the print as modelled, every other one keeps "
-        f"{100 * window.pass_share:g} % of it. Judged by {', '.join(map(named, passed.figures))}."
+        f"{100 * window.pass_share:g} % of it{errors}. Judged by {', '.join(map(named, passed.figures))}."
     )
     figure = new_figure(8, 3)
     (axes,) = figure.subplots(1, len(figures), sharey=True, squeeze=False)
     for axis, (name, (modelled, label)) in zip(axes, figures.items(), strict=True):
         values = np.sort([draw[name] for draw in draws])
-        axis.step(values, 1 - np.arange(len(values)) / len(values), where="pre")
+        worse = np.arange(len(values)) / len(values)
+        if less_is_better(name):
+            axis.step(values, worse + 1 / len(values), where="post")
+        else:
+            axis.step(values, 1 - worse, where="pre")
         axis.axvline(modelled, color="0.5", linestyle="--", linewidth=1)
         axis.set_xlabel(label)
     axes[0].set_ylabel("yield")

@@ -207,6 +207,7 @@ def _effect_section(page: Page, result: CloseLoop) -> None:
     if not result.effects:
         page.paragraph("None.")
         return
+    alike = any(e.confusable_with for e in result.effects)
     page.table(
         [
             {
@@ -214,7 +215,7 @@ def _effect_section(page: Page, result: CloseLoop) -> None:
                 "role": e.role,
                 "verdict": e.verdict,
                 "share of the best rival (%)": np.nan if e.share is None else 100 * e.share,
-                "or": ", ".join(e.confusable_with),
+                **({"or": ", ".join(e.confusable_with)} if alike else {}),
                 "terms per scan": " / ".join(f"{k:.0f}" for k in e.terms_per_scan or ()),
                 "before (nm)": e.before_nm,
                 "after (nm)": e.after_nm,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from litho_data.foundation.report import Page
+from litho_data.foundation.report import Page, spelt_out
 from litho_models.loop.findings import LoopFindings
 from litho_models.loop.report.plots import profile_figure
 
@@ -13,7 +13,7 @@ def identifiability_section(page: Page, findings: LoopFindings) -> None:
     if found is None:
         return
     page.heading("How well these scans determine the fit", folded=True)
-    weakest = ", ".join(f"{part:+.2f} {name}" for name, part in found.weakest.items())
+    weakest = ", ".join(f"{part:+.2f} {spelt_out(name)}" for name, part in found.weakest.items())
     idle = ", ".join(found.without_slope)
     bounds = f" At a bound, or without influence: {idle}." if idle else ""
     page.paragraph(
