@@ -126,7 +126,7 @@ def cost_of(command: list[str]) -> Cost:
     peak_bytes, ended = 0, 0
     try:
         while not ended:
-            peak_bytes = max(peak_bytes, sum(_resident_bytes(pid) for pid in _with_descendants(process.pid)))
+            peak_bytes = max(peak_bytes, sum(resident_bytes(pid) for pid in _with_descendants(process.pid)))
             time.sleep(_SAMPLED_EVERY_S)
             ended, status, usage = os.wait4(process.pid, os.WNOHANG)
     finally:
@@ -176,7 +176,8 @@ def _with_descendants(pid: int) -> list[int]:
     return found
 
 
-def _resident_bytes(pid: int) -> int:
+def resident_bytes(pid: int) -> int:
+    """Linux: the resident set of a process; 0 where it is gone."""
     try:
         return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
     except (OSError, IndexError):

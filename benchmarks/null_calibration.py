@@ -16,7 +16,6 @@ import os
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +24,7 @@ import torch
 
 from benchmarks.record import conclude, origin, write_record
 from litho_data.foundation.commands import run_script
+from litho_data.foundation.workers import ONE_THREAD, Workers, run_jobs
 from litho_data.layouts import random_layout
 from litho_data.store import PrintedScan
 from litho_data.virtual_fab.random_curves import line_roughness
@@ -48,6 +48,7 @@ def main() -> None:
     )
     parser.add_argument("--stores", type=int, default=ALLOWED_OF)
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--dask", help="address of a Dask scheduler: its workers in the place of --workers")
     parser.add_argument("--cache", type=Path, default=Path("runs/null-calibration"), help="a file per store")
     parser.add_argument("--out", type=Path, default=RESULT, help="JSON file to write")
     parser.add_argument("--publish", action="store_true", help="write the figures into the page")
@@ -64,7 +65,7 @@ def main() -> None:
         "noise": f"Gaussian, {1000 * ROUGHNESS_UM:g} nm, spectrum of a flat print of the virtual fab",
         "allowed": ALLOWED,
         **origin(),
-        "stores": _run_all(arguments.cache, arguments.stores, arguments.workers),
+        "stores": _run_all(arguments.cache, arguments.stores, Workers(arguments.workers, arguments.dask)),
     }
     conclude(record, as_markdown(record), arguments.out, PAGE, NAME, published=arguments.publish)
 
@@ -133,21 +134,19 @@ def as_markdown(record: Mapping[str, Any]) -> str:
     )
 
 
-def _run_all(cache: Path, count: int, workers: int) -> list[dict[str, Any]]:
+def _run_all(cache: Path, count: int, workers: Workers) -> list[dict[str, Any]]:
     seeds = range(FIRST_SEED, FIRST_SEED + count)
     missing = [seed for seed in seeds if not _file(cache, seed).exists()]
-    with ThreadPoolExecutor(workers) as pool:
-        running = {pool.submit(_run_apart, cache, seed): seed for seed in missing}
-        for place, done in enumerate(as_completed(running), 1):
-            done.result()
-            print(f"[{place}/{len(missing)}] seed {running[done]}", flush=True)
+    jobs = [(cache, seed) for seed in missing]
+    for place, ((_, seed), _) in enumerate(run_jobs(_run_apart, jobs, workers, apart=True), 1):
+        print(f"[{place}/{len(missing)}] seed {seed}", flush=True)
     return [json.loads(_file(cache, seed).read_text(encoding="utf-8")) for seed in seeds]
 
 
-def _run_apart(cache: Path, seed: int) -> None:
+def _run_apart(job: tuple[Path, int]) -> None:
+    cache, seed = job
     command = [sys.executable, "-m", "benchmarks.null_calibration", "--cache", str(cache), "--one", str(seed)]
-    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
-    subprocess.run(command, env=os.environ | threads, check=True)
+    subprocess.run(command, env=os.environ | ONE_THREAD, check=True)
 
 
 def _file(cache: Path, seed: int) -> Path:

@@ -1,6 +1,7 @@
 """Blind trials of the closed loop on the virtual fab.
 
     python -m benchmarks.blind_trials --out runs/blind-trials --workers 2
+    python -m benchmarks.blind_trials --out runs/blind-trials --dask tcp://host:8786
     python -m benchmarks.blind_trials --out runs/development --seed 1 --only 0,1,2
     python -m benchmarks.blind_trials --out runs/development --seed 1 --plan
     python -m benchmarks.blind_trials --out runs/earlier --count 24 --seed 20266
@@ -28,6 +29,7 @@ from benchmarks.blind_trials.report import CSV_NAME, write_report
 from benchmarks.blind_trials.scoreboard import figures_of, make_scoreboard, publish
 from litho_data.foundation.commands import run_script
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.workers import Workers
 
 # Drawn from once the loop was finished; development uses seeds 0 and 1.
 REPORTED_SEED = 20267
@@ -66,7 +68,7 @@ def _campaign(arguments: argparse.Namespace) -> None:
         out,
         draws,
         numbers=numbers,
-        workers=arguments.workers,
+        workers=Workers(arguments.workers, arguments.dask),
         timeout_s=arguments.timeout_s,
         keep_data=arguments.keep_data,
     )
@@ -105,6 +107,7 @@ def _arguments() -> argparse.Namespace:
     parser.add_argument("--scans", type=int, default=12, help="scans per trial (default 12)")
     parser.add_argument("--size-px", type=int, default=256, help="side of a layout, pixels (default 256)")
     parser.add_argument("--workers", type=int, default=1, help="trials side by side, one thread each")
+    parser.add_argument("--dask", help="address of a Dask scheduler: its workers in the place of --workers")
     parser.add_argument("--only", type=_numbers, help="numbers of the trials to run, such as 0,3,7")
     parser.add_argument("--timeout-s", type=float, default=3600.0, help="longest time of a trial, seconds")
     parser.add_argument("--keep-data", action="store_true", help="keep raw files and stores")

@@ -7,19 +7,18 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
+from typing import NamedTuple
 
 from benchmarks.blind_trials.draws import draw_board, draw_earlier
 from benchmarks.blind_trials.planting import plant, trial_jobs
 from benchmarks.blind_trials.records import COUNTS_FROM_RMS_NM, Draw, Draws, Trial
 from benchmarks.blind_trials.trial import failed, run_trial, trial_folder
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.workers import ONE_THREAD, Workers, run_jobs
 from litho_data.virtual_fab.jobs import Plan
 
 _ROOT = Path(__file__).parents[2]
-# One thread per trial: trials side by side use the cores better than threads within one.
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 def make_draws(*, count: int | None, seed: int, n_scans: int, size_px: int) -> Draws:
@@ -57,29 +56,26 @@ def finished(out: Path, draws: Draws) -> list[Trial]:
 
 
 def run_campaign(
-    out: Path, draws: Draws, *, numbers: Sequence[int], workers: int, timeout_s: float, keep_data: bool
+    out: Path, draws: Draws, *, numbers: Sequence[int], workers: Workers, timeout_s: float, keep_data: bool
 ) -> None:
     """Run the trials of these numbers that are not finished; a line per trial as it ends.
 
     A trial whose process dies or takes longer than ``timeout_s`` is recorded as failed.
 
     Raises:
-        InputError: a number that was not drawn, or fewer than one worker.
+        InputError: a number that was not drawn, or workers that cannot be had.
     """
     unknown = set(numbers) - {draw.number for draw in draws.trials}
     if unknown:
         raise InputError("trials", got=sorted(unknown), wanted=f"numbers below {len(draws.trials)}")
-    if workers < 1:
-        raise InputError("workers", got=workers, wanted="at least 1")
     done = {trial.draw.number for trial in finished(out, draws)}
     todo = [draw for draw in draws.trials if draw.number in set(numbers) - done]
     if len(todo) < len(set(numbers)):
         print(f"{len(set(numbers)) - len(todo)} trials are finished already", flush=True)
-    with ThreadPoolExecutor(workers) as pool:
-        running = {pool.submit(_run_apart, out, draw, timeout_s, keep_data): draw for draw in todo}
-        for place, future in enumerate(as_completed(running), 1):
-            trial, seconds = future.result()
-            print(f"[{place}/{len(todo)}] {_line(trial)} ({seconds:.0f} s)", flush=True)
+    jobs = [_Job(out, draw, timeout_s, keep_data) for draw in todo]
+    results = run_jobs(_run_apart, jobs, workers, name=lambda job: f"trial {job.draw.number}", apart=True)
+    for place, (_, (trial, seconds)) in enumerate(results, 1):
+        print(f"[{place}/{len(todo)}] {_line(trial)} ({seconds:.0f} s)", flush=True)
 
 
 def plan_lines(draws: Draws, numbers: Sequence[int]) -> Iterator[str]:
@@ -109,8 +105,16 @@ def run_one(out: Path, number: int, keep_data: bool) -> None:
     )
 
 
-def _run_apart(out: Path, draw: Draw, timeout_s: float, keep_data: bool) -> tuple[Trial, float]:
+class _Job(NamedTuple):
+    out: Path
+    draw: Draw
+    timeout_s: float
+    keep_data: bool
+
+
+def _run_apart(job: _Job) -> tuple[Trial, float]:
     """Run a trial in a process of its own; what it prints goes to a log beside its result."""
+    out, draw, timeout_s, keep_data = job
     folder, clock = trial_folder(out, draw.number), time.monotonic()
     command = [sys.executable, "-m", "benchmarks.blind_trials", "--out", str(out.resolve())]
     command += ["--run-one", str(draw.number), *(["--keep-data"] if keep_data else [])]
@@ -121,7 +125,8 @@ def _run_apart(out: Path, draw: Draw, timeout_s: float, keep_data: bool) -> tupl
             code = subprocess.run(
                 command,
                 cwd=_ROOT,
-                env=os.environ | _ONE_THREAD,
+                # Trials side by side use the cores better than threads within one.
+                env=os.environ | ONE_THREAD,
                 stdout=stream,
                 stderr=subprocess.STDOUT,
                 timeout=timeout_s,

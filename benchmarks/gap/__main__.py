@@ -19,12 +19,13 @@ from pathlib import Path
 
 from benchmarks.gap.cost import as_text, estimate, read_records, run_trial, trial_job
 from benchmarks.gap.document import publish_results, write_results
-from benchmarks.gap.jobs import run_jobs
+from benchmarks.gap.jobs import run_commands
 from benchmarks.gap.plan import Effort, Plan, open_plan
 from benchmarks.gap.steps import fab_jobs, model_jobs, proof_jobs
 from benchmarks.gap.tasks import Task, chosen, tasks
 from litho_data.foundation.commands import run_script
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.workers import Workers
 from litho_models.frozen import zoo
 
 
@@ -44,7 +45,8 @@ def main() -> None:
 
 
 def _run(given: argparse.Namespace) -> None:
-    out, workers, logs = given.out, given.workers, given.out / "logs"
+    out, logs = given.out, given.out / "logs"
+    workers = Workers(given.workers, given.dask)
     if given.publish and given.tasks:
         raise InputError("--publish", got="with --tasks", wanted="all tasks: the page shows all of them")
     effort = _effort(given)
@@ -55,21 +57,21 @@ def _run(given: argparse.Namespace) -> None:
     trials = {
         trial.name: trial for task in todo for arm in task.models for trial in [trial_job(out, task, arm)]
     }
-    run_jobs(list(trials.values()), logs, 1)
+    run_commands(list(trials.values()), logs)
     rows = estimate(read_records(out), todo, effort)
-    print(as_text(rows, workers), flush=True)
+    print(as_text(rows, given.workers), flush=True)
     if given.estimate:
         return
     started = time.monotonic()
     for stage in (*fab_jobs(out, effort), *model_jobs(out, effort)):
-        run_jobs(stage, logs, workers)
+        run_commands(stage, logs, workers)
     for task in todo:
         print(f"{task.name}: {len(task.designs(out))} designs", flush=True)
-        run_jobs(task.designs(out), logs, workers)
-    run_jobs([task.compare(out) for task in todo], logs, workers)
+        run_commands(task.designs(out), logs, workers)
+    run_commands([task.compare(out) for task in todo], logs, workers)
     if given.proof:
         for job in proof_jobs(out, effort):
-            run_jobs([job], logs, 1)
+            run_commands([job], logs)
     results = write_results(out, plan, todo, rows)
     print(f"{results} ({(time.monotonic() - started) / 3600:.2f} h in this run)")
     if given.publish:
@@ -95,6 +97,7 @@ def _arguments() -> argparse.Namespace:
     )
     parser.add_argument("--out", type=Path, required=True, help="folder of the comparison")
     parser.add_argument("--workers", type=int, default=1, help="processes side by side, one thread each")
+    parser.add_argument("--dask", help="address of a Dask scheduler: its workers in the place of --workers")
     parser.add_argument("--small", type=int, metavar="PX", help="tiny elements, to try the machinery")
     parser.add_argument("--hoe-iterations", type=int, help="of every hologram, at most 300")
     parser.add_argument("--lens-iterations", type=int, help="of every lens, at most 200")

@@ -8,15 +8,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.workers import HERE, ONE_THREAD, Workers, run_jobs
 
 _BIN = Path(sys.executable).parent
-# One thread per process: processes side by side use the cores better than threads within one.
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 @dataclass(frozen=True)
@@ -33,8 +31,8 @@ class Job:
         return self.result.exists()
 
 
-def run_jobs(jobs: Sequence[Job], logs: Path, workers: int) -> None:
-    """Run the jobs that are not done, ``workers`` at a time; a line per job as it ends.
+def run_commands(jobs: Sequence[Job], logs: Path, workers: Workers = HERE) -> None:
+    """Run the jobs that are not done; a line per job as it ends.
 
     Raises:
         InputError: a job failed; the others that had started come to their end first.
@@ -42,16 +40,13 @@ def run_jobs(jobs: Sequence[Job], logs: Path, workers: int) -> None:
     todo = [job for job in jobs if not job.done]
     if len(todo) < len(jobs):
         print(f"{len(jobs) - len(todo)} of {len(jobs)} done before", flush=True)
-    failed: list[str] = []
-    with ThreadPoolExecutor(workers) as pool:
-        running = {pool.submit(_run, job, logs, failed): job for job in todo}
-        for place, future in enumerate(as_completed(running), 1):
-            if seconds := future.result():
-                print(f"[{place}/{len(todo)}] {running[future].name}: {seconds / 60:.1f} min", flush=True)
-    if failed:
-        raise InputError(
-            f"step {failed[0]}", got="a failed command", hint=f"its output is in {_log(logs, failed[0])}"
-        )
+    steps = [(job, _log(logs, job.name)) for job in todo]
+    done = run_jobs(_run, steps, workers, name=lambda step: step[0].name, apart=True)
+    for place, ((job, log), seconds) in enumerate(done, 1):
+        if seconds is None:
+            done.close()
+            raise InputError(f"step {job.name}", got="a failed command", hint=f"its output is in {log}")
+        print(f"[{place}/{len(todo)}] {job.name}: {seconds / 60:.1f} min", flush=True)
 
 
 def command(program: str, *words: object) -> tuple[str, ...]:
@@ -69,21 +64,17 @@ def module_command(*words: object) -> tuple[str, ...]:
     return (sys.executable, "-m", "benchmarks.gap", *map(str, words))
 
 
-def _run(job: Job, logs: Path, failed: list[str]) -> float:
-    """Seconds that the command took; 0 where it was not run or failed."""
-    if failed:
-        return 0.0
-    log, started = _log(logs, job.name), time.monotonic()
+def _run(step: tuple[Job, Path]) -> float | None:
+    """Seconds that the command took; None where it failed."""
+    (job, log), started = step, time.monotonic()
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("a", encoding="utf-8") as stream:
         print(f"$ {shlex.join(job.command)}", file=stream, flush=True)
+        # Processes side by side use the cores better than threads within one.
         code = subprocess.run(
-            job.command, stdout=stream, stderr=stream, env={**os.environ, **_ONE_THREAD}
+            job.command, stdout=stream, stderr=stream, env={**os.environ, **ONE_THREAD}
         ).returncode
-    if code or not job.done:
-        failed.append(job.name)
-        return 0.0
-    return time.monotonic() - started
+    return None if code or not job.done else time.monotonic() - started
 
 
 def _log(logs: Path, name: str) -> Path:

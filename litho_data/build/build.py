@@ -25,7 +25,7 @@ from litho_data.cards.listing import Listing, list_fields
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import software_record
-from litho_data.foundation.workers import run_jobs
+from litho_data.foundation.workers import HERE, Workers, run_jobs
 from litho_data.store.partial import partial_store
 from litho_data.store.schema import DatasetId
 
@@ -71,9 +71,10 @@ def build_dataset(
     if tip is not None:
         listing = replace(listing, card=with_tip(listing.card, tip))
     recipe = load_recipe(_recipe_path(listing))
-    jobs = with_tip_found(field_jobs(listing, recipe, seed), workers, dask)
+    places = Workers(workers, dask)
+    jobs = with_tip_found(field_jobs(listing, recipe, seed), places)
     source = _source(listing, recipe, seed, jobs)
-    return make_store(source, Path(out), workers=workers, dask=dask, strict=strict)
+    return make_store(source, Path(out), workers=places, strict=strict)
 
 
 def _recipe_path(listing: Listing) -> Path | None:
@@ -102,9 +103,7 @@ def _source(listing: Listing, recipe: Mapping[str, Any], seed: int, jobs: Sequen
     )
 
 
-def make_store(
-    source: Source, out: Path, *, workers: int = 1, dask: str | None = None, strict: bool = False
-) -> BuildResult:
+def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bool = False) -> BuildResult:
     """Run the jobs of a source and put the store and its report in place; see ``build_dataset``."""
     started, clock = datetime.now(UTC), time.perf_counter()
     with partial_store(out) as partial:
@@ -116,8 +115,8 @@ def make_store(
             for scan_id, reason in skipped.items():
                 _report_skipped(scan_id, reason)
             todo = [job for job in source.jobs if job.id not in records]
-            finished = run_jobs(attempt, todo, workers, dask)
-            for outcome in progress(finished, f"building {source.card.name}", total=len(todo)):
+            finished = run_jobs(attempt, todo, workers, name=lambda job: job.id)
+            for _, outcome in progress(finished, f"building {source.card.name}", total=len(todo)):
                 if isinstance(outcome, Skipped):
                     # Recorded names: the manifest must not depend on where the raw files lie.
                     skipped[outcome.id] = outcome.reason.replace(f"{source.data_dir}{os.sep}", "")
@@ -125,6 +124,12 @@ def make_store(
                 else:
                     partial.add(root, outcome)
                     records[outcome.record["id"]] = dict(outcome.record)
+        except InputError:
+            # Of the cluster: finished scans stay for the next run.
+            if not records:
+                partial.discard()
+            raise
+        try:
             for scan_id, reason in _odd_pixels(records, source.card).items():
                 skipped[scan_id] = reason
                 _report_skipped(scan_id, reason)
@@ -156,7 +161,7 @@ def make_store(
             unpaired=_left_out(source.unpaired),
             reused=reused,
             seconds=round(time.perf_counter() - clock, 2),
-            workers=workers,
+            workers=workers.processes,
             software=software_record(),
         )
         write_report(result, partial.store, report_folder(out))

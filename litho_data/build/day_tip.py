@@ -10,18 +10,19 @@ import numpy as np
 
 from litho_data.build.jobs import FieldJob, scaled_pitch_um
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.workers import run_jobs
+from litho_data.foundation.workers import Workers, run_jobs
 from litho_data.tip.radius import PeakRadius, of_one_tip, peak_radius
 
 
-def with_tip_found(jobs: Sequence[FieldJob], workers: int, dask: str | None) -> list[FieldJob]:
+def with_tip_found(jobs: Sequence[FieldJob], workers: Workers) -> list[FieldJob]:
     """The jobs with the radius in the place of ``blind``, or without a tip where the scans set no bound.
 
     Says on stderr what was found. Scans that cannot be read say nothing here; their jobs tell why.
     """
     if not jobs or jobs[0].card.process.tip != "blind":
         return list(jobs)
-    found = [one for one in run_jobs(tip_of, jobs, workers, dask) if one is not None]
+    bounds = run_jobs(tip_of, jobs, workers, name=lambda job: job.id)
+    found = [one for _, one in bounds if one is not None]
     tip = of_one_tip(found) if found else None
     radius_um = None if tip is None else tip.radius_um
     if tip is None or radius_um is None:

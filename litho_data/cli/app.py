@@ -12,7 +12,7 @@ import typer
 from litho_data.cli.layouts import masks, simulate
 from litho_data.cli.scan import inspect, level
 from litho_data.cli.tip import tip
-from litho_data.foundation.app import new_app, run_app
+from litho_data.foundation.app import DaskOption, WorkersOption, new_app, run_app
 
 app = new_app(
     "Raw AFM scans and layouts in, a dataset with provenance out. Lengths in µm unless said otherwise."
@@ -30,7 +30,6 @@ DataDir = Annotated[
         help="folder of the raw files; by default the card's, $LITHO_DATA_DIR/<name> or the user cache"
     ),
 ]
-Workers = Annotated[int, typer.Option(min=1, help="local processes; the result does not depend on it")]
 Strict = Annotated[bool, typer.Option("--strict", help="do not build if a scan is skipped or has no partner")]
 
 
@@ -65,10 +64,8 @@ def build(
         Path, typer.Option(help="store to write, e.g. prints.zarr; an older store there is replaced")
     ],
     data_dir: DataDir = None,
-    workers: Workers = 1,
-    dask: Annotated[
-        str | None, typer.Option(help="address of a Dask scheduler, e.g. tcp://host:8786")
-    ] = None,
+    workers: WorkersOption = 1,
+    dask: DaskOption = None,
     strict: Strict = False,
     seed: Annotated[int, typer.Option(min=0, help="seed of the robust registration")] = 0,
     tip: Annotated[
@@ -209,7 +206,8 @@ def import_pairs(
     level_height_um: Annotated[float, typer.Option(help="nominal height of one level, µm")] = 0.1,
     levels: Annotated[int, typer.Option(help="number of levels of the layouts")] = 13,
     name: Annotated[str | None, typer.Option(help="name of the dataset; by default the folder's")] = None,
-    workers: Workers = 1,
+    workers: WorkersOption = 1,
+    dask: DaskOption = None,
     strict: Strict = False,
 ) -> None:
     """Build a store from the authors' 8-bit pair format; four quadrants of one name become one field.
@@ -228,6 +226,7 @@ def import_pairs(
         levels=levels,
         name=name,
         workers=workers,
+        dask=dask,
         strict=strict,
     )
     typer.echo(f"{target}: {result.n_scans} fields, {len(result.skipped)} skipped, {result.seconds:.1f} s")

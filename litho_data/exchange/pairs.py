@@ -28,6 +28,7 @@ from litho_data.foundation.files import atomic_folder
 from litho_data.foundation.hashes import file_sha256, record_sha256
 from litho_data.foundation.outputs import require_replaceable_folder
 from litho_data.foundation.run_facts import software_record
+from litho_data.foundation.workers import Workers
 from litho_data.readers.pairs import GREY_MAX, quadrant_slices
 from litho_data.store.partial import Piece
 from litho_data.store.read import open_store
@@ -46,6 +47,7 @@ def import_pairs(
     levels: int = 13,
     name: str | None = None,
     workers: int = 1,
+    dask: str | None = None,
     strict: bool = False,
 ) -> BuildResult:
     """Build a store from a folder in the pair format; four quadrants of one name become one field.
@@ -58,7 +60,7 @@ def import_pairs(
         out: the store.
         pitch_um, level_height_um, levels: not in the files; by default those of the paper.
         name: of the dataset, by default the folder's.
-        workers: local processes.
+        workers, dask: as for ``build_dataset``.
         strict: refuse to build if any field has to be skipped.
 
     Raises:
@@ -92,7 +94,7 @@ def import_pairs(
         ),
         unpaired=unpaired,
     )
-    return make_store(source, Path(out), workers=workers, strict=strict)
+    return make_store(source, Path(out), workers=Workers(workers, dask), strict=strict)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import errno
 import re
 import sys
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 
@@ -18,7 +18,16 @@ from litho_data.foundation.run_facts import running_command
 UsageError: type[Exception] = typer.BadParameter.__mro__[1]
 _CHOICE = re.compile(r"(?:Value error, )?'(.*)' is not one of (.*?)\.?$", re.DOTALL)
 _LIMIT = re.compile(r"Input should be (?:a valid )?([^,]*)")
-
+WorkersOption = Annotated[
+    int, typer.Option("--workers", min=1, help="local processes; the result does not depend on it")
+]
+DaskOption = Annotated[
+    str | None,
+    typer.Option(
+        "--dask",
+        help="address of a Dask scheduler, such as tcp://host:8786: its workers in the place of --workers",
+    ),
+]
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 

@@ -1,68 +1,177 @@
-"""Running the jobs of a build: in this process, in local processes, or on a Dask cluster, a few at a time."""
+"""Independent jobs in this process, in local processes, or on a Dask cluster, a few at a time."""
 
 from __future__ import annotations
 
 import os
+import pickle
 import threading
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
-from contextlib import contextmanager
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    ThreadPoolExecutor,
+    wait,
+)
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass, replace
 from itertools import islice
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.run_facts import run_facts, software_record
+from litho_data.foundation.sending import Away, Known, received, sent
 
 J = TypeVar("J")
 R = TypeVar("R")
 
+# What the numerical libraries read when they are loaded; a Dask worker has these values too.
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+_CONNECT_S = 5.0
+
+
+class Pool(NamedTuple):
+    """Workers that take jobs: how many there are now, and the errors of a job lost with its worker."""
+
+    submit: Callable[..., Future[bytes]]
+    present: Callable[[], int]
+    lost: tuple[type[BaseException], ...]
+    fate: str
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Where jobs run. With as many threads in each process the results are the same, to the bit.
+
+    Attributes:
+        processes: local ones, of one thread unless the environment says otherwise; 1 is this process.
+        dask: address of a Dask scheduler whose workers see the same files; replaces ``processes``.
+        known: what jobs hold and need not be sent.
+        pool: see ``kept_open``.
+    """
+
+    processes: int = 1
+    dask: str | None = None
+    known: Known | None = None
+    pool: Pool | None = None
+
+    def __post_init__(self) -> None:
+        if self.processes < 1:
+            raise InputError("workers", got=self.processes, wanted="1 or more")
+
+    @property
+    def elsewhere(self) -> bool:
+        """Whether jobs leave this process."""
+        return self.dask is not None or self.processes > 1
+
+
+HERE = Workers()
+
 
 def run_jobs(
-    function: Callable[[J], R], jobs: Sequence[J], workers: int = 1, dask: str | None = None
-) -> Iterator[R]:
-    """Results of ``function`` over the jobs, in the order in which they are finished.
+    function: Callable[[J], R],
+    jobs: Sequence[J],
+    workers: Workers = HERE,
+    *,
+    name: Callable[[J], str] = str,
+    apart: bool = False,
+) -> Generator[tuple[J, R], None, None]:
+    """Each job with its result, in the order in which they are finished.
 
-    At most two jobs per worker are in progress, so memory does not grow with the number of jobs.
+    At most two jobs per worker are in progress, so memory does not grow with the number of jobs. Dask runs a
+    job again whose worker died, as often as the scheduler allows (three times by default).
 
     Args:
-        function: importable by name.
-        jobs: picklable.
-        workers: local processes; 1 runs the jobs in this process.
-        dask: address of a running Dask scheduler whose workers see the same files; replaces ``workers``.
+        function: importable by name; jobs and results can be pickled.
+        name: what messages call a job.
+        apart: the function waits for a process of its own, so that threads will do for local workers.
 
     Raises:
-        InputError: fewer than one worker, or no scheduler at the address.
+        InputError: no scheduler at the address, a worker of other software or with several threads, or a job
+            whose worker died.
     """
-    if workers < 1:
-        raise InputError("workers", got=workers, wanted="1 or more")
-    if dask is None and (workers == 1 or len(jobs) < 2):
-        yield from map(function, jobs)
+    if not workers.elsewhere or len(jobs) < (1 if workers.dask else 2):
+        yield from ((job, function(job)) for job in jobs)
         return
-    with _dask_executor(dask) if dask else _local_executor(min(workers, len(jobs))) as (executor, count):
-        yield from _windowed(executor, function, jobs, 2 * count)
-
-
-def _windowed(executor: Executor, function: Callable[[J], R], jobs: Sequence[J], window: int) -> Iterator[R]:
-    waiting = iter(jobs)
-    running: set[Future[R]] = {executor.submit(function, job) for job in islice(waiting, window)}
-    while running:
-        done, running = wait(running, return_when=FIRST_COMPLETED)
-        running |= {executor.submit(function, job) for job in islice(waiting, len(done))}
-        for future in done:
-            yield future.result()
+    known = workers.known or Known(dict, {})
+    names = {id(one): key for key, one in known.objects.items()}
+    software = software_record() if workers.dask else None
+    away = Away(function, pickle.dumps(known.make), os.getcwd(), run_facts()["command"], software)
+    with nullcontext(workers.pool) if workers.pool else _opened(workers, apart, len(jobs)) as pool:
+        for job, future in _windowed(lambda one: pool.submit(away, sent(one, names)), jobs, pool.present):
+            try:
+                answer = future.result()
+            except pool.lost as error:
+                raise InputError(
+                    f"the worker of {name(job)}",
+                    got=pool.fate,
+                    hint="run it again, it resumes; should memory have run out, with fewer or larger workers",
+                ) from error
+            yield job, received(answer, known.objects)
 
 
 @contextmanager
-def _local_executor(workers: int) -> Iterator[tuple[Executor, int]]:
+def kept_open(workers: Workers) -> Iterator[Workers]:
+    """The same workers, started once for all the jobs of a block; those that cannot be had are told at once.
+
+    Raises:
+        InputError: no scheduler at the address, or no worker there.
+    """
+    if not workers.elsewhere:
+        yield workers
+        return
+    with _opened(workers) as pool:
+        yield replace(workers, pool=pool)
+
+
+def _windowed(
+    submit: Callable[[J], Future[R]], jobs: Iterable[J], count: Callable[[], int]
+) -> Iterator[tuple[J, Future[R]]]:
+    """Jobs as they are finished, two for each of ``count()`` workers under way."""
+    waiting = iter(jobs)
+    running: dict[Future[R], J] = {}
+
+    def fill() -> None:
+        room = 2 * max(1, count()) - len(running)
+        running.update({submit(job): job for job in islice(waiting, max(0, room))})
+
+    fill()
+    while running:
+        done = wait(running, return_when=FIRST_COMPLETED).done
+        finished = [(running.pop(future), future) for future in done]
+        fill()
+        yield from finished
+
+
+def _opened(workers: Workers, apart: bool = False, most: int | None = None) -> AbstractContextManager[Pool]:
+    if workers.dask is not None:
+        return _dask(workers.dask)
+    return _local(min(workers.processes, most or workers.processes), apart)
+
+
+@contextmanager
+def _local(count: int, apart: bool) -> Iterator[Pool]:
     from multiprocessing import get_context
 
     # Spawned, because a forked copy of a process with threads may hang.
-    with ProcessPoolExecutor(
-        workers, mp_context=get_context("spawn"), initializer=_die_with_parent
-    ) as executor:
-        try:
-            yield executor, workers
-        finally:
-            executor.shutdown(wait=False, cancel_futures=True)
+    executor: Executor = (
+        ThreadPoolExecutor(count)
+        if apart
+        else ProcessPoolExecutor(count, get_context("spawn"), initializer=_die_with_parent)
+    )
+    before = os.environ.copy()
+    os.environ.update({**ONE_THREAD, **before})
+    try:
+        yield Pool(
+            executor.submit, lambda: count, (BrokenProcessPool,), "died, or that of another job under way"
+        )
+    finally:
+        executor.shutdown(wait=apart, cancel_futures=True)
+        for variable in ONE_THREAD.keys() - before.keys():
+            del os.environ[variable]
 
 
 def _die_with_parent() -> None:
@@ -79,20 +188,36 @@ def _die_with_parent() -> None:
 
 
 @contextmanager
-def _dask_executor(address: str) -> Iterator[tuple[Executor, int]]:
+def _dask(address: str) -> Iterator[Pool]:
     try:
-        from distributed import Client
+        from distributed import Client, KilledWorker
     except ImportError as error:
         raise InputError("dask", got="not installed", wanted="pip install 'litholoop[cluster]'") from error
     try:
-        client = Client(address, timeout="10s", set_as_default=False)
+        client = Client(address, timeout=_CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TimeoutError) as error:
         raise InputError(
             "Dask scheduler", got=f"none at {address} ({error})", wanted="for example tcp://host:8786"
         ) from error
+
+    def count() -> int:
+        try:
+            return len(client.nthreads())
+        except OSError:  # the jobs under way tell that the scheduler is gone
+            return 0
+
     with client:
-        threads = sum(client.nthreads().values())
-        if threads == 0:
-            raise InputError(f"Dask scheduler {address}", got="no workers", wanted="at least one")
-        with client.get_executor(pure=False) as executor:
-            yield executor, threads
+        try:
+            client.wait_for_workers(1, timeout=_CONNECT_S)
+        except TimeoutError as error:
+            raise InputError(f"Dask scheduler {address}", got="no workers", wanted="at least one") from error
+        executor = client.get_executor(pure=False)
+        try:
+            yield Pool(
+                executor.submit,
+                count,
+                (KilledWorker, CancelledError),
+                "died, as did those that took its place, or Dask's scheduler",
+            )
+        finally:
+            executor.shutdown(wait=False)

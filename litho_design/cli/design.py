@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 import typer
 
+from litho_data.foundation.app import DaskOption, WorkersOption
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.settings import changed
 from litho_design.cli.options import (
@@ -96,6 +97,8 @@ def hoe(
     spread_of: SpreadOf = None,
     roughness_of: RoughnessOf = None,
     ensemble: Ensemble = None,
+    workers: WorkersOption = 1,
+    dask: DaskOption = None,
     large: Annotated[
         bool,
         typer.Option(
@@ -113,13 +116,15 @@ def hoe(
     Example: litho-design hoe --model zoo:pbl --target photo.png --size-px 512 --out hologram
     """
     settings = _settings(given, _hologram, "hoe", spread_of, roughness_of)
+    if front is None and (dask or workers > 1):
+        raise InputError("--workers and --dask", got="one design", wanted="several: --front")
     if large:
         if front is not None or ensemble:
             raise InputError("--large", got="--front or --ensemble", wanted="one design through one model")
         _large(target, model, out, settings, band_px, device, extrapolate)
         return
     if front is not None:
-        _front(front, target, model, out, settings, ensemble or (), device, extrapolate)
+        _front(front, target, model, out, settings, ensemble or (), device, extrapolate, workers, dask)
         return
     from litho_design.workflows.design import design_hologram
 
@@ -219,6 +224,8 @@ def compare(
     spread_of: SpreadOf = None,
     roughness_of: RoughnessOf = None,
     seeds: Annotated[int, typer.Option(help="number of seeds: 0, 1, 2 …")] = 3,
+    workers: WorkersOption = 1,
+    dask: DaskOption = None,
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
@@ -238,7 +245,7 @@ def compare(
     result = run_comparison(
         settings, models.split(","), out, judges=judge or (), target=target, objects=objects or (),
         held_out_objects=held_out_objects or (), seeds=range(seeds), device=device,
-        extrapolate=extrapolate,
+        extrapolate=extrapolate, workers=workers, dask=dask,
     )  # fmt: skip
     for item in result.summary:
         if item.figure == headline(result.task)[0]:
@@ -351,6 +358,8 @@ def _front(
     ensemble: Sequence[str],
     device: str,
     extrapolate: bool,
+    workers: int,
+    dask: str | None,
 ) -> None:
     from litho_design.reports.advice import baseline_line
     from litho_design.workflows.front import efficiency_front
@@ -361,7 +370,7 @@ def _front(
         raise InputError("--front", got=repr(front), wanted="numbers, separated by commas") from None
     result = efficiency_front(
         target, model, out, weights=weights, settings=settings, ensemble=ensemble, device=device,
-        extrapolate=extrapolate,
+        extrapolate=extrapolate, workers=workers, dask=dask,
     )  # fmt: skip
     for point in result.points:
         print(

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.outputs import require_own_folder
 from litho_data.foundation.run_facts import run_facts
+from litho_data.foundation.sending import Known
+from litho_data.foundation.workers import Workers, run_jobs
 from litho_design.holograms.settings import HologramSettings
 from litho_design.holograms.task import HologramTask
 from litho_design.images.targets import Target, load_target
@@ -32,7 +36,7 @@ from litho_design.printers.printer import Printer
 from litho_design.printers.source import Device, load_printers
 from litho_design.reports.design import write_design_report
 from litho_design.reports.gap import write_gap_report
-from litho_design.tasks.design import DESIGNS
+from litho_design.tasks.design import DESIGNS, Design
 from litho_design.tasks.run import run_design
 from litho_design.tasks.task import Task, registered_task
 
@@ -56,6 +60,8 @@ def compare(
     device: Device = "cpu",
     extrapolate: bool = False,
     announce: bool = True,
+    workers: int = 1,
+    dask: str | None = None,
     report: GapReport = write_gap_report,
 ) -> GapResult:
     """Design once per arm and seed with equal budgets, and print each layout with every judge.
@@ -74,6 +80,7 @@ def compare(
         objects, held_out_objects: as for ``design_lens``.
         seeds: one design per arm and seed.
         device, extrapolate, announce: as for ``design_hologram``.
+        workers: local processes; ``dask``: address of a Dask scheduler instead. They design.
         report: writes the report; the designs are in the folder then.
 
     Returns:
@@ -85,7 +92,9 @@ def compare(
     """
     every_seed = list(seeds)
     fit: Any = {"device": device, "extrapolate": extrapolate}
+    arms = dict(arms) if isinstance(arms, Mapping) else list(arms)
     designers = load_printers(arms, settings.layout, **fit)
+    known = Known(partial(load_printers, arms, settings.layout, **fit), designers)
     others = load_printers(judges, settings.layout, **fit)
     _check(designers, others, every_seed)
     folder = Path(out)
@@ -93,49 +102,54 @@ def compare(
     # Printers are checked before a target is drawn or a picture is read.
     make: Callable[[Any, Printer], Task]
     if task is not None:
-        kind = registered_task(task.name)
-
-        def make(settings, printer):
-            return kind(settings, printer, inputs=inputs)
+        make = partial(registered_task(task.name), inputs=inputs)
     elif isinstance(settings, HologramSettings):
         if objects or held_out_objects:
             raise InputError(
                 "objects", got="the hoe task, which has a target", wanted="a lens", hint="--target"
             )
-        wanted = load_target(target, settings.layout.size_px)
-
-        def make(settings, printer):
-            return HologramTask(settings, printer, wanted)
+        make = partial(HologramTask, target=load_target(target, settings.layout.size_px))
     else:
         assert isinstance(settings, LensSettings)
         settings, pictures = with_objects(settings, objects, held_out_objects)
-
-        def make(settings, printer):
-            return lens_task(settings, printer, (), pictures)
+        make = partial(lens_task, pictures=pictures)
 
     everyone = {**designers, **others}
-    entries: list[GapEntry] = []
+    jobs: list[_Job] = []
     for (arm, printer), seed in itertools.product(designers.items(), every_seed):
         search = settings.search.model_copy(update={"seed": seed})
-        place = design_folder(folder, arm, seed)
-        made = make(settings.model_copy(update={"search": search}), printer)
-        design = run_design(made, place, write_design_report, announce=announce)
-        entries += _judged(place, arm, seed, everyone)
+        own = settings.model_copy(update={"search": search})
+        jobs.append((make, own, printer, design_folder(folder, arm, seed), announce))
+    done = run_jobs(_design, jobs, Workers(workers, dask, known), name=lambda job: str(job[3]))
+    designs = [design for _, design in progress(done, "designs", len(jobs))]
+    entries = [
+        entry
+        for arm, seed in itertools.product(designers, every_seed)
+        for entry in _judged(design_folder(folder, arm, seed), arm, seed, everyone)
+    ]
     result = GapResult(
-        task=design.task,
+        task=designs[0].task,
         **run_facts(),
         settings=settings,
-        target=design.target.name if design.target else "",
+        target=designs[0].target.name if designs[0].target else "",
         seeds=every_seed,
         arms={name: printer.record() for name, printer in designers.items()},
         judges={name: printer.record() for name, printer in everyone.items()},
         entries=entries,
         summary=summarise(entries),
-        paired=paired_differences(entries, headline(made.name) or tuple(design.predicted)),
+        paired=paired_differences(entries, headline(designs[0].task) or tuple(designs[0].predicted)),
     )
     report(folder, result, everyone)
     result.write(folder)
     return result
+
+
+_Job = tuple[Callable[[Any, Printer], Task], DesignSettings, Printer, Path, bool]
+
+
+def _design(job: _Job) -> Design:
+    make, settings, printer, place, announce = job
+    return run_design(make(settings, printer), place, write_design_report, announce=announce)
 
 
 def _judged(place: Path, arm: str, seed: int, printers: Mapping[str, Printer]) -> list[GapEntry]:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 import litho_models
-from litho_data.foundation.app import new_app, run_app
+from litho_data.foundation.app import DaskOption, WorkersOption, new_app, run_app
 from litho_data.foundation.errors import InputError
 from litho_models.cli.check import check
 from litho_models.cli.loop import close_loop
@@ -171,6 +171,8 @@ def benchmark(
         int | None,
         typer.Option(min=0, help="of weights and crops alone, same split; --seed by default"),
     ] = None,
+    workers: WorkersOption = 1,
+    dask: DaskOption = None,
 ) -> None:
     """Train every model per fold and score it on scans it has not seen; resumable.
 
@@ -194,6 +196,8 @@ def benchmark(
         noise=noise,
         open_lock_box=open_lock_box,
         seed=seed,
+        workers=workers,
+        dask=dask,
     )
     table = headline_table(result.scores, result.nuisance, result.noise_floor)
     typer.echo(table.round(2).to_string(index=False, na_rep="–"))

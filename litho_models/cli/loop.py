@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import typer
 
 import litho_models
+from litho_data.foundation.app import DaskOption, WorkersOption
 
 
 def close_loop(
@@ -72,6 +73,8 @@ def close_loop(
         ),
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="folds and bootstrap, not the lock box")] = 0,
+    workers: WorkersOption = 1,
+    dask: DaskOption = None,
 ) -> None:
     """Find what a model lacks on measured prints, add it, and report the error on held-out scans (nm).
 
@@ -99,6 +102,8 @@ def close_loop(
         config=config,
         steps=steps,
         cache=cache,
+        workers=workers,
+        dask=dask,
         report=lambda message: typer.echo(message, err=True),
     )
     for line in (verdict_text(result), *error_lines(result)):

@@ -12,11 +12,16 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from litho_data.foundation.commands import progress, say_estimate
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.outputs import require_own_folder
 from litho_data.foundation.run_facts import run_info
+from litho_data.foundation.sending import Known
+from litho_data.foundation.workers import Workers, run_jobs
 from litho_data.store import PrintedScan, open_store
+from litho_data.store.again import StoredScans
 from litho_data.store.lock_box import ids_sha256
 from litho_models.evaluation.fit_cache import FitRecord, fit_or_load
 from litho_models.evaluation.reports import write_benchmark_report
@@ -30,7 +35,7 @@ from litho_models.scoring.noise_floor import estimated_floor, stated_floor
 from litho_models.scoring.pairs import paired_scores
 from litho_models.scoring.records import ModelScores, Prediction
 from litho_models.scoring.scores import score_model
-from litho_models.splits.folds import GROUPED_FOLDS, ScoredSplit, SplitKind, plan_folds
+from litho_models.splits.folds import GROUPED_FOLDS, Fold, ScoredSplit, SplitKind, plan_folds
 
 CACHE_FOLDER = "cache"
 BASELINES = ("identity", "affine", "affine-mtf", "blur-table", "linear", "features")
@@ -50,6 +55,8 @@ def benchmark(
     noise: str | Path | None = None,
     open_lock_box: bool = False,
     seed: int = 0,
+    workers: int = 1,
+    dask: str | None = None,
 ) -> Benchmark:
     """Train and score ``models`` out of fold; write ``benchmark.json``, a report and CSV tables.
 
@@ -67,6 +74,7 @@ def benchmark(
             the floor is estimated from the held-out residuals of the best model here.
         open_lock_box: also train on all development scans and score the locked ones.
         seed: of the split, the nuisance blocks and the training.
+        workers: local processes; ``dask``: address of a Dask scheduler instead. They fit and predict.
 
     Raises:
         InputError: no model, an unknown one or one twice, a store that cannot be read or is too small for
@@ -84,16 +92,25 @@ def benchmark(
     if split == "grouped" and made < folds:
         print(f"{made} folds instead of {folds}: one for each scan that is not locked", file=sys.stderr)
     configs = {name: _config(name, settings, seed) for name in models}
-    fits: list[FitRecord] = []
+    fits: dict[tuple[str, int], FitRecord] = {}
     predicted: dict[tuple[str, bool], dict[str, Prediction]] = {}
-    jobs = [(name, fold) for name in models for fold in plan]
-    for name, fold in progress(jobs, f"benchmark of {dataset.name}", estimate_of=0):
-        started = time.monotonic()
-        record, heights = fit_or_load(name, fold, configs[name], Path(out) / CACHE_FOLDER)
-        if fold is plan[0]:
+    known = Known(StoredScans.of(dataset, scans).by_id, {scan.id: scan for scan in scans})
+    places = Workers(workers, dask, known)
+    jobs: list[_Job] = [
+        (name, fold, configs[name], Path(out) / CACHE_FOLDER) for name in models for fold in plan
+    ]
+    done = run_jobs(_fit, jobs, places, name=lambda job: f"{job[0]}, fold {job[1].number}")
+    started = time.monotonic()
+    # Models differ too much for one estimate where each tells its own.
+    of = len(jobs) if places.elsewhere else 0
+    for (name, fold, *_), (record, heights) in progress(
+        done, f"benchmark of {dataset.name}", len(jobs), estimate_of=of
+    ):
+        if fold is plan[0] and not of:
             rest = (len(plan) - 1) * (time.monotonic() - started)
             say_estimate(f"{name} on the other {len(plan) - 1} folds", rest)
-        fits.append(record)
+        started = time.monotonic()
+        fits[name, fold.number] = record
         assert record.diagnostics is not None
         learned = record.diagnostics.background if background == "training" else None
         predicted.setdefault((name, fold.locked), {}).update(
@@ -132,11 +149,18 @@ def benchmark(
         scores=scores,
         locked_scores=[score(name, boxed, True) for name in models] if boxed else [],
         paired=[paired_scores(*pair, seed) for pair in combinations(scores, 2)],
-        fits=fits,
+        fits=[fits[name, fold.number] for name, fold, *_ in jobs],
     )
     result.write(out)
     write_benchmark_report(result, scored, maps, out)
     return result
+
+
+_Job = tuple[str, Fold, TrainingConfig, Path]
+
+
+def _fit(job: _Job) -> tuple[FitRecord, list[np.ndarray]]:
+    return fit_or_load(*job)
 
 
 def _config(name: str, settings: dict[str, Any] | None, seed: int) -> TrainingConfig:

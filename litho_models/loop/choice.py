@@ -122,7 +122,9 @@ def choose(
     if not refitted:
         report("training the base model" if trainer else "predicting with the base model as it is")
         folded = (
-            train_folds(study.scans, study.fold_of, trainer) if trainer else same_for_all(base, study.scans)
+            train_folds(study.scans, study.fold_of, trainer, study.workers)
+            if trainer
+            else same_for_all(base, study.scans)
         )
         start, search = _carry_over(search, folded, study, terms)
         # What single scans add to the model that is reported, not to the guide.

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from torch import nn
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.sending import Known
+from litho_data.foundation.workers import HERE, Workers
+from litho_data.store.again import StoredScans
 from litho_data.store.lock_box import locked_ids
 from litho_data.store.read import PrintedScan
 from litho_models.effects import get_effect
@@ -21,7 +25,7 @@ from litho_models.loop.gain_split import split_gain
 from litho_models.loop.identifiability import identifiability, profiles
 from litho_models.loop.nested import nest
 from litho_models.loop.parameters import is_refitted
-from litho_models.loop.prepared import prepare_scans
+from litho_models.loop.prepared import by_name, prepare_scans, prepared_again
 from litho_models.loop.screening.power import parse_injection, plant
 from litho_models.loop.selection.search import EffectSets
 from litho_models.loop.selection.weight import weigh_effects
@@ -39,6 +43,8 @@ def close_loop(
     rounding_um: Mapping[str, float] | None = None,
     lock_box: Sequence[str] | None = None,
     cache: Path | None = None,
+    workers: Workers = HERE,
+    stored: StoredScans | None = None,
     report: Callable[[str], None] = lambda message: None,
 ) -> LoopFindings:
     """Find what the base model lacks on these scans, add it, and measure the error on held-out scans.
@@ -53,6 +59,8 @@ def close_loop(
         lock_box: ids of the locked scans; ``locked_ids`` of ``scans`` if None. Neither the seed nor the
             scans left out of ``scans`` may change it: whoever holds them all says which are locked.
         cache: folder where the finished parts of a nested selection are kept.
+        workers: where independent fits, trainings and selections are made.
+        stored: where other processes find ``scans``; without it they are sent with each job.
         report: told what happens, a sentence at a time.
 
     Raises:
@@ -71,7 +79,10 @@ def close_loop(
             wanted="one with few parameters, by its name",
             hint="it is fitted anew in every selection: --base physics, for example",
         )
-    prepared = [scan for scan in prepare_scans(scans) if len(scan.sample) >= 64]
+    every = prepare_scans(scans)
+    if stored is not None:
+        workers = replace(workers, known=Known(partial(prepared_again, stored), by_name(every)))
+    prepared = [scan for scan in every if len(scan.sample) >= 64]
     lock_box = locked_ids(scans) if lock_box is None else list(lock_box)
     development = [scan for scan in prepared if scan.id not in lock_box]
     locked = [scan for scan in prepared if scan.id in lock_box]
@@ -82,7 +93,9 @@ def close_loop(
             wanted="at least 2",
         )
     fold_of = deal(development, config.folds, config.seed)
-    study = Study(development, fold_of, config.seed, config.loss, config.weights, report=report)
+    study = Study(
+        development, fold_of, config.seed, config.loss, config.weights, workers=workers, report=report
+    )
     choice = choose(study, base, trainer, announce=True)
     final, search = choice.final, choice.search
     terms = DATUM_FREE | names_to_terms(passed(choice.first_tests))

@@ -8,9 +8,11 @@ import numpy as np
 from torch import nn
 
 from litho_data.foundation.commands import progress
+from litho_data.foundation.workers import HERE, Workers, run_jobs
 from litho_data.store import PrintedScan
 from litho_models.loop.prepared import PreparedScan
 
+# Where other processes train, it is sent to them.
 Trainer = Callable[[Sequence[PrintedScan]], nn.Module]
 
 
@@ -39,15 +41,25 @@ class FoldedBase(nn.Module):
         return self.common if fold is None else self.models[fold]
 
 
-def train_folds(scans: Sequence[PreparedScan], fold_of: np.ndarray, trainer: Trainer) -> FoldedBase:
+def train_folds(
+    scans: Sequence[PreparedScan], fold_of: np.ndarray, trainer: Trainer, workers: Workers = HERE
+) -> FoldedBase:
     """Train once without each fold and once on all development scans."""
-    count = int(fold_of.max()) + 1
-    models = [
-        trainer([scan.stored for scan, own in zip(scans, fold_of, strict=True) if own != fold])
-        for fold in progress(range(count), "training the base model", count + 1)
+    folds = range(int(fold_of.max()) + 1)
+    # No scan has the number of the last one.
+    jobs = [
+        (fold, trainer, [scan.stored for scan, own in zip(scans, fold_of, strict=True) if own != fold])
+        for fold in (*folds, len(folds))
     ]
+    done = run_jobs(_train, jobs, workers, name=lambda job: f"fold {job[0]}")
+    trained = {fold: model for (fold, *_), model in progress(done, "training the base model", len(jobs))}
     assigned = {scan.id: int(fold) for scan, fold in zip(scans, fold_of, strict=True)}
-    return FoldedBase(models, assigned, trainer([scan.stored for scan in scans]))
+    return FoldedBase([trained[fold] for fold in folds], assigned, trained[len(folds)])
+
+
+def _train(job: tuple[int, Trainer, Sequence[PrintedScan]]) -> nn.Module:
+    _, trainer, scans = job
+    return trainer(scans)
 
 
 def same_for_all(model: nn.Module, scans: Sequence[PreparedScan]) -> FoldedBase:

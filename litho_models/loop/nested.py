@@ -18,6 +18,7 @@ from torch import nn
 
 from litho_data.foundation.commands import progress
 from litho_data.foundation.files import atomic_folder
+from litho_data.foundation.workers import run_jobs
 from litho_models.effects import CATALOGUE
 from litho_models.fitting.checkpoint import reading_kept
 from litho_models.fitting.fit import scans_sha256
@@ -80,8 +81,8 @@ def nest(study: Study, base: nn.Module, held_out: HeldOut, cache: Path | None = 
         if held_out == "folds"
         else leave_one_print_out(ids, [scan.stored.print_id for scan in study.scans])
     )
-    parts = []
-    for number, group in enumerate(progress(groups, "choosing anew"), start=1):
+    jobs: list[_Job] = []
+    for number, group in enumerate(groups, start=1):
         others = [scan for scan in study.scans if scan.id not in group]
         inner = replace(
             study,
@@ -91,17 +92,26 @@ def nest(study: Study, base: nn.Module, held_out: HeldOut, cache: Path | None = 
             report=_prefixed(study.report, f"selection {number} of {len(groups)}, on {len(others)} scans"),
         )
         scans = [scan for scan in study.scans if scan.id in group]
-        parts.append(_select_or_load(inner, base, scans, study, cache))
-    return Nested(held_out, parts, _scores(parts, study))
+        jobs.append((number, inner, base, scans, study, cache))
+    done = run_jobs(_select_or_load, jobs, study.workers, name=lambda job: f"selection {job[0]}")
+    parts = {}
+    for (number, *_), part in progress(done, "choosing anew", len(jobs)):
+        parts[number] = part
+        study.report(f"selection {number} is made, {len(parts)} of {len(jobs)}")
+    ordered = [parts[number] for number, *_ in jobs]
+    return Nested(held_out, ordered, _scores(ordered, study))
 
 
 def _prefixed(report: Callable[[str], None], prefix: str) -> Callable[[str], None]:
     return lambda message: report(f"{prefix}: {message}")
 
 
-def _select_or_load(
-    inner: Study, base: nn.Module, scans: list[PreparedScan], study: Study, cache: Path | None
-) -> Part:
+_Job = tuple[int, Study, nn.Module, list[PreparedScan], Study, Path | None]
+
+
+def _select_or_load(job: _Job) -> Part:
+    """One selection: number, study to choose on, base, the scans left out, the whole study, the cache."""
+    _, inner, base, scans, study, cache = job
     folder = None if cache is None else cache / f"selection-{_key(inner, base, scans, study)[:16]}"
     if folder is not None and folder.exists():
         inner.report("kept from an earlier run")

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from torch import nn
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_folder
 from litho_data.foundation.outputs import require_replaceable_folder, require_same_settings
+from litho_data.foundation.workers import Workers, kept_open
 from litho_data.store import PrintedScan, Store, open_store
+from litho_data.store.again import StoredScans
 from litho_models.effects import get_effect
+from litho_models.fitting import TrainingConfig, fit_in_cache
 from litho_models.fitting.runs import level_share, step_share
 from litho_models.frozen import zoo
 from litho_models.frozen.files import save_frozen
@@ -43,6 +48,8 @@ def close_loop_on_store(
     config: LoopConfig | None = None,
     steps: int | None = None,
     cache: str | Path | None = None,
+    workers: int = 1,
+    dask: str | None = None,
     report: Callable[[str], None] = lambda message: None,
 ) -> CloseLoop:
     """Close the loop on a dataset store and write everything to ``out``, which appears when complete.
@@ -56,6 +63,8 @@ def close_loop_on_store(
         steps: optimiser steps of a base that is trained per fold; the recipe's by default.
         cache: folder where such trainings, and the parts of a nested selection, are kept and continued, by
             default beside ``out``; that of a benchmark with the same folds and settings spares its trainings.
+        workers: local processes; ``dask``: address of a Dask scheduler instead. They train the base of each
+            fold, fit candidates, and make the selections of a nested one.
 
     Raises:
         InputError: no store, no such base, a base of another pitch, too few usable scans, further stores of
@@ -87,16 +96,19 @@ def close_loop_on_store(
     trainer, kept_in = None, Path(cache or f"{out}-cache")
     if base in MODELS and not is_small(simulator):
         trainer = _trainer(base, config, steps, kept_in)
-    findings = close_loop(
-        usable,
-        simulator,
-        config,
-        trainer=trainer,
-        rounding_um=_rounding_um(opened, usable),
-        lock_box=opened.locked_ids,
-        cache=kept_in,
-        report=report,
-    )
+    with kept_open(Workers(workers, dask)) as places:
+        findings = close_loop(
+            usable,
+            simulator,
+            config,
+            trainer=trainer,
+            rounding_um=_rounding_um(opened, usable),
+            lock_box=opened.locked_ids,
+            cache=kept_in,
+            workers=places,
+            stored=StoredScans.of(opened, usable),
+            report=report,
+        )
     result = summarise(findings, dataset=opened.dataset_id, base_name=name, dropped=dropped)
     result = result.model_copy(update={"settings": settings})
     shares = level_share([scan.stored for scan in findings.development])
@@ -168,13 +180,23 @@ def _rounding_um(store: Store, scans: Sequence[PrintedScan]) -> dict[str, float]
         return None
 
 
-def _trainer(base: str, config: LoopConfig, steps: int | None, cache: Path) -> Trainer:
-    from litho_models.fitting import TrainingConfig, fit_in_cache
+@dataclass(frozen=True)
+class _Training:
+    """Trains the base model of a fold, in whatever process it is called."""
 
+    base: str
+    settings: TrainingConfig
+    cache: Path
+
+    def __call__(self, scans: Sequence[PrintedScan]) -> nn.Module:
+        return fit_in_cache(self.base, scans, self.settings, self.cache).model
+
+
+def _trainer(base: str, config: LoopConfig, steps: int | None, cache: Path) -> Trainer:
     given: dict[str, Any] = {} if steps is None else {"steps": steps}
     given |= {"seed": config.seed, "weights": config.weights}
     settings = TrainingConfig.of_recipe("fast", base, **given)
-    return lambda scans: fit_in_cache(base, scans, settings, cache).model
+    return _Training(base, settings, cache)
 
 
 def _base_model(base: str, store: Store) -> tuple[Simulator, str]:

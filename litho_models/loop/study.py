@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from litho_data.foundation.units import NM_PER_UM
+from litho_data.foundation.workers import HERE, Workers
 from litho_models.effects.chain import EffectChain
 from litho_models.fitting.least_squares import Loss
 from litho_models.fitting.pixel_weights import Weights
@@ -62,6 +64,7 @@ class Study:
         floor_nm2: squared noise floor or its lower bound, nm².
         background: ``training``: to each prediction is added what the training scans of its fold have in
             common beside their prints, as in a benchmark. The search goes without.
+        workers: where steps with independent parts have them done.
         report: told in a sentence what happens.
     """
 
@@ -72,7 +75,12 @@ class Study:
     weights: Weights = "uniform"
     floor_nm2: float = 0.0
     background: BackgroundUse = "none"
+    workers: Workers = HERE
     report: Callable[[str], None] = _silent
+
+    def __getstate__(self) -> dict[str, Any]:
+        """In another process a study has no workers of its own, and nobody to tell."""
+        return {**vars(self), "workers": HERE, "report": _silent}
 
     @property
     def folds(self) -> int:

@@ -48,6 +48,7 @@ from benchmarks.blind_trials.scoreboard import (
 )
 from benchmarks.blind_trials.trial import run_trial, trial_folder
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.workers import Workers
 from litho_data.virtual_fab import KNOBS, Fab, Microscope, Noise, Printer, Truth, scan_job
 from litho_data.virtual_fab.knobs import KnobBoard
 from litho_models.effects import CATALOGUE
@@ -529,7 +530,7 @@ def test_a_campaign_records_a_dying_trial_and_does_not_repeat_a_finished_one(tmp
         return subprocess.CompletedProcess(command, 0)
 
     monkeypatch.setattr(campaign.subprocess, "run", process)
-    options = {"workers": 2, "timeout_s": 7.0, "keep_data": False}
+    options = {"workers": Workers(2), "timeout_s": 7.0, "keep_data": False}
     campaign.run_campaign(tmp_path, draws, numbers=[0, 1], **options)
     campaign.run_campaign(tmp_path, draws, numbers=[0, 1, 2, 3], **options)
     assert sorted(started) == [0, 1, 2, 3]

@@ -1,47 +1,141 @@
-"""Every job runs once, however many workers and jobs there are, and few are under way at a time."""
+"""Jobs run once, wherever they run, few at a time; what goes wrong is one line.
+
+On a cluster: tests/laws/test_cluster.py.
+"""
 
 from __future__ import annotations
 
+import os
+import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
 
 import pytest
 
+from litho_data.build.build import build_dataset
+from litho_data.foundation import workers as module
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.workers import _windowed, run_jobs
+from litho_data.foundation.run_facts import running_command
+from litho_data.foundation.sending import Known, sent
+from litho_data.foundation.workers import Workers, _windowed, run_jobs
+from litho_data.store import open_store
+from litho_data.store.partial import PartialStore
+from tests.jobs import die, large, refuse, told
+from tests.litho_data.campaigns import write_campaign
+
+NOBODY = "tcp://127.0.0.1:9"
 
 
 def double(number: int) -> int:
     return 2 * number
 
 
+@pytest.mark.parametrize(("processes", "apart"), [(1, False), (2, False), (2, True)])
+def test_jobs_run_once_in_the_same_folder_for_the_same_command(
+    processes: int, apart: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    before = dict(os.environ)
+    known = Known(partial(large, 10**5), large(10**5))
+    jobs = [(number, known.objects["all"]) for number in range(9)]
+    with running_command("litho-data build card.toml"):
+        done = list(run_jobs(told, jobs, Workers(processes, known=known), apart=apart))
+    assert sorted(job[0] for job, _ in done) == list(range(9))
+    threads = before.get("OMP_NUM_THREADS", "1" if processes > 1 else None)
+    for job, (whole, entry, facts) in done:
+        # The object of this process, though others had one of their own.
+        assert whole is job[1]
+        assert entry == job[0]
+        assert facts == ("litho-data build card.toml", str(tmp_path), threads)
+    assert dict(os.environ) == before
+    assert len(sent(jobs, {id(known.objects["all"]): "all"})) < 200
+
+
 @pytest.mark.parametrize("count", [0, 1, 3, 4, 5, 17])
-def test_every_job_runs_once(count: int) -> None:
+def test_every_job_is_submitted_once(count: int) -> None:
     with ThreadPoolExecutor(2) as executor:
-        assert sorted(_windowed(executor, double, range(count), 4)) == [2 * number for number in range(count)]
+        done = _windowed(lambda job: executor.submit(double, job), range(count), lambda: 2)
+        assert sorted(future.result() for _, future in done) == [2 * number for number in range(count)]
 
 
-def test_two_processes_do_the_same_as_this_one() -> None:
-    assert sorted(run_jobs(double, range(9), workers=2)) == list(run_jobs(double, range(9)))
-
-
-def test_jobs_are_taken_only_as_results_are() -> None:
+def test_jobs_are_taken_only_as_results_are_and_by_workers_that_come_later() -> None:
     taken: list[int] = []
+    present = 2
 
-    class Jobs(list[int]):
-        def __iter__(self) -> Iterator[int]:
-            for number in range(100):
-                taken.append(number)
-                yield number
+    def jobs() -> Iterator[int]:
+        for number in range(100):
+            taken.append(number)
+            yield number
 
     with ThreadPoolExecutor(1) as executor:
-        results = _windowed(executor, double, Jobs(), 4)
+        results = _windowed(lambda job: executor.submit(double, job), jobs(), lambda: present)
         next(results)
         # Four under way, and at most four more for those that finished meanwhile.
         assert len(taken) <= 8
+        present, before = 5, len(taken)
+        for _ in range(5):
+            next(results)
+        assert len(taken) >= before + 6
         results.close()
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_what_is_bad_there_is_said_here(processes: int) -> None:
+    with pytest.raises(InputError, match=r"^job \d, got nothing, wanted something$"):
+        list(run_jobs(refuse, range(3), Workers(processes), apart=True))
+
+
+def test_a_job_that_kills_its_worker_is_named_in_one_line() -> None:
+    with pytest.raises(InputError, match=r"^the worker of scan 7, got died, .*; run it again") as said:
+        list(run_jobs(die, [7, 7], Workers(2), name=lambda number: f"scan {number}"))
+    assert "\n" not in str(said.value)
+
+
+def test_an_address_without_scheduler_is_one_line_in_a_few_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("distributed")
+    assert module._CONNECT_S <= 5
+    monkeypatch.setattr(module, "_CONNECT_S", 0.3)
+    for wrong in (NOBODY, "nonsense://"):
+        with pytest.raises(
+            InputError, match=r"^Dask scheduler, got none at \S+ .*wanted for example"
+        ) as said:
+            list(run_jobs(double, [1], Workers(dask=wrong)))
+        assert "\n" not in str(said.value)
+
+
+def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(
+        InputError, match=r"^dask, got not installed, wanted pip install 'litholoop\[cluster\]'$"
+    ):
+        list(run_jobs(double, [1], Workers(dask=NOBODY)))
 
 
 def test_no_worker_is_bad_input() -> None:
     with pytest.raises(InputError, match="workers"):
-        list(run_jobs(double, [1], workers=0))
+        Workers(0)
+
+
+def test_a_build_without_its_cluster_keeps_what_is_finished(
+    campaign: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("distributed")
+    monkeypatch.setattr(module, "_CONNECT_S", 0.3)
+    out, add = tmp_path / "prints.zarr", PartialStore.add
+    card = write_campaign(tmp_path, count=3)
+
+    def add_one(partial: PartialStore, *given: object) -> None:
+        add(partial, *given)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(PartialStore, "add", add_one)
+    with pytest.raises(KeyboardInterrupt):
+        build_dataset(card, out)
+    monkeypatch.setattr(PartialStore, "add", add)
+    with pytest.raises(InputError, match="Dask scheduler"):
+        build_dataset(card, out, dask=NOBODY)
+    result = build_dataset(card, out)
+    assert result.reused == 1
+    assert result.dataset.sha256 == open_store(campaign / "prints.zarr").sha256

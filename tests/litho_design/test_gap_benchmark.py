@@ -12,12 +12,13 @@ from typer.testing import CliRunner
 
 from benchmarks.gap.cost import estimate
 from benchmarks.gap.document import NAME, PAGE, RESULT_FILE, RESULTS
-from benchmarks.gap.jobs import Job, run_jobs
+from benchmarks.gap.jobs import Job, run_commands
 from benchmarks.gap.plan import ARMS, PRINT_KNOBS, Effort, open_plan
 from benchmarks.gap.tables import as_markdown
 from benchmarks.gap.tasks import Task, chosen, tasks
 from benchmarks.record import published
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.workers import Workers
 from litho_data.virtual_fab import KnobSetting, knob_rms_nm
 from litho_data.virtual_fab.settings import Printer
 from litho_data.virtual_fab.strength import default_fields
@@ -90,13 +91,13 @@ def test_finished_jobs_are_skipped_and_failed_ones_are_named(tmp_path):
 
     touch = "import pathlib, sys; pathlib.Path({!r}).write_text(sys.argv[0])"
     good = job("good", touch.format(str(tmp_path / "good")))
-    run_jobs([good], tmp_path / "logs", 2)
+    run_commands([good], tmp_path / "logs", Workers(2))
     before = good.result.stat().st_mtime_ns
     with pytest.raises(InputError, match="bad"):
-        run_jobs([good, job("bad", "raise SystemExit(1)")], tmp_path / "logs", 2)
+        run_commands([good, job("bad", "raise SystemExit(1)")], tmp_path / "logs", Workers(2))
     assert good.result.stat().st_mtime_ns == before
     with pytest.raises(InputError, match="silent"):
-        run_jobs([job("silent", "")], tmp_path / "logs", 1)
+        run_commands([job("silent", "")], tmp_path / "logs")
 
 
 def test_the_estimate_adds_up(tmp_path):

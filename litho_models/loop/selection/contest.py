@@ -12,7 +12,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from litho_data.foundation.workers import run_jobs
 from litho_models.effects import Effect
+from litho_models.effects.chain import EffectChain
 from litho_models.loop.fold_fits import FREE_TERMS, FoldFits
 from litho_models.loop.linear import pooled_cosine, without_scan_terms
 from litho_models.loop.parameters import effect_slots
@@ -161,12 +163,20 @@ def fold_amplitudes(fits: FoldFits, effect: Effect) -> dict[str, np.ndarray]:
 
 
 def _fitted(state: State, entering: Sequence[Screened], study: Study) -> list[Entrant]:
-    entrants, chain = [], state.fits.chain
-    for s in entering:
-        study.report(f"fitting {s.effect.name}")
-        extended = chain.with_effects({**chain.values(), s.effect.name: fitting_start(s)})
-        entrants.append(Entrant(s, fit_state(extended, study)))
-    return entrants
+    chain = state.fits.chain
+    values = chain.values()
+    jobs = [
+        (s.effect.name, chain.with_effects({**values, s.effect.name: fitting_start(s)}), study)
+        for s in entering
+    ]
+    fitted = {name: own for (name, *_), own in run_jobs(_fit, jobs, study.workers, name=lambda job: job[0])}
+    return [Entrant(s, fitted[s.effect.name]) for s in entering]
+
+
+def _fit(job: tuple[str, EffectChain, Study]) -> State:
+    name, chain, study = job
+    study.report(f"fitting {name}")
+    return fit_state(chain, study)
 
 
 def fitting_start(s: Screened) -> dict[str, float]:

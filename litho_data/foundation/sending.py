@@ -1,0 +1,114 @@
+"""A function and its job on the way to another process, and the result on the way back."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pickle
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from io import BytesIO
+from typing import Any
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.run_facts import running_command, software_record
+
+
+@dataclass(frozen=True)
+class Known:
+    """Large objects that other processes make for themselves; jobs and results that hold them name them.
+
+    ``make``: importable by name, such as a partial; it gives ``objects`` again. A process
+    keeps those it made last.
+    """
+
+    make: Callable[[], Mapping[str, Any]]
+    objects: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Away:
+    """A function as another process runs it: in the same folder, for results with the same command line.
+
+    ``software``: what a Dask worker has to run too.
+    """
+
+    function: Callable[[Any], Any]
+    make: bytes
+    folder: str
+    command: str
+    software: Mapping[str, Any] | None
+
+    def __call__(self, job: bytes) -> bytes:
+        if self.software is not None:
+            _require_alike(self.software, self.folder)
+        with contextlib.chdir(self.folder), running_command(self.command):
+            objects = _made(self.make)
+            result = self.function(received(job, objects))
+        return sent(result, {id(one): key for key, one in objects.items()})
+
+
+@lru_cache(maxsize=1)
+def _made(make: bytes) -> Mapping[str, Any]:
+    made: Mapping[str, Any] = pickle.loads(make)()
+    return made
+
+
+def sent(content: Any, names: Mapping[int, str]) -> bytes:
+    """Anything as bytes; ``names``: of the objects, by their ``id``, that are only named."""
+    stream = BytesIO()
+    _Sender(stream, names).dump(content)
+    return stream.getvalue()
+
+
+def received(content: bytes, objects: Mapping[str, Any]) -> Any:
+    """What was sent, with these objects in the places of their names."""
+    return _Receiver(BytesIO(content), objects).load()
+
+
+class _Sender(pickle.Pickler):
+    def __init__(self, stream: BytesIO, names: Mapping[int, str]):
+        super().__init__(stream, pickle.HIGHEST_PROTOCOL)
+        self._names = names
+
+    def persistent_id(self, content: Any) -> str | None:
+        return self._names.get(id(content))
+
+
+class _Receiver(pickle.Unpickler):
+    def __init__(self, stream: BytesIO, objects: Mapping[str, Any]):
+        super().__init__(stream)
+        self._objects = objects
+
+    def persistent_load(self, name: str) -> Any:
+        return self._objects[name]
+
+
+def _require_alike(wanted: Mapping[str, Any], folder: str) -> None:
+    """Refuse a Dask worker whose results would differ; asked with each job, as workers come and go."""
+    from distributed import get_worker
+
+    worker = get_worker()
+    if worker.state.nthreads > 1:
+        # Seeds and numbers of threads belong to a process, so jobs in its threads would disturb each other.
+        raise InputError(
+            f"Dask worker {worker.address}",
+            got=f"{worker.state.nthreads} threads",
+            wanted="one, with more workers instead",
+            hint="dask worker ADDRESS --nworkers N --nthreads 1",
+        )
+    if not os.path.isdir(folder):
+        raise InputError(
+            f"Dask worker {worker.address}", got=f"no folder {folder}", wanted="the files of this machine"
+        )
+    own, there = ({**one["versions"], "commit": one["commit"]} for one in (software_record(), wanted))
+    for package in sorted(own.keys() | there.keys()):
+        found, asked = own.get(package), there.get(package)
+        if found != asked:
+            raise InputError(
+                f"{package} of Dask worker {worker.address}",
+                got=found or "none",
+                wanted=f"{asked or 'none'}, as here",
+                hint="start the workers again in this environment",
+            )

@@ -1,0 +1,214 @@
+"""What runs on a Dask cluster is what runs here, to the bit, even where a worker dies half-way."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from benchmarks.blind_trials import campaign
+from litho_data.build.build import build_dataset
+from litho_data.foundation import workers as module
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.run_facts import running_command
+from litho_data.foundation.sending import Known
+from litho_data.foundation.workers import Workers, run_jobs
+from litho_data.store import open_store
+from litho_data.store.again import StoredScans
+from litho_data.store.partial import PartialStore
+from litho_design import hologram_settings
+from litho_design.judging.gap import design_folder
+from litho_design.tasks.design import Design
+from litho_design.workflows.compare import compare
+from litho_models.effects import get_effect
+from litho_models.evaluation.benchmark import benchmark
+from litho_models.evaluation.fit_cache import fit_folder, kept_fit
+from litho_models.loop import LoopConfig, close_loop_on_store
+from litho_models.loop.folded_base import train_folds
+from litho_models.loop.prepared import by_name, prepare_scans, prepared_again
+from litho_models.loop.run import _trainer
+from litho_models.loop.selection.contest import _fitted
+from litho_models.loop.study import Study, deal, fit_state
+from tests.jobs import die, die_once, large, refuse, told
+from tests.litho_data.campaigns import write_campaign
+from tests.litho_models.loop_scans import printed_scans, true_model
+from tests.litho_models.prints import make_scans, write_store
+
+distributed = pytest.importorskip("distributed")
+
+
+@pytest.fixture(scope="module")
+def address() -> Iterator[str]:
+    """A cluster of two workers with one thread each; a job may cost one of them, not two."""
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, dashboard_address=None, scheduler_kwargs={"allowed_failures": 1}
+    ) as cluster:
+        yield cluster.scheduler_address
+
+
+def test_jobs_know_command_folder_and_large_objects(
+    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    known = Known(partial(large, 10**5), large(10**5))
+    jobs = [(number, known.objects["all"]) for number in range(9)]
+    with running_command("litho-data build card.toml"):
+        done = list(run_jobs(told, jobs, Workers(dask=address, known=known)))
+    assert sorted(job[0] for job, _ in done) == list(range(9))
+    for job, (whole, entry, facts) in done:
+        assert whole is job[1]
+        assert entry == job[0]
+        # Dask gives its workers one thread unless the environment says otherwise.
+        assert facts == ("litho-data build card.toml", str(tmp_path), os.environ.get("OMP_NUM_THREADS", "1"))
+
+
+def test_what_is_bad_there_is_said_here(address: str) -> None:
+    with pytest.raises(InputError, match=r"^job \d, got nothing, wanted something$"):
+        list(run_jobs(refuse, range(3), Workers(dask=address)))
+
+
+def test_a_worker_of_other_software_or_other_files_is_refused(
+    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own = module.software_record()
+    monkeypatch.setattr(
+        module, "software_record", lambda: {**own, "versions": {**own["versions"], "numpy": "0"}}
+    )
+    with pytest.raises(InputError, match=r"^numpy of Dask worker tcp://\S+, got \S+, wanted 0, as here"):
+        list(run_jobs(refuse, [1], Workers(dask=address)))
+    monkeypatch.setattr(module.os, "getcwd", lambda: "/nowhere")
+    with pytest.raises(InputError, match=r"^Dask worker tcp://\S+, got no folder /nowhere"):
+        list(run_jobs(refuse, [1], Workers(dask=address)))
+
+
+def test_a_build_that_loses_a_worker_has_the_same_hash(address: str, tmp_path: Path) -> None:
+    card = write_campaign(tmp_path, count=4)
+    alone = build_dataset(card, tmp_path / "alone.zarr")
+    killed: list[int] = []
+    add = PartialStore.add
+
+    def add_and_kill(store: PartialStore, *given: object) -> None:
+        add(store, *given)
+        if not killed:
+            with distributed.Client(address, set_as_default=False) as client:
+                killed.append(client.run(os.getpid).popitem()[1])
+            os.kill(killed[0], signal.SIGKILL)
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(PartialStore, "add", add_and_kill)
+        patched.setattr("litho_data.build.build.write_report", lambda *_: None)
+        result = build_dataset(card, tmp_path / "prints.zarr", dask=address)
+    assert killed
+    assert result.dataset.sha256 == alone.dataset.sha256
+    attributes = [open_store(tmp_path / name).root.attrs for name in ("alone.zarr", "prints.zarr")]
+    assert attributes[0]["manifest_sha256"] == attributes[1]["manifest_sha256"]
+
+
+def test_a_job_whose_worker_dies_is_run_again(address: str, tmp_path: Path) -> None:
+    jobs = [(number, tmp_path / "mark") for number in range(4)]
+    assert sorted(result for _, result in run_jobs(die_once, jobs, Workers(dask=address))) == list(range(4))
+    assert (tmp_path / "mark").exists()
+
+
+def test_a_job_that_kills_every_worker_is_named_in_one_line(address: str) -> None:
+    with pytest.raises(InputError, match=r"^the worker of scan 7, got died, .*; run it again") as said:
+        list(run_jobs(die, [7], Workers(dask=address), name=lambda number: f"scan {number}"))
+    assert "\n" not in str(said.value)
+
+
+def test_a_benchmark_is_the_same_to_the_bit(
+    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("litho_models.evaluation.benchmark.write_benchmark_report", lambda *_: None)
+    store = write_store(tmp_path / "made.zarr", make_scans(6, size_px=64))
+    wanted = {"models": ("affine", "linear"), "folds": 2, "settings": {"nuisance": "offset"}}
+    here, there = (
+        benchmark(store, tmp_path / name, **wanted, dask=dask) for name, dask in (("a", None), ("b", address))
+    )
+    assert here.scores == there.scores
+    assert [(fit.model, fit.fold) for fit in there.fits] == [
+        (model, fold) for model in wanted["models"] for fold in (0, 1)
+    ]
+    for fit in here.fits:
+        pair = [kept_fit(fit_folder(tmp_path / name / "cache", fit.model, fit.key))[1] for name in "ab"]
+        assert all((one == other).all() for one, other in zip(*pair, strict=True))
+
+
+def test_candidates_and_trainings_of_folds_are_the_same_to_the_bit(address: str, tmp_path: Path) -> None:
+    path = write_store(tmp_path / "made.zarr", printed_scans(count=6, size_px=48))
+    store = open_store(path)
+    stored = StoredScans.of(store, store.scans())
+    scans = prepare_scans(stored.read())
+    places = Workers(dask=address, known=Known(partial(prepared_again, stored), by_name(scans)))
+    here = Study(scans, deal(scans, 2, 0))
+    there = replace(here, workers=places)
+    state = fit_state(true_model({}), here)
+    entering = [
+        SimpleNamespace(effect=get_effect(name), values=get_effect(name).with_values({}))
+        for name in ("vignetting", "dose-exponent")
+    ]
+    for one, other in zip(_fitted(state, entering, here), _fitted(state, entering, there), strict=True):
+        assert one.state.fits.chain.names == other.state.fits.chain.names == (one.name,)
+        assert (one.state.fits.per_fold == other.state.fits.per_fold).all()
+        assert (one.training_error == other.training_error).all()
+        for own, its in zip(one.state.predictions, other.state.predictions, strict=True):
+            assert (own == its).all()
+    trainer = _trainer("linear", LoopConfig(), None, tmp_path / "cache")
+    bases = [train_folds(scans, here.fold_of, trainer, workers) for workers in (Workers(), places)]
+    assert len(bases[0].models) == len(bases[1].models) == 2
+    for own, its in zip(bases[0].state_dict().values(), bases[1].state_dict().values(), strict=True):
+        assert (own == its).all()
+
+
+@pytest.mark.long
+def test_a_whole_loop_with_nested_selections_is_the_same_to_the_bit(address: str, tmp_path: Path) -> None:
+    scans = printed_scans({"vignetting": {"strength": 0.3}}, count=12, size_px=48, seed=1)
+    store = write_store(tmp_path / "made.zarr", scans)
+    config = LoopConfig(folds=2, nested="prints")
+    told: list[str] = []
+    here, there = (
+        close_loop_on_store(store, tmp_path / name, config=config, dask=dask, report=report)
+        for name, dask, report in (("a", None, lambda _: None), ("b", address, told.append))
+    )
+    assert "selection 1 is made" in " ".join(told)
+    assert [effect.name for effect in here.effects] == ["vignetting"]
+    assert here.model_dump(exclude={"run"}) == there.model_dump(exclude={"run"})
+    folders = (tmp_path / f"{name}-cache" for name in "ab")
+    chosen = [sorted(path.relative_to(folder) for path in folder.rglob("*")) for folder in folders]
+    assert chosen[0] == chosen[1] != []
+
+
+@pytest.mark.long
+def test_designs_are_the_same_to_the_bit(
+    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    tiny = {"layout.size_px": 48, "optics.distance_um": 8, "search.iterations": 4, "search.polish_rounds": 1}
+    settings = hologram_settings(changes={**tiny, "window.yield_draws": 2, "window.defocus_sd_um": 0.5})
+    arms = {"none": "none", "physics": "zoo:physics"}
+    here, there = (
+        compare(settings, arms, name, target="ring", seeds=(0,), announce=False, dask=dask)
+        for name, dask in (("a", None), ("b", address))
+    )
+    assert (here.entries, here.arms) == (there.entries, there.arms)
+    for arm in arms:
+        one, other = (Design.read(design_folder(tmp_path / name, arm, 0)) for name in "ab")
+        assert one.fingerprint == other.fingerprint
+        # Hashes of levels, height, image, target.
+        assert one.files == other.files != {}
+        assert one.predicted == other.predicted
+
+
+def test_a_trial_runs_in_a_process_of_its_own_on_a_worker(address: str, tmp_path: Path) -> None:
+    draws = campaign.make_draws(count=4, seed=0, n_scans=12, size_px=64)
+    campaign.open_campaign(tmp_path, draws)
+    # Long enough for a process to start, too short for a trial.
+    settings = {"workers": Workers(dask=address), "timeout_s": 0.3, "keep_data": False}
+    campaign.run_campaign(tmp_path, draws, numbers=[0, 1], **settings)
+    assert [trial.failure for trial in campaign.finished(tmp_path, draws)] == ["not finished after 0.3 s"] * 2
