@@ -20,6 +20,8 @@ _PRECISION_M = 1e-9
 
 # Side of the blocks that a part is cut into.
 _BLOCK_PX = 128
+# Shapes that are read at once.
+_CHUNK = 1 << 10
 
 GdsLayers = Literal["cumulative", "exclusive"]
 Box = tuple[int, int, int, int]
@@ -135,8 +137,8 @@ class GdsRows:
     def __init__(self, path: Path, shape: tuple[int, int], pitch_um: float, layers: GdsLayers):
         self.shape = shape
         self._step, self._layers = pitch_um * _UNIT_M / _PRECISION_M, layers
-        self._data = np.memmap(path, np.uint8, "r")
-        self._shapes: dict[str, slice] = {}
+        self._path = path
+        self._shapes: dict[str, tuple[int, int]] = {}
         self._references: dict[str, list[tuple[str, int, int]]] = {}
         self._index()
         # Every row of blocks by its lower left corner in pixels.
@@ -154,7 +156,8 @@ class GdsRows:
         for x0, y0, cell in self._bands:
             if y0 < high and y0 + _BLOCK_PX > low:
                 for name, dx, _ in self._references[cell]:
-                    shapes = self._data[self._shapes[name]].view(_RECTANGLE)
+                    start, count = self._shapes[name]
+                    shapes = np.fromfile(self._path, _RECTANGLE, count, offset=start)
                     corners = np.rint(shapes["corners"][:, [0, 2]] / self._step).astype(np.intp)
                     x = corners[..., 0] + (x0 + round(dx / self._step))
                     y = np.clip(corners[..., 1] + y0, low, high) - low
@@ -168,14 +171,15 @@ class GdsRows:
         """Where the shapes of every cell lie in the file, and to which cells it refers."""
         at, cell, name = 0, "", ""
         while True:
-            length, kind = struct.unpack(">HH", self._data[at : at + 4].tobytes())
-            body = self._data[at + 4 : at + length].tobytes()
+            # No record but those of shapes is longer.
+            part = np.fromfile(self._path, np.uint8, 64, offset=at).tobytes()
+            length, kind = struct.unpack(">HH", part[:4])
+            body = part[4:length]
             if kind == _CELL_NAME:
                 cell = body.rstrip(b"\0").decode()
-                end = at + length + self._shapes_from(at + length) * _RECTANGLE.itemsize
-                self._shapes[cell], self._references[cell] = slice(at + length, end), []
-                at = end
-                continue
+                count = self._shapes_from(at + length)
+                self._shapes[cell], self._references[cell] = (at + length, count), []
+                at += count * _RECTANGLE.itemsize
             if kind == _REFERENCE_NAME:
                 name = body.rstrip(b"\0").decode()
             elif kind == _PLACE:
@@ -186,15 +190,14 @@ class GdsRows:
 
     def _shapes_from(self, at: int) -> int:
         """How many rectangles follow in the file."""
-        count, chunk = 0, 1 << 10
+        count = 0
         while True:
             start = at + count * _RECTANGLE.itemsize
-            size = min(chunk, (len(self._data) - start) // _RECTANGLE.itemsize)
-            part = self._data[start : start + size * _RECTANGLE.itemsize].view(_RECTANGLE)
+            part = np.fromfile(self._path, _RECTANGLE, _CHUNK, offset=start)
             other = np.flatnonzero(part["start"] != _START)
-            if other.size or size < chunk:
-                return count + (int(other[0]) if other.size else size)
-            count += size
+            if other.size or len(part) < _CHUNK:
+                return count + (int(other[0]) if other.size else len(part))
+            count += len(part)
 
 
 def _write_cell(stream: BinaryIO, name: str, contents: Iterable[bytes]) -> None:
