@@ -1,4 +1,4 @@
-"""Memory, time and file size of the export of a lens of rings: written and read back a band of rows at a time.
+"""Memory, time and file size of the export of a lens of rings, written and read back in bands of rows.
 
     python -m benchmarks.large_export [--sizes 1024 4096] [--out FILE]
 

@@ -121,8 +121,8 @@ def score_from_disk(
     folder, record = Path(design), Design.read(design)
     layout, optics = record.layout, record.optics
     if record.task != "hoe" or optics.element != "thin":
-        got = f"{record.task}, {optics.element}"
-        raise InputError("design to score from disk", got=got, wanted="a hologram, thin")
+        got, hint = f"{record.task}, {optics.element}", "without --stream" if record.in_rings else ""
+        raise InputError("design to score from disk", got=got, wanted="a hologram, thin", hint=hint)
     level, expected, seen, target = (
         read_array(folder, name, on_disk=True) for name in (LEVELS_FILE, HEIGHT_FILE, IMAGE_FILE, TARGET_FILE)
     )
