@@ -182,16 +182,13 @@ def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> None:
     fields = {job.id: job for job in jobs if isinstance(job, FieldJob)}
     lost = [key for key in skipped if key in fields and UNREGISTERED in skipped[key]]
     layouts = {key: layout for key, job in fields.items() if lost and (layout := job.layout()) is not None}
+    # One layout may be printed, and one print scanned, more than once: it goes by its first id.
+    distinct = {layout.tobytes(): name for name, layout in reversed(layouts.items())}
     # A search takes a twentieth of a second.
-    for key in lost[: max(1, _MOST_SEARCHES // max(1, len(layouts)))]:
+    for key in lost[: max(1, _MOST_SEARCHES // max(1, len(distinct)))]:
         read = fields[key].read()
-        # One layout may be printed, and one print scanned, more than once.
-        own = layouts.get(key)
-        others = {
-            name: layout
-            for name, layout in layouts.items()
-            if name != key and (own is None or layout.tobytes() != own.tobytes())
-        }
+        own = layouts[key].tobytes() if key in layouts else None
+        others = {name: layouts[name] for held, name in distinct.items() if held != own}
         height_um, pitch_y_x = read.arrays["raw_height_um"], read.facts["pitch_um"]
         pitch_um = fields[key].card.layout.pitch_um
         if fits := fitting_layout(height_um, (pitch_y_x[0], pitch_y_x[1]), others, pitch_um):
