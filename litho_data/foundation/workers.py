@@ -195,7 +195,8 @@ def _dask(address: str) -> Iterator[Pool]:
         raise InputError("dask", got="not installed", wanted="pip install 'litholoop[cluster]'") from error
     try:
         client = Client(address, timeout=_CONNECT_S, set_as_default=False)
-    except (OSError, ValueError, TimeoutError) as error:
+    except (OSError, ValueError, TimeoutError, MemoryError) as error:
+        # MemoryError: another program answers there, and its words are taken for sizes.
         raise InputError(
             "Dask scheduler", got=f"none at {address} ({error})", wanted="for example tcp://host:8786"
         ) from error
