@@ -101,10 +101,22 @@ def headline_words(result: CloseLoop) -> str:
         missing = "although something with structure is left" if left else "or needed"
         return f"Nothing was found to add, {missing}: the held-out error stays at {before:.2f} nm."
     named = [e for e in result.effects if e.verdict != "traced-to-covariate"]
-    names = ", ".join(get_effect(e.name).title for e in named) or "no named effect, only generic terms"
-    text = f"{result.base_model[:1].upper()}{result.base_model[1:]} lacks: {names}. "
-    if len(named) < len(result.effects) and named:
-        text += f"Generic terms without a name were added as well ({len(result.effects) - len(named)}). "
+    own = [e for e in named if get_effect(e.name).per_scan]
+    lacking = ", ".join(get_effect(e.name).title for e in named if e not in own)
+    base, generic = (
+        f"{result.base_model[:1].upper()}{result.base_model[1:]}",
+        len(result.effects) - len(named),
+    )
+    terms = f"{generic} generic {'terms' if generic > 1 else 'term'}"
+    if lacking:
+        text = f"{base} lacks {lacking}. " + (f"Beside it {terms} without a name. " if generic else "")
+    else:
+        text = (
+            f"What {base} lacks has no name: {terms}. " if generic else f"{base} lacks nothing that shows. "
+        )
+    if own:
+        titles = [get_effect(e.name).title.removesuffix(" of the single scan") for e in own]
+        text += f"Each scan has its own {', '.join(titles)}. "
     text += f"With all of it the held-out error goes from {before:.2f} to {after:.2f} nm"
     if result.headline is None:
         return f"{text}."
