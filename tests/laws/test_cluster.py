@@ -29,7 +29,7 @@ from litho_design.workflows.compare import compare
 from litho_models.effects import get_effect
 from litho_models.evaluation.benchmark import benchmark
 from litho_models.evaluation.fit_cache import fit_folder, kept_fit
-from litho_models.loop import LoopConfig, close_loop_on_store
+from litho_models.loop import LoopConfig
 from litho_models.loop.folded_base import train_folds
 from litho_models.loop.prepared import by_name, prepare_scans, prepared_again
 from litho_models.loop.run import _trainer
@@ -164,24 +164,6 @@ def test_candidates_and_trainings_of_folds_are_the_same_to_the_bit(address: str,
     assert len(bases[0].models) == len(bases[1].models) == 2
     for own, its in zip(bases[0].state_dict().values(), bases[1].state_dict().values(), strict=True):
         assert (own == its).all()
-
-
-@pytest.mark.long
-def test_a_whole_loop_with_nested_selections_is_the_same_to_the_bit(address: str, tmp_path: Path) -> None:
-    scans = printed_scans({"vignetting": {"strength": 0.3}}, count=12, size_px=48, seed=1)
-    store = write_store(tmp_path / "made.zarr", scans)
-    config = LoopConfig(folds=2, nested="prints")
-    told: list[str] = []
-    here, there = (
-        close_loop_on_store(store, tmp_path / name, config=config, dask=dask, report=report)
-        for name, dask, report in (("a", None, lambda _: None), ("b", address, told.append))
-    )
-    assert "selection 1 is made" in " ".join(told)
-    assert [effect.name for effect in here.effects] == ["vignetting"]
-    assert here.model_dump(exclude={"run"}) == there.model_dump(exclude={"run"})
-    folders = (tmp_path / f"{name}-cache" for name in "ab")
-    chosen = [sorted(path.relative_to(folder) for path in folder.rglob("*")) for folder in folders]
-    assert chosen[0] == chosen[1] != []
 
 
 @pytest.mark.long
