@@ -597,7 +597,7 @@ def test_one_effect_is_found_or_in_the_set(tmp_path):
     assert trial.errors.mae_to_floor <= 1.15
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_nothing_is_reported_where_there_is_nothing(tmp_path):
     trial = run_small("none", tmp_path)
     assert not trial.failure

@@ -20,7 +20,7 @@ def test_interval_is_students():
 
 
 def test_matrix_gap_and_resume(tmp_path, small_settings, make_printer):
-    search = small_settings.search.model_copy(update={"iterations": 25, "polish_rounds": 0})
+    search = small_settings.search.model_copy(update={"iterations": 15, "polish_rounds": 0})
     settings = small_settings.model_copy(update={"search": search})
     arms = {"none": Printer(None, settings.layout, source="none"), "blur": make_printer(settings.layout)}
     judges = {"fab": make_printer(settings.layout, sigma_um=0.22, gain=0.6)}

@@ -36,7 +36,15 @@ def frozen(name: str, folder: Path) -> FrozenSimulator:
     return load_frozen(save_frozen(model, folder / name))
 
 
-@pytest.mark.parametrize("name", ["physics", "pbl", "fno", *CLOSED_FORM])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "physics",
+        "pbl",
+        *CLOSED_FORM[:-1],
+        *(pytest.param(n, marks=pytest.mark.long) for n in ("fno", "features")),
+    ],
+)
 def test_a_program_prints_what_the_model_prints(name: str, tmp_path: Path) -> None:
     model = frozen(name, tmp_path)
     assert export_model(model, tmp_path / "model.pt2", SIZE_PX) <= LARGEST_DIFFERENCE_UM

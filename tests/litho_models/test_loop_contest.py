@@ -26,17 +26,20 @@ def added_to(scans) -> dict[str, list[str]]:
     return {entry.effect.name: entry.confusable_with for entry in findings.search.added}
 
 
+@pytest.mark.long
 def test_an_elliptical_spot_is_not_taken_for_diffusion() -> None:
     # Along one diagonal 0.3 µm wider in quadrature: more than half of it is plain blur.
     scans = printed_scans({"elliptical-psf": {"shear_um2": 0.09}}, count=12, size_px=96, seed=2)
     assert added_to(scans) == {"elliptical-psf": []}
 
 
+@pytest.mark.long
 def test_a_print_that_lost_its_foot_is_not_called_shrunk() -> None:
     scans = printed_scans({"interface-offset": {"offset_um": -0.25}}, count=12, size_px=96, seed=3)
     assert "interface-offset" in {name for own, others in added_to(scans).items() for name in (own, *others)}
 
 
+@pytest.mark.long
 def test_ripples_are_found_though_offsets_of_lines_could_hide_them() -> None:
     ripple = {"cosine_um": 0.006, "sine_um": 0.004, "frequency_per_um": 0.31}
     scans = printed_scans({"hatch-ripple": ripple}, count=12, size_px=96, seed=4)

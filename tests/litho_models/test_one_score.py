@@ -14,7 +14,7 @@ STEPS = 2
 @pytest.mark.slow
 @pytest.mark.parametrize("base", ["physics", pytest.param("pbl", marks=pytest.mark.long)])
 def test_the_loop_starts_where_the_benchmark_ends(base: str, tmp_path) -> None:
-    store = write_store(tmp_path / "s.zarr", make_scans(5, size_px=96, bow_um=0.02))
+    store = write_store(tmp_path / "s.zarr", make_scans(4, size_px=80, bow_um=0.02))
     settings = {"steps": STEPS} if base == "pbl" else None
     scored = benchmark(store, tmp_path / "b", models=[base], folds=2, settings=settings).scores[0]
     config = LoopConfig(folds=2, loss="absolute", background="training")

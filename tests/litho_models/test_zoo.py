@@ -136,6 +136,7 @@ def test_listing_the_zoo_loads_no_torch():
     assert done.stdout.strip() == "False"
 
 
+@pytest.mark.long
 def test_the_zoo_is_made_in_one_call_and_reproduces_its_cards(store, tmp_path):
     from litho_models.evaluation.benchmark import benchmark
 
