@@ -13,7 +13,7 @@ from litho_models.planning.rivalry import PlannedPrint, Rivalry
 
 _COUNTS = range(1, power.MOST_PRINTS + 1)
 # What the rivals' numbers could be as well: a difference that rests on one of them may not be there.
-_DRAWS = 8
+DRAWS = 8
 
 
 def of_rivals(
@@ -58,7 +58,7 @@ def _pairs(rivalry: Rivalry, prints: Sequence[PlannedPrint]) -> list[PlannedPair
     """Unordered pairs, each in the direction with less power; a power is the mean over the draws."""
     names = [rival.name for rival in rivalry.question.rivals]
     random, first = np.random.default_rng(0), rivalry.linearised(prints)
-    drawn = [rivalry.drawn(random) for _ in range(_DRAWS)]
+    drawn = [rivalry.drawn(random) for _ in range(DRAWS)]
     contrasts = [one.contrasts(prints, one.refitted(prints, first=first)) for one in drawn]
     directed = {}
     for pair, fitted, *others in zip(rivalry.pairs, rivalry.contrasts(prints), *contrasts, strict=True):

@@ -16,6 +16,7 @@ from litho_data.register.coarse import SEARCH_BLUR_PX
 from litho_data.register.orientation import rival_alignment
 from litho_data.register.topography import predicted_topography
 from litho_models.loop.result.questions import OpenQuestions, Question
+from litho_models.planning.answers import DRAWS
 from litho_models.planning.layouts import NEAREST, TILE_PX, Limits, climb, score, starts
 from litho_models.planning.rivalry import Place, PlannedPrint, Rivalry, Way
 
@@ -199,7 +200,9 @@ class Designer:
         step_s = time.perf_counter() - clock
         tile_s = self.steps * step_s + (1 + self.steps / 10) * refit_s
         area = (self.size_px / self.tile_px) ** 2
-        rest_s = len(self.rivalries) * (9 * refit_s + 8 * area * refit_s)
+        # Two prints and two random ones are judged: a refit each and two rounds, and all draws.
+        judged = 12 + 4 * DRAWS
+        rest_s = len(self.rivalries) * (9 * refit_s + judged * area * refit_s)
         total_s = (count - done) * tile_s + rest_s
         kept = f", {done} of {count} tiles are kept from an earlier run" if done else ""
         self.report(f"this takes about {max(1, round(total_s / 60))} min on one core{kept}")
