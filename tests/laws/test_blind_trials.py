@@ -611,7 +611,7 @@ def test_nothing_is_reported_where_there_is_nothing(tmp_path):
     assert trial.errors.floor.rmse_nm == pytest.approx(floor_nm, rel=0.04)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_an_effect_outside_the_catalogue_is_never_given_a_name(tmp_path):
     trial = run_small("off-catalogue", tmp_path)
     assert not trial.failure
