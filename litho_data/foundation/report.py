@@ -201,6 +201,11 @@ def _template() -> jinja2.Template:
     return jinja2.Environment(autoescape=True, trim_blocks=True).from_string(text)
 
 
+def capitalised(text: str) -> str:
+    """A text with a capital to begin with, the rest as it is."""
+    return text[:1].upper() + text[1:]
+
+
 def spelt_out(key: str) -> str:
     """The key of a column in words: ``mae_abs_nm`` is "MAE abs (nm)"."""
     if "_" not in key:

@@ -21,7 +21,7 @@ from litho_design.judging.measured import MeasuredRecord, MeasuredSource, as_it_
 from litho_design.judging.photographs import PhotoSource, score_hologram_photo, score_lens_photo
 from litho_design.lenses.task import LensTask
 from litho_design.optics import Optics
-from litho_design.optimisation.stitching import Stitching, in_fields
+from litho_design.optimisation.stitching import Stitching
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer, PrinterRecord
 from litho_design.tasks.design import Design
@@ -133,13 +133,8 @@ def judge_design(
         height, record = loaded.printed_um(judge), judge.record()
         independent = record.sha256 != loaded.record.printer.sha256
         if stitch is not None:
-            pitch_um, side = loaded.record.layout.pitch_um, len(height)
-            drawn = [
-                in_fields(
-                    height, pitch_um, stitch.field_px(pitch_um), stitch.offsets_um(side, pitch_um, [seed])
-                )
-                for seed in range(DRAWS)
-            ]
+            pitch_um = loaded.record.layout.pitch_um
+            drawn = [stitch.drawn(height, pitch_um, [seed]) for seed in range(DRAWS)]
             scores.append(_stitched_score(loaded, record, independent, drawn, stitch))
             height = drawn[0]
         else:

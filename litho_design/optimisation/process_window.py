@@ -15,7 +15,7 @@ from litho_data.foundation.results import Record
 from litho_data.foundation.settings import leaves, setting
 from litho_design.optics import Optics, sampling_limit_um
 from litho_design.optimisation.roughness import Roughness
-from litho_design.optimisation.stitching import Stitching, in_fields
+from litho_design.optimisation.stitching import Stitching
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -115,8 +115,7 @@ class Draw:
         if sigma_px >= _NARROWEST_BLUR_PX:
             changed = _blur(changed, sigma_px)
         if self.stitch.sigma_um:
-            offsets_um = self.stitch.offsets_um(len(changed), pitch_um, list(self.stitch_seed))
-            changed = in_fields(changed, pitch_um, self.stitch.field_px(pitch_um), offsets_um)
+            changed = self.stitch.drawn(changed, pitch_um, list(self.stitch_seed))
         if not self.roughness.sigma_um:
             return changed
         shape = tuple(height_um.shape)

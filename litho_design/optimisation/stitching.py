@@ -34,6 +34,11 @@ class Stitching(Record):
         count = math.ceil(size_px / self.field_px(pitch_um))
         return self.sigma_um * np.random.default_rng(seed).standard_normal((count, count, 2))
 
+    def drawn(self, height_um: Tensor, pitch_um: float, seed: list[int]) -> Tensor:
+        """A print (size, size), µm, whose fields lie off their places as this seed draws them."""
+        offsets_um = self.offsets_um(len(height_um), pitch_um, seed)
+        return in_fields(height_um, pitch_um, self.field_px(pitch_um), offsets_um)
+
     def field_px(self, pitch_um: float) -> int:
         """Side of a field in pixels."""
         return max(1, round(self.field_um / pitch_um))
@@ -71,20 +76,14 @@ def in_fields(
         for step in np.ndindex(2, 2):
             weight = float(np.prod(np.where(step, share, 1 - share)))
             by = (whole + step).tolist()
-            low = [
-                min(max(edge[0] + d, 0), size)
+            spans = [
+                [min(max(end + d, 0), size) for end in edge]
                 for edge, d, size in zip((rows, columns), by, shape, strict=True)
             ]
-            high = [
-                max(min(edge[1] + d, size), 0)
-                for edge, d, size in zip((rows, columns), by, shape, strict=True)
-            ]
-            if weight == 0 or low[0] >= high[0] or low[1] >= high[1]:
+            if weight == 0 or any(low >= high for low, high in spans):
                 continue
-            to, of = (
-                tuple(slice(a - d, b - d) for a, b, d in zip(low, high, moved, strict=True))
-                for moved in ((0, 0), by)
-            )
+            to = tuple(slice(low, high) for low, high in spans)
+            of = tuple(slice(low - d, high - d) for (low, high), d in zip(spans, by, strict=True))
             summed[to] += weight * height_um[of]
             covered[to] += weight
     return summed / covered.clamp(min=1)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from litho_data.foundation.report import Page
+from litho_data.foundation.report import Page, capitalised
 from litho_data.foundation.report_pictures import new_figure
 from litho_design.holograms.task import HologramTask
 from litho_design.lenses.task import LensTask
@@ -58,7 +58,7 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
     )
     if design.baselines:
         line = baseline_line(design.baselines)
-        page.paragraph(f"{line[0].upper()}{line[1:]}.")
+        page.paragraph(f"{capitalised(line)}.")
     add_notes(page, design)
     page.figure(
         _pictures(folder, design, task, levels, height_um, seen),

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from litho_data.foundation.report import Page
+from litho_data.foundation.report import Page, capitalised
 from litho_data.foundation.report_pictures import new_figure
 from litho_design.judging.gap import GapResult, design_folder
 from litho_design.judging.loaded import LoadedDesign
@@ -43,7 +43,7 @@ def write_first_report(folder: Path, result: GapResult, printers: Mapping[str, P
         f"{DESIGNER} expects of its own design; {JUDGE}, a model that had no part in it, finds it "
         f"{abs(judged):.1f} dB {doubt}. One hologram, so nothing is said about chance."
     )
-    page.note(*(note[0].upper() + note[1:] + "." for note in designs[WITHOUT].record.notes))
+    page.note(*(f"{capitalised(note)}." for note in designs[WITHOUT].record.notes))
     page.figure(
         draw_images(designs, printers[DESIGNER], scores),
         "Left: the wanted image. Middle and right: what the printed holograms would show, at matched scale.",

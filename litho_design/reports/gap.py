@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.foundation.report import Page
+from litho_data.foundation.report import Page, capitalised
 from litho_data.foundation.report_pictures import model_colour, new_figure
 from litho_design.holograms.bench import HologramScore
 from litho_design.judging.gap import GapResult, PairedDifference, design_folder, headline
@@ -33,7 +33,7 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
     shown = headline(result.task)
     page = Page(
         "The design-to-manufacturing gap",
-        f"{what[0].upper()}{what[1:]}: {len(result.arms)} arms, seeds {', '.join(map(str, result.seeds))}, "
+        f"{capitalised(what)}: {len(result.arms)} arms, seeds {', '.join(map(str, result.seeds))}, "
         f"{result.settings.search.iterations} iterations each; layouts are scored as they would be printed.",
         run=result,
         facts={"seeds": ", ".join(map(str, result.seeds))}
@@ -43,7 +43,7 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
     own = Design.read(design_folder(folder, next(iter(result.arms)), result.seeds[0]))
     shown = shown or tuple(own.predicted)
     page.verdict(_verdict(result, shown[0]))
-    page.note(*(note[0].upper() + note[1:] + "." for note in own.notes))
+    page.note(*(f"{capitalised(note)}." for note in own.notes))
     judged = _judged(folder, result, printers)
     page.figure(
         _pictures(result, judged),
@@ -60,7 +60,7 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
     page.table(_matrix(result, shown[0]), _caption(shown[0]), f"matrix_{shown[0]}.csv", digits=3)
     if own.baselines:
         line = baseline_line(own.baselines)
-        page.paragraph(f"{line[0].upper()}{line[1:]}. No printer is involved in these.")
+        page.paragraph(f"{capitalised(line)}. No printer is involved in these.")
     page.heading("Further figures", folded=True)
     for figure in shown[1:]:
         page.table(_matrix(result, figure), _caption(figure), f"matrix_{figure}.csv", digits=3)

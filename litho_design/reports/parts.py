@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from litho_data.foundation.report import Page
+from litho_data.foundation.report import Page, capitalised
 from litho_data.foundation.report_pictures import new_figure
 from litho_data.foundation.results import Record
 from litho_design.optimisation.process_window import ProcessWindow, Yield, spreads
@@ -29,7 +29,7 @@ BRIGHTEST = 1.5
 def add_notes(page: Page, design: Design) -> None:
     """The remarks of the record, and where layout or element lie beyond what the scores can tell."""
     notes = filter(None, (distribution_warning(design), thickness_warning(design), *design.notes))
-    page.note(*(note[0].upper() + note[1:] + "." for note in notes))
+    page.note(*(f"{capitalised(note)}." for note in notes))
 
 
 def identity(design: Design) -> dict[str, object]:

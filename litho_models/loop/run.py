@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -180,23 +180,15 @@ def _rounding_um(store: Store, scans: Sequence[PrintedScan]) -> dict[str, float]
         return None
 
 
-@dataclass(frozen=True)
-class _Training:
-    """Trains the base model of a fold, in whatever process it is called."""
-
-    base: str
-    settings: TrainingConfig
-    cache: Path
-
-    def __call__(self, scans: Sequence[PrintedScan]) -> nn.Module:
-        return fit_in_cache(self.base, scans, self.settings, self.cache).model
+def _trained(base: str, settings: TrainingConfig, cache: Path, scans: Sequence[PrintedScan]) -> nn.Module:
+    return fit_in_cache(base, scans, settings, cache).model
 
 
 def _trainer(base: str, config: LoopConfig, steps: int | None, cache: Path) -> Trainer:
     given: dict[str, Any] = {} if steps is None else {"steps": steps}
     given |= {"seed": config.seed, "weights": config.weights}
     settings = TrainingConfig.of_recipe("fast", base, **given)
-    return _Training(base, settings, cache)
+    return partial(_trained, base, settings, cache)
 
 
 def _base_model(base: str, store: Store) -> tuple[Simulator, str]:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from litho_data.foundation.report import capitalised
 from litho_models.monitoring.change_point import SOON
 from litho_models.monitoring.prints import FIGURES, Figure, in_order
 from litho_models.monitoring.result import FigureCheck
@@ -72,7 +73,7 @@ def _quiet_text(check: FigureCheck) -> str:
     low, high = (100 * end for end in check.spread_ci95)
     words = figure_of(check).words
     return (
-        f"{words[0].upper()}{words[1:]}: no change; unchanged prints differ by {100 * check.spread:.1f} % "
+        f"{capitalised(words)}: no change; unchanged prints differ by {100 * check.spread:.1f} % "
         f"(95 %: {low:.1f} to {high:.1f} %), {seen}."
     )
 

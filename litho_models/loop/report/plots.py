@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,7 +30,7 @@ _TABLES = {
     "axis-slope-table": "steepness along the axis (µm/µm)",
     "diagonal-slope-table": "steepness along the diagonal (µm/µm)",
 }
-_BEFORE, _AFTER = "#9aa5b1", "#2f7fd0"
+_BEFORE, _AFTER, _SECOND = "#9aa5b1", "#2f7fd0", "#c05621"
 
 
 def staircase_figure(frame: pd.DataFrame) -> Figure:
@@ -113,11 +113,15 @@ def probe_figure(entry: AddedProbe) -> Figure:
     if probe.name in _TABLES:
         return _table_figure(entry)
     if "-shift-" in probe.name:
-        return _shift_figure(probe.name, common)
+        parts = dict(zip(("along y", "along x"), shifts(common), strict=True))
+        if probe.name.endswith("profile"):
+            lines = {axis: drawn_profile(one) for axis, one in parts.items()}
+            return _profile_figure(probe.name, lines, "displaced (µm)")
+        return _arrows_figure(*(drawn(one, _ARROWS) for one in parts.values()))
     unit = "relative height" if "-gain-" in probe.name else "nm"
     scale = 1.0 if unit == "relative height" else NM_PER_UM
     if probe.name.endswith("profile"):
-        return _profile_figure(drawn_profile(common) * scale, probe.name.partition("-")[0], unit)
+        return _profile_figure(probe.name, {"": drawn_profile(common) * scale}, unit)
     return _image(drawn(common) * scale, (1.0, 1.0), unit, 1.0)
 
 
@@ -127,7 +131,7 @@ def _copy_figure(probe: DisplacedCopy, common: np.ndarray) -> Figure:
     axes = figure.subplots()
     y, x = probe.places_um.T
     points = axes.scatter(x, y, c=probe.gain_nm2(), s=6, cmap="viridis")
-    axes.plot(common[1], common[0], "o", mfc="none", mec="#c05621", ms=14)
+    axes.plot(common[1], common[0], "o", mfc="none", mec=_SECOND, ms=14)
     figure.colorbar(points, ax=axes, label="gain of one copy (nm²)")
     axes.set_aspect("equal")
     axes.invert_yaxis()
@@ -162,7 +166,7 @@ def _table_figure(entry: AddedProbe) -> Figure:
     axes = figure.subplots()
     axes.axhline(0, color=LIGHT["ink"], lw=0.6)
     for colour, (covariate, table) in zip(
-        (_AFTER, "#c05621"), values.groupby("covariate", sort=False), strict=False
+        (_AFTER, _SECOND), values.groupby("covariate", sort=False), strict=False
     ):
         errors = np.abs(table[["low", "high"]].to_numpy().T - table["height"].to_numpy())
         label = str(covariate).replace("_", " ")
@@ -175,34 +179,27 @@ def _table_figure(entry: AddedProbe) -> Figure:
     return figure
 
 
-def _profile_figure(values: np.ndarray, along: str, unit: str) -> Figure:
+def _profile_figure(name: str, lines: Mapping[str, np.ndarray], unit: str) -> Figure:
+    """Profiles over the rows or the columns, by their labels."""
     figure = new_figure(6, 3)
     axes = figure.subplots()
     axes.axhline(0, color=LIGHT["ink"], lw=0.6)
-    axes.plot(np.linspace(0, 1, len(values)), values, color=_AFTER)
-    axes.set(xlabel=f"{along}s, from the first to the last", ylabel=unit)
+    for (label, values), colour in zip(lines.items(), (_AFTER, _SECOND), strict=False):
+        axes.plot(np.linspace(0, 1, len(values)), values, color=colour, label=label)
+    if len(lines) > 1:
+        axes.legend(frameon=False)
+    axes.set(xlabel=f"{name.partition('-')[0]}s, from the first to the last", ylabel=unit)
     axes.spines[["top", "right"]].set_visible(False)
     return figure
 
 
-def _shift_figure(name: str, common: np.ndarray) -> Figure:
-    """Where the print lies: arrows over the scan, or one line for each axis."""
-    along_y, along_x = shifts(common)
+def _arrows_figure(y_um: np.ndarray, x_um: np.ndarray) -> Figure:
+    """Where the print lies off its place, over the scan."""
     figure = new_figure(5, 4)
     axes = figure.subplots()
-    if name.endswith("profile"):
-        axes.axhline(0, color=LIGHT["ink"], lw=0.6)
-        for axis, one, colour in (("y", along_y, _AFTER), ("x", along_x, "#c05621")):
-            values = drawn_profile(one)
-            axes.plot(np.linspace(0, 1, len(values)), values, color=colour, label=f"along {axis}")
-        axes.legend(frameon=False)
-        axes.set(xlabel=f"{name.partition('-')[0]}s, from the first to the last", ylabel="displaced (µm)")
-        axes.spines[["top", "right"]].set_visible(False)
-        return figure
-    y, x = (drawn(one, _ARROWS) for one in (along_y, along_x))
-    at = np.linspace(-1, 1, _ARROWS)
-    longest_um = float(np.hypot(y, x).max())
-    arrows = axes.quiver(at, at, x, y, angles="xy", color=_AFTER)
+    at = np.linspace(-1, 1, len(y_um))
+    longest_um = float(np.hypot(y_um, x_um).max())
+    arrows = axes.quiver(at, at, x_um, y_um, angles="xy", color=_AFTER)
     axes.quiverkey(arrows, 0.8, 1.04, longest_um, f"{longest_um:.2f} µm", labelpos="E")
     axes.set_aspect("equal")
     axes.invert_yaxis()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from litho_data.foundation.report import capitalised
 from litho_models.effects import get_effect
 from litho_models.frozen.readme import bounds_text
 from litho_models.loop.findings import LoopFindings
@@ -100,14 +101,10 @@ def headline_words(result: CloseLoop) -> str:
         left = result.verdict == "unexplained"
         missing = "although something with structure is left" if left else "or needed"
         return f"Nothing was found to add, {missing}: the held-out error stays at {before:.2f} nm."
-    named = [e for e in result.effects if e.verdict != "traced-to-covariate"]
-    own = [e for e in named if get_effect(e.name).per_scan]
-    lacking = ", ".join(get_effect(e.name).title for e in named if e not in own)
-    base, generic = (
-        f"{result.base_model[:1].upper()}{result.base_model[1:]}",
-        len(result.effects) - len(named),
-    )
-    terms = f"{generic} generic {'terms' if generic > 1 else 'term'}"
+    causes, own, generic = _by_kind(result)
+    lacking = ", ".join(get_effect(e.name).title for e in causes)
+    base = capitalised(result.base_model)
+    terms = f"{len(generic)} generic {'terms' if len(generic) > 1 else 'term'}"
     if lacking:
         text = f"{base} lacks {lacking}. " + (f"Beside it {terms} without a name. " if generic else "")
     else:
@@ -128,12 +125,17 @@ def headline_words(result: CloseLoop) -> str:
     return f"{text}, {sure} (p = {over.p:.2g} over {over.count} {unit})."
 
 
+def _by_kind(result: CloseLoop) -> tuple[list[AddedEffect], list[AddedEffect], list[AddedEffect]]:
+    """Named causes, what single scans add, and generic terms."""
+    generic = [e for e in result.effects if e.verdict == "traced-to-covariate"]
+    named = [e for e in result.effects if e.verdict != "traced-to-covariate"]
+    own = [e for e in named if get_effect(e.name).per_scan]
+    return [e for e in named if not get_effect(e.name).per_scan], own, generic
+
+
 def plain_words(findings: LoopFindings, result: CloseLoop) -> list[str]:
     """What was found, point by point, for a process engineer."""
-    traced = [e for e in result.effects if e.verdict == "traced-to-covariate"]
-    named = [e for e in result.effects if e.verdict != "traced-to-covariate"]
-    scan_terms = [e for e in named if get_effect(e.name).per_scan]
-    causes = [e for e in named if not get_effect(e.name).per_scan]
+    causes, scan_terms, traced = _by_kind(result)
     total = len(findings.development)
     parts = [
         f"On {total} scans, each predicted by a fit that has not seen it, the model is wrong by "
@@ -154,7 +156,7 @@ def plain_words(findings: LoopFindings, result: CloseLoop) -> list[str]:
         title = get_effect(e.name).title
         alike = f" (or {', '.join(e.confusable_with)}: these data cannot tell)" if e.confusable_with else ""
         parts.append(
-            f"{title[:1].upper()}{title[1:]} [{e.name}]{alike}: {_estimate_text(e)}; with it the "
+            f"{capitalised(title)} [{e.name}]{alike}: {_estimate_text(e)}; with it the "
             f"held-out error falls from {e.before_nm:.2f} to {e.after_nm:.2f} nm, in "
             f"{e.scans_improved[0]} of "
             f"{e.scans_improved[1]} scans."
