@@ -1,20 +1,20 @@
 """Two rounds on the virtual fab: a loop, the prints that it asks for, and what they decide.
 
-    python -m benchmarks.two_rounds --out runs/two-rounds [--trials 48] [--seed 20271] [--publish]
+    python -m benchmarks.two_rounds --out runs/two-rounds [--trials 48] [--seed 20271] [--knobs …] [--publish]
 
 Each trial plants one knob, of a size between 12 and 30 nm rms, in a fab of its own; what is planted is drawn
 from the seed before anything is run. The first round is a loop on 14 scans of random layouts. Its open
 questions are planned for and printed in the same fab, four prints, and as many prints with random layouts
 are scanned in the same ways as a control. An answer is right if only the planted cause is left, and as the
-one whose it is. A trial whose first round leaves no question that scans can decide is counted apart. An
-interrupted run resumes.
+one whose it is. A trial whose first round leaves no question that scans can decide is counted apart. Every
+seed has a result file and a table of its own. An interrupted run resumes.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,6 +26,7 @@ from benchmarks.markdown_table import markdown_table
 from benchmarks.record import conclude, origin, write_record
 from litho_data.build.build import build_dataset
 from litho_data.foundation.commands import run_script
+from litho_data.foundation.errors import InputError
 from litho_data.store import open_store
 from litho_data.virtual_fab import KNOBS, simulate, simulate_plan, strength_for_rms
 from litho_models.fitting.runs import level_share
@@ -44,7 +45,7 @@ from litho_models.planning.record import PlannedQuestion
 from litho_models.planning.run import next_print
 
 PAGE = Path(__file__).parents[1] / "docs" / "next_print.md"
-RESULT = PAGE.parent / "results" / "two-rounds" / "two_rounds.json"
+RESULTS = PAGE.parent / "results" / "two-rounds"
 DEALT = (
     "slope-thinning-x",
     "feedback-lag",
@@ -72,31 +73,38 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of the trials")
     parser.add_argument("--trials", type=int, default=48)
     parser.add_argument("--seed", type=int, default=20271, help="of everything that is drawn")
+    parser.add_argument("--knobs", nargs="+", choices=DEALT, default=DEALT, help="what is planted, in turn")
     parser.add_argument("--size", type=int, default=192, help="side of a layout, pixels")
     parser.add_argument("--publish", action="store_true", help="write the figures into the page")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     trials = []
-    for draw in draws(arguments.trials, arguments.seed):
+    for draw in draws(arguments.trials, arguments.seed, arguments.knobs):
         folder = arguments.out / f"{draw['number']:02d}"
         kept = folder / "trial.json"
         if not kept.is_file():
             write_record(kept, run_trial(draw, folder, arguments.size, print))
         trials.append(json.loads(kept.read_text(encoding="utf-8")))
+        if not draw.items() <= trials[-1].items():
+            raise InputError(
+                f"trial {draw['number']} in {arguments.out}",
+                got=f"{trials[-1]['knob']}, seed {trials[-1]['seed']}",
+                wanted=f"{draw['knob']}, seed {draw['seed']}",
+                hint="give another --out",
+            )
         print(line_of(trials[-1]), flush=True)
     record = {**origin(), "seed": arguments.seed, "size_px": arguments.size, "trials": trials}
-    out = RESULT if arguments.publish else arguments.out / RESULT.name
-    out.parent.mkdir(parents=True, exist_ok=True)
-    conclude(record, summary(trials), out, PAGE, RESULT.name, published=arguments.publish)
+    out = (RESULTS if arguments.publish else arguments.out) / f"{arguments.seed}.json"
+    conclude(record, summary(trials), out, PAGE, f"two-rounds-{arguments.seed}", published=arguments.publish)
 
 
-def draws(count: int, seed: int) -> list[dict[str, Any]]:
+def draws(count: int, seed: int, knobs: Sequence[str] = DEALT) -> list[dict[str, Any]]:
     """What is planted in each trial: knobs dealt in turn, sizes log-uniform, a seed of its own."""
     random = np.random.default_rng([seed, 17])
     return [
         {
             "number": number,
-            "knob": DEALT[number % len(DEALT)],
+            "knob": knobs[number % len(knobs)],
             "rms_nm": float(np.exp(random.uniform(*np.log(RMS_NM)))),
             "seed": int(random.integers(1, 2**20)),
         }
@@ -235,7 +243,7 @@ def summary(trials: list[dict[str, Any]]) -> str:
 
 def _by_knob(trials: list[dict[str, Any]]) -> str:
     told = []
-    for knob in DEALT:
+    for knob in dict.fromkeys(trial["knob"] for trial in trials):
         every = [one for t in trials if t["knob"] == knob for one in t["answers"].get("optimised", [])]
         asked = [one for one in every if one["counts"]]
         told.append(f"`{knob}` {sum(one['right'] for one in asked)} of {len(asked)}")

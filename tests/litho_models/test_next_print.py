@@ -445,6 +445,10 @@ def test_what_is_planted_is_drawn_before_anything_is_run_and_judged_by_its_owner
     assert drawn != two_rounds.draws(24, 2)
     assert all(12 <= one["rms_nm"] <= 30 for one in drawn)
     assert {one["knob"] for one in drawn} == set(two_rounds.DEALT)
+    assert [one["knob"] for one in two_rounds.draws(3, 1, ["galvo-lag", "tip-dilation"])][1:] == [
+        "tip-dilation",
+        "galvo-lag",
+    ]
     answer = {
         "question": "slope-thinning",
         "kind": "role",
