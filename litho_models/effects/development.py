@@ -27,13 +27,20 @@ def dose_dependent_shrinkage(height: Tensor, values: Values, context: FieldConte
 
 
 def lateral_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H(x + s ((H - mean) / full) (x - xc)): tops pull in towards the centre of the field, more than bases.
+    """H(r + s H(r) / full r), r from the centre of the field: tops pull in, more than bases.
 
-    What the mean height pulls is a magnification, which registration has taken out of a scan.
+    What the mean height pulls is a magnification, which registration has taken out of a scan: what it shows
+    at x is what lies at r = x / (1 + s mean / full).
     """
-    y, x = context.centred_um()
-    pull = values["fraction"] * (height[0, 0] - height.mean()) / context.full_height_um
-    return add_warp(height, pull * y, pull * x, context.pitch_um)
+    places = context.centred_um()
+    share = values["fraction"] / context.full_height_um
+    raw = 1 / (1 + share * height.mean())
+
+    def looked_up(scale: Tensor) -> Tensor:
+        shift_y, shift_x = ((scale - 1) * place for place in places)
+        return add_warp(height, shift_y, shift_x, context.pitch_um)
+
+    return looked_up(raw * (1 + share * looked_up(raw)[0, 0]))
 
 
 def feature_collapse(height: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -47,11 +54,26 @@ def trench_residue(height: Tensor, values: Values, context: FieldContext) -> Ten
 
 
 def _closing(height: Tensor, width_um: Tensor, context: FieldContext) -> Tensor:
-    """Closing by a square: whatever is narrower and lower than its surroundings is filled."""
-    half = max(1, math.floor(float(width_um.detach()) / context.pitch_um / 2 + 0.5))
-    size = 2 * half + 1
-    dilated = functional.max_pool2d(functional.pad(height, (half,) * 4, mode="replicate"), size, stride=1)
-    return -functional.max_pool2d(functional.pad(-dilated, (half,) * 4, mode="replicate"), size, stride=1)
+    """Closing by a square: whatever is narrower and lower than its surroundings is filled.
+
+    A square is an odd number of pixels wide; between two of them the closing is interpolated.
+    """
+    half_px = (width_um / context.pitch_um / 2).clamp(min=1)
+    below = math.floor(float(half_px.detach()))
+    closed = _closed_by(height, below)
+    return closed + (half_px - below) * (_closed_by(height, below + 1) - closed)
+
+
+def _closed_by(height: Tensor, half_px: int) -> Tensor:
+    """Closing by a square of 2 half_px + 1 pixels; the field goes on beyond its edge."""
+    padded = functional.pad(height, (2 * half_px,) * 4, mode="replicate")
+    return -_largest(-_largest(padded, half_px), half_px)
+
+
+def _largest(field: Tensor, half_px: int) -> Tensor:
+    """The largest value in a square around each pixel that has all of it, one axis after the other."""
+    size = 2 * half_px + 1
+    return functional.max_pool2d(functional.max_pool2d(field, (size, 1), stride=1), (1, size), stride=1)
 
 
 def slope_thinning(height: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -62,7 +84,7 @@ def slope_thinning(height: Tensor, values: Values, context: FieldContext) -> Ten
 
 _OF_NARROW = {
     "fraction": Parameter("1", 0.0, 0.9, 0.1),
-    "width_um": Parameter("µm", 0.2, 3.0, 0.6, kind="choice"),
+    "width_um": Parameter("µm", 0.2, 3.0, 0.5, kind="shape"),
 }
 _NARROW = tuple({"fraction": 0.1, "width_um": width} for width in (0.4, 0.8, 1.4))
 

@@ -44,13 +44,13 @@ def registration_residual(height: Tensor, values: Values, context: FieldContext)
 
 
 def piezo_nonlinearity(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H(x + c x (1 - x/L)): the scanner's x axis runs fast in the middle of a line."""
+    """H(x + c L / 4 (1/3 - u²)), u from -1 to 1 over the scan: its x axis runs fast in the middle of a line.
+
+    That is c x (1 - x / L) without its mean, which registration has taken out of a scan.
+    """
     y, x = context.scan_position()
-    length = context.whole_shape()[1] * context.pitch_um
-    from_left = (x + 1) / 2 * length
-    return add_warp(
-        height, 0 * y, values["strength"] * from_left * (1 - from_left / length), context.pitch_um
-    )
+    length_um = context.whole_shape()[1] * context.pitch_um
+    return add_warp(height, 0 * y, values["strength"] * length_um / 4 * (1 / 3 - x**2), context.pitch_um)
 
 
 def resampling_blur(height: Tensor, values: Values, context: FieldContext) -> Tensor:

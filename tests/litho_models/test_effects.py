@@ -303,6 +303,29 @@ def test_only_what_is_narrow_is_filled_or_lost(name: str, sign: float) -> None:
     assert torch.equal(changed[pits == 1], pits[pits == 1])
 
 
+@pytest.mark.parametrize(("width_um", "share"), [(0.6, 0.0), (0.65, 0.25), (0.7, 0.5), (0.8, 1.0)])
+def test_a_width_between_two_squares_fills_in_part(width_um: float, share: float) -> None:
+    """A pit of 7 pixels is left by a square of 7, filled by one of 9, whose half width is 0.4 µm."""
+    pit = torch.ones(1, 1, 40, 40, dtype=torch.float64)
+    pit[..., 16:23] = 0
+    values = {"fraction": 1.0, "width_um": width_um}
+    filled = get_effect("trench-residue")(pit, values, FieldContext(pit, PITCH_UM, 1.2))
+    # Widths are float32.
+    assert float(filled[0, 0, 20, 19]) == pytest.approx(share, abs=1e-5)
+
+
+def test_a_field_goes_on_beyond_its_edge_for_what_is_narrow_too() -> None:
+    """A part of a surface that is constant outwards is closed as the whole is."""
+    part = torch.rand(1, 1, 40, 50, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    whole = torch.nn.functional.pad(part, (20,) * 4, mode="replicate")
+    values = {"fraction": 1.0, "width_um": 0.9}
+    closed, of_whole = (
+        get_effect("trench-residue")(field, values, FieldContext(field, PITCH_UM, 1.2))
+        for field in (part, whole)
+    )
+    assert torch.equal(closed, of_whole[..., 20:-20, 20:-20])
+
+
 def test_stripes_follow_the_scan_lines_with_the_stated_spread() -> None:
     flat = torch.zeros(1, 1, 2000, 4, dtype=torch.float64)
     striped = get_effect("scan-line-stripes")(
