@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import shutil
 import sys
@@ -15,7 +16,7 @@ from typing import Any
 from litho_data.build.assemble import Source, assemble, records_of_use
 from litho_data.build.calibration import measure_scales, standards_of
 from litho_data.build.day_tip import with_tip_found
-from litho_data.build.jobs import FieldJob, Job, Skipped, attempt, field_jobs
+from litho_data.build.jobs import FieldJob, Job, Skipped, field_jobs, finish
 from litho_data.build.operations import UNREGISTERED, load_recipe
 from litho_data.build.report import write_report
 from litho_data.build.result import BuildResult, LeftOut, report_folder
@@ -115,15 +116,15 @@ def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bo
             for scan_id, reason in skipped.items():
                 _report_skipped(scan_id, reason)
             todo = [job for job in source.jobs if job.id not in records]
-            finished = run_jobs(attempt, todo, workers, name=lambda job: job.id)
-            for _, outcome in progress(finished, f"building {source.card.name}", total=len(todo)):
+            making = functools.partial(finish, unfinished=partial)
+            finished = run_jobs(making, todo, workers, name=lambda job: job.id)
+            for job, outcome in progress(finished, f"building {source.card.name}", total=len(todo)):
                 if isinstance(outcome, Skipped):
                     # Recorded names: the manifest must not depend on where the raw files lie.
                     skipped[outcome.id] = outcome.reason.replace(f"{source.data_dir}{os.sep}", "")
                     _report_skipped(outcome.id, skipped[outcome.id])
                 else:
-                    partial.add(root, outcome)
-                    records[outcome.record["id"]] = dict(outcome.record)
+                    records[job.id] = dict(outcome)
         except InputError:
             # Of the cluster: finished scans stay for the next run.
             if not records:

@@ -21,7 +21,7 @@ from litho_data.cards.listing import Listing, PrintedField
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256, record_sha256
 from litho_data.foundation.run_facts import software_record
-from litho_data.store.partial import Piece
+from litho_data.store.partial import PartialStore, Piece
 
 
 class Job(Protocol):
@@ -46,12 +46,17 @@ class Skipped:
     reason: str
 
 
-def attempt(job: Job) -> Piece | Skipped:
-    """Run a job; bad input becomes a reason for skipping, so one bad file never stops a build."""
+def finish(job: Job, unfinished: PartialStore) -> Mapping[str, Any] | Skipped:
+    """Run a job and keep its piece, whose record is returned: arrays stay where they are made.
+
+    Bad input becomes a reason for skipping, so one bad file never stops a build.
+    """
     try:
-        return job.run()
+        piece = job.run()
     except InputError as error:
         return Skipped(job.id, str(error))
+    unfinished.add(piece)
+    return piece.record
 
 
 @dataclass(frozen=True)

@@ -70,7 +70,10 @@ class PartialStore:
             for child in self.store.iterdir():
                 if child.name != "scans":
                     shutil.rmtree(child) if child.is_dir() else child.unlink()
-        return zarr.open_group(self.store, mode="a", zarr_format=3)
+        root = zarr.open_group(self.store, mode="a", zarr_format=3)
+        # Several processes add to it.
+        root.require_group("scans")
+        return root
 
     def finished(self, root: zarr.Group, keys: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         """Records of the scans that need not be computed again.
@@ -92,9 +95,12 @@ class PartialStore:
                 shutil.rmtree(path)
         return records
 
-    def add(self, root: zarr.Group, piece: Piece) -> None:
-        """Keep one finished scan; its record is written last."""
+    def add(self, piece: Piece) -> None:
+        """Keep one finished scan, in any process; its record is written last."""
+        import zarr
+
         scan_id = piece.record["id"]
+        root = zarr.open_group(self.store, mode="r+")
         write_scan_group(root, scan_id, piece.arrays, {"use": piece.record["use"]})
         samples = {v.name: piece.arrays[v.name] for v in LAYOUT_VARIABLES if v.name in piece.arrays}
         with atomic_file(self._pieces / f"{scan_id}.npz") as temporary, open(temporary, "wb") as stream:

@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
@@ -21,7 +22,6 @@ from litho_data.foundation.sending import Known
 from litho_data.foundation.workers import Workers, run_jobs
 from litho_data.store import open_store
 from litho_data.store.again import StoredScans
-from litho_data.store.partial import PartialStore
 from litho_design import hologram_settings
 from litho_design.judging.gap import design_folder
 from litho_design.tasks.design import Design
@@ -91,17 +91,17 @@ def test_a_build_that_loses_a_worker_has_the_same_hash(address: str, tmp_path: P
     card = write_campaign(tmp_path, count=4)
     alone = build_dataset(card, tmp_path / "alone.zarr")
     killed: list[int] = []
-    add = PartialStore.add
 
-    def add_and_kill(store: PartialStore, *given: object) -> None:
-        add(store, *given)
-        if not killed:
-            with distributed.Client(address, set_as_default=False) as client:
-                killed.append(client.run(os.getpid).popitem()[1])
-            os.kill(killed[0], signal.SIGKILL)
+    def and_kill(*given: Any, **named: Any) -> Iterator[Any]:
+        for one in run_jobs(*given, **named):
+            if not killed:
+                with distributed.Client(address, set_as_default=False) as client:
+                    killed.append(client.run(os.getpid).popitem()[1])
+                os.kill(killed[0], signal.SIGKILL)
+            yield one
 
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(PartialStore, "add", add_and_kill)
+        patched.setattr("litho_data.build.build.run_jobs", and_kill)
         patched.setattr("litho_data.build.build.write_report", lambda *_: None)
         result = build_dataset(card, tmp_path / "prints.zarr", dask=address)
     assert killed
