@@ -68,9 +68,9 @@ def write_report(result: BuildResult, store_path: Path, folder: Path) -> Path:
         facts={"dataset": store.sha256},
     )
     _summary(page, result, store)
+    _pictures(page, store)
     _left_out(page, result)
     _warnings(page, store.quality)
-    _pictures(page, store)
     _quality(page, store.quality)
     result.write(folder)
     with atomic_file(folder / "quality.csv") as temporary:
@@ -86,7 +86,7 @@ def _summary(page: Page, result: BuildResult, store: Store) -> None:
         tiles.append((f"{quality['ncc_after'].median():.3f}", "median correlation of height and layout"))
     if "tre_median_nm" in quality:
         tiles.append((f"{quality['tre_median_nm'].median():.0f} nm", "median held-out registration error"))
-    tiles += [(str(len(result.skipped)), "scans skipped"), (f"{result.seconds:.1f} s", "time of the build")]
+    tiles.append((f"{result.seconds:.1f} s", "time of the build"))
     page.tiles(tiles)
     page.paragraph(
         f"Pitch {store.pitch_um} µm, level height {store.level_height_um} µm, {store.levels} levels. "
@@ -100,7 +100,9 @@ def _summary(page: Page, result: BuildResult, store: Store) -> None:
 def _verdict(result: BuildResult, quality: pd.DataFrame) -> str:
     left = len(result.skipped) + len(result.unpaired)
     stored = f"All {result.n_scans} scans are" if not left else f"{result.n_scans} scans are"
-    text = f"{stored} in the store" + (f", {left} ids are not" if left else "")
+    parts = {"refused": len(result.skipped), "half of a pair": len(result.unpaired)}
+    why = ", ".join(f"{count} {reason}" for reason, count in parts.items() if count)
+    text = f"{stored} in the store" + (f"; {left} ids are not ({why})" if left else "")
     warned = int(quality["warning"].astype(bool).sum()) if "warning" in quality else 0
     return text + (f"; {warned} passed with a warning." if warned else ", and none has a warning.")
 

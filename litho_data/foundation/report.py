@@ -213,6 +213,9 @@ def spelt_out(key: str) -> str:
     head, _, more = key.partition(" ")
     if more and "_" in head:
         return f"{spelt_out(head)}, {more}"
+    head, between, more = key.partition("_sd_between_")
+    if between:
+        return f"{spelt_out(head)}, standard deviation between {more}"
     words, unit = key, ""
     for suffix, text in _UNITS.items():
         if key.endswith(f"_{suffix}"):

@@ -160,7 +160,9 @@ def _unfold_words(figure: Figure, shown: list[Axes], columns: int) -> float:
         axes.set_title(textwrap.fill(axes.get_title(), letters), fontsize=9)
         extra += (0.2 + 0.15 * axes.get_title().count("\n")) / columns if axes.get_title() else 0.0
         label = axes.get_ylabel() or (label if axes.get_shared_y_axes().get_siblings(axes)[1:] else "")
-        axes.set(ylabel=textwrap.fill(label, 40), xlabel=textwrap.fill(axes.get_xlabel(), letters - 10))
+        names = max((len(text.get_text()) for text in axes.get_yticklabels()), default=0)
+        room = max(14, letters - max(10, names))
+        axes.set(ylabel=textwrap.fill(label, 40), xlabel=textwrap.fill(axes.get_xlabel(), room))
         if axes.xaxis.get_visible() and len(axes.get_xticks()):
             axes.tick_params(labelbottom=True, labelleft=True)
         if (old := axes.get_legend()) is not None and len(old.get_texts()) > 3:

@@ -40,10 +40,10 @@ def write_noise_report(result: NoiseAnalysis, references: Sequence[Reference], o
             f"Repeated prints ({result.repeats.scans}): σ {result.repeats.sigma_nm:.2f} nm "
             f"({interval_text(result.repeats.ci95_nm)}), half the variance of a pair's difference."
         )
-    if result.budget is not None:
-        _budget(page, result.budget)
     if result.spread is not None:
         _spread(page, result.spread)
+    if result.budget is not None:
+        _budget(page, result.budget)
     return page.write(out)
 
 
@@ -157,7 +157,11 @@ def _spread(page: Page, found: SpreadAnalysis) -> None:
             "member freed of its mean). The fitted σ already holds the error that this disagreement is "
             "part of; the row with it added shows whether it helps."
         )
-    page.figure(plots.calibration(found), "Calibration on scans left out.")
+    page.figure(
+        plots.calibration(found),
+        "Scans left out. First: how many pixels lie inside the 90 % interval that was predicted for them. "
+        "Second: where among the predicted heights the measured ones fall; flat if σ is right.",
+    )
     page.heading(f"What the uncertainty of {found.model} depends on", folded=True)
     page.figure(plots.spread(found), "Spread against level, slope, distance to the next edge, and radius.")
     rows = [

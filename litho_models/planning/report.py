@@ -13,6 +13,7 @@ from litho_data.foundation.report import Page, capitalised
 from litho_data.foundation.report_pictures import new_figure
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.layouts.statistics_report import layouts_figure
+from litho_models.effects import CATALOGUE
 from litho_models.planning.power import ENOUGH
 from litho_models.planning.record import NextPrint, PlannedQuestion
 from litho_models.planning.rivalry import PlannedPrint, Rivalry
@@ -21,6 +22,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _SHOWN_LAYOUTS = 4
+_WORDS = {
+    "asked": ("asked", ""),
+    "power": ("power", f"chance that these prints give the right answer; {ENOUGH} or more decides"),
+    "random_power": ("with random layouts", "the same, scanned alike, on random layouts"),
+    "prints_needed": ("prints needed", f"for a power of {ENOUGH}"),
+    "difference_nm": ("difference (nm)", "between the two nearest answers, root mean square over the prints"),
+    "noise_nm": ("noise (nm)", "along that difference, for one pixel; large where neighbours are alike"),
+}
 
 
 def write_report(
@@ -36,12 +45,12 @@ def write_report(
         f"{plan.prints} prints of {plan.field_um:g} µm in {len(plan.scans)} scans, three of them references.",
         run=plan.run,
         facts={"dataset": plan.dataset.sha256},
+        words=_WORDS,
     )
-    decided = [q for q in plan.questions if q.status == "decides"]
-    names = ": " + ", ".join(q.name for q in decided) if decided else ""
+    decided = [_asked(q) for q in plan.questions if q.status == "decides"]
     page.verdict(
-        f"These prints decide {len(decided)} of {len(plan.questions)} open questions with a power of "
-        f"{ENOUGH} or more{names}."
+        f"These prints decide {len(decided)} of {len(plan.questions)} open questions with a chance of "
+        f"{ENOUGH} or more of being right" + (f": {'; '.join(decided)}." if decided else ".")
     )
     page.tiles(
         [
@@ -49,12 +58,11 @@ def write_report(
             (f"{plan.smallest_feature_um:.2g} µm", "half a period of the finest structure"),
         ]
     )
-    page.table(_table(plan), "Open questions, and what the plan makes of them.", "questions.csv")
-    page.heading("Layouts")
     first = {f"print {place}": level for place, level in enumerate(levels[:_SHOWN_LAYOUTS], start=1)}
     page.figure(
         layouts_figure(first, plan.levels), "Levels of the first prints; tiles come in another order in each."
     )
+    page.table(_table(plan), "Open questions, and what the plan makes of them.", "questions.csv")
     for question in plan.questions:
         page.heading(f"{question.name}: {question.status}", folded=True)
         page.paragraph(f"{_sentence(question.text)} {_sentence(question.why)}")
@@ -75,6 +83,18 @@ def write_report(
     return page.write(folder)
 
 
+def _asked(question: PlannedQuestion) -> str:
+    """The question in words."""
+    first, *others = [
+        CATALOGUE[name].title if name in CATALOGUE else name for name in question.name.split(" or ")
+    ]
+    if others:
+        return f"which is at work, {', '.join([first, *others[:-1]])} or {others[-1]}"
+    if question.kind == "fact":
+        return f"{first}: {question.text}"
+    return f"{first}: the printer's or the microscope's"
+
+
 def _sentence(text: str) -> str:
     return f"{capitalised(text)}."
 
@@ -83,13 +103,13 @@ def _table(plan: NextPrint) -> list[dict[str, Any]]:
     return [
         {
             "question": q.name,
-            "rivals": ", ".join(q.rivals),
-            "difference, nm rms": np.nan if q.difference_nm is None else q.difference_nm,
-            "noise along it, nm": np.nan if q.noise_nm is None else q.noise_nm,
-            f"power with {plan.prints} prints": q.power[plan.prints - 1],
-            "power of random layouts": q.random_power[plan.prints - 1],
-            "prints needed": "more" if q.prints_needed is None else str(q.prints_needed),
             "status": q.status,
+            "power": q.power[plan.prints - 1],
+            "random_power": q.random_power[plan.prints - 1],
+            "prints_needed": f"over {len(q.power)}" if q.prints_needed is None else str(q.prints_needed),
+            "difference_nm": np.nan if q.difference_nm is None else q.difference_nm,
+            "noise_nm": np.nan if q.noise_nm is None else q.noise_nm,
+            "asked": _asked(q),
         }
         for q in plan.questions
     ]

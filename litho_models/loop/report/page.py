@@ -13,7 +13,13 @@ from litho_models.evaluation.tables import interval_text
 from litho_models.loop import equal_terms
 from litho_models.loop.equal_terms import TermSet
 from litho_models.loop.findings import LoopFindings
-from litho_models.loop.report.plots import curve_figure, map_figure, probe_figure, staircase_figure
+from litho_models.loop.report.plots import (
+    OF_SHAPES,
+    curve_figure,
+    map_figure,
+    probe_figure,
+    staircase_figure,
+)
 from litho_models.loop.report.power import identifiability_section, power_section
 from litho_models.loop.report.wording import (
     headline_words,
@@ -283,10 +289,11 @@ def _probe_section(page: Page, findings: LoopFindings) -> None:
     probed = findings.probed
     page.heading("What has no name", folded=True)
     for entry in probed.added:
+        letters = " h: height (µm), y and x: slopes along y and x." if entry.probe.name in OF_SHAPES else ""
         page.figure(
             probe_figure(entry),
             f"{entry.probe.name}: held-out error {entry.before.mean_mae_nm:.2f} to "
-            f"{entry.after.mean_mae_nm:.2f} nm. It says where the residual lives, not why.",
+            f"{entry.after.mean_mae_nm:.2f} nm. It says where the residual lives, not why.{letters}",
         )
     if probed.trends:
         page.table(

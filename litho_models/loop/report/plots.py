@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _MAPS, _ARROWS = 3, 11
+# Probes whose numbers belong to powers of the shape.
+OF_SHAPES = ("shape-powers", "order-shapes")
 # Probes that are tables, and what they run along.
 _TABLES = {
     "level-table": "printed level",
@@ -30,6 +32,8 @@ _TABLES = {
     "axis-slope-table": "steepness along the axis (µm/µm)",
     "diagonal-slope-table": "steepness along the diagonal (µm/µm)",
 }
+# The scan runs from -1 to 1.
+_OVER_SCAN = "y over the scan", "x over the scan"
 _BEFORE, _AFTER, _SECOND = "#9aa5b1", "#2f7fd0", "#c05621"
 
 
@@ -105,10 +109,11 @@ def probe_figure(entry: AddedProbe) -> Figure:
     if isinstance(probe, MissingKernel):
         kernel = probe.kernel_map(common) / probe.pitch_um**2
         shown = probe.size[0] * probe.pitch_um / 2, probe.size[1] * probe.pitch_um / 2
-        return _image(kernel, shown, "height per layout height and µm²", min(5.5, shown[0]))
+        away = _displaced("y"), _displaced("x")
+        return _image(kernel, shown, "height per layout height and µm²", min(5.5, shown[0]), away)
     if isinstance(probe, DisplacedCopy):
         return _copy_figure(probe, common)
-    if probe.name in ("shape-powers", "order-shapes"):
+    if probe.name in OF_SHAPES:
         return _bars_figure(entry)
     if probe.name in _TABLES:
         return _table_figure(entry)
@@ -122,7 +127,7 @@ def probe_figure(entry: AddedProbe) -> Figure:
     scale = 1.0 if unit == "relative height" else NM_PER_UM
     if probe.name.endswith("profile"):
         return _profile_figure(probe.name, {"": drawn_profile(common) * scale}, unit)
-    return _image(drawn(common) * scale, (1.0, 1.0), unit, 1.0)
+    return _image(drawn(common) * scale, (1.0, 1.0), unit, 1.0, _OVER_SCAN)
 
 
 def _copy_figure(probe: DisplacedCopy, common: np.ndarray) -> Figure:
@@ -135,8 +140,12 @@ def _copy_figure(probe: DisplacedCopy, common: np.ndarray) -> Figure:
     figure.colorbar(points, ax=axes, label="gain of one copy (nm²)")
     axes.set_aspect("equal")
     axes.invert_yaxis()
-    axes.set(xlabel="displaced along x (µm)", ylabel="displaced along y (µm)")
+    axes.set(xlabel=_displaced("x"), ylabel=_displaced("y"))
     return figure
+
+
+def _displaced(axis: str) -> str:
+    return f"displaced along {axis} (µm)"
 
 
 def _bars_figure(entry: AddedProbe) -> Figure:
@@ -203,10 +212,13 @@ def _arrows_figure(y_um: np.ndarray, x_um: np.ndarray) -> Figure:
     axes.quiverkey(arrows, 0.8, 1.04, longest_um, f"{longest_um:.2f} µm", labelpos="E")
     axes.set_aspect("equal")
     axes.invert_yaxis()
+    axes.set(ylabel=_OVER_SCAN[0], xlabel=_OVER_SCAN[1])
     return figure
 
 
-def _image(values: np.ndarray, half: tuple[float, float], label: str, shown: float) -> Figure:
+def _image(
+    values: np.ndarray, half: tuple[float, float], label: str, shown: float, along: tuple[str, str]
+) -> Figure:
     figure = new_figure(5, 4)
     axes = figure.subplots()
     limit = float(np.abs(values).max()) or 1.0
@@ -214,7 +226,7 @@ def _image(values: np.ndarray, half: tuple[float, float], label: str, shown: flo
         values, cmap="RdBu_r", vmin=-limit, vmax=limit,
         extent=(-half[1], half[1], half[0], -half[0]),
     )  # fmt: skip
-    axes.set(xlim=(-shown, shown), ylim=(shown, -shown))
+    axes.set(xlim=(-shown, shown), ylim=(shown, -shown), ylabel=along[0], xlabel=along[1])
     figure.colorbar(picture, ax=axes, label=label)
     return figure
 
