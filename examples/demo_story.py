@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,6 +23,8 @@ if TYPE_CHECKING:
 
 # What compare calls the printer that printed the scans.
 FAB = "fab"
+# Found in all scans: the fab gives each its own zero, as an AFM does, without being asked to.
+ZERO = "datum-offset"
 PLANTED, OTHER = "#2a7ab8", "#b0b0b0"
 
 
@@ -32,7 +35,7 @@ def tell(page: Page, out: Path, model: str = "pbl") -> None:
     gap = GapResult.read(out / "compare")
     units = {knob.name: "" if knob.unit == "1" else f" {knob.unit}" for knob in truth.knobs}
     planted = {knob.effect: f"{knob.name}, {knob.strength:g}{units[knob.name]}" for knob in truth.knobs}
-    found = [effect.name for effect in loop.effects]
+    found = [effect.name for effect in loop.effects if effect.name != ZERO]
     hit = [name for name in planted if name in found]
     psnr = {
         entry.arm: entry.judged["si_psnr_db"]
@@ -41,10 +44,13 @@ def tell(page: Page, out: Path, model: str = "pbl") -> None:
     }
     terms = loop.headline
     assert terms is not None
+    less = 100 * (1 - terms.after.mae_nm / terms.before.mae_nm)
     page.verdict(
         f"{len(planted)} effects were hidden in the prints, and the loop found {len(hit)} of them"
+        f"{': ' if hit else ''}{' and '.join(hit)}"
         f"{_also([name for name in found if name not in planted])}. On scans that it had not seen the error "
-        f"went from {terms.before.mae_nm:.2f} to {terms.after.mae_nm:.2f} nm. A hologram designed through "
+        f"went from {terms.before.mae_nm:.1f} to {terms.after.mae_nm:.1f} nm, {abs(less):.0f} % "
+        f"{'less' if less >= 0 else 'more'}. A hologram designed through "
         f"{model} has {psnr[model]:.1f} dB when this printer prints it, and {psnr['none']:.1f} dB designed "
         "without a model. One run, so nothing is said about chance."
     )
@@ -56,7 +62,8 @@ def tell(page: Page, out: Path, model: str = "pbl") -> None:
     page.links([("store-report/report.html", "The dataset, scan by scan")])
     page.heading("2. What was found")
     page.paragraph(f"Found and planted: {', '.join(hit) or 'none'}. Planted and not found: "
-                   f"{', '.join(name for name in planted if name not in found) or 'none'}.")  # fmt: skip
+                   f"{', '.join(name for name in planted if name not in found) or 'none'}."
+                   f"{_width(loop)}")  # fmt: skip
     page.figure(_gains(loop, set(planted)), "What each effect takes off the error; blue if it was planted.")
     page.links([("close-loop/report.html", "The closed loop, with its evidence")])
     page.heading("3. The error before and after, at equal freedom")
@@ -86,6 +93,16 @@ def tell(page: Page, out: Path, model: str = "pbl") -> None:
         page.links([((folder / "report.html").as_posix(), f"The hologram designed {how}")])
 
 
+def _width(loop: CloseLoop) -> str:
+    """How much wider the loop finds the spot along one direction, in the unit of the knob."""
+    spot = next((effect for effect in loop.effects if effect.name == "elliptical-psf"), None)
+    if spot is None:
+        return ""
+    # The moments grow by s² along one axis: Cxx - Cyy and 2 Cxy are s² cos 2a and s² sin 2a.
+    stretch, shear = (spot.parameters[name].value for name in ("stretch_um2", "shear_um2"))
+    return f" By the loop's own estimate the spot gains {math.hypot(stretch, shear) ** 0.5:.2f} µm."
+
+
 def _also(names: list[str]) -> str:
     return f", and besides them {', '.join(names)}" if names else ""
 
@@ -102,10 +119,11 @@ def _first_scan(store: Path) -> Figure:
 
 
 def _gains(loop: CloseLoop, planted: set[str]) -> Figure:
-    figure = new_figure(8.0, 0.6 + 0.45 * max(1, len(loop.effects)))
+    effects = [effect for effect in loop.effects if effect.name != ZERO]
+    figure = new_figure(8.0, 0.6 + 0.45 * max(1, len(effects)))
     axis = figure.subplots()
-    names = [effect.name for effect in loop.effects]
-    gains = [effect.before_nm - effect.after_nm for effect in loop.effects]
+    names = [effect.name for effect in effects]
+    gains = [effect.before_nm - effect.after_nm for effect in effects]
     axis.barh(names, gains, color=[PLANTED if name in planted else OTHER for name in names])
     axis.invert_yaxis()
     axis.set_xlabel("error less, nm")

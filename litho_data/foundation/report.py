@@ -41,6 +41,7 @@ _SHORT |= {
     "ssim": "SSIM",
     "id": "scan",
     "fwhm": "FWHM",
+    "mtf": "MTF",
     "psf": "PSF",
     "sha256": "SHA-256",
     "k": "k",

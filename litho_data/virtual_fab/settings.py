@@ -123,7 +123,7 @@ PRESETS = {
     "demo": Preset(
         count=12,
         size_px=192,
-        knobs=("write-order-memory=0.15", "scan-line-stripes=6", "tilt-bow=15"),
+        knobs=("elliptical-psf=0.55", "tilt-bow=10"),
     ),
     "measured-like": Preset(
         count=24,

@@ -222,7 +222,7 @@ def _narrow_window(bench: LensBench) -> list[str]:
         return []
     return [
         f"the PSF window of {window_um:.1f} µm is narrower than the focusing circle (radius "
-        f"{radius_um:.1f} µm), so the focusing efficiency leaves light out; use --window-px {enough_px}"
+        f"{radius_um:.3g} µm), so the focusing efficiency leaves light out; use --window-px {enough_px}"
     ]
 
 

@@ -75,15 +75,16 @@ def _cost_of_staying_inside(design: Design) -> str:
         now, then = design.predicted.get(name, 0.0), gauge.inside.get(name, 0.0)
         if min(now, then) > 0:
             lost = now - then if scale == 0 else scale * math.log10(now / then)
-            told.append(f"{lost:.2f} dB of {named(name).removesuffix(' (dB)')}")
+            more = "less" if lost >= 0 else "more"
+            told.append(f"{abs(lost):.2f} dB {more} {named(name).removesuffix(' (dB)')}")
     if not told:
         told = [
             f"{named(key)} {now:.4g}, not {design.predicted[key]:.4g}" for key, now in gauge.inside.items()
         ]
         told = told[:2]
     return (
-        f". A short search that stays closer ({100 * gauge.inside_distance:.0f} % of the pixels) ends at a "
-        f"cost of {', '.join(told)}, as the model prints both (--inside-weight searches so from the start)"
+        f". A short search that stays closer ({100 * gauge.inside_distance:.0f} % of the pixels) ends "
+        f"with {', '.join(told)}, as the model prints both (--inside-weight searches so from the start)"
     )
 
 

@@ -38,6 +38,7 @@ _TITLES = {
     "lens-computational": "Multi-level diffractive lens with deconvolution",
     "relief": "Corrected relief",
 }
+_PSF = " The PSF is in decibels below its peak."
 
 
 def write_design_report(folder: Path, design: Design, task: Task, history: list[dict[str, float]]) -> Path:
@@ -59,11 +60,11 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
     if design.baselines:
         line = baseline_line(design.baselines)
         page.paragraph(f"{capitalised(line)}.")
-    add_notes(page, design)
     page.figure(
         _pictures(folder, design, task, levels, height_um, seen),
-        "Rows are y (down), columns x; lengths in µm. A PSF is in decibels below its peak.",
+        "Rows are y (down), columns x; lengths in µm." + (_PSF if isinstance(task, LensTask) else ""),
     )
+    add_notes(page, design)
     page.tiles([*_tiles(design, task), (f"{design.stroke.stroke_waves:.2f} waves", "printed stroke")])
     page.heading("All scores", folded=True)
     labels = meanings(task.score_type)
@@ -108,7 +109,7 @@ def _tiles(design: Design, task: Task) -> list[tuple[str, str]]:
         value, label = design.predicted[name], labels.get(name, named(name))
         more = f" (black image {black[name]:.3f})" if name in black and name.startswith("ssim") else ""
         ceiling = design.predicted.get(f"{name}_ceiling")
-        more += f" (ceiling {ceiling:.0f})" if ceiling else ""
+        more += f" (ceiling {ceiling:.3g})" if ceiling else ""
         tiles.append((f"{value:.1f}" if abs(value) >= 10 else f"{value:.3f}", label + more))
     return tiles
 

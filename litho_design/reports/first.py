@@ -43,11 +43,11 @@ def write_first_report(folder: Path, result: GapResult, printers: Mapping[str, P
         f"{DESIGNER} expects of its own design; {JUDGE}, a model that had no part in it, finds it "
         f"{abs(judged):.1f} dB {doubt}. One hologram, so nothing is said about chance."
     )
-    page.note(*(f"{capitalised(note)}." for note in designs[WITHOUT].record.notes))
     page.figure(
         draw_images(designs, printers[DESIGNER], scores),
         "Left: the wanted image. Middle and right: what the printed holograms would show, at matched scale.",
     )
+    page.note(*(f"{capitalised(note)}." for note in designs[WITHOUT].record.notes))
     page.paragraph(
         "dB is the scale-invariant peak signal-to-noise ratio of the image: higher is better. The prints "
         f"are those that the model {DESIGNER} predicts. One of the layouts was designed through this very "

@@ -43,7 +43,6 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
     own = Design.read(design_folder(folder, next(iter(result.arms)), result.seeds[0]))
     shown = shown or tuple(own.predicted)
     page.verdict(_verdict(result, shown[0]))
-    page.note(*(f"{capitalised(note)}." for note in own.notes))
     judged = _judged(folder, result, printers)
     page.figure(
         _pictures(result, judged),
@@ -52,6 +51,7 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
             "Square root of the PSF over its peak." if result.task.startswith("lens-") else "Scaled to match."
         ),
     )
+    page.note(*(f"{capitalised(note)}." for note in own.notes))
     page.paragraph(
         "An arm is a model that layouts are designed with (rows); a judge is a model that prints them "
         "(columns). On the diagonal a model judges its own design: that is its expectation, not an "
