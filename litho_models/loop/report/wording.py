@@ -103,14 +103,13 @@ def headline_words(result: CloseLoop) -> str:
         return f"Nothing was found to add, {missing}: the held-out error stays at {before:.2f} nm."
     causes, own, generic = _by_kind(result)
     lacking = ", ".join(get_effect(e.name).title for e in causes)
-    base = capitalised(result.base_model)
     terms = f"{len(generic)} generic {'terms' if len(generic) > 1 else 'term'}"
     if lacking:
-        text = f"{base} lacks {lacking}. " + (f"Beside it {terms} without a name. " if generic else "")
+        beside = f"Beside it {terms} without a name. " if generic else ""
+        text = f"Missing from {result.base_model}: {lacking}. {beside}"
     else:
-        text = (
-            f"What {base} lacks has no name: {terms}. " if generic else f"{base} lacks nothing that shows. "
-        )
+        nameless = f"What {result.base_model} lacks has no name: {terms}. "
+        text = nameless if generic else f"{capitalised(result.base_model)} lacks nothing that shows. "
     if own:
         titles = [get_effect(e.name).title.removesuffix(" of the single scan") for e in own]
         text += f"Each scan has its own {', '.join(titles)}. "
@@ -120,7 +119,10 @@ def headline_words(result: CloseLoop) -> str:
     over = result.headline.over_prints or result.headline.over_scans
     unit = "scans" if result.headline.over_prints is None else "prints"
     if over.smallest_p > _CHANCE:
-        return f"{text}; {over.count} {unit} are too few to tell that from chance."
+        alike = result.headline.over_scans
+        better = f"{alike.positive} of {alike.count} scans are better (p = {alike.p:.2g}), but "
+        known = better if result.headline.over_prints and alike.p <= _CHANCE else ""
+        return f"{text}; {known}{over.count} {unit} are too few to tell that from chance."
     sure = "more than chance" if over.p <= _CHANCE and after < before else "which may be chance"
     return f"{text}, {sure} (p = {over.p:.2g} over {over.count} {unit})."
 
