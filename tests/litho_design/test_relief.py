@@ -16,8 +16,10 @@ from benchmarks.record import NOT_MEASURED, published
 from litho_data.foundation.errors import InputError
 from litho_design import correct, load_design
 from litho_design.cli.app import main
+from litho_design.optimisation.process_window import measure_yield
 from litho_design.reliefs.settings import relief_settings
 from litho_design.reliefs.targets import load_relief
+from litho_design.reliefs.task import ReliefTask
 
 TINY = {
     "layout.size_px": 48,
@@ -45,6 +47,32 @@ def test_a_relief_that_a_layout_prints_is_printed(tmp_path, make_printer):
     loaded = load_design(tmp_path)
     assert loaded.score(loaded.expected_um).rms_nm == pytest.approx(made.predicted["rms_nm"], rel=1e-4)
     assert np.abs(np.load(tmp_path / "unprintable_um.npy")).mean() < 0.006
+
+
+def test_the_zero_of_a_print_decides_no_yield(make_printer):
+    changes = {"window.gain_sd": 0.0, "window.blur_sd_um": 0.0, "window.offset_sd_um": 0.5}
+    settings = relief_settings(TINY | changes)
+    printer = make_printer(settings.layout)
+    with torch.no_grad():
+        printed = printer(torch.arange(48).float().div(4).floor().repeat(48, 1)[None, None])[0, 0]
+    wanted = (printed + 0.01 * torch.cos(torch.arange(48.0))).numpy()
+
+    def passed(window):
+        task = ReliefTask(
+            settings.model_copy(update={"window": window}), printer, inputs={"relief_um": wanted}
+        )
+        drawn = task.window_scores(printed, 20)
+        return drawn, measure_yield(drawn, task.score(printed).model_dump(), window)
+
+    drawn, found = passed(settings.window)
+    assert found.share == 1
+    assert {"rms_nm", "mae_nm", "p95_nm"} == set(found.figures)
+    # 10 nm / sqrt(2), whatever the offset; float32 is exact to 1e-4 nm.
+    assert [one["rms_nm"] for one in drawn] == pytest.approx(
+        [1e3 * (printed.numpy() - wanted).std()] * 20, abs=0.01
+    )
+    # A gain is no offset: 5 % of a staircase of 0.2 µm rms is more than the error as modelled.
+    assert passed(settings.window.model_copy(update={"gain_sd": 0.05}))[1].share < 0.5
 
 
 def test_what_no_layout_prints_is_shown_beside_it(tmp_path, monkeypatch, capsys):
