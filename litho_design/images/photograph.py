@@ -20,6 +20,12 @@ from litho_design.images.targets import ImagedObject
 _HOT_SIGMAS = 6.0
 _SMALLEST_CORRELATION = 0.45
 _LARGEST_STRETCH = 1.2
+# Of pixels at the end of their range: more of them change the likeness of an image.
+_LARGEST_SATURATED = 0.01
+# What undoes the encoding of pictures for a screen.
+_SCREEN_GAMMA = 2.2
+# A tilt is accepted if it leaves no more than this share of what is unexplained without it.
+_TILTED = 0.8
 # Orientations are told apart on images of about this side, px; correlations this close are a tie.
 _SMALL_PX = 192
 _TIE = 0.03
@@ -64,9 +70,10 @@ class Photograph:
 
     Attributes:
         counts: cleaned, without the dark level (ny, nx).
-        window_to_photo: affine map (2, 3) from window pixels to its pixels.
+        window_to_photo: projective map (3, 3) from window pixels to its pixels.
         side_px: side of the window.
         pitch_um: pixel of the window.
+        finest_per_um: the highest spatial frequency that the light can have.
         record: source and processing.
     """
 
@@ -74,6 +81,7 @@ class Photograph:
     window_to_photo: np.ndarray
     side_px: int
     pitch_um: float
+    finest_per_um: float
     record: CameraRecord
 
     def image(self) -> np.ndarray:
@@ -82,7 +90,9 @@ class Photograph:
 
     def power_share(self, image: np.ndarray, power_counts: float) -> np.ndarray:
         """``image`` as the share of the light that falls on the element, of its summed counts."""
-        return image * abs(np.linalg.det(self.window_to_photo[:, :2])) / power_counts
+        # Pixels of the photograph to a pixel in the middle of the window.
+        warp, middle = self.window_to_photo, np.array([self.side_px / 2, self.side_px / 2, 1])
+        return image * abs(np.linalg.det(warp) / (warp[2] @ middle) ** 3) / power_counts
 
     def as_it_might_be(self) -> Iterator[np.ndarray]:
         """Images that the photograph would also allow: other noise, dark level and position."""
@@ -92,16 +102,20 @@ class Photograph:
             counts = self.counts + (record.noise_counts or 0) * generator.standard_normal(self.counts.shape)
             counts = counts - (record.dark_level_sd or 0) * generator.standard_normal()
             moved = (record.position_sd_um or 0) / self.pitch_um * generator.standard_normal(2)
-            yield self._warped(np.clip(counts, 0, None).astype(np.float32), moved)
+            yield self._warped(counts.astype(np.float32), moved)
 
     def _warped(self, counts: np.ndarray, moved_px: np.ndarray) -> np.ndarray:
         import cv2
+        from scipy.fft import dctn, idctn
 
-        warp = self.window_to_photo.copy()
+        warp, side = self.window_to_photo.copy(), self.side_px
         warp[:, 2] += warp[:, :2] @ moved_px
-        side = (self.side_px, self.side_px)
-        found = cv2.warpAffine(counts, warp, side, flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP)
-        # Cubic interpolation swings below zero beside bright pixels.
+        found: Any = cv2.warpPerspective(
+            counts, warp, (side, side), flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+        )
+        # What is finer than any light of the element is noise.
+        passed = np.arange(side) / (2 * side * self.pitch_um) <= self.finest_per_um
+        found = idctn(dctn(found, norm="ortho") * np.outer(passed, passed), norm="ortho")
         return np.clip(found, 0, None)
 
 
@@ -111,26 +125,28 @@ def photographed_image(
     photo_file: str | Path,
     pitch_um: float,
     *,
+    finest_per_um: float,
     dark_level: float | None = None,
     orientation: str = "identity",
 ) -> Photograph:
     """A photograph, registered on the image that the design expects.
 
-    Dark level subtracted (the 1st percentile where none is given), single hot or dead pixels
-    replaced by their neighbours' median, then shifted, rotated and scaled onto the expected image:
-    the shift by cross-correlation, the rest by maximising the correlation coefficient (Evangelidis
-    and Psarakis 2008). All eight orientations are tried, and a photograph that fits another one better
-    than ``orientation`` is refused.
+    Dark level subtracted (where none is given, the 1st percentile of means over 5 px), single hot or dead
+    pixels replaced by their neighbours' median, then brought onto the expected image as a camera sees it
+    that is moved, turned and tilted: the shift by cross-correlation, the rest by maximising the correlation
+    coefficient (Evangelidis and Psarakis 2008). All eight orientations are tried, and a photograph that fits
+    another one better than ``orientation`` is refused.
 
     Args:
         wanted: expected image (m, m), any scale; ``wanted_pitch_um`` its pixel, µm.
-        photo_file: grey image of any bit depth.
+        photo_file: grey image of any bit depth, counts proportional to the light.
         pitch_um: camera pixel in the plane of the image, µm.
+        finest_per_um: highest spatial frequency of the light, 2 NA / wavelength; what is finer is left out.
         orientation: what brings the photograph upright, such as ``flip-x`` or ``rotate-180``.
 
     Raises:
         InputError: not an image, a pitch that is not positive, an unknown orientation, or a photograph that
-            is unlike the expected image, or mirrored or turned.
+            is overexposed, not linear, unlike the expected image, or mirrored or turned.
     """
     import cv2
 
@@ -144,25 +160,34 @@ def photographed_image(
     if raw is None:
         raise InputError("photograph", got=str(photo_file), wanted="an image file")
     photo = raw.astype(np.float32)
-    darkest = np.percentile(photo, [1, 10])
+    darkest = np.percentile(cv2.blur(photo, (5, 5)), [1, 10])
     dark = float(darkest[0]) if dark_level is None else dark_level
-    cleaned, replaced = _replace_outliers(np.clip(photo - dark, 0, None))
+    top = float(2 ** (8 * raw.dtype.itemsize) - 1) if raw.dtype.kind == "u" else float(raw.max())
+    # Below the dark level noise is cut off at zero.
+    saturated, cut_off = float((raw >= top).mean()), float((raw == 0).mean()) if dark > 0 else 0.0
+    if max(saturated, cut_off) > _LARGEST_SATURATED:
+        raise InputError(
+            f"photograph {photo_file}",
+            got=f"{100 * max(saturated, cut_off):.1f} % of its pixels at an end of their range",
+            wanted=f"at most {100 * _LARGEST_SATURATED:g} %",
+            hint="a shorter exposure" if saturated > cut_off else "a black level above the noise",
+        )
+    cleaned, replaced = _replace_outliers(photo - np.float32(dark))
     wanted = wanted.astype(np.float32)
     ambiguous = _check_orientation(cleaned, wanted, pitch_um / wanted_pitch_um, orientation, photo_file)
     upright = np.ascontiguousarray(orient(cleaned, orientation))
-    fit = _register(upright, wanted, pitch_um / wanted_pitch_um)
+    fit = _register(upright, wanted, pitch_um / wanted_pitch_um, tilted=True)
     if fit.correlation < _SMALLEST_CORRELATION:
         raise _unlike(photo_file, fit.correlation)
     back = np.linalg.inv(orientation_matrix(orientation, cleaned.shape))
-    warp = (back @ np.vstack([fit.window_to_photo, [0, 0, 1]]))[:2]
-    top = float(2 ** (8 * raw.dtype.itemsize) - 1) if raw.dtype.kind == "u" else float(raw.max())
+    warp = back @ fit.window_to_photo
     record = CameraRecord(
         name=Path(photo_file).name,
         sha256=file_sha256(photo_file),
         pitch_um=pitch_um,
         dark_level=dark,
         replaced_pixels=replaced,
-        saturated_share=float((raw >= top).mean()),
+        saturated_share=saturated,
         correlation=fit.correlation,
         photo_to_window=warp.tolist(),
         orientation=orientation,
@@ -171,7 +196,25 @@ def photographed_image(
         dark_level_sd=float(np.diff(darkest)[0]) / 2 if dark_level is None else 0.0,
         position_sd_um=fit.position_sd_px * wanted_pitch_um,
     )
-    return Photograph(cleaned, warp, wanted.shape[0], wanted_pitch_um, record)
+    found = Photograph(cleaned, warp, wanted.shape[0], wanted_pitch_um, finest_per_um, record)
+    _check_linear(found.image(), wanted, photo_file)
+    return found
+
+
+def _check_linear(image: np.ndarray, wanted: np.ndarray, photo_file: str | Path) -> None:
+    """Refuse counts that fit the expected image better once the encoding for a screen is undone."""
+    import cv2
+
+    smooth = [cv2.GaussianBlur(one, (0, 0), 2.0).ravel() for one in (wanted, image, image**_SCREEN_GAMMA)]
+    _, as_it_is, decoded = np.corrcoef(smooth)[0]
+    if decoded > as_it_is:
+        raise InputError(
+            f"photograph {photo_file}",
+            got=f"counts that fit the expected image better to the power {_SCREEN_GAMMA} (correlation "
+            f"{decoded:.2f}) than as they are ({as_it_is:.2f})",
+            wanted="counts proportional to the light",
+            hint="take the camera's raw file, or undo its gamma",
+        )
 
 
 def _check_orientation(
@@ -231,14 +274,14 @@ def _replace_outliers(photo: np.ndarray) -> tuple[np.ndarray, int]:
 
 @dataclass(frozen=True)
 class _Fit:
-    """Affine map (2, 3) from window to photograph pixels, its correlation, the shift's uncertainty."""
+    """Projective map (3, 3) from window to photograph pixels, its correlation, the shift's uncertainty."""
 
     window_to_photo: np.ndarray
     correlation: float
     position_sd_px: float
 
 
-def _register(photo: Any, wanted: Any, scale: float) -> _Fit:
+def _register(photo: Any, wanted: Any, scale: float, *, tilted: bool = False) -> _Fit:
     import cv2
 
     side = wanted.shape[0]
@@ -250,24 +293,32 @@ def _register(photo: Any, wanted: Any, scale: float) -> _Fit:
     start[:, 2] = centre - start[:, :2] @ np.full(2, (side - 1) / 2)
     moving: Any = cv2.warpAffine(photo, start, (side, side), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
     moving = cv2.GaussianBlur(moving / max(float(moving.max()), 1e-12), (0, 0), blur_px)
-    warp: Any = np.hstack([np.eye(2), _shift_px(reference, moving)[:, None]]).astype(np.float32)
+    warp: Any = np.eye(3, dtype=np.float32)
+    warp[:2, 2] = _shift_px(reference, moving)
     criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 200, 1e-7)
     correlation = 0.0
     # From coarse to fine: the fine structure of an image has maxima beside the right one.
-    for further in (3.0 * blur_px, 0.0):
+    for rows, further in ((2, 3.0 * blur_px), (2, 0.0), *([(3, 0.0)] if tilted else [])):
         fixed, moved = reference, moving.astype(np.float32)
         if further:
             fixed, moved = (cv2.GaussianBlur(image, (0, 0), further) for image in (fixed, moved))
+        motion = cv2.MOTION_AFFINE if rows == 2 else cv2.MOTION_HOMOGRAPHY
         try:
-            correlation, warp = cv2.findTransformECC(fixed, moved, warp, cv2.MOTION_AFFINE, criteria)
+            reached, found = cv2.findTransformECC(fixed, moved, warp[:rows].copy(), motion, criteria)
         except cv2.error:
-            correlation = 0.0
-    # A fit that strongly shrinks or shears the image has matched noise.
-    stretch = np.linalg.svd(warp[:, :2], compute_uv=False)
-    if stretch.max() > _LARGEST_STRETCH or stretch.min() < 1 / _LARGEST_STRETCH:
+            reached, found = 0.0, warp[:rows]
+        # Two numbers more fit what differs in the image, too, if no tilt asks for them.
+        if rows == 2 or 1 - reached**2 < _TILTED * (1 - correlation**2):
+            correlation, warp[:rows] = reached, found
+    # A fit that strongly shrinks, shears or tilts the image has matched noise.
+    middle = warp @ np.array([(side - 1) / 2, (side - 1) / 2, 1])
+    linear = (warp[:2, :2] - np.outer(middle[:2] / middle[2], warp[2, :2])) / middle[2]
+    tilt = np.abs(warp[2, :2]).sum() * side / 2 / middle[2]
+    stretch = np.linalg.svd(linear, compute_uv=False)
+    if max(stretch.max(), 1 / stretch.min(), 1 + tilt) > _LARGEST_STRETCH:
         correlation = 0.0
-    whole = np.vstack([start, [0, 0, 1]]) @ np.vstack([warp, [0, 0, 1]])
-    return _Fit(whole[:2], float(correlation), _position_sd_px(reference, correlation, blur_px))
+    whole = np.vstack([start, [0, 0, 1]]) @ warp
+    return _Fit(whole, float(correlation), _position_sd_px(reference, correlation, blur_px))
 
 
 def _shift_px(reference: np.ndarray, moving: np.ndarray) -> np.ndarray:

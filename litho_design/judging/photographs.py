@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,6 +22,9 @@ from litho_design.lenses.bench import reconstruct, sensor_psf
 from litho_design.lenses.objects import object_name, object_stack, read_object
 from litho_design.lenses.task import LensTask
 from litho_design.optics.imaging import Blur
+
+# Noise that adds this much again to the error has added as much already.
+_LARGEST_SD_DB = 0.2
 
 
 @dataclass(frozen=True)
@@ -88,8 +92,8 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
     """Score a photograph of a printed hologram's image.
 
     Raises:
-        InputError: what ``photographed_image`` refuses, an incident power that is not positive, or an
-            object in front of a hologram.
+        InputError: what ``photographed_image`` refuses, an incident power that is not positive, an object
+            in front of a hologram, or noise that leaves the score open.
     """
     assert loaded.target is not None
     if source.imaged is not None:
@@ -102,7 +106,7 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
     wanted = loaded.image(loaded.expected_um)
     photo = photographed_image(
         wanted, loaded.record.layout.pitch_um, source.path, source.pitch_um,
-        dark_level=source.dark_level, orientation=source.orientation,
+        finest_per_um=_finest_per_um(loaded), dark_level=source.dark_level, orientation=source.orientation,
     )  # fmt: skip
     target = loaded.target.cpu().double()
     resolved = loaded.bench.resolved(target)
@@ -113,12 +117,21 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
 
     image = photo.image()
     score = figures(image)
-    return PhotoVerdict(
-        score,
-        uncertainties(figures, score, photo.as_it_might_be()),
-        photo.record,
-        {f"photograph {photo.record.name}": image},
-    )
+    uncertainty = uncertainties(figures, score, photo.as_it_might_be())
+    if uncertainty["si_psnr_db"] > _LARGEST_SD_DB:
+        raise InputError(
+            f"photograph {source.path}",
+            got=f"a SI-PSNR that its noise and dark level leave open by {uncertainty['si_psnr_db']:.2f} dB",
+            wanted=f"at most {_LARGEST_SD_DB} dB",
+            hint="a longer exposure or the mean of several, and --camera-dark-level",
+        )
+    return PhotoVerdict(score, uncertainty, photo.record, {f"photograph {photo.record.name}": image})
+
+
+def _finest_per_um(loaded: LoadedDesign) -> float:
+    """Highest spatial frequency of the light behind an element: that of rays from its two sides, 1/µm."""
+    optics, half_um = loaded.record.optics, loaded.record.layout.size_um / 2
+    return 2 * half_um / math.hypot(half_um, optics.distance_um) / optics.wavelength_um
 
 
 def photo_score(image: np.ndarray, target: Tensor, resolved: Tensor, *, has_power: bool) -> PhotoScore:
@@ -166,7 +179,7 @@ def score_lens_photo(
     pixel_um = settings.pixel_px * loaded.record.layout.pitch_um
     photo = photographed_image(
         expected.cpu().numpy(), pixel_um, source.path, source.pitch_um,
-        dark_level=source.dark_level, orientation=source.orientation,
+        finest_per_um=_finest_per_um(loaded), dark_level=source.dark_level, orientation=source.orientation,
     )  # fmt: skip
 
     def estimates(image: np.ndarray) -> dict[str, Tensor]:

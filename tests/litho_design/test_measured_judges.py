@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import cv2
@@ -9,13 +10,16 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks import photographs
+from benchmarks.photographs import Camera
+from benchmarks.record import NOT_MEASURED, published
 from litho_data.foundation.errors import InputError
 from litho_data.register.geometry import ORIENTATIONS, orient
 from litho_design.images.similarity import si_psnr_db
 from litho_design.images.targets import load_target
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.judging.measured import MeasuredSource, fitted_background
-from litho_design.judging.photographs import PhotoSource
+from litho_design.judging.photographs import PhotoSource, score_hologram_photo
 from litho_design.judging.score import ScoreResult
 from litho_design.printers.printer import Printer
 from litho_design.workflows.design import design_hologram
@@ -123,7 +127,7 @@ def test_a_photograph_is_cleaned_registered_and_scored(tmp_path, printed_design)
     assert score.judge.replaced_pixels == 3
     assert score.judge.correlation > 0.97
     # photograph = matrix^-1 window / 2: the linear part found must undo what was done.
-    found = np.array(score.judge.photo_to_window)[:, :2]
+    found = np.array(score.judge.photo_to_window)[:2, :2]
     assert found == pytest.approx(np.linalg.inv(2 * matrix), abs=0.01)
     blurred = torch.from_numpy(cv2.GaussianBlur(image, (0, 0), 1.4)).double()
     wanted = si_psnr_db(blurred, loaded.target.double())
@@ -161,6 +165,42 @@ def test_a_mirrored_or_turned_photograph_is_never_scored_in_silence(tmp_path, sm
             assert score.figures["eff_signal"] == pytest.approx(image[loaded.target > 0.5].sum(), rel=0.01)
             assert 0 < score.uncertainty["si_psnr_db"] < 0.3
             assert bool(score.judge.ambiguous) == (target == "ring")
+
+
+def test_a_photograph_is_within_a_third_of_a_decibel_of_its_light_or_refused(tmp_path, small_settings):
+    """Seen at an angle, turned, noisy, dark in its corners; and what no score could stand."""
+    printer = Printer(None, small_settings.layout, source="none")
+    design_hologram("text", printer, tmp_path / "design", settings=small_settings, announce=False)
+    loaded = LoadedDesign(tmp_path / "design")
+    light = cv2.GaussianBlur(loaded.image(0.95 * loaded.expected_um), (0, 0), 1.0)
+    truth = si_psnr_db(torch.from_numpy(light).double(), loaded.target.double())
+
+    def scored(dark=photographs.DARK, **camera):
+        counts = Camera(**camera).counts(light, 0.1, seed=0)
+        cv2.imwrite(str(tmp_path / "p.png"), counts)
+        return score_hologram_photo(loaded, PhotoSource(tmp_path / "p.png", 0.15, dark))
+
+    for camera in (
+        {"tilt": (0.08, -0.08), "turn_deg": 6.0},
+        {"tilt": (-0.05, 0.08), "vignetting": 0.3, "scale": 0.92, "shift_um": (0.8, -0.5)},
+        {"noise": 0.04, "dark": None},
+    ):
+        assert scored(**camera).figures.si_psnr_db == pytest.approx(truth, abs=0.3)
+    for camera, why in (
+        ({"noise": 0.25}, "above the noise"),
+        ({"gamma": 1 / 2.2}, "proportional"),
+        ({"exposure": 4.0}, "shorter exposure"),
+    ):
+        with pytest.raises(InputError, match=why):
+            scored(**camera)
+
+
+def test_the_page_quotes_the_photographs_that_were_scored():
+    text = published(photographs.PAGE, photographs.NAME)
+    if not photographs.RESULT.exists():
+        assert text == NOT_MEASURED
+        return
+    assert text == photographs.as_markdown(json.loads(photographs.RESULT.read_text(encoding="utf-8")))
 
 
 def test_baselines_stand_beside_every_score(printed_design, tmp_path):
