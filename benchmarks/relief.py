@@ -183,9 +183,10 @@ def as_markdown(record: Mapping[str, Any]) -> str:
     seeds = sorted({row["seed"] for row in record["rows"]})
     note = (
         f"rms error of the print without roughness, its offset free, nm; reliefs {record['height_um']:g} µm "
-        f"high on {record['size_px']} px, seeds {', '.join(map(str, seeds))}, in this order; "
-        f"{record['model']} trained on {record['scans']} scans of each fab, {record['iterations']} iterations, "
-        f"{record['polish_rounds']} rounds of polish. The last two columns: how many times lower the error is."
+        f"high on {record['size_px']} px. Seeds {', '.join(map(str, seeds))}, in this order; each "
+        f"{record['model']} was trained on {record['scans']} scans of its fab. {record['iterations']} "
+        f"iterations, {record['polish_rounds']} rounds of polish. The last two columns: how many times lower "
+        "the error is."
     )
     heads = ("relief", *COLUMNS.values(), "affine over corrected", "affine over second round")
     return markdown_table(heads, lines, note)

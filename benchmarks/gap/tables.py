@@ -68,14 +68,14 @@ def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, A
         judges = [judge for judge in dict.fromkeys(row["judge"] for row in rows) if judge != "none"]
         shown = dict(list(shown.items())[:1])
     # Judged by one printer, the expectation stands beside it; by several, each is a column.
-    lines = [
-        "| designed with | "
-        + " | ".join(f"{_LABELS[figure]}, in design → by {judge}" for judge in judges for figure in shown)
-        + " |",
-        "|---" * (1 + len(judges) * len(shown)) + "|",
-    ]
+    heads = [f"{_LABELS[figure]}, in design → by {judge}" for judge in judges for figure in shown]
+    # A perfect lens has a Strehl ratio of 1: what is missing is the gap to the ceiling.
+    heads += ["Strehl ratio lost against a perfect lens"] if "strehl" in shown else []
+    lines = [f"| designed with | {' | '.join(heads)} |", "|---" * (1 + len(heads)) + "|"]
     for arm in arms:
         cells = [_cell(values[arm, judge, figure], _digits(figure)) for judge in judges for figure in shown]
+        if "strehl" in shown:
+            cells.append(f"{100 * (1 - values[arm, judges[0], 'strehl']['judged']):.1f} %")
         lines.append(f"| {arm} | {' | '.join(cells)} |")
     seeds = len(task["seeds"])
     told = f"{seeds} seed{'s' * (seeds > 1)}"

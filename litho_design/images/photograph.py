@@ -206,7 +206,8 @@ def _check_linear(image: np.ndarray, wanted: np.ndarray, photo_file: str | Path)
     import cv2
 
     smooth = [cv2.GaussianBlur(one, (0, 0), 2.0).ravel() for one in (wanted, image, image**_SCREEN_GAMMA)]
-    _, as_it_is, decoded = np.corrcoef(smooth)[0]
+    correlations: Any = np.corrcoef(smooth)
+    _, as_it_is, decoded = correlations[0]
     if decoded > as_it_is:
         raise InputError(
             f"photograph {photo_file}",

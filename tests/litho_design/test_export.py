@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import tifffile
+import torch
 from PIL import Image
 
 from litho_data.foundation.errors import InputError
@@ -192,17 +193,48 @@ def test_stl_is_watertight_where_columns_touch_at_corners(tmp_path, seed):
     count = write_stl(file, levels, 0.4, 0.1, 1.0)
     for corners in (_by_struct(file), _by_cells_of_bytes(file)):
         assert len(corners) == count
-        places = {
-            point: number for number, point in enumerate(dict.fromkeys(c for face in corners for c in face))
-        }
-        edges = [(places[f[i]], places[f[(i + 1) % 3]]) for f in corners for i in range(3)]
-        # Every edge is met once in each direction: closed, of one sheet, and facing outwards all round.
-        assert len(set(edges)) == len(edges) == 3 * count
-        assert {(end, start) for start, end in edges} == set(edges)
-        # Euler: a solid without holes.
-        assert len(places) - len(edges) // 2 + count == 2
+        _require_closed(corners)
     assert _volume(np.array(corners)) == pytest.approx((1.0 + 0.1 * levels).sum() * 0.16, rel=3e-4)
     assert np.array_equal(read_stl_levels(file, levels.shape, 0.4, 0.1, 1.0), levels)
+
+
+@pytest.mark.long
+def test_stl_of_twenty_holograms_of_1024_px_is_watertight(tmp_path):
+    """Blots at random, three Gerchberg-Saxton steps, 13 levels in cells of 4 px; prints the sizes (-s)."""
+    from litho_design.holograms.bench import HologramBench
+    from litho_design.optics import Optics
+    from litho_design.optimisation.parameters import CellMap
+    from litho_design.optimisation.phases import gerchberg_saxton
+
+    layout, megabytes = LayoutSettings(size_px=1024), []
+    bench, cells = HologramBench(layout, Optics(distance_um=300.0)), CellMap(layout)
+    for seed in range(20):
+        blots = cv2.GaussianBlur(np.random.default_rng(seed).standard_normal((1024, 1024)), (0, 0), 20.0)
+        target = torch.from_numpy(blots > blots.std()).float()
+        phase, _ = gerchberg_saxton(bench.propagator, target, cells, iterations=3, weighted=False, seed=seed)
+        levels = (phase.remainder(2 * np.pi) * (11.5 / (2 * np.pi))).round().numpy().astype(np.uint8)
+        file = tmp_path / "hologram.stl"
+        count = write_stl(file, levels, 0.4, 0.1, 1.0)
+        for corners in (_by_struct(file), _by_cells_of_bytes(file)):
+            assert len(corners) == count
+            _require_closed(corners)
+        megabytes.append(file.stat().st_size / 1e6)
+    print(f"20 closed surfaces, {min(megabytes):.1f} to {max(megabytes):.1f} MB")
+    # Independent random levels have 22.2 MB.
+    assert max(megabytes) < 22.2
+
+
+def _require_closed(corners) -> None:
+    """One sheet around a solid without holes, which faces outwards all round."""
+    points, places = np.unique(np.reshape(corners, (-1, 3)), axis=0, return_inverse=True)
+    faces = places.reshape(-1, 3)
+    ends = np.roll(faces, -1, axis=1)
+    there, back = np.sort(faces * len(points) + ends, None), np.sort(ends * len(points) + faces, None)
+    # Every edge is met once in each direction.
+    assert np.array_equal(there, back)
+    assert (np.diff(there) > 0).all()
+    # Euler.
+    assert len(points) - len(there) // 2 + len(faces) == 2
 
 
 def _volume(triangles: np.ndarray) -> float:
@@ -213,7 +245,8 @@ def _volume(triangles: np.ndarray) -> float:
 def _by_struct(file) -> list:
     data = file.read_bytes()
     (count,) = struct.unpack_from("<I", data, 80)
-    found = [struct.unpack_from("<12fH", data, 84 + 50 * number) for number in range(count)]
+    found = list(struct.iter_unpack("<12fH", data[84:]))
+    assert len(found) == count
     return [tuple(one[first : first + 3] for first in (3, 6, 9)) for one in found]
 
 
