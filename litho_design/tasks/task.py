@@ -50,7 +50,7 @@ class Task:
         starts: starts of the search that make sense.
         headline: figures that reports and commands show first; all of them where empty.
         score_type: record of the scores, whose field descriptions are the meanings in reports.
-        settings, printer, printers, inputs, notes: as given, and remarks for the record.
+        settings: as given, as are ``printer``, ``printers`` and ``inputs``; ``notes``: for the record.
         bench: from a height map to what is seen, in the optics of the settings.
 
     Args:
