@@ -14,7 +14,7 @@ from torch import Tensor
 from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.results import Record
 from litho_design.images.noise import uncertainties
-from litho_design.images.photograph import CameraRecord, photographed_image
+from litho_design.images.photograph import CameraRecord, Photograph, photographed_image
 from litho_design.images.similarity import likeness, matched_scale, similarity
 from litho_design.images.targets import ImagedObject
 from litho_design.judging.loaded import LoadedDesign
@@ -104,10 +104,7 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
     if power is not None and not power > 0:
         raise InputError("incident power of the photograph", got=power, wanted="a positive sum of counts")
     wanted = loaded.image(loaded.expected_um)
-    photo = photographed_image(
-        wanted, loaded.record.layout.pitch_um, source.path, source.pitch_um,
-        finest_per_um=_finest_per_um(loaded), dark_level=source.dark_level, orientation=source.orientation,
-    )  # fmt: skip
+    photo = _registered(loaded, wanted, loaded.record.layout.pitch_um, source)
     target = loaded.target.cpu().double()
     resolved = loaded.bench.resolved(target)
 
@@ -128,10 +125,14 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
     return PhotoVerdict(score, uncertainty, photo.record, {f"photograph {photo.record.name}": image})
 
 
-def _finest_per_um(loaded: LoadedDesign) -> float:
-    """Highest spatial frequency of the light behind an element: that of rays from its two sides, 1/µm."""
+def _registered(loaded: LoadedDesign, wanted: np.ndarray, pitch_um: float, source: PhotoSource) -> Photograph:
     optics, half_um = loaded.record.optics, loaded.record.layout.size_um / 2
-    return 2 * half_um / math.hypot(half_um, optics.distance_um) / optics.wavelength_um
+    # The finest fringes are those of rays from two sides of the element.
+    finest_per_um = 2 * half_um / math.hypot(half_um, optics.distance_um) / optics.wavelength_um
+    return photographed_image(
+        wanted, pitch_um, source.path, source.pitch_um,
+        finest_per_um=finest_per_um, dark_level=source.dark_level, orientation=source.orientation,
+    )  # fmt: skip
 
 
 def photo_score(image: np.ndarray, target: Tensor, resolved: Tensor, *, has_power: bool) -> PhotoScore:
@@ -177,10 +178,7 @@ def score_lens_photo(
     kernels = {name: sensor_psf(loaded.bench(um), settings.pixel_px) for name, um in heights.items()}
     expected = Blur(kernels["design"], (settings.object_px, settings.object_px)).forward(wanted)
     pixel_um = settings.pixel_px * loaded.record.layout.pitch_um
-    photo = photographed_image(
-        expected.cpu().numpy(), pixel_um, source.path, source.pitch_um,
-        finest_per_um=_finest_per_um(loaded), dark_level=source.dark_level, orientation=source.orientation,
-    )  # fmt: skip
+    photo = _registered(loaded, expected.cpu().numpy(), pixel_um, source)
 
     def estimates(image: np.ndarray) -> dict[str, Tensor]:
         seen = torch.from_numpy(image).to(expected)
