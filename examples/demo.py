@@ -18,14 +18,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from examples.demo_story import FAB, tell
+from examples.demo_story import CORRECTED, FAB, tell
 from litho_data.foundation.report import Page
 
 BIN = Path(sys.executable).parent
 CARDS = Path(__file__).parents[1] / "datasets"
 # Draws of the paper's split.
 PAPER_SEEDS = (0, 1, 2, 3)
-ARMS = ("affine", "physics", "pbl")
 # On whole prints the networks would take as long again as all the rest.
 BY_PRINT = "identity,affine,affine-mtf,blur-table,linear,features,physics,random-features"
 SMALL_BASES = ("affine-mtf", "blur-table")
@@ -39,6 +38,7 @@ class Effort:
     """
 
     models: str
+    arms: tuple[str, ...]
     training_steps: int | None
     folds: int
     element_px: int
@@ -52,6 +52,7 @@ class Effort:
 # target have strokes of 0.8 µm.
 QUICK = Effort(
     models="identity,affine,blur-table,physics,pbl",
+    arms=("physics", "pbl"),
     training_steps=60,
     folds=2,
     element_px=256,
@@ -63,6 +64,7 @@ QUICK = Effort(
 # As published in docs/results: at 75 µm the letters are blurred (1.9 µm).
 MEASURED = Effort(
     models=f"{BY_PRINT},pbl,fno",
+    arms=("affine", "physics", "pbl"),
     training_steps=None,
     folds=5,
     element_px=256,
@@ -183,7 +185,7 @@ def plan(out: Path, dataset: str) -> list[Step]:
                 network / "report.html",
             ),
         ]  # fmt: skip
-    for model in ARMS:
+    for model in effort.arms:
         trained, frozen = out / "runs" / model, out / "models" / model
         steps += [
             Step(
@@ -193,14 +195,15 @@ def plan(out: Path, dataset: str) -> list[Step]:
             ),
             Step(f"Freeze {model}", _models("freeze", trained, "--out", frozen), frozen),
         ]
-    corrected = out / "models" / "corrected"
+    corrected = out / "models" / CORRECTED
     element = (
         "--size-px", effort.element_px, "--distance-um", effort.distance_um,
         "--iterations", effort.iterations, "--start", effort.start,
     )  # fmt: skip
-    # The printer itself, where it is a virtual one.
-    by_fab = () if dataset else ("--judge", f"{FAB}={out / 'fab' / 'truth'}")
-    models = ",".join(["none", *(f"{name}={out / 'models' / name}" for name in ARMS)])
+    # The printer itself, where it is a virtual one; then designs can be made through the corrected model too.
+    judge = ("--judge", f"{FAB}={out / 'fab' / 'truth'}" if not dataset else f"corrected={corrected}")
+    arms = effort.arms if dataset else (*effort.arms, CORRECTED)
+    models = ",".join(["none", *(f"{name}={out / 'models' / name}" for name in arms)])
     steps += [
         Step("Freeze the corrected model", _models("freeze", loop, "--out", corrected), corrected),
         Step(
@@ -218,7 +221,7 @@ def plan(out: Path, dataset: str) -> list[Step]:
         Step(
             "Designed with × judged with",
             _design(
-                "compare", "--models", models, "--judge", f"corrected={corrected}", *by_fab, *element,
+                "compare", "--models", models, *judge, *element,
                 "--seeds", effort.seeds, "--out", out / "compare",
             ),
             out / "compare" / "gap.json",

@@ -23,13 +23,15 @@ if TYPE_CHECKING:
 
 # What compare calls the printer that printed the scans.
 FAB = "fab"
+# The base model with what the loop added to it.
+CORRECTED = "corrected"
 # Found in all scans: the fab gives each its own zero, as an AFM does, without being asked to.
 ZERO = "datum-offset"
 PLANTED, OTHER = "#2a7ab8", "#b0b0b0"
 
 
-def tell(page: Page, out: Path, model: str = "pbl") -> None:
-    """Add verdict and cards to the index of a demo in ``out``; ``model``: what the hologram was made with."""
+def tell(page: Page, out: Path) -> None:
+    """Add verdict and cards to the index of a demo in ``out``."""
     truth = Truth.read(out / "fab" / "truth")
     loop = CloseLoop.read(out / "close-loop")
     gap = GapResult.read(out / "compare")
@@ -51,8 +53,8 @@ def tell(page: Page, out: Path, model: str = "pbl") -> None:
         f"{_also([name for name in found if name not in planted])}. On scans that it had not seen the error "
         f"went from {terms.before.mae_nm:.1f} to {terms.after.mae_nm:.1f} nm, {abs(less):.0f} % "
         f"{'less' if less >= 0 else 'more'}. A hologram designed through "
-        f"{model} has {psnr[model]:.1f} dB when this printer prints it, and {psnr['none']:.1f} dB designed "
-        "without a model. One run, so nothing is said about chance."
+        f"the corrected model has {psnr[CORRECTED]:.1f} dB when this printer prints it, and "
+        f"{psnr['none']:.1f} dB designed without a model. One run, so nothing is said about chance."
     )
     page.heading("1. What was planted")
     page.paragraph(
@@ -85,7 +87,8 @@ def tell(page: Page, out: Path, model: str = "pbl") -> None:
     page.links(
         [("benchmark/report.html", "The benchmark"), ("compare/report.html", "Designed × judged with")]
     )
-    for number, (arm, how) in enumerate({"none": "without a model", model: f"through {model}"}.items(), 5):
+    designs = {"none": "without a model", CORRECTED: "through the corrected model"}
+    for number, (arm, how) in enumerate(designs.items(), 5):
         folder = design_folder(Path("compare"), arm, gap.seeds[0])
         page.heading(f"{number}. A hologram designed {how}")
         page.paragraph(f"Printed by the fab itself, its image has {psnr[arm]:.1f} dB.")

@@ -9,7 +9,7 @@ from pathlib import Path
 import litho_data
 import litho_design
 import litho_models
-from examples.demo_story import FAB, tell
+from examples.demo_story import CORRECTED, FAB, tell
 from litho_data.foundation.report import Page
 from tests.litho_models.prints import make_scans, write_store
 
@@ -32,7 +32,7 @@ def test_the_story_has_six_cards_with_pictures_and_links(tmp_path):
     )
     litho_design.compare(
         settings,
-        {"none": "none", "pbl": str(model)},
+        {"none": "none", CORRECTED: str(model)},
         tmp_path / "compare",
         judges={FAB: str(tmp_path / "fab" / "truth")},
         seeds=(0,),
