@@ -34,7 +34,7 @@ from litho_data.virtual_fab.printer import Job
 PAGE = Path(__file__).parents[1] / "docs" / "own_data.md"
 RESULT = PAGE.parent / "results" / "mixed-up" / "mixed_up.json"
 NAME = "mixed_up.json"
-SEED = 30100
+SEED = 30500
 SIZE_PX = 128
 DOSES = (0.9, 1.0, 1.1)
 _LAYOUTS = 2

@@ -152,7 +152,8 @@ def _gains(prints: Sequence[_Print]) -> list[tuple[str, str]]:
     same_layout = Counter(one.layout for one in prints)
     repeated = len(prints) > 0 and min(same_layout.values()) > 1
     scatter = _SCATTER_SAME if repeated else _SCATTER_OTHER
-    logs = np.array([np.log(max(abs(_gain(one)), 1e-12)) for one in prints])
+    responses = [_response(one) for one in prints]
+    logs = np.array([np.log(max(abs(gain), 1e-12)) for gain, _ in responses])
     if repeated:
         logs -= [
             np.median([logs[k] for k, other in enumerate(prints) if other.layout == one.layout])
@@ -172,45 +173,64 @@ def _gains(prints: Sequence[_Print]) -> list[tuple[str, str]]:
             percent = 100 * np.expm1(logs[k] - middle[one.group])
             text = f"height per level {percent:+.0f} % off the others of {one.group}, as in {nearest}"
             said.append((one.id, f"{text}: is its id or dose the right one?"))
-    return said + _dose_order(prints, groups, middle, scatter)
+    growth = np.array([growth for _, growth in responses])
+    rising = {
+        group: (middle[group], int(members.sum()))
+        for group, members in groups.items()
+        if isinstance(group, float) and np.median(growth[members]) > 0
+    }
+    traded = _traded_doses(rising, scatter)
+    return said + [(one.id, traded[one.group]) for one in prints if one.group in traded]
 
 
-def _gain(one: _Print) -> float:
-    """Height per level, µm: the slope of the heights over the blurred layout."""
-    seen = np.isfinite(one.height)
-    level = one.topography[seen] - one.topography[seen].mean(dtype=np.float64)
-    return float((level * one.height[seen]).sum() / max(float((level**2).sum()), 1e-12))
+def _response(one: _Print) -> tuple[float, float]:
+    """Height per level, µm: the slope of the heights over the blurred layout; and how it grows with the dose.
 
-
-def _dose_order(
-    prints: Sequence[_Print],
-    groups: Mapping[float | str, np.ndarray],
-    middle: Mapping[float | str, float],
-    scatter: float,
-) -> list[tuple[str, str]]:
-    """Scans of two doses that must change places for the height per level to rise with the dose.
-
-    A set in which it falls throughout, three doses or more, is taken for a process of the other sign.
+    Level times dose is the exposure, so that the curve of the heights over the levels tells what a larger
+    dose would do to their slope over g(dose * level): d ln slope / d ln dose = cov(T, T g') / cov(T, g), T
+    the blurred levels. Of a parabola that is one plus the share that its square has in the slope; in a
+    saturated print it is negative.
     """
-    doses = sorted(group for group in groups if isinstance(group, float))
-    values = np.array([middle[dose] for dose in doses])
-    error = scatter / np.sqrt([groups[dose].sum() for dose in doses])
+    seen = np.isfinite(one.height)
+    level, height = one.topography[seen].astype(np.float64), one.height[seen]
+    from_mean = level - level.mean()
+    slope = float((from_mean * height).sum())
+    square = float(np.polyfit(level, height, 2)[0]) * float((from_mean * level**2).sum())
+    growth = 1 + square / slope if slope else 0.0
+    return slope / max(float((from_mean**2).sum()), 1e-12), growth
+
+
+def _traded_doses(rising: Mapping[float, tuple[float, int]], scatter: float) -> dict[float, str]:
+    """What is said of the doses that must change places for the height per level to rise with the dose.
+
+    Two may have been swapped, or the order of all turned round.
+
+    Args:
+        rising: per dose, of those where more dose should raise it: log of the height per level, and scans.
+        scatter: of the log of one scan.
+    """
+    doses = sorted(rising)
+    values = np.array([rising[dose][0] for dose in doses])
+    error = scatter / np.sqrt([rising[dose][1] for dose in doses])
     clear = _CLEAR_SIGMA * np.hypot.outer(error, error)
 
     def falls(order: np.ndarray) -> bool:
         return bool((np.triu(order[:, None] - order[None, :] - clear, 1) > 0).any())
 
-    if len(doses) < 2 or not falls(values) or (len(doses) > 2 and not falls(-values)):
-        return []
-    pairs = [(i, j) for i in range(len(doses)) for j in range(i + 1, len(doses))]
-    swapped = []
-    for i, j in pairs:
+    count = len(doses)
+    trades = [[(i, j)] for i in range(count) for j in range(i + 1, count)]
+    trades.append([(i, count - 1 - i) for i in range(count // 2)])
+    rights = []
+    for trade in trades:
         order = values.copy()
-        order[[i, j]] = order[[j, i]]
+        for i, j in trade:
+            order[[i, j]] = values[[j, i]]
         if not falls(order):
-            swapped.append((float(values[i] - values[j]), i, j))
-    if not swapped:
-        return []
-    _, i, j = max(swapped)
-    text = f"height per level falls from dose {doses[i]:g} to {doses[j]:g}: are these two swapped?"
-    return [(one.id, text) for one in prints if one.group in (doses[i], doses[j])]
+            rights.append((float(order @ np.arange(count)), trade))
+    if not falls(values) or not rights:
+        return {}
+    return {
+        doses[k]: f"height per level falls from dose {doses[i]:g} to {doses[j]:g}: are these two swapped?"
+        for i, j in max(rights)[1]
+        for k in (i, j)
+    }

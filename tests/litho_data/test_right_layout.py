@@ -87,11 +87,34 @@ def test_doses_that_were_mixed_up_are_named(layouts: int, seed: int) -> None:
         assert "as in 0.8" in said["P31"]
 
 
-def test_a_process_whose_height_falls_with_the_dose_is_left_in_peace() -> None:
-    prints = doses(1, 0)
-    for one, dose in zip(prints.values(), reversed(DOSES), strict=True):
+@pytest.mark.parametrize("left_out", [(), (0.8,)])
+def test_doses_in_the_wrong_order_throughout_are_named(left_out: tuple[float, ...]) -> None:
+    prints = {name: one for name, one in doses(1, 0).items() if one["dose"] not in left_out}
+    right = [one["dose"] for one in prints.values()]
+    for one, dose in zip(prints.values(), reversed(right), strict=True):
         one["dose"] = dose
+    said = doubts_of(prints)
+    # The middle one of three is where it belongs.
+    assert set(said) == {name for name, one in prints.items() if len(right) == 4 or one["dose"] != 1.0}
+    assert said[min(prints)] == said[max(prints)]
+
+
+@pytest.mark.parametrize(("exposure", "expected"), [(0.5, 2), (3.0, 0)])
+def test_in_a_saturated_print_more_dose_may_lower_its_slope(exposure: float, expected: int) -> None:
+    """Heights 1 - exp(-dose · level): the curve of each says whether the order of the doses can be wrong.
+
+    From 0.5 of full exposure on the slope grows with the dose, from 3 on it falls, and in the right order.
+    """
+    prints = doses(1, 0)
+    for name, dose in list(zip(prints, DOSES, strict=True)):
+        level = prints[name]["mask_level"]
+        height_um = 1 - np.exp(-exposure * dose * gaussian_filter(level.astype(float), 2) / 12)
+        prints[name]["height_um"] = height_um.astype(np.float32)
+    gains = [np.polyfit(one["mask_level"].ravel(), one["height_um"].ravel(), 1)[0] for one in prints.values()]
+    assert np.all(np.diff(gains) > 0) == (expected > 0)
     assert doubts_of(prints) == {}
+    swap_heights(prints, "P11", "P41")
+    assert len(doubts_of(prints)) == expected
 
 
 def test_a_mirrored_layout_is_named(tmp_path: Path) -> None:
