@@ -1,10 +1,12 @@
 """Time and memory of `litho-data build`, every build in a fresh process.
 
     python -m benchmarks.build --out FILE.json [--scans 1000] [--workers 2] [--publish]
+    python -m benchmarks.build --against CHECKOUT [--publish]
 
 First the measured prints (LITHO_DATA_DIR says where they are), then many virtual scans. These come from a
 cheap generator, not from the virtual fab: blurred random layouts with white noise, as .npy files. Making them
-is not part of what is measured. --publish also writes the table into docs/dataset_store.md.
+is not part of what is measured. With --against only the measured prints are built, in turns by the code that
+is here and by that of another checkout. --publish also writes the table into docs/dataset_store.md.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,13 +26,16 @@ import numpy as np
 
 from benchmarks.record import conclude, origin, usable_cores
 from litho_data.foundation.commands import run_script
+from litho_data.foundation.run_facts import checkout_state
 from litho_data.layouts import random_layout
 from litho_data.layouts.card_text import write_layout
 
-PAGE = Path(__file__).parents[1] / "docs" / "dataset_store.md"
+HERE = Path(__file__).parents[1]
+PAGE = HERE / "docs" / "dataset_store.md"
 RESULT = PAGE.parent / "results" / "build" / "build.json"
 NAME = "build.json"
-MEASURED_CARD = Path(__file__).parents[1] / "datasets" / "neural-lithography.toml"
+IN_TURNS = "build_in_turns.json"
+MEASURED_CARD = HERE / "datasets" / "neural-lithography.toml"
 GOAL_WALL_S, GOAL_PEAK_MIB = 25.0, 1536.0
 _MARGIN_PX = 14
 _SAMPLED_EVERY_S = 0.05
@@ -49,7 +54,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--out", type=Path, default=RESULT, help="JSON file to write")
+    parser.add_argument("--out", type=Path, help="JSON file to write; default: that of the page")
+    parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="compare with its code, in turns")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument(
         "--repeats", type=int, default=3, help="builds of the measured prints; 0 leaves them out"
@@ -64,13 +70,14 @@ def main() -> None:
     with tempfile.TemporaryDirectory(dir=arguments.scratch) as scratch:
         folder = Path(scratch)
         runs = []
+        trees = [HERE, *([] if arguments.against is None else [arguments.against.resolve()])]
         if arguments.repeats:
-            runs.append(
-                measure("measured prints", MEASURED_CARD, folder, arguments.workers, arguments.repeats)
+            runs += measure(
+                "measured prints", MEASURED_CARD, folder, arguments.workers, arguments.repeats, trees
             )
-        if arguments.scans:
+        if arguments.scans and arguments.against is None:
             card = write_virtual_scans(folder / "virtual", arguments.scans, arguments.size)
-            runs.append(measure("virtual scans", card, folder, arguments.workers, repeats=1))
+            runs += measure("virtual scans", card, folder, arguments.workers, repeats=1)
     record = {
         "schema": "litho-data/benchmark-build/1",
         "machine": {"cores": usable_cores()},
@@ -79,7 +86,30 @@ def main() -> None:
         "generator": "blurred random layouts with white noise, .npy",
         "runs": runs,
     }
-    conclude(record, as_markdown(record), arguments.out, PAGE, NAME, published=arguments.publish)
+    if arguments.against is None:
+        text, name = as_markdown(record), NAME
+    else:
+        text, name = compared(record), IN_TURNS
+    out = arguments.out or RESULT.with_name(name)
+    conclude(record, text, out, PAGE, name, published=arguments.publish)
+
+
+def compared(record: Mapping[str, Any]) -> str:
+    """The builds of two checkouts, and what the first takes of the second."""
+    here, other = record["runs"]
+    rows = [
+        f"| {run['commit'][:7]} | {sum(run['wall_s']) / len(run['wall_s']):.1f} | {min(run['wall_s']):.1f} "
+        f"| {sum(run['cpu_s']) / len(run['cpu_s']):.1f} | {max(run['peak_mib']):.0f} |"
+        for run in (other, here)
+    ]
+    wall, cpu = (sum(here[key]) / sum(other[key]) for key in ("wall_s", "cpu_s"))
+    return (
+        f"{here['scans']} measured prints, {here['workers']} workers on {record['machine']['cores']} cores, "
+        f"{len(here['wall_s'])} builds of each in turns: the second commit takes {wall:.2f} × the wall time "
+        f"and {cpu:.2f} × the processor time of the first.\n\n"
+        "| commit | wall, mean, s | wall, best, s | processor time, mean, s | peak memory, MiB |\n"
+        "|---|---|---|---|---|\n" + "\n".join(rows)
+    )
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
@@ -96,33 +126,45 @@ def as_markdown(record: Mapping[str, Any]) -> str:
     )
 
 
-def measure(what: str, card: Path, folder: Path, workers: int, repeats: int) -> dict[str, Any]:
-    """Build a card ``repeats`` times, each into a store of its own and in a process of its own."""
-    costs, result = [], {}
+def measure(
+    what: str, card: Path, folder: Path, workers: int, repeats: int, trees: Sequence[Path] = (HERE,)
+) -> list[dict[str, Any]]:
+    """Build a card ``repeats`` times by the code of each checkout in turn: one record per checkout.
+
+    Every build goes into a store of its own and is a process of its own.
+    """
+    costs: list[list[Cost]] = [[] for _ in trees]
+    results: list[dict[str, Any]] = [{} for _ in trees]
     for _ in range(repeats):
-        with tempfile.TemporaryDirectory(dir=folder) as scratch:
-            store = Path(scratch) / "prints.zarr"
-            command = [Path(sys.executable).with_name("litho-data"), "build", card, "--out", store]
-            costs.append(cost_of([*map(str, command), "--workers", str(workers)]))
-            result = json.loads((Path(scratch) / "prints-report" / "build.json").read_text(encoding="utf-8"))
-    return {
-        "what": what,
-        "scans": result["n_scans"],
-        "skipped": len(result["skipped"]),
-        "workers": workers,
-        **{name: [round(getattr(cost, name), 2) for cost in costs] for name in Cost._fields},
-        "dataset_sha256": result["dataset"]["sha256"],
-    }
+        for k, tree in enumerate(trees):
+            with tempfile.TemporaryDirectory(dir=folder) as scratch:
+                store = Path(scratch) / "prints.zarr"
+                command = [Path(sys.executable).with_name("litho-data"), "build", card, "--out", store]
+                costs[k].append(cost_of([*map(str, command), "--workers", str(workers)], tree))
+                report = Path(scratch) / "prints-report" / "build.json"
+                results[k] = json.loads(report.read_text(encoding="utf-8"))
+    return [
+        {
+            "what": what,
+            "commit": checkout_state(tree)["commit"],
+            "scans": result["n_scans"],
+            "skipped": len(result["skipped"]),
+            "workers": workers,
+            **{name: [round(getattr(cost, name), 2) for cost in spent] for name in Cost._fields},
+            "dataset_sha256": result["dataset"]["sha256"],
+        }
+        for tree, spent, result in zip(trees, costs, results, strict=True)
+    ]
 
 
-def cost_of(command: list[str]) -> Cost:
-    """Run a command and watch it and all its descendants.
+def cost_of(command: list[str], tree: Path = HERE) -> Cost:
+    """Run a command by the code of a checkout and watch it and all its descendants.
 
     Raises:
         CalledProcessError: it fails.
     """
     started = time.perf_counter()
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, env=os.environ | {"PYTHONPATH": str(tree)})
     peak_bytes, ended = 0, 0
     try:
         while not ended:

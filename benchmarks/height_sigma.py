@@ -27,7 +27,7 @@ from litho_data.virtual_fab.simulate import simulate
 PAGE = Path(__file__).parents[1] / "docs" / "dataset_store.md"
 RESULT = PAGE.parent / "results" / "height-sigma" / "height_sigma.json"
 NAME = "height_sigma.json"
-SEED = 20301
+SEED = 20407
 COVERED = {"within_68": 1.0, "within_95": 1.96}
 _LEVEL = '\n[process]\nlevel = "recipe.toml"\n'
 _RECIPE = '[[step]]\nop = "plane"\n'

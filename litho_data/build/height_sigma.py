@@ -57,7 +57,7 @@ def height_sigma(
         "resampling": 1e-6
         * _resampling_nm2(own, scan_pitch_um, layout_pitch_um, pixel_nm, line_nm, fast_axis),
         "registration": fit.warp_variance(fill_gaps(height)),
-        "levelling": fit.surface_rms**2 if levelled or fit.is_clear else 0.0,
+        "levelling": fit.surface_variance(levelled),
         "calibration": (z_uncertainty * (height - height[valid].mean())) ** 2,
     }
     total = np.zeros(shape)

@@ -132,16 +132,15 @@ def _misfit(scan: np.ndarray, fine: FineFit) -> np.ndarray | None:
     seen = overlap_of(found.layout_to_scan, shape, np.isfinite(scan), found.bend)
     places = warped_grid(found.layout_to_scan, shape, found.bend)
     warped = np.where(seen, map_coordinates(fill_gaps(scan), places, order=1, mode="nearest"), np.nan)
-    knots = np.linspace(topography.min(), topography.max(), _KNOTS)
-    design = [np.interp(topography, knots, hat) for hat in np.eye(_KNOTS)]
-    design += list(quadratic_basis(shape)[1:])
     sparse = (slice(None, None, _EVERY),) * 2
     seen = np.isfinite(warped[sparse])
     if seen.sum() < _FEWEST_PX:
         return None
-    columns_of = np.stack([one[sparse][seen] for one in design], axis=1)
-    coefficients = _robust(columns_of, warped[sparse][seen])
-    misfit = warped - np.einsum("k,kyx->yx", coefficients, np.stack(design))
+    knots, surfaces = np.linspace(topography.min(), topography.max(), _KNOTS), quadratic_basis(shape)[1:]
+    hats = [np.interp(topography[sparse][seen], knots, hat) for hat in np.eye(_KNOTS)]
+    design = np.stack([*hats, *surfaces[:, *sparse][:, seen]], axis=1)
+    response, background = np.split(_robust(design, warped[sparse][seen]), [_KNOTS])
+    misfit = warped - np.interp(topography, knots, response) - np.einsum("k,kyx->yx", background, surfaces)
     inner = (slice(BORDER_PX, -BORDER_PX),) * 2
     framed = np.full(shape, np.nan)
     framed[inner] = misfit[inner]

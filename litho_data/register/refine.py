@@ -147,7 +147,7 @@ def aligned_gram(
     shape = (topography.shape[0], topography.shape[1])
     inside = _interior(shape) & np.isfinite(aligned)
     regressors = np.concatenate([_regressors(topography, count), *(one[None] for one in further)])
-    return _cell_grams(regressors, np.where(inside, aligned, 0.0), inside)
+    return _cell_grams(regressors, np.where(inside, aligned, 0.0).astype(np.float32), inside)
 
 
 def in_blocks(gram: np.ndarray) -> np.ndarray:
@@ -243,7 +243,8 @@ class _Sums:
 
 def _cell_grams(regressors: np.ndarray, warped: np.ndarray, inside: np.ndarray) -> np.ndarray:
     ny, nx = warped.shape
-    stack = np.concatenate([regressors, warped[None]]) * inside.astype(np.float32)
+    stack = np.concatenate([regressors, warped[None]])
+    stack *= inside
     rows, columns = _cell_edges(ny), _cell_edges(nx)
     gram = np.empty((len(rows) - 1, len(columns) - 1, len(stack), len(stack)))
     for i, (top, bottom) in enumerate(pairwise(rows)):

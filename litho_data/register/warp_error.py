@@ -7,6 +7,7 @@ spread of the fits contains what the topography does not explain, as far as bloc
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -21,6 +22,11 @@ _CLEAR = 6.0**0.5
 # How far a place feels what is printed around it (proximity, shrinkage), layout pixels. A fit without that
 # takes it for a surface, and the same in neighbouring blocks, so that the jackknife does not see it.
 _REACHES_PX = (4.0, 10.0, 25.0)
+# Within as much of the layout's border as a cell is wide, a print has other surroundings than inside. What
+# that does is alike on all four sides, and in all blocks there: it pulls the magnification by more than the
+# jackknife states. A field of this many cells still has two thirds of its area without its outermost ones.
+_FEWEST_CELLS = 12
+_MAGNIFICATION = 3
 
 
 @dataclass(frozen=True)
@@ -29,15 +35,27 @@ class WarpError:
 
     Attributes:
         covariance: (k, k) of the amounts of the flows of ``register.flows``, normalised layout frame.
-        surface_rms: of the quadratic surface that the scan has beside the print, its offset aside, over the
-            field, unit of the heights. The true one lies about the fitted one as far as the fit errs, so its
-            expected square is that of the fitted one and the variance of the fit.
+        surface_rms: of the quadratic surface that the fit finds beside the print, its offset aside, over the
+            field, unit of the heights.
+        surface_error_rms: of the error of that fit.
         is_clear: whether there is such a surface.
     """
 
     covariance: np.ndarray
     surface_rms: float
+    surface_error_rms: float
     is_clear: bool
+
+    def surface_variance(self, levelled: bool) -> float:
+        """Mean square of the surface that the heights have beside the print.
+
+        That of a fitted surface is larger than that of the true one by the variance of the fit. What
+        levelling took is not a surface of the scan, but of the print with its roughness, which is in the
+        error of the fit and no longer in the heights: here the two squares add.
+        """
+        if levelled:
+            return self.surface_rms**2 + self.surface_error_rms**2
+        return max(self.surface_rms**2 - self.surface_error_rms**2, 0.0) if self.is_clear else 0.0
 
     def warp_variance(self, height: np.ndarray) -> np.ndarray:
         """Variance of registered heights (ny, nx) by the error of the warp: steep places move most."""
@@ -67,25 +85,44 @@ def warp_error(height: np.ndarray, layout_level: np.ndarray, blur_px: float, mod
         blur_px: Gaussian sigma of the topography, layout pixels.
         model: as in the quality record: a rung of the ladder, ``quadratic`` or ``creep``.
     """
-    from scipy.ndimage import gaussian_filter
-
     shape = (height.shape[0], height.shape[1])
     smooth = np.where(np.isfinite(height), smooth_measured(height, SCAN_BLUR_PX), np.nan)
     count = {str(name): number for name, number in LADDER.items()}.get(model, BENT_COUNT)
     topography = predicted_topography(layout_level, blur_px)
-    around = [gaussian_filter(topography - topography.mean(), reach, truncate=3.0) for reach in _REACHES_PX]
-    blocks = in_blocks(aligned_gram(smooth, topography, count, around))
-    blocks = blocks.reshape(-1, *blocks.shape[2:])
+    around = [_around(topography - topography.mean(), reach_px) for reach_px in _REACHES_PX]
+    cells = aligned_gram(smooth, topography, count, around)
+    blocks = in_blocks(cells).reshape(-1, *cells.shape[2:])
     # The registration knows nothing of the surroundings, so its error is that of a fit without them.
-    own = np.r_[: NUISANCES + count, -1]
-    _, covariance = _without_each(blocks[:, own[:, None], own])
+    own = np.ix_(*[np.r_[: NUISANCES + count, -1]] * 2)
+    _, covariance = _without_each(blocks[:, *own])
+    if count > _MAGNIFICATION and min(cells.shape[:2]) >= _FEWEST_CELLS:
+        at = NUISANCES + _MAGNIFICATION
+        whole, inner = (solve_gram(one.sum(axis=(0, 1))[own]) for one in (cells, cells[1:-1, 1:-1]))
+        covariance[at, at] += (inner[at] / inner[0] - whole[at] / whole[0]) ** 2
     fitted, spread = _without_each(blocks)
     terms = slice(2, NUISANCES)
     surface, error = fitted[terms], spread[terms, terms]
-    is_clear = bool(np.mean(surface**2 / np.maximum(np.diag(error), 1e-300)) > _CLEAR**2)
-    products = np.cov(quadratic_basis(shape)[1:].reshape(len(surface), -1), bias=True)
-    squared = surface @ products @ surface + (products * error).sum()
-    return WarpError(covariance[NUISANCES:, NUISANCES:], float(squared) ** 0.5, is_clear)
+    products = _products(shape)
+    return WarpError(
+        covariance=covariance[NUISANCES:, NUISANCES:],
+        surface_rms=float(surface @ products @ surface) ** 0.5,
+        surface_error_rms=float((products * error).sum()) ** 0.5,
+        is_clear=bool(np.mean(surface**2 / np.maximum(np.diag(error), 1e-300)) > _CLEAR**2),
+    )
+
+
+def _around(topography: np.ndarray, reach_px: float) -> np.ndarray:
+    """Gaussian mean of what surrounds each place, reflected at the border."""
+    import cv2
+
+    width_px = 2 * round(3 * reach_px) + 1
+    return cv2.GaussianBlur(topography, (width_px, width_px), reach_px, borderType=cv2.BORDER_REFLECT)
+
+
+@lru_cache(maxsize=4)
+def _products(shape: tuple[int, int]) -> np.ndarray:
+    """Covariances (5, 5) of the terms of a quadratic surface over the field."""
+    return np.cov(quadratic_basis(shape)[1:].reshape(5, -1), bias=True)
 
 
 def _without_each(blocks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -106,6 +106,6 @@ def test_levelling_is_compared_where_gwyddions_time_is_known():
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is read from /proc")
 def test_virtual_scans_of_the_benchmark_can_be_built(tmp_path: Path):
     card = build_benchmark.write_virtual_scans(tmp_path / "virtual", 3, 128)
-    run = build_benchmark.measure("virtual scans", card, tmp_path, workers=2, repeats=1)
+    (run,) = build_benchmark.measure("virtual scans", card, tmp_path, workers=2, repeats=1)
     assert (run["scans"], run["skipped"]) == (3, 0)
     assert np.isfinite([*run["wall_s"], *run["cpu_s"], *run["peak_mib"]]).all()

@@ -75,7 +75,7 @@ def test_an_uncertain_warp_moves_a_plane_by_its_slope():
     shape, (a, b, c), (p, q) = (40, 60), (0.01, 0.02, 0.005), (0.3, -0.2)
     y, x = np.mgrid[:40, :60].astype(float)
     scale = normalisation(shape)[0, 0]
-    error = WarpError(np.diag([a, b, c]) ** 2, 0.0, False)
+    error = WarpError(np.diag([a, b, c]) ** 2, 0.0, 0.0, False)
     # Amounts are in the normalised frame: a shift of a is a / scale pixels.
     known = ((p * a) ** 2 + (q * b) ** 2) / scale**2 + c**2 * (q * (x - 29.5) - p * (y - 19.5)) ** 2
     np.testing.assert_allclose(error.warp_variance(p * x + q * y), known, rtol=1e-9)
@@ -99,6 +99,32 @@ def test_the_warp_is_as_uncertain_as_it_comes_out():
     assert 0.7 < np.sqrt((ratio**2).mean()) < 1.4
 
 
+@pytest.mark.parametrize(("size", "sees_the_border"), [(416, True), (256, False)])
+def test_a_border_that_pulls_the_magnification_is_part_of_its_error(size, sees_the_border):
+    """The outermost 32 px lie 0.1 px further out, on all sides alike, and nothing else is wrong."""
+    layout = layout_of(3, (size, size))
+    topography = predicted_topography(layout, 2.0)
+    y, x = np.indices(topography.shape) - (size - 1) / 2
+    gradient_y, gradient_x = np.gradient(topography)
+    outwards = (abs(x) > size / 2 - 32) * np.sign(x) * gradient_x + (abs(y) > size / 2 - 32) * np.sign(
+        y
+    ) * gradient_y
+    height = topography - 0.1 * outwards
+    found = solve_gram(aligned_gram(height, topography, LADDER["affine"]).sum(axis=(0, 1)))
+    pull, stated = found[NUISANCES + 3] / found[0], warp_error(height, layout, 2.0, "affine").covariance[3, 3]
+    # The inner cells show no displacement but for the smoothing across their edge; the jackknife, which sees
+    # that blocks differ, states less than half of the pull.
+    assert (stated**0.5 > 0.9 * abs(pull)) == sees_the_border
+    assert stated**0.5 < 1.5 * abs(pull)
+
+
+def test_the_error_of_a_fit_is_taken_off_a_surface_or_added_to_what_was_levelled():
+    assert WarpError(np.eye(6), 5.0, 3.0, True).surface_variance(levelled=False) == pytest.approx(16)
+    assert WarpError(np.eye(6), 5.0, 3.0, False).surface_variance(levelled=True) == pytest.approx(34)
+    assert WarpError(np.eye(6), 5.0, 3.0, False).surface_variance(levelled=False) == 0
+    assert WarpError(np.eye(6), 3.0, 5.0, True).surface_variance(levelled=False) == 0
+
+
 def test_what_levelling_took_from_a_print_is_as_large_as_stated():
     """Least squares takes the surface of topography and roughness; after it, only the first can be seen."""
     layout = layout_of(3, (256, 256))
@@ -109,7 +135,7 @@ def test_what_levelling_took_from_a_print_is_as_large_as_stated():
         white = gaussian_filter(np.random.default_rng(seed).standard_normal((256, 256)), 8.0)
         height = topography + 0.02 * white / white.std()
         surface = (np.linalg.lstsq(basis.T, height.ravel(), rcond=None)[0] @ basis).reshape(height.shape)
-        stated.append(1e6 * warp_error(height - surface, layout, 2.0, "affine").surface_rms ** 2)
+        stated.append(1e6 * warp_error(height - surface, layout, 2.0, "affine").surface_variance(True))
         taken.append(1e6 * surface.var())
     # The topography's surface has 76 nm², and noise of 20 nm correlated over 16 pixels adds 30: of single
     # scans 30 nm² too much or too little, in the mean of 12 so 9, three times that allowed. A jackknife of
