@@ -99,6 +99,8 @@ def find_defects(scan: np.ndarray, fine: FineFit) -> tuple[np.ndarray, float]:
     # Without noise the misfit may be all edges: what is small beside the print is no defect.
     sigma = max(np.nanmedian(np.abs(misfit)) / _MAD_PER_SIGMA, _LEAST_SIGMA * np.nanstd(scan))
     size = np.nan_to_num(np.abs(misfit) / sigma)
+    if size.max() <= SUSPECT_SIGMA:
+        return nowhere
     regions, count = label(size > EDGE_SIGMA)
     index = np.arange(1, count + 1)
     suspect = sum_labels(size > SUSPECT_SIGMA, regions, index) > 0

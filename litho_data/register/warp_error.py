@@ -64,16 +64,15 @@ class WarpError:
         gradient_y, gradient_x = (gradient / normalise[0, 0] for gradient in np.gradient(height))
         x = normalise[0, 0] * np.arange(shape[1])[None, :] + normalise[0, 2]
         y = normalise[1, 1] * np.arange(shape[0])[:, None] + normalise[1, 2]
-        moved = [
-            along_x * gradient_x + along_y * gradient_y
-            for along_x, along_y in flows(len(self.covariance), x, y)
-        ]
+        moved = np.stack(
+            [
+                (along_x * gradient_x + along_y * gradient_y).ravel()
+                for along_x, along_y in flows(len(self.covariance), x, y)
+            ]
+        )
         sizes, directions = np.linalg.eigh(self.covariance)
-        total = np.zeros(shape)
-        for size, direction in zip(sizes, directions.T, strict=True):
-            combined = sum(part * one for part, one in zip(direction, moved, strict=True))
-            total += max(size, 0.0) * combined**2
-        return total
+        total: np.ndarray = np.maximum(sizes, 0.0) @ (directions.T @ moved) ** 2
+        return total.reshape(shape)
 
 
 def warp_error(height: np.ndarray, layout_level: np.ndarray, blur_px: float, model: str) -> WarpError:

@@ -44,6 +44,12 @@ def test_the_page_quotes_the_committed_measurement(benchmark):
     assert text == benchmark.as_markdown(json.loads(benchmark.RESULT.read_text(encoding="utf-8")))
 
 
+def test_the_page_quotes_the_builds_in_turns():
+    name = build_benchmark.IN_TURNS
+    record = json.loads(build_benchmark.RESULT.with_name(name).read_text(encoding="utf-8"))
+    assert published(build_benchmark.PAGE, name) == build_benchmark.compared(record)
+
+
 def test_publishing_replaces_what_stands_between_the_marks(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("top\n<!-- a: written by the benchmark -->\nold\n<!-- end of a -->\nbottom\n")
