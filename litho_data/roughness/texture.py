@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import digamma, polygamma
-from scipy.stats import gamma, norm
+from scipy.special import digamma, gammaincc, ndtri, polygamma
 
 from litho_data.foundation.errors import InputError
 
@@ -17,7 +16,7 @@ _AROUND = 16
 _OWN = 3
 # Powers k = 0, 1, 2 frequencies apart are correlated by 1, 4/9, 1/36 under a Hann window: share that is free.
 _INDEPENDENT = 1 / (1 + 2 * 4 / 9 + 2 / 36)
-_QUANTILES = norm.ppf((np.arange(200) + 0.5) / 200)
+_QUANTILES = ndtri((np.arange(200) + 0.5) / 200)
 # The slowest frequencies are what levelling leaves of a bow.
 _FIRST = 3
 
@@ -156,5 +155,5 @@ def _against_surroundings(power: np.ndarray, scans: int) -> tuple[np.ndarray, np
         fitted = inverse[0] @ logarithm[around]
         variance = polygamma(1, scans) * (inverse[0] @ inverse[0]) / _INDEPENDENT
         ratio = power[at] / np.exp(fitted - np.sqrt(variance) * _QUANTILES)
-        level[at], chance[at] = np.exp(fitted), gamma.sf(scans * ratio, scans).mean()
+        level[at], chance[at] = np.exp(fitted), gammaincc(scans, scans * ratio).mean()
     return level, chance
