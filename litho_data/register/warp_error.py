@@ -93,7 +93,7 @@ def warp_error(height: np.ndarray, layout_level: np.ndarray, blur_px: float, mod
     blocks = in_blocks(cells).reshape(-1, *cells.shape[2:])
     # The registration knows nothing of the surroundings, so its error is that of a fit without them.
     own = np.ix_(*[np.r_[: NUISANCES + count, -1]] * 2)
-    _, covariance = _without_each(blocks[:, *own])
+    _, covariance = _without_each(blocks[:, own[0], own[1]])
     if count > _MAGNIFICATION and min(cells.shape[:2]) >= _FEWEST_CELLS:
         at = NUISANCES + _MAGNIFICATION
         whole, inner = (solve_gram(one.sum(axis=(0, 1))[own]) for one in (cells, cells[1:-1, 1:-1]))
