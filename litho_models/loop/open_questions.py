@@ -142,7 +142,7 @@ def _rivals(findings: LoopFindings, replaced: str | None, names: Sequence[str]) 
     windows = [scan.window for scan in findings.development]
     rivals = []
     for name in names:
-        own = chain.values().get(name) or fitting_start(_screened(findings, name))
+        own = chain.values().get(name) or fitting_start(_screened(findings, name, replaced))
         started = chain.with_effects({**kept, name: own})
         fit = fit_least_squares(ChainProblem(started, windows), get_vector(started), RULES["squares"])
         stands_for = sum(int(w.usable.sum()) for w in windows) / sum(len(w.sample) for w in windows)
@@ -165,9 +165,10 @@ def _rivals(findings: LoopFindings, replaced: str | None, names: Sequence[str]) 
     return rivals
 
 
-def _screened(findings: LoopFindings, name: str) -> Screened:
+def _screened(findings: LoopFindings, name: str, replaced: str | None) -> Screened:
+    """Where a rival starts: beside what was added, or in the place of one of it as before any was."""
     search = findings.search
-    return search.last.get(name) or search.first[name]
+    return search.first[name] if replaced or name not in search.last else search.last[name]
 
 
 def _spread(before: Score, after: Score, noise: NoiseSpectrum) -> float:

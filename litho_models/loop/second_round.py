@@ -3,7 +3,8 @@
 Every rival is fitted to all prints, old and new, and judged on the new ones alone: the difference of two
 squared errors against its standard deviation, from blocks of pixels and, as in the plan, from what prints
 differ by. Scans of one print share its roughness, so their blocks are added up before they count. A rival is
-excluded where another is better with p <= 0.005; a name is given where one is left.
+excluded where another is better with p <= 0.005 and by 1 % of its squared error; a name is given where one is
+left.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from litho_models.loop.parameters import chain_at, get_vector
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.result.questions import IN_SCAN, OpenQuestions, Question, Rival
 from litho_models.loop.result.record import AddedEffect, CloseLoop, Comparison, Decided, Decision
-from litho_models.loop.selection.confirming import BINOMIAL_P
+from litho_models.loop.selection.confirming import BINOMIAL_P, SMALLEST_SHARE
 from litho_models.loop.single_scans.nested_tests import scan_parameters
 from litho_models.loop.study import Score, score
 from litho_models.scan_terms import Terms, parameter_names, terms_of_effect
@@ -142,7 +143,9 @@ def _decision(
 ) -> Decision:
     scores = {name: score(new, own, ALL_FREE, findings.study.blocks) for name, own in predictions.items()}
     comparisons = [_compare(a, b, scores, new, question.spread) for a in scores for b in scores if a != b]
-    excluded = {one.worse for one in comparisons if one.z >= Z_DECIDED}
+    # As in the loop: a smaller difference may come from what no rival describes.
+    least = {name: SMALLEST_SHARE * float(own.mse_nm2.mean()) for name, own in scores.items()}
+    excluded = {c.worse for c in comparisons if c.z >= Z_DECIDED and c.gain_nm2 >= least[c.better]}
     left = [name for name in names if name not in excluded]
     evident = [one for one in comparisons if one.better in left and one.worse != NONE and one.gain_nm2 > 0]
     if not left or (NONE not in excluded and len(left) <= 1):

@@ -25,6 +25,7 @@ from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 from litho_models.effects import FieldContext, get_effect
 from litho_models.effects.chain import EffectChain
 from litho_models.frozen.files import save_frozen
+from litho_models.loop.open_questions import _screened
 from litho_models.loop.parameters import chain_at, get_vector
 from litho_models.loop.prepared import prepare_scans
 from litho_models.loop.residual_spectrum import NoiseSpectrum, residual_spectrum
@@ -32,7 +33,7 @@ from litho_models.loop.result.exporting import part_of
 from litho_models.loop.result.questions import IN_SCAN, OpenQuestions, Question, Rival
 from litho_models.loop.result.record import AddedEffect, CloseLoop, Decision
 from litho_models.loop.run import _attributed, _new_scans
-from litho_models.loop.second_round import decide, with_decisions
+from litho_models.loop.second_round import NONE, Z_DECIDED, _decision, decide, with_decisions
 from litho_models.planning import power
 from litho_models.planning.answers import _pairs
 from litho_models.planning.designer import as_tensor
@@ -399,6 +400,37 @@ def test_two_turned_prints_say_whose_a_loss_on_slopes_is(frame: tuple[str, ...])
     decision = decide(findings, opened([slope_question()]), prepare_scans(second_round(frame, 5)))[0]
     assert decision.verdict == "decided"
     assert decision.left == ["slope-thinning" + IN_SCAN * bool(frame)]
+
+
+@pytest.mark.parametrize(("share", "verdict"), [(0.005, "still open"), (0.03, "decided")])
+def test_a_difference_below_one_per_cent_of_the_squared_error_decides_nothing(
+    share: float, verdict: str
+) -> None:
+    """However sure: what no rival describes may be as large. The errors of the worse are the better's, grown."""
+    scans = prepare_scans(printed_scans(size_px=64, count=2))
+    random = np.random.default_rng(3)
+    errors = [0.01 * random.standard_normal(scan.usable.shape) for scan in scans]
+    predictions = {
+        name: [
+            scan.stored.height_um - math.sqrt(1 + more) * error
+            for scan, error in zip(scans, errors, strict=True)
+        ]
+        for name, more in (("a", 0.0), ("b", share), (NONE, 0.5))
+    }
+    question = slope_question()
+    findings = SimpleNamespace(study=SimpleNamespace(blocks=Blocks()))
+    decision = _decision(question, scans, predictions, ["a", "b"], findings)
+    between = next(one for one in decision.comparisons if (one.better, one.worse) == ("a", "b"))
+    assert between.z > Z_DECIDED
+    assert decision.verdict == verdict
+
+
+def test_a_rival_in_the_place_of_a_named_effect_starts_as_if_that_had_not_been_found() -> None:
+    """Beside the named one it would start at what is left for it: a blur beside a blur at a negative one."""
+    alone, beside = object(), object()
+    findings = SimpleNamespace(search=SimpleNamespace(first={"a": alone}, last={"a": beside}))
+    assert _screened(findings, "a", replaced="b") is alone
+    assert _screened(findings, "a", replaced=None) is beside
 
 
 def test_what_is_decided_gets_its_owner_in_the_result_and_in_the_model() -> None:
