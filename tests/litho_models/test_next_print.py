@@ -406,7 +406,7 @@ def test_two_turned_prints_say_whose_a_loss_on_slopes_is(frame: tuple[str, ...])
 def test_a_difference_below_one_per_cent_of_the_squared_error_decides_nothing(
     share: float, verdict: str
 ) -> None:
-    """However sure: what no rival describes may be as large. The errors of the worse are the better's, grown."""
+    """However sure: what no rival describes may be as large. The worse has the better's errors, grown."""
     scans = prepare_scans(printed_scans(size_px=64, count=2))
     random = np.random.default_rng(3)
     errors = [0.01 * random.standard_normal(scan.usable.shape) for scan in scans]
