@@ -119,7 +119,7 @@ def of_seed(folder: Path, seed: int, model: str, settings: ReliefSettings) -> li
             first, level, expected_um = _corrected(wanted_um, frozen, folder / relief, settings)
             off_um = gaussian_filter(_print_um(rough, level, settings) - expected_um, SECOND_BLUR_PX)
             again = (wanted_um - off_um + off_um.mean()).astype(np.float32)
-            second, _, _ = _corrected(again, frozen, folder / f"{relief}-again", settings)
+            _, second, _ = _corrected(again, frozen, folder / f"{relief}-again", settings)
             found = errors_nm(smooth, wanted_um, level, settings)
             found["second_nm"] = _error_nm(smooth, wanted_um, second, settings)
             write_record(kept, {"relief": relief, "seed": seed, **found, **first})
