@@ -39,6 +39,7 @@ from litho_models.planning.answers import _pairs
 from litho_models.planning.designer import as_tensor
 from litho_models.planning.layouts import Limits, climb, score, starts
 from litho_models.planning.record import NextPrint, PlannedQuestion
+from litho_models.planning.report import _asked
 from litho_models.planning.rivalry import PlannedPrint, Printing, Rivalry, Way
 from litho_models.planning.run import next_print
 from litho_models.scan_terms import Blocks
@@ -469,6 +470,18 @@ def test_new_prints_have_to_be_of_this_printer_and_turned_as_they_say(tmp_path: 
     store.__dict__["manifest"] = {"card": {"plan": {"dataset_sha256": "a" * 64}}}
     with pytest.raises(InputError, match="plan for dataset aaaaaaaaaaaa"):
         _new_scans(first, store)
+
+
+def test_a_question_is_put_in_words_by_its_rivals() -> None:
+    def asked(kind: str, name: str, rivals: list[str]) -> str:
+        return _asked(PlannedQuestion.model_construct(kind=kind, name=name, rivals=rivals, text="no place"))
+
+    blurs = asked("set", "diffusion-blur", ["diffusion-blur", "resampling-blur"])
+    titles = [get_effect(name).title for name in ("diffusion-blur", "resampling-blur")]
+    assert blurs == f"which is at work, {titles[0]} or {titles[1]}"
+    slope = asked("role", "slope-thinning", ["slope-thinning", "slope-thinning" + IN_SCAN])
+    assert slope == f"{get_effect('slope-thinning').title}: the printer's or the microscope's"
+    assert asked("fact", "vignetting", []).endswith(": no place")
 
 
 def test_what_is_planted_is_drawn_before_anything_is_run_and_judged_by_its_owner() -> None:

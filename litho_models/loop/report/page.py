@@ -289,7 +289,7 @@ def _probe_section(page: Page, findings: LoopFindings) -> None:
     probed = findings.probed
     page.heading("What has no name", folded=True)
     for entry in probed.added:
-        letters = " h: height (µm), y and x: slopes along y and x." if entry.probe.name in OF_SHAPES else ""
+        letters = " h: share of the full height, y and x: slopes." if entry.probe.name in OF_SHAPES else ""
         page.figure(
             probe_figure(entry),
             f"{entry.probe.name}: held-out error {entry.before.mean_mae_nm:.2f} to "
