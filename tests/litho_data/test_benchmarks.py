@@ -19,9 +19,10 @@ from benchmarks import mixed_up as mixed_up_benchmark
 from benchmarks import readers as readers_benchmark
 from benchmarks import registration as registration_benchmark
 from benchmarks import tip as tip_benchmark
-from benchmarks.record import NOT_MEASURED, publish, published
+from benchmarks.record import publish, published
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import run_facts
+from tests.quoted import require_quoted
 
 
 @pytest.mark.parametrize(
@@ -37,11 +38,7 @@ from litho_data.foundation.run_facts import run_facts
     ],
 )
 def test_the_page_quotes_the_committed_measurement(benchmark):
-    text = published(benchmark.PAGE, benchmark.NAME)
-    if not benchmark.RESULT.exists():
-        assert text == NOT_MEASURED
-        return
-    assert text == benchmark.as_markdown(json.loads(benchmark.RESULT.read_text(encoding="utf-8")))
+    require_quoted(benchmark)
 
 
 def test_the_page_quotes_the_builds_in_turns():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 
 import cv2
@@ -12,7 +11,6 @@ import torch
 
 from benchmarks import photographs
 from benchmarks.photographs import Camera
-from benchmarks.record import NOT_MEASURED, published
 from litho_data.foundation.errors import InputError
 from litho_data.register.geometry import ORIENTATIONS, orient
 from litho_design.images.similarity import si_psnr_db
@@ -24,6 +22,7 @@ from litho_design.judging.score import ScoreResult
 from litho_design.printers.printer import Printer
 from litho_design.workflows.design import design_hologram
 from litho_design.workflows.score import score as score_design
+from tests.quoted import require_quoted
 
 
 @pytest.fixture
@@ -196,11 +195,7 @@ def test_a_photograph_is_within_a_third_of_a_decibel_of_its_light_or_refused(tmp
 
 
 def test_the_page_quotes_the_photographs_that_were_scored():
-    text = published(photographs.PAGE, photographs.NAME)
-    if not photographs.RESULT.exists():
-        assert text == NOT_MEASURED
-        return
-    assert text == photographs.as_markdown(json.loads(photographs.RESULT.read_text(encoding="utf-8")))
+    require_quoted(photographs)
 
 
 def test_baselines_stand_beside_every_score(printed_design, tmp_path):

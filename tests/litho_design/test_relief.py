@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 
 import cv2
@@ -12,7 +11,6 @@ import tifffile
 import torch
 
 from benchmarks import relief as benchmark
-from benchmarks.record import NOT_MEASURED, published
 from litho_data.foundation.errors import InputError
 from litho_design import correct, load_design
 from litho_design.cli.app import main
@@ -20,6 +18,7 @@ from litho_design.optimisation.process_window import measure_yield
 from litho_design.reliefs.settings import relief_settings
 from litho_design.reliefs.targets import load_relief
 from litho_design.reliefs.task import ReliefTask
+from tests.quoted import require_quoted
 
 TINY = {
     "layout.size_px": 48,
@@ -124,8 +123,4 @@ def test_the_benchmark_gives_each_arm_the_error_of_its_own_print():
 
 
 def test_the_page_quotes_the_committed_measurement():
-    text = published(benchmark.PAGE, benchmark.NAME)
-    if not benchmark.RESULT.exists():
-        assert text == NOT_MEASURED
-        return
-    assert text == benchmark.as_markdown(json.loads(benchmark.RESULT.read_text(encoding="utf-8")))
+    require_quoted(benchmark)
