@@ -1,9 +1,10 @@
 """The fast recipe against itself in bfloat16, another seed, and the first epochs of the paper's, on one draw.
 
-    python -m benchmarks.recipes STORE --publish
+    python -m benchmarks.recipes STORE [--runs paper-pbl] --publish
 
-``--fast`` is the result of `litho-models benchmark STORE --split paper` with the fast recipe in float32. A
-interrupted run resumes. All epochs of the paper, ``--epochs 4000``, are a task for a GPU.
+``--fast`` is the result of `litho-models benchmark STORE --split paper` with the fast recipe in float32. An
+interrupted run resumes. The page shows all runs that are published, those of earlier calls too. All epochs of
+the paper, ``--epochs 4000``, are a task for a GPU.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ RUNS: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {
     "reduced": (("pbl",), {"precision": "bf16-mixed"}),
     "reseeded": (("pbl",), {"seed": 1}),
     "paper": (("physics", "pbl"), {"recipe": "paper", "precision": "bf16-mixed"}),
+    "paper-physics": (("physics",), {"recipe": "paper", "variant": "paper"}),
+    "paper-pbl": (("pbl",), {"recipe": "paper", "variant": "paper"}),
     "paper-fno": (("fno",), {"recipe": "paper", "variant": "paper"}),
 }
 STEPS_PER_EPOCH = PAPER_CROPS // PAPER_BATCH
@@ -65,12 +68,16 @@ def main() -> None:
             settings=settings,
             seed=fast.split.seed,
         )
-    text = recipe_text(fast, list(results.values()))
-    print(text)
+    print(recipe_text(fast, list(results.values())))
     if given.publish:
         for name, result in results.items():
             result.write(FOLDER / name)
-        publish(PAGE, MARK, text)
+        publish(PAGE, MARK, recipe_text(fast, published_runs()))
+
+
+def published_runs() -> list[Benchmark]:
+    """The committed results, in the order of `RUNS`."""
+    return [Benchmark.read(FOLDER / name) for name in RUNS if (FOLDER / name).is_dir()]
 
 
 def recipe_text(fast: Benchmark, others: Sequence[Benchmark]) -> str:
