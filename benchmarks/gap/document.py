@@ -16,7 +16,7 @@ from benchmarks.gap.steps import proof_folders
 from benchmarks.gap.tables import SHOWN, as_markdown, figure_file
 from benchmarks.gap.tasks import Task
 from benchmarks.record import origin, publish, usable_cores, write_record
-from litho_design.judging.gap import GapResult, headline
+from litho_design.judging.gap import GapResult, design_folder, headline
 from litho_design.judging.score import ScoreResult
 from litho_design.tasks.design import Design
 
@@ -49,6 +49,7 @@ def write_results(
                 "printers": {arm: used.sha256 for arm, used in gap.arms.items()},
                 "minutes": _minutes(out / name, gap.seeds),
                 "paired": [item.model_dump(mode="json") for item in gap.paired if item.judge not in gap.arms],
+                "ceiling": _ceiling(out / name, gap),
             }
             for name, gap in gaps.items()
         },
@@ -100,6 +101,12 @@ def _models(out: Path) -> dict[str, dict[str, float]]:
             policies = {item["policy"]: item["mae_nm"] for item in scores["by_policy"]}
             errors[arm] = {"offset": scores["mae_datum_free_nm"], "full": policies["full"]}
     return errors
+
+
+def _ceiling(folder: Path, gap: GapResult) -> dict[str, float] | None:
+    """Figures of a continuous phase on the grid of the designs, no printer and no levels; None for a lens."""
+    design = Design.read(design_folder(folder, next(iter(gap.arms)), gap.seeds[0]))
+    return (design.baselines or {}).get("continuous phase")
 
 
 def _minutes(folder: Path, seeds: Sequence[int]) -> dict[str, float]:

@@ -69,17 +69,27 @@ def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, A
         shown = dict(list(shown.items())[:1])
     # Judged by one printer, the expectation stands beside it; by several, each is a column.
     heads = [f"{_LABELS[figure]}, in design → by {judge}" for judge in judges for figure in shown]
-    # A perfect lens has a Strehl ratio of 1: what is missing is the gap to the ceiling.
+    # A perfect lens has a Strehl ratio of 1: what is missing is the gap to the ceiling. A hologram's is a
+    # continuous phase, and what is left of its image is measured as rms error, which SI-PSNR is in dB.
+    ceiling = task.get("ceiling") if independent else None
     heads += ["Strehl ratio lost against a perfect lens"] if "strehl" in shown else []
+    heads += [f"rms error of the image above a continuous phase's, by {judge}" for judge in judges if ceiling]
     lines = [f"| designed with | {' | '.join(heads)} |", "|---" * (1 + len(heads)) + "|"]
     for arm in arms:
         cells = [_cell(values[arm, judge, figure], _digits(figure)) for judge in judges for figure in shown]
         if "strehl" in shown:
             cells.append(f"{100 * (1 - values[arm, judges[0], 'strehl']['judged']):.1f} %")
+        if ceiling:
+            short_db = [ceiling["si_psnr_db"] - values[arm, judge, "si_psnr_db"]["judged"] for judge in judges]
+            cells += [f"{100 * (10 ** (db / 20) - 1):.0f} %" for db in short_db]
         lines.append(f"| {arm} | {' | '.join(cells)} |")
     seeds = len(task["seeds"])
     told = f"{seeds} seed{'s' * (seeds > 1)}"
-    head = f"### {_TITLES[name]}\n\n{task['iterations']} iterations for every arm, {told}.\n\n"
+    head = f"### {_TITLES[name]}\n\n{task['iterations']} iterations for every arm, {told}."
+    if ceiling:
+        reached = ", ".join(f"{_LABELS[figure]} {ceiling[figure]:.3f}" for figure in SHOWN[kind])
+        head += f" A continuous phase on the same grid, without printer or levels: {reached}."
+    head += "\n\n"
     verdict = ""
     # Among printers that are arms themselves each prefers its own design: nobody wins.
     if seeds > 1 and independent:

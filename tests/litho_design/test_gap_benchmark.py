@@ -146,6 +146,7 @@ def test_the_tables_name_the_winner_and_what_is_undecided():
             "hoe": {
                 "target": "text", "iterations": 100, "seeds": [0, 1, 2],
                 "minutes": {"none": 1.0, "pbl": 9.0}, "paired": [{**pair, "ci95": [-0.5, 4.5]}],
+                "ceiling": {"si_psnr_db": 18.0, "ssim": 0.9, "eff_signal": 0.5},
             }
         },
         "summary": rows,
@@ -159,6 +160,9 @@ def test_the_tables_name_the_winner_and_what_is_undecided():
     assert "1,000 iterations" in text
     assert "SI-PSNR, dB 15.500 → 14.500" in text
     assert "| none | 16.000 → 12.000 ± 0.100 |" in text
+    # 6 and 4 dB below the ceiling: the error is 10^(6/20) and 10^(4/20) times as large.
+    assert "| 100 % |" in text
+    assert "| 58 % |" in text
     assert "pbl is best" in text
     assert "over none +2.000 [-0.500, +4.500], which includes 0" in text
 
