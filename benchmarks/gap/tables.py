@@ -80,7 +80,9 @@ def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, A
         if "strehl" in shown:
             cells.append(f"{100 * (1 - values[arm, judges[0], 'strehl']['judged']):.1f} %")
         if ceiling:
-            short_db = [ceiling["si_psnr_db"] - values[arm, judge, "si_psnr_db"]["judged"] for judge in judges]
+            short_db = [
+                ceiling["si_psnr_db"] - values[arm, judge, "si_psnr_db"]["judged"] for judge in judges
+            ]
             cells += [f"{100 * (10 ** (db / 20) - 1):.0f} %" for db in short_db]
         lines.append(f"| {arm} | {' | '.join(cells)} |")
     seeds = len(task["seeds"])
