@@ -138,9 +138,9 @@ def _bars(values: dict[str, float], label: str, colours: str | list[str] = PLANT
     axis = figure.subplots()
     drawn = axis.barh(list(values), list(values.values()), color=colours)
     axis.bar_label(drawn, fmt="%.2f", padding=3)
-    axis.margins(x=0.15)
+    # On a telephone the numbers beside the bars take a fifth of the width.
+    axis.margins(x=0.22)
     axis.invert_yaxis()
-    axis.margins(x=0.12)
     axis.set_xlabel(label)
     return figure
 
