@@ -18,7 +18,7 @@ from litho_data.store.read import PrintedScan
 from litho_models.effects import get_effect
 from litho_models.loop.choice import Choice, choose, passed
 from litho_models.loop.equal_terms import scores_elsewhere
-from litho_models.loop.explainable import Learner, Rest
+from litho_models.loop.explainable import GENERIC_TERMS, Learner, Rest
 from litho_models.loop.findings import LoopConfig, LoopFindings, loop_config
 from litho_models.loop.folded_base import Trainer
 from litho_models.loop.gain_split import split_gain
@@ -133,7 +133,7 @@ def _explainable(choice: Choice, learner: Learner) -> dict[str, Rest]:
     """What layout and place still explain: beside the base, after each effect, and at last."""
     search = choice.search
     stages = {"base": choice.base} | {f"with {name}": after for name, (_, after) in search.steps.items()}
-    stages |= {"named effects": search.state, "generic terms": choice.final}
+    stages |= {"named effects": search.state, GENERIC_TERMS: choice.final}
     rests: dict[str, Rest] = {}
     seen: list[State] = []
     for name, state in stages.items():

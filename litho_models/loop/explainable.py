@@ -33,6 +33,9 @@ _KEPT_BYTES, _MOST_ROWS = 512 * 2**20, 360
 # order or dose: height, |∂y| and |∂x|, surroundings of 1.6 µm.
 _PLACED, _VARYING = (18, 19, 20), (18, 21, 22, 7)
 
+# The last stage of a loop, by name.
+GENERIC_TERMS = "generic terms"
+
 
 @dataclass(frozen=True)
 class Rest:
@@ -60,6 +63,12 @@ class Rest:
     def ci95_nm2(self) -> tuple[float, float] | None:
         """Interval over scans of the mean gain; None with fewer than six scans."""
         return interval(self.gains_nm2.tolist())
+
+    @property
+    def most_nm(self) -> float:
+        """The root of the upper end of the interval: what the form of the model may be wrong by, rms."""
+        interval_nm2 = self.ci95_nm2
+        return float(np.sqrt(max(self.mean_nm2 if interval_nm2 is None else interval_nm2[1], 0.0)))
 
     @property
     def matters(self) -> bool:

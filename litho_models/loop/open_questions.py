@@ -13,9 +13,10 @@ import numpy as np
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import CATALOGUE, get_effect
-from litho_models.fitting.least_squares import eliminated_sum, fit_least_squares
+from litho_models.fitting.least_squares import eliminated_sum
+from litho_models.loop.explainable import GENERIC_TERMS, Learner
 from litho_models.loop.findings import LoopFindings
-from litho_models.loop.fold_fits import RULES, TERM_WEIGHT, ChainProblem, robust_covariance
+from litho_models.loop.fold_fits import TERM_WEIGHT, ChainProblem, predict, robust_covariance
 from litho_models.loop.linear import ALL_FREE, without_scan_terms
 from litho_models.loop.parameters import chain_at, get_vector
 from litho_models.loop.prepared import PreparedScan
@@ -24,6 +25,7 @@ from litho_models.loop.probes.probe import Probe
 from litho_models.loop.residual_spectrum import NoiseSpectrum, residual_spectrum
 from litho_models.loop.result.questions import IN_SCAN, Doing, OpenQuestions, Question, Rival, Turning
 from litho_models.loop.result.record import CloseLoop
+from litho_models.loop.rival_fits import fit_rivals
 from litho_models.loop.screening.score_test import FAMILY_P, Screened
 from litho_models.loop.selection.contest import fitting_start
 from litho_models.loop.study import Score
@@ -93,6 +95,8 @@ def _of_named(
     names = ", ".join(rival.name for rival in rivals)
     text = f"which of these it is: {names}" if members else f"whose it is: {names}"
     texts = [get_effect(member).separating for member in (name, *members)]
+    # Rivals are judged without generic terms.
+    rests = [rest for stage, rest in findings.explainable.items() if stage != GENERIC_TERMS]
     return [
         Question(
             name=name,
@@ -101,6 +105,7 @@ def _of_named(
             experiment="; ".join(dict.fromkeys(filter(None, texts))),
             rivals=rivals,
             spread=_spread(entry.before, entry.after, noise),
+            form_nm=rests[-1].most_nm,
         )
     ]
 
@@ -125,40 +130,57 @@ def _suspects(findings: LoopFindings, report: Callable[[str], None]) -> list[Que
     names = [s.effect.name for s in standing[:_MOST_SUSPECTS]]
     report(f"fitting the suspects {', '.join(names)}")
     texts = [get_effect(name).separating for name in names]
+    rivals = _rivals(findings, None, names)
     return [
         Question(
             name=" or ".join(names),
             kind="suspects",
             text="each stands out and none was confirmed: which of these carries it",
             experiment="; ".join(dict.fromkeys(filter(None, texts))),
-            rivals=_rivals(findings, None, names),
+            rivals=rivals,
+            form_nm=_left_by_suspects(findings, rivals),
         )
     ]
+
+
+def _left_by_suspects(findings: LoopFindings, rivals: Sequence[Rival]) -> float:
+    """The error of the form beside the best of them, nm: the loop measured it with none of them in."""
+    learner = Learner(findings.study, findings.base.predictions)
+    chain, rests = findings.search.state.fits.chain, []
+    for rival in rivals:
+        if not rival.scan_frame:
+            fitted = chain_at(chain.with_effects(rival.effects), np.array(rival.vector))
+            vector = np.array(rival.vector)
+            rests.append(learner.rest([predict(fitted, vector, scan) for scan in findings.development]))
+    return min(rest.most_nm for rest in rests)
 
 
 def _rivals(findings: LoopFindings, replaced: str | None, names: Sequence[str]) -> list[Rival]:
     chain = findings.search.state.fits.chain
     kept = {name: own for name, own in chain.values().items() if name != replaced}
     windows = [scan.window for scan in findings.development]
+    stands_for = sum(int(w.usable.sum()) for w in windows) / sum(len(w.sample) for w in windows)
+    started = [
+        chain.with_effects(
+            {**kept, name: chain.values().get(name) or fitting_start(_screened(findings, name, replaced))}
+        )
+        for name in names
+    ]
+    vectors = fit_rivals(started, [get_vector(one) for one in started], windows)
     rivals = []
-    for name in names:
-        own = chain.values().get(name) or fitting_start(_screened(findings, name, replaced))
-        started = chain.with_effects({**kept, name: own})
-        fit = fit_least_squares(ChainProblem(started, windows), get_vector(started), RULES["squares"])
-        stands_for = sum(int(w.usable.sum()) for w in windows) / sum(len(w.sample) for w in windows)
-        normal = stands_for * eliminated_sum(fit.linear, TERM_WEIGHT)[0]
+    for name, own, vector in zip(names, started, vectors, strict=True):
+        linear = ChainProblem(own, windows).linearise(vector)
         frames: list[list[str]] = [[]]
         if get_effect(name).role == "undetermined":
             frames.append([name])
-        values = chain_at(started, fit.vector).values()
         rivals += [
             Rival(
                 name=name + IN_SCAN * bool(frame),
-                effects=values,
+                effects=chain_at(own, vector).values(),
                 scan_frame=frame,
-                vector=fit.vector.tolist(),
-                information=normal.tolist(),
-                covariance=robust_covariance(fit.linear).tolist(),
+                vector=vector.tolist(),
+                information=(stands_for * eliminated_sum(linear, TERM_WEIGHT)[0]).tolist(),
+                covariance=robust_covariance(linear).tolist(),
             )
             for frame in frames
         ]
@@ -224,6 +246,7 @@ def _of_generic(findings: LoopFindings, entry: AddedProbe, noise: NoiseSpectrum)
         else "scan each print at 0 and 90 degrees",
         turning=Turning(by=what, rms_nm=size_nm, noise_nm=float(np.mean(along)), pixels=int(np.mean(pixels))),
         spread=_spread(entry.before, entry.after, noise),
+        form_nm=findings.rest.most_nm,
     )
 
 

@@ -1,32 +1,32 @@
 """What new prints decide: the names and sets of a first round, declared before the new scans are looked at.
 
 Every rival is fitted to all prints, old and new, and judged on the new ones alone: the difference of two
-squared errors against its standard deviation, from blocks of pixels and, as in the plan, from what prints
-differ by. Scans of one print share its roughness, so their blocks are added up before they count. A rival is
-excluded where another is better with p <= 0.005 and by 1 % of its squared error; a name is given where one is
-left.
+squared errors, less what the form of the model may have made of it, against its standard deviation, from
+blocks of pixels and, as in the plan, from what prints differ by. Scans of one print share its roughness, so
+their blocks are added up before they count. A rival is excluded where another is better with p <= 0.005 and
+by 1 % of its squared error; a name is given where one is left.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from scipy.stats import f as f_distribution
-from scipy.stats import norm
 
 from litho_models.effects.chain import EffectChain
-from litho_models.fitting.least_squares import fit_least_squares
+from litho_models.loop.decision_error import Z_DECIDED, surely_better
 from litho_models.loop.findings import LoopFindings
-from litho_models.loop.fold_fits import RULES, ChainProblem, predict
+from litho_models.loop.fold_fits import predict
 from litho_models.loop.linear import ALL_FREE
 from litho_models.loop.open_questions import as_scanned
 from litho_models.loop.parameters import chain_at, get_vector
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.result.questions import IN_SCAN, OpenQuestions, Question, Rival
 from litho_models.loop.result.record import AddedEffect, CloseLoop, Comparison, Decided, Decision
+from litho_models.loop.rival_fits import fit_rivals
 from litho_models.loop.selection.confirming import BINOMIAL_P, SMALLEST_SHARE
 from litho_models.loop.single_scans.nested_tests import scan_parameters
 from litho_models.loop.study import Score, score
@@ -34,7 +34,6 @@ from litho_models.scan_terms import Terms, parameter_names, terms_of_effect
 from litho_models.scan_terms.lines import axis_along, shrunk_line_offsets
 from litho_models.scan_terms.term import row_index
 
-Z_DECIDED = float(norm.isf(BINOMIAL_P))
 NONE = "none of them"
 BOTH = PRINTER, MICROSCOPE = "the printer", "the microscope"
 _BLOCK_PX = 32
@@ -87,34 +86,32 @@ def with_decisions(result: CloseLoop, decisions: list[Decision]) -> CloseLoop:
     )
 
 
-def fitted_rival(
-    findings: LoopFindings, rival: Rival, new: Sequence[PreparedScan], *, without: Sequence[str] = ()
-) -> EffectChain:
-    """The rival fitted to all prints, old and new; ``without``: effects that are left out."""
+def _among_rivals(findings: LoopFindings, question: Question, new: Sequence[PreparedScan]) -> Decision:
+    own = {rival.name.removesuffix(IN_SCAN) for rival in question.rivals}
+    names = [rival.name for rival in question.rivals]
+    chains = [_chain(findings, rival) for rival in question.rivals]
+    starts = [np.array(rival.vector) for rival in question.rivals]
+    without = _chain(findings, question.rivals[0], without=own)
+    windows = [scan.window for scan in (*findings.development, *new)]
+    chains, starts = [*chains, without], [*starts, get_vector(without)]
+    predictions = {}
+    for name, chain, vector in zip((*names, NONE), chains, fit_rivals(chains, starts, windows), strict=True):
+        fitted = chain_at(chain, vector)
+        predictions[name] = [predict(fitted, get_vector(fitted), scan) for scan in new]
+    return _decision(question, new, predictions, names, findings)
+
+
+def _chain(findings: LoopFindings, rival: Rival, *, without: Collection[str] = ()) -> EffectChain:
+    """The rival's effects on the base of the first round; ``without``: those that are left out."""
     chain = findings.search.state.fits.chain
     kept = {name: own for name, own in rival.effects.items() if name not in without}
-    started = EffectChain(
+    return EffectChain(
         chain.base,
         kept,
         full_height_um=chain.full_height_um,
         pitch_um=chain.pitch_um,
         scan_frame=[name for name in rival.scan_frame if name in kept],
     )
-    start = get_vector(started) if without else np.array(rival.vector)
-    windows = [scan.window for scan in (*findings.development, *new)]
-    return chain_at(
-        started, fit_least_squares(ChainProblem(started, windows), start, RULES["squares"]).vector
-    )
-
-
-def _among_rivals(findings: LoopFindings, question: Question, new: Sequence[PreparedScan]) -> Decision:
-    own = {rival.name.removesuffix(IN_SCAN) for rival in question.rivals}
-    chains = {rival.name: fitted_rival(findings, rival, new) for rival in question.rivals}
-    chains[NONE] = fitted_rival(findings, question.rivals[0], new, without=sorted(own))
-    predictions = {
-        name: [predict(chain, get_vector(chain), scan) for scan in new] for name, chain in chains.items()
-    }
-    return _decision(question, new, predictions, [rival.name for rival in question.rivals], findings)
 
 
 def _of_generic(findings: LoopFindings, question: Question, new: Sequence[PreparedScan]) -> Decision:
@@ -142,7 +139,7 @@ def _decision(
     findings: LoopFindings,
 ) -> Decision:
     scores = {name: score(new, own, ALL_FREE, findings.study.blocks) for name, own in predictions.items()}
-    comparisons = [_compare(a, b, scores, new, question.spread) for a in scores for b in scores if a != b]
+    comparisons = [_compare(a, b, scores, new, question) for a in scores for b in scores if a != b]
     # As in the loop: a smaller difference may come from what no rival describes.
     least = {name: SMALLEST_SHARE * float(own.mse_nm2.mean()) for name, own in scores.items()}
     excluded = {c.worse for c in comparisons if c.z >= Z_DECIDED and c.gain_nm2 >= least[c.better]}
@@ -158,18 +155,26 @@ def _decision(
         f"{one.better} better than {one.worse} by {one.gain_nm2:.1f} nm² (z = {one.z:.1f})" for one in evident
     )
     evidence = said or "no rival is better than another"
+    declared = [one for one in comparisons if NONE not in (one.better, one.worse)]
+    if verdict == "still open" and question.form_nm is not None:
+        nearest_nm = min(one.difference_nm or 0.0 for one in declared if {one.better, one.worse} <= {*left})
+        evidence += (
+            f"; the model's own error is {question.form_nm:.1f} nm at most, the nearest two that are left "
+            f"differ by {nearest_nm:.1f} nm"
+        )
     return _answer(question, new, evidence, left, verdict, names, comparisons)
 
 
 def _compare(
-    better: str, worse: str, scores: Mapping[str, Score], new: Sequence[PreparedScan], spread: float
+    better: str, worse: str, scores: Mapping[str, Score], new: Sequence[PreparedScan], question: Question
 ) -> Comparison:
     """Squared errors of two rivals: sums over blocks of a print, their spread within and between prints."""
     by_print: dict[str, list[np.ndarray]] = {}
-    pixels = 0
+    pixels, difference = 0, 0.0
     for scan, good, bad in zip(new, scores[better].residual_um, scores[worse].residual_um, strict=True):
         gain = 1e6 * (bad**2 - good**2)
         pixels += int(np.isfinite(gain).sum())
+        difference += 1e6 * float(np.nansum((bad - good) ** 2))
         by_print.setdefault(scan.stored.print_id, []).append(_block_sums(gain))
     total, variance = 0.0, 0.0
     for sums in by_print.values():
@@ -177,9 +182,16 @@ def _compare(
         # The mean over blocks is what the print says; their spread about it is noise.
         variance += together.size * float(together.var(ddof=1)) if together.size > 1 else 0.0
         total += float(together.sum())
-    variance += (spread * total) ** 2 / len(by_print)
-    z = total / np.sqrt(variance) if variance > 0 else 0.0
-    return Comparison(better=better, worse=worse, gain_nm2=total / max(pixels, 1), z=float(z))
+    variance += (question.spread * total) ** 2 / len(by_print)
+    count, form_nm = max(pixels, 1), question.form_nm
+    return Comparison(
+        better=better,
+        worse=worse,
+        gain_nm2=total / count,
+        z=surely_better(total, difference, float(np.sqrt(variance)), count * (form_nm or 0.0) ** 2),
+        difference_nm=float(np.sqrt(difference / count)),
+        form_nm=form_nm,
+    )
 
 
 def _block_sums(gain: np.ndarray) -> np.ndarray:

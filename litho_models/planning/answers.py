@@ -14,6 +14,7 @@ from litho_models.planning.rivalry import PlannedPrint, Rivalry
 _COUNTS = range(1, power.MOST_PRINTS + 1)
 # What the rivals' numbers could be as well: a difference that rests on one of them may not be there.
 DRAWS = 8
+_HOPELESS: Status = "no experiment separates"
 
 
 def of_rivals(
@@ -37,12 +38,14 @@ def of_rivals(
         status=status,
         why=f"the nearest two rivals differ by so many standard deviations on one random print: {ways}"
         + (f"; what a print says varies by {100 * spread:.0f} %, beyond noise" if spread else "")
-        + (f". Not in this plan: {question.experiment}" if status == "no experiment separates" else ""),
+        + _of_form(hardest.difference_nm, question.form_nm, status)
+        + (f". Not in this plan: {question.experiment}" if status == _HOPELESS else ""),
         rivals=names,
         pairs=pairs,
         difference_nm=hardest.difference_nm,
         random_difference_nm=min(pair.difference_nm for pair in control),
         noise_nm=hardest.noise_nm,
+        form_nm=question.form_nm,
         power=hardest.power,
         random_power=np.min([pair.power for pair in control], axis=0).tolist(),
         prints_needed=power.prints_needed(hardest.power),
@@ -54,6 +57,14 @@ def of_rivals(
     )
 
 
+def _of_form(difference_nm: float, form_nm: float | None, status: Status) -> str:
+    """The difference beside the error of the model's own form."""
+    if form_nm is None:
+        return ""
+    told = f"the model's own error is {form_nm:.1f} nm at most, the two differ by {difference_nm:.1f} nm"
+    return f"; {'no experiment of this plan separates them: ' if status == _HOPELESS else ''}{told}"
+
+
 def _pairs(rivalry: Rivalry, prints: Sequence[PlannedPrint]) -> list[PlannedPair]:
     """Unordered pairs, each in the direction with less power; a power is the mean over the draws."""
     names = [rival.name for rival in rivalry.question.rivals]
@@ -62,7 +73,7 @@ def _pairs(rivalry: Rivalry, prints: Sequence[PlannedPrint]) -> list[PlannedPair
     contrasts = [one.contrasts(prints, one.refitted(prints, first=first)) for one in drawn]
     directed = {}
     for pair, fitted, *others in zip(rivalry.pairs, rivalry.contrasts(prints), *contrasts, strict=True):
-        powers = [[power.of_contrast(one, rivalry.question.spread, n) for n in _COUNTS] for one in others]
+        powers = [[power.of_contrast(one, rivalry.question, n) for n in _COUNTS] for one in others]
         directed[pair] = fitted, np.mean(powers, axis=0).tolist()
     found = []
     for first, second in (pair for pair in directed if pair[0] < pair[1]):
@@ -92,6 +103,7 @@ def of_others(
         shown = [n if turning.by == "turned scan" else 1 for n in _COUNTS]
         powers = [power.of_generic(question, n) for n in shown]
         why = f"{turning.by}: as the printer's and as the microscope's it differs by {difference:.1f} nm rms"
+        why += _of_form(difference, question.form_nm, _status(powers, prints))
         if difference < 0.1:
             why += "; turning a print does not show it: a second tip and a step standard do"
         outcomes = [
@@ -132,6 +144,7 @@ def of_others(
         difference_nm=difference,
         random_difference_nm=difference,
         noise_nm=noise,
+        form_nm=question.form_nm,
         power=powers,
         random_power=powers,
         prints_needed=power.prints_needed(powers),
@@ -144,4 +157,4 @@ def _status(powers: Sequence[float], prints: int) -> Status:
     if reached >= power.ENOUGH:
         return "decides"
     hopeful = reached > power.HOPELESS or power.prints_needed(powers) is not None
-    return "may decide" if hopeful else "no experiment separates"
+    return "may decide" if hopeful else _HOPELESS

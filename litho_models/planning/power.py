@@ -9,28 +9,29 @@ import numpy as np
 from scipy.stats import f as f_distribution
 from scipy.stats import norm
 
+from litho_data.foundation.units import NM_PER_UM
+from litho_models.loop.decision_error import Z_DECIDED, surely_better
 from litho_models.loop.residual_spectrum import NoiseSpectrum
 from litho_models.loop.result.questions import Question
 from litho_models.loop.selection.confirming import BINOMIAL_P
 from litho_models.planning.rivalry import Contrast
 
-# A wrong name is given with this probability at most.
-Z_DECIDED = float(norm.isf(BINOMIAL_P))
 ENOUGH = 0.95
 # Beside this power no allowed experiment separates the rivals.
 HOPELESS = 0.2
 MOST_PRINTS = 12
 
 
-def of_contrast(contrast: Contrast, spread: float, prints: int) -> float:
+def of_contrast(contrast: Contrast, question: Question, prints: int) -> float:
     """Power with so many prints like those of the contrast.
 
     The difference of two squared errors has the mean of the squared distance; its variance is that of the
-    noise along the distance, and that of the distance itself, which varies between prints by ``spread``.
+    noise along the distance, and that of the distance itself, which varies between prints by the question's
+    ``spread``. What its ``form_nm`` may have made of it does not count, as in the decision.
     """
-    squares = float(contrast.squares_um2.mean())
-    variance = float((contrast.sd_um2**2).mean()) + (spread * squares) ** 2
-    return float(norm.cdf(math.sqrt(prints) * squares / math.sqrt(variance) - Z_DECIDED))
+    squares, pixels = float(contrast.squares_um2.mean()), float(contrast.pixels.mean())
+    noise = float((contrast.sd_um2**2).mean())
+    return _power(squares, noise, pixels, question, prints, NM_PER_UM)
 
 
 def of_generic(question: Question, prints: int) -> float:
@@ -39,8 +40,17 @@ def of_generic(question: Question, prints: int) -> float:
     assert turning is not None
     squares = turning.pixels * turning.rms_nm**2
     noise = 2 * math.sqrt(turning.pixels) * turning.rms_nm * turning.noise_nm
-    variance = noise**2 + (question.spread * squares) ** 2
-    return float(norm.cdf(math.sqrt(prints) * squares / math.sqrt(variance) - Z_DECIDED)) if squares else 0.0
+    return _power(squares, noise**2, turning.pixels, question, prints, 1.0) if squares else 0.0
+
+
+def _power(
+    squares: float, variance: float, pixels: float, question: Question, prints: int, nm_per_unit: float
+) -> float:
+    """Of prints with so large a squared distance and variance of its evidence by noise, each."""
+    form = pixels * ((question.form_nm or 0.0) / nm_per_unit) ** 2
+    sd = math.sqrt(prints * (variance + (question.spread * squares) ** 2))
+    expected = surely_better(prints * squares, prints * squares, sd, prints * form)
+    return float(norm.cdf(expected - Z_DECIDED))
 
 
 def of_repeats(prints: int, scans: int, share: float = 0.9) -> float:

@@ -1,4 +1,4 @@
-"""``plan.json``, schema ``litho-models/next-print/1``."""
+"""``plan.json``, schema ``litho-models/next-print/2``."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class PlannedQuestion(Record):
 
     ``power``: probability of a right decision with 1, 2, 3, … prints; ``random_power``: with random layouts
     and the same scans, as ``random_difference_nm``, the smallest of any pair. ``prints_needed``: for a
-    power of 0.95.
+    power of 0.95. ``form_nm``: the error of the model's own form at most, None where it is not known.
     """
 
     name: str
@@ -54,6 +54,7 @@ class PlannedQuestion(Record):
     difference_nm: float | None
     random_difference_nm: float | None
     noise_nm: float | None
+    form_nm: float | None = None
     power: list[float]
     random_power: list[float]
     prints_needed: int | None
@@ -63,7 +64,8 @@ class PlannedQuestion(Record):
 class NextPrint(Result):
     """A plan: what to print and scan, and what it will decide; ``settings``: what was asked for."""
 
-    SCHEMA: ClassVar[str] = "litho-models/next-print/1"
+    SCHEMA: ClassVar[str] = "litho-models/next-print/2"
+    OLDER: ClassVar[tuple[str, ...]] = ("litho-models/next-print/1",)
     FILE_NAME: ClassVar[str] = "plan.json"
 
     run: RunInfo

@@ -30,6 +30,7 @@ _WORDS = {
     "prints_needed": ("prints needed", f"for a power of {ENOUGH}"),
     "difference_nm": ("difference (nm)", "between the two nearest answers, root mean square over the prints"),
     "noise_nm": ("noise (nm)", "along that difference, for one pixel; large where neighbours are alike"),
+    "form_nm": ("form (nm)", "the model's own error at most; twice as much of a difference decides nothing"),
 }
 
 
@@ -109,6 +110,7 @@ def _table(plan: NextPrint) -> list[dict[str, Any]]:
             "prints_needed": f"over {len(q.power)}" if q.prints_needed is None else str(q.prints_needed),
             "difference_nm": np.nan if q.difference_nm is None else q.difference_nm,
             "noise_nm": np.nan if q.noise_nm is None else q.noise_nm,
+            "form_nm": np.nan if q.form_nm is None else q.form_nm,
             "asked": _asked(q),
         }
         for q in plan.questions

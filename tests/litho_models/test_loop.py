@@ -222,7 +222,7 @@ def test_the_result_is_read_back_as_written_and_keeps_to_its_keys(planted, null,
     path = result.write(tmp_path)
     assert CloseLoop.read(tmp_path) == result
     content = json.loads(path.read_text())
-    assert content["schema"] == "litho-models/close-loop/2"
+    assert content["schema"] == "litho-models/close-loop/3"
     assert sum(content["shares"].values()) == pytest.approx(1)
     assert next(e for e in content["effects"] if e["name"] == "datum-offset")["prior_hypothesis"]
     content["surprise"] = 1

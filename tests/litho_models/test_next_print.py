@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.ndimage import gaussian_filter
+from scipy.stats import norm
 
 from benchmarks import two_rounds
 from litho_data.cards.card import load_card
@@ -24,7 +25,10 @@ from litho_data.virtual_fab.printer import Job
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 from litho_models.effects import FieldContext, get_effect
 from litho_models.effects.chain import EffectChain
+from litho_models.fitting.least_squares import fit_least_squares
 from litho_models.frozen.files import save_frozen
+from litho_models.loop.decision_error import Z_DECIDED, surely_better
+from litho_models.loop.fold_fits import RULES, ChainProblem
 from litho_models.loop.open_questions import _screened
 from litho_models.loop.parameters import chain_at, get_vector
 from litho_models.loop.prepared import prepare_scans
@@ -32,15 +36,16 @@ from litho_models.loop.residual_spectrum import NoiseSpectrum, residual_spectrum
 from litho_models.loop.result.exporting import part_of
 from litho_models.loop.result.questions import IN_SCAN, OpenQuestions, Question, Rival
 from litho_models.loop.result.record import AddedEffect, CloseLoop, Decision
+from litho_models.loop.rival_fits import fit_rivals
 from litho_models.loop.run import _attributed, _new_scans
-from litho_models.loop.second_round import NONE, Z_DECIDED, _decision, decide, with_decisions
+from litho_models.loop.second_round import NONE, _decision, decide, with_decisions
 from litho_models.planning import power
-from litho_models.planning.answers import _pairs
+from litho_models.planning.answers import _pairs, of_rivals
 from litho_models.planning.designer import as_tensor
 from litho_models.planning.layouts import Limits, climb, score, starts
 from litho_models.planning.record import NextPrint, PlannedQuestion
 from litho_models.planning.report import _asked
-from litho_models.planning.rivalry import PlannedPrint, Printing, Rivalry, Way
+from litho_models.planning.rivalry import Contrast, PlannedPrint, Printing, Rivalry, Way
 from litho_models.planning.run import next_print
 from litho_models.scan_terms import Blocks
 from tests.litho_models.loop_scans import printed_scans, true_model
@@ -424,6 +429,108 @@ def test_a_difference_below_one_per_cent_of_the_squared_error_decides_nothing(
     between = next(one for one in decision.comparisons if (one.better, one.worse) == ("a", "b"))
     assert between.z > Z_DECIDED
     assert decision.verdict == verdict
+
+
+def planted(form_nm: float | None, difference_nm: float, error_nm: float) -> Decision:
+    """``a`` is true but for an error of its form along the difference to ``b``, towards ``b``."""
+    scans = prepare_scans(printed_scans(size_px=128, count=2))
+    random = np.random.default_rng(4)
+    predictions: dict[str, list[np.ndarray]] = {"a": [], "b": [], NONE: []}
+    for scan in scans:
+        along = gaussian_filter(random.standard_normal(scan.usable.shape), 1.0)
+        along *= 1e-3 / along.std()
+        true = scan.stored.height_um - 0.01 * random.standard_normal(scan.usable.shape)
+        predictions["a"].append(true - error_nm * along)
+        predictions["b"].append(true + (difference_nm - error_nm) * along)
+        predictions[NONE].append(true + 0.1 * random.standard_normal(scan.usable.shape))
+    question = slope_question().model_copy(update={"form_nm": form_nm})
+    return _decision(
+        question, scans, predictions, ["a", "b"], SimpleNamespace(study=SimpleNamespace(blocks=Blocks()))
+    )
+
+
+def test_an_error_of_the_form_decides_nothing_below_its_bound() -> None:
+    """Of 4.5 nm along a difference of 5 nm it makes the wrong one better by (2 · 4.5 / 5 - 1) · 25 nm²."""
+    assert planted(None, 5.0, 4.5).left == ["b"]
+    counted = planted(4.5, 5.0, 4.5)
+    assert counted.verdict == "still open"
+    assert "own error is 4.5 nm at most" in counted.evidence
+    between = next(one for one in counted.comparisons if (one.better, one.worse) == ("b", "a"))
+    # Terms of a scan, fitted on the other half of its blocks, add to a difference.
+    assert between.difference_nm == pytest.approx(5.0, rel=0.1)
+    assert between.gain_nm2 == pytest.approx(20.0, rel=0.2)
+    assert between.z == 0
+    assert planted(4.5, 40.0, 4.5).left == ["a"]
+    without = [[one.z for one in planted(form_nm, 5.0, 0.0).comparisons] for form_nm in (None, 0.0)]
+    assert without[0] == without[1]
+
+
+def test_what_counts_of_a_gain() -> None:
+    # Without an error of the form, and as large as the rivals differ: the gain over its noise.
+    assert surely_better(30.0, 30.0, 2.0, 0.0) == 15.0
+    assert surely_better(-30.0, 30.0, 2.0, 0.0) == -15.0
+    # 2 · √(30 · 1.2) = 12 of it may be the form's.
+    assert surely_better(30.0, 30.0, 2.0, 1.2) == pytest.approx(9.0)
+    assert surely_better(30.0, 30.0, 2.0, 30.0) == 0.0
+    # Prints that lie halfway between the rivals tell them apart by noise alone, whatever was known before.
+    assert surely_better(14.0, 30.0, 0.1, 0.0) < Z_DECIDED < surely_better(16.0, 30.0, 0.1, 0.0)
+
+
+def test_the_power_counts_the_form_as_the_decision_does() -> None:
+    pixels, difference_um, sd = 10_000, 0.005, 0.05
+    squares = pixels * difference_um**2
+    contrast = Contrast(np.array([squares]), np.array([sd]), np.array([pixels]))
+
+    def powers(form_nm: float | None) -> list[float]:
+        question = slope_question().model_copy(update={"form_nm": form_nm})
+        return [power.of_contrast(contrast, question, prints) for prints in (1, 4, 100)]
+
+    today = [norm.cdf(math.sqrt(prints) * squares / sd - Z_DECIDED) for prints in (1, 4, 100)]
+    assert powers(None) == pytest.approx(today)
+    assert powers(0.0) == pytest.approx(today)
+    # Half as large as the difference: no number of prints decides, beyond the 0.5 % of chance.
+    assert max(powers(2.5)) <= 0.005 + 1e-12
+    assert powers(1.0)[1] == pytest.approx(norm.cdf(2 * (1 - 2 / 5) * squares / sd - Z_DECIDED))
+
+
+def test_a_question_below_the_models_own_error_is_declared_before_printing(
+    rivalry: Rivalry, limits: Limits
+) -> None:
+    prints = [PlannedPrint(as_tensor(first_layout(limits, 64)), TURNED)]
+
+    def asked(form_nm: float | None) -> PlannedQuestion:
+        question = slope_question().model_copy(update={"form_nm": form_nm})
+        own = Rivalry(question, true_model({}).base, rivalry.printing, rivalry.noise)
+        return of_rivals(own, prints, prints, {}, 4)
+
+    plain = asked(None)
+    assert plain.status == "decides"
+    told = asked(plain.difference_nm)
+    assert told.status == "no experiment separates"
+    assert told.form_nm == plain.difference_nm == told.difference_nm
+    said = f"own error is {told.form_nm:.1f} nm at most, the two differ by {told.form_nm:.1f} nm"
+    assert f"no experiment of this plan separates them: the model's {said}" in told.why
+
+
+def test_two_names_of_one_model_end_in_one_optimum() -> None:
+    """One starts with an almost straight projection, from which a fit of its own ends elsewhere."""
+    blurred = {"diffusion-blur": {"variance_um2": 0.1}}
+    windows = [one.window for one in prepare_scans(printed_scans(blurred, size_px=64, count=4))]
+    chains = [true_model({name: {"variance_um2": 0.1}}) for name in ("diffusion-blur", "resampling-blur")]
+    starts = [get_vector(chain) for chain in chains]
+    names = [name for name, _ in chains[1].base.named_parameters()]
+    starts[1][names.index("raw_alpha")] = -4.0
+    starts[1][names.index("raw_eta")] = -4.0
+
+    def squares(chain: EffectChain, vector: np.ndarray) -> float:
+        return sum(float(one @ one) for one in ChainProblem(chain, windows).residuals(vector))
+
+    alone = fit_least_squares(ChainProblem(chains[1], windows), starts[1], RULES["squares"]).vector
+    together = fit_rivals(chains, starts, windows)
+    best, other = (squares(chain, vector) for chain, vector in zip(chains, together, strict=True))
+    assert squares(chains[1], alone) > 1.02 * best
+    # A fit ends once a step gains less than 0.05 % of the loss.
+    assert other == pytest.approx(best, rel=1e-3)
 
 
 def test_a_rival_in_the_place_of_a_named_effect_starts_as_if_that_had_not_been_found() -> None:

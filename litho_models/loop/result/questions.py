@@ -48,7 +48,9 @@ class Question(Record):
     """Something a loop left open.
 
     ``spread``: how much the evidence that a print gives for the effect varies between the prints so far,
-    relative to its mean, beyond the noise. ``sizes``: figures of terms of single scans, by name and unit.
+    relative to its mean, beyond the noise. ``form_nm``: the error of the model's own form at most, rms, by
+    what could still be learned beside the best answer; None in files of schema 1. ``sizes``: figures of terms
+    of single scans, by name and unit.
     """
 
     name: str
@@ -58,13 +60,15 @@ class Question(Record):
     rivals: list[Rival] = Field(default_factory=list)
     turning: Turning | None = None
     spread: float = 0.0
+    form_nm: float | None = None
     sizes: dict[str, float] = Field(default_factory=dict)
 
 
 class OpenQuestions(Result):
     """``open_questions.json``: what is open, and the noise against which it is to be decided."""
 
-    SCHEMA: ClassVar[str] = "litho-models/open-questions/1"
+    SCHEMA: ClassVar[str] = "litho-models/open-questions/2"
+    OLDER: ClassVar[tuple[str, ...]] = ("litho-models/open-questions/1",)
     FILE_NAME: ClassVar[str] = "open_questions.json"
 
     dataset: DatasetId

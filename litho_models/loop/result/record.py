@@ -1,4 +1,4 @@
-"""``close_loop.json``, schema ``litho-models/close-loop/2``."""
+"""``close_loop.json``, schema ``litho-models/close-loop/3``."""
 
 from __future__ import annotations
 
@@ -177,14 +177,19 @@ class Residual(Record):
 
 
 class Comparison(Record):
-    """Of two rivals on new scans: how much smaller the squared error of the first is, mean over pixels;
-    ``z``: in standard deviations.
+    """Of two rivals on new scans: how much smaller the squared error of the first is, mean over pixels.
+
+    ``z``: what of it neither noise nor the form of the model explains, in standard deviations of the noise.
+    ``difference_nm``: rms difference of the two predictions; ``form_nm``: error of the model's own form at
+    most. Both None before schema 3, where ``z`` counted noise alone.
     """
 
     better: str
     worse: str
     gain_nm2: float
     z: float
+    difference_nm: float | None = None
+    form_nm: float | None = None
 
 
 class Decision(Record):
@@ -212,8 +217,8 @@ class CloseLoop(Result):
     ``locked_equal_terms`` are None in results of schema 1.
     """
 
-    SCHEMA: ClassVar[str] = "litho-models/close-loop/2"
-    OLDER: ClassVar[tuple[str, ...]] = ("litho-models/close-loop/1",)
+    SCHEMA: ClassVar[str] = "litho-models/close-loop/3"
+    OLDER: ClassVar[tuple[str, ...]] = ("litho-models/close-loop/2", "litho-models/close-loop/1")
     FILE_NAME: ClassVar[str] = "close_loop.json"
 
     run: RunInfo
