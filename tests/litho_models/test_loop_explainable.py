@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -13,7 +14,7 @@ from scipy.ndimage import gaussian_filter
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.fitting.ridge import feature_rows
 from litho_models.loop import explainable
-from litho_models.loop.explainable import Learner
+from litho_models.loop.explainable import Learner, Rest
 from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.loop.study import Study
 from litho_models.models import build_model
@@ -131,3 +132,13 @@ def test_the_squared_error_is_that_of_the_residual_without_what_a_scan_adds(scen
     assert moved.squares_nm2 == pytest.approx(plain.squares_nm2, rel=1e-6)
     # Roughness of 6 nm is all that is there.
     assert np.sqrt(plain.squares_nm2.mean()) == pytest.approx(0.006 * NM_PER_UM, rel=0.1)
+
+
+def test_the_form_may_be_wrong_by_the_upper_end_of_what_could_be_learned() -> None:
+    gains = np.array([8.0, 10.0, 9.0, 11.0, 10.0, 12.0])
+    some = Rest(gains, np.full(6, 100.0), 13)
+    assert some.ci95_nm2 is not None
+    assert math.sqrt(10.0) < some.most_nm == pytest.approx(math.sqrt(some.ci95_nm2[1]))
+    assert Rest(-gains, np.full(6, 100.0), 13).most_nm == 0.0
+    # Too few scans for an interval: the mean.
+    assert Rest(gains[:2], np.full(2, 100.0), 13).most_nm == pytest.approx(3.0)
