@@ -26,15 +26,18 @@ from litho_design import hologram_settings
 from litho_design.judging.gap import design_folder
 from litho_design.tasks.design import Design
 from litho_design.workflows.compare import compare
+from litho_design.workflows.front import efficiency_front
 from litho_models.effects import get_effect
 from litho_models.evaluation.benchmark import benchmark
 from litho_models.evaluation.fit_cache import fit_folder, kept_fit
 from litho_models.loop import LoopConfig
 from litho_models.loop.folded_base import train_folds
+from litho_models.loop.nested import nest
 from litho_models.loop.prepared import by_name, prepare_scans, prepared_again
 from litho_models.loop.run import _trainer
 from litho_models.loop.selection.contest import _fitted
 from litho_models.loop.study import Study, deal, fit_state
+from litho_models.models import build_model
 from tests.jobs import die, die_once, large, refuse, told
 from tests.litho_data.campaigns import write_campaign
 from tests.litho_models.loop_scans import printed_scans, true_model
@@ -185,6 +188,59 @@ def test_designs_are_the_same_to_the_bit(
         # Hashes of levels, height, image, target.
         assert one.files == other.files != {}
         assert one.predicted == other.predicted
+
+
+@pytest.mark.long
+def test_a_front_is_the_same_to_the_bit(
+    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    tiny = {"layout.size_px": 48, "optics.distance_um": 8, "search.iterations": 4, "search.polish_rounds": 1}
+    settings = hologram_settings(changes={**tiny, "window.yield_draws": 2, "window.defocus_sd_um": 0.5})
+    here, there = (
+        efficiency_front(
+            "ring", "zoo:physics", name, weights=(0.0, 0.3), settings=settings, announce=False, dask=dask
+        )
+        for name, dask in (("a", None), ("b", address))
+    )
+    assert here.points == there.points
+    for point in here.points:
+        one, other = (Design.read(tmp_path / name / point.folder) for name in "ab")
+        assert one.files == other.files != {}
+
+
+@pytest.mark.long
+def test_nested_selections_are_the_same_to_the_bit(address: str, tmp_path: Path) -> None:
+    path = write_store(tmp_path / "made.zarr", printed_scans({"vignetting": {"strength": 0.2}}, count=12))
+    store = open_store(path)
+    stored = StoredScans.of(store, store.scans())
+    scans = prepare_scans(stored.read())
+    places = Workers(dask=address, known=Known(partial(prepared_again, stored), by_name(scans)))
+    here = Study(scans, deal(scans, 3, 0))
+    base = build_model("physics", sigma_diffusion_init_um=0.4)
+    one, other = (nest(study, base, "folds") for study in (here, replace(here, workers=places)))
+    for own, its in zip(one.parts, other.parts, strict=True):
+        assert (own.named, own.generic, own.accepted) == (its.named, its.generic, its.accepted)
+        assert [scan.id for scan in own.scans] == [scan.id for scan in its.scans]
+        maps = zip([*own.before, *own.after], [*its.before, *its.after], strict=True)
+        assert all((a == b).all() for a, b in maps)
+
+
+@pytest.mark.long
+def test_blind_trials_are_the_same_to_the_bit(address: str, tmp_path: Path) -> None:
+    # Smaller fields cannot be registered.
+    draws = campaign.make_draws(count=4, seed=0, n_scans=12, size_px=128)
+    records = []
+    for name, dask in (("a", None), ("b", address)):
+        (tmp_path / name).mkdir()
+        campaign.open_campaign(tmp_path / name, draws)
+        settings = {"workers": Workers(dask=dask), "timeout_s": 3600.0, "keep_data": False}
+        campaign.run_campaign(tmp_path / name, draws, numbers=[0, 1], **settings)
+        trials = campaign.finished(tmp_path / name, draws)
+        assert not any(trial.failure for trial in trials)
+        # Seconds are the machine's; everything else is the trial's.
+        records.append([trial.model_dump(exclude={"cost"}) for trial in trials])
+    assert records[0] == records[1]
 
 
 def test_a_trial_runs_in_a_process_of_its_own_on_a_worker(address: str, tmp_path: Path) -> None:
