@@ -43,7 +43,8 @@ class LinearProbe:
     Attributes:
         columns_of: (scan, prediction (y, x) µm) -> maps (m, y, x).
         penalty: (m, m), what a ridge fit keeps small.
-        shuffle: (generator, m) -> order of the columns of one scan under the probe's control.
+        shuffle: (generator, m) -> order of the columns of one scan under the probe's control; None turns the
+            residual of a scan upside down or not.
         summary: coefficients -> numbers for people, name to (value, unit).
         grams, rights: (scans, m, m) and (scans, m), freed of per-scan terms, µm².
         pixels: (scans,).
@@ -52,7 +53,7 @@ class LinearProbe:
     name: str
     columns_of: ColumnsOf
     penalty: np.ndarray
-    shuffle: Shuffle
+    shuffle: Shuffle | None
     summary: Summary
     grams: np.ndarray
     rights: np.ndarray
@@ -67,7 +68,11 @@ class LinearProbe:
         return held_out_ridge(self.grams, self.rights, self.pixels, self.penalty, fold_of)
 
     def control(self, fold_of: np.ndarray, random: np.random.Generator) -> float:
-        """Mean held-out gain, nm², after the columns of every scan were shuffled on their own."""
+        """Mean held-out gain, nm², after the columns or the sign of every scan were shuffled on their own."""
+        if self.shuffle is None:
+            signs = random.choice([-1.0, 1.0], size=(len(self.rights), 1))
+            mixed = signs * self.rights
+            return held_out_ridge(self.grams, mixed, self.pixels, self.penalty, fold_of).mean_gain_nm2
         grams, rights = np.empty_like(self.grams), np.empty_like(self.rights)
         for scan in range(len(grams)):
             order = self.shuffle(random, len(self.penalty))
@@ -78,7 +83,7 @@ class LinearProbe:
         """Correlation of the corrections that two disjoint halves of the scans ask for."""
         halves = [np.arange(start, len(self.grams), 2) for start in (0, 1)]
         first, second = (
-            _ridge(self.grams[h].sum(0), self.rights[h].sum(0), self.penalty, 1e-2) for h in halves
+            _ridge(self.grams[h].sum(0), self.rights[h].sum(0), self.penalty, (1e-2,))[0] for h in halves
         )
         pooled = self.grams.sum(axis=0)
         sizes = np.sqrt(max(first @ pooled @ first, 0.0) * max(second @ pooled @ second, 0.0))
@@ -93,7 +98,7 @@ def linear_probe(
     name: str,
     columns_of: ColumnsOf,
     penalty: np.ndarray,
-    shuffle: Shuffle,
+    shuffle: Shuffle | None,
     summary: Summary,
     left: Left,
 ) -> LinearProbe:
@@ -147,24 +152,24 @@ def _best_ridge(grams: np.ndarray, rights: np.ndarray, penalty: np.ndarray) -> n
     """The ridge whose fits without a fold do best on that fold, then fitted on all of them."""
     gram, right = grams.sum(axis=0), rights.sum(axis=0)
     others = [(gram - own_gram, right - own_right) for own_gram, own_right in zip(grams, rights, strict=True)]
-    totals = [
-        sum(
-            _gain(own_gram, own_right, _ridge(*kept, penalty, ridge))
-            for own_gram, own_right, kept in zip(grams, rights, others, strict=True)
-        )
-        for ridge in (RIDGES if len(grams) > 1 else RIDGES[:1])
-    ]
-    return _ridge(gram, right, penalty, RIDGES[int(np.argmax(totals))])
+    ridges = RIDGES if len(grams) > 1 else RIDGES[:1]
+    totals = sum(
+        np.array([_gain(own_gram, own_right, one) for one in _ridge(*kept, penalty, ridges)])
+        for own_gram, own_right, kept in zip(grams, rights, others, strict=True)
+    )
+    return _ridge(gram, right, penalty, (ridges[int(np.argmax(totals))],))[0]
 
 
-def _ridge(gram: np.ndarray, right: np.ndarray, penalty: np.ndarray, ridge: float) -> np.ndarray:
+def _ridge(gram: np.ndarray, right: np.ndarray, penalty: np.ndarray, ridges: Sequence[float]) -> np.ndarray:
+    """Coefficients (ridges, m)."""
     information = np.diag(gram)
     known = information > _IDLE * max(information.max(), np.finfo(float).tiny)
     own = np.ix_(known, known)
-    weight = ridge * information[known].mean() / max(np.diag(penalty)[known].mean(), np.finfo(float).tiny)
-    coefficients = np.zeros(len(right))
+    scale = information[known].mean() / max(np.diag(penalty)[known].mean(), np.finfo(float).tiny)
     # Every penalty has some weight on the size, so that the system has one solution.
-    coefficients[known] = np.linalg.solve(gram[own] + weight * penalty[own], right[known])
+    coefficients = np.zeros((len(ridges), len(right)))
+    systems = gram[own] + scale * np.array(ridges)[:, None, None] * penalty[own]
+    coefficients[:, known] = np.linalg.solve(systems, right[known][:, None])[..., 0]
     return coefficients
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.probes.defects import Defects, find_defects
 from litho_models.loop.probes.displaced import displaced_copy
+from litho_models.loop.probes.far import far_response
 from litho_models.loop.probes.kernel import missing_kernel
 from litho_models.loop.probes.linear import Left
 from litho_models.loop.probes.places import position_map, profile
@@ -151,6 +152,7 @@ GENERIC: dict[str, Maker] = {
     "level-table": _on_samples(level_table),
     "order-shapes": _on_samples(order_shapes),
     "displaced-copy": displaced_copy,
+    "far-response": _on_samples(far_response),
 }
 
 

@@ -12,7 +12,7 @@ from litho_data.foundation.report_pictures import LIGHT, new_figure
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.findings import LoopFindings
 from litho_models.loop.identifiability import Profile
-from litho_models.loop.probes import AddedProbe, with_intervals
+from litho_models.loop.probes import AddedProbe, far, with_intervals
 from litho_models.loop.probes.displaced import DisplacedCopy
 from litho_models.loop.probes.kernel import MissingKernel
 from litho_models.loop.probes.places import drawn, drawn_profile, shifts
@@ -104,7 +104,7 @@ def curve_figure(curves: list[CovariateTest]) -> Figure:
 
 
 def probe_figure(entry: AddedProbe) -> Figure:
-    """What one generic term looks like: a kernel, a copy, a table, a profile or a map."""
+    """What one generic term looks like: a kernel, a copy, a far response, a table, a profile or a map."""
     probe, common = entry.probe, entry.estimate.common
     if isinstance(probe, MissingKernel):
         kernel = probe.kernel_map(common) / probe.pitch_um**2
@@ -112,7 +112,11 @@ def probe_figure(entry: AddedProbe) -> Figure:
         away = _displaced("y"), _displaced("x")
         return _image(kernel, shown, "height per layout height and µm²", min(5.5, shown[0]), away)
     if isinstance(probe, DisplacedCopy):
-        return _copy_figure(probe, common)
+        figure = _places_figure(probe.places_um, probe.gain_nm2(), "gain of one copy (nm²)")
+        figure.axes[0].plot(common[1], common[0], "o", mfc="none", mec=_SECOND, ms=14)
+        return figure
+    if probe.name == "far-response":
+        return _places_figure(*far.drawn(common), "height per layout height and µm")
     if probe.name in OF_SHAPES:
         return _bars_figure(entry)
     if probe.name in _TABLES:
@@ -130,14 +134,13 @@ def probe_figure(entry: AddedProbe) -> Figure:
     return _image(drawn(common) * scale, (1.0, 1.0), unit, 1.0, _OVER_SCAN)
 
 
-def _copy_figure(probe: DisplacedCopy, common: np.ndarray) -> Figure:
-    """Gain of one copy at every displacement, and where it was taken."""
+def _places_figure(places_um: np.ndarray, values: np.ndarray, label: str) -> Figure:
+    """Values (n,) at displacements (y, x) from the layout, (n, 2)."""
+    y, x = places_um.T
     figure = new_figure(5, 4)
     axes = figure.subplots()
-    y, x = probe.places_um.T
-    points = axes.scatter(x, y, c=probe.gain_nm2(), s=6, cmap="viridis")
-    axes.plot(common[1], common[0], "o", mfc="none", mec=_SECOND, ms=14)
-    figure.colorbar(points, ax=axes, label="gain of one copy (nm²)")
+    points = axes.scatter(x, y, c=values, s=6, cmap="viridis")
+    figure.colorbar(points, ax=axes, label=label)
     axes.set_aspect("equal")
     axes.invert_yaxis()
     axes.set(xlabel=_displaced("x"), ylabel=_displaced("y"))

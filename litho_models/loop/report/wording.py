@@ -8,6 +8,7 @@ from litho_data.foundation.report import capitalised
 from litho_models.effects import get_effect
 from litho_models.frozen.readme import bounds_text
 from litho_models.loop.findings import LoopFindings
+from litho_models.loop.probes.far import in_words
 from litho_models.loop.result.record import AddedEffect, CloseLoop, EqualTerms, NestedResult, Part
 from litho_models.loop.selection.confirming import FEWEST_SCANS
 from litho_models.scoring.pairs import OverUnits
@@ -178,8 +179,10 @@ def plain_words(findings: LoopFindings, result: CloseLoop) -> list[str]:
     if not causes and result.verdict != "too-few-scans":
         parts.append("No named effect of the printer is confirmed as missing from the model.")
     for e in traced:
+        far = e.name == "far-response"
+        follows = f", {in_words({k: p.value for k, p in e.parameters.items()})}," if far else ""
         parts.append(
-            f"A generic term [{e.name}] lowers the held-out error from {e.before_nm:.2f} to "
+            f"A generic term [{e.name}]{follows} lowers the held-out error from {e.before_nm:.2f} to "
             f"{e.after_nm:.2f} nm in {e.scans_improved[0]} of {e.scans_improved[1]} scans: it says where the "
             "rest lives, not why, and design does not use it."
         )
