@@ -77,10 +77,9 @@ def _shown(file: Path) -> str:
 
 def _reference(package: str) -> str:
     tree = ast.parse((ROOT / package / "__init__.py").read_text("utf-8"))
-    for node in tree.body:
-        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "__all__":
-            names = [name for name in ast.literal_eval(node.value) if not name.startswith("_")]
-    entries = "\n".join(f"::: {package}.{name}\n" for name in names)
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    names = {alias.asname for node in imports for alias in node.names if alias.asname}
+    entries = "\n".join(f"::: {package}.{name}\n" for name in sorted(names))
     return f"# {package}\n\n{ast.get_docstring(tree)}\n\n{entries}"
 
 

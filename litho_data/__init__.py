@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     __version__: str
 else:
-    __getattr__, __dir__ = lazy_face(
+    __all__, __getattr__, __dir__ = lazy_face(
         __name__,
         {
             "InputError": "litho_data.foundation.errors",
@@ -48,22 +48,3 @@ else:
             "verify": "litho_data.provenance.verify",
         },
     )
-
-__all__ = [
-    "InputError",
-    "PrintedScan",
-    "Recipe",
-    "Scan",
-    "Store",
-    "__version__",
-    "build_dataset",
-    "fetch",
-    "level_scan",
-    "open_store",
-    "read_layout",
-    "read_scan",
-    "register_scan",
-    "resample_to_layout",
-    "simulate",
-    "verify",
-]

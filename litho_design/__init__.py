@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     __version__: str
 else:
-    __getattr__, __dir__ = lazy_face(
+    __all__, __getattr__, __dir__ = lazy_face(
         __name__,
         {
             "Element": "litho_design.elements.element",
@@ -51,26 +51,3 @@ else:
             "score": "litho_design.workflows.score",
         },
     )
-
-__all__ = [
-    "Element",
-    "MeasuredSource",
-    "PhotoSource",
-    "Task",
-    "__version__",
-    "compare",
-    "correct",
-    "design",
-    "design_hologram",
-    "design_lens",
-    "design_settings",
-    "export",
-    "first",
-    "hologram_settings",
-    "import_levels",
-    "lens_settings",
-    "load_design",
-    "load_printer",
-    "register_task",
-    "score",
-]

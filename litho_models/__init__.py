@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from litho_models.frozen.freezing import freeze as freeze
     from litho_models.frozen.simulator import FrozenSimulator as FrozenSimulator
     from litho_models.loop import LoopConfig as LoopConfig
-    from litho_models.loop import close_loop_on_store as close_loop
+    from litho_models.loop import close_loop_on_store as close_loop  # noqa: F401
     from litho_models.models import build_model as build_model
     from litho_models.models.authors import model_of_authors as model_of_authors
     from litho_models.noise import analyse_noise as analyse_noise
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     __version__: str
 else:
-    __getattr__, __dir__ = lazy_face(
+    __all__, __getattr__, __dir__ = lazy_face(
         __name__,
         {
             "FrozenSimulator": "litho_models.frozen.simulator",
@@ -51,26 +51,3 @@ else:
             "zoo": "litho_models.frozen",
         },
     )
-
-__all__ = [
-    "FrozenSimulator",
-    "LoopConfig",
-    "PatchDataset",
-    "Simulator",
-    "__version__",
-    "analyse_noise",
-    "benchmark",
-    "build_model",
-    "close_loop",
-    "compare",
-    "evaluate",
-    "freeze",
-    "load_frozen",
-    "model_of_authors",
-    "register_effect",
-    "register_metric",
-    "register_scan_term",
-    "save_frozen",
-    "train",
-    "zoo",
-]

@@ -12,15 +12,17 @@ _DISTRIBUTION = "litholoop"
 _OF_EXTRAS = "torch"
 
 
-def lazy_face(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """``__getattr__`` and ``__dir__`` of a package that loads its public names lazily.
+def lazy_face(
+    package: str, homes: Mapping[str, str]
+) -> tuple[list[str], Callable[[str], Any], Callable[[], list[str]]]:
+    """``__all__``, ``__getattr__`` and ``__dir__`` of a package that loads its public names lazily.
 
     In a package's ``__init__``, where type checkers read the imports and Python the mapping::
 
         if TYPE_CHECKING:
             from litho_data.readers.read import read_scan as read_scan
         else:
-            __getattr__, __dir__ = lazy_face(__name__, {"read_scan": "litho_data.readers.read"})
+            __all__, __getattr__, __dir__ = lazy_face(__name__, {"read_scan": "litho_data.readers.read"})
 
     Args:
         package: ``__name__`` of the package.
@@ -49,10 +51,8 @@ def lazy_face(package: str, homes: Mapping[str, str]) -> tuple[Callable[[str], A
         setattr(sys.modules[package], name, value)
         return value
 
-    def names() -> list[str]:
-        return sorted([*homes, "__version__"])
-
-    return load, names
+    names = sorted([*homes, "__version__"])
+    return names, load, lambda: names
 
 
 def require_extra(command: str, extra: str) -> None:

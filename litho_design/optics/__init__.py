@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from litho_design.optics.thin_element import intensity_share as intensity_share
 else:
     # Loaded when used: the command line reads the settings in `Optics` without torch.
-    __getattr__, __dir__ = lazy_face(
+    __all__, __getattr__, __dir__ = lazy_face(
         __name__,
         {
             "ASMPropagator": "litho_design.optics.angular_spectrum",
