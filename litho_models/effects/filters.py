@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 
 import torch
+from scipy.fft import next_fast_len
 from torch import Tensor
 from torch.nn import functional
 
@@ -26,7 +27,7 @@ def add_filtered(
     """
     ny, nx = field.shape[-2:]
     pad = min(round(reach_um / pitch_um) + 1, ny - 1, nx - 1)
-    size_y, size_x = _fast_length(ny + 2 * pad), _fast_length(nx + 2 * pad)
+    size_y, size_x = (next_fast_len(n + 2 * pad, real=True) for n in (ny, nx))
     padding = (pad, size_x - nx - pad, pad, size_y - ny - pad)
     padded = functional.pad(field, padding, mode="replicate")
     fy = torch.fft.fftfreq(size_y, pitch_um, dtype=field.dtype, device=field.device)[:, None]
@@ -95,16 +96,3 @@ def _look_up(field: Tensor, y_px: Tensor, x_px: Tensor) -> Tensor:
     grid = torch.stack([2 * x_px / max(nx - 1, 1) - 1, 2 * y_px / max(ny - 1, 1) - 1], dim=-1)
     grid = grid.reshape(-1, ny, nx, 2).expand(field.shape[0], ny, nx, 2)
     return functional.grid_sample(field, grid, mode="bicubic", padding_mode="border", align_corners=True)
-
-
-def _fast_length(n: int) -> int:
-    """The next length whose only prime factors are 2, 3 and 5."""
-    candidate = n
-    while True:
-        rest = candidate
-        for prime in (2, 3, 5):
-            while rest % prime == 0:
-                rest //= prime
-        if rest == 1:
-            return candidate
-        candidate += 1
