@@ -24,7 +24,7 @@ from litho_data.foundation.outputs import require_own_folder
 from litho_design.judging.score import JudgedScore
 from litho_design.large.bands import Bands
 from litho_design.large.printing import check_printer
-from litho_design.lenses.bench import RadialLensBench, centre_to_background
+from litho_design.lenses.bench import RadialLensBench
 from litho_design.lenses.score import LensScore, lens_score
 from litho_design.lenses.settings import LensSettings
 from litho_design.lenses.task import strip_rings
@@ -126,10 +126,7 @@ class RingLens:
 
     def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
         """-log(centre-to-background ratio), and its parts."""
-        layout, view = self.settings.layout, self.settings.view
-        seen = self.bench(self.printed_um(level))
-        ratio = centre_to_background(seen, round(view.centre_um / layout.pitch_um), layout.size_px)
-        return -ratio.log(), {"cbr": float(ratio.detach()), "window": float(seen.detach().sum())}
+        return self.bench.focusing_loss(self.bench(self.printed_um(level)))
 
     def start(self, parameters: DirectLevels, heights: list[float]) -> None:
         """Levels whose print is nearest to a perfect lens, or random ones."""

@@ -35,6 +35,16 @@ class LensOptics(nn.Module):
         half = self.layout.size_um / 2
         return half / math.hypot(half, self.optics.distance_um)
 
+    def ratio(self, psf: Tensor) -> Tensor:
+        """Centre-to-background ratio of a PSF (window, window), with the centre of the view."""
+        centre_px = round(self.view.centre_um / self.layout.pitch_um)
+        return centre_to_background(psf, centre_px, self.layout.size_px)
+
+    def focusing_loss(self, psf: Tensor) -> tuple[Tensor, dict[str, float]]:
+        """-log(centre-to-background ratio) of a PSF (window, window), and its parts."""
+        ratio = self.ratio(psf)
+        return -ratio.log(), {"cbr": float(ratio.detach()), "window": float(psf.detach().sum())}
+
     def radius_um(self) -> Tensor:
         """Distance from the axis, float64, µm, of each height that is asked for."""
         raise NotImplementedError

@@ -15,7 +15,6 @@ from litho_design.images.similarity import similarity
 from litho_design.lenses.bench import (
     LensBench,
     RadialLensBench,
-    centre_to_background,
     reconstruct,
     record,
     sensor_psf,
@@ -73,7 +72,6 @@ def lens_score(bench: LensBench | RadialLensBench, height_um: Tensor) -> LensSco
     radius_um = 3 * fwhm_ideal
     y, x = torch.from_numpy(bench.window.y_um), torch.from_numpy(bench.window.x_um)
     near = (torch.hypot(y[:, None], x[None, :]) <= radius_um).to(psf.device)
-    centre_px = round(bench.view.centre_um / pitch)
     cutoff = 2 * bench.numerical_aperture / bench.optics.wavelength_um
     return LensScore(
         focusing_efficiency=float(psf[near].sum()),
@@ -83,8 +81,8 @@ def lens_score(bench: LensBench | RadialLensBench, height_um: Tensor) -> LensSco
         mtf_half_cutoff=mtf_at(psf, cutoff / 2, pitch),
         fwhm_um=half_maximum_width_um(psf, pitch),
         fwhm_ideal_um=fwhm_ideal,
-        cbr=float(centre_to_background(psf, centre_px, bench.layout.size_px)),
-        cbr_ceiling=float(centre_to_background(ideal, centre_px, bench.layout.size_px)),
+        cbr=float(bench.ratio(psf)),
+        cbr_ceiling=float(bench.ratio(ideal)),
         eff_window=float(psf.sum()),
     )
 
@@ -195,9 +193,7 @@ def lens_baselines(
     flat = lens_score(bench, torch.zeros_like(ideal))
     found = {
         "perfect lens": score_lens(settings, bench, ideal, ideal, pictures).model_dump(),
-        "no lens": {
-            name: getattr(flat, name) for name in ("focusing_efficiency", "strehl", "cbr", "eff_window")
-        },
+        "no lens": {name: getattr(flat, name) for name in _OF_POWER},
     }
     if settings.task == "computational":
         imaging = settings.imaging

@@ -16,7 +16,6 @@ from litho_data.foundation.errors import InputError
 from litho_design.lenses.bench import (
     LensBench,
     RadialLensBench,
-    centre_to_background,
     reconstruct,
     record,
     sensor_psf,
@@ -155,7 +154,7 @@ class LensTask(Task):
 
     def window_figures(self, seen: Tensor) -> dict[str, float]:
         """Strehl ratio and centre-to-background ratio."""
-        return {"strehl": float(seen.max()) / self._ideal_peak, "cbr": float(self._ratio(seen))}
+        return {"strehl": float(seen.max()) / self._ideal_peak, "cbr": float(self.bench.ratio(seen))}
 
     def display(self, seen: np.ndarray) -> np.ndarray:
         """The root of the PSF over its peak."""
@@ -175,12 +174,6 @@ class LensTask(Task):
     def _ideal_peak(self) -> float:
         return float(self.bench(self.bench.ideal_height_um()).max())
 
-    def _ratio(self, psf: Tensor) -> Tensor:
-        layout = self.settings.layout
-        return centre_to_background(
-            psf, round(self.settings.view.centre_um / layout.pitch_um), layout.size_px
-        )
-
 
 @register_task
 class DirectLensTask(LensTask):
@@ -192,8 +185,7 @@ class DirectLensTask(LensTask):
 
     def loss(self, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
         """-log(centre-to-background ratio)."""
-        ratio = self._ratio(seen)
-        return -ratio.log(), {"cbr": float(ratio.detach()), "window": float(seen.detach().sum())}
+        return self.bench.focusing_loss(seen)
 
 
 @register_task
@@ -210,7 +202,7 @@ class ComputationalLensTask(LensTask):
         kernel = sensor_psf(seen, imaging.pixel_px)
         image = record(self.objects, kernel, imaging.read_noise, _DESIGN_NOISE_SEED)
         error = (reconstruct(image, kernel, imaging.iterations) - self.objects).abs().mean()
-        return error, {"cbr": float(self._ratio(seen).detach()), "window": float(seen.detach().sum())}
+        return error, {"cbr": float(self.bench.ratio(seen).detach()), "window": float(seen.detach().sum())}
 
 
 def _narrow_window(bench: LensBench) -> list[str]:
