@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from torch import Tensor
@@ -43,6 +43,27 @@ class JudgedScore(Record):
     figures: dict[str, float]
     uncertainty: dict[str, float] | None = None
     stitching: Stitching | None = None
+
+    @classmethod
+    def of_print(
+        cls,
+        design: Design,
+        judge: PrinterRecord | MeasuredRecord,
+        differences_um: tuple[float, float],
+        figures: dict[str, float],
+        **more: Any,
+    ) -> JudgedScore:
+        """The figures of a predicted or measured print; mean and rms of its height minus the designed one."""
+        model = isinstance(judge, PrinterRecord)
+        return cls(
+            kind="model" if model else "scan",
+            judge=judge,
+            independent=not model or judge.sha256 != design.printer.sha256,
+            mean_height_difference_um=differences_um[0],
+            rms_height_difference_um=differences_um[1],
+            figures=figures,
+            **more,
+        )
 
     def remarks(self) -> list[str]:
         """What was done to a measurement, and what stays open about it, one phrase each."""
@@ -131,18 +152,17 @@ def judge_design(
     photos: dict[str, np.ndarray] = {}
     for judge in judges:
         height, record = loaded.printed_um(judge), judge.record()
-        independent = record.sha256 != loaded.record.printer.sha256
         if stitch is not None:
             pitch_um = loaded.record.layout.pitch_um
             drawn = [stitch.drawn(height, pitch_um, [seed]) for seed in range(DRAWS)]
-            scores.append(_stitched_score(loaded, record, independent, drawn, stitch))
+            scores.append(_stitched_score(loaded, record, drawn, stitch))
             height = drawn[0]
         else:
-            scores.append(_height_score(loaded, "model", record, independent, height))
+            scores.append(_height_score(loaded, record, height))
         pictures[f"printed by {record.name}"] = loaded.image(height)
     if scan is not None:
         printed_um, measured = measured_print(loaded, scan)
-        scores.append(_height_score(loaded, "scan", measured, True, printed_um))
+        scores.append(_height_score(loaded, measured, printed_um))
         pictures[f"measured print {measured.name}"] = loaded.image(printed_um)
     if camera is not None:
         of_lens = isinstance(loaded.task, LensTask)
@@ -169,9 +189,9 @@ def judge_design(
 
 
 def _stitched_score(
-    loaded: LoadedDesign, judge: PrinterRecord, independent: bool, drawn: list[Tensor], stitch: Stitching
+    loaded: LoadedDesign, judge: PrinterRecord, drawn: list[Tensor], stitch: Stitching
 ) -> JudgedScore:
-    scores = [_height_score(loaded, "model", judge, independent, height) for height in drawn]
+    scores = [_height_score(loaded, judge, height) for height in drawn]
     figures = {name: [score.figures[name] for score in scores] for name in scores[0].figures}
     mean_um, rms_um = (
         float(np.mean([getattr(score, f"{what}_height_difference_um") for score in scores]))
@@ -188,24 +208,11 @@ def _stitched_score(
     )
 
 
-def _height_score(
-    loaded: LoadedDesign,
-    kind: Literal["model", "scan"],
-    judge: PrinterRecord | MeasuredRecord,
-    independent: bool,
-    height: Tensor,
-) -> JudgedScore:
+def _height_score(loaded: LoadedDesign, judge: PrinterRecord | MeasuredRecord, height: Tensor) -> JudgedScore:
     difference, figures = height - loaded.expected_um, loaded.score(height)
     spread = None
     if isinstance(judge, MeasuredRecord):
         variants = as_it_might_be(height, judge, loaded.record.layout.pitch_um)
         spread = uncertainties(loaded.score, figures, variants)
-    return JudgedScore(
-        kind=kind,
-        judge=judge,
-        independent=independent,
-        mean_height_difference_um=float(difference.mean()),
-        rms_height_difference_um=float(difference.square().mean().sqrt()),
-        figures=figures.model_dump(),
-        uncertainty=spread,
-    )
+    off_um = float(difference.mean()), float(difference.square().mean().sqrt())
+    return JudgedScore.of_print(loaded.record, judge, off_um, figures.model_dump(), uncertainty=spread)

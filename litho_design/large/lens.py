@@ -241,15 +241,7 @@ def judge_rings(
         }
         off, area = (height.cpu() - expected).double(), bench.propagator.ring_area_um2
         share = area / area.sum()
-        scores.append(
-            JudgedScore(
-                kind="model",
-                judge=judge,
-                independent=judge.sha256 != record.printer.sha256,
-                mean_height_difference_um=float((off * share).sum()),
-                rms_height_difference_um=float((off.square() * share).sum().sqrt()),
-                figures=lens.score(height).model_dump(),
-            )
-        )
+        off_um = float((off * share).sum()), float((off.square() * share).sum().sqrt())
+        scores.append(JudgedScore.of_print(record, judge, off_um, lens.score(height).model_dump()))
     assert bench is not None
     return scores, pictures, bench.window.size_um[0]

@@ -144,20 +144,10 @@ def score_from_disk(
             if stitch is not None:
                 printed = in_fields_from_disk(height, layout.pitch_um, stitch, bands, on_disk(room)).numpy()
             zero_order = image_from_disk(printed, layout.pitch_um, optics, bands, image, on_disk(room))
-            mean, rms = _difference(printed, expected, bands)
+            off_um = _difference(printed, expected, bands)
             figures = image_figures(image, target, bands) | {"zero_order_share": zero_order}
             pictures[f"printed by {judge.name}"] = preview(image, bands)
-        scores.append(
-            JudgedScore(
-                kind="model",
-                judge=judge,
-                independent=judge.sha256 != record.printer.sha256,
-                mean_height_difference_um=mean,
-                rms_height_difference_um=rms,
-                figures=figures,
-                stitching=stitch,
-            )
-        )
+        scores.append(JudgedScore.of_print(record, judge, off_um, figures, stitching=stitch))
     result = ScoreResult.of(folder, record, scores)
     brightest = {title: picture / picture.max() for title, picture in pictures.items()}
     write_score_report(Path(out), result, brightest, layout.size_um, {}, layout.size_um)
