@@ -38,6 +38,7 @@ from litho_design.optimisation.search import (
     remove_checkpoint,
     search_layout,
 )
+from litho_design.optimisation.starts import start_search
 from litho_design.printers.layout import LayoutSettings, printability
 from litho_design.printers.printer import Printer
 from litho_design.tasks.design import (
@@ -130,15 +131,14 @@ class RingLens:
 
     def start(self, parameters: DirectLevels, heights: list[float]) -> None:
         """Levels whose print is nearest to a perfect lens, or random ones."""
-        search, optics = self.settings.search, self.settings.optics
-        if search.start == "random":
-            return parameters.start_random(search.seed)
-        ideal = self.bench.ideal_height_um().double() * (2 * math.pi / optics.wave_height_um)
-        wave = self.cells.average(torch.polar(torch.ones_like(ideal), ideal))
-        levels = focusing_levels(wave.angle().float().cpu(), printed_phase(heights, optics))
-        return parameters.start_from(
-            levels.float(), jitter_levels=search.start_jitter_levels, seed=search.seed
-        )
+        optics = self.settings.optics
+
+        def perfect() -> Tensor:
+            ideal = self.bench.ideal_height_um().double() * (2 * math.pi / optics.wave_height_um)
+            wave = self.cells.average(torch.polar(torch.ones_like(ideal), ideal))
+            return focusing_levels(wave.angle().float().cpu(), printed_phase(heights, optics))
+
+        start_search(parameters, self.settings.search, perfect)
 
     @torch.no_grad()
     def score(self, height_um: Tensor) -> LensScore:

@@ -30,7 +30,7 @@ from litho_design.optimisation.search import (
     remove_checkpoint,
     search_layout,
 )
-from litho_design.optimisation.starts import start_search
+from litho_design.optimisation.starts import start_levels, start_search
 from litho_design.printers.layout import printability
 from litho_design.printers.printer import Printer
 from litho_design.printers.training import out_of_distribution
@@ -87,7 +87,8 @@ def design_in_bands(
     heights = printer.level_heights_um()
     parameters = DirectLevels(settings.layout, bands.rows()).to(printer.device)
     with printer.at_precision(search.precision):
-        start_search(parameters, search.start, hologram.scene(printed_phase(heights, settings.optics)))
+        phase = printed_phase(heights, settings.optics)
+        start_search(parameters, search, lambda: start_levels(search.start, hologram.scene(phase)))
         with torch.no_grad():
             start_loss = float(hologram.objective(_pixels(parameters, parameters.best_levels()))[0])
         budget = measure_budget(parameters, hologram.objective, search)

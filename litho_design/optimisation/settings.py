@@ -12,10 +12,10 @@ from litho_data.foundation.settings import changed, setting
 from litho_design.optics import Optics
 from litho_design.optimisation.fabrication import Fabrication
 from litho_design.optimisation.process_window import ProcessWindow
-from litho_design.optimisation.starts import StartName
 from litho_design.printers.layout import LayoutSettings
 
 Variant = Literal["default", "paper", "authors"]
+StartName = Literal["random", "gs", "wgs", "fresnel", "inverse"]
 
 
 class SearchSettings(Record):

@@ -1,7 +1,7 @@
 """Starts of a search: each is a function that gives one level for every free cell.
 
-To add a start, give it a name in ``StartName`` and a function in ``_STARTS``, and list it in ``starts`` of
-the tasks that have what it needs.
+To add a start, give it a name in ``StartName`` of the settings and a function in ``_STARTS``, and list it in
+``starts`` of the tasks that have what it needs.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from litho_data.foundation.errors import InputError
 
@@ -18,9 +18,7 @@ if TYPE_CHECKING:
 
     from litho_design.optics import Optics
     from litho_design.optimisation.parameters import CellMap, Parametrisation
-
-# The command line reads the names: what computes is imported when a start is made, torch with it.
-StartName = Literal["random", "gs", "wgs", "fresnel", "inverse"]
+    from litho_design.optimisation.settings import SearchSettings
 
 
 @dataclass(frozen=True)
@@ -63,14 +61,18 @@ def check_start(name: str, fit: Sequence[str], task: str) -> None:
         raise InputError("start", got=repr(name), wanted=f"{', '.join(map(repr, fit))} for {task}")
 
 
-def start_search(
-    parameters: Parametrisation, name: StartName, scene: Scene, *, jitter_levels: float = 0.0
-) -> None:
-    """Set ``parameters`` to the start ``name``; Gaussian ``jitter_levels`` are added unless it is random."""
-    if name == "random":
-        parameters.start_random(scene.seed)
+def start_search(parameters: Parametrisation, search: SearchSettings, levels: Callable[[], Tensor]) -> None:
+    """Set ``parameters`` to random levels, or to those given (*cells) with the jitter of the settings."""
+    if search.start == "random":
+        parameters.start_random(search.seed)
     else:
-        parameters.start_from(_STARTS[name](scene).float(), jitter_levels=jitter_levels, seed=scene.seed)
+        jitter_levels = search.start_jitter_levels
+        parameters.start_from(levels().float(), jitter_levels=jitter_levels, seed=search.seed)
+
+
+def start_levels(name: str, scene: Scene) -> Tensor:
+    """The levels (*cells) of a start that needs no more than the scene, such as ``gs``."""
+    return _STARTS[name](scene)
 
 
 def _gerchberg_saxton(scene: Scene, *, weighted: bool = False) -> Tensor:

@@ -16,6 +16,7 @@ from litho_data.foundation.results import Record
 from litho_design.images.targets import TargetRecord
 from litho_design.optics import Optics, centred_grid
 from litho_design.optimisation.parameters import DirectLevels, Parametrisation
+from litho_design.optimisation.starts import start_search
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 from litho_design.reliefs.settings import ReliefSettings
@@ -107,12 +108,7 @@ class ReliefTask(Task):
 
     def start(self, parameters: Parametrisation, level_heights_um: list[float]) -> None:
         """The level that prints the wanted height where it is uniform, or random levels."""
-        search = self.settings.search
-        if search.start == "random":
-            parameters.start_random(search.seed)
-        else:
-            levels = self._levels_printing(level_heights_um)
-            parameters.start_from(levels, jitter_levels=search.start_jitter_levels, seed=search.seed)
+        start_search(parameters, self.settings.search, lambda: self._levels_printing(level_heights_um))
 
     def baselines(self) -> dict[str, dict[str, float]]:
         """Errors of the nominal layout, of the best affine correction, and of levels of any height."""

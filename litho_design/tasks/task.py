@@ -26,7 +26,7 @@ from litho_design.optimisation.phases import printed_phase
 from litho_design.optimisation.process_window import Draw, check_draws, draws
 from litho_design.optimisation.robust import penalised, windowed_loss
 from litho_design.optimisation.settings import DesignSettings
-from litho_design.optimisation.starts import Scene, check_start, start_search
+from litho_design.optimisation.starts import Scene, check_start, start_levels, start_search
 from litho_design.printers.printer import Printer
 from litho_design.tasks.bench import ViewsBench
 from litho_design.tasks.design import IMAGE_FILE
@@ -216,7 +216,7 @@ class Task:
     def start(self, parameters: Parametrisation, level_heights_um: list[float]) -> None:
         """Set the start of the search, from the phases of the levels as printed."""
         search, phase = self.settings.search, printed_phase(level_heights_um, self.settings.optics)
-        start_search(parameters, search.start, self.scene(phase), jitter_levels=search.start_jitter_levels)
+        start_search(parameters, search, lambda: start_levels(search.start, self.scene(phase)))
 
     @torch.no_grad()
     def window_scores(self, height_um: Tensor, count: int) -> list[dict[str, float]]:

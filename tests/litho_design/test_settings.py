@@ -21,7 +21,8 @@ from litho_design.holograms.settings import HologramSettings, hologram_settings
 from litho_design.holograms.task import HologramTask
 from litho_design.lenses.settings import LensSettings, lens_settings
 from litho_design.lenses.task import LensTask
-from litho_design.optimisation.starts import _STARTS, StartName
+from litho_design.optimisation.settings import StartName
+from litho_design.optimisation.starts import _STARTS
 from litho_design.reliefs.settings import ReliefSettings
 from litho_design.reliefs.task import ReliefTask
 
