@@ -18,9 +18,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import writable
 from litho_data.foundation.hashes import record_sha256
-from litho_data.foundation.outputs import require_own_folder
 from litho_design.judging.score import JudgedScore
 from litho_design.large.bands import Bands
 from litho_design.large.printing import check_printer
@@ -28,12 +26,10 @@ from litho_design.lenses.bench import RadialLensBench
 from litho_design.lenses.score import LensScore, lens_score
 from litho_design.lenses.settings import LensSettings
 from litho_design.lenses.task import strip_rings
-from litho_design.optics.stroke import measure_stroke
 from litho_design.optimisation.budget import measure_budget
 from litho_design.optimisation.parameters import CellMap, DirectLevels
 from litho_design.optimisation.phases import focusing_levels, printed_phase
 from litho_design.optimisation.search import (
-    CHECKPOINTS,
     finished_iterations,
     remove_checkpoint,
     search_layout,
@@ -160,14 +156,11 @@ def design_in_rings(
         InputError: what ``RingLens`` refuses, or ``out`` holds another result.
     """
     folder, search, layout = Path(out), settings.search, settings.layout
-    require_own_folder(folder, Design.FILE_NAME, CHECKPOINTS)
     before = printer.weights_sha256()
     fingerprint = record_sha256(["lens in rings", settings.model_dump(mode="json"), before])
     finished = finished_design(folder, fingerprint, settings)
     if finished is not None:
         return finished
-    with writable(folder):
-        folder.mkdir(parents=True, exist_ok=True)
     started = time.monotonic()
     lens, heights = RingLens(settings, printer, tile_px), printer.level_heights_um()
     parameters = DirectLevels(layout, cells=lens.cells).to(printer.device)
@@ -185,25 +178,18 @@ def design_in_rings(
     with torch.no_grad():
         height = lens.printed_um(level.float()[None, None])
     rows = level.cpu().numpy().astype("uint8")
-    design = Design(
+    design = Design.searched(
+        settings,
+        printer,
+        heights,
+        state,
         task="lens-direct",
-        variant=settings.variant,
         fingerprint=fingerprint,
         run=RunRecord.of(printer.device, time.monotonic() - started, budget.seconds_per_iteration),
-        settings=settings.model_dump(mode="json"),
-        layout=layout,
-        optics=settings.optics,
-        printer=printer.record(),
         printer_unchanged=printer.weights_sha256() == before,
-        stroke=measure_stroke(
-            heights, settings.optics.wave_height_um, level_height_um=layout.level_height_um
-        ),
         printability=printability(torch.cat([level.flip(0), level])[None].cpu().numpy(), layout),
         notes=["a lens in rings: levels and heights along one radius; no layout of the plane, no polish"],
-        iterations=state.iteration,
         start_loss=start_loss,
-        sample_loss=state.history[-1]["sample_loss"],
-        argmax_loss=state.best_loss,
         polished_loss=state.best_loss,
         reference_efficiency=lens.score(lens.bench.ideal_height_um()).focusing_efficiency,
         predicted=lens.score(height).model_dump(),

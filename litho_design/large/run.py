@@ -11,21 +11,17 @@ import torch
 from torch import Tensor
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import writable
 from litho_data.foundation.hashes import file_sha256, record_sha256
-from litho_data.foundation.outputs import require_own_folder
 from litho_design.holograms.settings import HologramSettings
 from litho_design.images.targets import Target
 from litho_design.large.bands import Bands
 from litho_design.large.hologram import BandedHologram
 from litho_design.large.printing import print_bands
 from litho_design.large.score import image_figures
-from litho_design.optics.stroke import measure_stroke
 from litho_design.optimisation.budget import measure_budget
 from litho_design.optimisation.parameters import DirectLevels
 from litho_design.optimisation.phases import printed_phase
 from litho_design.optimisation.search import (
-    CHECKPOINTS,
     finished_iterations,
     remove_checkpoint,
     search_layout,
@@ -75,12 +71,9 @@ def design_in_bands(
     fingerprint = record_sha256(
         ["hoe in bands", settings.model_dump(mode="json"), before, target.record.sha256, bands.band_px]
     )
-    require_own_folder(folder, Design.FILE_NAME, CHECKPOINTS)
     finished = finished_design(folder, fingerprint, settings)
     if finished is not None:
         return finished
-    with writable(folder):
-        folder.mkdir(parents=True, exist_ok=True)
     part = f"-{ranks.rank + 1}-of-{ranks.count}" if ranks.count > 1 else ""
     done = _resumed(folder, part, bands)
     started = time.monotonic()
@@ -114,27 +107,20 @@ def design_in_bands(
             np.load(folder / name, mmap_mode="r") for name in (LEVELS_FILE, IMAGE_FILE, TARGET_FILE)
         )
         layout = settings.layout
-        Design(
+        Design.searched(
+            settings,
+            printer,
+            heights,
+            state,
             task="hoe",
-            variant=settings.variant,
             fingerprint=fingerprint,
             run=RunRecord.of(printer.device, seconds, budget.seconds_per_iteration),
-            settings=settings.model_dump(mode="json"),
-            layout=layout,
-            optics=settings.optics,
             target=target.record,
-            printer=printer.record(),
             printer_unchanged=True,
-            stroke=measure_stroke(
-                heights, settings.optics.wave_height_um, level_height_um=layout.level_height_um
-            ),
             printability=printability(levels, layout),
             out_of_distribution=out_of_distribution(levels, layout, printer.card),
             notes=[_LEFT_OUT, f"{bands.count} bands of {bands.band_px} rows, {ranks.count} process(es)"],
-            iterations=state.iteration,
             start_loss=start_loss,
-            sample_loss=state.history[-1]["sample_loss"],
-            argmax_loss=state.best_loss,
             polished_loss=state.best_loss,
             predicted=image_figures(seen, aim, Bands(layout.size_px, bands.band_px)),
             files=files,

@@ -10,19 +10,20 @@ import torch
 from pydantic import Field
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import atomic_file
+from litho_data.foundation.files import atomic_file, writable
 from litho_data.foundation.hashes import file_sha256
-from litho_data.foundation.outputs import first_difference
+from litho_data.foundation.outputs import first_difference, require_own_folder
 from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import RunFacts, run_facts
 from litho_design.images.targets import TargetRecord
 from litho_design.optics import Optics
-from litho_design.optics.stroke import Stroke
+from litho_design.optics.stroke import Stroke, measure_stroke
 from litho_design.optimisation.budget import peak_memory_gib
 from litho_design.optimisation.robust import EnsembleRecord
+from litho_design.optimisation.search import CHECKPOINTS, SearchState
 from litho_design.optimisation.settings import DesignSettings
 from litho_design.printers.layout import LayoutSettings, Printability
-from litho_design.printers.printer import PrinterRecord, TilingCheck
+from litho_design.printers.printer import Printer, PrinterRecord, TilingCheck
 from litho_design.printers.training import OutOfDistribution
 
 LEVELS_FILE = "layout_level.npy"
@@ -93,6 +94,30 @@ class Design(Result):
     thick: dict[str, float] | None = None
     files: dict[str, str]
 
+    @classmethod
+    def searched(
+        cls,
+        settings: DesignSettings,
+        printer: Printer,
+        level_heights_um: list[float],
+        state: SearchState,
+        **found: Any,
+    ) -> Design:
+        """The record of a layout that was searched; ``found``: the fields that these do not decide."""
+        layout, wave_um = settings.layout, settings.optics.wave_height_um
+        return cls(
+            variant=settings.variant,
+            settings=settings.model_dump(mode="json"),
+            layout=layout,
+            optics=settings.optics,
+            printer=printer.record(),
+            stroke=measure_stroke(level_heights_um, wave_um, level_height_um=layout.level_height_um),
+            iterations=state.iteration,
+            sample_loss=state.history[-1]["sample_loss"],
+            argmax_loss=state.best_loss,
+            **found,
+        )
+
     @property
     def in_rings(self) -> bool:
         """Whether it has levels and heights along one radius, and none of a plane."""
@@ -105,12 +130,15 @@ class Design(Result):
 
 
 def finished_design(folder: Path, fingerprint: str, settings: DesignSettings) -> Design | None:
-    """The design that a folder holds already; None where there is none.
+    """The design that a folder holds already; None where there is none, and the folder is there then.
 
     Raises:
-        InputError: one of other settings, another target or model.
+        InputError: a folder with something else, or a design of other settings, another target or model.
     """
+    require_own_folder(folder, Design.FILE_NAME, CHECKPOINTS)
     if not (folder / Design.FILE_NAME).exists():
+        with writable(folder):
+            folder.mkdir(parents=True, exist_ok=True)
         return None
     design = Design.read(folder)
     if design.fingerprint != fingerprint:

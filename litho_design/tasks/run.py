@@ -14,16 +14,12 @@ import torch
 from torch import Tensor
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import writable
 from litho_data.foundation.hashes import record_sha256
-from litho_data.foundation.outputs import require_own_folder
-from litho_design.optics.stroke import measure_stroke
 from litho_design.optimisation.budget import Budget, measure_budget
 from litho_design.optimisation.fabrication import outside
 from litho_design.optimisation.polish import polish_levels
 from litho_design.optimisation.robust import measure_disagreement
 from litho_design.optimisation.search import (
-    CHECKPOINTS,
     SearchState,
     finished_iterations,
     make_parametrisation,
@@ -87,7 +83,6 @@ def run_design(
     settings = task.settings
     _check_printers(task.printers)
     folder = Path(out)
-    require_own_folder(folder, Design.FILE_NAME, CHECKPOINTS)
     hashes_before = [printer.weights_sha256() for printer in task.printers]
     target = task.target_record.model_dump(mode="json") if task.target_record else None
     fingerprint = record_sha256(
@@ -96,8 +91,6 @@ def run_design(
     finished = finished_design(folder, fingerprint, settings)
     if finished is not None:
         return finished
-    with writable(folder):
-        folder.mkdir(parents=True, exist_ok=True)
     heights = task.printer.level_heights_um()
     with ExitStack() as precisions:
         for printer in task.printers:
@@ -120,29 +113,22 @@ def run_design(
     arrays = {LEVELS_FILE: layout_array, HEIGHT_FILE: height.cpu().numpy(), **task.arrays(height)}
     files = write_arrays(folder, arrays) | write_level_image(folder, layout_array)
     thick = task.thick_score(height)
-    design = Design(
+    design = Design.searched(
+        settings,
+        task.printer,
+        heights,
+        outcome.state,
         task=task.name,
-        variant=settings.variant,
         fingerprint=fingerprint,
         run=RunRecord.of(height.device, outcome.seconds, outcome.budget.seconds_per_iteration),
-        settings=settings.model_dump(mode="json"),
-        layout=settings.layout,
-        optics=settings.optics,
         target=task.target_record,
-        printer=task.printer.record(),
         printer_unchanged=hashes_after == hashes_before,
         tiling=task.printer.tiling_check(level),
         ensemble=measure_disagreement(task.printers, level, settings.optics.wave_height_um),
-        stroke=measure_stroke(
-            heights, settings.optics.wave_height_um, level_height_um=settings.layout.level_height_um
-        ),
         printability=printability(layout_array, settings.layout),
         out_of_distribution=_gauge(task, outcome.levels, layout_array),
         notes=list(task.notes),
-        iterations=outcome.state.iteration,
         start_loss=outcome.start_loss,
-        sample_loss=outcome.state.history[-1]["sample_loss"],
-        argmax_loss=outcome.state.best_loss,
         polished_loss=outcome.polished_loss,
         reference_efficiency=task.reference_efficiency(height),
         predicted=task.score(height).model_dump(),
