@@ -15,13 +15,12 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.utils.checkpoint import checkpoint
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import record_sha256
 from litho_design.judging.score import JudgedScore
 from litho_design.large.bands import Bands
-from litho_design.large.printing import check_printer
+from litho_design.large.printing import check_printer, tiles
 from litho_design.lenses.bench import RadialLensBench
 from litho_design.lenses.score import LensScore, lens_score
 from litho_design.lenses.settings import LensSettings
@@ -107,17 +106,10 @@ class RingLens:
     def printed_um(self, level: Tensor) -> Tensor:
         """Printed height, µm (rings of a pixel,), of levels along the radius (1, 1, pixels)."""
         free = self.cells.average(level[0, 0])
-        strip, halo = free[self._strip][None, None], self.printer.halo_px
-        length = strip.shape[-1] - 2 * halo
-        parts = [
-            strip[..., at : min(at + self.tile_px, length) + 2 * halo]
-            for at in range(0, length, self.tile_px)
-        ]
+        strip = free[self._strip]
         printed = [
-            checkpoint(self.printer.print_patch, part, use_reentrant=False)
-            if torch.is_grad_enabled()
-            else self.printer.print_patch(part)
-            for part in parts
+            self.printer.print_again(strip[None, None, :, part])
+            for part in tiles(strip, self.printer, self.tile_px)
         ]
         return torch.cat(printed, -1)[0, 0].mean(0)
 

@@ -45,12 +45,12 @@ def print_band(around: Tensor, printer: Printer, tile_px: int) -> Tensor:
     """Printed height, µm (y, x), of a band of levels with the printer's halo above and below it."""
     wide = F.pad(around, (printer.halo_px, printer.halo_px))
     return torch.cat(
-        [printer.print_patch(wide[None, None, :, part])[0, 0] for part in _tiles(wide, printer, tile_px)], 1
+        [printer.print_patch(wide[None, None, :, part])[0, 0] for part in tiles(wide, printer, tile_px)], 1
     )
 
 
-def _tiles(wide: Tensor, printer: Printer, tile_px: int) -> list[slice]:
-    """Columns of the tiles of a band that has its halo on all sides, theirs included."""
+def tiles(wide: Tensor, printer: Printer, tile_px: int) -> list[slice]:
+    """Columns of the tiles of a band (y, x) that has its halo on all sides, theirs included."""
     border = 2 * printer.halo_px
     length = wide.shape[1] - border
     return [slice(at, min(at + tile_px, length) + border) for at in range(0, length, tile_px)]
@@ -87,7 +87,7 @@ def _band_gradient(around: Tensor, gradient: Tensor, printer: Printer, tile_px: 
     halo = printer.halo_px
     wide = F.pad(around, (halo, halo))
     found = torch.zeros_like(wide)
-    for part in _tiles(wide, printer, tile_px):
+    for part in tiles(wide, printer, tile_px):
         patch = wide[None, None, :, part].clone().requires_grad_()
         with torch.enable_grad():
             printed = printer.print_patch(patch)

@@ -75,10 +75,8 @@ class Printer(nn.Module):
         self.source = source
         self.extrapolate = extrapolate
         self.name = name or ("none" if simulator is None else str(simulator.name))
-        # The reach is a whole number of pixels times the pitch, up to rounding.
-        self.guard_px = 0 if simulator is None else math.ceil(_guard_um(simulator) / layout.pitch_um - 1e-6)
-        self.halo_px = 0 if simulator is None else _halo_px(simulator, self.guard_px)
-        self.strip_halo_px = 0 if simulator is None else _strip_halo_px(simulator, self.guard_px)
+        borders_px = (0, 0, 0) if simulator is None else _borders_px(simulator, layout.pitch_um)
+        self.guard_px, self.halo_px, self.strip_halo_px = borders_px
         # The guard ring is cut off again: a model that can skip it does not compute it.
         self._interior: Callable[..., Tensor] | None = None
         if getattr(simulator, "has_interior", False):
@@ -109,8 +107,6 @@ class Printer(nn.Module):
     def forward(self, level: Tensor) -> Tensor:
         """Printed height, µm (b, 1, size, size), of real ``level`` (b, 1, size, size)."""
         height_um = level * self.layout.level_height_um
-        if self.simulator is None:
-            return height_um
         return self._inside(F.pad(height_um, (self.guard_px,) * 4), self.guard_px)
 
     def print_patch(self, level: Tensor, halo_px: int | None = None) -> Tensor:
@@ -120,6 +116,13 @@ class Printer(nn.Module):
         """
         height_um = level * self.layout.level_height_um
         return self._inside(height_um, self.halo_px if halo_px is None else halo_px)
+
+    def print_again(self, level: Tensor) -> Tensor:
+        """As ``print_patch``, but nothing is kept for the gradient: it prints the patch a second time."""
+        if torch.is_grad_enabled():
+            again: Tensor = checkpoint(self.print_patch, level, use_reentrant=False)
+            return again
+        return self.print_patch(level)
 
     def print_in_tiles(self, level: Tensor, tile_px: int) -> Tensor:
         """Printed height as by ``forward``, in tiles with their halo that are computed again for gradients.
@@ -132,10 +135,7 @@ class Printer(nn.Module):
 
         def tile(top: int, left: int) -> Tensor:
             bottom, right = (min(start + tile_px, self.layout.size_px) + 2 * halo for start in (top, left))
-            part = around[..., top:bottom, left:right]
-            if torch.is_grad_enabled():
-                return checkpoint(self.print_patch, part, use_reentrant=False)
-            return self.print_patch(part)
+            return self.print_again(around[..., top:bottom, left:right])
 
         starts = range(0, self.layout.size_px, tile_px)
         return torch.cat([torch.cat([tile(top, left) for left in starts], -1) for top in starts], -2)
@@ -207,44 +207,37 @@ class Printer(nn.Module):
     def level_heights_um(self) -> list[float]:
         """Printed height of a wide uniform field of each level, µm: the level table of the advisor."""
         size = 2 * self.guard_px + 16
+        middle = slice(size // 2 - 4, size // 2 + 4)
         heights = []
         for level in range(self.layout.levels):
             nominal = torch.full((1, 1, size, size), level * self.layout.level_height_um, device=self.device)
-            printed = (
-                nominal if self.simulator is None else self.simulator(nominal, pitch_um=self.layout.pitch_um)
-            )
-            heights.append(
-                float(printed[..., size // 2 - 4 : size // 2 + 4, size // 2 - 4 : size // 2 + 4].mean())
-            )
+            heights.append(float(self._printed(nominal)[..., middle, middle].mean()))
         return heights
 
     def _inside(self, height_um: Tensor, border_px: int) -> Tensor:
         """Print of ``height_um`` without its outer ``border_px``."""
         if border_px and self._interior is not None:
             return self._interior(height_um, pitch_um=self.layout.pitch_um)
-        printed = (
-            height_um if self.simulator is None else self.simulator(height_um, pitch_um=self.layout.pitch_um)
-        )
-        return F.pad(printed, (-border_px,) * 4)
+        return F.pad(self._printed(height_um), (-border_px,) * 4)
+
+    def _printed(self, height_um: Tensor) -> Tensor:
+        if self.simulator is None:
+            return height_um
+        printed: Tensor = self.simulator(height_um, pitch_um=self.layout.pitch_um)
+        return printed
 
 
-def _guard_um(simulator: nn.Module) -> float:
-    reach = getattr(simulator, "reach_um", None)
-    return _GUARD_UM if reach is None else float(reach)
+def _borders_px(simulator: nn.Module, pitch_um: float) -> tuple[int, int, int]:
+    """Guard ring, and what a patch, and two rows of pixels, need around them.
 
-
-def _halo_px(simulator: nn.Module, guard_px: int) -> int:
-    """What a patch needs around it: the guard, or a whole tile where the model runs on tiles."""
-    tile = getattr(simulator, "tile", None)
-    return guard_px if tile is None else max(guard_px, tile.size_px)
-
-
-def _strip_halo_px(simulator: nn.Module, guard_px: int) -> int:
-    """What two rows of pixels need around them: the guard, or what makes the strip two rows of tiles high.
-
-    A whole tile around them would only add tiles whose print is cut off again.
+    A model that runs on tiles needs a whole tile around a patch. Around two rows it would only add tiles
+    whose print is cut off again: there the strip has to be two rows of tiles high.
     """
+    reach_um = getattr(simulator, "reach_um", None)
+    # The reach is a whole number of pixels times the pitch, up to rounding.
+    guard = math.ceil((_GUARD_UM if reach_um is None else float(reach_um)) / pitch_um - 1e-6)
     tile = getattr(simulator, "tile", None)
     if tile is None:
-        return guard_px
-    return max(guard_px, (2 * tile.size_px - 3 * tile.overlap_px) // 2 - 1)
+        return guard, guard, guard
+    rows = (2 * tile.size_px - 3 * tile.overlap_px) // 2 - 1
+    return guard, max(guard, tile.size_px), max(guard, rows)
