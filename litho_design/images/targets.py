@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
@@ -25,6 +26,16 @@ class TargetRecord(Record):
     name: str
     sha256: str
     adaptation: str = ""
+
+    @classmethod
+    def of_file(cls, path: Path, notes: Sequence[str]) -> TargetRecord:
+        """A file, and what was done to it, one phrase each."""
+        return cls(name=path.name, sha256=file_sha256(path), adaptation="; ".join(notes))
+
+    @classmethod
+    def of_array(cls, name: str, pixels: np.ndarray, unit: str) -> TargetRecord:
+        """A drawing or an array (ny, nx), used as it is."""
+        return cls(name=name, sha256=array_sha256(pixels, unit, ("y", "x")))
 
 
 # What a lens images: a drawing by its name, or a picture, whose pixels are kept beside the settings.
@@ -58,20 +69,15 @@ def load_target(source: str | Path | np.ndarray | Target, size_px: int) -> Targe
         return source
     if isinstance(source, np.ndarray):
         pixels = np.ascontiguousarray(source, np.float32)
-        return Target(pixels, _record("array", pixels))
+        return Target(pixels, TargetRecord.of_array("array", pixels, "1"))
     name = str(source)
     if name in get_args(DrawnTarget):
         pixels = draw_target(name, size_px)
-        return Target(pixels, _record(name, pixels))
+        return Target(pixels, TargetRecord.of_array(name, pixels, "1"))
     if not Path(name).is_file():
         raise unknown_name("target", name, get_args(DrawnTarget), also="an image file")
     pixels, notes = read_image(Path(name), size_px, "target")
-    record = TargetRecord(name=Path(name).name, sha256=file_sha256(name), adaptation="; ".join(notes))
-    return Target(pixels, record)
-
-
-def _record(name: str, pixels: np.ndarray) -> TargetRecord:
-    return TargetRecord(name=name, sha256=array_sha256(pixels, "1", ("y", "x")))
+    return Target(pixels, TargetRecord.of_file(Path(name), notes))
 
 
 def stroke_width_px(pixels: np.ndarray) -> float:

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.hashes import file_sha256
 from litho_design.images.targets import ImagedObject, TargetRecord, draw_target, object_name, read_image
 from litho_design.lenses.settings import LensSettings
 
@@ -104,8 +103,7 @@ def read_object(path: Path, size_px: int) -> tuple[np.ndarray, TargetRecord]:
     border = size_px // _BORDER_SHARE
     inner, notes = read_image(path, size_px - 2 * border, "object")
     notes += ["divided by its brightest value", f"dark border of {border} px"]
-    record = TargetRecord(name=path.name, sha256=file_sha256(path), adaptation="; ".join(notes))
-    return np.pad(inner, border), record
+    return np.pad(inner, border), TargetRecord.of_file(path, notes)
 
 
 def _frame(item: ImagedObject, size_px: int, pictures: Mapping[str, np.ndarray]) -> np.ndarray:

@@ -8,7 +8,6 @@ from typing import Literal, get_args
 import numpy as np
 
 from litho_data.foundation.errors import InputError, unknown_name
-from litho_data.foundation.hashes import array_sha256, file_sha256
 from litho_design.images.targets import TargetRecord, read_image
 from litho_design.printers.layout import LayoutSettings
 
@@ -31,11 +30,11 @@ def load_relief(
     """
     size = layout.size_px
     if isinstance(source, np.ndarray):
-        return _checked(source, size), _record("array", _checked(source, size))
+        return _checked(source, size), TargetRecord.of_array("array", _checked(source, size), "um")
     name, path = str(source), Path(source)
     if name in get_args(DrawnRelief):
         drawn = (height_um * _draw(name, size)).astype(np.float32)
-        return drawn, _record(name, drawn)
+        return drawn, TargetRecord.of_array(name, drawn, "um")
     if not path.is_file():
         raise unknown_name("relief", name, get_args(DrawnRelief), also="a picture, or a float TIFF in µm")
     notes: list[str] = []
@@ -44,8 +43,7 @@ def load_relief(
         grey, notes = read_image(path, size, "relief")
         heights = height_um * grey
         notes.append(f"its brightest value is {height_um:g} µm")
-    record = TargetRecord(name=path.name, sha256=file_sha256(path), adaptation="; ".join(notes))
-    return _checked(heights, size), record
+    return _checked(heights, size), TargetRecord.of_file(path, notes)
 
 
 def _float_tiff(path: Path) -> np.ndarray | None:
@@ -78,7 +76,3 @@ def _checked(heights: np.ndarray, size_px: int) -> np.ndarray:
     if not np.isfinite(found).all() or np.ptp(found) == 0:
         raise InputError("relief", got="heights that are all equal or not numbers", wanted="a relief in µm")
     return found
-
-
-def _record(name: str, heights: np.ndarray) -> TargetRecord:
-    return TargetRecord(name=name, sha256=array_sha256(heights, "um", ("y", "x")))
