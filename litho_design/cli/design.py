@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -27,9 +28,15 @@ from litho_design.optimisation.settings import DesignSettings
 from litho_design.reliefs.settings import ReliefSettings, relief_settings
 
 if TYPE_CHECKING:
+    from litho_design.judging.front import FrontResult
     from litho_design.tasks.design import Design
 
 S = TypeVar("S", bound=DesignSettings)
+N = TypeVar("N", int, float)
+
+# A variant or a task among the changes replaces these.
+_hologram = partial(hologram_settings, "default")
+_lens = partial(lens_settings, "direct", "default")
 
 _TARGET_HELP = "an image file, or a drawing: text, ring, chart, spots, letters"
 Model = Annotated[str, typer.Option(help="folder of a frozen model, zoo:NAME, or `none` for nominal heights")]
@@ -118,21 +125,29 @@ def hoe(
     settings = _settings(given, _hologram, "hoe", spread_of, roughness_of)
     if front is None and (dask or workers > 1):
         raise InputError("--workers and --dask", got="one design", wanted="several: --front")
+    fit: Any = {"device": device, "extrapolate": extrapolate}
     if large:
         if front is not None or ensemble:
             raise InputError("--large", got="--front or --ensemble", wanted="one design through one model")
-        _large(target, model, out, settings, band_px, device, extrapolate)
-        return
-    if front is not None:
-        _front(front, target, model, out, settings, ensemble or (), device, extrapolate, workers, dask)
-        return
-    from litho_design.workflows.design import design_hologram
+        from litho_design.large.bands import Ranks
+        from litho_design.workflows.large import design_large_hologram
 
-    design = design_hologram(
-        target, model, out, settings=settings, ensemble=ensemble or (), device=device,
-        extrapolate=extrapolate,
-    )  # fmt: skip
-    _print_design(design, out)
+        design = design_large_hologram(target, model, out, settings=settings, band_px=band_px, **fit)
+        if Ranks.joined().rank == 0:
+            _print_design(design, out)
+    elif front is not None:
+        from litho_design.workflows.front import efficiency_front
+
+        result = efficiency_front(
+            target, model, out, weights=_numbers("--front", front, float), settings=settings,
+            ensemble=ensemble or (), workers=workers, dask=dask, **fit,
+        )  # fmt: skip
+        _print_front(result, out)
+    else:
+        from litho_design.workflows.design import design_hologram
+
+        design = design_hologram(target, model, out, settings=settings, ensemble=ensemble or (), **fit)
+        _print_design(design, out)
 
 
 @takes_settings(ReliefSettings())
@@ -154,7 +169,7 @@ def correct(
 
     Example: litho-design correct blaze --model zoo:pbl --out blaze
     """
-    settings = _settings(given, _relief, "correct", spread_of, roughness_of)
+    settings = _settings(given, relief_settings, "correct", spread_of, roughness_of)
     from litho_design.workflows.design import correct as correct_relief
 
     design = correct_relief(
@@ -272,10 +287,7 @@ def estimate(
     from litho_design.workflows.large import estimate_large
 
     made = _settings(given, _hologram, "estimate")
-    try:
-        sizes = [int(word) for word in measure_px.split(",")]
-    except ValueError:
-        raise InputError("--measure-px", got=repr(measure_px), wanted="numbers of pixels") from None
+    sizes = _numbers("--measure-px", measure_px, int)
     for line in estimate_large(model, made, sizes, ranks, band_px, device=device, extrapolate=extrapolate):
         print(line)
 
@@ -289,21 +301,9 @@ def settings(
 
     Example: litho-design settings hoe > hoe.toml
     """
-    make: Callable[[Mapping[str, Any]], DesignSettings]
-    make = {"hoe": _hologram, "lens": _lens, "relief": _relief}[element]
-    print(as_toml(_settings(given, make, element)), end="")
-
-
-def _hologram(changes: Mapping[str, Any]) -> HologramSettings:
-    return hologram_settings(changes=changes)
-
-
-def _relief(changes: Mapping[str, Any]) -> ReliefSettings:
-    return relief_settings(changes)
-
-
-def _lens(changes: Mapping[str, Any]) -> LensSettings:
-    return lens_settings(changes=changes)
+    makes: dict[str, Callable[[Mapping[str, Any]], DesignSettings]]
+    makes = {"hoe": _hologram, "lens": _lens, "relief": relief_settings}
+    print(as_toml(_settings(given, makes[element], element)), end="")
 
 
 def _settings(
@@ -330,48 +330,17 @@ def _settings(
     return measured if window is made.window else changed(measured, given.options)
 
 
-def _large(
-    target: str,
-    model: str,
-    out: Path,
-    settings: HologramSettings,
-    band_px: int,
-    device: str,
-    extrapolate: bool,
-) -> None:
-    from litho_design.large.bands import Ranks
-    from litho_design.workflows.large import design_large_hologram
-
-    design = design_large_hologram(
-        target, model, out, settings=settings, band_px=band_px, device=device, extrapolate=extrapolate
-    )
-    if Ranks.joined().rank == 0:
-        _print_design(design, out)
-
-
-def _front(
-    front: str,
-    target: str,
-    model: str,
-    out: Path,
-    settings: HologramSettings,
-    ensemble: Sequence[str],
-    device: str,
-    extrapolate: bool,
-    workers: int,
-    dask: str | None,
-) -> None:
-    from litho_design.reports.advice import baseline_line
-    from litho_design.workflows.front import efficiency_front
-
+def _numbers(option: str, words: str, kind: Callable[[str], N]) -> list[N]:
+    """The numbers behind an option, separated by commas."""
     try:
-        weights = [float(word) for word in front.split(",")]
+        return [kind(word) for word in words.split(",")]
     except ValueError:
-        raise InputError("--front", got=repr(front), wanted="numbers, separated by commas") from None
-    result = efficiency_front(
-        target, model, out, weights=weights, settings=settings, ensemble=ensemble, device=device,
-        extrapolate=extrapolate, workers=workers, dask=dask,
-    )  # fmt: skip
+        raise InputError(option, got=repr(words), wanted="numbers, separated by commas") from None
+
+
+def _print_front(result: FrontResult, out: Path) -> None:
+    from litho_design.reports.advice import baseline_line
+
     for point in result.points:
         print(
             f"efficiency weight {point.efficiency_weight:g}: {100 * point.eff_signal:.1f} % on the signal, "
