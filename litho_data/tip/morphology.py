@@ -7,7 +7,6 @@ highest surface pixel plus tip, ``erode`` the lowest image pixel minus tip; dila
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -71,23 +70,7 @@ def _erode_rows(
 
 
 def _erode(image: np.ndarray, tip: np.ndarray) -> np.ndarray:
+    from scipy.ndimage import grey_erosion
+
     heights = np.where(np.isfinite(image), image, np.asarray(np.inf, image.dtype))
-    lowest = np.full_like(heights, np.inf)
-    for (dy, dx), height in _parts(tip):
-        to_y, from_y = _overlap(dy, image.shape[0])
-        to_x, from_x = _overlap(dx, image.shape[1])
-        place = lowest[to_y, to_x]
-        np.minimum(place, heights[from_y, from_x] - height, out=place)
-    return lowest
-
-
-def _parts(tip: np.ndarray) -> Iterator[tuple[tuple[int, int], float]]:
-    half_y, half_x = tip.shape[0] // 2, tip.shape[1] // 2
-    for (row, column), height in np.ndenumerate(tip):
-        if np.isfinite(height):
-            yield (row - half_y, column - half_x), float(height)
-
-
-def _overlap(step: int, size: int) -> tuple[slice, slice]:
-    """Slices so that ``out[to]`` meets ``image[from]`` at ``to + step``."""
-    return slice(max(-step, 0), size - max(step, 0)), slice(max(step, 0), size - max(-step, 0))
+    return grey_erosion(heights, footprint=np.isfinite(tip), structure=tip, mode="constant", cval=np.inf)
