@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, Self, get_args
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 
-from litho_data.foundation.errors import unknown_name
+from litho_data.foundation.errors import require_known
 from litho_models.layers.gaussian import pad_field
 from litho_models.layers.ranges import Range
 
@@ -39,8 +39,7 @@ class SimulatorConfig(BaseModel):
         Raises:
             InputError: unknown variant.
         """
-        if variant not in VARIANTS:
-            raise unknown_name("variant", variant, VARIANTS)
+        require_known("variant", variant, VARIANTS)
         return cls(**{"variant": variant, **cls.VARIANT_FIELDS.get(variant, {}), **fields})
 
     @property

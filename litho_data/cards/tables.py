@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import get_args
 
 from litho_data.cards.card import Use
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, require_known
 from litho_data.store.schema import OPTIONAL_COLUMNS
 
 SAFE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._+-]*")
@@ -55,8 +55,7 @@ def _check_row(row: Mapping[str, str], what: str, overfull: bool, needs_order: b
         raise InputError(f"{what}: id", got=repr(scan_id), wanted="an id of the data folder, without path")
     if needs_order and not row.get("order", "").lstrip("-").isdecimal():
         raise InputError(f"{what}: order", got=repr(row.get("order", "")), wanted="a whole number")
-    if row.get("use", "dataset") not in get_args(Use):
-        raise InputError(f"{what}: use", got=repr(row["use"]), wanted=" | ".join(get_args(Use)))
+    require_known(f"{what}: use", row.get("use", "dataset"), get_args(Use))
     for name in OPTIONAL_COLUMNS:
         if name in row and not _is_finite(row[name]):
             raise InputError(f"{what}: {name}", got=repr(row[name]), wanted="a number")

@@ -34,6 +34,16 @@ def said(error: Exception) -> str:
     return str(error).partition("\n")[0] or type(error).__name__
 
 
+def require_known(what: str, got: str, known: Iterable[str]) -> None:
+    """Refuse a name that is not among ``known``; the arguments are those of `unknown_name`.
+
+    Raises:
+        InputError: the name is not known.
+    """
+    if got not in known:
+        raise unknown_name(what, got, known)
+
+
 def unknown_name(
     what: str, got: object, known: Iterable[str], hint: str = "", *, also: str = ""
 ) -> InputError:

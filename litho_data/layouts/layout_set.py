@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from litho_data.foundation.commands import progress
-from litho_data.foundation.errors import InputError, unknown_name
+from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.files import atomic_folder
 from litho_data.foundation.outputs import require_replaceable_folder, require_same_settings
 from litho_data.layouts.card_text import CARD_NAME, TABLE_NAME, CardText, write_layout, write_table
@@ -98,8 +98,7 @@ def write_layout_set(
         InputError: an unknown pattern, one that does not fit the size, lengths that are not positive, or a
             folder with a set of other settings or something else in it, such as scans.
     """
-    if pattern not in PATTERNS:
-        raise unknown_name("pattern", pattern, PATTERNS)
+    require_known("pattern", pattern, PATTERNS)
     if not 2 <= levels <= 256:
         raise InputError("levels of a layout", got=levels, wanted="2 to 256")
     shape = (size_px, size_px) if isinstance(size_px, int) else size_px

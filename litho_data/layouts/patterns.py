@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, require_known
 
 
 def flat(shape: tuple[int, int], *, level: int) -> np.ndarray:
@@ -71,8 +71,7 @@ def line_space_sweep(
         along: axis of the lines: ``y`` (their order is along x) or ``x``.
     """
     _positive(narrowest_px, "narrowest_px of a line/space sweep")
-    if along not in ("x", "y"):
-        raise InputError("direction of the lines", got=repr(along), wanted="x or y")
+    require_known("direction of the lines", along, ("x", "y"))
     length = shape[1] if along == "y" else shape[0]
     profile = np.full(length, low)
     start, width = 0, narrowest_px

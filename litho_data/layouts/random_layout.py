@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, require_known
 
 PASSBANDS = ("square", "round")
 QUANTISERS = ("round", "floor")
@@ -80,8 +80,7 @@ def random_layout(
 
 def low_pass(field: np.ndarray, *, cutoff_per_um: float, pitch_um: float, passband: str) -> np.ndarray:
     """Keep spatial frequencies up to and including ``cutoff_per_um``, with periodic boundaries."""
-    if passband not in PASSBANDS:
-        raise InputError("passband", got=repr(passband), wanted=" or ".join(PASSBANDS))
+    require_known("passband", passband, PASSBANDS)
     if not cutoff_per_um > 0 or not pitch_um > 0:
         raise InputError(
             "cutoff_per_um and pitch_um", got=(cutoff_per_um, pitch_um), wanted="positive numbers"
@@ -98,6 +97,5 @@ def low_pass(field: np.ndarray, *, cutoff_per_um: float, pitch_um: float, passba
 
 def quantise(unit_field: np.ndarray, levels: int, quantiser: str = "round") -> np.ndarray:
     """Values in [0, 1] to the nearest of ``levels`` integers, halves up, or to the one below; uint8."""
-    if quantiser not in QUANTISERS:
-        raise InputError("quantiser", got=repr(quantiser), wanted=" or ".join(QUANTISERS))
+    require_known("quantiser", quantiser, QUANTISERS)
     return np.floor(unit_field * (levels - 1) + 0.5 * (quantiser == "round")).astype(np.uint8)

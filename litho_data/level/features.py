@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from scipy import ndimage
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, require_known
 from litho_data.level.polynomial import evaluate, fit_terms, polynomial_terms
 from litho_data.level.robust import noise_sigma, robust_surface
 from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
@@ -106,8 +106,7 @@ def mask_and_relevel(
 def _check(threshold: float, side: str, grow_px: int) -> None:
     if not threshold > 0:
         raise InputError("feature threshold", got=threshold, wanted="a positive number of noise sigmas")
-    if side not in get_args(Side):
-        raise InputError("side of the features", got=repr(side), wanted=" | ".join(get_args(Side)))
+    require_known("side of the features", side, get_args(Side))
     if grow_px < 0:
         raise InputError("grow_px", got=grow_px, wanted="0 or more pixels")
 

@@ -6,7 +6,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import require_known
 from litho_data.level.polynomial import Terms, evaluate, fit_terms, polynomial_terms
 from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
 
@@ -43,8 +43,7 @@ def level_robust(
         InputError: an unknown loss, or pixels that do not determine the polynomial.
     """
     z = as_height(height)
-    if loss not in get_args(Loss):
-        raise InputError("robust loss", got=repr(loss), wanted=" | ".join(get_args(Loss)))
+    require_known("robust loss", loss, get_args(Loss))
     terms = polynomial_terms(x_degree, y_degree, total_degree)
     return subtract(z, robust_surface(z, select(z, mask, masking), terms, loss))
 

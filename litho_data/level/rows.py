@@ -6,7 +6,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, require_known
 from litho_data.level.row_statistics import (
     MEDIAN_TRIM,
     METRE_PER_UM,
@@ -76,12 +76,8 @@ def align_rows(
 def _check(
     method: str, direction: str, degree: int, trim: float, pitch_um: tuple[float, float] | None
 ) -> None:
-    if method not in get_args(RowMethod):
-        raise InputError("row alignment method", got=repr(method), wanted=" | ".join(get_args(RowMethod)))
-    if direction not in get_args(Direction):
-        raise InputError(
-            "row alignment direction", got=repr(direction), wanted=" | ".join(get_args(Direction))
-        )
+    require_known("row alignment method", method, get_args(RowMethod))
+    require_known("row alignment direction", direction, get_args(Direction))
     if not 0 <= degree <= MAX_ROW_DEGREE:
         raise InputError("row alignment degree", got=degree, wanted=f"0 to {MAX_ROW_DEGREE}")
     if not 0 <= trim <= MEDIAN_TRIM:

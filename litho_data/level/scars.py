@@ -8,7 +8,7 @@ import numpy as np
 from scipy import ndimage, sparse
 from scipy.sparse import linalg
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, require_known
 from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
 
 ScarSign = Literal["both", "positive", "negative"]
@@ -46,8 +46,7 @@ def mark_scars(
             got=f"low {low}, high {high}, min_length_px {min_length_px}, max_width_px {max_width_px}",
             wanted="0 < low <= high and sizes of at least 1 px",
         )
-    if sign not in get_args(ScarSign):
-        raise InputError("sign of the scars", got=repr(sign), wanted=" | ".join(get_args(ScarSign)))
+    require_known("sign of the scars", sign, get_args(ScarSign))
     chosen = select(z, mask, masking)
     steps = np.diff(z, axis=0)
     rms = np.sqrt(float(np.nansum(steps**2)) / z.size)

@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, require_known
 
 Masking = Literal["ignore", "exclude", "include"]
 MASKINGS: tuple[Masking, ...] = ("ignore", "exclude", "include")
@@ -46,8 +46,7 @@ def select(z: np.ndarray, mask: np.ndarray | None, masking: Masking) -> np.ndarr
         InputError: a mask that is not boolean or has another shape, an unknown masking, or a
             selection without any pixel.
     """
-    if masking not in MASKINGS:
-        raise InputError("masking", got=repr(masking), wanted=" | ".join(MASKINGS))
+    require_known("masking", masking, MASKINGS)
     chosen = None
     if mask is not None and masking != "ignore":
         if mask.dtype != np.bool_ or mask.shape != z.shape:

@@ -10,7 +10,7 @@ import numpy as np
 
 from litho_data.build.step import Step
 from litho_data.cards.fetch import known_folders
-from litho_data.foundation.errors import InputError, unknown_name
+from litho_data.foundation.errors import InputError, require_known
 from litho_data.store.access import group_of, read_table
 from litho_data.store.read import Store, open_store
 from litho_data.store.schema import SCAN_VARIABLES
@@ -78,8 +78,7 @@ def read_steps(store: Store) -> dict[str, list[tuple[str, Step]]]:
 
 def steps_of(recorded: dict[str, list[tuple[str, Step]]], scan_id: str) -> list[tuple[str, Step]]:
     """The recorded steps of one scan; InputError if there is no such scan."""
-    if scan_id not in recorded:
-        raise unknown_name("scan", scan_id, recorded)
+    require_known("scan", scan_id, recorded)
     return recorded[scan_id]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from litho_data.build.operations import OPERATIONS
 from litho_data.build.step import Step
 from litho_data.foundation.commands import progress
-from litho_data.foundation.errors import InputError, unknown_name
+from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.hashes import file_sha256
 from litho_data.provenance.history import raw_folder, read_steps, steps_of, stored_array
 from litho_data.store.read import open_store
@@ -53,8 +53,7 @@ def replay(
             "raw files of the store", got="none found", wanted="data_dir", hint="say where they are"
         )
     for name in arrays or ():
-        if name not in VARIABLES:
-            raise unknown_name("array", name, VARIABLES)
+        require_known("array", name, VARIABLES)
     rows = []
     for scan_id in progress(list(scan_ids or recorded), "replaying"):
         steps = [step for _, step in steps_of(recorded, scan_id)]

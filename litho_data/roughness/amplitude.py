@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import numpy as np
 import scipy.fft
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
+from litho_data.scan import Axis
 
 
 class AmplitudeParameters(Record):
@@ -59,9 +58,6 @@ def amplitude_parameters(height_um: np.ndarray, valid: np.ndarray | None = None)
         sz_nm=float(np.ptp(height_nm)),
         pixels=int(height_nm.size),
     )
-
-
-Axis = Literal["x", "y"]
 
 
 def autocorrelation(height_um: np.ndarray) -> np.ndarray:

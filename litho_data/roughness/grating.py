@@ -9,7 +9,7 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
-from litho_data.roughness.noise import Axis
+from litho_data.scan import Axis
 
 # The period of a scanner that is not calibrated is within this factor of the true one.
 SEARCHED = 1.25

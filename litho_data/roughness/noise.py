@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from math import comb
-from typing import Literal
+from typing import get_args
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.results import Record
 from litho_data.roughness.amplitude import amplitude_parameters, sq_uncertainty_nm
-
-Axis = Literal["x", "y"]
+from litho_data.scan import Axis
 
 # Median absolute deviation of a Gaussian: 0.6745 sd.
 _MAD_TO_SD = 1 / 0.6744897501960817
@@ -60,8 +59,7 @@ def split_noise(height_um: np.ndarray, *, fast_axis: Axis = "x") -> NoiseSplit:
     Raises:
         InputError: NaN in the surface, or fewer than 8 pixels along an axis.
     """
-    if fast_axis not in ("x", "y"):
-        raise InputError("fast_axis", got=repr(fast_axis), wanted="x or y")
+    require_known("fast_axis", fast_axis, get_args(Axis))
     if not np.isfinite(height_um).all() or min(height_um.shape) < 8:
         raise InputError(
             "surface", got=f"{height_um.shape} px", wanted="finite heights, at least 8 px each way"

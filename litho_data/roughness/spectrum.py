@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import get_args
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-
-Axis = Literal["x", "y"]
+from litho_data.foundation.errors import InputError, require_known
+from litho_data.scan import Axis
 
 
 @dataclass(frozen=True)
@@ -81,8 +80,7 @@ def psd_radial(height_um: np.ndarray, pitch_um: float, *, window: bool = True) -
 
 
 def _lines(height_um: np.ndarray, axis: Axis) -> np.ndarray:
-    if axis not in ("x", "y"):
-        raise InputError("axis", got=repr(axis), wanted="x or y")
+    require_known("axis", axis, get_args(Axis))
     lines = 1e3 * (height_um if axis == "x" else height_um.T).astype(np.float64)
     if not np.isfinite(lines).all():
         raise InputError(

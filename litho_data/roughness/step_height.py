@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import get_args
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.results import Record
+from litho_data.scan import Axis
 
-Axis = Literal["x", "y"]
 # Of a rough surface without step the largest change is 4 to 5 times the usual one.
 _EDGE_SIGMA = 9.0
 
@@ -97,8 +97,7 @@ def stair_steps(
 
 
 def _profiles(height_um: np.ndarray, pitch_um: float, axis: Axis) -> tuple[np.ndarray, np.ndarray]:
-    if axis not in ("x", "y"):
-        raise InputError("axis", got=repr(axis), wanted="x or y")
+    require_known("axis", axis, get_args(Axis))
     lines = 1e3 * (height_um if axis == "x" else height_um.T).astype(np.float64)
     return lines, (np.arange(lines.shape[1]) + 0.5) * pitch_um
 

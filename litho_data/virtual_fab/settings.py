@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from litho_data.foundation.errors import unknown_name
+from litho_data.foundation.errors import require_known
 
 
 @dataclass(frozen=True)
@@ -148,6 +148,5 @@ def preset(name: str) -> Preset:
     Raises:
         InputError: no such preset.
     """
-    if name not in PRESETS:
-        raise unknown_name("preset", name, PRESETS)
+    require_known("preset", name, PRESETS)
     return PRESETS[name]

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from litho_data.foundation.commands import progress
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.files import atomic_folder
 from litho_data.foundation.hashes import array_sha256, record_sha256
 from litho_data.foundation.outputs import require_replaceable_folder, require_same_settings
@@ -76,8 +76,7 @@ def simulate(
         InputError: an unknown knob, a strength out of range, an impossible plan, or a folder with a run of
             other settings or something else in it.
     """
-    if metadata not in ("full", "files-only"):
-        raise InputError("metadata", got=repr(metadata), wanted="full or files-only")
+    require_known("metadata", metadata, ("full", "files-only"))
     if references and metadata != "full":
         raise InputError(
             "references", got="metadata files-only", wanted="full: only the table tells them apart"

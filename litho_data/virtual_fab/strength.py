@@ -8,7 +8,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, require_known
 from litho_data.virtual_fab.fab import Fab, scan_job
 from litho_data.virtual_fab.jobs import Plan, random_jobs
 from litho_data.virtual_fab.knobs import KNOBS, KnobBoard, KnobSetting
@@ -117,8 +117,7 @@ def knob_rms_nm(
     removes the least-squares fit of {1, P, x, y, x², xy, y²} from each scan, P the scan without the
     knob; ``offset`` the mean; ``none`` nothing.
     """
-    if policy not in get_args(Policy):
-        raise InputError("policy", got=repr(policy), wanted=", ".join(get_args(Policy)))
+    require_known("policy", policy, get_args(Policy))
     mean_squares = []
     for job in jobs:
         without = _noise_free(job, (), printer)

@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, unknown_name
+from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.files import writable
 from litho_data.foundation.outputs import require_replaceable_folder
 from litho_design.exports.gds import GdsLayers, GdsRows, write_gds
@@ -58,8 +58,7 @@ def export(
         InputError: an incomplete design, a format that cannot hold it or would need too much memory, job
             settings below zero, an element too small for marks, or a folder that holds something else.
     """
-    if format not in _SUFFIX:
-        raise unknown_name("format", format, _SUFFIX)
+    require_known("format", format, _SUFFIX)
     job = {"pedestal_um": pedestal_um, "slicing_um": slicing_um, "hatching_um": hatching_um}
     for setting, value in job.items():
         # Only a closed solid needs a base.

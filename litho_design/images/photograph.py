@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, unknown_name
+from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Record
 from litho_data.register.geometry import ORIENTATIONS, orient, orientation_matrix
@@ -152,8 +152,7 @@ def photographed_image(
 
     if not pitch_um > 0:
         raise InputError("camera pitch", got=f"{pitch_um} µm", wanted="a positive number")
-    if orientation not in ORIENTATIONS:
-        raise unknown_name("camera orientation", orientation, ORIENTATIONS)
+    require_known("camera orientation", orientation, ORIENTATIONS)
     if not Path(photo_file).is_file():
         raise InputError("photograph", got=f"{photo_file}, which does not exist", wanted="an image file")
     raw = cv2.imread(str(photo_file), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from litho_data.foundation.errors import InputError, unknown_name
+from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Record
 from litho_design.images.noise import DRAWS, white_noise
@@ -100,8 +100,7 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
     from litho_data.readers import read_scan
     from litho_data.register import register_scan, resample_to_layout
 
-    if source.levelling not in get_args(Levelling):
-        raise unknown_name("levelling", source.levelling, get_args(Levelling))
+    require_known("levelling", source.levelling, get_args(Levelling))
     if not source.scale_sd >= 0:
         raise InputError("uncertainty of the height scale", got=source.scale_sd, wanted="0 or more")
     scan = read_scan(source.path, unit=source.unit, size_um=source.size_um)

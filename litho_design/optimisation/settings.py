@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
-from litho_data.foundation.errors import unknown_name
+from litho_data.foundation.errors import require_known
 from litho_data.foundation.results import Record
 from litho_data.foundation.settings import changed, setting
 from litho_design.optics import Optics
@@ -120,5 +120,4 @@ def check_variant(variant: str) -> None:
     Raises:
         InputError: no such preset.
     """
-    if variant not in get_args(Variant):
-        raise unknown_name("variant", variant, get_args(Variant))
+    require_known("variant", variant, get_args(Variant))

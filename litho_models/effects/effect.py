@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from litho_data.foundation.errors import InputError, unknown_name
+from litho_data.foundation.errors import InputError, require_known
 
 Stage = Literal["exposure", "resist", "development", "measurement"]
 Role = Literal["process", "measurement", "nuisance", "undetermined"]
@@ -207,8 +207,7 @@ class Effect:
             InputError: a name this effect does not have.
         """
         for name in values:
-            if name not in self.parameters:
-                raise unknown_name(f"parameter of {self.name}", name, self.parameters)
+            require_known(f"parameter of {self.name}", name, self.parameters)
         return {**self.off_values(), **values}
 
     def require_in_range(self, values: Mapping[str, float]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from litho_data.foundation.errors import InputError, unknown_name
+from litho_data.foundation.errors import InputError, require_known
 from litho_models.effects import (
     development,
     exposure_field,
@@ -103,8 +103,7 @@ def get_effect(name: str) -> Effect:
     Raises:
         InputError: no such effect.
     """
-    if name not in CATALOGUE:
-        raise unknown_name("effect", name, CATALOGUE)
+    require_known("effect", name, CATALOGUE)
     return CATALOGUE[name]
 
 

@@ -6,7 +6,7 @@ from typing import Any, Literal, Self, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
-from litho_data.foundation.errors import unknown_name
+from litho_data.foundation.errors import require_known
 from litho_models.fitting.pixel_weights import Weights
 from litho_models.scan_terms import Policy
 from litho_models.simulator import Simulator, Variant, is_small
@@ -78,8 +78,7 @@ class TrainingConfig(BaseModel):
         Raises:
             InputError: unknown recipe.
         """
-        if recipe not in RECIPES:
-            raise unknown_name("recipe", recipe, RECIPES)
+        require_known("recipe", recipe, RECIPES)
         if recipe == "fast":
             usual = {"steps": FAST_STEPS[model_name]} if model_name in FAST_STEPS else {}
             if model_name == "pbl" and settings.get("variant", "default") == "default":

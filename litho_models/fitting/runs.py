@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import Field, ValidationError
 
-from litho_data.foundation.errors import InputError, unknown_name
+from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.files import atomic_file
 from litho_data.foundation.outputs import require_own_folder
 from litho_data.foundation.results import Result
@@ -154,8 +154,7 @@ def training_config(recipe: Recipe, model: str, settings: dict[str, Any]) -> Tra
         InputError: unknown recipe, unknown field, or a value out of range.
     """
     for name in settings:
-        if name not in TrainingConfig.model_fields:
-            raise unknown_name("training setting", name, TrainingConfig.model_fields)
+        require_known("training setting", name, TrainingConfig.model_fields)
     try:
         return TrainingConfig.of_recipe(recipe, model, **settings)
     except ValidationError as error:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from litho_data.foundation.errors import InputError, unknown_name
+from litho_data.foundation.errors import InputError, require_known
 from litho_models.models.baselines import Affine, AffineMtf, BlurTable, Identity, Linear
 from litho_models.models.features import Features, RandomFeatures
 from litho_models.models.fno import Fno
@@ -30,8 +30,7 @@ def model_class(name: str) -> type[Simulator]:
     Raises:
         InputError: unknown name.
     """
-    if name not in MODELS:
-        raise unknown_name("model", name, MODELS)
+    require_known("model", name, MODELS)
     return MODELS[name]
 
 

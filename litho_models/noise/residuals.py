@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, unknown_name
+from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan, Store
 from litho_models.frozen import zoo
@@ -112,8 +112,7 @@ def _of_benchmarks(
             )
         names = [score.model for score in result.scores]
         chosen = chosen or min(result.scores, key=lambda score: score.mae_datum_free_nm).model
-        if chosen not in names:
-            raise unknown_name(f"model of {folder}", chosen, names)
+        require_known(f"model of {folder}", chosen, names)
         allowed = set(result.split.scored_ids) & set(store.ids)
         protocols.append(result.nuisance)
         with_background = result.nuisance.background == "training"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
 
@@ -11,9 +10,8 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.roughness import stair_steps
+from litho_data.scan import Axis
 from litho_models.noise.spread_scores import GAUSSIAN
-
-Axis = Literal["x", "y"]
 
 # Two heights are told apart if at most 2.5 % of each lie beyond the middle between them.
 READABLE_AT = 2 * GAUSSIAN.half_width(0.95)

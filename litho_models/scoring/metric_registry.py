@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, require_known
 from litho_data.store import PrintedScan
 from litho_models.scoring.records import ModelScores, ScanRow
 from litho_models.scoring.shapes import EDGES_TEXT, SIMILARITY_TEXT, edges_of_scan, similarity_of_scan
@@ -86,8 +86,7 @@ def register_metric(
     metric = Metric(name, unit, over_scans)
     if not (name.isidentifier() and (unit == "1" or unit.isidentifier())):
         raise InputError("metric", got=f"{name!r} in {unit!r}", wanted="letters, digits and underscores")
-    if over_scans not in get_args(Summary):
-        raise InputError(f"over_scans of {name}", got=over_scans, wanted=", ".join(get_args(Summary)))
+    require_known(f"over_scans of {name}", over_scans, get_args(Summary))
     taken = {known.key for known in registered_metrics()} | ScanRow.model_fields.keys()
     if metric.key in taken | ModelScores.model_fields.keys():
         raise InputError("metric", got=metric.key, wanted="a name that is not taken")
