@@ -11,7 +11,6 @@ is here and by that of another checkout. --publish also writes the table into do
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import subprocess
@@ -24,7 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from benchmarks.record import conclude, origin, usable_cores
+from benchmarks.record import conclude, options, origin, usable_cores
 from litho_data.foundation.commands import run_script
 from litho_data.foundation.run_facts import checkout_state
 from litho_data.layouts import random_layout
@@ -51,9 +50,7 @@ class Cost(NamedTuple):
 
 def main() -> None:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__, "write the table into docs/dataset_store.md")
     parser.add_argument("--out", type=Path, help="JSON file to write; default: that of the page")
     parser.add_argument("--against", type=Path, metavar="CHECKOUT", help="compare with its code, in turns")
     parser.add_argument("--workers", type=int, default=2)
@@ -63,7 +60,6 @@ def main() -> None:
     parser.add_argument("--scans", type=int, default=1000, help="virtual scans; 0 leaves them out")
     parser.add_argument("--size", type=int, default=512, help="side of their layouts, pixels")
     parser.add_argument("--scratch", type=Path, help="folder for scans and stores; 6 MB per virtual scan")
-    parser.add_argument("--publish", action="store_true", help="write the table into docs/dataset_store.md")
     arguments = parser.parse_args()
     if arguments.scratch:
         Path(arguments.scratch).mkdir(parents=True, exist_ok=True)

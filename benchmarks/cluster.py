@@ -10,7 +10,6 @@ the table into docs/cluster.md.
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import signal
@@ -23,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.build import resident_bytes, write_virtual_scans
-from benchmarks.record import conclude, origin, usable_cores
+from benchmarks.record import conclude, options, origin, usable_cores
 from litho_data.foundation.commands import run_script
 from litho_data.foundation.workers import ONE_THREAD
 
@@ -37,14 +36,10 @@ _TICKS_PER_S = os.sysconf("SC_CLK_TCK")
 
 def main() -> None:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, default=RESULT, help="JSON file to write")
+    parser = options(__doc__, "write the table into docs/cluster.md", RESULT)
     parser.add_argument("--scans", type=int, default=1000)
     parser.add_argument("--size", type=int, default=128, help="side of their layouts, pixels")
     parser.add_argument("--turns", type=int, default=1)
-    parser.add_argument("--publish", action="store_true", help="write the table into docs/cluster.md")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         card = write_virtual_scans(Path(scratch) / "virtual", arguments.scans, arguments.size)

@@ -14,7 +14,6 @@ resumes.
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -25,7 +24,7 @@ import numpy as np
 from scipy.stats import t as student
 
 from benchmarks.markdown_table import markdown_table
-from benchmarks.record import NOT_MEASURED, origin, publish, write_record
+from benchmarks.record import NOT_MEASURED, options, origin, publish, write_record
 from litho_data.foundation.commands import run_script
 from litho_data.store import PrintedScan, open_store
 from litho_data.virtual_fab.canvas import Canvas
@@ -240,9 +239,7 @@ def _sets_of_cache(cache: Path, spread: float, store: int) -> list[dict[str, Any
 
 def main() -> None:
     """Run, print, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__, "write the figures into the page")
     parser.add_argument("--store", type=Path, required=True, help="measured prints")
     parser.add_argument("--residuals", type=Path, required=True, help="their leave-one-print-out benchmark")
     parser.add_argument("--model", default="physics", help="which model of it")
@@ -251,7 +248,6 @@ def main() -> None:
         "--parts", type=int, help="make so many missing parts and stop; what is complete is written"
     )
     parser.add_argument("--out", type=Path, default=RESULT, help="JSON file to write")
-    parser.add_argument("--publish", action="store_true", help="write the figures into the page")
     given = parser.parse_args()
     parts: dict[str, Callable[[], Any]] = {
         "rule": lambda: [rule_on_gaussian_figures(prints) for prints in RULE_REFERENCES],

@@ -9,7 +9,6 @@ docs/dataset_store.md.
 
 from __future__ import annotations
 
-import argparse
 import tempfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.markdown_table import markdown_table
-from benchmarks.record import conclude, origin
+from benchmarks.record import conclude, options, origin
 from litho_data.build.build import build_dataset
 from litho_data.foundation.commands import run_script
 from litho_data.store import open_store
@@ -46,13 +45,9 @@ CONDITIONS: Mapping[str, tuple[int, tuple[str, ...], str]] = {
 
 def main() -> None:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, default=RESULT, help="JSON file to write")
+    parser = options(__doc__, "write the table into docs/dataset_store.md", RESULT)
     parser.add_argument("--count", type=int, default=20, help="scans of each condition")
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--publish", action="store_true", help="write the table into docs/dataset_store.md")
     arguments = parser.parse_args()
     record = {
         "schema": "litho-data/benchmark-height-sigma/1",

@@ -7,7 +7,6 @@ Best and median of many runs of each method. --publish also writes the table int
 
 from __future__ import annotations
 
-import argparse
 import os
 import time
 from collections.abc import Callable, Mapping
@@ -16,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.record import conclude, origin, usable_cores
+from benchmarks.record import conclude, options, origin, usable_cores
 from litho_data.foundation.commands import run_script
 from litho_data.level import (
     align_rows,
@@ -50,14 +49,10 @@ GOAL = 3.0
 
 def main() -> None:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, default=RESULT, help="JSON file to write")
+    parser = options(__doc__, "write the table into docs/levelling.md", RESULT)
     parser.add_argument("--scan", type=Path, help="a 540 x 540 scan; by default an artificial one")
     parser.add_argument("--unit", help="unit of its heights where the file states none")
     parser.add_argument("--repeats", type=int, default=50)
-    parser.add_argument("--publish", action="store_true", help="write the table into docs/levelling.md")
     arguments = parser.parse_args()
     height_um = (
         artificial_scan()

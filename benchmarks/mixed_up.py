@@ -9,7 +9,6 @@ that it touches and nothing else has to be. --store asks the same of measured pr
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import csv
 import io
@@ -22,7 +21,7 @@ import numpy as np
 import tifffile
 
 from benchmarks.markdown_table import markdown_table
-from benchmarks.record import conclude, origin
+from benchmarks.record import conclude, options, origin
 from litho_data.build.build import build_dataset
 from litho_data.build.right_layout import doubts
 from litho_data.foundation.commands import progress, run_script
@@ -44,12 +43,8 @@ Mistake = Callable[[Path, np.random.Generator], list[str]]
 
 def main() -> None:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, default=RESULT, help="JSON file to write")
+    parser = options(__doc__, "write the table into docs/own_data.md", RESULT)
     parser.add_argument("--store", type=Path, help="measured prints, by litho-data build")
-    parser.add_argument("--publish", action="store_true", help="write the table into docs/own_data.md")
     arguments = parser.parse_args()
     cases = [kind for kind, (count, *_) in MISTAKES.items() for _ in range(count)]
     record = {

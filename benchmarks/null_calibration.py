@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.record import conclude, origin, write_record
+from benchmarks.record import conclude, options, origin, write_record
 from litho_data.foundation.commands import run_script
 from litho_data.foundation.workers import ONE_THREAD, Workers, run_jobs
 from litho_data.layouts import random_layout
@@ -43,15 +43,12 @@ FIRST_SEED = 7000
 
 def main() -> None:
     """Run what is missing, print, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__, "write the figures into the page")
     parser.add_argument("--stores", type=int, default=ALLOWED_OF)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--dask", help="address of a Dask scheduler: its workers in the place of --workers")
     parser.add_argument("--cache", type=Path, default=Path("runs/null-calibration"), help="a file per store")
     parser.add_argument("--out", type=Path, default=RESULT, help="JSON file to write")
-    parser.add_argument("--publish", action="store_true", help="write the figures into the page")
     parser.add_argument("--one", type=int, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     arguments.cache.mkdir(parents=True, exist_ok=True)

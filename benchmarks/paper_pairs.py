@@ -9,7 +9,6 @@ residual is its datum, and |mean r| ≤ mean |r|: the mean size of the datums is
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.markdown_table import markdown_table, with_interval
-from benchmarks.record import origin, publish, write_record
+from benchmarks.record import options, origin, publish, write_record
 from litho_data.foundation.commands import run_script
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.readers.pairs import quadrant_slices
@@ -98,13 +97,8 @@ COLUMNS = ("datum_size", "affine_mae", "affine_mae_datum_freed")
 
 def main() -> None:
     """Measure, print, write, publish."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__, "write result and table into the documentation")
     parser.add_argument("store", type=Path, help="store of litho-data import-pairs")
-    parser.add_argument(
-        "--publish", action="store_true", help="write result and table into the documentation"
-    )
     given = parser.parse_args()
     store = open_store(given.store)
     record = {"run": origin(), "bounds": [bound(store), bound(store, (WRONG_SCALE,))]}

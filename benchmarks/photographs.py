@@ -10,7 +10,6 @@ mirrored are also given without saying so.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,7 @@ import cv2
 import numpy as np
 import torch
 
-from benchmarks.record import conclude, origin
+from benchmarks.record import conclude, options, origin
 from litho_data.foundation.commands import run_script
 from litho_data.foundation.errors import InputError
 from litho_data.register.geometry import ORIENTATIONS, orient
@@ -156,12 +155,9 @@ def as_markdown(record: Mapping[str, Any]) -> str:
 
 def main() -> None:
     """Design, photograph, score, print, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__, "write record and text into docs")
     parser.add_argument("--out", type=Path, required=True, help="folder of designs and photographs")
     parser.add_argument("--photographs", type=int, default=18, help="of each hologram")
-    parser.add_argument("--publish", action="store_true", help="write record and text into docs")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     rows = []

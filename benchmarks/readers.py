@@ -8,7 +8,6 @@ for three of them at every 8th pixel. --publish also writes the tables into docs
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import sys
@@ -23,7 +22,7 @@ import numpy as np
 
 from benchmarks.build import cost_of
 from benchmarks.markdown_table import markdown_table
-from benchmarks.record import conclude, origin, write_record
+from benchmarks.record import conclude, options, origin, write_record
 from litho_data.foundation.commands import progress, run_script
 from litho_data.foundation.errors import InputError
 from litho_data.readers import list_channels, read_scan
@@ -61,13 +60,9 @@ _MORE_SIGNATURES = (
 
 def main() -> None:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, default=RESULT, help="JSON file to write")
+    parser = options(__doc__, "write the tables into docs/readers.md", RESULT)
     parser.add_argument("--bodies", type=int, default=1000, help="random bodies behind each signature")
     parser.add_argument("--only-bodies", action="store_true", help="read random bodies and nothing else")
-    parser.add_argument("--publish", action="store_true", help="write the tables into docs/readers.md")
     arguments = parser.parse_args()
     if arguments.only_bodies:
         write_record(arguments.out, {"signatures": read_bodies(arguments.bodies)})

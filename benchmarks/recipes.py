@@ -9,13 +9,12 @@ the paper, ``--epochs 4000``, are a task for a GPU.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from benchmarks.markdown_table import markdown_table, with_interval
-from benchmarks.record import publish
+from benchmarks.record import options, publish
 from litho_data.foundation.commands import run_script
 from litho_models.evaluation.benchmark import benchmark
 from litho_models.evaluation.results import Benchmark
@@ -42,17 +41,12 @@ STEPS_PER_EPOCH = PAPER_CROPS // PAPER_BATCH
 
 def main() -> None:
     """Train with the paper's recipe, print, write, publish."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__, "write table and results into the documentation")
     parser.add_argument("store", type=Path)
     parser.add_argument("--fast", type=Path, default=FAST, help="benchmark of the fast recipe, split paper")
     parser.add_argument("--runs", default=",".join(RUNS), help="names, separated by commas")
     parser.add_argument("--epochs", type=int, default=400, help="of the paper's 4,000")
     parser.add_argument("--out", type=Path, default=Path("runs/recipes"))
-    parser.add_argument(
-        "--publish", action="store_true", help="write table and results into the documentation"
-    )
     given = parser.parse_args()
     fast = Benchmark.read(given.fast)
     results = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 from collections.abc import Mapping
@@ -14,6 +15,15 @@ from litho_data.foundation.files import atomic_file
 from litho_data.foundation.run_facts import run_facts
 
 NOT_MEASURED = "Not measured yet."
+
+
+def options(doc: str | None, publishing: str, out: Path | None = None) -> argparse.ArgumentParser:
+    """A benchmark's options: ``--publish``, whose help is given, and ``--out`` where it has a default."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    if out is not None:
+        parser.add_argument("--out", type=Path, default=out, help="JSON file to write")
+    parser.add_argument("--publish", action="store_true", help=publishing)
+    return parser
 
 
 def usable_cores() -> int:

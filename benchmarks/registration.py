@@ -10,7 +10,6 @@ docs/registration.md.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ import pandas as pd
 from scipy.ndimage import gaussian_filter, map_coordinates
 
 from benchmarks.markdown_table import markdown_table
-from benchmarks.record import conclude, origin
+from benchmarks.record import conclude, options, origin
 from benchmarks.register_phantoms import (
     PITCH_UM,
     random_layout,
@@ -49,13 +48,9 @@ Seen = Callable[[np.ndarray], np.ndarray]
 
 def main() -> None:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, default=RESULT, help="JSON file to write")
+    parser = options(__doc__, "write the tables into docs/registration.md", RESULT)
     parser.add_argument("--seeds", type=int, default=3, help="phantoms of each kind")
     parser.add_argument("--store", type=Path, help="the measured prints, by litho-data build")
-    parser.add_argument("--publish", action="store_true", help="write the tables into docs/registration.md")
     arguments = parser.parse_args()
     cases = [(name, FIRST_SEED + n) for name in ("clean", *DEFECTS) for n in range(arguments.seeds)]
     creeps = [(name, creep_um) for name in SETTLING for creep_um in CREEP_UM]

@@ -11,7 +11,6 @@ model, blurred by 1 µm, is taken off the wanted height. An interrupted run resu
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -23,7 +22,7 @@ from scipy.ndimage import gaussian_filter
 
 from benchmarks.gap.plan import PRINT_KNOBS, SCAN_KNOBS
 from benchmarks.markdown_table import markdown_table
-from benchmarks.record import conclude, origin, write_record
+from benchmarks.record import conclude, options, origin, write_record
 from litho_data.build.build import build_dataset
 from litho_data.foundation.commands import run_script
 from litho_data.foundation.errors import InputError
@@ -56,14 +55,11 @@ COLUMNS = {
 
 def main() -> None:
     """Make what is missing, print, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__, "write record and table into docs")
     parser.add_argument("--out", type=Path, required=True, help="folder of the fabs, models and designs")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--size", type=int, default=256, help="side of scans and reliefs, pixels")
     parser.add_argument("--model", default="physics", help="what is trained on the scans")
-    parser.add_argument("--publish", action="store_true", help="write record and table into docs")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     settings = relief_settings({"layout.size_px": arguments.size})

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from benchmarks.record import conclude, origin, usable_cores
+from benchmarks.record import conclude, options, origin, usable_cores
 from litho_models.frozen import zoo
 
 PAGE = Path(__file__).parents[1] / "docs" / "speed.md"
@@ -36,20 +36,14 @@ Work = tuple[Callable[[], object], Callable[[], Arrays]]
 
 def parser(description: str | None, name: str, repeats: int, size_px: int) -> argparse.ArgumentParser:
     """The options that all comparisons have."""
-    options = argparse.ArgumentParser(
-        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    options.add_argument("--out", type=Path, default=RESULTS / f"{name}.json", help="JSON file to write")
-    options.add_argument(
-        "--model", type=Path, default=zoo.folder("pbl"), help="frozen PBL; default: the zoo's"
-    )
-    options.add_argument("--size-px", type=int, default=size_px)
-    options.add_argument("--repeats", type=int, default=repeats)
-    options.add_argument("--threads", type=int, default=usable_cores())
-    options.add_argument("--publish", action="store_true", help="write the table into docs/speed.md")
-    options.add_argument("--side", help=argparse.SUPPRESS)
-    options.add_argument("--arrays", type=Path, help=argparse.SUPPRESS)
-    return options
+    found = options(description, "write the table into docs/speed.md", RESULTS / f"{name}.json")
+    found.add_argument("--model", type=Path, default=zoo.folder("pbl"), help="frozen PBL; default: the zoo's")
+    found.add_argument("--size-px", type=int, default=size_px)
+    found.add_argument("--repeats", type=int, default=repeats)
+    found.add_argument("--threads", type=int, default=usable_cores())
+    found.add_argument("--side", help=argparse.SUPPRESS)
+    found.add_argument("--arrays", type=Path, help=argparse.SUPPRESS)
+    return found
 
 
 def run(

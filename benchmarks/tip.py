@@ -9,7 +9,6 @@ a pixel. --publish also writes the tables into docs/tip.md.
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ import numpy as np
 import scipy.ndimage
 
 from benchmarks.markdown_table import markdown_table
-from benchmarks.record import conclude, origin
+from benchmarks.record import conclude, options, origin
 from litho_data.foundation.commands import progress, run_script
 from litho_data.scan import Scan
 from litho_data.tip import estimate_tip, tip_certain
@@ -40,12 +39,8 @@ _INNER = (slice(15, -15),) * 2
 
 def main() -> None:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--out", type=Path, default=RESULT, help="JSON file to write")
+    parser = options(__doc__, "write the tables into docs/tip.md", RESULT)
     parser.add_argument("--seeds", type=int, default=20, help="surfaces of each kind and tip")
-    parser.add_argument("--publish", action="store_true", help="write the tables into docs/tip.md")
     arguments = parser.parse_args()
     cases = [(kind, *tip) for kind in KINDS for tip in TIPS]
     record = {

@@ -9,14 +9,13 @@ Both judge all pixels alike. --publish also writes the table into docs/evaluatio
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from benchmarks.markdown_table import markdown_table
-from benchmarks.record import conclude, origin
+from benchmarks.record import conclude, options, origin
 from litho_data.foundation.commands import run_script
 from litho_models.evaluation.compare import compare
 from litho_models.evaluation.results import Benchmark
@@ -28,13 +27,10 @@ NAME = "weights.json"
 
 def main() -> None:
     """Compare, print, write."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = options(__doc__, "write the table into docs/evaluation.md")
     parser.add_argument("uniform", type=Path, help="result folder with uniform weights")
     parser.add_argument("sigma", type=Path, help="result folder with --weights sigma")
     parser.add_argument("--out", type=Path, default=RESULT, help="JSON file to write")
-    parser.add_argument("--publish", action="store_true", help="write the table into docs/evaluation.md")
     arguments = parser.parse_args()
     results = [Benchmark.read(folder) for folder in (arguments.uniform, arguments.sigma)]
     table = compare(arguments.sigma, arguments.uniform)
