@@ -71,16 +71,12 @@ def build_dataset(
     listing = list_fields(card_path, data_dir)
     if tip is not None:
         listing = replace(listing, card=with_tip(listing.card, tip))
-    recipe = load_recipe(_recipe_path(listing))
+    level = listing.card.process.level
+    recipe = load_recipe(None if level is None else listing.card_path.parent / level)
     places = Workers(workers, dask)
     jobs = with_tip_found(field_jobs(listing, recipe, seed), places)
     source = _source(listing, recipe, seed, jobs)
     return make_store(source, Path(out), workers=places, strict=strict)
-
-
-def _recipe_path(listing: Listing) -> Path | None:
-    level = listing.card.process.level
-    return None if level is None else listing.card_path.parent / level
 
 
 def _source(listing: Listing, recipe: Mapping[str, Any], seed: int, jobs: Sequence[Job]) -> Source:

@@ -203,7 +203,8 @@ def export_pairs(store_path: str | Path, out: str | Path) -> list[str]:
                 raise InputError(
                     f"size of field {scan_id}", got=scan.shape, wanted="even numbers of pixels, for quadrants"
                 )
-            height_um, lift_um = _positive(scan.height_um)
+            lift_um = -float(np.nanmin(scan.height_um, initial=0))
+            height_um = scan.height_um + lift_um
             if lift_um:
                 notes.append(
                     f"{scan_id}: raised by {lift_um * 1e3:.1f} nm, the format has no negative heights"
@@ -223,11 +224,6 @@ def export_pairs(store_path: str | Path, out: str | Path) -> list[str]:
                 scales[name] = full_scale_um * 1e-6
         (folder / SCALES_FILE).write_text(json.dumps(scales), encoding="utf-8")
     return notes
-
-
-def _positive(height_um: np.ndarray) -> tuple[np.ndarray, float]:
-    lowest = float(np.nanmin(height_um, initial=0))
-    return (height_um - lowest, -lowest) if lowest < 0 else (height_um, 0.0)
 
 
 def _cut(image: np.ndarray, quadrant: int) -> np.ndarray:

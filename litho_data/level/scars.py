@@ -112,7 +112,8 @@ def _harmonic(z: np.ndarray, unknown: np.ndarray) -> np.ndarray:
     known = np.isfinite(z) & ~unknown
     coupling, right, anchors = np.zeros(n), np.zeros(n), np.zeros(n)
     pairs = []
-    for here, there in _neighbours():
+    every, first, last = slice(None), slice(None, -1), slice(1, None)
+    for here, there in (((first, every), (last, every)), ((every, first), (every, last))):
         for a, b in ((here, there), (there, here)):
             inside, border = unknown[a] & unknown[b], unknown[a] & known[b]
             pairs.append((index[a][inside], index[b][inside]))
@@ -128,8 +129,3 @@ def _harmonic(z: np.ndarray, unknown: np.ndarray) -> np.ndarray:
     rows, columns = (np.concatenate(parts) for parts in zip(*pairs, strict=True))
     links = sparse.csc_matrix((-np.ones(len(rows)), (rows, columns)), shape=(n, n))
     return linalg.spsolve(links + sparse.diags(coupling + anchors, format="csc"), right)
-
-
-def _neighbours() -> tuple[tuple[tuple[slice, slice], tuple[slice, slice]], ...]:
-    every, first, last = slice(None), slice(None, -1), slice(1, None)
-    return (((first, every), (last, every)), ((every, first), (every, last)))

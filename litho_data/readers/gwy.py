@@ -50,7 +50,7 @@ def _channel(path: Path, container: Any, key: str) -> Channel:
         unit=_unit(field, "si_unit_z"),
         size_um=extent_um(field["yreal"], field["xreal"], _unit(field, "si_unit_xy")),
         load=partial(_load, path, key, shape),
-        header=_header(container.get(f"/{number}/meta")),
+        header={str(key): str(value) for key, value in (container.get(f"/{number}/meta") or {}).items()},
     )
 
 
@@ -78,10 +78,6 @@ def _unit(field: Any, key: str) -> str | None:
     """None if Gwyddion states no unit, as it does for pure numbers."""
     unit = field.get(key)
     return None if unit is None else str(unit.get("unitstr", "")) or None
-
-
-def _header(meta: Any) -> dict[str, str]:
-    return {} if meta is None else {str(key): str(value) for key, value in meta.items()}
 
 
 def check_structure(path: Path) -> None:

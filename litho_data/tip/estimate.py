@@ -15,7 +15,7 @@ from litho_data.scan import Scan
 from litho_data.tip.blind import blind_tip, full_angle_bound_deg
 from litho_data.tip.certainty import tip_certain
 from litho_data.tip.curvature import noise_of
-from litho_data.tip.radius import PeakRadius, of_one_tip, peak_radius
+from litho_data.tip.radius import of_one_tip, peak_radius
 from litho_data.tip.resolution import lateral_resolution_um
 
 _THRESHOLD_SIGMA = 6.0
@@ -93,7 +93,9 @@ def estimate_tip(scans: Sequence[Scan]) -> TipEstimate:
         max(pitch_um) ** 2 / (2 * found.radius_um) if found.radius_um else 0.0,
         _LEAST_THRESHOLD * found.depth_um,
     )
-    reach_px = _reach_px(found, pitch_um)
+    reach_px = None
+    if found.radius_um is not None:
+        reach_px = math.sqrt(2 * found.radius_um * found.depth_um) / max(pitch_um)
     half_px = int(np.clip(math.ceil(reach_px or 0) + 1, _SMALLEST_HALF_PX, _LARGEST_HALF_PX))
     blind = blind_tip(heights, half_px, threshold_um)
     return TipEstimate(
@@ -144,12 +146,6 @@ def _common_pitch(scans: Sequence[Scan]) -> tuple[float, float]:
             what = f"pitch of {scan.source or scan.name}"
             raise InputError(what, got=f"{pitch} µm", wanted=f"{pitches[0]} µm, as the first scan has")
     return pitches[0]
-
-
-def _reach_px(found: PeakRadius, pitch_um: tuple[float, float]) -> float | None:
-    if found.radius_um is None:
-        return None
-    return math.sqrt(2 * found.radius_um * found.depth_um) / max(pitch_um)
 
 
 def _rms(values: Sequence[float]) -> float:

@@ -40,11 +40,11 @@ def hologram_baselines(
         bench.propagator(limited), limited, target, bench.grid, settings.optics, settings.camera
     )
     found["diffraction-limited"] = {name: getattr(score, name) for name in _OF_IMAGES}
-    best, loss = _continuous_phase(bench, cells, target, settings)
-    for name, phase in (
-        ("continuous phase", best),
-        ("weighted GS", _weighted(bench, cells, target, settings)),
-    ):
+    best, loss = _continuous_phase(bench, cells, target, settings, counted)
+    weighted, _ = gerchberg_saxton(
+        bench.propagator, target, cells, iterations=_ITERATIONS, weighted=True, seed=settings.search.seed
+    )
+    for name, phase in (("continuous phase", best), ("weighted GS", weighted)):
         height_um = cells(phase) * (wave_um / (2 * math.pi))
         found[name] = bench.score(height_um, target, settings.camera).model_dump()
         if counted is not None:
@@ -92,11 +92,10 @@ def _free_amplitude(bench: HologramBench, target: Tensor) -> Tensor:
 
 
 def _continuous_phase(
-    bench: HologramBench, cells: CellMap, target: Tensor, settings: HologramSettings
+    bench: HologramBench, cells: CellMap, target: Tensor, settings: HologramSettings, counted: Tensor | None
 ) -> tuple[Tensor, float]:
     """The phase per cell with the lowest loss, radian, and that loss."""
     wave_um = settings.optics.wave_height_um
-    counted = counted_pixels(target, settings.loss, settings.layout.pitch_um)
     phase, _ = gerchberg_saxton(
         bench.propagator, target, cells, iterations=_ITERATIONS, weighted=False, seed=settings.search.seed,
         counted=counted,
@@ -114,10 +113,3 @@ def _continuous_phase(
         loss.backward()
         optimiser.step()
     return best, lowest
-
-
-def _weighted(bench: HologramBench, cells: CellMap, target: Tensor, settings: HologramSettings) -> Tensor:
-    phase, _ = gerchberg_saxton(
-        bench.propagator, target, cells, iterations=_ITERATIONS, weighted=True, seed=settings.search.seed
-    )
-    return phase
