@@ -58,12 +58,13 @@ def _work(side: str, arguments: argparse.Namespace) -> Work:
     layout = settings.layout.model_copy(update={"size_px": arguments.size_px})
     settings = settings.model_copy(update={"layout": layout})
     target = load_target("text", arguments.size_px)
-    parameters = make_parametrisation(layout, settings.search)
+    device = arguments.device
+    parameters = make_parametrisation(layout, settings.search).to(device)
     parameters.start_random(0)
     reduced: Callable[[], AbstractContextManager[None]] = nullcontext
     if side == side_by_side.PLAIN:
-        pbl = PlainPbl(load_pbl(arguments.model)).requires_grad_(False)
-        wanted = torch.from_numpy(target.pixels)
+        pbl = PlainPbl(load_pbl(arguments.model)).to(device).requires_grad_(False)
+        wanted = torch.from_numpy(target.pixels).to(device)
 
         def prints(level: Tensor) -> Tensor:
             return pbl(level * layout.level_height_um)
@@ -73,7 +74,7 @@ def _work(side: str, arguments: argparse.Namespace) -> Work:
             return hologram_loss(share, wanted, settings.loss)
 
     else:
-        printer = load_printer(str(arguments.model), layout)
+        printer = load_printer(str(arguments.model), layout, device=device)
         prints, objective = printer, HologramTask(settings, printer, target).objective
         reduced = partial(printer.at_precision, side)
 
@@ -85,7 +86,7 @@ def _work(side: str, arguments: argparse.Namespace) -> Work:
 
     def made() -> Arrays:
         with torch.no_grad(), reduced():
-            return {"height_um": prints(parameters.sample(1.0, True, 0)).numpy()}
+            return {"height_um": prints(parameters.sample(1.0, True, 0)).cpu().numpy()}
 
     return once, made
 
@@ -102,7 +103,7 @@ def _propagate(height_um: Tensor, settings: HologramSettings) -> Tensor:
     optics, pitch_um = settings.optics, settings.layout.pitch_um
     size = height_um.shape[-1]
     wavenumber = 2 * math.pi / optics.wavelength_um
-    x = (torch.arange(2 * size, dtype=torch.float64) - size) * pitch_um
+    x = (torch.arange(2 * size, dtype=torch.float64, device=height_um.device) - size) * pitch_um
     radius = (x[:, None] ** 2 + x[None, :] ** 2 + optics.distance_um**2).sqrt()
     kernel = optics.distance_um / (2 * math.pi * radius**2) * (1 / radius - 1j * wavenumber)
     kernel = (kernel * torch.exp(1j * wavenumber * radius) * pitch_um**2).to(torch.complex64)

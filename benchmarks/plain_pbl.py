@@ -32,7 +32,10 @@ class PlainPbl(nn.Module):
         self.tau = nn.Parameter(pbl.tau.detach().clone())
 
     def forward(self, layout_um: Tensor) -> Tensor:
-        initial = self._blur(layout_um, torch.tensor(self.config.sigma_optical_um, dtype=torch.float64))
+        initial = self._blur(
+            layout_um,
+            torch.tensor(self.config.sigma_optical_um, dtype=torch.float64, device=layout_um.device),
+        )
         initial = initial + self.thresh(initial)
         dose = self._blur(initial, self.config.sigma_diffusion_max_um * torch.sigmoid(self.tau))
         product = initial * (1 + self.shrink(dose))
@@ -40,7 +43,7 @@ class PlainPbl(nn.Module):
 
     def _blur(self, field: Tensor, sigma_um: Tensor) -> Tensor:
         radius = kernel_radius_px(float(sigma_um.detach()) / self.config.pitch_um)
-        x_um = torch.arange(-radius, radius + 1) * self.config.pitch_um
+        x_um = torch.arange(-radius, radius + 1, device=field.device) * self.config.pitch_um
         kernel = torch.exp(-(x_um[:, None] ** 2 + x_um[None, :] ** 2) / (2 * sigma_um**2))
         size = [length + 2 * radius for length in field.shape[-2:]]
         padded = F.pad(field, (radius,) * 4, mode="replicate")

@@ -53,23 +53,24 @@ def gradient_gflop(config: PblConfig, side: str, pixels: int) -> Mapping[str, fl
 
 def _work(side: str, arguments: argparse.Namespace) -> Work:
     pbl = load_pbl(arguments.model)
-    layout_um = random_layout(pbl.config, arguments.size_px).requires_grad_()
-    upstream = torch.randn(layout_um.shape, generator=torch.Generator().manual_seed(1))
-    made: dict[str, np.ndarray] = {}
+    device = arguments.device
+    layout_um = random_layout(pbl.config, arguments.size_px).to(device).requires_grad_()
+    upstream = torch.randn(layout_um.shape, generator=torch.Generator().manual_seed(1)).to(device)
+    made: dict[str, torch.Tensor] = {}
     reduced: Callable[[], AbstractContextManager[None]] = nullcontext
     if side == side_by_side.PLAIN:
-        model: torch.nn.Module = PlainPbl(pbl).requires_grad_(False)
+        model: torch.nn.Module = PlainPbl(pbl).to(device).requires_grad_(False)
     else:
-        model = frozen = load_frozen(arguments.model)
+        model = frozen = load_frozen(arguments.model, device=device)
         reduced = partial(frozen.at_precision, side)
 
     def once() -> None:
         with reduced():
             height_um = model(layout_um)
         (gradient,) = torch.autograd.grad(height_um, layout_um, upstream)
-        made.update(height_um=height_um.detach().numpy(), gradient=gradient.numpy())
+        made.update(height_um=height_um.detach(), gradient=gradient)
 
-    return once, lambda: made
+    return once, lambda: {name: array.cpu().numpy() for name, array in made.items()}
 
 
 def _differences(ours: Arrays, plain: Arrays, reach_px: int) -> Mapping[str, float]:

@@ -1,14 +1,14 @@
 """Several implementations of one task, each in a process of its own, timed in turns.
 
 A process per side keeps their peak memories apart. All are started and warmed up first, then each
-does one repeat after the other, so that a slow minute of the machine hits them alike.
+does one repeat after the other, so that a slow minute of the machine hits them alike. On a GPU ours also runs
+on the processors beside it, in the same turns.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import resource
 import statistics
 import subprocess
 import sys
@@ -22,13 +22,20 @@ import numpy as np
 import torch
 
 from benchmarks.record import conclude, options, origin, usable_cores
+from litho_design.optimisation.budget import peak_memory_gib
+from litho_design.printers.source import check_device
 from litho_models.frozen import zoo
 
 PAGE = Path(__file__).parents[1] / "docs" / "speed.md"
 RESULTS = PAGE.parent / "results" / "speed"
 SCHEMA = "litho-models/benchmark-speed/1"
 PLAIN = "plain"
-_MATRIX = 2048
+# Beside a GPU: ours on the processors of the same machine.
+ON_CPU = "float32, CPU"
+# Gradients in another precision than heights are for CPUs.
+_CPU_ONLY = ("mixed",)
+# Side of the matrices whose product shows the highest rate.
+_MATRIX = {"cpu": 2048, "cuda": 8192}
 
 Arrays = Mapping[str, np.ndarray]
 Work = tuple[Callable[[], object], Callable[[], Arrays]]
@@ -41,6 +48,7 @@ def parser(description: str | None, name: str, repeats: int, size_px: int) -> ar
     found.add_argument("--size-px", type=int, default=size_px)
     found.add_argument("--repeats", type=int, default=repeats)
     found.add_argument("--threads", type=int, default=usable_cores())
+    found.add_argument("--device", default="cpu", help="cpu, or a GPU: cuda")
     found.add_argument("--side", help=argparse.SUPPRESS)
     found.add_argument("--arrays", type=Path, help=argparse.SUPPRESS)
     return found
@@ -69,17 +77,26 @@ def run(
         facts: further entries of the record.
     """
     torch.set_num_threads(arguments.threads)
+    check_device(arguments.device)
+    device = torch.device(arguments.device)
     if arguments.side:
-        _serve(*work(arguments.side, arguments), arguments.arrays)
+        _serve(*work(arguments.side, arguments), arguments.arrays, device)
         return
-    peaks = {str(dtype).split(".")[-1]: peak_gflops(dtype) for dtype in (torch.float32, torch.bfloat16)}
+    peaks = _peaks_gflops(device)
+    cpu_peaks = _peaks_gflops(torch.device("cpu"))
+    if device.type == "cuda":
+        name = f"{name}_gpu"
+        sides = [side for side in sides if side not in _CPU_ONLY] + [ON_CPU]
+        arguments.out = arguments.out.with_name(f"{name}.json")
     with tempfile.TemporaryDirectory() as folder:
         measured = _in_turns(module, arguments, sides, Path(folder))
         made = {side: dict(np.load(_arrays_file(Path(folder), side))) for side in sides}
     plain = measured[PLAIN]
     rows = []
     for side, row in measured.items():
-        work_gflop = limit_gflop(side, arguments)
+        on_cpu = side == ON_CPU
+        work_gflop = limit_gflop("float32" if on_cpu else side, arguments)
+        rates = cpu_peaks if on_cpu else peaks
         rows.append(
             {
                 "side": side,
@@ -87,7 +104,7 @@ def run(
                 "faster": plain["median_s"] / row["median_s"],
                 "memory": row["peak_gib"] / plain["peak_gib"],
                 "gflop": sum(work_gflop.values()),
-                "limit_s": sum(gflop / peaks[dtype] for dtype, gflop in work_gflop.items()),
+                "limit_s": sum(gflop / rates[dtype] for dtype, gflop in work_gflop.items()),
                 **differences(made[side], made[PLAIN]),
             }
         )
@@ -96,10 +113,15 @@ def run(
         "size_px": arguments.size_px,
         **facts,
         "repeats": arguments.repeats,
-        "machine": {"cores": usable_cores(), "bfloat16_matrix_unit": _has_matrix_unit()},
+        "machine": {
+            "cores": usable_cores(),
+            "bfloat16_matrix_unit": _has_matrix_unit(),
+            **({"gpu": torch.cuda.get_device_name(device)} if device.type == "cuda" else {}),
+        },
         "threads": arguments.threads,
         **origin(),
         "peak_gflops": peaks,
+        **({"cpu_peak_gflops": cpu_peaks} if device.type == "cuda" else {}),
         "sides": rows,
     }
     conclude(record, as_markdown(record), arguments.out, PAGE, name, published=arguments.publish)
@@ -125,24 +147,32 @@ def as_markdown(record: Mapping[str, Any]) -> str:
         ]
         rows.append("| " + " | ".join(cells) + " |")
     unit = "with" if record["machine"]["bfloat16_matrix_unit"] else "without"
-    peaks = ", ".join(f"{value:.0f} in {dtype}" for dtype, value in record["peak_gflops"].items())
+    gpu = record["machine"].get("gpu")
+    side_px = _MATRIX["cuda" if gpu else "cpu"]
+    rates = f"Matrix products of {side_px}² reach {_rates(record['peak_gflops'])} GFLOP/s"
+    if gpu:
+        rates += (
+            f" on the GPU, in float32 with factors rounded to TF32 as its convolutions do; "
+            f"{_rates(record['cpu_peak_gflops'])} on the CPU"
+        )
     return (
-        f"{record['size_px']} × {record['size_px']} px, {record['threads']} threads on "
-        f"{record['machine']['cores']} cores {unit} a bfloat16 matrix unit, {record['repeats']} repeats, "
-        f"torch {record['versions']['torch']}. Matrix products of {_MATRIX}² reach {peaks} GFLOP/s.\n\n"
+        f"{record['size_px']} × {record['size_px']} px, {f'{gpu} beside ' if gpu else ''}{record['threads']} "
+        f"threads on {record['machine']['cores']} cores {unit} a bfloat16 matrix unit, {record['repeats']} "
+        f"repeats, torch {record['versions']['torch']}. {rates}.\n\n"
         f"| {' | '.join(heads)} |\n|{'---|' * len(heads)}\n" + "\n".join(rows)
     )
 
 
-def peak_gflops(dtype: torch.dtype, repeats: int = 12) -> float:
-    """Best rate of a large matrix product on the threads in use, GFLOP/s."""
-    square = torch.ones(_MATRIX, _MATRIX, dtype=dtype)
+def peak_gflops(dtype: torch.dtype, device: torch.device, repeats: int = 12) -> float:
+    """Best rate of a large matrix product on the threads in use or on a GPU, GFLOP/s."""
+    size = _MATRIX[device.type]
+    square = torch.randn(size, size, device=device).to(dtype)
     seconds = []
     for _ in range(repeats):
-        started = time.perf_counter()
+        started = _now(device)
         square @ square
-        seconds.append(time.perf_counter() - started)
-    return 2 * _MATRIX**3 / min(seconds) / 1e9
+        seconds.append(_now(device) - started)
+    return 2 * size**3 / min(seconds) / 1e9
 
 
 def relative_percent(difference: np.ndarray, reference: np.ndarray) -> float:
@@ -150,6 +180,28 @@ def relative_percent(difference: np.ndarray, reference: np.ndarray) -> float:
     return 100 * float(
         np.sqrt(np.mean(difference.astype(float) ** 2) / np.mean(reference.astype(float) ** 2))
     )
+
+
+def _peaks_gflops(device: torch.device) -> dict[str, float]:
+    before = torch.backends.cuda.matmul.allow_tf32
+    torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32
+    try:
+        return {
+            str(dtype).split(".")[-1]: peak_gflops(dtype, device) for dtype in (torch.float32, torch.bfloat16)
+        }
+    finally:
+        torch.backends.cuda.matmul.allow_tf32 = before
+
+
+def _now(device: torch.device) -> float:
+    """Seconds of the clock, once the device has done what was asked of it."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
+def _rates(peaks: Mapping[str, float]) -> str:
+    return ", ".join(f"{value:,.0f} in {dtype}" for dtype, value in peaks.items())
 
 
 def _in_turns(
@@ -179,7 +231,10 @@ def _in_turns(
 
 
 def _start(module: str, arguments: argparse.Namespace, side: str, folder: Path) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", module, "--side", side, "--arrays", str(_arrays_file(folder, side))]
+    device = "cpu" if side == ON_CPU else arguments.device
+    does = "float32" if side == ON_CPU else side
+    command = [sys.executable, "-m", module, "--side", does, "--device", device]
+    command += ["--arrays", str(_arrays_file(folder, side))]
     for option in ("model", "size_px", "threads"):
         command += [f"--{option.replace('_', '-')}", str(getattr(arguments, option))]
     return subprocess.Popen(
@@ -198,21 +253,23 @@ def _answer(worker: subprocess.Popen[str], request: str) -> str:
     return answer
 
 
-def _serve(once: Callable[[], object], made: Callable[[], Arrays], arrays: Path) -> None:
+def _serve(
+    once: Callable[[], object], made: Callable[[], Arrays], arrays: Path, device: torch.device
+) -> None:
     """Answer requests for one repeat each with its seconds; at the end with the peak memory, GiB."""
     for request in sys.stdin:
         if request.strip() == "end":
-            peak_gib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20)
+            peak_gib = peak_memory_gib(device)
             np.savez(arrays, **made())
             print(json.dumps(peak_gib), flush=True)
             return
-        started = time.perf_counter()
+        started = _now(device)
         once()
-        print(json.dumps(time.perf_counter() - started), flush=True)
+        print(json.dumps(_now(device) - started), flush=True)
 
 
 def _arrays_file(folder: Path, side: str) -> Path:
-    return folder / f"{side}.npz"
+    return folder / f"{side.replace(', ', '_')}.npz"
 
 
 def _has_matrix_unit() -> bool:

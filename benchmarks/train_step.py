@@ -54,20 +54,22 @@ def _gflop(config: PblConfig, side: str, size_px: int) -> Mapping[str, float]:
 
 
 def _work(side: str, arguments: argparse.Namespace) -> Work:
+    device = torch.device(arguments.device)
     pbl = load_pbl(arguments.model)
     margin = pbl.reach_px
     wide_um = random_layout(pbl.config, arguments.size_px + 2 * margin, BATCH)
     inside_um = crop_border(wide_um, margin).contiguous()
     generator = torch.Generator().manual_seed(1)
     measured_um = inside_um + 0.05 * torch.randn(inside_um.shape, generator=generator)
-    plain = PlainPbl(pbl)
-    model = plain if side == side_by_side.PLAIN else pbl
+    wide_um, inside_um, measured_um = (one.to(device) for one in (wide_um, inside_um, measured_um))
+    plain = PlainPbl(pbl).to(device)
+    model = plain if side == side_by_side.PLAIN else pbl.to(device)
     optimiser = torch.optim.AdamW(model.parameters(), lr=_RATE)
-    reduced = torch.autocast("cpu", torch.bfloat16) if side == "bfloat16" else nullcontext()
+    reduced = torch.autocast(device.type, torch.bfloat16) if side == "bfloat16" else nullcontext()
     made: dict[str, np.ndarray] = {}
 
     windows = [Window(sample, 0, 0, arguments.size_px) for sample in range(BATCH)]
-    passes = [windows] if side == side_by_side.PLAIN else in_passes(windows, torch.device("cpu"))
+    passes = [windows] if side == side_by_side.PLAIN else in_passes(windows, device)
 
     def once() -> None:
         optimiser.zero_grad(set_to_none=True)
@@ -83,7 +85,7 @@ def _work(side: str, arguments: argparse.Namespace) -> Work:
             heights_um.append(height_um.detach())
         optimiser.step()
         # Those of the first step: later ones have other weights.
-        made.setdefault("height_um", crop_border(torch.cat(heights_um), margin).numpy().copy())
+        made.setdefault("height_um", crop_border(torch.cat(heights_um), margin).cpu().numpy().copy())
 
     return once, lambda: made
 

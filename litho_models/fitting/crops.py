@@ -28,11 +28,16 @@ class Window:
 
 def cut(field: np.ndarray, window: Window, margin_px: int = 0) -> np.ndarray:
     """The window of (ny, nx) with ``margin_px`` around it; beyond the field its outermost pixels continue."""
-    rows, columns = (
-        np.clip(np.arange(start - margin_px, start + window.size_px + margin_px), 0, length - 1)
-        for start, length in zip((window.y, window.x), field.shape, strict=True)
-    )
-    cropped = field[np.ix_(rows, columns)]
+    (top, left), size = (window.y - margin_px, window.x - margin_px), window.size_px + 2 * margin_px
+    ny, nx = field.shape
+    if min(top, left) >= 0 and top + size <= ny and left + size <= nx:
+        cropped = field[top : top + size, left : left + size]
+    else:
+        rows, columns = (
+            np.clip(np.arange(start, start + size), 0, length - 1)
+            for start, length in ((top, ny), (left, nx))
+        )
+        cropped = field[np.ix_(rows, columns)]
     if window.flip[0]:
         cropped = cropped[::-1]
     return cropped[:, ::-1] if window.flip[1] else cropped

@@ -73,15 +73,16 @@ def train_network(
         terms = training_terms(config.nuisance, config.free_gain)
         added = estimate_scan_terms(training, predictions, terms)
         targets = _Targets(training, added, _overhang_px(model, training, config), config.weights)
-        losses = []
+        sums = []
         left = config.steps - first if first == begun else 0
         what = f"training {model.name} to step {config.steps}"
         for step in progress(range(first, last), what, estimate_of=left):
-            losses.append(_step(fabric, module, optimiser, targets, config, step))
+            sums.append(_step(fabric, module, optimiser, targets, config, step))
+        absolute, counted = torch.stack(sums).double().cpu().numpy().T
         state.record(
             RoundRecord(
                 step=last,
-                training_mae_nm=1000 * float(np.mean(losses)),
+                training_mae_nm=1000 * float(np.mean(absolute / counted)),
                 validation_mae_datum_free_nm=validation_error(model, validation),
                 seconds=time.monotonic() - started,
             )
@@ -150,7 +151,8 @@ def _step(
     targets: _Targets,
     config: TrainingConfig,
     step: int,
-) -> float:
+) -> Tensor:
+    """One step; the weighted absolute error, µm, and the weight, (2,), which a GPU may still be computing."""
     for group in optimiser.param_groups:
         group["lr"] = learning_rate(config, step)
     batch = plan_batch(targets.shapes, config, step)
@@ -168,17 +170,16 @@ def _step(
             fabric.backward(share * loss)
         sums += share * means
     optimiser.step()
-    absolute, counted = cast(Tensor, fabric.all_reduce(sums)).tolist()
-    return absolute / counted
+    return cast(Tensor, fabric.all_reduce(sums))
 
 
 def _losses(
     fabric: Fabric, module: _Heights, targets: _Targets, windows: list[Window], config: TrainingConfig
 ) -> tuple[Tensor, Tensor]:
     """Loss of some windows, and for the record the weighted absolute error, µm, and the weight, (2,)."""
-    prediction = module(fabric.to_device(stack(targets.layouts_um, windows, module.margin_px)))
-    height = fabric.to_device(stack(targets.heights_um, windows))
-    weight = fabric.to_device(stack(targets.weights, windows))
+    prediction = module(_crops(fabric, targets.layouts_um, windows, module.margin_px))
+    height = _crops(fabric, targets.heights_um, windows)
+    weight = _crops(fabric, targets.weights, windows)
     if module.tile is not None:
         # A pixel counts as much as it will in the blended field.
         window = blending_window(module.tile, weight)
@@ -186,6 +187,15 @@ def _losses(
     # A mean over all pixels, valid or not: every crop of a step counts alike, in whatever group it comes.
     loss = (weight * _error(prediction, height, config)).mean()
     return loss, torch.stack([(weight * (prediction - height).abs()).mean().detach(), weight.mean()])
+
+
+def _crops(
+    fabric: Fabric, fields: Sequence[np.ndarray], windows: Sequence[Window], margin_px: int = 0
+) -> Tensor:
+    crops = stack(fields, windows, margin_px)
+    # From pinned memory a copy to a GPU waits for nothing that the GPU is still doing.
+    on_device: Tensor = fabric.to_device(crops.pin_memory() if fabric.device.type == "cuda" else crops)
+    return on_device
 
 
 def _overhang_px(model: Simulator, scans: Sequence[PrintedScan], config: TrainingConfig) -> int:
