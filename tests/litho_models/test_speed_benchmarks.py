@@ -39,10 +39,12 @@ def make_pbl(**fields):
     return model
 
 
+@pytest.mark.parametrize("device", ["", "_gpu"])
 @pytest.mark.parametrize("benchmark", [train_step, predict, hoe_iteration])
-def test_the_page_quotes_the_committed_measurement(benchmark):
-    text = published(PAGE, benchmark.NAME)
-    record = RESULTS / f"{benchmark.NAME}.json"
+def test_the_page_quotes_the_committed_measurement(benchmark, device):
+    name = benchmark.NAME + device
+    text = published(PAGE, name)
+    record = RESULTS / f"{name}.json"
     if not record.exists():
         assert text == NOT_MEASURED
         return
