@@ -4,7 +4,7 @@
 
 Every phantom is registered as a build does it, and once more by the straight fit alone, which knows of
 neither. --store compares the held-out block error of measured scans with that before defects and creep were
-looked for, docs/results/neural-lithography/registration.csv. --publish also writes the tables into
+looked for, docs/results/registration/before_defects.csv. --publish also writes the tables into
 docs/registration.md.
 """
 
@@ -34,7 +34,7 @@ from litho_data.store import open_store
 
 PAGE = Path(__file__).parents[1] / "docs" / "registration.md"
 RESULT = PAGE.parent / "results" / "registration" / "registration.json"
-BEFORE = PAGE.parent / "results" / "neural-lithography" / "registration.csv"
+BEFORE = PAGE.parent / "results" / "registration" / "before_defects.csv"
 NAME = "registration.json"
 SHAPE, SCAN_SHAPE = (384, 384), (440, 440)
 SNR = 10
