@@ -9,8 +9,8 @@ from benchmarks.markdown_table import markdown_table, with_interval
 from litho_models.effects import CATALOGUE
 from litho_models.evaluation.zoo_making import HELD_OUT
 from litho_models.frozen.card import ModelCard
-from litho_models.loop.report.wording import chosen_text, over_text, terms_text
-from litho_models.loop.result.record import EqualTerms, NestedResult
+from litho_models.loop.report.wording import chosen_text, terms_text
+from litho_models.loop.result.record import EqualTerms, NestedResult, OverUnits
 
 
 def equal_freedom_table(loops: Sequence[dict[str, Any]]) -> str:
@@ -23,20 +23,23 @@ def equal_freedom_table(loops: Sequence[dict[str, Any]]) -> str:
             rows += _equal_rows(
                 f"{loop['base_model']}, chosen anew ({nested['held_out']})", nested["equal_terms"]
             )
-    first = loops[0]["equal_terms"][0]
-    prints = first["over_prints"]
+    first = EqualTerms.model_validate(loops[0]["equal_terms"][0])
+    scans, prints = first.over_scans, first.over_prints
     best = (
-        f" Scans of a print are not independent: what {prints['count']} prints can show at best is "
-        f"p = {prints['smallest_p']:.3f}."
+        f" Scans of a print are not independent: what {prints.count} prints can show at best is "
+        f"p = {prints.smallest_p:.3f}."
         if prints
         else ""
     )
+    over = (f"over {scans.count} scans", f"over {prints.count} prints" if prints else "over prints")
     return markdown_table(
-        ("loop on", "terms per scan", "before", "after", "gain", "over scans", "over prints"),
+        ("loop on", "terms per scan", "before", "after", "gain", *over),
         rows,
-        f"Mean absolute error on {first['over_scans']['count']} held-out scans, on the benchmark's pixels, "
+        f"Mean absolute error on {scans.count} held-out scans, on the benchmark's pixels, "
         f"{_background(loops)}; terms are fitted on pixels that are not scored. Intervals of 95 % resample "
-        "whole scans, or whole prints; p is of sign flips of these." + best,
+        "whole scans, or whole prints, and are those of the gain in the last columns, with how many of them "
+        "are better. p of sign flips stands where it is not the smallest that so many can show "
+        f"({scans.smallest_p:.2g} over scans)." + best,
         *(_split_text(loop) for loop in loops if loop.get("gain_split")),
         *(_nested_text(loop) for loop in loops if loop.get("nested")),
         _names_text(loops),
@@ -63,15 +66,22 @@ def _of_scans(effect: dict[str, Any]) -> bool:
 def _equal_rows(name: str, equal_terms: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
     return [
         (
-            name,
+            "" if place else name,
             terms_text(row),
             *(with_interval(side.mae_nm, side.mae_ci95_nm) for side in (row.before, row.after)),
             f"{row.gain_nm:.2f} nm",
-            over_text(row.over_scans, "scans"),
-            "–" if row.over_prints is None else over_text(row.over_prints, "prints"),
+            *map(_over_text, (row.over_scans, row.over_prints)),
         )
-        for row in map(EqualTerms.model_validate, equal_terms)
+        for place, row in enumerate(map(EqualTerms.model_validate, equal_terms))
     ]
+
+
+def _over_text(over: OverUnits | None) -> str:
+    """Interval of a gain, how many scans or prints are better, and p where more could have been shown."""
+    if over is None or over.ci95_nm is None:
+        return "–"
+    p = "" if over.p <= over.smallest_p else f", p = {over.p:.2g}"
+    return "{:.2f} … {:.2f}".format(*over.ci95_nm) + f", better in {over.positive}{p}"
 
 
 def _split_text(loop: dict[str, Any]) -> str:

@@ -204,7 +204,8 @@ def test_terminal_and_pages_name_the_terms_and_what_was_resampled(planted, tmp_p
     assert f"the smallest that {prints} prints can have" in said
     assert "chosen in so many of 1 selections: vignetting 1, datum-offset 1" in said
     table = equal_freedom_table([result.model_dump(mode="json")])
-    assert "| physics, chosen anew (prints) | k = 7 |" in table
+    assert "| physics, chosen anew (prints) | k = 1 |" in table
+    assert f"| over {len(scans)} scans | over {prints} prints |" in table
     assert f"what {prints} prints can show at best is p = {2 / 2**prints:.3f}" in table
     write_report(findings, result, tmp_path)
     assert "vignetting" in (tmp_path / "gain_split.csv").read_text()
