@@ -7,7 +7,7 @@ import math
 from torch import Tensor
 from torch.nn import functional
 
-from litho_models.effects.effect import Effect, FieldContext, Parameter, Values
+from litho_models.effects.effect import Effect, FieldContext, Parameter, Values, of_development
 from litho_models.effects.filters import add_blur, add_warp, gradient
 
 _SLOPE_SOURCE = "empirical: loss proportional to the squared slope, one coefficient per axis"
@@ -89,12 +89,9 @@ _OF_NARROW = {
 _NARROW = tuple({"fraction": 0.1, "width_um": width} for width in (0.4, 0.8, 1.4))
 
 EFFECTS = (
-    Effect(
+    of_development(
         name="vertical-shrinkage",
         title="the whole print losing height on development",
-        stage="development",
-        role="process",
-        acts_on="height",
         parameters={"fraction": Parameter("1", 0.0, 0.7, 0.05)},
         apply=vertical_shrinkage,
         trials=({"fraction": 0.05},),
@@ -102,12 +99,9 @@ EFFECTS = (
         separating="a step standard for the microscope, then a printed staircase",
         linear=True,
     ),
-    Effect(
+    of_development(
         name="dose-dependent-shrinkage",
         title="thin surroundings shrinking more than thick ones",
-        stage="development",
-        role="process",
-        acts_on="height",
         parameters={
             "fraction": Parameter("1", 0.0, 0.5, 0.1),
             "length_um": Parameter("µm", 0.3, 6.0, 1.0, kind="shape"),
@@ -117,36 +111,27 @@ EFFECTS = (
         source="Lang 2022, arXiv:2205.14891: shrinkage falls with dose",
         separating="print the same height inside low and high surroundings; a power sweep",
     ),
-    Effect(
+    of_development(
         name="lateral-shrinkage",
         title="tops shrinking towards the centre of the field",
-        stage="development",
-        role="process",
-        acts_on="height",
         parameters={"fraction": Parameter("1", 0.0, 0.1, 0.005)},
         apply=lateral_shrinkage,
         trials=({"fraction": 0.005},),
         source="print bound to the substrate at its base, free at its top",
         separating="print the layout in fields of two sizes",
     ),
-    Effect(
+    of_development(
         name="feature-collapse",
         title="narrow tall features losing height",
-        stage="development",
-        role="process",
-        acts_on="height",
         parameters=_OF_NARROW,
         apply=feature_collapse,
         trials=_NARROW,
         source="capillary force while drying; opening of the surface by a square of width w",
         separating="pillars of one height and five widths, dried in air and supercritically",
     ),
-    Effect(
+    of_development(
         name="trench-residue",
         title="resist left in narrow trenches",
-        stage="development",
-        role="process",
-        acts_on="height",
         parameters=_OF_NARROW,
         apply=trench_residue,
         trials=_NARROW,

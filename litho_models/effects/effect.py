@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Literal
 
 import torch
@@ -241,3 +242,10 @@ class Effect:
         turn = context.quarter_turns % 4
         seen = self.apply(torch.rot90(height, turn, (-2, -1)), values, context.in_scan_frame())
         return torch.rot90(seen, -turn, (-2, -1))
+
+
+# The entries of most effects, by where they happen: called like ``Effect``, without these three fields.
+of_exposure = partial(Effect, stage="exposure", role="process", acts_on="layout")
+of_resist = partial(Effect, stage="resist", role="process", acts_on="height")
+of_development = partial(Effect, stage="development", role="process", acts_on="height")
+of_microscope = partial(Effect, stage="measurement", role="measurement", acts_on="height")

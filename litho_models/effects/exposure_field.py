@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from litho_models.effects.effect import Effect, FieldContext, Parameter, Values
+from litho_models.effects.effect import Effect, FieldContext, Parameter, Values, of_exposure
 
 
 def vignetting(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -37,12 +37,9 @@ def interface_offset(layout: Tensor, values: Values, context: FieldContext) -> T
 
 
 EFFECTS = (
-    Effect(
+    of_exposure(
         name="vignetting",
         title="dose falling towards the edge of the write field",
-        stage="exposure",
-        role="process",
-        acts_on="layout",
         parameters={"strength": Parameter("1", 0.0, 0.6, 0.1)},
         apply=vignetting,
         trials=({"strength": 0.1},),
@@ -78,12 +75,9 @@ EFFECTS = (
         separating="repeat one layout at the start, the middle and the end of the set; log the laser power",
         needs=("order",),
     ),
-    Effect(
+    of_exposure(
         name="interface-offset",
         title="writing started above or below the substrate",
-        stage="exposure",
-        role="process",
-        acts_on="layout",
         parameters={"offset_um": Parameter("µm", -0.5, 0.3, -0.05)},
         apply=interface_offset,
         trials=({"offset_um": -0.05}, {"offset_um": -0.15}, {"offset_um": -0.3}),

@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from litho_models.effects.effect import Effect, FieldContext, Parameter, Values
+from litho_models.effects.effect import Effect, FieldContext, Parameter, Values, of_exposure
 from litho_models.effects.filters import add_filtered, centred_lag, trailing_response
 
 _TAIL_LENGTHS = 6
@@ -61,12 +61,9 @@ def line_roughness(height: Tensor, values: Values, context: FieldContext) -> Ten
 
 
 EFFECTS = (
-    Effect(
+    of_exposure(
         name="galvo-lag",
         title="beam lagging behind the scan command along the written lines",
-        stage="exposure",
-        role="process",
-        acts_on="layout",
         parameters={
             "length_um": Parameter("µm", 0.0, 1.5, 0.2),
             "direction": Parameter("1", -1.0, 1.0, 1.0, kind="choice"),

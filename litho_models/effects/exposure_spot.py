@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from litho_models.effects.effect import Effect, FieldContext, Parameter, Values
+from litho_models.effects.effect import Effect, FieldContext, Parameter, Values, of_exposure
 from litho_models.effects.filters import add_blur, add_filtered
 
 # Below this difference of variances the spot is sharpened along one axis as much as it is widened
@@ -75,12 +75,9 @@ def _step(dose: Tensor, threshold: Tensor, steepness: Tensor) -> Tensor:
 
 
 EFFECTS = (
-    Effect(
+    of_exposure(
         name="elliptical-psf",
         title="writing spot wider along one direction",
-        stage="exposure",
-        role="process",
-        acts_on="layout",
         parameters={
             "stretch_um2": Parameter("µm²", -0.4, 0.4, 0.02),
             "shear_um2": Parameter("µm²", -0.4, 0.4, 0.02),
@@ -98,12 +95,9 @@ EFFECTS = (
         separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
         linear=True,
     ),
-    Effect(
+    of_exposure(
         name="long-range-proximity",
         title="dose leaking in from the neighbourhood",
-        stage="exposure",
-        role="process",
-        acts_on="layout",
         parameters={
             "weight": Parameter("1", -0.3, 1.5, 0.1),
             "length_um": Parameter("µm", 0.6, 10.0, 2.0, kind="shape"),
@@ -114,12 +108,9 @@ EFFECTS = (
         separating="print one feature alone and inside dense surroundings of three sizes",
         linear=True,
     ),
-    Effect(
+    of_exposure(
         name="dose-exponent",
         title="height not proportional to dose",
-        stage="exposure",
-        role="process",
-        acts_on="layout",
         parameters={"exponent": Parameter("1", 0.4, 2.0, 1.15, null=1.0)},
         apply=dose_exponent,
         trials=({"exponent": 1.15},),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from litho_models.effects.effect import Effect, FieldContext, Parameter, Values
+from litho_models.effects.effect import FieldContext, Parameter, Values, of_microscope
 from litho_models.scan_terms.term import CREEP_DECAYS
 
 
@@ -49,36 +49,27 @@ def slow_drift(height: Tensor, values: Values, context: FieldContext) -> Tensor:
 _STEP = "scan a step standard and a bare substrate before and after the print"
 
 EFFECTS = (
-    Effect(
+    of_microscope(
         name="datum-offset",
         title="zero of the single scan",
-        stage="measurement",
-        role="measurement",
-        acts_on="height",
         parameters={"offset_um": Parameter("µm", -0.5, 0.5, 0.03)},
         apply=datum_offset,
         source="levelling without a reference surface",
         separating="leave bare substrate in every field",
         per_scan=True,
     ),
-    Effect(
+    of_microscope(
         name="z-gain",
         title="height calibration of the single scan",
-        stage="measurement",
-        role="measurement",
-        acts_on="height",
         parameters={"gain": Parameter("1", -0.2, 0.2, 0.02)},
         apply=z_gain,
         source="calibration of the z-scanner",
         separating=_STEP,
         per_scan=True,
     ),
-    Effect(
+    of_microscope(
         name="tilt-bow",
         title="tilt and bow of the single scan",
-        stage="measurement",
-        role="measurement",
-        acts_on="height",
         parameters={
             name: Parameter("µm", -0.5, 0.5, 0.02)
             for name in ("tilt_x_um", "tilt_y_um", "bow_xx_um", "bow_xy_um", "bow_yy_um")
@@ -88,24 +79,18 @@ EFFECTS = (
         separating=_STEP,
         per_scan=True,
     ),
-    Effect(
+    of_microscope(
         name="scan-line-stripes",
         title="height offset of every scan line",
-        stage="measurement",
-        role="measurement",
-        acts_on="height",
         parameters={"sd_um": Parameter("µm", 0.0, 0.1, 0.008)},
         apply=scan_line_stripes,
         source="drift and feedback noise between the lines of a raster scan",
         separating="scan the same field at 0 and 90 degrees",
         per_scan=True,
     ),
-    Effect(
+    of_microscope(
         name="slow-drift",
         title="creep after the scan starts",
-        stage="measurement",
-        role="measurement",
-        acts_on="height",
         parameters={name: Parameter("µm", -1.0, 1.0, 0.03) for name in CREEP_DECAYS},
         apply=slow_drift,
         source="exponential creep of the scanner; its slow part lies in the bow",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from litho_models.effects.effect import Effect, FieldContext, Parameter, Values
+from litho_models.effects.effect import FieldContext, Parameter, Values, of_microscope
 from litho_models.effects.filters import add_blur, add_warp
 
 _BLUR_REACH_UM = 4.0
@@ -59,12 +59,9 @@ def resampling_blur(height: Tensor, values: Values, context: FieldContext) -> Te
 
 
 EFFECTS = (
-    Effect(
+    of_microscope(
         name="feedback-lag",
         title="probe lagging behind the surface along the fast axis",
-        stage="measurement",
-        role="measurement",
-        acts_on="height",
         parameters={
             "length_um": Parameter("µm", 0.0, 1.5, 0.2),
             "rising": Parameter("1", 0.0, 1.0, 0.5, kind="shape"),
@@ -82,12 +79,9 @@ EFFECTS = (
         linear=True,
         reverses=("direction",),
     ),
-    Effect(
+    of_microscope(
         name="registration-residual",
         title="shift and distortion left by the registration",
-        stage="measurement",
-        role="measurement",
-        acts_on="height",
         parameters={
             name: Parameter("µm", -0.5, 0.5, 0.05)
             for name in (
@@ -100,12 +94,9 @@ EFFECTS = (
         separating="alignment marks in every field",
         per_scan=True,
     ),
-    Effect(
+    of_microscope(
         name="piezo-nonlinearity",
         title="scanner running unevenly along a line",
-        stage="measurement",
-        role="measurement",
-        acts_on="height",
         parameters={"strength": Parameter("1", -0.05, 0.05, 0.005)},
         apply=piezo_nonlinearity,
         trials=({"strength": 0.005},),
@@ -113,12 +104,9 @@ EFFECTS = (
         separating="scan a calibration grating; scan at 0 and 180 degrees",
         reverses=("strength",),
     ),
-    Effect(
+    of_microscope(
         name="resampling-blur",
         title="blur of the finished scan",
-        stage="measurement",
-        role="measurement",
-        acts_on="height",
         parameters={"variance_um2": Parameter("µm²", 0.0, 1.0, 0.0025)},
         apply=resampling_blur,
         trials=({"variance_um2": 0.0025}, {"variance_um2": 0.04}),

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from litho_models.effects.effect import Effect, FieldContext, Parameter, Values
+from litho_models.effects.effect import FieldContext, Parameter, Values, of_microscope
 
 # Cubic interpolation half-way between four neighbours.
 _MIDDLE = (-1 / 16, 9 / 16, 9 / 16, -1 / 16)
@@ -71,12 +71,9 @@ def _continued(rows: Tensor, by_px: int, mode: str) -> Tensor:
 
 
 EFFECTS = (
-    Effect(
+    of_microscope(
         name="tip-dilation",
         title="tip of finite radius widening tops",
-        stage="measurement",
-        role="measurement",
-        acts_on="height",
         parameters={"radius_um": Parameter("µm", 0.0, 2.0, 0.04)},
         apply=tip_dilation,
         trials=({"radius_um": 0.04}, {"radius_um": 0.4}),

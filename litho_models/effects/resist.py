@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from litho_models.effects.effect import Effect, FieldContext, Parameter, Values
+from litho_models.effects.effect import FieldContext, Parameter, Values, of_resist
 from litho_models.effects.filters import add_blur
 
 _BLUR_REACH_UM = 4.0
@@ -40,12 +40,9 @@ def height_saturation(height: Tensor, values: Values, context: FieldContext) -> 
 
 
 EFFECTS = (
-    Effect(
+    of_resist(
         name="diffusion-blur",
         title="reactants diffusing sideways",
-        stage="resist",
-        role="process",
-        acts_on="height",
         parameters={"variance_um2": Parameter("µm²", 0.0, 1.0, 0.01)},
         apply=diffusion_blur,
         trials=({"variance_um2": 0.01}, {"variance_um2": 0.09}),
@@ -53,12 +50,9 @@ EFFECTS = (
         separating="step edges of two heights, scanned with two pixel sizes and a new tip",
         linear=True,
     ),
-    Effect(
+    of_resist(
         name="threshold-softness",
         title="exposure threshold of the resist",
-        stage="resist",
-        role="process",
-        acts_on="height",
         parameters={
             "steepness_squared": Parameter("1", 0.0, 60.0, 2.0),
             "centre": Parameter("1", 0.05, 0.95, 0.5, kind="shape"),
@@ -68,12 +62,9 @@ EFFECTS = (
         source="Zhou 2014, the normalised projection used in the paper's Physics model",
         separating="a wide staircase of all levels",
     ),
-    Effect(
+    of_resist(
         name="height-saturation",
         title="tall structures growing less than nominal",
-        stage="resist",
-        role="process",
-        acts_on="height",
         parameters={"rate_per_um": Parameter("1/µm", 0.0, 1.0, 0.1)},
         apply=height_saturation,
         trials=({"rate_per_um": 0.1},),
