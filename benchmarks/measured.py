@@ -105,7 +105,7 @@ def main() -> None:
     for name, source in RESULTS.items():
         shutil.copyfile(runs / source, FOLDER / name)
     draw_steps(FOLDER / "close_loop_errors.csv", FOLDER / "loop_steps.png")
-    draw_prediction(runs / "store.zarr", runs / "benchmark", FOLDER / "prediction.jpg")
+    draw_prediction(runs / "store.zarr", runs / "benchmark-pbl", FOLDER / "prediction.jpg")
     written = texts(FOLDER)
     for page, names in PAGES.items():
         for name in names:

@@ -42,10 +42,13 @@ def draw_prediction(store: Path, benchmark: Path, path: Path, model: str = "pbl"
     prediction = _held_out(benchmark / "cache", model, scan.id)
     difference = 1e3 * np.where(scan.valid, scan.height_um - prediction, np.nan)
     difference -= np.nanmedian(difference)
+    measured = np.where(scan.valid, scan.height_um, np.nan)
+    # Layout and print on scales of their own: a print is lower than its layout and has a zero of its own.
+    printed = np.nanpercentile(measured, (0.1, 99.9))
     panels = [
         ("layout (µm)", scan.layout_um, "viridis", (0, 1.2)),
-        ("measured (µm)", np.where(scan.valid, scan.height_um, np.nan), "viridis", (0, 1.2)),
-        (f"{model}, not trained on this scan (µm)", prediction, "viridis", (0, 1.2)),
+        ("measured (µm)", measured, "viridis", printed),
+        (f"{model}, not trained on this scan (µm)", prediction, "viridis", printed),
         ("measured - predicted (nm)", difference, "RdBu_r", (-80, 80)),
     ]
     figure = new_figure(15, 3.9)
