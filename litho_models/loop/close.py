@@ -26,6 +26,7 @@ from litho_models.loop.identifiability import identifiability, profiles
 from litho_models.loop.nested import nest
 from litho_models.loop.parameters import is_refitted
 from litho_models.loop.prepared import by_name, prepare_scans, prepared_again
+from litho_models.loop.probes.layout import LAYOUT_FEATURES
 from litho_models.loop.screening.power import parse_injection, plant
 from litho_models.loop.selection.search import EffectSets
 from litho_models.loop.selection.weight import weigh_effects
@@ -113,7 +114,7 @@ def close_loop(
         locked=locked,
         lock_box=lock_box,
         floor_nm=noise_lower_bound_nm(development, final.predictions),
-        structure=covariate_tests(development, final.predictions)
+        structure=covariate_tests(development, choice.probed.traced.predictions)
         if choice.probed.added
         else choice.left_by_named,
         explainable=_explainable(choice, learner),
@@ -130,10 +131,11 @@ def close_loop(
 
 
 def _explainable(choice: Choice, learner: Learner) -> dict[str, Rest]:
-    """What layout and place still explain: beside the base, after each effect, and at last."""
+    """What layout and place still explain: beside the base, after each effect and all terms, and at last."""
     search = choice.search
     stages = {"base": choice.base} | {f"with {name}": after for name, (_, after) in search.steps.items()}
-    stages |= {"named effects": search.state, GENERIC_TERMS: choice.final}
+    stages |= {"named effects": search.state, GENERIC_TERMS: choice.probed.traced}
+    stages |= {LAYOUT_FEATURES: choice.final}
     rests: dict[str, Rest] = {}
     seen: list[State] = []
     for name, state in stages.items():

@@ -18,12 +18,13 @@ from litho_models.fitting.least_squares import gram_inside, orthonormal
 from litho_models.fitting.ridge import feature_rows
 from litho_models.loop.linear import ALL_FREE
 from litho_models.loop.prepared import PreparedScan
+from litho_models.loop.probes.layout import richest_features
 from litho_models.loop.probes.linear import held_out_ridge
 from litho_models.loop.probes.places import map_columns_at
 from litho_models.loop.probes.tables import FEWEST_ORDERS, ORDER_STEPS
 from litho_models.loop.selection.confirming import SMALLEST_SHARE
 from litho_models.loop.study import Study
-from litho_models.models.features import Features, FeaturesConfig, RandomFeaturesConfig
+from litho_models.models.features import Features
 from litho_models.scan_terms import Terms
 from litho_models.scoring.statistics import interval
 
@@ -33,7 +34,7 @@ _KEPT_BYTES, _MOST_ROWS = 512 * 2**20, 360
 # order or dose: height, |∂y| and |∂x|, surroundings of 1.6 µm.
 _PLACED, _VARYING = (18, 19, 20), (18, 21, 22, 7)
 
-# The last stage of a loop, by name.
+# The stage of a loop at which all is in that follows one covariate, by name.
 GENERIC_TERMS = "generic terms"
 
 
@@ -87,11 +88,7 @@ class Learner:
     def __init__(self, study: Study, predictions: Sequence[np.ndarray]):
         self._study = study
         self._predictions = list(predictions)
-        first = study.scans[0].stored
-        richest = RandomFeaturesConfig.of_variant(
-            pitch_um=first.pitch_um, level_height_um=first.level_height_um, levels=first.levels
-        )
-        model = Features(FeaturesConfig(**richest.model_dump(include=set(FeaturesConfig.model_fields))))
+        model = richest_features(study.scans[0])
         pixels = sum(len(scan.sample) for scan in study.scans)
         self._every = -(-pixels * 4 * _MOST_ROWS // _KEPT_BYTES)
         varied = [of for of in _VARIED if len({of(scan) for scan in study.scans}) >= FEWEST_ORDERS]

@@ -23,6 +23,7 @@ from litho_models.loop.gain_split import GainStep
 from litho_models.loop.identifiability import Identifiability, Profile
 from litho_models.loop.nested import HeldOut, Nested
 from litho_models.loop.prepared import PreparedScan
+from litho_models.loop.probes.layout import LAYOUT_FEATURES
 from litho_models.loop.screening.power import Planted
 from litho_models.loop.selection.weight import Weight
 from litho_models.loop.single_scans.observed import Observed
@@ -77,7 +78,7 @@ class LoopFindings(Choice):
         locked: the scans that are not in ``study``.
         lock_box: ids of the locked scans, those that cannot be used among them.
         floor_nm: lower bound of the noise, nm (root mean square, mean absolute).
-        structure: covariate tests on what is left at last.
+        structure: covariate tests on what is left beside all that follows a covariate.
         explainable: what layout and place still explain, by stage of the loop.
         weights: what each named effect gains beside its generic rivals.
         locked_scores: by name of the terms, errors of the locked scans before and after, if opened.
@@ -117,8 +118,8 @@ class LoopFindings(Choice):
 
     @property
     def rest(self) -> Rest:
-        """What layout and place still explain at last."""
-        return list(self.explainable.values())[-1]
+        """What layout and place still explain beside all that follows a covariate."""
+        return [rest for stage, rest in self.explainable.items() if stage != LAYOUT_FEATURES][-1]
 
     def errors(self, state: State, terms: Terms) -> Score:
         """Held-out errors of a state over the development scans."""

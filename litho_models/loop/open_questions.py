@@ -21,6 +21,7 @@ from litho_models.loop.linear import ALL_FREE, without_scan_terms
 from litho_models.loop.parameters import chain_at, get_vector
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.probes import AddedProbe
+from litho_models.loop.probes.layout import LAYOUT_FEATURES
 from litho_models.loop.probes.probe import Probe
 from litho_models.loop.residual_spectrum import NoiseSpectrum, residual_spectrum
 from litho_models.loop.result.questions import IN_SCAN, Doing, OpenQuestions, Question, Rival, Turning
@@ -96,7 +97,8 @@ def _of_named(
     text = f"which of these it is: {names}" if members else f"whose it is: {names}"
     texts = [get_effect(member).separating for member in (name, *members)]
     # Rivals are judged without generic terms.
-    rests = [rest for stage, rest in findings.explainable.items() if stage != GENERIC_TERMS]
+    terms = (GENERIC_TERMS, LAYOUT_FEATURES)
+    rests = [rest for stage, rest in findings.explainable.items() if stage not in terms]
     return [
         Question(
             name=name,

@@ -55,10 +55,10 @@ class DisplacedCopy:
         """(y, x, amount) without each fold and the gain of each scan by those that have not seen it."""
         return self._held_out(self.scores, fold_of)
 
-    def control(self, fold_of: np.ndarray, random: np.random.Generator) -> float:
-        """Mean held-out gain, nm², of the same search with the residual of each scan upside down or not."""
-        signs = random.choice([-1.0, 1.0], size=(len(self.scores), 1))
-        return self._held_out(signs * self.scores, fold_of).mean_gain_nm2
+    def controls(self, fold_of: np.ndarray, random: np.random.Generator, count: int) -> np.ndarray:
+        """Mean held-out gains (count,), nm², with the residual of each scan upside down or not."""
+        signs = random.choice([-1.0, 1.0], size=(count, len(self.scores), 1))
+        return np.array([self._held_out(one * self.scores, fold_of).mean_gain_nm2 for one in signs])
 
     def agreement(self) -> float:
         """Ratio of the amounts that two halves of the scans find at one place; 0 at two places."""

@@ -70,8 +70,11 @@ class MissingKernel:
         per_fold = np.stack([kernel.ravel() for kernel in kernels])
         return Estimate(common=common, per_fold=per_fold, gains_nm2=gains)
 
-    def control(self, fold_of: np.ndarray, random: np.random.Generator) -> float:
-        """Mean held-out gain, nm², with every residual next to the layout of another scan."""
+    def controls(self, fold_of: np.ndarray, random: np.random.Generator, count: int) -> np.ndarray:
+        """Mean held-out gains (count,), nm², with every residual next to the layout of another scan."""
+        return np.array([self._control(fold_of, random) for _ in range(count)])
+
+    def _control(self, fold_of: np.ndarray, random: np.random.Generator) -> float:
         count = len(self.layouts)
         other = (np.arange(count) + random.integers(1, count)) % count
         signs = random.choice([-1.0, 1.0], size=(count, 1, 1))

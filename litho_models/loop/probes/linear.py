@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,7 @@ _IDLE = 1e-6
 
 Summary = Callable[[np.ndarray], dict[str, tuple[float, str]]]
 ColumnsOf = Callable[[PreparedScan, np.ndarray], np.ndarray]
+MapOf = Callable[[np.ndarray, PreparedScan, np.ndarray], np.ndarray]
 Shuffle = Callable[[np.random.Generator, int], np.ndarray]
 
 
@@ -41,7 +43,7 @@ class LinearProbe:
     """Residual = columns · coefficients, the same coefficients for all scans.
 
     Attributes:
-        columns_of: (scan, prediction (y, x) µm) -> maps (m, y, x).
+        map_of: (coefficients (m,), scan, prediction (y, x) µm) -> height to add (y, x), µm.
         penalty: (m, m), what a ridge fit keeps small.
         shuffle: (generator, m) -> order of the columns of one scan under the probe's control; None turns the
             residual of a scan upside down or not.
@@ -51,7 +53,7 @@ class LinearProbe:
     """
 
     name: str
-    columns_of: ColumnsOf
+    map_of: MapOf
     penalty: np.ndarray
     shuffle: Shuffle | None
     summary: Summary
@@ -67,15 +69,18 @@ class LinearProbe:
         """Coefficients without each fold, and the gain of each scan by those that have not seen it."""
         return held_out_ridge(self.grams, self.rights, self.pixels, self.penalty, fold_of)
 
-    def control(self, fold_of: np.ndarray, random: np.random.Generator) -> float:
-        """Mean held-out gain, nm², after the columns or the sign of every scan were shuffled on their own."""
+    def controls(self, fold_of: np.ndarray, random: np.random.Generator, count: int) -> np.ndarray:
+        """Mean held-out gains (count,), nm², after the columns or the sign of every scan were shuffled."""
         if self.shuffle is None:
-            signs = random.choice([-1.0, 1.0], size=(len(self.rights), 1))
-            mixed = signs * self.rights
-            return held_out_ridge(self.grams, mixed, self.pixels, self.penalty, fold_of).mean_gain_nm2
+            signs = random.choice([-1.0, 1.0], size=(count, *self.pixels.shape, 1))
+            per_scan = _without_each_fold(self.grams, signs * self.rights, self.penalty, fold_of)[1]
+            return (per_scan / self.pixels * NM_PER_UM**2).mean(axis=-1)
+        return np.array([self._shuffled(self.shuffle, fold_of, random) for _ in range(count)])
+
+    def _shuffled(self, shuffle: Shuffle, fold_of: np.ndarray, random: np.random.Generator) -> float:
         grams, rights = np.empty_like(self.grams), np.empty_like(self.rights)
         for scan in range(len(grams)):
-            order = self.shuffle(random, len(self.penalty))
+            order = shuffle(random, len(self.penalty))
             grams[scan], rights[scan] = self.grams[scan][np.ix_(order, order)], self.rights[scan][order]
         return held_out_ridge(grams, rights, self.pixels, self.penalty, fold_of).mean_gain_nm2
 
@@ -91,7 +96,7 @@ class LinearProbe:
 
     def correction(self, parameters: np.ndarray, scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
         """Height to add (y, x), µm."""
-        return np.tensordot(parameters, self.columns_of(scan, prediction), axes=1).astype(np.float32)
+        return self.map_of(parameters, scan, prediction).astype(np.float32)
 
 
 def linear_probe(
@@ -102,19 +107,47 @@ def linear_probe(
     summary: Summary,
     left: Left,
 ) -> LinearProbe:
-    """Measure a probe's inner products with the residual on the sampled pixels."""
+    """A probe whose columns are maps: ``columns_of``: (scan, prediction (y, x) µm) -> maps (m, y, x)."""
+    rows_of, map_of = partial(_sampled, columns_of=columns_of), partial(_mixed, columns_of=columns_of)
+    return probe_of_rows(name, rows_of, map_of, penalty, shuffle, summary, left)
+
+
+def probe_of_rows(
+    name: str,
+    rows_of: ColumnsOf,
+    map_of: MapOf,
+    penalty: np.ndarray,
+    shuffle: Shuffle | None,
+    summary: Summary,
+    left: Left,
+) -> LinearProbe:
+    """Measure a probe's inner products with the residual on the sampled pixels.
+
+    Args:
+        rows_of: (scan, prediction (y, x) µm) -> columns at the sampled pixels (m, n).
+        map_of: as of the probe.
+    """
     grams, rights = [], []
     for scan, prediction, use in zip(*left, strict=True):
-        maps = columns_of(scan, prediction)
-        columns = np.stack([scan.at_sample(m) for m in maps] + [scan.height - scan.at_sample(prediction)])
-        columns = columns[:, use].T
+        residual = scan.height - scan.at_sample(prediction)
+        columns = np.vstack([rows_of(scan, prediction), residual])[:, use].T
         basis = orthonormal(scan.terms_at_sample(prediction, ALL_FREE)[:, use].T)
         columns -= basis @ (basis.T @ columns)
         products = columns.T @ columns
         grams.append(products[:-1, :-1])
         rights.append(products[:-1, -1])
     pixels = np.array([use.sum() for use in left.kept])
-    return LinearProbe(name, columns_of, penalty, shuffle, summary, np.stack(grams), np.stack(rights), pixels)
+    return LinearProbe(name, map_of, penalty, shuffle, summary, np.stack(grams), np.stack(rights), pixels)
+
+
+def _sampled(scan: PreparedScan, prediction: np.ndarray, columns_of: ColumnsOf) -> np.ndarray:
+    return np.stack([scan.at_sample(column) for column in columns_of(scan, prediction)])
+
+
+def _mixed(
+    coefficients: np.ndarray, scan: PreparedScan, prediction: np.ndarray, columns_of: ColumnsOf
+) -> np.ndarray:
+    return np.tensordot(coefficients, columns_of(scan, prediction), axes=1)
 
 
 def second_differences(count: int) -> np.ndarray:
@@ -133,45 +166,62 @@ def held_out_ridge(
         penalty: (m, m), what is kept small; how much is chosen inside the training folds.
         fold_of: (scans,).
     """
-    folds = np.arange(int(fold_of.max()) + 1)
-    fold_grams, fold_rights = (
-        np.stack([part[fold_of == fold].sum(axis=0) for fold in folds]) for part in (grams, rights)
-    )
-    per_fold = [_best_ridge(fold_grams[folds != f], fold_rights[folds != f], penalty) for f in folds]
-    gains = np.array(
-        [_gain(gram, right, per_fold[f]) for gram, right, f in zip(grams, rights, fold_of, strict=True)]
-    )
+    per_fold, gains = _without_each_fold(grams, rights, penalty, fold_of)
+    fold_grams, fold_rights = _by_fold(grams, fold_of), _by_fold(rights, fold_of)
     return Estimate(
         common=_best_ridge(fold_grams, fold_rights, penalty),
-        per_fold=np.stack(per_fold),
+        per_fold=per_fold,
         gains_nm2=gains / pixels * NM_PER_UM**2,
     )
 
 
-def _best_ridge(grams: np.ndarray, rights: np.ndarray, penalty: np.ndarray) -> np.ndarray:
-    """The ridge whose fits without a fold do best on that fold, then fitted on all of them."""
-    gram, right = grams.sum(axis=0), rights.sum(axis=0)
-    others = [(gram - own_gram, right - own_right) for own_gram, own_right in zip(grams, rights, strict=True)]
-    ridges = RIDGES if len(grams) > 1 else RIDGES[:1]
-    totals = sum(
-        np.array([_gain(own_gram, own_right, one) for one in _ridge(*kept, penalty, ridges)])
-        for own_gram, own_right, kept in zip(grams, rights, others, strict=True)
+def _without_each_fold(
+    grams: np.ndarray, rights: np.ndarray, penalty: np.ndarray, fold_of: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Coefficients (folds, ..., m) without each fold, their gains (..., scans); rights: (..., scans, m)."""
+    fold_grams, fold_rights = _by_fold(grams, fold_of), _by_fold(rights, fold_of, axis=-2)
+    folds = np.arange(len(fold_grams))
+    per_fold = np.stack(
+        [_best_ridge(fold_grams[folds != f], fold_rights[..., folds != f, :], penalty) for f in folds]
     )
-    return _ridge(gram, right, penalty, (ridges[int(np.argmax(totals))],))[0]
+    gains = [_gain(gram, rights[..., i, :], per_fold[fold_of[i]]) for i, gram in enumerate(grams)]
+    return per_fold, np.stack(gains, axis=-1)
+
+
+def _by_fold(part: np.ndarray, fold_of: np.ndarray, axis: int = 0) -> np.ndarray:
+    """Sums over the scans of each fold."""
+    folds = range(int(fold_of.max()) + 1)
+    return np.stack([part.compress(fold_of == fold, axis).sum(axis) for fold in folds], axis)
+
+
+def _best_ridge(grams: np.ndarray, rights: np.ndarray, penalty: np.ndarray) -> np.ndarray:
+    """The ridges (..., m) whose fits without a fold do best on that fold, then fitted on all of them."""
+    gram, right = grams.sum(axis=0), rights.sum(axis=-2)
+    ridges = RIDGES if len(grams) > 1 else RIDGES[:1]
+    totals = np.zeros((len(ridges), *right.shape[:-1]))
+    for fold, own in enumerate(grams):
+        own_right = rights[..., fold, :]
+        totals += _gain(own, own_right, _ridge(gram - own, right - own_right, penalty, ridges))
+    best = np.argmax(totals, axis=0)
+    return np.take_along_axis(_ridge(gram, right, penalty, ridges), best[None, ..., None], axis=0)[0]
 
 
 def _ridge(gram: np.ndarray, right: np.ndarray, penalty: np.ndarray, ridges: Sequence[float]) -> np.ndarray:
-    """Coefficients (ridges, m)."""
+    """Coefficients (ridges, ..., m) for right-hand sides (..., m)."""
     information = np.diag(gram)
     known = information > _IDLE * max(information.max(), np.finfo(float).tiny)
     own = np.ix_(known, known)
     scale = information[known].mean() / max(np.diag(penalty)[known].mean(), np.finfo(float).tiny)
     # Every penalty has some weight on the size, so that the system has one solution.
-    coefficients = np.zeros((len(ridges), len(right)))
     systems = gram[own] + scale * np.array(ridges)[:, None, None] * penalty[own]
-    coefficients[:, known] = np.linalg.solve(systems, right[known][:, None])[..., 0]
+    wanted = right[..., known].reshape(-1, known.sum())
+    coefficients = np.zeros((len(ridges), *right.shape))
+    coefficients[..., known] = (
+        np.linalg.solve(systems, wanted.T).swapaxes(1, 2).reshape(len(ridges), *right.shape[:-1], -1)
+    )
     return coefficients
 
 
-def _gain(gram: np.ndarray, right: np.ndarray, coefficients: np.ndarray) -> float:
-    return float(2 * coefficients @ right - coefficients @ gram @ coefficients)
+def _gain(gram: np.ndarray, right: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+    """Gains (...) of coefficients (..., m)."""
+    return (coefficients * (2 * right - coefficients @ gram)).sum(axis=-1)

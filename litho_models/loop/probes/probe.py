@@ -56,8 +56,8 @@ class Probe(Protocol):
     def held_out(self, fold_of: np.ndarray) -> Estimate:
         """Fit without each fold; ``fold_of``: (scans,)."""
 
-    def control(self, fold_of: np.ndarray, random: np.random.Generator) -> float:
-        """Mean held-out gain, nm², of the same fit where there can be nothing to find."""
+    def controls(self, fold_of: np.ndarray, random: np.random.Generator, count: int) -> np.ndarray:
+        """Mean held-out gains (count,), nm², of the same fit where there can be nothing to find."""
 
     def agreement(self) -> float:
         """Correlation of what two disjoint halves of the scans ask for."""

@@ -13,6 +13,7 @@ from litho_models.loop.probes.defects import Defects, find_defects
 from litho_models.loop.probes.displaced import displaced_copy
 from litho_models.loop.probes.far import far_response
 from litho_models.loop.probes.kernel import missing_kernel
+from litho_models.loop.probes.layout import LAYOUT_FEATURES, layout_features
 from litho_models.loop.probes.linear import Left
 from litho_models.loop.probes.places import position_map, profile
 from litho_models.loop.probes.probe import Estimate, Probe
@@ -62,9 +63,14 @@ class AddedProbe:
 
 @dataclass(frozen=True)
 class Probed:
-    """What the probes found; ``state`` has the chain's fits and the corrected held-out predictions."""
+    """What the probes found.
+
+    ``state`` has the chain's fits and the corrected held-out predictions; ``traced`` has them without the
+    features of the layout, which trace the residual to nothing.
+    """
 
     state: State
+    traced: State
     added: list[AddedProbe]
     tests: list[ProbeTest]
     defects: Defects
@@ -87,16 +93,23 @@ def probe_residual(state: State, study: Study, terms: Terms) -> Probed:
     trends = order_trends(study.scans, state.predictions, study.seed)
     added: list[AddedProbe] = []
     tests: dict[str, ProbeTest] = {}
-    while True:
-        taken = {entry.probe.name for entry in added}
-        open_names = [name for name in GENERIC if name not in taken]
-        candidates = list(generic_terms(study.scans, state.predictions, defects, open_names))
+
+    def add_best(names: Sequence[str]) -> bool:
+        """Take the best of these terms into the state; whether one passed."""
+        nonlocal state
+        candidates = list(generic_terms(study.scans, state.predictions, defects, names))
         found = _best(candidates, state, study, terms, tests)
-        if found is None:
-            break
-        entry, state = found
-        added.append(entry)
-    return Probed(state, added, list(tests.values()), defects, trends)
+        if found is not None:
+            entry, state = found
+            added.append(entry)
+        return found is not None
+
+    open_names = list(GENERIC)
+    while add_best(open_names):
+        open_names.remove(added[-1].probe.name)
+    traced = state
+    add_best(list(_LAST))
+    return Probed(state, traced, added, list(tests.values()), defects, trends)
 
 
 def generic_terms(
@@ -108,10 +121,12 @@ def generic_terms(
     """Probes, one by one, measured on the residual of these held-out predictions.
 
     Args:
-        names: those wanted, of ``GENERIC``; all by default. One that these scans do not allow is left out.
+        names: those wanted, ``layout-features`` or of ``GENERIC``; all of these by default. One that these
+            scans do not allow is left out.
     """
+    makers = GENERIC | _LAST
     for name in GENERIC if names is None else names:
-        probe = GENERIC[name](scans, predictions, defects.masks)
+        probe = makers[name](scans, predictions, defects.masks)
         if probe is not None:
             yield probe
 
@@ -154,6 +169,8 @@ GENERIC: dict[str, Maker] = {
     "displaced-copy": displaced_copy,
     "far-response": _on_samples(far_response),
 }
+# No rival of a name: it contains every cause that follows the layout.
+_LAST: dict[str, Maker] = {LAYOUT_FEATURES: _on_samples(layout_features)}
 
 
 def _best(
@@ -179,7 +196,7 @@ def _best(
             continue
         study.report(f"probing with {probe.name}")
         random = np.random.default_rng([study.seed, 7])
-        controls = np.array([probe.control(fold_of, random) for _ in range(CONTROLS)])
+        controls = probe.controls(fold_of, random, CONTROLS)
         limit = float(np.quantile(controls, CONTROL_QUANTILE))
         agreement = probe.agreement()
         extended = _with_probe(state, study, probe, estimate)

@@ -13,6 +13,7 @@ from litho_models.evaluation.tables import interval_text
 from litho_models.loop import equal_terms
 from litho_models.loop.equal_terms import TermSet
 from litho_models.loop.findings import LoopFindings
+from litho_models.loop.probes.layout import LAYOUT_FEATURES
 from litho_models.loop.report.plots import (
     OF_SHAPES,
     curve_figure,
@@ -289,6 +290,9 @@ def _probe_section(page: Page, findings: LoopFindings) -> None:
     probed = findings.probed
     page.heading("What has no name", folded=True)
     for entry in probed.added:
+        if entry.probe.name == LAYOUT_FEATURES:
+            # Hundreds of features that stand for each other: no picture.
+            continue
         letters = " h: share of the full height, y and x: slopes." if entry.probe.name in OF_SHAPES else ""
         page.figure(
             probe_figure(entry),

@@ -9,6 +9,7 @@ from litho_models.effects import get_effect
 from litho_models.frozen.readme import bounds_text
 from litho_models.loop.findings import LoopFindings
 from litho_models.loop.probes.far import in_words
+from litho_models.loop.probes.layout import LAYOUT_FEATURES
 from litho_models.loop.result.record import AddedEffect, CloseLoop, EqualTerms, NestedResult, Part
 from litho_models.loop.selection.confirming import FEWEST_SCANS
 from litho_models.scoring.pairs import OverUnits
@@ -180,11 +181,14 @@ def plain_words(findings: LoopFindings, result: CloseLoop) -> list[str]:
         parts.append("No named effect of the printer is confirmed as missing from the model.")
     for e in traced:
         far = e.name == "far-response"
+        says = "it says where the rest lives, not why"
+        if e.name == LAYOUT_FEATURES:
+            says = "what is left follows the layout, in a way that no covariate shows"
         follows = f", {in_words({k: p.value for k, p in e.parameters.items()})}," if far else ""
         parts.append(
             f"A generic term [{e.name}]{follows} lowers the held-out error from {e.before_nm:.2f} to "
-            f"{e.after_nm:.2f} nm in {e.scans_improved[0]} of {e.scans_improved[1]} scans: it says where the "
-            "rest lives, not why, and design does not use it."
+            f"{e.after_nm:.2f} nm in {e.scans_improved[0]} of {e.scans_improved[1]} scans: "
+            f"{says}, and design does not use it."
         )
     if result.residual.state == "unexplained":
         parts.append(f"What is left is still structured: {result.residual.signature}.")

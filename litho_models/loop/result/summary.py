@@ -17,6 +17,7 @@ from litho_models.loop.equal_terms import BeforeAfter, TermSet
 from litho_models.loop.findings import LoopFindings
 from litho_models.loop.nested import Nested
 from litho_models.loop.parameters import at_bounds
+from litho_models.loop.probes.layout import LAYOUT_FEATURES
 from litho_models.loop.result.added_effects import added_effects
 from litho_models.loop.result.candidates import all_candidates
 from litho_models.loop.result.exporting import part_of
@@ -68,7 +69,7 @@ def summarise(findings: LoopFindings, *, dataset: DatasetId, base_name: str, dro
     unexplained = _signature(findings)
     fewest = max(FEWEST_SCANS, fewest_scans_for_structure(len(findings.structure)))
     verdict: Verdict = "nothing-missing"
-    if any(e.verdict != "partial" for e in tested):
+    if any(e.verdict != "partial" and e.name != LAYOUT_FEATURES for e in tested):
         verdict = "traced"
     elif tested or unexplained:
         verdict = "unexplained"
@@ -117,7 +118,7 @@ def _signature(findings: LoopFindings) -> str:
         f"follows {t.name} (p = {t.p:.4f}, {100 * t.share:.1f} % of the squared error)"
         for t in sorted(findings.structured, key=lambda t: -t.share)
     ]
-    if findings.rest.matters:
+    if findings.rest.matters or findings.probed.state is not findings.probed.traced:
         parts.append(f"layout and place explain {100 * findings.rest.share:.1f} % of the squared error")
     if (blobs := findings.probed.defects.share_of_squares) > SMALLEST_SHARE:
         parts.append(f"localised defects hold {100 * blobs:.1f} % of the squared error")
