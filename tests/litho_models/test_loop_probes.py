@@ -18,6 +18,8 @@ from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.loop.probes import Probed, probe_residual, with_intervals
 from litho_models.loop.probes.defects import find_defects
 from litho_models.loop.probes.kernel import missing_kernel, off_centre_peak, resampled
+from litho_models.loop.probes.layout import LAYOUT_FEATURES, _rows, layout_features
+from litho_models.loop.probes.linear import Left, held_out_ridge
 from litho_models.loop.probes.places import PROFILE_SPLINES, SPLINES, _over, drawn, drawn_profile, shifts
 from litho_models.loop.probes.selection import GENERIC, SMALLEST_AGREEMENT, _anchor, _corrected, generic_terms
 from litho_models.loop.probes.tables import SPOT_UM
@@ -160,6 +162,55 @@ def test_a_jump_over_the_rows_is_seen() -> None:
 
     found = probed(*scene(jump))
     assert found.added[0].probe.name == "row-profile"
+
+
+@pytest.mark.slow
+def test_a_law_without_a_covariate_is_left_to_the_features_of_the_layout() -> None:
+    """Height where a ring of 0.8 to 1.6 µm differs from its inside: what a pixel has itself holds half."""
+
+    def ringed(scan: PreparedScan) -> np.ndarray:
+        layout, pitch_um = scan.stored.layout_um, scan.stored.pitch_um
+        return 1.5 * (gaussian_filter(layout, 0.8 / pitch_um) - gaussian_filter(layout, 1.6 / pitch_um)) ** 2
+
+    scans, predictions = scene(ringed)
+    found = probed(scans, predictions)
+    assert found.added[-1].probe.name == LAYOUT_FEATURES
+    study = Study(scans, FOLD_OF, floor_nm2=(1e3 * NOISE_UM) ** 2)
+    planted, traced, after = (
+        state.score(study, ALL_FREE).mse_nm2.mean() - study.floor_nm2
+        for state in (replace(found.state, predictions=predictions), found.traced, found.state)
+    )
+    # Above the noise 681, 357 and 92 nm²: the terms before it leave half, it takes three quarters of that.
+    assert traced > 0.4 * planted
+    assert after < 0.4 * traced
+
+
+def test_the_features_are_the_same_at_the_sampled_pixels_and_over_the_field() -> None:
+    """A correction is made by tiles, with the scale of its columns taken out again."""
+    scans, predictions = scene()
+    probe = layout_features(Left(scans, predictions, [np.ones(len(f.sample), bool) for f in scans]))
+    assert probe is not None
+    size = len(probe.penalty)
+    coefficients = np.random.default_rng(0).normal(size=size)
+    for scan, prediction in list(zip(scans, predictions, strict=True))[:2]:
+        rows = _rows(scan, prediction, **probe.map_of.keywords)  # type: ignore[attr-defined]
+        whole = scan.at_sample(probe.correction(coefficients, scan, prediction))
+        # 216 terms of up to 22, rounded to 2^-24 of their size: 216 · 22 · 2^-24.
+        assert whole == pytest.approx(coefficients @ rows, abs=size * np.abs(rows).max() * 2**-24)
+
+
+def test_controls_are_the_fits_of_residuals_upside_down() -> None:
+    """All draws at once, by one factor of each system, as one after another."""
+    scans, predictions = scene(lambda scan: 0.05 * gaussian_filter(scan.stored.layout_um, 3))
+    defects = find_defects(scans, predictions)
+    (probe,) = generic_terms(scans, predictions, defects, ["level-table"])
+    signs = np.random.default_rng(5).choice([-1.0, 1.0], size=(4, COUNT, 1))
+    one_by_one = [
+        held_out_ridge(probe.grams, s * probe.rights, probe.pixels, probe.penalty, FOLD_OF).mean_gain_nm2
+        for s in signs
+    ]
+    probe = replace(probe, shuffle=None)
+    assert probe.controls(FOLD_OF, np.random.default_rng(5), 4) == pytest.approx(one_by_one, rel=1e-9)
 
 
 @pytest.mark.slow

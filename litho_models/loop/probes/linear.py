@@ -210,12 +210,14 @@ def _ridge(gram: np.ndarray, right: np.ndarray, penalty: np.ndarray, ridges: Seq
     """Coefficients (ridges, ..., m) for right-hand sides (..., m)."""
     information = np.diag(gram)
     known = information > _IDLE * max(information.max(), np.finfo(float).tiny)
+    coefficients = np.zeros((len(ridges), *right.shape))
+    if not known.any():
+        return coefficients
     own = np.ix_(known, known)
     scale = information[known].mean() / max(np.diag(penalty)[known].mean(), np.finfo(float).tiny)
     # Every penalty has some weight on the size, so that the system has one solution.
     systems = gram[own] + scale * np.array(ridges)[:, None, None] * penalty[own]
     wanted = right[..., known].reshape(-1, known.sum())
-    coefficients = np.zeros((len(ridges), *right.shape))
     coefficients[..., known] = (
         np.linalg.solve(systems, wanted.T).swapaxes(1, 2).reshape(len(ridges), *right.shape[:-1], -1)
     )
