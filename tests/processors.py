@@ -2,7 +2,8 @@
 
     python tests/processors.py [--all] [native] [avx2] [avx512]
 
-Without names as all of them; with --all every test, not only those of numerics that are quick.
+Without names as all of them; with --all every test, not only those of numerics that are quick. What this
+processor is anyway is not played where the tests run as it is.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import os
 import subprocess
 import sys
 import time
+from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,14 +23,18 @@ _QUICK = ["-m", "numerics and not slow and not long"]
 
 
 class Processor(NamedTuple):
-    """What a processor must be able to do to play another, and what makes the libraries play it."""
+    """What a processor must be able to do to play another, and what makes the libraries play it.
+
+    ``beyond``: what it lacks. A processor that lacks it too is the other one, as far as the numbers go.
+    """
 
     capability: str
     environment: dict[str, str]
+    beyond: tuple[str, ...]
 
 
 PROCESSORS = {
-    "native": Processor("", {}),
+    "native": Processor("", {}, ()),
     "avx2": Processor(
         "avx2",
         {
@@ -39,6 +45,7 @@ PROCESSORS = {
             # Else Numba takes the features of this processor under the name of the other.
             "NUMBA_CPU_FEATURES": "",
         },
+        ("avx512_f", "avx_ne_convert"),
     ),
     # Without the bfloat16 unit, which oneDNN then replaces by arithmetic in float32.
     "avx512": Processor(
@@ -50,6 +57,7 @@ PROCESSORS = {
             "NUMBA_CPU_NAME": "skylake-avx512",
             "NUMBA_CPU_FEATURES": "",
         },
+        ("avx512_bf16", "amx_bf16"),
     ),
 }
 
@@ -58,6 +66,16 @@ def can_play(name: str) -> bool:
     """Whether this processor knows the instructions of the other."""
     capability = PROCESSORS[name].capability
     return not capability or bool(torch.cpu.get_capabilities().get(capability))
+
+
+def why_left_out(name: str, beside: Collection[str]) -> str:
+    """Why the tests do not run as this processor, beside those; empty where they do."""
+    if not can_play(name):
+        return "this processor has other instructions"
+    known = torch.cpu.get_capabilities()
+    if name != "native" and "native" in beside and not any(known.get(one) for one in PROCESSORS[name].beyond):
+        return "this processor is one, see native"
+    return ""
 
 
 def main(arguments: list[str]) -> int:
@@ -70,9 +88,10 @@ def main(arguments: list[str]) -> int:
         print(f"processors: got {got}, wanted {wanted}", file=sys.stderr)
         return 2
     outcomes = []
-    for name in names or PROCESSORS:
-        if not can_play(name):
-            outcomes.append((name, "left out: this processor has other instructions"))
+    names = names or list(PROCESSORS)
+    for name in names:
+        if reason := why_left_out(name, names):
+            outcomes.append((name, f"left out: {reason}"))
             continue
         print(f"== {what}, {name}", flush=True)
         started = time.perf_counter()

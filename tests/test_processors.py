@@ -34,3 +34,13 @@ def test_a_played_processor_uses_its_own_instructions(name, vectors_of_16, tmp_p
 def test_an_unknown_processor_is_refused(capsys):
     assert processors.main(["avx3"]) == 2
     assert "wanted native, avx2, avx512" in capsys.readouterr().err
+
+
+def test_what_this_processor_is_anyway_is_played_only_where_the_tests_do_not_run_as_it_is(monkeypatch):
+    monkeypatch.setattr("torch.cpu.get_capabilities", lambda: {"avx2": True, "avx512_f": False})
+    assert processors.why_left_out("avx2", ["native", "avx2"]) == "this processor is one, see native"
+    assert not processors.why_left_out("avx2", ["avx2", "avx512"])
+    assert processors.why_left_out("avx512", ["avx2", "avx512"]) == "this processor has other instructions"
+    able = {"avx2": True, "avx512_f": True, "avx512_bf16": True}
+    monkeypatch.setattr("torch.cpu.get_capabilities", lambda: able)
+    assert not any(processors.why_left_out(name, processors.PROCESSORS) for name in processors.PROCESSORS)
