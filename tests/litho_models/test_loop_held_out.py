@@ -52,12 +52,14 @@ def test_a_contest_takes_nobody_on_whom_the_training_sets_do_not_agree(errors, w
         for s, e in zip(screened, errors, strict=True)
     ]
     passed = SimpleNamespace(confirmation=SimpleNamespace(passed=True, reason=""))
+    held_out, from_held_out = [np.zeros(3)], object()
     replaced = {
-        "held_out_residuals": lambda *_: [],
-        "measure_directions": lambda *_: None,
-        "screen": lambda *_: screened,
+        "held_out_residuals": lambda *_: held_out,
+        # Candidates are screened by what the fits that have not seen a scan leave of it, and by nothing else.
+        "measure_directions": lambda _, __, residuals, ___: from_held_out if residuals is held_out else None,
+        "screen": lambda directions, _: screened if directions is from_held_out else [],
         "is_eligible": lambda *_: True,
-        "shortlist": lambda *_: (screened, []),
+        "shortlist": lambda _, remaining, __: (remaining, []),
         "_fitted": lambda _, entering, __: [e for e in entrants if e.screened in entering],
         # Changes of different shape: nobody stands for anybody else.
         "_changes": lambda _, state, __: [np.eye(2)[[e.state for e in entrants].index(state)]],
