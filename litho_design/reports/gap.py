@@ -45,7 +45,7 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
     page.verdict(_verdict(result, shown[0]))
     judged = _judged(folder, result, printers)
     page.figure(
-        _pictures(result, judged),
+        _pictures(judged),
         f"Seed {result.seeds[0]}. Rows: designed with; columns: printed by. "
         + (
             "Square root of the PSF over its peak." if result.task.startswith("lens-") else "Scaled to match."
@@ -153,7 +153,7 @@ def _judged(
     return images
 
 
-def _pictures(result: GapResult, judged: dict[str, tuple[LoadedDesign, dict[str, np.ndarray]]]):
+def _pictures(judged: dict[str, tuple[LoadedDesign, dict[str, np.ndarray]]]):
     images, titles, side_um = [], [], 0.0
     for arm, (loaded, by_judge) in judged.items():
         images.append([loaded.display(image) for image in by_judge.values()])

@@ -26,9 +26,8 @@ def term_sets(accepted: Terms) -> dict[TermSet, Terms]:
 
 def scores(choice: Choice) -> dict[TermSet, BeforeAfter]:
     """Held-out errors of the scans that were chosen on, each by the fits that have not seen it."""
-    states = choice.base, choice.final
     return {
-        name: (states[0].score(choice.study, terms), states[1].score(choice.study, terms))
+        name: (choice.base.score(choice.study, terms), choice.final.score(choice.study, terms))
         for name, terms in term_sets(choice.terms).items()
     }
 

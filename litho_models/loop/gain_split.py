@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from litho_models.loop.choice import Choice, passed
 from litho_models.loop.probes.selection import with_generic_terms
 from litho_models.loop.selection.search import EffectSets
-from litho_models.loop.study import DATUM_FREE, Correction, State, Study, names_to_terms
+from litho_models.loop.study import DATUM_FREE, State, names_to_terms
 from litho_models.scan_terms import Terms
 
 
@@ -65,21 +65,14 @@ def split_gain(choice: Choice, fitted: EffectSets) -> list[GainStep]:
         model = fitted.state(search.names[: at + 1])
         rest = fitted.without(name)
         steps.append((name, model, freed, with_generic_terms(rest, study, probes), choice.terms))
-    for at, name in enumerate(probes):
+    corrected = search.state
+    for name, correct in zip(probes, final.corrections, strict=True):
         study.report(f"what {name} gains")
-        model = _corrected(search.state, final.corrections[: at + 1], study)
+        model = corrected = corrected.with_correction(correct, study)
         others = [other for other in probes if other != name]
         steps.append((name, model, freed, with_generic_terms(search.state, study, others), choice.terms))
     free(late)
     return _measured(choice, steps)
-
-
-def _corrected(state: State, corrections: Sequence[Correction], study: Study) -> State:
-    maps = state.predictions
-    for correct in corrections:
-        held_out = zip(study.fold_of, study.scans, maps, strict=True)
-        maps = [correct(int(fold), scan, prediction) for fold, scan, prediction in held_out]
-    return State(state.fits, maps, tuple(corrections))
 
 
 def _measured(choice: Choice, steps: Sequence[tuple[str, State, Terms, State, Terms]]) -> list[GainStep]:

@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.linear import without_scan_terms
 from litho_models.loop.prepared import PreparedScan
-from litho_models.scoring.statistics import sign_flip_statistics, smallest_flip_p
+from litho_models.scoring.statistics import family_wise_p, sign_flip_statistics, smallest_flip_p
 
 BINS = 8
 # Cells of the scan along y and along x.
@@ -150,4 +150,4 @@ def _joint_p(sums: np.ndarray) -> float:
     if informative.shape[1] == 0:
         return 1.0
     z, null_max = sign_flip_statistics(informative)
-    return float(np.mean(null_max >= np.abs(z).max() * (1 - 1e-9)))
+    return family_wise_p(float(np.abs(z).max()), null_max)

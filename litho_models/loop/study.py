@@ -151,6 +151,12 @@ class State:
             prediction = correction(fold, scan, prediction)
         return prediction
 
+    def with_correction(self, correct: Correction, study: Study) -> State:
+        """The state with one more correction, its held-out predictions corrected each by its own fold."""
+        held_out = zip(study.fold_of, study.scans, self.predictions, strict=True)
+        corrected = [correct(int(fold), scan, prediction) for fold, scan, prediction in held_out]
+        return State(self.fits, corrected, (*self.corrections, correct))
+
     def score(self, study: Study, terms: Terms) -> Score:
         """Held-out errors over the scans of the study that the state belongs to."""
         key = study.background, terms

@@ -16,7 +16,7 @@ from scipy.signal import fftconvolve
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.prepared import PreparedScan
-from litho_models.loop.probes.probe import Estimate
+from litho_models.loop.probes.probe import Estimate, sums_by_fold
 from litho_models.scan_terms import POLICIES, TermPixels, Terms, least_squares, term_maps
 
 SUPPORT_UM = 5.0
@@ -59,7 +59,7 @@ class MissingKernel:
     def held_out(self, fold_of: np.ndarray) -> Estimate:
         """Kernels (flattened, support cut) without each fold and their gain on each held-out scan."""
         cross, power = np.conj(self.layouts) * self.residuals, np.abs(self.layouts) ** 2
-        sums = _by_fold(cross, fold_of), _by_fold(power, fold_of)
+        sums = sums_by_fold(cross, fold_of), sums_by_fold(power, fold_of)
         choice = self._regularisation(*sums)
         kernels = self._without_each(*sums, choice)
         gains = np.zeros(len(cross))
@@ -79,7 +79,7 @@ class MissingKernel:
         other = (np.arange(count) + random.integers(1, count)) % count
         signs = random.choice([-1.0, 1.0], size=(count, 1, 1))
         cross = np.conj(self.layouts[other]) * self.residuals * signs.astype(np.float32)
-        sums = _by_fold(cross, fold_of), _by_fold(np.abs(self.layouts[other]) ** 2, fold_of)
+        sums = sums_by_fold(cross, fold_of), sums_by_fold(np.abs(self.layouts[other]) ** 2, fold_of)
         return max(self._pooled_gain(*sums, c) for c in REGULARISATIONS) / count
 
     def agreement(self) -> float:
@@ -205,11 +205,6 @@ def resampled(kernel: np.ndarray, pitch_um: float, wanted_um: float) -> np.ndarr
     columns = np.exp(2j * np.pi * np.outer(offsets, np.fft.fftfreq(nx)))
     spectrum = np.fft.fft2(kernel)
     return (rows @ spectrum @ columns.T).real / (ny * nx) / factor**2
-
-
-def _by_fold(values: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
-    """Sums over the scans of each fold (folds, …)."""
-    return np.stack([values[fold_of == fold].sum(axis=0) for fold in range(int(fold_of.max()) + 1)])
 
 
 def off_centre_peak(kernel: np.ndarray, pitch_um: float) -> tuple[float, float, float]:

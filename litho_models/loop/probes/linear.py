@@ -13,7 +13,7 @@ from litho_data.foundation.units import NM_PER_UM
 from litho_models.fitting.least_squares import orthonormal
 from litho_models.loop.linear import ALL_FREE
 from litho_models.loop.prepared import PreparedScan
-from litho_models.loop.probes.probe import Estimate
+from litho_models.loop.probes.probe import Estimate, sums_by_fold
 from litho_models.scan_terms import Terms
 
 # Relative to the mean information per column; the grid is wide, its choice is made on training scans.
@@ -167,7 +167,7 @@ def held_out_ridge(
         fold_of: (scans,).
     """
     per_fold, gains = _without_each_fold(grams, rights, penalty, fold_of)
-    fold_grams, fold_rights = _by_fold(grams, fold_of), _by_fold(rights, fold_of)
+    fold_grams, fold_rights = sums_by_fold(grams, fold_of), sums_by_fold(rights, fold_of)
     return Estimate(
         common=_best_ridge(fold_grams, fold_rights, penalty),
         per_fold=per_fold,
@@ -179,19 +179,13 @@ def _without_each_fold(
     grams: np.ndarray, rights: np.ndarray, penalty: np.ndarray, fold_of: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Coefficients (folds, ..., m) without each fold, their gains (..., scans); rights: (..., scans, m)."""
-    fold_grams, fold_rights = _by_fold(grams, fold_of), _by_fold(rights, fold_of, axis=-2)
+    fold_grams, fold_rights = sums_by_fold(grams, fold_of), sums_by_fold(rights, fold_of, axis=-2)
     folds = np.arange(len(fold_grams))
     per_fold = np.stack(
         [_best_ridge(fold_grams[folds != f], fold_rights[..., folds != f, :], penalty) for f in folds]
     )
     gains = [_gain(gram, rights[..., i, :], per_fold[fold_of[i]]) for i, gram in enumerate(grams)]
     return per_fold, np.stack(gains, axis=-1)
-
-
-def _by_fold(part: np.ndarray, fold_of: np.ndarray, axis: int = 0) -> np.ndarray:
-    """Sums over the scans of each fold."""
-    folds = range(int(fold_of.max()) + 1)
-    return np.stack([part.compress(fold_of == fold, axis).sum(axis) for fold in folds], axis)
 
 
 def _best_ridge(grams: np.ndarray, rights: np.ndarray, penalty: np.ndarray) -> np.ndarray:

@@ -42,6 +42,12 @@ def with_intervals(probe: Probe, estimate: Estimate) -> dict[str, tuple[float, s
     return found
 
 
+def sums_by_fold(part: np.ndarray, fold_of: np.ndarray, axis: int = 0) -> np.ndarray:
+    """Sums over the scans of each fold, (folds, …); ``axis``: that of the scans."""
+    folds = range(int(fold_of.max()) + 1)
+    return np.stack([part.compress(fold_of == fold, axis).sum(axis) for fold in folds], axis)
+
+
 class Probe(Protocol):
     """One generic term; it says where a residual lives, not why."""
 

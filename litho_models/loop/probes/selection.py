@@ -230,9 +230,7 @@ def _with_probe(state: State, study: Study, probe: Probe, estimate: Estimate) ->
     def correct(fold: int, scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
         return _corrected(probe, estimate.per_fold[fold], anchors[fold], scan, prediction)
 
-    held_out = zip(study.fold_of, study.scans, state.predictions, strict=True)
-    corrected = [correct(int(fold), scan, prediction) for fold, scan, prediction in held_out]
-    return State(state.fits, corrected, (*state.corrections, correct))
+    return state.with_correction(correct, study)
 
 
 def _corrected(

@@ -30,7 +30,7 @@ def all_candidates(findings: LoopFindings, added: set[str]) -> list[Candidate]:
         elif name in findings.untestable:
             rows.append(Candidate(name=name, verdict="not-testable", reason=findings.untestable[name]))
         else:
-            rows.append(_process_candidate(findings, name, added, sets))
+            rows.append(_process_candidate(findings, name, sets))
     return rows + [_probe_candidate(findings, test) for test in findings.probed.tests]
 
 
@@ -68,9 +68,7 @@ def _measurement_candidate(findings: LoopFindings, test: MeasurementTest, added:
     )
 
 
-def _process_candidate(
-    findings: LoopFindings, name: str, added: set[str], sets: dict[str, Added]
-) -> Candidate:
+def _process_candidate(findings: LoopFindings, name: str, sets: dict[str, Added]) -> Candidate:
     search = findings.search
     entry = next((a for a in search.added if a.effect.name == name), None)
     screened = search.last.get(name) or search.first.get(name)
