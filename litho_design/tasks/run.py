@@ -26,7 +26,6 @@ from litho_design.optimisation.search import (
     remove_checkpoint,
     search_layout,
 )
-from litho_design.optimisation.settings import DesignSettings
 from litho_design.printers.layout import printability
 from litho_design.printers.printer import Printer
 from litho_design.printers.training import OutOfDistribution, out_of_distribution
@@ -44,7 +43,6 @@ from litho_design.tasks.task import Task
 # Writes the report into the folder of a design, from the record and the history of the search.
 Report = Callable[[Path, Design, Task, list[dict[str, float]]], object]
 
-
 # Brings a hologram from 0.67 to 0.2 of the level distance in twenty iterations.
 _INSIDE_WEIGHT = 0.5
 
@@ -59,13 +57,7 @@ class _Outcome:
     seconds: float
 
 
-def run_design(
-    task: Task,
-    out: str | Path,
-    report: Report,
-    *,
-    announce: bool = True,
-) -> Design:
+def run_design(task: Task, out: str | Path, report: Report, *, announce: bool = True) -> Design:
     """Optimise, polish and score one layout, and write the folder ``out``.
 
     If the folder holds an interrupted run of the same task, the run resumes, with the same result as an
@@ -95,7 +87,7 @@ def run_design(
     with ExitStack() as precisions:
         for printer in task.printers:
             precisions.enter_context(printer.at_precision(settings.search.precision))
-        outcome = _optimise(task, settings, folder, fingerprint, heights, announce)
+        outcome = _optimise(task, folder, fingerprint, heights, announce)
     cells = make_parametrisation(settings.layout, settings.search).to(outcome.levels.device).cells
     layout_level = cells(outcome.levels)
     level = layout_level[None, None].float()
@@ -187,17 +179,10 @@ def _check_printers(printers: Sequence[Printer]) -> None:
             )
 
 
-def _optimise(
-    task: Task,
-    settings: DesignSettings,
-    folder: Path,
-    fingerprint: str,
-    heights: list[float],
-    announce: bool,
-) -> _Outcome:
+def _optimise(task: Task, folder: Path, fingerprint: str, heights: list[float], announce: bool) -> _Outcome:
     started = time.monotonic()
-    search = settings.search
-    parameters = make_parametrisation(settings.layout, search).to(task.printer.device)
+    layout, search = task.settings.layout, task.settings.search
+    parameters = make_parametrisation(layout, search).to(task.printer.device)
     task.start(parameters, heights)
     with torch.no_grad():
         start_loss = float(task.objective(parameters.cells(parameters.best_levels())[None, None].float())[0])
@@ -214,7 +199,7 @@ def _optimise(
             levels,
             parameters.cells,
             task.objective,
-            level_count=settings.layout.levels,
+            level_count=layout.levels,
             rounds=search.polish_rounds,
         )
         polished = losses[-1]

@@ -37,12 +37,11 @@ def folder(name: str, root: str | Path = ZOO_FOLDER) -> Path:
     return Path(root) / name
 
 
-def model_folder(source: str | Path, root: str | Path = ZOO_FOLDER, other: Iterable[str] = ()) -> Path:
+def model_folder(source: str | Path, other: Iterable[str] = ()) -> Path:
     """The folder of a model as a command is given it: a path, or ``zoo:NAME`` for a model of the zoo.
 
     Args:
         source: what the user typed.
-        root: the zoo.
         other: names that the caller takes besides, for the message.
 
     Raises:
@@ -50,9 +49,9 @@ def model_folder(source: str | Path, root: str | Path = ZOO_FOLDER, other: Itera
     """
     text = str(source)
     if text.startswith(PREFIX):
-        return folder(text.removeprefix(PREFIX), root)
+        return folder(text.removeprefix(PREFIX))
     if not Path(source).is_dir():
-        known = [*(f"{PREFIX}{name}" for name in list(root)), *other]
+        known = [*(f"{PREFIX}{name}" for name in list()), *other]
         raise unknown_name("model", text, known, also="the folder of a model")
     return Path(source)
 

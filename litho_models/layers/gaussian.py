@@ -99,19 +99,19 @@ def _is_wide(shape: Sequence[int], radii: Sequence[int]) -> bool:
     return min(shape[-2:]) > max(_DENSE_PX, 4 * max(radii))
 
 
-def kernel_radius_px(sigma_px: float, support: float = SUPPORT_SIGMAS) -> int:
-    """Whole pixels on each side that hold ``support`` standard deviations; 1 at least.
+def kernel_radius_px(sigma_px: float) -> int:
+    """Whole pixels on each side that hold ``SUPPORT_SIGMAS`` standard deviations; 1 at least.
 
     Raises:
         InputError: a Gaussian wider than any field, or without a width.
     """
-    if not support * sigma_px <= _LARGEST_RADIUS_PX:
+    if not SUPPORT_SIGMAS * sigma_px <= _LARGEST_RADIUS_PX:
         raise InputError(
             "Gaussian blur",
             got=f"a standard deviation of {sigma_px:g} px",
-            wanted=f"at most {_LARGEST_RADIUS_PX / support:g} px",
+            wanted=f"at most {_LARGEST_RADIUS_PX / SUPPORT_SIGMAS:g} px",
         )
-    return max(1, math.ceil(support * sigma_px))
+    return max(1, math.ceil(SUPPORT_SIGMAS * sigma_px))
 
 
 def supported_radius_px(sigma_px: float, support: Support, cap_px: int | None) -> int:

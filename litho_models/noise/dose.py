@@ -13,10 +13,10 @@ import numpy as np
 from litho_data.foundation.results import Record
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
-from litho_models.noise.staircase import READABLE_AT
+from litho_models.noise.staircase import READABLE_AT, pooled_sd
 
 # Off every change of level by four σ of the optical spot and two of a diffusion of 0.5 µm.
-GUARD_UM = 1.0
+_GUARD_UM = 1.0
 # A step that prints at less than half of what the steps of its dose usually do is lost.
 LOST_BELOW = 0.5
 _FEWEST_PIXELS = 50
@@ -70,9 +70,7 @@ class DoseMatrix(Record):
     guard_um: float
 
 
-def dose_matrix(
-    scans: Sequence[PrintedScan], guard_um: float = GUARD_UM
-) -> tuple[DoseMatrix | None, list[str]]:
+def dose_matrix(scans: Sequence[PrintedScan]) -> tuple[DoseMatrix | None, list[str]]:
     """Judge the doses of the scans that carry one; notes say what is not judged, and why.
 
     A dose without three levels that have areas wide enough to measure on is left out; fewer than two doses
@@ -87,7 +85,7 @@ def dose_matrix(
         return None, ["No doses in the store: a dose matrix needs a column 'dose' in the card's table."]
     if len(by_dose) == 1:
         return None, [f"No dose matrix: every dose in the store is {min(by_dose):g}."]
-    heights = {dose: _level_heights(by_dose[dose], guard_um) for dose in sorted(by_dose)}
+    heights = {dose: _level_heights(by_dose[dose]) for dose in sorted(by_dose)}
     narrow = [dose for dose in heights if len(heights[dose]) < _FEWEST_LEVELS]
     rows = [_row(dose, by_dose[dose], heights[dose]) for dose in heights if dose not in narrow]
     notes = []
@@ -95,7 +93,7 @@ def dose_matrix(
         notes.append(
             f"{'Left out of the' if len(rows) > 1 else 'No'} dose matrix: prints at dose "
             f"{', '.join(f'{dose:g}' for dose in narrow)} have fewer than {_FEWEST_LEVELS} levels with areas "
-            f"farther than {guard_um:g} µm from every edge; step ladders have them (litho-data masks "
+            f"farther than {_GUARD_UM:g} µm from every edge; step ladders have them (litho-data masks "
             "--pattern dose-matrix)."
         )
     if len(rows) < 2:
@@ -109,7 +107,7 @@ def dose_matrix(
         f"nominal one (gain {best.height_gain:.3f}); single pixels of neighbouring levels {told_apart} be "
         f"told apart (worst step {best.worst_readability:.2f} σ, needed {READABLE_AT:.2f} σ)"
     )
-    return DoseMatrix(rows=rows, recommended_dose=best.dose, reason=reason, guard_um=guard_um), notes
+    return DoseMatrix(rows=rows, recommended_dose=best.dose, reason=reason, guard_um=_GUARD_UM), notes
 
 
 def _row(dose: float, scans: Sequence[PrintedScan], levels: list[LevelHeight]) -> DoseRow:
@@ -136,11 +134,11 @@ def _row(dose: float, scans: Sequence[PrintedScan], levels: list[LevelHeight]) -
     )
 
 
-def _level_heights(scans: Sequence[PrintedScan], guard_um: float) -> list[LevelHeight]:
+def _level_heights(scans: Sequence[PrintedScan]) -> list[LevelHeight]:
     """Per level mean and sd inside areas of one level; datum, tilt and surroundings of each scan removed."""
     found: dict[int, list[np.ndarray]] = {}
     for scan in scans:
-        inside = _plateaus(scan, guard_um)
+        inside = _plateaus(scan)
         if not inside.any():
             continue
         level = scan.mask_level[inside]
@@ -160,7 +158,7 @@ def _level_heights(scans: Sequence[PrintedScan], guard_um: float) -> list[LevelH
     for level_number, parts in sorted(found.items()):
         heights = np.concatenate(parts)
         if heights.size >= _FEWEST_PIXELS:
-            rows.append((level_number, float(heights.mean()), _pooled_sd(parts), int(heights.size)))
+            rows.append((level_number, float(heights.mean()), pooled_sd(parts), int(heights.size)))
     ground = rows[0][1] if rows else 0.0
     return [
         LevelHeight(level=level, height_nm=mean - ground, sigma_nm=sd, pixels=pixels)
@@ -177,17 +175,13 @@ def _surroundings(scan: PrintedScan) -> np.ndarray:
     return np.stack(blurs) - layout
 
 
-def _plateaus(scan: PrintedScan, guard_um: float) -> np.ndarray:
+def _plateaus(scan: PrintedScan) -> np.ndarray:
+    """Measured pixels (ny, nx) off every change of level."""
     from scipy.ndimage import maximum_filter, minimum_filter
 
-    size = 2 * round(guard_um / scan.pitch_um) + 1
+    size = 2 * round(_GUARD_UM / scan.pitch_um) + 1
     even = maximum_filter(scan.mask_level, size) == minimum_filter(scan.mask_level, size)
     return even & scan.usable
-
-
-def _pooled_sd(parts: Sequence[np.ndarray]) -> float:
-    squares = sum(float(((part - part.mean()) ** 2).sum()) for part in parts)
-    return float(np.sqrt(squares / max(1, sum(part.size - 1 for part in parts))))
 
 
 def _run_length(flags: np.ndarray) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -15,6 +16,10 @@ from litho_models.noise.spread_scores import GAUSSIAN
 
 # Two heights are told apart if at most 2.5 % of each lie beyond the middle between them.
 READABLE_AT = 2 * GAUSSIAN.half_width(0.95)
+# Kept off each edge: three σ of the printer's blur at least.
+_GUARD_UM = 0.75
+# Side of the squares whose means are compared.
+_AREA_UM = 1.0
 # A tread narrower than this share of the field is an edge, not a tread.
 _NARROWEST_TREAD = 1 / 25
 _MOST_TREADS = 24
@@ -65,9 +70,6 @@ def step_print(
     height_um: np.ndarray,
     pitch_um: tuple[float, float],
     level_height_um: float,
-    *,
-    guard_um: float = 0.75,
-    area_um: float = 1.0,
 ) -> StepPrint:
     """Find the treads of a staircase along x or y and judge its steps.
 
@@ -76,18 +78,16 @@ def step_print(
         height_um: (ny, nx), µm; NaN where not measured.
         pitch_um: (y, x) sampling, µm.
         level_height_um: nominal step; an edge counts if it parts treads by half of it.
-        guard_um: kept off each edge, at least three σ of the printer's blur.
-        area_um: side of the squares whose means are compared.
 
     Raises:
         InputError: no step found.
     """
     axis, edges_px = find_edges(height_um, level_height_um)
     along = height_um if axis == "x" else height_um.T
-    pitch_along, pitch_across = (pitch_um[1], pitch_um[0]) if axis == "x" else (pitch_um[0], pitch_um[1])
+    pitch_across, pitch_along = pitch_um if axis == "x" else pitch_um[::-1]
     edges_um = [edge * pitch_along for edge in edges_px]
     steps = stair_steps(along, pitch_along, edges_um=edges_um)
-    treads = _treads(along.shape, edges_px, round(guard_um / pitch_along))
+    treads = _treads(along.shape, edges_px, round(_GUARD_UM / pitch_along))
     flat = _without_plane(along, treads)
     means, sigmas, deviations = [], [], []
     for tread in treads:
@@ -111,7 +111,7 @@ def step_print(
             )
         )
     tread_sigma = float(np.sqrt(np.mean(np.square(sigmas))))
-    block = (max(1, round(area_um / pitch_across)), max(1, round(area_um / pitch_along)))
+    block = max(1, round(_AREA_UM / pitch_across)), max(1, round(_AREA_UM / pitch_along))
     area_sigma = _sigma_of_block_means(flat, treads, block)
     return StepPrint(
         id=scan_id,
@@ -122,7 +122,7 @@ def step_print(
         tread_sigma_nm=tread_sigma,
         tread_mae_nm=float(np.concatenate(deviations).mean()),
         resolvable_step_nm=READABLE_AT * tread_sigma,
-        area_um2=area_um**2,
+        area_um2=_AREA_UM**2,
         area_sigma_nm=area_sigma,
         resolvable_step_area_nm=None if area_sigma is None else READABLE_AT * area_sigma,
     )
@@ -215,7 +215,7 @@ def _misread(flat: np.ndarray, first: slice, second: slice) -> float:
 
 def _sigma_of_block_means(flat: np.ndarray, treads: list[slice], block: tuple[int, int]) -> float | None:
     """Pooled sd of the means of blocks (rows, columns) within treads, nm; None with fewer than two."""
-    squares, freedom = 0.0, 0
+    found = []
     for tread in treads:
         region = flat[:, tread]
         rows, columns = region.shape[0] // block[0], max(1, region.shape[1] // block[1])
@@ -223,7 +223,11 @@ def _sigma_of_block_means(flat: np.ndarray, treads: list[slice], block: tuple[in
         if rows * columns < 2:
             continue
         cut = region[: rows * block[0], : columns * width].reshape(rows, block[0], columns, width)
-        means = np.nanmean(cut, axis=(1, 3)) * NM_PER_UM
-        squares += float(((means - means.mean()) ** 2).sum())
-        freedom += means.size - 1
-    return float(np.sqrt(squares / freedom)) if freedom else None
+        found.append(np.nanmean(cut, axis=(1, 3)) * NM_PER_UM)
+    return pooled_sd(found) if found else None
+
+
+def pooled_sd(parts: Sequence[np.ndarray]) -> float:
+    """Standard deviation within parts that have a mean each; 0 where no part has two values."""
+    squares = sum(float(((part - part.mean()) ** 2).sum()) for part in parts)
+    return float(np.sqrt(squares / max(1, sum(part.size - 1 for part in parts))))

@@ -92,19 +92,19 @@ def sign_flips(count: int, seed: int = 0, *, exact_scans: int = EXACT_SCANS) -> 
     return np.vstack([np.ones(count), drawn])
 
 
-def one_sided_flip_p(values: np.ndarray, seed: int = 0) -> float:
+def one_sided_flip_p(values: np.ndarray) -> float:
     """Share of sign flips of the scans' values whose sum reaches the observed one."""
-    return float(np.mean(sign_flips(len(values), seed) @ values >= values.sum() * _ROUNDING))
+    return float(np.mean(sign_flips(len(values)) @ values >= values.sum() * _ROUNDING))
 
 
-def sign_flip_statistics(scores: np.ndarray, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+def sign_flip_statistics(scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Cluster-robust z of each column of (scans, columns), and the null distribution of max |z|.
 
     z = sum s / sqrt(F/(F-1) sum (s - mean)²). The null flips scans, the same flip for all columns:
     see ``sign_flips``.
     """
     count = len(scores)
-    signs = sign_flips(count, seed)
+    signs = sign_flips(count)
     sums = signs @ scores
     squares = (scores**2).sum(axis=0)
     # A column of equal scores would divide by zero; z is capped where the spread vanishes.

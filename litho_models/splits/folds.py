@@ -145,7 +145,7 @@ def leave_one_print_out(ids: Sequence[str], print_ids: Sequence[str]) -> list[li
     ]
 
 
-def paper_draw(ids: Sequence[str], draw: int, held_out_fraction: float = 0.25) -> list[Crop]:
+def paper_draw(ids: Sequence[str], draw: int) -> list[Crop]:
     """The crops held out in one random draw over quadrants, as in the paper (24 of 96).
 
     Quadrants of one scan land on both sides, so this leaks; for comparison with the paper only.
@@ -153,7 +153,7 @@ def paper_draw(ids: Sequence[str], draw: int, held_out_fraction: float = 0.25) -
     require_unique(ids)
     crops = [Crop(scan_id, quadrant) for scan_id in ids for quadrant in QUADRANTS]
     shuffled = sorted(crops, key=lambda crop: drawing_key(f"{crop.scan_id} {crop.quadrant}", draw))
-    held_out = shuffled[: round(held_out_fraction * len(crops))]
+    held_out = shuffled[: round(len(crops) / 4)]
     return sorted(held_out, key=lambda crop: (crop.scan_id, crop.quadrant))
 
 

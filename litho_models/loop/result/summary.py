@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from typing import Literal
 
 import numpy as np
 
@@ -46,13 +45,6 @@ from litho_models.scoring.statistics import interval
 from litho_models.splits.folds import Split
 
 _NO_TERMS: Terms = frozenset()
-# Sets of terms that the loop scores and the noise is estimated for.
-_SHARED_POLICIES: tuple[Literal["none", "offset", "offset-gain", "full"], ...] = (
-    "none",
-    "offset",
-    "offset-gain",
-    "full",
-)
 
 
 def summarise(findings: LoopFindings, *, dataset: DatasetId, base_name: str, dropped: list[str]) -> CloseLoop:
@@ -127,10 +119,11 @@ def _signature(findings: LoopFindings) -> str:
 
 def _noise_floor(findings: LoopFindings, found: Mapping[TermSet, BeforeAfter]) -> NoiseFloor:
     """What the residuals after correction have in common with none of their like; else a lower bound."""
-    after: dict[Policy, tuple[float, list[np.ndarray]]] = {}
-    for policy in _SHARED_POLICIES:
-        score = found[policy][1]
-        after[policy] = score.degrees_of_freedom, score.residual_um
+    after: dict[Policy, tuple[float, list[np.ndarray]]] = {
+        name: (score.degrees_of_freedom, score.residual_um)
+        for name, (_, score) in found.items()
+        if name != "accepted"
+    }
     scans = [scan.stored for scan in findings.development]
     estimate = floor_of_residuals("the corrected model", scans, after, findings.config.seed)
     if estimate.mae_nm is not None:
