@@ -75,11 +75,13 @@ class ScanScore:
 
     ``*_abs`` and ``bias`` (measured minus predicted) use no fit at test time; ``*_datum_free`` are
     freed of the nuisances of ``policy``, fitted on other pixels, with ``degrees_of_freedom`` terms.
+    ``line_sd_um``: standard deviation of the offsets of lines among them.
     """
 
     scan_id: str
     policy: str
     degrees_of_freedom: float
+    line_sd_um: float
     pixels: int
     mae_abs_nm: float
     bias_nm: float
@@ -121,6 +123,7 @@ def score_scan(
         scan_id=scan_id,
         policy=policy,
         degrees_of_freedom=free.degrees_of_freedom,
+        line_sd_um=free.line_sd_um,
         pixels=int(scored.sum()),
         mae_abs_nm=float(np.abs(plain).mean()),
         bias_nm=float(plain.mean()),

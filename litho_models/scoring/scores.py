@@ -13,12 +13,7 @@ from litho_data.store import PrintedScan
 from litho_models.scan_terms import POLICIES, Blocks, NuisanceProtocol, Policy, cross_fit, scan_line_index
 from litho_models.scoring.metric_registry import metrics_of, metrics_over_scans
 from litho_models.scoring.metrics import ScanScore, phase_waves, score_scan
-from litho_models.scoring.records import (
-    ModelScores,
-    PolicyError,
-    Prediction,
-    ScanRow,
-)
+from litho_models.scoring.records import ModelScores, PolicyError, Prediction, ScanRow
 from litho_models.scoring.statistics import interval
 from litho_models.scoring.transfer import level_errors, transfer_curves
 
@@ -51,14 +46,14 @@ def score_model(
     scores = {policy: _scan_scores(scans, maps, policy, blocks) for policy in POLICIES}
     chosen = scores[protocol.policy]
     bare = _BLIND_POLICIES if protocol.background == "training" else ()
-    residuals, rows, lines = [], [], []
+    residuals, lines = [], []
     for scan, expected in zip(scans, maps, strict=True):
         arrays = (scan.height_um, expected, scan.valid)
         residuals.append(cross_fit(*arrays, POLICIES[protocol.policy], blocks).residual_um)
         line = scan_line_index(scan.shape, scan.scan_to_layout, scan.pitch_um, scan.bend_um)
-        rows.append(cross_fit(*arrays, POLICIES["full+rows"], blocks).line_sd_um)
         along_lines = POLICIES["full"] | {"scan-lines"}
         lines.append(cross_fit(*arrays, along_lines, blocks, scan_line=line).line_sd_um)
+    rows = [score.line_sd_um for score in scores["full+rows"]]
     table = [
         _row(scan, score, metrics_of(scan, expected, residual))
         for scan, score, expected, residual in zip(scans, chosen, maps, residuals, strict=True)
