@@ -12,7 +12,7 @@ from pydantic import Field, ValidationError
 
 from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.files import atomic_file
-from litho_data.foundation.outputs import require_own_folder
+from litho_data.foundation.outputs import first_difference, require_own_folder
 from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import RunInfo, run_info
 from litho_data.foundation.settings import refused
@@ -133,15 +133,11 @@ def _require_same_run(folder: Path, facts: dict[str, Any]) -> None:
     if not (folder / TrainingRun.FILE_NAME).exists():
         return
     held = TrainingRun.read(folder)
-    then, now = (
-        {name: fact for name, fact in one.items() if name != "config"} | one["config"].model_dump()
-        for one in ({name: getattr(held, name) for name in facts}, facts)
-    )
-    differing = [name for name in now if then[name] != now[name]]
-    if differing:
+    then, now = (one.model_dump(mode="json") for one in (held, held.model_copy(update=facts)))
+    if other := first_difference(then, now):
         raise InputError(
             f"{folder} holds another run",
-            got=f"{held.model} on {held.dataset.name}, of another {', '.join(differing)}",
+            got=f"{held.model} on {held.dataset.name}, {other}",
             wanted="a new folder, or the same run again",
             hint="choose another --out, or delete the folder",
         )
