@@ -18,6 +18,14 @@ from litho_data.cards.tables import SAFE_ID, read_full_scales, read_table
 from litho_data.foundation.errors import InputError
 from litho_data.store.schema import OPTIONAL_COLUMNS
 
+# An expression of a card is matched in a process of its own, for so long at most.
+_LONGEST_S = 10.0
+_MATCH = """
+import json, re, sys
+pattern, ids = json.load(sys.stdin)
+json.dump([found and found["print"] for found in (re.fullmatch(pattern, one) for one in ids)], sys.stdout)
+"""
+
 
 @dataclass(frozen=True)
 class PrintedField:
@@ -183,14 +191,6 @@ def _assumptions(card: Card, table: Mapping[str, Mapping[str, str]]) -> tuple[st
     if card.ids.print is None:
         assumed.append("every scan is a print of its own")
     return tuple(assumed)
-
-
-_LONGEST_S = 10.0
-_MATCH = """
-import json, re, sys
-pattern, ids = json.load(sys.stdin)
-json.dump([found and found["print"] for found in (re.fullmatch(pattern, one) for one in ids)], sys.stdout)
-"""
 
 
 def prints_of(ids: Sequence[str], pattern: str | None) -> list[str | None]:

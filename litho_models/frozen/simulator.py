@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -16,16 +17,9 @@ from litho_models.prediction.tiles import predict_field, predict_interior
 from litho_models.simulator import Simulator, Tile
 
 if TYPE_CHECKING:
-    from litho_models.effects.chain import EffectChain
-
-
-from typing import TYPE_CHECKING, TypeVar
-
-import numpy as np
-
-if TYPE_CHECKING:
     import xarray as xr
 
+    from litho_models.effects.chain import EffectChain
 
 # A level's height in float32 may exceed the range by rounding; a level off it differs by 100 nm.
 _ROUNDING_UM = 1e-5

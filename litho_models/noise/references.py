@@ -27,6 +27,8 @@ from litho_models.noise.texture import Texture, texture
 from litho_models.scoring.statistics import interval
 
 _SQUARE_WITHIN = 0.01
+# That two prints of one layout must have in common.
+_FEWEST_PIXELS = 64
 
 
 @dataclass(frozen=True)
@@ -112,9 +114,6 @@ def _recorded_pitches(store: Store) -> dict[str, tuple[float, float]]:
         if pitch:
             pitches[row["scan"]] = (float(pitch[0]), float(pitch[1]))
     return pitches
-
-
-_FEWEST_PIXELS = 64
 
 
 class RepeatedPrints(Record):

@@ -11,6 +11,9 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.scan_terms import Blocks, Policy, cross_fit, policy_terms
 
+# The step of index from air to the resist, at a red helium-neon line: where its elements are used.
+INDEX_STEP, WAVELENGTH_UM = 0.548, 0.6328
+
 
 class PrintGain(NamedTuple):
     """Measured height = slope · prediction + intercept, µm; standard errors and correlation of the two.
@@ -63,10 +66,6 @@ def print_gain(
         intercept_error_um=errors[1],
         correlation=float(shared / (errors[0] * errors[1])) if min(errors) > 0 else float("nan"),
     )
-
-
-# The step of index from air to the resist, at a red helium-neon line: where its elements are used.
-INDEX_STEP, WAVELENGTH_UM = 0.548, 0.6328
 
 
 @dataclass(frozen=True)

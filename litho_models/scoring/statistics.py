@@ -15,6 +15,7 @@ from litho_data.foundation.results import Record
 FEWEST_FOR_INTERVAL = 6
 BOOTSTRAP_DRAWS = 2000
 SIGN_FLIP_DRAWS = 9999
+PERMUTATIONS = 1999
 # Of a 95 % interval; written so, because 0.025 is another number in its last bits.
 _ENDS = (1 - 0.95) / 2, (1 + 0.95) / 2
 # Up to so many scans every combination of signs is used. A table of 2^14 rows is the larger for all
@@ -173,9 +174,6 @@ def paired_difference(
         second_better=int((sums > 0).sum()),
         units=sums.size,
     )
-
-
-PERMUTATIONS = 1999
 
 
 class ByPrint(Record):

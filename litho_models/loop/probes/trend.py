@@ -10,8 +10,8 @@ import numpy as np
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.single_scans.nested_tests import scan_parameters
+from litho_models.scoring.statistics import PERMUTATIONS
 
-PERMUTATIONS = 1999
 # Fewer scans than this on one side of a step fit anything.
 _SHORTEST_SIDE = 3
 
