@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from litho_data.foundation.results import Record
+from litho_data.foundation.units import NM_PER_UM
 from litho_design.optimisation.process_window import Draw, ProcessWindow, risk
 from litho_design.printers.printer import Printer, PrinterRecord
 
@@ -93,6 +94,6 @@ def measure_disagreement(
     apart_um = float(disagreement_um(torch.stack([printer(level)[0, 0] for printer in printers])))
     return EnsembleRecord(
         members=[printer.record() for printer in printers[1:]],
-        disagreement_nm=1000 * apart_um,
+        disagreement_nm=NM_PER_UM * apart_um,
         disagreement_waves=apart_um / wave_height_um,
     )

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.utils.checkpoint import checkpoint
 
 from litho_data.foundation.results import Record
+from litho_data.foundation.units import NM_PER_UM
 from litho_design.printers.fab import FabSimulator
 from litho_design.printers.layout import LayoutSettings
 
@@ -165,7 +166,7 @@ class Printer(nn.Module):
             part = slice(start, start + tile_px)
             wide = slice(start, start + tile_px + 2 * halo)
             off.append(self.print_patch(around[..., wide, wide]) - whole[..., part, part])
-        nm = torch.stack(off).double() * 1000
+        nm = torch.stack(off).double() * NM_PER_UM
         return TilingCheck(
             tile_px=tile_px,
             tiles=count,

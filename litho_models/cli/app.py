@@ -11,6 +11,7 @@ import typer
 import litho_models
 from litho_data.foundation.app import DaskOption, WorkersOption, new_app, run_app
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.units import NM_PER_UM
 from litho_models.cli.check import check
 from litho_models.cli.loop import close_loop
 from litho_models.cli.next_print import next_print
@@ -244,7 +245,7 @@ def export(
     difference_um = export_model(frozen, out, size_px)
     typer.echo(
         f"{out}: layouts of {size_px} x {size_px} px, (1, 1, y, x) float32 µm; differs by "
-        f"{1000 * difference_um:.2g} nm at most"
+        f"{NM_PER_UM * difference_um:.2g} nm at most"
     )
 
 

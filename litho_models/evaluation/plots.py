@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from litho_data.foundation.report_pictures import LIGHT, model_colour, new_figure
+from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.scan_terms import NuisanceProtocol, cross_fit, policy_terms
 from litho_models.scoring.records import ModelScores
@@ -79,7 +80,7 @@ def residual_maps(
     grid[0].set_title(f"{scan.id}: measured, µm", fontsize=9)
     figure.colorbar(image, ax=grid[0], shrink=0.8)
     for axes, (name, prediction) in zip(grid[1:], predictions_um.items(), strict=False):
-        error = 1000 * residual_um(scan, prediction, protocol)
+        error = NM_PER_UM * residual_um(scan, prediction, protocol)
         image = axes.imshow(
             error, extent=extent, cmap="RdBu_r", vmin=-_RESIDUAL_RANGE_NM, vmax=_RESIDUAL_RANGE_NM
         )

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from litho_data.foundation.commands import progress
+from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.fitting.checkpoint import CheckpointFolder, RoundRecord, TrainingState
 from litho_models.fitting.config import TrainingConfig
@@ -82,7 +83,7 @@ def train_network(
         state.record(
             RoundRecord(
                 step=last,
-                training_mae_nm=1000 * float(np.mean(absolute / counted)),
+                training_mae_nm=NM_PER_UM * float(np.mean(absolute / counted)),
                 validation_mae_datum_free_nm=validation_error(model, validation),
                 seconds=time.monotonic() - started,
             )
