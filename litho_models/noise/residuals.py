@@ -58,7 +58,7 @@ def read_residuals(store: Store, sources: Sequence[str | Path], model: str | Non
         InputError: a folder that is neither, one given twice, sources of another dataset or of different
             policies, a ``model`` together with frozen ones, or no scan that all predict.
     """
-    folders = [zoo.model_folder(source, other="or that of a benchmark") for source in sources]
+    folders = [zoo.model_folder(source, other=["the result of a benchmark"]) for source in sources]
     if len({folder.resolve() for folder in folders}) < len(folders):
         raise InputError("residuals", got="one source twice", wanted="different members of an ensemble")
     frozen = [(folder / CARD_FILE).exists() for folder in folders]

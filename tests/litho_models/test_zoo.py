@@ -128,6 +128,10 @@ def test_every_command_that_takes_a_frozen_model_takes_it_from_the_zoo(store, tm
     for wrong, said in (("zoo:resnet", name), (name, f"did you mean {named}")):
         with pytest.raises(InputError, match=said):
             zoo.model_folder(wrong)
+    wanted = ", ".join(f"zoo:{one}" for one in zoo.list())
+    also = "the result of a benchmark or the folder of a model"
+    with pytest.raises(InputError, match=f"wanted {wanted}, {also}$"):
+        read_residuals(open_store(store), [tmp_path / "absent"])
 
 
 def test_listing_the_zoo_loads_no_torch():
