@@ -139,7 +139,7 @@ def imaging_score(
         for estimate, wanted in zip(estimates, objects, strict=True):
             found = similarity(estimate, wanted)
             rows.setdefault(f"mae_{name}", []).append(found.mae)
-            rows.setdefault(f"psnr_{name}", []).append(found.psnr_db)
+            rows.setdefault(f"psnr_{name}_db", []).append(found.psnr_db)
             rows.setdefault(f"ssim_{name}", []).append(found.ssim)
 
     for seed in _TEST_SEEDS:
@@ -148,20 +148,9 @@ def imaging_score(
         add("direct", seen * scale[:, None, None])
         add("design", reconstruct(seen, expected, settings.iterations))
         add("calibrated", reconstruct(seen, real, settings.iterations))
-    means = {name: sum(values) / len(values) for name, values in rows.items()}
-    spread = {name: float(torch.tensor(values).std()) for name, values in rows.items()}
-    return ImagingScore(
-        mae_direct=means["mae_direct"],
-        mae_design=means["mae_design"],
-        mae_calibrated=means["mae_calibrated"],
-        mae_calibrated_sd=spread["mae_calibrated"],
-        psnr_design_db=means["psnr_design"],
-        psnr_calibrated_db=means["psnr_calibrated"],
-        ssim_direct=means["ssim_direct"],
-        ssim_design=means["ssim_design"],
-        ssim_calibrated=means["ssim_calibrated"],
-        ssim_calibrated_sd=spread["ssim_calibrated"],
-    )
+    figures = {name: sum(values) / len(values) for name, values in rows.items()}
+    figures |= {f"{name}_sd": float(torch.tensor(values).std()) for name, values in rows.items()}
+    return ImagingScore(**{name: figures[name] for name in ImagingScore.model_fields})
 
 
 class ImagingLensScore(LensScore, ImagingScore):

@@ -58,16 +58,15 @@ def noise_budget(found: Residuals, seed: int = 0) -> NoiseBudget:
     freed = freed_by_policy(found.scans, found.maps_um, found.protocol.blocks)
     slopes = [layout_slope(scan) for scan in found.scans]
     limit = float(np.quantile(np.concatenate([slope.ravel() for slope in slopes]), FLAT_SHARE))
-    level, square, absolute, number = [], [], [], []
+    level, left, number = [], [], []
     lines_out = freed["full+rows"][1]
     for at, (scan, residual_um, slope) in enumerate(zip(found.scans, lines_out, slopes, strict=True)):
         flat = np.isfinite(residual_um) & (slope <= limit)
-        residual = NM_PER_UM * residual_um[flat]
         level.append(scan.mask_level[flat])
-        square.append(residual**2)
-        absolute.append(np.abs(residual))
-        number.append(np.full(residual.size, at))
-    levels, squares, sizes, owner = (np.concatenate(part) for part in (level, square, absolute, number))
+        left.append(NM_PER_UM * residual_um[flat])
+        number.append(np.full(np.count_nonzero(flat), at))
+    levels, residuals, owner = (np.concatenate(part) for part in (level, left, number))
+    squares, sizes = residuals**2, np.abs(residuals)
     prints = [scan.print_id for scan in found.scans]
     rows = []
     for value in np.unique(levels).tolist():
@@ -84,8 +83,8 @@ def noise_budget(found: Residuals, seed: int = 0) -> NoiseBudget:
                 mae_nm=float(sizes[mine].mean()),
             )
         )
-    left = zip(freed["full"][1], slopes, strict=True)
-    flats = [np.where(slope <= limit, residual_um, np.nan) for residual_um, slope in left]
+    lines_in = zip(freed["full"][1], slopes, strict=True)
+    flats = [np.where(slope <= limit, residual_um, np.nan) for residual_um, slope in lines_in]
     pitch_um = found.scans[0].pitch_um
     small = min(min(flat.shape) for flat in flats) < FEWEST_LINES
     return NoiseBudget(
@@ -100,15 +99,12 @@ def noise_budget(found: Residuals, seed: int = 0) -> NoiseBudget:
 
 def _length_um(maps_um: Sequence[np.ndarray], pitch_um: float, axis: int) -> float:
     """Distance along an axis over which the correlation of maps with gaps falls to 1/e, at most 40 px."""
+    maps = [np.moveaxis(one, axis, 0) for one in maps_um]
     variances = sum(float(np.nanmean(one**2)) for one in maps_um)
     correlation = [1.0]
     while correlation[-1] > np.exp(-1) and len(correlation) <= _FARTHEST_PX:
         lag = len(correlation)
-        products = 0.0
-        for one in maps_um:
-            rows = np.moveaxis(one, axis, 0)
-            both = rows[lag:] * rows[:-lag]
-            products += float(np.nanmean(both))
+        products = sum(float(np.nanmean(one[lag:] * one[:-lag])) for one in maps)
         correlation.append(products / variances)
     before, after = correlation[-2:]
     if after > np.exp(-1):
