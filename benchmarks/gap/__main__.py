@@ -7,7 +7,7 @@ Prints fields in a fab whose effects no model was told of, trains six arms on th
 hologram and two lenses through each of them with equal budgets, and lets the fab print the designs; then
 the same hologram through the models of measured prints that come with the package. Time and memory are
 measured on trial iterations and told before the long part; ``--tasks`` does some of the tasks. Every step
-is skipped where its result exists, and a killed design goes on from its checkpoint.
+is skipped where its result exists, and an interrupted design resumes from its checkpoint.
 """
 
 from __future__ import annotations

@@ -70,7 +70,7 @@ def nest(study: Study, base: nn.Module, held_out: HeldOut, cache: Path | None = 
         study: the development scans; its background is that of the reported errors.
         base: a small simulator, refitted in every selection.
         held_out: what is left out of a selection: the folds of the study, by scan, or whole prints.
-        cache: folder where finished selections are kept; an interrupted run goes on with the next.
+        cache: folder where finished selections are kept; an interrupted run resumes with the next.
 
     Raises:
         InputError: a single print, too few scans to select on, or a kept selection that cannot be read.
