@@ -100,7 +100,7 @@ def benchmark_verdict(result: Benchmark) -> str:
         names = {best.model, second.model}
         pair = next((one for one in result.paired if {one.first, one.second} == names), None)
         text += "they were not compared scan by scan. " if pair is None else f"{chance_text(pair)}. "
-    return text + floor_text(result.noise_floor, best.mae_datum_free_nm, result.nuisance.policy)
+    return text + _share_of_noise(result.noise_floor, best.mae_datum_free_nm, result.nuisance.policy)
 
 
 def evaluation_verdict(result: Evaluation) -> str:
@@ -111,7 +111,7 @@ def evaluation_verdict(result: Evaluation) -> str:
     return (
         f"{result.model.name} is off by {scores.mae_abs_nm:.1f} nm over {len(scores.scans)} scans{seen} as "
         f"it stands, and by {scores.mae_datum_free_nm:.2f} nm once the scan's own terms are fitted. "
-        + floor_text(result.noise_floor, scores.mae_datum_free_nm, result.nuisance.policy)
+        + _share_of_noise(result.noise_floor, scores.mae_datum_free_nm, result.nuisance.policy)
     )
 
 
@@ -128,7 +128,7 @@ def chance_text(pair: Paired) -> str:
     return f"{size}, which may be chance (p = {p:.2g} over {count} {unit})"
 
 
-def floor_text(floor: NoiseFloor, error_nm: float, policy: str) -> str:
+def _share_of_noise(floor: NoiseFloor, error_nm: float, policy: str) -> str:
     """What of an error is noise that no model can predict."""
     least = floor.mae_at(policy)
     if least is None:

@@ -82,7 +82,7 @@ def like_pixels(
         candidates = np.flatnonzero(scored[number])
         drawn[number] = random.choice(candidates, min(most, candidates.size), replace=False)
     owner = np.concatenate([np.full(len(drawn[number]), number) for number in used])
-    feature = _whitened(np.concatenate([layout_features(scans[n])[:, drawn[n]].T for n in used]))
+    feature = _whitened(np.concatenate([_surroundings(scans[n])[:, drawn[n]].T for n in used]))
     if not feature.shape[1]:
         return None
     partners = np.empty((len(owner), min(PARTNERS, min(map(len, groups)) - 1)), np.intp)
@@ -98,7 +98,7 @@ def like_pixels(
     return LikePixels(owner, np.concatenate([drawn[number] for number in used]), partners)
 
 
-def layout_features(scan: PrintedScan) -> np.ndarray:
+def _surroundings(scan: PrintedScan) -> np.ndarray:
     """What the surroundings of each pixel look like: blurred layouts and two slopes, (k, ny·nx), µm."""
     from scipy.ndimage import gaussian_filter
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from litho_data.foundation.report import Page
+from litho_data.foundation.report import Page, capitalised
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.evaluation.tables import interval_text
 from litho_models.loop import equal_terms
@@ -136,7 +136,7 @@ def _error_section(page: Page, findings: LoopFindings, result: CloseLoop) -> Non
         )
     if result.gain_split:
         page.heading("Whose the gain is", folded=True)
-        page.paragraph(f"{parts_text(result).capitalize()}.")
+        page.paragraph(f"{capitalised(parts_text(result))}.")
         page.table(
             [
                 {
