@@ -83,12 +83,6 @@ class EffectChain(nn.Module):
         geometry = {"full_height_um": self.full_height_um, "pitch_um": self.pitch_um}
         return EffectChain(self.base, effects, **geometry, scan_frame=self.scan_frame)
 
-    def process_model(self, undetermined: bool = False) -> EffectChain:
-        """Only the effects that belong to the printer; those of unknown role on request."""
-        allowed = {"process", "undetermined"} if undetermined else {"process"}
-        kept = {name: values for name, values in self.values().items() if get_effect(name).role in allowed}
-        return self.with_effects(kept)
-
     def _run_stage(self, acts_on: str, field: Tensor, context: FieldContext) -> Tensor:
         for name in self.names:
             effect = get_effect(name)

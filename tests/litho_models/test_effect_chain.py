@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from litho_data.foundation.errors import InputError
 from litho_models.effects import CATALOGUE
 from litho_models.effects.chain import EffectChain
 from litho_models.frozen.files import load_frozen, save_frozen
@@ -42,13 +43,11 @@ def test_no_measurement_effect_changes_the_process_model(effect, tmp_path) -> No
     typical = {name: p.typical for name, p in effect.parameters.items()}
     on, off = chain_of({**process, effect.name: typical}), chain_of(process)
     assert not torch.equal(on(LAYOUT), off(LAYOUT))
-    assert torch.equal(on.process_model()(LAYOUT), off.process_model()(LAYOUT))
-
-
-def test_undetermined_effects_enter_the_process_model_only_on_request() -> None:
-    chain = chain_of({"slope-thinning": {"along_x_um": 0.3}})
-    assert torch.equal(chain.process_model()(LAYOUT), chain.base(LAYOUT))
-    assert torch.equal(chain.process_model(undetermined=True)(LAYOUT), chain(LAYOUT))
+    measured = {effect.name: on.values()[effect.name]}
+    save_frozen(on.base, tmp_path / "model", process_effects=off.values(), measurement_effects=measured)
+    assert torch.equal(load_frozen(tmp_path / "model")(LAYOUT), off(LAYOUT).detach())
+    with pytest.raises(InputError, match=f"{effect.name}, whose role is measurement"):
+        save_frozen(on.base, tmp_path / "other", process_effects=on.values())
 
 
 def test_a_corrected_model_freezes_and_loads_to_the_same_heights(tmp_path) -> None:
