@@ -156,8 +156,7 @@ def _row(job: Job, number: int) -> tuple[object, ...]:
 def _named(value: T | str, what: str, known: dict[str, T]) -> T:
     if not isinstance(value, str):
         return value
-    if value not in known:
-        raise InputError(what, got=repr(value), wanted=" or ".join(known))
+    require_known(what, value, known)
     return known[value]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from litho_data.foundation.errors import InputError, require_known
 from litho_data.virtual_fab.fab import Fab, scan_job
 from litho_data.virtual_fab.jobs import Plan, random_jobs
-from litho_data.virtual_fab.knobs import KNOBS, KnobBoard, KnobSetting
+from litho_data.virtual_fab.knobs import KNOBS, KnobBoard, KnobSetting, checked
 from litho_data.virtual_fab.printer import Job
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 
@@ -63,8 +63,7 @@ def strength_for_rms(
     def measured(strength: float) -> float:
         return knob_rms_nm(KnobSetting(name, strength, seed), fields, policy=policy, printer=printer)
 
-    if name not in KNOBS:
-        KnobSetting.parse(f"{name}=0")
+    checked(KnobSetting(name, 0.0))
     highest = KNOBS[name].limit
     if name == NOISE_KNOB:
         strength = min(rms_nm, highest)
