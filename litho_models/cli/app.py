@@ -11,6 +11,7 @@ import typer
 import litho_models
 from litho_data.foundation.app import DaskOption, WorkersOption, new_app, run_app
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.settings import assigned
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.cli.check import check
 from litho_models.cli.loop import close_loop
@@ -64,6 +65,13 @@ WeightsOption = Annotated[
     ),
 ]
 Seed = Annotated[int, typer.Option(min=0, help="seed of weights, crops and splits")]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        help="FIELD=VALUE of the training that has no option, such as learning_rate=0.001; repeatable",
+    ),
+]
 
 
 @app.command()
@@ -83,6 +91,7 @@ def train(
     precision: PrecisionOption = None,
     weights: WeightsOption = "uniform",
     seed: Seed = 0,
+    set_: SetOption = None,
     use_lock_box: Annotated[
         bool,
         typer.Option("--use-lock-box", help="train on the locked scans too; nothing is left to judge by"),
@@ -94,9 +103,11 @@ def train(
     """
     from litho_models.frozen.readme import bounds_text
 
-    settings = {"seed": seed, "weights": weights, **_given(steps=steps, precision=precision)}
+    settings = _training(
+        set_, recipe=recipe, variant=variant, seed=seed, weights=weights, steps=steps, precision=precision
+    )
     run = litho_models.train(
-        store, model, out, recipe=recipe, variant=variant, settings=settings, use_lock_box=use_lock_box
+        store, model, out, recipe=settings.pop("recipe"), settings=settings, use_lock_box=use_lock_box
     )
     typer.echo(f"{model} trained on {len(run.training_ids)} scans in {run.seconds:.0f} s: {out}")
     if run.at_bounds:
@@ -172,6 +183,7 @@ def benchmark(
         int | None,
         typer.Option(min=0, help="of weights and crops alone, same split; --seed by default"),
     ] = None,
+    set_: SetOption = None,
     workers: WorkersOption = 1,
     dask: DaskOption = None,
 ) -> None:
@@ -183,8 +195,10 @@ def benchmark(
     from litho_models.evaluation.tables import headline_table
     from litho_models.scoring.statistics import FEWEST_FOR_INTERVAL
 
-    settings = {"recipe": recipe, "variant": variant, "weights": weights}
-    settings |= _given(steps=steps, precision=precision, seed=training_seed)
+    settings = _training(
+        set_, recipe=recipe, variant=variant, weights=weights, steps=steps, precision=precision,
+        seed=training_seed,
+    )  # fmt: skip
     result = litho_models.benchmark(
         store,
         out,
@@ -327,5 +341,9 @@ def main() -> None:
     run_app(app, "litho-models")
 
 
-def _given(**options: Any) -> dict[str, Any]:
-    return {name: value for name, value in options.items() if value is not None}
+def _training(words: Sequence[str] | None, **options: Any) -> dict[str, Any]:
+    """Settings of a training: the options that were given, and those of ``--set``."""
+    found = assigned(words or ())
+    if twice := sorted(found.keys() & options.keys()):
+        raise InputError("--set", got=f"{twice[0]}, which an option sets", wanted="another setting")
+    return {name: value for name, value in options.items() if value is not None} | found

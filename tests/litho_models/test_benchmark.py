@@ -371,3 +371,26 @@ def test_the_commands(store, tmp_path):
     assert content["schema"] == "litho-models/evaluation/1"
     refused = runner.invoke(app, ["train", str(store), "--model", "resnet", "--out", run])
     assert isinstance(refused.exception, InputError)
+
+
+def test_every_setting_of_a_training_is_reached_from_the_command_line(store, tmp_path):
+    from typer.testing import CliRunner
+
+    from litho_models.cli.app import app
+    from litho_models.fitting.runs import TrainingRun
+
+    command = ["train", str(store), "--model", "affine", "--steps", "7", "--out"]
+    given = ["--set", "free_gain=true", "--set", "nuisance=full", "--set", "batch=8"]
+    CliRunner().invoke(app, [*command, str(tmp_path / "run"), *given], catch_exceptions=False)
+    config = TrainingRun.read(tmp_path / "run").config
+    assert (config.steps, config.free_gain, config.nuisance, config.batch) == (7, True, "full", 8)
+    for wrong, said in (
+        ("batsh=8", "did you mean batch?"),
+        ("batch=0", "setting batch, got 0"),
+        ("seed=1", "seed, which an option sets"),
+        ("batch", "PATH=VALUE"),
+    ):
+        words = [*command, str(tmp_path / "other"), "--set", wrong]
+        refused = CliRunner().invoke(app, words).exception
+        assert isinstance(refused, InputError)
+        assert said in str(refused)
