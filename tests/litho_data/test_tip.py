@@ -104,6 +104,8 @@ def test_the_radius_of_a_known_tip_is_found(kind: str, radius_um: float, snr: fl
     assert found.radius_um == pytest.approx(radius_um, rel=0.1)
     assert found.radius_sd_um is not None
     assert abs(found.radius_um - radius_um) < 3 * found.radius_sd_um
+    # What the benchmark measures is what the command says.
+    assert peak_radius(_scan(kind, radius_um, snr).height_um, PITCH).radius_um == found.radius_um
 
 
 @pytest.mark.parametrize("seed", [5002, 5004, 5010, 5011])
