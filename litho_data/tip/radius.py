@@ -30,8 +30,8 @@ _SMALLEST_REACH_PX = 5.0
 # Share of the tops beyond 0.4 of the edge that are within 0.8 of it. Surfaces that no tip limits: up to 0.16.
 _TIP_SHARE = 0.25
 # A tip is the same all over a scan, its few sharpest tops are not: that share times the share of the scan's
-# 5 x 5 parts whose own edge is within 0.9 of the whole one. Of rounded bumps, most estimates that are more than
-# 10 % too blunt have less; of steep walls and spikes one in thirty.
+# 5 x 5 parts whose own edge is within 0.9 of the whole one. Of rounded bumps, most estimates that are more
+# than 10 % too blunt have less; of steep walls and spikes one estimate in twenty.
 _AGREEMENT, _EVERYWHERE, _PARTS = 0.9, 0.13, 5
 # Valleys under a tip are sharper than its tops; those of other surfaces, and of most noise, are not.
 _SHARPER_VALLEYS = 1.2
