@@ -26,27 +26,31 @@ from litho_data.virtual_fab.simulate import simulate
 PAGE = Path(__file__).parents[1] / "docs" / "dataset_store.md"
 RESULT = PAGE.parent / "results" / "height-sigma" / "height_sigma.json"
 NAME = "height_sigma.json"
-SEED = 20407
+SEED = 20441
 COVERED = {"within_68": 1.0, "within_95": 1.96}
 _LEVEL = '\n[process]\nlevel = "recipe.toml"\n'
 _RECIPE = '[[step]]\nop = "plane"\n'
 # Side of the fields, px; what is added to the fab's default noise (pixels 0.75, lines 0.6 nm, roughness
-# 15.9 nm); and the recipe.
-CONDITIONS: Mapping[str, tuple[int, tuple[str, ...], str]] = {
-    "default noise": (512, (), ""),
-    "lines of 8 nm": (512, ("scan-line-stripes=8",), ""),
-    "tilt and bow of 20 nm": (512, ("tilt-bow=20",), ""),
-    "tilt and bow, plane taken out": (512, ("tilt-bow=20",), _RECIPE),
-    "256 px": (256, (), ""),
-    "256 px, tilt and bow of 20 nm": (256, ("tilt-bow=20",), ""),
-    "256 px, plane taken out": (256, ("tilt-bow=20",), _RECIPE),
+# 15.9 nm); the recipe; and how many times as many scans as asked for. A tilt and bow is one draw a scan.
+# Even with its size known exactly, 20 scans have 69.6 ± 1.1 % of their pixels within 1 σ, one set in nine
+# more than 71 %.
+CONDITIONS: Mapping[str, tuple[int, tuple[str, ...], str, int]] = {
+    "default noise": (512, (), "", 1),
+    "lines of 8 nm": (512, ("scan-line-stripes=8",), "", 1),
+    "tilt and bow of 20 nm": (512, ("tilt-bow=20",), "", 3),
+    "tilt and bow, plane taken out": (512, ("tilt-bow=20",), _RECIPE, 3),
+    "256 px": (256, (), "", 1),
+    "256 px, tilt and bow of 20 nm": (256, ("tilt-bow=20",), "", 3),
+    "256 px, plane taken out": (256, ("tilt-bow=20",), _RECIPE, 3),
 }
 
 
 def main() -> None:
     """Measure, print, write."""
     parser = options(__doc__, "write the table into docs/dataset_store.md", RESULT)
-    parser.add_argument("--count", type=int, default=20, help="scans of each condition")
+    parser.add_argument(
+        "--count", type=int, default=20, help="scans of each condition, three times as many with a surface"
+    )
     parser.add_argument("--workers", type=int, default=1)
     arguments = parser.parse_args()
     record = {
@@ -55,8 +59,8 @@ def main() -> None:
         "count": arguments.count,
         **origin(),
         "conditions": [
-            {"what": what, **measure(knobs, recipe, arguments.count, size_px, arguments.workers)}
-            for what, (size_px, knobs, recipe) in CONDITIONS.items()
+            {"what": what, **measure(knobs, recipe, times * arguments.count, size_px, arguments.workers)}
+            for what, (size_px, knobs, recipe, times) in CONDITIONS.items()
         ],
     }
     conclude(record, as_markdown(record), arguments.out, PAGE, NAME, published=arguments.publish)
@@ -107,6 +111,7 @@ def as_markdown(record: Mapping[str, Any]) -> str:
         rows.append(
             (
                 one["what"],
+                str(one["scans"]),
                 f"{one['error_nm']:.1f}",
                 f"{one['budget_nm']['sigma_nm']:.1f}",
                 ", ".join(f"{name} {value:.1f}" for name, value in parts.items()),
@@ -117,17 +122,17 @@ def as_markdown(record: Mapping[str, Any]) -> str:
         )
     heads = (
         "virtual prints",
+        "scans",
         "error, nm",
         "σ, nm",
         "of which",
         "sd of error / σ",
         "within 1, 1.96 σ",
-        "scans",
+        "sd of a scan",
     )
-    first = record["conditions"][0]
     note = (
-        f"{first['scans']} scans each, of 512 px ({first['pixels'] / 1e6:.1f} million pixels) if nothing "
-        f"else is said, seed {record['seed']}; pooled; last column: smallest and largest sd of one scan."
+        f"Fields of 512 px if nothing else is said, seed {record['seed']}; all pixels of all scans "
+        "pooled; last column: smallest and largest of one scan."
     )
     return markdown_table(heads, rows, note)
 

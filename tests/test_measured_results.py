@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import csv
+from pathlib import Path
+from statistics import median
+
 import pytest
 
 from benchmarks import recipes
@@ -83,3 +87,20 @@ def test_only_what_the_loop_on_physics_confirms_is_said_to_be_found_there():
 
 def test_every_result_is_there():
     assert {path.name for path in FOLDER.iterdir()} >= {*RESULTS, "prediction.jpg", "loop_steps.png"}
+
+
+def test_the_page_on_the_store_quotes_the_uncertainty_of_the_measured_heights():
+    page = " ".join((Path(__file__).parents[1] / "docs" / "dataset_store.md").read_text("utf-8").split())
+    with (FOLDER / "registration.csv").open(encoding="utf-8") as file:
+        scans = list(csv.DictReader(file))
+
+    def middle(name: str) -> str:
+        return f"{median(float(scan[name]) for scan in scans):.1f}"
+
+    unclear = sum(float(scan["sigma_levelling_nm"]) == 0 for scan in scans)
+    assert f"the median of `sigma_nm` is {middle('sigma_nm')} nm" in page
+    assert (
+        f"(`sigma_levelling_nm`: {middle('sigma_levelling_nm')}; {unclear} of the {len(scans)} show no clear "
+        f"surface); pixels and lines ({middle('sigma_pixel_nm')}, {middle('sigma_line_nm')}), resampling "
+        f"({middle('sigma_resampling_nm')}) and registration ({middle('sigma_registration_nm')})"
+    ) in page

@@ -69,7 +69,7 @@ def run_app(app: typer.Typer, name: str) -> None:
         if error.errno not in _NO_ROOM:
             raise
         where = f" {error.filename}" if error.filename else ""
-        hint = "a build goes on from here once there is room"
+        hint = "make room and give the command again; a build resumes"
         said = f"{name}: cannot write{where}, got {error.strerror}; {hint}"
     else:
         raise SystemExit(code if isinstance(code, int) else 0)

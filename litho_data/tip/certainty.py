@@ -23,8 +23,9 @@ from litho_data.tip.curvature import (
 from litho_data.tip.morphology import paraboloid_erosion
 
 # Curvature of a valley in units of the tip's: from the first on it may be a jump, from the second it is. The
-# image of a valley of curvature k has k / (1 − kR): 0.75 of the tip's means 0.43 in the surface.
-_MAY_JUMP, _JUMPS = 0.35, 0.75
+# image of a valley of curvature k has k / (1 − kR): 0.6 of the tip's means 0.375 in the surface. A disc that
+# noise makes as wide as the valley shows less than the valley has; noise alone reaches 0.6 at 3.5 sd.
+_MAY_JUMP, _JUMPS = 0.35, 0.6
 # A disc sees a jump from a radius away, weaker; the jump is where it is more than this share of its peak.
 _CORE = 0.55
 _SMOOTHING = 0.25

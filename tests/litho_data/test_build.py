@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import shutil
 import signal
@@ -26,7 +27,7 @@ from litho_data.provenance.replay import replay
 from litho_data.provenance.verify import verify
 from litho_data.store import open_store
 from litho_data.store.access import values_of
-from litho_data.store.partial import partial_store
+from litho_data.store.partial import PartialStore, Piece, partial_store
 from tests.litho_data.campaigns import (
     LEVEL_HEIGHT_UM,
     MARGIN_PX,
@@ -265,6 +266,31 @@ def test_a_killed_build_is_finished_by_the_next(campaign: Path, tmp_path: Path) 
     assert result.dataset.sha256 == open_store(campaign / "prints.zarr").sha256
     assert verify(out).findings == ()
     assert not pieces.parent.exists()
+
+
+def test_a_full_disk_loses_neither_the_older_store_nor_the_scans_that_are_done(
+    campaign: Path, own_campaign: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, card = own_campaign / "prints.zarr", own_campaign / "card.toml"
+    older = open_store(out).sha256
+    card.write_text(card.read_text() + '\n[process]\nregistration = "homography"\n')
+    add, kept = PartialStore.add, []
+
+    def full_after_two(self: PartialStore, piece: Piece) -> None:
+        if len(kept) == 2:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        kept.append(piece)
+        add(self, piece)
+
+    with monkeypatch.context() as disk:
+        disk.setattr(PartialStore, "add", full_after_two)
+        with pytest.raises(OSError, match="No space left"):
+            build_dataset(card, out)
+    assert open_store(out).sha256 == open_store(out).computed_sha256() == older
+    result = build_dataset(card, out)
+    assert result.reused == 2
+    assert result.dataset.sha256 == open_store(out).sha256 != older
+    assert verify(out).findings == ()
 
 
 def test_a_damaged_or_outdated_piece_is_made_again(campaign: Path, own_campaign: Path) -> None:

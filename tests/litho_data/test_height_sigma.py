@@ -125,6 +125,20 @@ def test_the_error_of_a_fit_is_taken_off_a_surface_or_added_to_what_was_levelled
     assert WarpError(np.eye(6), 3.0, 5.0, True).surface_variance(levelled=False) == 0
 
 
+def test_shapes_alone_scatter_the_share_of_pixels_within_a_known_surface():
+    """Tilt and bow of five equal terms, σ their exact size: what docs/dataset_store.md compares with."""
+    basis = quadratic_basis((48, 48))[1:].reshape(5, -1)
+    basis = (basis - basis.mean(axis=1, keepdims=True)) / basis.std(axis=1, keepdims=True)
+    surfaces = np.random.default_rng(0).standard_normal((6000, 5)) @ basis
+    errors = np.abs(surfaces / surfaces.std(axis=1, keepdims=True))
+    within_1, within_196 = ((errors < limit).mean(axis=1) for limit in (1.0, 1.96))
+    # One scan scatters by 0.048 and 0.012: the means of 6000 by 0.0006 and 0.0002, and the spread of 300
+    # sets of 20, 0.0107, by a twenty-fourth of itself; three times that, and what 48 pixels a side round.
+    assert within_1.mean() == pytest.approx(0.696, abs=0.004)
+    assert within_196.mean() == pytest.approx(0.946, abs=0.002)
+    assert within_1.reshape(300, 20).mean(axis=1).std() == pytest.approx(0.0107, rel=0.13)
+
+
 def test_what_levelling_took_from_a_print_is_as_large_as_stated():
     """Least squares takes the surface of topography and roughness; after it, only the first can be seen."""
     layout = layout_of(3, (256, 256))

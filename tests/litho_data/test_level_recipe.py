@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import get_args
 
@@ -11,6 +12,7 @@ import pytest
 from litho_data.foundation.errors import InputError
 from litho_data.level import Recipe, align_rows, level_plane, level_polynomial, mask_and_relevel
 from litho_data.level.recipe_steps import AnyStep, Plane, Polynomial
+from litho_data.level.rows import RowMethod
 from litho_data.scan import Scan
 
 CHAIN = """
@@ -131,3 +133,18 @@ def test_a_missing_recipe_and_a_missing_layout(tmp_path: Path) -> None:
         Recipe.from_toml(tmp_path / "none.toml")
     with pytest.raises(InputError, match=r"step 1 \(layout-aware\): the layout"):
         chain(tmp_path, '[[step]]\nop = "layout-aware"').apply(surface())
+
+
+def test_the_page_says_of_every_operation_whether_another_program_has_levelled_with_it() -> None:
+    """Names of the page's first column; where Gwyddion is followed, one of the two cells below has them."""
+    page = (Path(__file__).parents[2] / "docs" / "levelling.md").read_text(encoding="utf-8")
+    lines = [line for line in page.splitlines() if line.startswith("|")]
+    rows = [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in lines]
+    follows = {name: row[3] for row in rows if len(row) == 4 for name in re.findall("`([^`]+)`", row[0])}
+    known = {kind.model_fields["op"].default for kind in get_args(get_args(AnyStep)[0])}
+    assert known == follows.keys() - {"op"}
+    at = next(i for i, row in enumerate(rows) if row[0] == "has reference fields")
+    with_fields, without = (set(re.findall("`([^`]+)`", cell)) for cell in rows[at + 2])
+    assert {name for name, whose in follows.items() if whose.startswith("Gwyddion")} <= with_fields | without
+    assert not with_fields & without
+    assert all(f"`{method}" in page for method in get_args(RowMethod))

@@ -32,7 +32,7 @@ from litho_data.tip import (
     reconstructed,
     tip_certain,
 )
-from litho_data.tip.radius import PeakRadius, of_one_tip
+from litho_data.tip.radius import PeakRadius, of_one_tip, peak_radius
 from tests.litho_data.campaigns import write_campaign
 
 PITCH = PITCH_UM
@@ -104,6 +104,19 @@ def test_the_radius_of_a_known_tip_is_found(kind: str, radius_um: float, snr: fl
     assert found.radius_um == pytest.approx(radius_um, rel=0.1)
     assert found.radius_sd_um is not None
     assert abs(found.radius_um - radius_um) < 3 * found.radius_sd_um
+    # What the benchmark measures is what the command says.
+    assert peak_radius(_scan(kind, radius_um, snr).height_um, PITCH).radius_um == found.radius_um
+
+
+@pytest.mark.parametrize("seed", [5002, 5004, 5010, 5011])
+def test_a_few_tops_that_are_sharper_than_the_others_are_not_taken_for_the_tip(seed: int) -> None:
+    """Rounded bumps of many radii r: an image shows R + r, and where it ends few bumps decide."""
+    image, _ = print_under_tip("bumps", 0.15, 1.0, seed=seed)
+    found = peak_radius(image + noise_of_snr(image.shape, 1.0, 50, seed), PITCH)
+    # Taken for estimates they would be 15 to 52 % too blunt.
+    assert "parts of the scan" in found.reason
+    assert found.radius_um is not None
+    assert found.radius_um > 0.15
 
 
 @pytest.mark.parametrize("snr", [20, 100])
@@ -222,6 +235,18 @@ def test_untouched_pixels_are_uncertain_and_most_of_the_touched_certain(
     assert untouched.sum() > 100
     assert (~certain[untouched]).mean() >= 0.95
     assert certain[~untouched].mean() >= 0.8
+
+
+@pytest.mark.parametrize("kind", ["pillars", "spikes", "bumps"])
+def test_valleys_as_narrow_as_the_disc_are_uncertain_too(kind: str) -> None:
+    """A sharp tip and much noise: the disc that a curvature needs is more than half the reach of the tip."""
+    inner = (slice(15, -15),) * 2
+    for seed in (5000, 5001, 5002):
+        image, touched = print_under_tip(kind, 0.15, 1.0, seed=seed)
+        certain = tip_certain(image + noise_of_snr(image.shape, 1.0, 20, seed), PITCH, 0.15)[inner]
+        untouched = touched[inner] < 0.5
+        assert (~certain[untouched]).mean() >= 0.95
+        assert certain[~untouched].mean() >= 0.8
 
 
 def test_a_blunter_tip_leaves_fewer_pixels_certain_and_a_flat_scan_all() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,6 +13,7 @@ from litho_models.loop.fold_fits import FoldFits, predict
 from litho_models.loop.parameters import get_vector
 from litho_models.loop.prepared import prepare_scans
 from litho_models.loop.selection import contest
+from litho_models.loop.selection import search as selection
 from litho_models.loop.study import State, Study, held_out_residuals
 from litho_models.scan_terms import SCAN_TERMS
 from tests.litho_models.loop_scans import printed_scans, true_model
@@ -31,6 +33,28 @@ def test_scans_are_screened_by_the_fit_that_has_not_seen_them() -> None:
     ):
         seen_by_all = scan.height - scan.at_sample(predict(chain, common, scan))
         assert np.allclose(seen_by_all - residual, 0.01 * (fold + 1), atol=1e-6)
+
+
+@pytest.mark.parametrize("known_um", [0.13, None])
+def test_the_tip_enters_a_contest_at_the_radius_that_the_store_found(known_um, monkeypatch) -> None:
+    stored = printed_scans(count=4, seed=9)
+    # As after `build --tip blind`, but for a first scan that says nothing.
+    study = Study(
+        prepare_scans([stored[0], *(replace(scan, tip_radius_um=known_um) for scan in stored[1:])]), FOLD_OF
+    )
+    tried: list[float] = []
+
+    def hold(state: State, candidates, *_: object, **__: object) -> contest.Contest:
+        tip = next(effect for effect in candidates if effect.name == "tip-dilation")
+        tried.extend(trial["radius_um"] for trial in tip.trials)
+        return contest.Contest([])
+
+    monkeypatch.setattr(selection, "hold_contest", hold)
+    chain = true_model({})
+    nothing = FoldFits(chain, get_vector(chain), np.zeros((3, 1)), np.zeros(3), np.eye(1), [])
+    selection.search_effects(State(nothing, []), study, frozenset({"offset"}), exclude={})
+    own = [trial["radius_um"] for trial in get_effect("tip-dilation").trials]
+    assert tried == own + ([known_um] if known_um else [])
 
 
 @pytest.mark.parametrize(
