@@ -45,7 +45,7 @@ def write_plan(
     for scan, level in zip(plan.scans, layouts, strict=True):
         write_layout(folder, scan.id, level)
     rows = [
-        (s.id, s.order, s.field_x_um, s.field_y_um, 1.0, s.use, s.turned_deg, s.direction, s.tip)
+        (s.id, s.order, s.field_x_um, s.field_y_um, s.dose, s.use, s.turned_deg, s.direction, s.tip)
         for s in plan.scans
     ]
     write_table(folder, _COLUMNS, rows)
@@ -79,18 +79,20 @@ def _printer_sheet(plan: NextPrint) -> str:
     lines = [
         f"# Printing for {plan.dataset.name}",
         "",
-        f"{plan.prints} prints of {plan.field_um:g} µm, in this order, with the dose, resist and recipe of "
-        "the prints so far, none turned. Write along x, one line below the other. Print the references once.",
+        f"{plan.prints} prints of {plan.field_um:g} µm, in this order, with the resist and recipe of the "
+        "prints so far, none turned. Write along x, one line below the other. Print the references once.",
         "",
-        "| order | layout | centre in the write field (x, y), µm | what it is |",
-        "|---|---|---|---|",
+        "| order | layout | centre in the write field (x, y), µm | dose, of the recipe's | what it is |",
+        "|---|---|---|---|---|",
     ]
     for scan in _first_scans(plan):
         what = "print" if scan.use == "dataset" else _USES[scan.use]
         place = f"{scan.field_x_um:g}, {scan.field_y_um:g}"
-        lines.append(f"| {scan.order} | layouts/{scan.id}.tif | {place} | {what} |")
+        lines.append(f"| {scan.order} | layouts/{scan.id}.tif | {place} | {scan.dose:g} | {what} |")
     lines += [
         "",
+        "Dose is what the resist takes up: with two photons it goes with the square of the laser power, so "
+        "that 0.8 of it takes 0.89 of the power.",
         "Note the laser power before each print, and anything that went otherwise than written here.",
     ]
     return "\n".join(lines) + "\n"

@@ -13,7 +13,7 @@ Status = Literal["decides", "may decide", "no experiment separates", "needs a fa
 
 
 class PlannedScan(Record):
-    """One scan of the plan; ``place``: in the write field."""
+    """One scan of the plan; ``field_x_um``, ``field_y_um``: in the write field; ``dose``: of its print."""
 
     id: str
     print: str
@@ -24,6 +24,7 @@ class PlannedScan(Record):
     tip: int
     field_x_um: float
     field_y_um: float
+    dose: float = 1.0
     why: str
 
 
