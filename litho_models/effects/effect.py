@@ -69,6 +69,7 @@ class FieldContext:
         quarter_turns: the microscope saw the array turned by so many quarters, as ``rot90`` turns it.
         backward: the scan lines were recorded on the way back.
         new_tip: scanned with another tip than the rest, a sharp one.
+        pixel_size: of the scan, relative to the rest: what lags in time goes with it.
         dose: of the print, relative to the recipe's; ``layout_um`` holds it already.
         seed: decides the draws of random effects where one is planted.
     """
@@ -88,6 +89,7 @@ class FieldContext:
     quarter_turns: int = 0
     backward: bool = False
     new_tip: bool = False
+    pixel_size: float = 1.0
     dose: float = 1.0
 
     def in_scan_frame(self) -> FieldContext:

@@ -119,6 +119,7 @@ def _prepare(scan: PrintedScan, order: float) -> PreparedScan:
         quarter_turns=scan.quarter_turns,
         backward=scan.direction == -1,
         new_tip=scan.tip not in (None, 1),
+        pixel_size=1.0 if scan.pixel_size is None else float(scan.pixel_size),
         dose=dose,
     )
     return _thinned(scan, context, scan.usable, scan.usable & _inner(scan.shape), line)

@@ -22,7 +22,7 @@ from litho_models.planning.layouts import NEAREST, TILE_PX, Limits, climb, score
 from litho_models.planning.rivalry import Place, PlannedPrint, Rivalry, Way
 
 TURNED = Way(turned_deg=90)
-_EXTRAS = (TURNED, Way(backward=True), Way(new_tip=True))
+_EXTRAS = (TURNED, Way(backward=True), Way(new_tip=True), Way(fine=True))
 _MOST_EXTRAS = 2
 # A further scan is worth its time if it brings rivals apart by this factor.
 _WORTH = 1.3
@@ -38,6 +38,8 @@ WORDS = {
         new_tip=True
     ): "with a new, sharp tip: what the tip adds is gone, what was printed stays; turning the "
     "print shows nothing of a round tip",
+    Way(fine=True): "with pixels of half the size, as much time for each: what the microscope blurs or "
+    "delays is half as long, what was printed stays",
 }
 
 

@@ -23,7 +23,10 @@ HOLDS = (
     PRINTER_SHEET,
     MICROSCOPE_SHEET,
 )
-_COLUMNS = ("id", "order", "field_x_um", "field_y_um", "dose", "use", "turned_deg", "direction", "tip")
+_COLUMNS = (
+    *("id", "order", "field_x_um", "field_y_um", "dose", "use"),
+    *("turned_deg", "direction", "tip", "pixel_size"),
+)
 _USES = {
     "substrate": "bare substrate, nothing printed: zero, tilt and bow of the microscope",
     "flat": "one level everywhere: the noise floor",
@@ -44,11 +47,7 @@ def write_plan(
     """Write card, table, layouts and sheets; ``layouts``: the level map of each scan."""
     for scan, level in zip(plan.scans, layouts, strict=True):
         write_layout(folder, scan.id, level)
-    rows = [
-        (s.id, s.order, s.field_x_um, s.field_y_um, s.dose, s.use, s.turned_deg, s.direction, s.tip)
-        for s in plan.scans
-    ]
-    write_table(folder, _COLUMNS, rows)
+    write_table(folder, _COLUMNS, [tuple(getattr(scan, name) for name in _COLUMNS) for scan in plan.scans])
     CardText(
         name=f"{plan.dataset.name}-next",
         title=f"Planned prints that decide what is open on {plan.dataset.name}",
@@ -107,20 +106,21 @@ def _microscope_sheet(plan: NextPrint) -> str:
         "margin of 1 to 2 µm around the print helps. Take the print out and put it back between two scans of "
         "it. Leave the file as the microscope shows it: do not turn it back.",
         "",
-        "| order | scan | print | turned | direction | tip | why |",
-        "|---|---|---|---|---|---|---|",
+        "| order | scan | print | turned | direction | tip | pixels | why |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for scan in plan.scans:
         direction = "there" if scan.direction > 0 else "back"
         tip = "as before" if scan.tip == 1 else "new"
+        pixels = "as before" if scan.pixel_size == 1 else f"{scan.pixel_size:g} of their size"
         lines.append(
             f"| {scan.order} | {scan.id} | {scan.print} | {scan.turned_deg}° | {direction} | {tip} | "
-            f"{scan.why} |"
+            f"{pixels} | {scan.why} |"
         )
     lines += [
         "",
-        "If a scan had to be made otherwise, say so in `scans.csv` (`turned_deg`, `direction`, `tip`): a "
-        "turned scan without its column is refused. Then",
+        "If a scan had to be made otherwise, say so in `scans.csv` (`turned_deg`, `direction`, `tip`, "
+        "`pixel_size`): a turned scan without its column is refused. Then",
         "",
         "    litho-data build card.toml --out next.zarr",
         "    litho-models close-loop prints.zarr next.zarr --out decided",

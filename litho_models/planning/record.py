@@ -22,6 +22,7 @@ class PlannedScan(Record):
     turned_deg: int
     direction: int
     tip: int
+    pixel_size: float = 1.0
     field_x_um: float
     field_y_um: float
     dose: float = 1.0

@@ -43,12 +43,19 @@ class Way:
     """How one scan is made.
 
     ``turned_deg``: by how much the print lies turned under the microscope; ``backward``: lines recorded on
-    the way back; ``new_tip``: with another, sharp tip.
+    the way back; ``new_tip``: with another, sharp tip; ``fine``: with pixels of half the size, and as much
+    time for each.
     """
 
     turned_deg: int = 0
     backward: bool = False
     new_tip: bool = False
+    fine: bool = False
+
+    @property
+    def pixel_size(self) -> float:
+        """Of the scan, relative to the scans so far."""
+        return 0.5 if self.fine else 1.0
 
 
 @dataclass(frozen=True)
@@ -91,6 +98,7 @@ class Printing:
             quarter_turns=way.turned_deg // 90,
             backward=way.backward,
             new_tip=way.new_tip,
+            pixel_size=way.pixel_size,
             dose=printed.dose,
         )
 

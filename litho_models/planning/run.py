@@ -201,6 +201,7 @@ def schedule(
             turned_deg=way.turned_deg,
             direction=-1 if way.backward else 1,
             tip=2 if way.new_tip else 1,
+            pixel_size=way.pixel_size,
             field_x_um=reach_um,
             field_y_um=reach_um,
             dose=dose,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.stats import norm
 
 from benchmarks import two_rounds
+from benchmarks.two_rounds_figure import bins
 from litho_data.cards.card import load_card
 from litho_data.cards.tables import read_table
 from litho_data.foundation.errors import InputError
@@ -623,6 +625,15 @@ def test_what_is_planted_is_drawn_before_anything_is_run_and_judged_by_its_owner
         told = two_rounds.judged(other.model_copy(update={"kind": kind}), planned, "slope-thinning-x")
         assert not told["counts"]
         assert told["wrong"] is wrong
+
+
+def test_the_picture_of_promises_shows_what_the_table_counts() -> None:
+    trials = json.loads((two_rounds.RESULTS / "20273.json").read_text("utf-8"))["trials"]
+    kept = bins(trials, "optimised")[-1]
+    assert kept.promised > 0.95
+    assert f"| {kept.right} of {kept.asked} (" in two_rounds.summary(trials)
+    counted = sum(one["counts"] for trial in trials for one in trial["answers"].get("optimised", []))
+    assert sum(one.asked for one in bins(trials, "optimised")) == counted
 
 
 def test_a_plan_is_printed_by_the_same_machine_with_new_chance() -> None:
