@@ -1,14 +1,15 @@
 """How often `litho-models check` alarms on an unchanged printer, and how often it notices a step.
 
-    python -m benchmarks.drift_alarm --store runs/neural-lithography/store.zarr
-        --residuals runs/neural-lithography/leave-one-print-out [--publish]
+    python -m benchmarks.drift_alarm [--store runs/neural-lithography/store.zarr
+        --residuals runs/neural-lithography/leave-one-print-out] [--publish]
 
 Virtual prints: the height gain of every print is drawn with a spread of 1 or 5 %; a Physics model is fitted
 to prints of the same fab. 1,000 times, 48 reference prints and three new ones are drawn from 600 prints, and
 three more from 200 whose gain is three spreads higher or lower; the first 12 and 24 of the reference are
 smaller ones. Fields lie on their layouts (microscope `aligned`), so that nothing is registered. Beside it the
-law of the rule for Gaussian figures, in closed form; and the measured prints, each in turn as the new one. An
-interrupted run resumes.
+law of the rule for Gaussian figures, in closed form; and the measured prints, each in turn as the new one.
+Without ``--store`` the figures of their scans are those of the published record, and only the rule is applied
+to them anew. An interrupted run resumes.
 """
 
 from __future__ import annotations
@@ -174,16 +175,24 @@ def best_chance(prints: int, rate: float) -> float:
     return float(nct.sf(student.isf(rate / 2, freedom), freedom, errors))
 
 
-def measured_prints(store: Path, residuals: Path, model: str) -> dict[str, Any]:
-    """Each measured print in turn against the others, all predicted by fits that had not seen them."""
+def measured_figures(store: Path | None, residuals: Path | None, model: str) -> dict[str, Any]:
+    """Figures of the measured scans, all predicted by fits that had not seen their print."""
+    if store is None or residuals is None:
+        known = json.loads(RESULT.read_text(encoding="utf-8"))["measured"]
+        return {"model": known["model"], "scans": known["scans"]}
     found = read_residuals(open_store(store), [residuals], model)
     rows = [scan_figures(*pair) for pair in zip(found.scans, found.maps_um, strict=True)]
-    known = [row for row in rows if row is not None]
+    return {"model": found.model, "scans": [row.model_dump(mode="json") for row in rows if row is not None]}
+
+
+def measured_prints(figures: Mapping[str, Any]) -> dict[str, Any]:
+    """Each measured print in turn against the others."""
+    known = [ScanFigures.model_validate(row) for row in figures["scans"]]
     checks = {}
     for name in dict.fromkeys(row.print for row in known):
         parts = [[row for row in known if (row.print == name) == new] for new in (False, True)]
         checks[name] = [one.model_dump(mode="json") for one in judge(*parts, between=True)]
-    return {"model": found.model, "scans": [row.model_dump(mode="json") for row in known], "checks": checks}
+    return {**figures, "checks": checks}
 
 
 def texts(record: Mapping[str, Any]) -> dict[str, str]:
@@ -283,15 +292,15 @@ def _prints_of_cache(cache: Path, spread: float, number: int) -> dict[str, Any]:
 def main() -> None:
     """Run, print, write."""
     parser = options(__doc__, "write the figures into the page")
-    parser.add_argument("--store", type=Path, required=True, help="measured prints")
-    parser.add_argument("--residuals", type=Path, required=True, help="their leave-one-print-out benchmark")
+    parser.add_argument("--store", type=Path, help="measured prints")
+    parser.add_argument("--residuals", type=Path, help="their leave-one-print-out benchmark")
     parser.add_argument("--model", default="physics", help="which model of it")
     parser.add_argument("--cache", type=Path, default=Path("runs/drift-alarm"), help="a file per part")
     parser.add_argument("--out", type=Path, default=RESULT, help="JSON file to write")
     given = parser.parse_args()
     parts: dict[str, Callable[[], Any]] = {
         "rule": lambda: [rule_on_gaussian_figures(prints) for prints in RULE_REFERENCES],
-        "measured": lambda: measured_prints(given.store, given.residuals, given.model),
+        "measured": lambda: measured_prints(measured_figures(given.store, given.residuals, given.model)),
     }
     for spread in SPREADS:
         for number in range(PARTS):
