@@ -43,7 +43,7 @@ def main() -> None:
     given = parser.parse_args()
     plan = NextPrint.read(given.plan)
     shutil.rmtree(RESULTS, ignore_errors=True)
-    for name in (*HOLDS, "scans.csv"):
+    for name in HOLDS:
         source = given.plan / name
         if name in _LEFT_OUT or not source.exists():
             continue
