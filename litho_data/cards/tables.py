@@ -62,6 +62,8 @@ def _check_row(row: Mapping[str, str], what: str, overfull: bool, needs_order: b
         if name in row and float(row[name]) not in _ALLOWED.get(name, (float(row[name]),)):
             wanted = " | ".join(f"{value:g}" for value in _ALLOWED[name])
             raise InputError(f"{what}: {name}", got=repr(row[name]), wanted=wanted)
+    if float(row.get("pixel_size", 1)) <= 0:
+        raise InputError(f"{what}: pixel_size", got=repr(row["pixel_size"]), wanted="above 0: 0.5 is half")
 
 
 def _is_finite(text: str) -> bool:

@@ -61,7 +61,7 @@ class PrintedScan:
         field_x_um, field_y_um: position of the scan in its write field, µm; ``dose``: relative dose;
             None if the card does not state it.
         turned_deg: by how much the scan is turned against the others, ``direction``: 1 trace, -1 retrace,
-            ``tip``: number of the tip; None as above.
+            ``tip``: number of the tip, ``pixel_size``: of the scan, relative to the others; None as above.
         bend_um: of a bent scan; ``scan_to_layout`` then acts on the straightened positions.
         tip_radius_um: of the microscope's tip, or the most that it can be; None if the store does not say.
         height_sigma_um: float32 (ny, nx), µm, standard uncertainty of ``height_um``, the scan's offset aside;
@@ -85,6 +85,7 @@ class PrintedScan:
     turned_deg: float | None = None
     direction: float | None = None
     tip: float | None = None
+    pixel_size: float | None = None
     bend_um: Bend | None = None
     tip_radius_um: float | None = None
     height_sigma_um: np.ndarray | None = None
@@ -182,9 +183,7 @@ class Store:
             levels=self.levels,
             scan_to_layout=self.sample("scan_to_layout", row),
             write=self.write,
-            field_x_um=self._column("field_x_um", row),
-            field_y_um=self._column("field_y_um", row),
-            **{name: self._column(name, row) for name in ("dose", "turned_deg", "direction", "tip")},
+            **{name: self._column(name, row) for name in OPTIONAL_COLUMNS},
             bend_um=self._bend_um(row),
             tip_radius_um=self._tip_radius_um(row),
             height_sigma_um=self.sample(SIGMA.name, row) if SIGMA.name in self._arrays else None,

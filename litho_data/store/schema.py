@@ -81,7 +81,7 @@ SCAN_VARIABLES = (
 # No unit for the whole of it; in hashes it counts as 1.
 MIXED_UNITS = {"scan_to_layout": "units of its rows: 1, 1, um; 1, 1, um; um-1, um-1, 1"}
 VARIABLES = {variable.name: variable for variable in (*LAYOUT_VARIABLES, *SCAN_VARIABLES)}
-OPTIONAL_COLUMNS = ("field_x_um", "field_y_um", "dose", "turned_deg", "direction", "tip")
+OPTIONAL_COLUMNS = ("field_x_um", "field_y_um", "dose", "turned_deg", "direction", "tip", "pixel_size")
 """Numbers per scan from the card's table; coordinates where the card has them, NaN where a row has not."""
 
 

@@ -25,7 +25,7 @@ def scan_surface(
     """Height that the microscope reports for a surface given at its pixels, µm.
 
     Lines are scanned from left to right (fast axis x; on the way back from right to left), the first line
-    on top.
+    on top. With smaller pixels the tip moves more slowly: what lags in time lags by a smaller length.
 
     Args:
         surface_um: true height at the pixels of the scan, µm.
@@ -37,14 +37,14 @@ def scan_surface(
         height = _dilate_by_tip(height, frame.pitch_um, strength)
     if strength := knobs["feedback-lag"]:
         onwards = slice(None, None, int(job.direction))
-        height = _follow_surface(height[:, onwards], frame.pitch_um, strength)[:, onwards]
+        lag_um = strength * job.pixel_size
+        height = _follow_surface(height[:, onwards], frame.pitch_um, lag_um)[:, onwards]
     if strength := knobs["z-gain"]:
         height = height * (1 + strength * knobs.scan_rng("z-gain", scan_index).standard_normal())
     height = height + 1e-3 * _additive_nm(frame, noise, knobs, scan_index, rng)
     if strength := knobs["resampling-blur"]:
-        height = scipy.ndimage.gaussian_filter(
-            height, strength / frame.pitch_um, mode="nearest", truncate=5.0
-        )
+        blur_px = strength / frame.layout_pitch_um
+        height = scipy.ndimage.gaussian_filter(height, blur_px, mode="nearest", truncate=5.0)
     if strength := knobs["scars-and-spikes"]:
         height = _scar(height, strength, knobs.scan_rng("scars-and-spikes", scan_index))
     if strength := knobs["min-to-zero-datum"]:

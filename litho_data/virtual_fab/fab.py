@@ -56,6 +56,7 @@ def scan_job(fab: Fab, job: Job) -> FabScan:
         fab.microscope,
         np.random.default_rng(geometry_seed),
         job.turned_deg,
+        job.pixel_size,
     )
     surface = print_clean(job, fab.printer, fab.knobs, fab.cause)
     rough = surface_noise(job, fab.printer, fab.noise, fab.knobs, np.random.default_rng(roughness_seed))

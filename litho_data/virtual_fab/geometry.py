@@ -22,11 +22,13 @@ class ScanFrame:
         shape: (ny, nx) of the scan.
         pitch_um: nominal pixel pitch, µm.
         scan_to_layout: 3×3, maps (x_um, y_um, 1) of the scan to the layout.
+        layout_pitch_um: of the layout, and of the canvas around it, µm.
     """
 
     shape: tuple[int, int]
     pitch_um: float
     scan_to_layout: np.ndarray
+    layout_pitch_um: float
 
     @property
     def size_um(self) -> tuple[float, float]:
@@ -45,10 +47,12 @@ def place_scan(
     microscope: Microscope,
     rng: np.random.Generator,
     turned_deg: float = 0.0,
+    pixel_size: float = 1.0,
 ) -> ScanFrame:
     """A scan centred on the layout up to a small random shift, rotation, shear and anisotropic scale.
 
-    ``turned_deg``: by how much the print lies turned under the microscope, on top of the small rotation.
+    ``turned_deg``: by how much the print lies turned under the microscope, on top of the small rotation;
+    ``pixel_size``: of the scan, in pixels of the layout.
     """
     margins_px = [round(microscope.margin_px * size / _REFERENCE_PX) for size in layout_shape]
     shape = (layout_shape[0] + 2 * margins_px[0], layout_shape[1] + 2 * margins_px[1])
@@ -64,7 +68,8 @@ def place_scan(
     transform = np.eye(3)
     transform[:2, :2] = linear
     transform[:2, 2] = layout_centre_um + microscope.shift_um * draws[4:6] - linear @ scan_centre_um
-    return ScanFrame(shape, pitch_um, transform)
+    pixels = round(shape[0] / pixel_size), round(shape[1] / pixel_size)
+    return ScanFrame(pixels, pixel_size * pitch_um, transform, pitch_um)
 
 
 def sample_surface(
@@ -87,8 +92,8 @@ def sample_surface(
         rng = knobs.scan_rng("registration-residual", scan_index)
         layout_x_um = layout_x_um + strength * _quadratic_distortion(frame, rng)
         layout_y_um = layout_y_um + strength * _quadratic_distortion(frame, rng)
-    rows = layout_y_um / frame.pitch_um - 0.5 + GUARD_PX
-    columns = layout_x_um / frame.pitch_um - 0.5 + GUARD_PX
+    rows = layout_y_um / frame.layout_pitch_um - 0.5 + GUARD_PX
+    columns = layout_x_um / frame.layout_pitch_um - 0.5 + GUARD_PX
     return scipy.ndimage.map_coordinates(surface, [rows, columns], order=3, mode="nearest")
 
 
@@ -96,6 +101,8 @@ def _whole_pixel_corner(frame: ScanFrame) -> tuple[int, int] | None:
     """(row, column) on the canvas of the scan's first pixel if the frames differ by whole pixels only."""
     shift_px = frame.scan_to_layout[:2, 2] / frame.pitch_um
     whole = np.round(shift_px)
+    if frame.pitch_um != frame.layout_pitch_um:
+        return None
     if not np.array_equal(frame.scan_to_layout[:2, :2], np.eye(2)) or np.abs(shift_px - whole).max() > 1e-9:
         return None
     return int(whole[1]) + GUARD_PX, int(whole[0]) + GUARD_PX

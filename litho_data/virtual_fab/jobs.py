@@ -19,7 +19,7 @@ from litho_data.virtual_fab.printer import Job, Use
 from litho_data.virtual_fab.settings import Printer
 
 # Columns of a card's table that say how a scan was made.
-SCANNING = ("turned_deg", "direction", "tip")
+SCANNING = ("turned_deg", "direction", "tip", "pixel_size")
 PRINT_PATTERN = r"P(?P<print>\d+)F\d+"
 _STEPS = 5
 
@@ -119,7 +119,7 @@ def jobs_of_card(path: str | Path, *, first: int = 0, printer: Printer | None = 
     """The layouts of a dataset card, with what its table says about printing and scanning them.
 
     Rows of one print with the same layout are scans of one printed field if the table says how a scan was
-    made (``turned_deg``, ``direction``, ``tip``).
+    made (``turned_deg``, ``direction``, ``tip``, ``pixel_size``).
 
     Args:
         path: the card.

@@ -37,6 +37,7 @@ class Job:
         turned_deg: by how much the print lies turned under the microscope, whole quarters.
         direction: 1 for lines recorded on the way there, -1 on the way back.
         tip: number of the tip; every one after the first is new and sharp.
+        pixel_size: of the scan, in pixels of the layout; the time per pixel stays.
     """
 
     id: str
@@ -51,6 +52,7 @@ class Job:
     turned_deg: float = 0.0
     direction: float = 1.0
     tip: float = 1.0
+    pixel_size: float = 1.0
 
     @property
     def printed(self) -> int:

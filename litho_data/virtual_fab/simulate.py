@@ -144,13 +144,13 @@ def _write_scan(file: Path, scan: FabScan, microscope: Microscope) -> None:
         write_text_matrix(file.with_suffix(".txt"), scan.height_um)
 
 
-# Not turned, on the way there, with the first tip.
-AS_EVER = (0.0, 1.0, 1.0)
+# Not turned, on the way there, with the first tip and the pixels of the layout.
+AS_EVER = (0.0, 1.0, 1.0, 1.0)
 
 
 def _row(job: Job, number: int) -> tuple[object, ...]:
     place = (job.field_um[1], job.field_um[0])
-    return (job.id, number, *place, job.dose, job.use, job.turned_deg, job.direction, job.tip)
+    return (job.id, number, *place, job.dose, job.use, *(getattr(job, name) for name in SCANNING))
 
 
 def _named(value: T | str, what: str, known: dict[str, T]) -> T:

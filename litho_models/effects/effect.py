@@ -55,7 +55,7 @@ class FieldContext:
     """What an effect may know about a field besides the array it acts on.
 
     Args:
-        layout_um: nominal height (1, 1, y, x), µm.
+        layout_um: nominal height times the relative dose (1, 1, y, x), µm: what is exposed.
         pitch_um: lateral sampling, µm.
         full_height_um: nominal height of the highest level, µm; scales the pointwise effects.
         slice_um: height of one slice, which is one level, µm.
@@ -69,6 +69,8 @@ class FieldContext:
         quarter_turns: the microscope saw the array turned by so many quarters, as ``rot90`` turns it.
         backward: the scan lines were recorded on the way back.
         new_tip: scanned with another tip than the rest, a sharp one.
+        pixel_size: of the scan, relative to the rest: what lags in time goes with it.
+        dose: of the print, relative to the recipe's; ``layout_um`` holds it already.
         seed: decides the draws of random effects where one is planted.
     """
 
@@ -87,6 +89,8 @@ class FieldContext:
     quarter_turns: int = 0
     backward: bool = False
     new_tip: bool = False
+    pixel_size: float = 1.0
+    dose: float = 1.0
 
     def in_scan_frame(self) -> FieldContext:
         """The same field as the microscope saw it, its fast axis along x."""

@@ -60,7 +60,9 @@ def layer_stacking(height: Tensor, values: Values, context: FieldContext) -> Ten
     """
     layout = context.layout_um
     count = max(1, round(context.full_height_um / context.slice_um))
-    slices = torch.clamp(layout / context.slice_um - torch.arange(count).to(layout)[:, None, None], 0, 1)
+    # Another dose is another exposure of as many slices.
+    number = layout / (context.dose * context.slice_um)
+    slices = context.dose * torch.clamp(number - torch.arange(count).to(layout)[:, None, None], 0, 1)
     variance = torch.as_tensor(_SLICED_VARIANCE_UM2, dtype=layout.dtype, device=layout.device)
     exposed = add_blur(
         slices.reshape(count, 1, *layout.shape[-2:]), variance, context.pitch_um, _SLICED_REACH_UM

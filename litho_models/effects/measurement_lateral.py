@@ -15,9 +15,11 @@ def feedback_lag(height: Tensor, values: Values, context: FieldContext) -> Tenso
     """The probe follows late along the fast axis, mean delay taken out: z += (H - z) / (1 + l / dx).
 
     The length l holds on the way down. On the way up, where the surface pushes, it is a part of it:
-    with 1 the probe is a linear filter, below 1 it parachutes off falling edges.
+    with 1 the probe is a linear filter, below 1 it parachutes off falling edges. The delay is one of time:
+    with smaller pixels it is shorter.
     """
-    length, rising = values["length_um"], values["length_um"] * values["rising"]
+    length = values["length_um"] * context.pixel_size
+    rising = length * values["rising"]
     forward = float(values["direction"]) > 0
     gains = [1 / (1 + part / context.pitch_um) for part in (rising, length)]
     columns = (height if forward else height.flip(-1)).unbind(-1)
@@ -54,8 +56,12 @@ def piezo_nonlinearity(height: Tensor, values: Values, context: FieldContext) ->
 
 
 def resampling_blur(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """The finished scan blurred by a Gaussian: by interpolation, or by the microscope's own low pass."""
-    return add_blur(height, values["variance_um2"], context.pitch_um, _BLUR_REACH_UM)
+    """The finished scan blurred by a Gaussian: by interpolation, or by the microscope's own low pass.
+
+    Either is one of pixels: smaller ones blur less.
+    """
+    variance_um2 = values["variance_um2"] * context.pixel_size**2
+    return add_blur(height, variance_um2, context.pitch_um, _BLUR_REACH_UM)
 
 
 EFFECTS = (

@@ -31,7 +31,8 @@ class PreparedScan:
 
     Attributes:
         stored: the scan as it lies in the store.
-        layout: nominal height (1, 1, y, x) float32, µm; ``context``: its place, for the effects.
+        layout: nominal height times relative dose (1, 1, y, x) float32, µm.
+        context: its place, for the effects.
         usable: bool (y, x), measured pixels; scored.
         sample: flat indices of thinned usable pixels away from the edge; fitted and screened.
         height: measured height at ``sample``, float64 µm.
@@ -100,7 +101,9 @@ def prepared_again(scans: StoredScans) -> dict[str, PreparedScan | PrintedScan]:
 
 
 def _prepare(scan: PrintedScan, order: float) -> PreparedScan:
-    layout = torch.from_numpy(scan.layout_um)[None, None]
+    dose = 1.0 if scan.dose is None else float(scan.dose)
+    # Level times dose is the exposure: to all that follows, less dose is a lower layout.
+    layout = torch.from_numpy(scan.layout_um * np.float32(dose))[None, None]
     write = scan.write or {}
     line = scan_line_index(scan.shape, scan.scan_to_layout, scan.pitch_um, scan.bend_um)
     context = FieldContext(
@@ -116,6 +119,8 @@ def _prepare(scan: PrintedScan, order: float) -> PreparedScan:
         quarter_turns=scan.quarter_turns,
         backward=scan.direction == -1,
         new_tip=scan.tip not in (None, 1),
+        pixel_size=1.0 if scan.pixel_size is None else float(scan.pixel_size),
+        dose=dose,
     )
     return _thinned(scan, context, scan.usable, scan.usable & _inner(scan.shape), line)
 

@@ -11,11 +11,10 @@ from scipy.stats import t as student
 from litho_models.monitoring.change_point import (
     Series,
     Step,
-    comparisons,
-    first_step,
+    likeliest_step,
     noticeable_step,
 )
-from litho_models.monitoring.prints import FIGURES, Figure, PrintValues, Spread, print_values, spread_of
+from litho_models.monitoring.prints import FIGURES, Figure, print_values, spread_of
 from litho_models.monitoring.result import Alarm, FigureCheck
 from litho_models.scoring.scan_figures import ScanFigures
 
@@ -81,35 +80,43 @@ def judge(
 
     Args:
         reference, new: scans of prints, in any order; of three reference prints at least.
-        rate: chance of a false alarm in an unchanged set, shared equally by the figures.
+        rate: chance of a false alarm in an unchanged set, which the figures share by their weights.
         tolerance: largest drift that is allowed, relative; three times the spread by default.
         between: the new prints were made among the reference ones: the trend is over the common order.
             Otherwise they follow the reference.
     """
     return [
-        _judged(figure, reference, new, rate / len(figures), tolerance, between=between) for figure in figures
+        _judged(figure, reference, new, own, tolerance, between=between)
+        for figure, own in zip(figures, rates(rate, figures), strict=True)
     ]
 
 
+def rates(rate: float, figures: Sequence[Figure] = FIGURES) -> list[float]:
+    """What each figure has of the rate of false alarms."""
+    total = sum(figure.weight for figure in figures)
+    return [rate * figure.weight / total for figure in figures]
+
+
 def alarms(
-    reference: Sequence[ScanFigures],
-    new: Sequence[ScanFigures],
-    *,
-    rate: float = DEFAULT_RATE,
-    figures: Sequence[Figure] = FIGURES,
-) -> dict[str, Step | None]:
-    """The step that is noticed in each figure, as ``judge`` finds it, and nothing else."""
-    found = {}
-    for figure in figures:
-        parts = print_values(reference, figure), print_values(new, figure)
-        series = _series(*parts, spread_of(reference, figure))
-        found[figure.name] = first_step(series, rate / len(figures))[0]
-    return found
+    reference: Sequence[ScanFigures], new: Sequence[ScanFigures], *, rate: float = DEFAULT_RATE
+) -> list[str]:
+    """The figures that raise an alarm, as ``judge`` finds them, and nothing else."""
+    return [
+        figure.name
+        for figure, own in zip(FIGURES, rates(rate), strict=True)
+        if _found(figure, reference, new)[1] <= own
+    ]
 
 
-def _series(old: PrintValues, now: PrintValues, spread: Spread) -> Series:
+def _found(
+    figure: Figure, reference: Sequence[ScanFigures], new: Sequence[ScanFigures]
+) -> tuple[Step, float, Series]:
+    """The likeliest step, its p, and the figures that it was found in."""
+    spread = spread_of(reference, figure)
+    old, now = print_values(reference, figure), print_values(new, figure)
     variances = [spread.relative_variance(part.counts) for part in (old, now)]
-    return Series(old.values, now.values, variances[0], variances[1])
+    series = Series(old.values, now.values, variances[0], variances[1])
+    return *likeliest_step(series), series
 
 
 def _judged(
@@ -123,9 +130,8 @@ def _judged(
 ) -> FigureCheck:
     old, now = print_values(reference, figure), print_values(new, figure)
     spread = spread_of(reference, figure)
-    series = _series(old, now, spread)
+    step, p, series = _found(figure, reference, new)
     variances = series.reference_variance, series.new_variance
-    step, smallest = first_step(series, rate)
     noticeable = spread.sd * noticeable_step(*variances, rate)
     allowed = tolerance if tolerance is not None else TOLERANCE_SPREADS * spread.sd
     values, variance = np.concatenate([old.values, now.values]), np.concatenate(variances)
@@ -143,20 +149,18 @@ def _judged(
         reference_prints=len(old.values),
         new_prints=len(now.values),
         alarm=None
-        if step is None
+        if p > rate
         else Alarm(
-            noticed_at=now.names[step.noticed],
             since=now.names[step.since],
             step=float(np.expm1(step.size)),
             step_ci95=(float(np.expm1(step.ci95[0])), float(np.expm1(step.ci95[1]))),
-            p=step.p,
         ),
-        smallest_p=smallest,
-        threshold_p=rate / comparisons(len(now.values)),
+        p=p,
+        alarm_at=rate,
         noticeable_step=float(np.expm1(noticeable)) if noticeable < 1 else None,
         tolerance=allowed,
         trend=trend.per_print,
         trend_ci95=trend.ci95,
         trend_p=trend.p,
-        measure_again_in=0 if step is not None else trend.prints_left,
+        measure_again_in=0 if p <= rate else trend.prints_left,
     )

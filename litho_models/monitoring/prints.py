@@ -16,13 +16,15 @@ _LEAST_GAIN = 0.01
 class Figure(NamedTuple):
     """A figure that is watched.
 
-    ``of``: its value for one scan, a logarithm: differences are relative, a step of 0.03 is 3 %.
+    ``of``: its value for one scan, a logarithm: differences are relative, a step of 0.03 is 3 %. ``weight``:
+    its part of the rate of false alarms; what is promised of steps is promised of the gain.
     """
 
     name: str
     words: str
     of: Callable[[ScanFigures], float]
     causes: str
+    weight: float
 
 
 FIGURES = (
@@ -33,6 +35,7 @@ FIGURES = (
         lambda scan: float(np.log(max(scan.gain, _LEAST_GAIN))),
         "the printer (dose, development) or the height scale of the microscope: a scan of a step of known "
         "height tells them apart",
+        0.8,
     ),
     Figure(
         "error",
@@ -40,6 +43,7 @@ FIGURES = (
         lambda scan: float(np.log(scan.error_nm)),
         "rougher or blurred prints, an effect that the model lacks, layouts of another kind, or the tip of "
         "the microscope: a scan of an older print with the same tip tells them apart",
+        0.2,
     ),
 )
 

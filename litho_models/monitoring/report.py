@@ -29,9 +29,8 @@ def write_check_report(result: Check, out: str | Path) -> Path:
     page.heading("In numbers", folded=True)
     page.table(
         _figures_table(result),
-        "Relative figures: 0.01 is 1 %. p: two-sided chance at one given print, at most the threshold for an "
-        f"alarm; the rate of {result.false_alarm_rate:g} is shared by the figures and, in each, by all pairs "
-        "of a last print and a first changed one.",
+        "Relative figures: 0.01 is 1 %. p: chance that unchanged prints look as changed, whichever print "
+        f"is the first; an alarm at alarm_at or less, the figure's share of {result.false_alarm_rate:g}.",
         "figures.csv",
         digits=4,
     )
@@ -93,9 +92,8 @@ def _figures_table(result: Check) -> list[dict[str, Any]]:
                 "figure": one.name,
                 "reference_mean": one.mean,
                 "spread": one.spread,
-                "smallest_p": f"{one.smallest_p:.2g}",
-                "threshold_p": f"{one.threshold_p:.2g}",
-                "alarm_at": alarm.noticed_at if alarm else "–",
+                "p": f"{one.p:.2g}",
+                "alarm_at": f"{one.alarm_at:.2g}",
                 "since": alarm.since if alarm else "–",
                 "step": alarm.step if alarm else float("nan"),
                 "noticeable_step": np.nan if one.noticeable_step is None else one.noticeable_step,

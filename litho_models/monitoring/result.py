@@ -19,27 +19,25 @@ class CheckedModel(Record):
 
 
 class Alarm(Record):
-    """A step in the mean of a figure, relative: noticed after which print, first changed print.
+    """A step in the mean of a figure, relative; ``since``: the first changed print.
 
     ``step``: mean from ``since`` on minus the mean before, with an interval that does not allow for the
-    choice of ``since``. ``p``: at one given print, to be compared with ``threshold_p``.
+    choice of ``since``.
     """
 
-    noticed_at: str
     since: str
     step: float
     step_ci95: tuple[float, float]
-    p: float
 
 
 class FigureCheck(Record):
     """One figure of the new prints against the reference; all but ``mean`` are relative, 0.01 is 1 %.
 
-    ``mean`` and ``spread``: of the reference prints. ``smallest_p`` of all comparisons sounds the alarm at
-    ``threshold_p``. ``noticeable_step``: the rise r at the first new print that is noticed within three
-    prints in 9 of 10 cases, and so is a fall by r/(1 + r); None where it is beyond a factor of e. ``trend``:
-    change per print over all prints. ``measure_again_in``: prints until the 95 % bound of the drift reaches
-    ``tolerance``.
+    ``mean`` and ``spread``: of the reference prints. ``p``: chance, at most, that unchanged prints look as
+    changed; an alarm at ``alarm_at``, the figure's share of the rate, or less. ``noticeable_step``: the rise
+    r that three new prints show in 9 of 10 cases (all new ones, if these are fewer), and so is a fall by
+    r/(1 + r); None where it is beyond a factor of e. ``trend``: change per print over all prints.
+    ``measure_again_in``: prints until the 95 % bound of the drift reaches ``tolerance``.
     """
 
     name: str
@@ -49,8 +47,8 @@ class FigureCheck(Record):
     reference_prints: int
     new_prints: int
     alarm: Alarm | None
-    smallest_p: float
-    threshold_p: float
+    p: float
+    alarm_at: float
     noticeable_step: float | None
     tolerance: float
     trend: float
@@ -65,7 +63,7 @@ class Check(Result):
     ``false_alarm_rate``: chance that a data set like this of an unchanged printer raises an alarm.
     """
 
-    SCHEMA: ClassVar[str] = "litho-models/check/1"
+    SCHEMA: ClassVar[str] = "litho-models/check/2"
     FILE_NAME: ClassVar[str] = "check.json"
 
     run: RunInfo

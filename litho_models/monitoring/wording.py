@@ -55,7 +55,7 @@ def _alarm_text(check: FigureCheck) -> str:
     low, high = (100 * end for end in alarm.step_ci95)
     way = "higher" if alarm.step > 0 else "lower"
     return (
-        f"ALARM, noticed at print {alarm.noticed_at}: since print {alarm.since} the {figure.words} is "
+        f"ALARM: since print {alarm.since} the {figure.words} is "
         f"{100 * abs(alarm.step):.1f} % {way} than before (95 %: {low:+.1f} to {high:+.1f} %); "
         f"unchanged prints differ by {100 * check.spread:.1f} %. It comes from {figure.causes}."
     )
@@ -67,8 +67,8 @@ def _quiet_text(check: FigureCheck) -> str:
     else:
         rise = check.noticeable_step
         seen = (
-            f"a rise by {100 * rise:.1f} % or a fall by {100 * rise / (1 + rise):.1f} % at the first new "
-            f"print would be noticed within {_count(min(SOON, check.new_prints), 'print')} in 9 of 10 cases"
+            f"a rise by {100 * rise:.1f} % or a fall by {100 * rise / (1 + rise):.1f} % is noticed within "
+            f"{_count(min(SOON, check.new_prints), 'print')} in 9 of 10 cases"
         )
     low, high = (100 * end for end in check.spread_ci95)
     words = figure_of(check).words

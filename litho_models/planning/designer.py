@@ -6,6 +6,7 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -21,10 +22,12 @@ from litho_models.planning.layouts import NEAREST, TILE_PX, Limits, climb, score
 from litho_models.planning.rivalry import Place, PlannedPrint, Rivalry, Way
 
 TURNED = Way(turned_deg=90)
-_EXTRAS = (TURNED, Way(backward=True), Way(new_tip=True))
+_EXTRAS = (TURNED, Way(backward=True), Way(new_tip=True), Way(fine=True))
 _MOST_EXTRAS = 2
 # A further scan is worth its time if it brings rivals apart by this factor.
 _WORTH = 1.3
+# Less dose keeps the exposure of every level among those that the models know; more would not.
+SECOND_DOSE = 0.8
 # Below this many standard deviations a layout shows nothing of the difference.
 _NOTHING = 0.3
 WORDS = {
@@ -35,21 +38,31 @@ WORDS = {
         new_tip=True
     ): "with a new, sharp tip: what the tip adds is gone, what was printed stays; turning the "
     "print shows nothing of a round tip",
+    Way(fine=True): "with pixels of half the size, as much time for each: what the microscope blurs or "
+    "delays is half as long, what was printed stays",
 }
 
 
-def choose_ways(
-    rivalry: Rivalry, level: np.ndarray, can_move: bool
-) -> tuple[tuple[Way, ...], Place, dict[str, float]]:
-    """Scans of each print, and the place of the prints in the write field.
+class Chosen(NamedTuple):
+    """How the prints of a question are made and scanned.
+
+    ``ways``: scans of each; ``place``: in the write field; ``second_dose``: whether every other print gets
+    less dose; ``tried``: separation in standard deviations by one scan, and by each way beside it.
+    """
+
+    ways: tuple[Way, ...]
+    place: Place
+    second_dose: bool
+    tried: dict[str, float]
+
+
+def choose(rivalry: Rivalry, level: np.ndarray, can_move: bool) -> Chosen:
+    """What brings the rivals of a question apart.
 
     Args:
         rivalry: the rivals.
         level: a layout to try the ways on.
         can_move: whether the write field is larger than a print and known.
-
-    Returns:
-        ways, place, and the separation in standard deviations by one scan and by each way beside it.
     """
     ways: tuple[Way, ...] = (Way(),)
     reached = score(rivalry, level, ways)
@@ -71,7 +84,9 @@ def choose_ways(
         tried["at the edge of the write field"] = at_edge
         if at_edge >= max(_WORTH * reached, _NOTHING):
             place = "edge"
-    return ways, place, tried
+    at_one, at_two = (score(rivalry, level, ways, place, (1.0, dose)) for dose in (1.0, SECOND_DOSE))
+    tried |= {"two prints so scanned": at_one, f"the second of them at {SECOND_DOSE:g} of the dose": at_two}
+    return Chosen(ways, place, at_two >= max(_WORTH * at_one, _NOTHING), tried)
 
 
 def ways_without_rivals(questions: Sequence[Question]) -> tuple[Way, ...]:
@@ -108,23 +123,26 @@ class Designer:
         self.ways: tuple[Way, ...] = (Way(),)
         self.tried: list[dict[str, float]] = []
         self.chosen: list[str] = []
-        self._edge = False
+        self._edge = self._second_dose = False
 
     def choose(self, asked: Sequence[Way], can_move: bool) -> None:
         """Settle how every print is scanned: what any of the questions needs."""
         ways = [Way(), *asked]
         for rivalry in self.rivalries:
-            own, place, tried = choose_ways(
-                rivalry, random_level(self.limits, self.tile_px, self.seed), can_move
-            )
-            ways += own
-            self._edge |= place == "edge"
-            self.tried.append(tried)
+            found = choose(rivalry, random_level(self.limits, self.tile_px, self.seed), can_move)
+            ways += found.ways
+            self._edge |= found.place == "edge"
+            self._second_dose |= found.second_dose
+            self.tried.append(found.tried)
         self.ways = tuple(dict.fromkeys(ways))
 
     def place(self, number: int) -> Place:
         """Where a print lies in the write field: in turn at edge and centre, if that shows anything."""
         return "edge" if self._edge and number % 2 == 0 else "centre"
+
+    def dose(self, number: int) -> float:
+        """Of a print, relative: every other one gets less, if that shows anything."""
+        return SECOND_DOSE if self._second_dose and number % 2 else 1.0
 
     def tiles(self, loop: Path, prints: int) -> list[np.ndarray]:
         """The tiles of all prints, soft levels; those of an interrupted run are taken as they are."""
@@ -202,7 +220,7 @@ class Designer:
         area = (self.size_px / self.tile_px) ** 2
         # Two prints and two random ones are judged: a refit each and two rounds, and all draws.
         judged = 12 + 4 * DRAWS
-        rest_s = len(self.rivalries) * (9 * refit_s + judged * area * refit_s)
+        rest_s = len(self.rivalries) * (13 * refit_s + judged * area * refit_s)
         total_s = (count - done) * tile_s + rest_s
         kept = f", {done} of {count} tiles are kept from an earlier run" if done else ""
         self.report(f"this takes about {max(1, round(total_s / 60))} min on one core{kept}")

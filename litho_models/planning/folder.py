@@ -23,7 +23,10 @@ HOLDS = (
     PRINTER_SHEET,
     MICROSCOPE_SHEET,
 )
-_COLUMNS = ("id", "order", "field_x_um", "field_y_um", "dose", "use", "turned_deg", "direction", "tip")
+_COLUMNS = (
+    *("id", "order", "field_x_um", "field_y_um", "dose", "use"),
+    *("turned_deg", "direction", "tip", "pixel_size"),
+)
 _USES = {
     "substrate": "bare substrate, nothing printed: zero, tilt and bow of the microscope",
     "flat": "one level everywhere: the noise floor",
@@ -44,11 +47,7 @@ def write_plan(
     """Write card, table, layouts and sheets; ``layouts``: the level map of each scan."""
     for scan, level in zip(plan.scans, layouts, strict=True):
         write_layout(folder, scan.id, level)
-    rows = [
-        (s.id, s.order, s.field_x_um, s.field_y_um, 1.0, s.use, s.turned_deg, s.direction, s.tip)
-        for s in plan.scans
-    ]
-    write_table(folder, _COLUMNS, rows)
+    write_table(folder, _COLUMNS, [tuple(getattr(scan, name) for name in _COLUMNS) for scan in plan.scans])
     CardText(
         name=f"{plan.dataset.name}-next",
         title=f"Planned prints that decide what is open on {plan.dataset.name}",
@@ -79,18 +78,20 @@ def _printer_sheet(plan: NextPrint) -> str:
     lines = [
         f"# Printing for {plan.dataset.name}",
         "",
-        f"{plan.prints} prints of {plan.field_um:g} µm, in this order, with the dose, resist and recipe of "
-        "the prints so far, none turned. Write along x, one line below the other. Print the references once.",
+        f"{plan.prints} prints of {plan.field_um:g} µm, in this order, with the resist and recipe of the "
+        "prints so far, none turned. Write along x, one line below the other. Print the references once.",
         "",
-        "| order | layout | centre in the write field (x, y), µm | what it is |",
-        "|---|---|---|---|",
+        "| order | layout | centre in the write field (x, y), µm | dose, of the recipe's | what it is |",
+        "|---|---|---|---|---|",
     ]
     for scan in _first_scans(plan):
         what = "print" if scan.use == "dataset" else _USES[scan.use]
         place = f"{scan.field_x_um:g}, {scan.field_y_um:g}"
-        lines.append(f"| {scan.order} | layouts/{scan.id}.tif | {place} | {what} |")
+        lines.append(f"| {scan.order} | layouts/{scan.id}.tif | {place} | {scan.dose:g} | {what} |")
     lines += [
         "",
+        "Dose is what the resist takes up: with two photons it goes with the square of the laser power, so "
+        "that 0.8 of it takes 0.89 of the power.",
         "Note the laser power before each print, and anything that went otherwise than written here.",
     ]
     return "\n".join(lines) + "\n"
@@ -105,20 +106,21 @@ def _microscope_sheet(plan: NextPrint) -> str:
         "margin of 1 to 2 µm around the print helps. Take the print out and put it back between two scans of "
         "it. Leave the file as the microscope shows it: do not turn it back.",
         "",
-        "| order | scan | print | turned | direction | tip | why |",
-        "|---|---|---|---|---|---|---|",
+        "| order | scan | print | turned | direction | tip | pixels | why |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for scan in plan.scans:
         direction = "there" if scan.direction > 0 else "back"
         tip = "as before" if scan.tip == 1 else "new"
+        pixels = "as before" if scan.pixel_size == 1 else f"{scan.pixel_size:g} of their size"
         lines.append(
             f"| {scan.order} | {scan.id} | {scan.print} | {scan.turned_deg}° | {direction} | {tip} | "
-            f"{scan.why} |"
+            f"{pixels} | {scan.why} |"
         )
     lines += [
         "",
-        "If a scan had to be made otherwise, say so in `scans.csv` (`turned_deg`, `direction`, `tip`): a "
-        "turned scan without its column is refused. Then",
+        "If a scan had to be made otherwise, say so in `scans.csv` (`turned_deg`, `direction`, `tip`, "
+        "`pixel_size`): a turned scan without its column is refused. Then",
         "",
         "    litho-data build card.toml --out next.zarr",
         "    litho-models close-loop prints.zarr next.zarr --out decided",

@@ -123,12 +123,19 @@ def starts(size_px: int, limits: Limits, seed: int) -> Iterator[tuple[str, np.nd
         yield name, whole
 
 
-def score(rivalry: Rivalry, level: np.ndarray, ways: tuple[Way, ...], place: Place = "centre") -> float:
-    """Separation of the nearest pair by one print of this layout, standard deviations."""
-    printed = PlannedPrint(torch.from_numpy(level.astype(np.float32)), ways, place)
-    refitted = rivalry.refitted([printed])
+def score(
+    rivalry: Rivalry,
+    level: np.ndarray,
+    ways: tuple[Way, ...],
+    place: Place = "centre",
+    doses: Sequence[float] = (1.0,),
+) -> float:
+    """Separation of the nearest pair by a print of this layout at each of the doses, standard deviations."""
+    soft = torch.from_numpy(level.astype(np.float32))
+    prints = [PlannedPrint(soft, ways, place, dose=dose) for dose in doses]
+    refitted = rivalry.refitted(prints)
     with torch.no_grad():
-        return float(rivalry.separations([printed], refitted).min())
+        return float(rivalry.separations(prints, refitted).min())
 
 
 def climb(

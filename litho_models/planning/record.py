@@ -13,7 +13,7 @@ Status = Literal["decides", "may decide", "no experiment separates", "needs a fa
 
 
 class PlannedScan(Record):
-    """One scan of the plan; ``place``: in the write field."""
+    """One scan of the plan; ``field_x_um``, ``field_y_um``: in the write field; ``dose``: of its print."""
 
     id: str
     print: str
@@ -22,8 +22,10 @@ class PlannedScan(Record):
     turned_deg: int
     direction: int
     tip: int
+    pixel_size: float = 1.0
     field_x_um: float
     field_y_um: float
+    dose: float = 1.0
     why: str
 
 

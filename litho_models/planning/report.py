@@ -72,7 +72,7 @@ def write_report(
         rivalry = next((r for r in rivalries if r.question.name == question.name), None)
         if rivalry is not None:
             page.figure(
-                _prints_figure(rivalry, shown),
+                prints_figure(rivalry, shown),
                 "What each rival predicts of the first print as the last of its scans shows it, and what it "
                 "has more than the first rival, nm.",
             )
@@ -117,7 +117,7 @@ def _table(plan: NextPrint) -> list[dict[str, Any]]:
     ]
 
 
-def _prints_figure(rivalry: Rivalry, shown: PlannedPrint) -> Figure:
+def prints_figure(rivalry: Rivalry, shown: PlannedPrint) -> Figure:
     with torch.no_grad():
         maps = [rivalry.printing.predict(chain, shown, shown.ways[-1]).numpy() for chain in rivalry.chains]
     figure = new_figure(11, 5.5)

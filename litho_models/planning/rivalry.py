@@ -43,25 +43,34 @@ class Way:
     """How one scan is made.
 
     ``turned_deg``: by how much the print lies turned under the microscope; ``backward``: lines recorded on
-    the way back; ``new_tip``: with another, sharp tip.
+    the way back; ``new_tip``: with another, sharp tip; ``fine``: with pixels of half the size, and as much
+    time for each.
     """
 
     turned_deg: int = 0
     backward: bool = False
     new_tip: bool = False
+    fine: bool = False
+
+    @property
+    def pixel_size(self) -> float:
+        """Of the scan, relative to the scans so far."""
+        return 0.5 if self.fine else 1.0
 
 
 @dataclass(frozen=True)
 class PlannedPrint:
     """One printed field and its scans.
 
-    ``level``: (y, x), whole or soft levels; ``place``: in the write field; ``order``: -0.5 first, 0.5 last.
+    ``level``: (y, x), whole or soft levels; ``place``: in the write field; ``order``: -0.5 first, 0.5 last;
+    ``dose``: relative to the prints so far.
     """
 
     level: Tensor
     ways: tuple[Way, ...]
     place: Place = "centre"
     order: float = 0.0
+    dose: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -89,11 +98,13 @@ class Printing:
             quarter_turns=way.turned_deg // 90,
             backward=way.backward,
             new_tip=way.new_tip,
+            pixel_size=way.pixel_size,
+            dose=printed.dose,
         )
 
     def predict(self, chain: EffectChain, printed: PlannedPrint, way: Way) -> Tensor:
         """Height (y, x), µm, as this scan would show it."""
-        layout_um = (printed.level * self.level_height_um)[None, None]
+        layout_um = (printed.dose * self.level_height_um * printed.level)[None, None]
         return chain(layout_um, self.context(layout_um, printed, way))[0, 0]
 
 

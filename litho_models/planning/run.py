@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -93,12 +94,12 @@ def next_print(
     levels = [assemble(tiles, number, size_px, limits) for number in range(prints)]
     orders = np.linspace(-0.5, 0.5, prints) if prints > 1 else np.zeros(1)
     planned = [
-        PlannedPrint(as_tensor(level), designer.ways, designer.place(i), float(order))
+        PlannedPrint(as_tensor(level), designer.ways, designer.place(i), float(order), designer.dose(i))
         for i, (level, order) in enumerate(zip(levels, orders, strict=True))
     ]
     report("comparing the rivals on the planned prints, and on random ones")
     random = [
-        PlannedPrint(as_tensor(random_level(limits, size_px, seed + 101 + i)), one.ways, one.place, one.order)
+        replace(one, level=as_tensor(random_level(limits, size_px, seed + 101 + i)))
         for i, one in enumerate(planned[:_JUDGED])
     ]
     judged = {
@@ -176,19 +177,21 @@ def schedule(
         ("flat", flat((size_px, size_px), level=(limits.lowest + limits.highest) // 2), "the noise floor"),
         ("steps", ladder, "height against level; on a step standard of known height the microscope's gain"),
     ]
-    rows: list[tuple[str, str, Use, Way, float, str, np.ndarray]] = []
+    rows: list[tuple[str, str, Use, Way, float, float, str, np.ndarray]] = []
     for number, (use, level, why) in enumerate(references, start=1):
-        rows.append((f"N0F{number}", "0", use, Way(), 0.0, why, level))
+        rows.append((f"N0F{number}", "0", use, Way(), 0.0, 1.0, why, level))
     for number, (one, level) in enumerate(zip(planned, levels, strict=True), start=1):
         reach_um = 0.0
         if one.place == "edge" and printing.write_field_um is not None:
             reach_um = (printing.write_field_um - size_px * printing.pitch_um) / 2
         for at, way in enumerate(one.ways, start=1):
             why = WORDS.get(way, "as the prints so far").split(":")[0]
-            rows.append((f"N{number}F{at}", str(number), "dataset", way, reach_um, why, level))
+            if one.dose != 1:
+                why += f"; the print has {one.dose:g} of the dose"
+            rows.append((f"N{number}F{at}", str(number), "dataset", way, reach_um, one.dose, why, level))
     if any(q.kind == "generic" and "early print" in q.why for q in questions):
         why = "the first print once more at the end: what changed in between is the microscope's"
-        rows.append((f"N1F{len(planned[0].ways) + 1}", "1", "dataset", Way(), 0.0, why, levels[0]))
+        rows.append((f"N1F{len(planned[0].ways) + 1}", "1", "dataset", Way(), 0.0, 1.0, why, levels[0]))
     scans = [
         PlannedScan(
             id=scan_id,
@@ -198,10 +201,12 @@ def schedule(
             turned_deg=way.turned_deg,
             direction=-1 if way.backward else 1,
             tip=2 if way.new_tip else 1,
+            pixel_size=way.pixel_size,
             field_x_um=reach_um,
             field_y_um=reach_um,
+            dose=dose,
             why=why,
         )
-        for order, (scan_id, block, use, way, reach_um, why, _) in enumerate(rows)
+        for order, (scan_id, block, use, way, reach_um, dose, why, _) in enumerate(rows)
     ]
     return scans, [row[-1] for row in rows]

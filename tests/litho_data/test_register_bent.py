@@ -254,7 +254,7 @@ def test_a_bent_campaign_is_built_verified_and_replayed_from_its_raw_files(tmp_p
         assert scan.bend_um is not None
         np.testing.assert_array_equal(scan.bend_um.amount[0, 0], row["bend_x_by_xx_um"])
         shape = store.scan_frame(scan.id, "raw_height_um").shape
-        frame = ScanFrame(shape, 0.1, np.array(truth.scans[index].scan_to_layout))
+        frame = ScanFrame(shape, 0.1, np.array(truth.scans[index].scan_to_layout), 0.1)
         # The fab itself says where each pixel was: it is made to scan ramps.
         true_px = np.stack([sample_surface(r, frame, board, index).ravel() for r in (x_px, y_px)], axis=1)
         found_um = apply_transform(scan.scan_to_layout, scan.bend_um.straighten(places_um(shape)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,9 @@ import torch
 from scipy.ndimage import gaussian_filter
 from scipy.stats import norm
 
-from benchmarks import two_rounds
+from benchmarks import measured_plan, two_rounds
+from benchmarks.record import published
+from benchmarks.two_rounds_figure import bins
 from litho_data.cards.card import load_card
 from litho_data.cards.tables import read_table
 from litho_data.foundation.errors import InputError
@@ -361,15 +364,20 @@ def test_nothing_open_and_no_questions_kept_are_said(tmp_path: Path) -> None:
 
 
 def test_the_page_quotes_the_plan_for_the_measured_prints() -> None:
-    plan = NextPrint.read(DOCS / "results" / "next-print")
-    page = (DOCS / "next_print.md").read_text(encoding="utf-8")
-    assert plan.questions
-    for question in plan.questions:
-        row = next(line for line in page.splitlines() if line.startswith(f"| {question.name} |"))
-        assert row.endswith(f"| {question.status} |")
-        if question.kind != "fact":
-            assert f"| {question.power[plan.prints - 1]:.2f} |" in row
-    assert plan.run.command in page
+    plan = NextPrint.read(measured_plan.RESULTS)
+    for name, text in measured_plan.texts(plan).items():
+        assert published(measured_plan.PAGE, name) == text
+    assert plan.run.command in measured_plan.PAGE.read_text(encoding="utf-8")
+
+
+def test_the_plan_for_the_measured_prints_is_ready_and_of_the_published_loop() -> None:
+    plan = NextPrint.read(measured_plan.RESULTS)
+    loop = CloseLoop.read(DOCS / "results" / "neural-lithography")
+    assert plan.dataset == loop.dataset
+    jobs = jobs_of_card(measured_plan.RESULTS / "card.toml", first=0)
+    assert [job.id for job in jobs] == [scan.id for scan in plan.scans]
+    asked = {question.name for question in plan.questions if question.kind == "generic"}
+    assert asked == {effect.name for effect in loop.effects if effect.verdict == "traced-to-covariate"}
 
 
 # --- the second round
@@ -623,6 +631,15 @@ def test_what_is_planted_is_drawn_before_anything_is_run_and_judged_by_its_owner
         told = two_rounds.judged(other.model_copy(update={"kind": kind}), planned, "slope-thinning-x")
         assert not told["counts"]
         assert told["wrong"] is wrong
+
+
+def test_the_picture_of_promises_shows_what_the_table_counts() -> None:
+    trials = json.loads((two_rounds.RESULTS / "20273.json").read_text("utf-8"))["trials"]
+    kept = bins(trials, "optimised")[-1]
+    assert kept.promised > 0.95
+    assert f"| {kept.right} of {kept.asked} (" in two_rounds.summary(trials)
+    counted = sum(one["counts"] for trial in trials for one in trial["answers"].get("optimised", []))
+    assert sum(one.asked for one in bins(trials, "optimised")) == counted
 
 
 def test_a_plan_is_printed_by_the_same_machine_with_new_chance() -> None:

@@ -1,0 +1,113 @@
+"""Carry the plan for the measured prints into the documentation: what a lab needs, tables and pictures.
+
+    litho-models next-print runs/neural-lithography/close-loop --out runs/neural-lithography/next-print
+        --steps 20
+    python -m benchmarks.measured_plan runs/neural-lithography/close-loop runs/neural-lithography/next-print
+
+Everything of the plan but its report goes to the page's results; the tables of the page are written anew.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+from pathlib import Path
+
+from benchmarks.markdown_table import markdown_table
+from benchmarks.record import publish
+from litho_data.foundation.commands import run_script
+from litho_data.layouts.statistics_report import layouts_figure
+from litho_data.readers.layout import read_layout
+from litho_models.frozen.card import ModelCard
+from litho_models.frozen.files import load_simulator
+from litho_models.loop.result.questions import OpenQuestions
+from litho_models.loop.run import MODEL_FOLDER
+from litho_models.planning.designer import as_tensor
+from litho_models.planning.folder import HOLDS
+from litho_models.planning.record import NextPrint
+from litho_models.planning.report import prints_figure
+from litho_models.planning.rivalry import PlannedPrint, Printing, Rivalry, Way
+
+PAGE = Path(__file__).parents[1] / "docs" / "next_print.md"
+RESULTS = PAGE.parent / "results" / "next-print"
+_LEFT_OUT = ("report.html", "*.csv")
+
+
+def main() -> None:
+    """Copy, draw, write."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("loop", type=Path, help="closed loop of the measured prints")
+    parser.add_argument("plan", type=Path, help="its plan")
+    given = parser.parse_args()
+    plan = NextPrint.read(given.plan)
+    shutil.rmtree(RESULTS, ignore_errors=True)
+    for name in HOLDS:
+        source = given.plan / name
+        if name in _LEFT_OUT or not source.exists():
+            continue
+        RESULTS.mkdir(parents=True, exist_ok=True)
+        if source.is_dir():
+            shutil.copytree(source, RESULTS / name)
+        else:
+            shutil.copy(source, RESULTS / name)
+    draw(plan, given.loop)
+    for name, text in texts(plan).items():
+        publish(PAGE, name, text)
+
+
+def draw(plan: NextPrint, loop: Path) -> None:
+    """The layouts of the prints; what each rival of the first question predicts of the first print."""
+    first = {scan.print: scan.id for scan in reversed(plan.scans) if scan.use == "dataset"}
+    levels = {
+        f"print {name}": read_layout(RESULTS / "layouts" / f"{first[name]}.tif") for name in sorted(first)
+    }
+    layouts_figure(levels, plan.levels).savefig(RESULTS / "layouts.jpg", dpi=80)
+    open_, card = OpenQuestions.read(loop), ModelCard.read(loop / MODEL_FOLDER)
+    question = next(q for q in open_.questions if len(q.rivals) > 1)
+    printing = Printing(card.pitch_um, card.level_height_um, card.levels - 1, open_.write_field_um)
+    rivalry = Rivalry(question, load_simulator(loop / MODEL_FOLDER, card), printing, open_.noise)
+    last = [scan for scan in plan.scans if scan.print == "1"][-1]
+    way = Way(last.turned_deg, last.direction < 0, last.tip != 1, last.pixel_size != 1)
+    shown = PlannedPrint(as_tensor(levels["print 1"]), (way,))
+    prints_figure(rivalry, shown).savefig(RESULTS / "rivals.jpg", dpi=80)
+
+
+def texts(plan: NextPrint) -> dict[str, str]:
+    """The text of each mark of the page."""
+    count = plan.prints
+
+    def number(value: float | None, digits: int = 1) -> str:
+        return "–" if value is None else f"{value:.{digits}f}"
+
+    questions = [
+        (
+            q.name,
+            str(len(q.rivals) or "–"),
+            number(q.difference_nm),
+            number(q.random_difference_nm),
+            number(q.noise_nm),
+            number(q.form_nm),
+            "–" if q.kind == "fact" else f"{q.power[count - 1]:.2f}",
+            "–" if q.prints_needed is None else str(q.prints_needed),
+            q.status,
+        )
+        for q in plan.questions
+    ]
+    pairs = [
+        (*pair.rivals, number(pair.difference_nm), number(pair.noise_nm), f"{pair.power[count - 1]:.2f}")
+        for q in plan.questions
+        for pair in q.pairs
+    ]
+    heads = ("question", "rivals", "difference, nm rms", "with random layouts", "noise along it, nm")
+    more = ("model's own error, nm", f"power, {count} prints", "prints for 0.95", "status")
+    of_pairs = ("rival", "rival", "difference, nm rms", "noise along it, nm", f"power, {count} prints")
+    return {
+        "measured questions": markdown_table((*heads, *more), questions),
+        "measured rivals": markdown_table(of_pairs, pairs),
+    }
+
+
+if __name__ == "__main__":
+    run_script(main)
