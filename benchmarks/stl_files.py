@@ -3,7 +3,7 @@
     python -m benchmarks.stl_files --out runs/stl.json [--designs 20] [--publish]
 
 Every design has a target of its own (blots at random) and a random start, and is searched with the default
-settings but for three steps of each kind: through the zoo's physics model, and for a perfect printer. Each
+settings but for forty steps in place of 300: through the zoo's physics model, and for a perfect printer. Each
 file is read by trimesh and numpy-stl, which know nothing of the writer (``pip install trimesh numpy-stl``).
 Beside it stands the least that any exact closed surface of these levels takes, by a count of its corners.
 """
@@ -35,7 +35,7 @@ PAGE = Path(__file__).parents[1] / "docs" / "optics.md"
 RESULT = PAGE.parent / "results" / "stl" / "stl.json"
 NAME = "stl.json"
 FIRST_SEED = 500
-STEPS, START_STEPS = 3, 3
+STEPS, START_STEPS = 40, 10
 LIMIT_MB = 15.0
 PEDESTAL_UM = 1.0
 PRINTERS = {"zoo:physics": "designed through `zoo:physics`", "none": "designed for a perfect printer"}

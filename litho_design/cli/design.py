@@ -240,7 +240,9 @@ def lens(
     _print_design(design, out)
 
 
-@takes_settings(HologramSettings(), LensSettings(), leave_out=("task", "search.seed", "ensemble.weight"))
+@takes_settings(
+    HologramSettings(), LensSettings(), leave_out=("task", "search.seed", "search.draft", "ensemble.weight")
+)
 def compare(
     models: Annotated[
         str, typer.Option(help="arms, comma-separated: none, NAME=MODEL or MODEL (a folder, or zoo:NAME)")
