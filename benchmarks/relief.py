@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.ndimage import gaussian_filter
 
 from benchmarks.gap.plan import PRINT_KNOBS, SCAN_KNOBS
 from benchmarks.markdown_table import markdown_table
@@ -31,7 +30,7 @@ from litho_data.virtual_fab.truth import Truth
 from litho_design import correct
 from litho_design.printers.fab import FabSimulator
 from litho_design.reliefs.settings import ReliefSettings, relief_settings
-from litho_design.reliefs.targets import load_relief
+from litho_design.reliefs.targets import load_relief, print_off_um
 from litho_design.tasks.design import HEIGHT_FILE, LEVELS_FILE, read_array
 from litho_models import freeze, train
 
@@ -42,7 +41,6 @@ RELIEFS = ("lens", "blaze", "staircase")
 GAINS, ZEROS = np.linspace(0.6, 2.4, 19), range(-3, 4)
 FIRST_SEED = 31
 SCANS = 24
-SECOND_BLUR_PX = 10
 COLUMNS = {
     "uncorrected_nm": "uncorrected",
     "affine_nm": "best affine",
@@ -113,8 +111,8 @@ def of_seed(folder: Path, seed: int, model: str, settings: ReliefSettings) -> li
         if not kept.is_file():
             wanted_um, _ = load_relief(relief, settings.layout, settings.height_um)
             first, level, expected_um = _corrected(wanted_um, frozen, folder / relief, settings)
-            off_um = gaussian_filter(_print_um(rough, level, settings) - expected_um, SECOND_BLUR_PX)
-            again = (wanted_um - off_um + off_um.mean()).astype(np.float32)
+            blur_px = settings.off_blur_um / settings.layout.pitch_um
+            again = wanted_um - print_off_um(_print_um(rough, level, settings), expected_um, blur_px)
             _, second, _ = _corrected(again, frozen, folder / f"{relief}-again", settings)
             found = errors_nm(smooth, wanted_um, level, settings)
             found["second_nm"] = _error_nm(smooth, wanted_um, second, settings)

@@ -10,7 +10,17 @@ import typer
 from litho_data.foundation.app import new_app, run_app
 from litho_data.foundation.errors import InputError
 from litho_design.cli.design import compare, correct, estimate, first, hoe, lens, settings
-from litho_design.cli.options import BandPx, Device, Extrapolate, Out
+from litho_design.cli.options import (
+    BandPx,
+    Device,
+    Extrapolate,
+    Out,
+    Scan,
+    ScanAligned,
+    ScanLevelling,
+    ScanSizeUm,
+    ScanUnit,
+)
 
 if TYPE_CHECKING:
     from litho_design.judging.score import ScoreResult
@@ -33,13 +43,11 @@ def score(
         list[str] | None,
         typer.Option(help="NAME=MODEL, MODEL or `none`; MODEL may be truth/ of a virtual fab; repeatable"),
     ] = None,
-    scan: Annotated[Path | None, typer.Option(help="AFM height map of the printed part")] = None,
-    scan_unit: Annotated[str | None, typer.Option(help="unit of its heights, if the file has none")] = None,
-    scan_size_um: Annotated[float | None, typer.Option(help="its side, µm, if the file has none")] = None,
-    scan_levelling: Annotated[
-        Literal["none", "plane", "bow"],
-        typer.Option(help="what is removed of the scan: nothing, a plane, or a bow of second order"),
-    ] = "bow",
+    scan: Scan = None,
+    scan_unit: ScanUnit = None,
+    scan_size_um: ScanSizeUm = None,
+    scan_levelling: ScanLevelling = "bow",
+    scan_aligned: ScanAligned = False,
     scan_scale_sd: Annotated[
         float, typer.Option(help="relative standard uncertainty of the microscope's height scale")
     ] = 0.02,
@@ -137,7 +145,9 @@ def score(
         design,
         out,
         judges=judge or (),
-        scan=None if scan is None else MeasuredSource(scan, scan_unit, size, scan_levelling, scan_scale_sd),
+        scan=None
+        if scan is None
+        else MeasuredSource(scan, scan_unit, size, scan_levelling, scan_scale_sd, scan_aligned),
         camera=None
         if camera is None
         else PhotoSource(

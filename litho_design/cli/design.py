@@ -19,6 +19,11 @@ from litho_design.cli.options import (
     Extrapolate,
     Given,
     Out,
+    Scan,
+    ScanAligned,
+    ScanLevelling,
+    ScanSizeUm,
+    ScanUnit,
     as_toml,
     takes_settings,
 )
@@ -159,6 +164,15 @@ def correct(
     model: Model,
     out: Out,
     given: Given,
+    after: Annotated[
+        Path | None,
+        typer.Option(help="a first correction, printed and measured: what its print was off is taken off"),
+    ] = None,
+    scan: Scan = None,
+    scan_unit: ScanUnit = None,
+    scan_size_um: ScanSizeUm = None,
+    scan_levelling: ScanLevelling = "bow",
+    scan_aligned: ScanAligned = False,
     spread_of: SpreadOf = None,
     roughness_of: RoughnessOf = None,
     ensemble: Ensemble = None,
@@ -168,13 +182,20 @@ def correct(
     """Find the layout whose print is the wanted relief; an interrupted run in OUT is continued.
 
     Example: litho-design correct blaze --model zoo:pbl --out blaze
+    Second round: litho-design correct blaze --model zoo:pbl --after blaze --scan print.gwy --out again
     """
     settings = _settings(given, relief_settings, "correct", spread_of, roughness_of)
+    from litho_design.judging.measured import MeasuredSource
     from litho_design.workflows.design import correct as correct_relief
 
+    size = None if scan_size_um is None else (scan_size_um, scan_size_um)
+    print_of = None
+    if scan is not None:
+        print_of = MeasuredSource(scan, scan_unit, size, scan_levelling, aligned=scan_aligned)
     design = correct_relief(
-        relief, model, out, settings=settings, ensemble=ensemble or (), device=device, extrapolate=extrapolate
-    )
+        relief, model, out, settings=settings, after=after, scan=print_of,
+        ensemble=ensemble or (), device=device, extrapolate=extrapolate,
+    )  # fmt: skip
     _print_design(design, out)
 
 
@@ -219,7 +240,9 @@ def lens(
     _print_design(design, out)
 
 
-@takes_settings(HologramSettings(), LensSettings(), leave_out=("task", "search.seed", "ensemble.weight"))
+@takes_settings(
+    HologramSettings(), LensSettings(), leave_out=("task", "search.seed", "search.draft", "ensemble.weight")
+)
 def compare(
     models: Annotated[
         str, typer.Option(help="arms, comma-separated: none, NAME=MODEL or MODEL (a folder, or zoo:NAME)")

@@ -30,6 +30,20 @@ BandPx = Annotated[
         help="rows of a band at most, px: with --large or --stream memory grows with its square", min=8
     ),
 ]
+Scan = Annotated[Path | None, typer.Option(help="AFM height map of the printed part")]
+ScanUnit = Annotated[str | None, typer.Option(help="unit of its heights, if the file has none")]
+ScanSizeUm = Annotated[float | None, typer.Option(help="its side, µm, if the file has none")]
+ScanLevelling = Annotated[
+    Literal["none", "plane", "bow"],
+    typer.Option(help="what is removed of the scan: nothing, a plane, or a bow of second order"),
+]
+ScanAligned = Annotated[
+    bool,
+    typer.Option(
+        "--scan-aligned",
+        help="it lies on the pixels of the element, upright: for one that looks alike in several places",
+    ),
+]
 _Config = Annotated[
     Path | None,
     typer.Option(

@@ -37,7 +37,7 @@ def hologram_baselines(
     found = {"black image": _of_black(bench, target, settings)}
     limited = _free_amplitude(bench, target)
     score = hologram_score(
-        bench.propagator(limited), limited, target, bench.grid, settings.optics, settings.camera
+        [(1.0, bench.propagator(limited))], limited, target, bench.grid, settings.optics, settings.camera
     )
     found["diffraction-limited"] = {name: getattr(score, name) for name in _OF_IMAGES}
     best, loss = _continuous_phase(bench, cells, target, settings, counted)
@@ -73,8 +73,8 @@ def best_signal_efficiency(bench: HologramBench, height_um: Tensor, target: Tens
 def _of_black(bench: HologramBench, target: Tensor, settings: HologramSettings) -> dict[str, float]:
     black, wanted = torch.zeros_like(target).double(), target.double()
     figures = likeness(black, wanted, bench.resolved(wanted))
-    field = black.to(torch.complex128)
-    return figures | {"ssim_camera": camera_ssim(field, wanted, bench.grid, settings.optics, settings.camera)}
+    dark = [(1.0, black.to(torch.complex128))]
+    return figures | {"ssim_camera": camera_ssim(dark, wanted, bench.grid, settings.optics, settings.camera)}
 
 
 @torch.no_grad()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -16,6 +17,8 @@ from litho_design.images.similarity import SSIM_WINDOW_PX, likeness, matched_sca
 from litho_design.optics import Optics, element_field
 from litho_design.tasks.bench import ElementBench
 
+Waves = Sequence[tuple[float, Tensor]]
+
 
 class HologramBench(ElementBench):
     """The image of a holographic element, and its score."""
@@ -24,7 +27,8 @@ class HologramBench(ElementBench):
     def score(self, height_um: Tensor, target: Tensor, camera: CameraView) -> HologramScore:
         """Score printed heights (size, size), µm, against ``target`` (size, size)."""
         element = element_field(height_um, self.grid, self.optics)
-        return hologram_score(self.propagator(element), element, target, self.grid, self.optics, camera)
+        waves = list(self.waves(height_um))
+        return hologram_score(waves, element, target, self.grid, self.optics, camera)
 
     def resolved(self, target: Tensor) -> Tensor:
         """``target`` (size, size) at the resolution of the element."""
@@ -59,22 +63,22 @@ class WindowedHologramScore(HologramScore):
 
 
 def hologram_score(
-    field: Tensor, element: Tensor, target: Tensor, grid: PixelGrid, optics: Optics, camera: CameraView
+    waves: Waves, element: Tensor, target: Tensor, grid: PixelGrid, optics: Optics, camera: CameraView
 ) -> HologramScore:
-    """Score the wave in the image plane against the wanted image.
+    """Score the waves in the image plane, whose intensities add up, against the wanted image.
 
     S = {T > 0.5}; scale before comparison c = sum(I T) / sum(I^2); SSIM with an 11 px Gaussian
     window, sigma 1.5, data range 1, on c I clipped to [0, 1].
 
     Args:
-        field: complex (m, m) in the image plane, for unit incident power, 1/µm.
+        waves: shares of the light, and complex (m, m) in the image plane, for unit incident power, 1/µm.
         element: complex (n, n) just behind the element on the same pixels; its mean gives the
             zero order, the share of power that goes straight on as a plane wave.
         target: real (m, m) in [0, 1].
-        grid: geometry of ``field``.
+        grid: geometry of the waves.
     """
     area = math.prod(grid.pitch_um)
-    share = field.abs().square().double() * area
+    share = _added(waves) * area
     wanted = target.double()
     signal = wanted > 0.5
     scaled = matched_scale(share, wanted) * share
@@ -88,7 +92,7 @@ def hologram_score(
         **likeness(share, wanted, at_resolution(wanted, grid, optics)),
         rmse_paper=float(paper_rmse(share, wanted)),
         clipped_share=float((scaled > 1).double().mean()),
-        ssim_camera=camera_ssim(field, wanted, grid, optics, camera),
+        ssim_camera=camera_ssim(waves, wanted, grid, optics, camera),
         speckle_contrast=float(lit.std(correction=0) / lit.mean()),
         uniformity=1 - (high - low) / (high + low),
         background_ratio=float(lit.mean() / dark.mean()),
@@ -117,11 +121,19 @@ def zero_order_share(element: Tensor) -> float:
     return float(element.to(torch.complex128).mean().abs().square() / power)
 
 
-def camera_ssim(field: Tensor, target: Tensor, grid: PixelGrid, optics: Optics, camera: CameraView) -> float:
-    """SSIM of |field|^2 as a camera records it, against the target on its pixels."""
+def _added(waves: Waves) -> Tensor:
+    found = [share * wave.abs().square().double() for share, wave in waves]
+    return sum(found[1:], found[0])
+
+
+def camera_ssim(waves: Waves, target: Tensor, grid: PixelGrid, optics: Optics, camera: CameraView) -> float:
+    """SSIM of the light of some waves as a camera records it, against the target on its pixels."""
     import cv2
 
-    seen = through_aperture(field, grid, optics.wavelength_um, camera.numerical_aperture).abs().square()
+    aperture = camera.numerical_aperture
+    seen = _added(
+        [(share, through_aperture(wave, grid, optics.wavelength_um, aperture)) for share, wave in waves]
+    )
     pixels = tuple(max(SSIM_WINDOW_PX, round(size / camera.pitch_um)) for size in reversed(grid.size_um))
 
     def sample(image: Tensor) -> Tensor:

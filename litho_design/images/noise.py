@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import TypeVar
 
 import numpy as np
@@ -28,9 +28,27 @@ def white_noise(values: np.ndarray) -> float:
 
 def uncertainties(score: Callable[[T], Record], measured: Record, variants: Iterable[T]) -> dict[str, float]:
     """Rms change of every figure of ``measured`` over variants of the measurement: one standard deviation."""
-    figures = measured.model_dump(exclude_none=True)
-    changes = [
-        {name: value - figures[name] for name, value in score(variant).model_dump(exclude_none=True).items()}
-        for variant in variants
-    ]
-    return {name: float(np.sqrt(np.mean([change[name] ** 2 for change in changes]))) for name in figures}
+    return {name: float(np.sqrt(np.mean(found**2))) for name, found in _changes(score, measured, variants)}
+
+
+def freed_of_noise(
+    score: Callable[[T], Record], measured: Record, variants: Iterable[T]
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Figures without what noise adds to them on average, and the standard deviation of each.
+
+    What the noise of the variants adds to a measurement that has as much already is taken for what that has
+    added to the truth (bias correction by bootstrap, Efron and Tibshirani 1993, chapter 10). Variants come
+    in pairs of opposite noise, so that it adds nothing to a figure that is linear in it.
+    """
+    changes = dict(_changes(score, measured, variants))
+    figures = {name: getattr(measured, name) - float(found.mean()) for name, found in changes.items()}
+    return figures, {name: float(found.std()) for name, found in changes.items()}
+
+
+def _changes(
+    score: Callable[[T], Record], measured: Record, variants: Iterable[T]
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Of every figure of ``measured`` its changes over variants of the measurement."""
+    scores = [score(variant).model_dump(exclude_none=True) for variant in variants]
+    for name, value in measured.model_dump(exclude_none=True).items():
+        yield name, np.array([one[name] for one in scores]) - value

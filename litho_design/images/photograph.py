@@ -85,7 +85,7 @@ class Photograph:
     record: CameraRecord
 
     def image(self) -> np.ndarray:
-        """Counts per pixel of the photograph, on the pixels of the window (m, m)."""
+        """Counts per pixel of the photograph, on the pixels of the window (m, m); noise goes below 0."""
         return self._warped(self.counts, np.zeros(2))
 
     def power_share(self, image: np.ndarray, power_counts: float) -> np.ndarray:
@@ -95,14 +95,15 @@ class Photograph:
         return image * abs(np.linalg.det(warp) / (warp[2] @ middle) ** 3) / power_counts
 
     def as_it_might_be(self) -> Iterator[np.ndarray]:
-        """Images that the photograph would also allow: other noise, dark level and position."""
+        """Images that it would also allow: other noise, dark level and position, in opposite pairs."""
         generator = np.random.default_rng(0)
         record = self.record
         for _ in range(DRAWS):
-            counts = self.counts + (record.noise_counts or 0) * generator.standard_normal(self.counts.shape)
-            counts = counts - (record.dark_level_sd or 0) * generator.standard_normal()
+            noise = (record.noise_counts or 0) * generator.standard_normal(self.counts.shape)
+            noise = noise - (record.dark_level_sd or 0) * generator.standard_normal()
             moved = (record.position_sd_um or 0) / self.pitch_um * generator.standard_normal(2)
-            yield self._warped(counts.astype(np.float32), moved)
+            for sign in (1, -1):
+                yield self._warped((self.counts + sign * noise).astype(np.float32), sign * moved)
 
     def _warped(self, counts: np.ndarray, moved_px: np.ndarray) -> np.ndarray:
         import cv2
@@ -115,8 +116,8 @@ class Photograph:
         )
         # What is finer than any light of the element is noise.
         passed = np.arange(side) / (2 * side * self.pitch_um) <= self.finest_per_um
-        found = idctn(dctn(found, norm="ortho") * np.outer(passed, passed), norm="ortho")
-        return np.clip(found, 0, None)
+        kept: np.ndarray = idctn(dctn(found, norm="ortho") * np.outer(passed, passed), norm="ortho")
+        return kept
 
 
 def photographed_image(
@@ -204,7 +205,8 @@ def _check_linear(image: np.ndarray, wanted: np.ndarray, photo_file: str | Path)
     """Refuse counts that fit the expected image better once the encoding for a screen is undone."""
     import cv2
 
-    smooth = [cv2.GaussianBlur(one, (0, 0), 2.0).ravel() for one in (wanted, image, image**_SCREEN_GAMMA)]
+    light = image.clip(0)
+    smooth = [cv2.GaussianBlur(one, (0, 0), 2.0).ravel() for one in (wanted, light, light**_SCREEN_GAMMA)]
     correlations: Any = np.corrcoef(smooth)
     _, as_it_is, decoded = correlations[0]
     if decoded > as_it_is:

@@ -32,6 +32,8 @@ class MeasuredSource:
     Attributes:
         levelling: what is removed of the scan: nothing, a plane, or a polynomial of second order (bow).
         scale_sd: relative standard uncertainty of its heights; a calibrated microscope's is about 0.02.
+        aligned: it lies on the pixels of the element already, upright: nothing is registered. For elements
+            that look alike in several places or orientations, such as a lens cap or a blaze.
     """
 
     path: Path
@@ -39,6 +41,7 @@ class MeasuredSource:
     size_um: tuple[float, float] | None = None
     levelling: Levelling = "bow"
     scale_sd: float = 0.02
+    aligned: bool = False
 
 
 class MeasuredRecord(Record):
@@ -53,6 +56,7 @@ class MeasuredRecord(Record):
     sha256: str
     coverage: float
     registration_ncc: float
+    aligned: bool = False
     height_offset_um: float
     orientation: str | None = None
     warning: str | None = None
@@ -66,6 +70,7 @@ class MeasuredRecord(Record):
     def remarks(self) -> list[str]:
         """What was removed, and whether the scan lies as the layout does, one phrase each."""
         found = [] if not self.warning else [self.warning]
+        found += ["the scan was taken as it lies"] if self.aligned else []
         if self.orientation not in (None, "identity"):
             found.append(f"the scan was brought onto the layout by {self.orientation}")
         if self.levelling == "none":
@@ -107,22 +112,37 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
     pitch = scan.require_pitch()
     layout = loaded.record.layout
     levels = loaded.level.cpu().numpy()
-    registration = register_scan(
-        scan.height_um, levels, scan_pitch_um=pitch, layout_pitch_um=layout.pitch_um, model="affine"
-    )
-    quality = registration.quality
-    if not quality.passed:
-        raise InputError(
-            f"scan {source.path} on the layout of the design", got=quality.reason, wanted="a match"
+    orientation, warning, position_sd_um = "identity", "", 0.0
+    if source.aligned:
+        height, valid = scan.height_um, np.isfinite(scan.height_um)
+        if height.shape != levels.shape or not np.allclose(pitch, layout.pitch_um, rtol=1e-3):
+            raise InputError(
+                f"aligned scan {source.path}",
+                got=f"{height.shape} px of {pitch[0]:g} µm",
+                wanted=f"the pixels of the element: {levels.shape} of {layout.pitch_um:g} µm",
+            )
+    else:
+        registration = register_scan(
+            scan.height_um, levels, scan_pitch_um=pitch, layout_pitch_um=layout.pitch_um, model="affine"
         )
-    height, valid = resample_to_layout(
-        scan.height_um,
-        registration.scan_to_layout,
-        levels.shape,
-        scan_pitch_um=pitch,
-        layout_pitch_um=layout.pitch_um,
-        bend_um=registration.bend_um,
-    )
+        quality = registration.quality
+        if not quality.passed:
+            raise InputError(
+                f"scan {source.path} on the layout of the design",
+                got=quality.reason,
+                wanted="a match",
+                hint="--scan-aligned, if it lies on the pixels of the element",
+            )
+        orientation, warning = quality.dihedral, quality.warning
+        position_sd_um = quality.corner_sd_nm / 1000
+        height, valid = resample_to_layout(
+            scan.height_um,
+            registration.scan_to_layout,
+            levels.shape,
+            scan_pitch_um=pitch,
+            layout_pitch_um=layout.pitch_um,
+            bend_um=registration.bend_um,
+        )
     coverage = float(valid.mean())
     if coverage < _SMALLEST_COVERAGE:
         raise InputError(
@@ -150,13 +170,14 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
         coverage=coverage,
         registration_ncc=ncc,
         height_offset_um=offset,
-        orientation=quality.dihedral,
-        warning=quality.warning,
+        aligned=source.aligned,
+        orientation=orientation,
+        warning=warning,
         levelling=source.levelling,
         tilt_um_per_um=background.tilt_um_per_um,
         bow_um=background.bow_um,
         noise_um=white_noise(complete - expected),
-        position_sd_um=quality.corner_sd_nm / 1000,
+        position_sd_um=position_sd_um,
         scale_sd=source.scale_sd,
     )
     return torch.from_numpy(complete).to(loaded.device), record

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.results import Record
-from litho_design.images.noise import uncertainties
+from litho_design.images.noise import freed_of_noise, uncertainties
 from litho_design.images.photograph import CameraRecord, Photograph, photographed_image
 from litho_design.images.similarity import likeness, matched_scale, similarity
 from litho_design.images.targets import ImagedObject
@@ -113,8 +113,7 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
         return photo_score(share, target, resolved, has_power=power is not None)
 
     image = photo.image()
-    score = figures(image)
-    uncertainty = uncertainties(figures, score, photo.as_it_might_be())
+    freed, uncertainty = freed_of_noise(figures, figures(image), photo.as_it_might_be())
     if uncertainty["si_psnr_db"] > _LARGEST_SD_DB:
         raise InputError(
             f"photograph {source.path}",
@@ -122,7 +121,8 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
             wanted=f"at most {_LARGEST_SD_DB} dB",
             hint="a longer exposure or the mean of several, and --camera-dark-level",
         )
-    return PhotoVerdict(score, uncertainty, photo.record, {f"photograph {photo.record.name}": image})
+    pictures = {f"photograph {photo.record.name}": image.clip(0)}
+    return PhotoVerdict(PhotoScore(**freed), uncertainty, photo.record, pictures)
 
 
 def _registered(loaded: LoadedDesign, wanted: np.ndarray, pitch_um: float, source: PhotoSource) -> Photograph:
@@ -181,7 +181,7 @@ def score_lens_photo(
     photo = _registered(loaded, expected.cpu().numpy(), pixel_um, source)
 
     def estimates(image: np.ndarray) -> dict[str, Tensor]:
-        seen = torch.from_numpy(image).to(expected)
+        seen = torch.from_numpy(image).to(expected).clamp(min=0)
         seen = seen * matched_scale(seen, expected)
         found = {name: reconstruct(seen, kernel, settings.iterations) for name, kernel in kernels.items()}
         return {

@@ -100,13 +100,17 @@ def check_settings(settings: HologramSettings) -> None:
     unknown = {
         "search.parametrisation": (search.parametrisation, "direct"),
         "search.start_jitter_levels": (search.start_jitter_levels, 0.0),
+        "search.draft": (search.draft, ""),
         "optics.element": (settings.optics.element, "thin"),
+        "optics.source_sine": (settings.optics.source_sine, 0.0),
+        "optics.bandwidth_um": (settings.optics.bandwidth_um, 0.0),
         "window.samples": (settings.window.samples, 0),
         "loss.signal_window_um": (settings.loss.signal_window_um, 0.0),
         "fabrication.max_step_levels": (fabrication.max_step_levels, 0),
         "fabrication.min_feature_um": (fabrication.min_feature_um, 0.0),
         "fabrication.inside_weight": (fabrication.inside_weight, 0.0),
         "layout.symmetry": (settings.layout.symmetry, "none"),
+        "layout.cell_filter_um": (settings.layout.cell_filter_um, 0.0),
     }
     for name, (given, wanted) in unknown.items():
         if given != wanted:

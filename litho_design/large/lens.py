@@ -88,9 +88,11 @@ class RingLens:
         wanted: dict[str, tuple[Any, Any]] = {
             "task": (settings.task, "direct"),
             "layout.symmetry": (layout.symmetry, "radial"),
+            "layout.cell_filter_um": (layout.cell_filter_um, 0.0),
             "view.aperture": (settings.view.aperture, "circle"),
             "optics.element": (settings.optics.element, "thin"),
             "search.parametrisation": (settings.search.parametrisation, "direct"),
+            "search.draft": (settings.search.draft, ""),
             "window.samples": (settings.window.samples, 0),
             "size_px modulo 2": (layout.size_px % 2, 0),
         }

@@ -18,6 +18,7 @@ from litho_design.optics import (
     make_propagator,
 )
 from litho_design.optics.imaging import Blur, bin_pixels, richardson_lucy
+from litho_design.optics.source import require_one_wave
 from litho_design.printers.layout import LayoutSettings
 
 
@@ -26,6 +27,7 @@ class LensOptics(nn.Module):
 
     def __init__(self, layout: LayoutSettings, optics: Optics, view: LensView):
         super().__init__()
+        require_one_wave(optics, "a lens")
         self.layout, self.optics, self.view = layout, optics, view
         self.window = centred_grid((view.window_px, view.window_px), layout.pitch_um)
 

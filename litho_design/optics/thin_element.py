@@ -37,6 +37,15 @@ class Optics(Record):
 
     incidence_x: float = setting(0.0, "Sine of the angle at which light falls in, along x", gt=-1, lt=1)
     incidence_y: float = setting(0.0, "Sine of the angle at which light falls in, along y", gt=-1, lt=1)
+    source_sine: float = setting(
+        0.0,
+        "Sine of half the angle under which the element sees an incoherent source; 0 for a point",
+        ge=0,
+        lt=1,
+    )
+    bandwidth_um: float = setting(
+        0.0, "Standard deviation of the wavelengths of the source; 0 for one colour", unit="µm", ge=0
+    )
     propagation: Literal["auto", "rayleigh-sommerfeld", "angular-spectrum"] = setting(
         "auto",
         "Propagator: the Rayleigh-Sommerfeld sum, the angular spectrum, or whichever is valid",

@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from litho_design.optimisation.process_window import blurred
 from litho_design.printers.layout import LayoutSettings
 
 # One level: the neighbours of the starting level can be reached from the first step.
@@ -102,18 +103,22 @@ class GumbelLevels(nn.Module):
 
 
 class DirectLevels(nn.Module):
-    """One real level per cell; rounding passes the gradient straight through when ``hard``."""
+    """One real level per cell, filtered where the layout says so.
+
+    Rounding passes the gradient straight through when ``hard``.
+    """
 
     def __init__(self, layout: LayoutSettings, rows: range | None = None, *, cells: CellMap | None = None):
         super().__init__()
         self.cells = cells or CellMap(layout, rows)
         self.levels = layout.levels
         self.height = nn.Parameter(torch.zeros(self.cells.cells))
+        self.filter_cells = layout.cell_filter_um / layout.cell_um
 
     def sample(self, temperature: float, hard: bool, seed: int) -> Tensor:
         """Levels on the pixels, float (1, 1, size, size); nothing here is random."""
-        kept = self._kept()
-        level = self.height + ((kept.round() if hard else kept) - self.height).detach()
+        free, kept = self._filtered(), self._kept()
+        level = free + ((kept.round() if hard else kept) - free).detach()
         return self.cells(level)[None, None]
 
     @torch.no_grad()
@@ -138,8 +143,11 @@ class DirectLevels(nn.Module):
         self.height.copy_(self.cells.own(drawn) * (self.levels - 1))
 
     def _kept(self) -> Tensor:
-        """Heights within the range, which an optimiser that does not project may have left."""
-        return self.height.clamp(0, self.levels - 1)
+        """Levels within the range, which an optimiser that does not project may have left."""
+        return self._filtered().clamp(0, self.levels - 1)
+
+    def _filtered(self) -> Tensor:
+        return blurred(self.height, self.filter_cells) if self.filter_cells else self.height
 
 
 Parametrisation = GumbelLevels | DirectLevels

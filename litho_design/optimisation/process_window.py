@@ -113,7 +113,7 @@ class Draw:
         changed = height_um * self.gain + self.offset_um
         sigma_px = self.blur_um / pitch_um
         if sigma_px >= _NARROWEST_BLUR_PX:
-            changed = _blur(changed, sigma_px)
+            changed = blurred(changed, sigma_px)
         if self.stitch.sigma_um:
             changed = self.stitch.drawn(changed, pitch_um, list(self.stitch_seed))
         if not self.roughness.sigma_um:
@@ -263,14 +263,13 @@ def measured_window(store: Any, window: ProcessWindow) -> ProcessWindow:
     )
 
 
-def _blur(height: Tensor, sigma_px: float) -> Tensor:
+def blurred(height: Tensor, sigma_px: float) -> Tensor:
     """Gaussian blur of a map with mirrored borders; rings are mirrored at the centre, level at the edge."""
     import torch
     import torch.nn.functional as F
 
     rings = height.dim() == 1
-    half = int(4 * sigma_px) + 1
-    half = min(half, height.numel() - 1) if rings else half
+    half = min(int(4 * sigma_px) + 1, min(height.shape) - 1)
     x = torch.arange(-half, half + 1, dtype=height.dtype, device=height.device)
     kernel = torch.exp(-(x**2) / (2 * sigma_px**2))
     kernel = kernel / kernel.sum()

@@ -46,7 +46,15 @@ class SearchState:
 
 
 def make_parametrisation(layout: LayoutSettings, search: SearchSettings) -> Parametrisation:
-    """The free parameters named by ``search.parametrisation``."""
+    """The free parameters named by ``search.parametrisation``.
+
+    Raises:
+        InputError: a filter over the cells of a distribution over levels.
+    """
+    if layout.cell_filter_um and search.parametrisation == "gumbel":
+        raise InputError(
+            "cell filter", got="the parametrisation gumbel", wanted="direct: distributions have no neighbours"
+        )
     return GumbelLevels(layout) if search.parametrisation == "gumbel" else DirectLevels(layout)
 
 

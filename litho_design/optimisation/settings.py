@@ -35,6 +35,12 @@ class SearchSettings(Record):
     start_jitter_levels: float = setting(
         0.0, "Noise added to a start that is not random", unit="levels", ge=0
     )
+    draft: str = setting(
+        "",
+        "Cheaper model for a first stage of the search: a folder, zoo:NAME or none; without it there is none",
+        option="--draft",
+    )
+    draft_iterations: int = setting(80, "Iterations of that stage", ge=1)
     iterations: int = setting(300, "Iterations of the search", option="--iterations", ge=1)
     optimiser: Literal["adam", "adamw"] = setting("adam", "Optimiser")
     learning_rate: float = setting(

@@ -26,6 +26,14 @@ class LayoutSettings(Record):
     cell_um: float = setting(
         0.4, "Side of a free cell (hologram) or width of a ring (lens)", unit="µm", option="--cell-um", gt=0
     )
+    cell_filter_um: float = setting(
+        0.0,
+        "Standard deviation of a Gaussian filter over the free cells, so that neighbours follow each other; "
+        "0 for none",
+        unit="µm",
+        option="--cell-filter-um",
+        ge=0,
+    )
     levels: int = setting(13, "Number of printable levels", option="--levels", ge=2, le=256)
     level_height_um: float = setting(0.1, "Height of one level", unit="µm", option="--level-height-um", gt=0)
     symmetry: Literal["none", "radial"] = setting("none", "Whether the free cells are rings around the axis")

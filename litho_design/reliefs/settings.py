@@ -25,6 +25,9 @@ class ReliefSettings(DesignSettings):
         option="--height-um",
         gt=0,
     )
+    off_blur_um: float = setting(
+        1.0, "Blur of what a first print was off, where one was measured", unit="µm", ge=0
+    )
 
 
 def relief_settings(changes: Mapping[str, Any] | None = None) -> ReliefSettings:

@@ -46,6 +46,17 @@ def load_relief(
     return _checked(heights, size), TargetRecord.of_file(path, notes)
 
 
+def print_off_um(printed_um: np.ndarray, expected_um: np.ndarray, blur_px: float) -> np.ndarray:
+    """What a print (size, size) was off from its expectation, µm, without its mean, blurred: float32.
+
+    A second print differs from the first by its roughness, which the blur takes out.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    off = gaussian_filter(printed_um.astype(np.float64) - expected_um, blur_px)
+    return (off - off.mean()).astype(np.float32)
+
+
 def _float_tiff(path: Path) -> np.ndarray | None:
     """Heights in µm of a TIFF of floating-point numbers; None for anything else."""
     if path.suffix.lower() not in (".tif", ".tiff"):

@@ -51,6 +51,9 @@ class _Bare(nn.Module):
 class ReliefTask(Task):
     """A wanted height map (size, size), µm, as ``load_relief`` gives it with its record.
 
+    ``off_um`` among the inputs is what a first print was off from its expectation, without its mean: the
+    search expects it again. Figures are those of the print alone, as others will measure it.
+
     Raises:
         InputError: a start for light, or spreads that no propagator could take.
     """
@@ -73,6 +76,9 @@ class ReliefTask(Task):
     ):
         super().__init__(settings, printer, inputs=inputs, ensemble=ensemble)
         self.target = torch.from_numpy(self.inputs["relief_um"]).to(printer.device)
+        off_um = self.inputs.get("off_um", np.zeros_like(self.inputs["relief_um"]))
+        # What the model has to print, so that the printer prints the target.
+        self.asked = self.target - torch.from_numpy(off_um).to(printer.device)
         self.target_record = record
         self.notes += [f"relief: {record.adaptation}"] if record and record.adaptation else []
         heights = printer.level_heights_um()
@@ -89,7 +95,7 @@ class ReliefTask(Task):
 
     def loss(self, seen: Tensor) -> Tensor:
         """Rms error without its mean, µm."""
-        return (seen - self.target).std(correction=0)
+        return (seen - self.asked).std(correction=0)
 
     def figures(self, seen: Tensor) -> dict[str, float]:
         """Errors, nm."""
@@ -108,7 +114,9 @@ class ReliefTask(Task):
 
     def start(self, parameters: Parametrisation, level_heights_um: list[float]) -> None:
         """The level that prints the wanted height where it is uniform, or random levels."""
-        start_search(parameters, self.settings.search, lambda: self._levels_printing(level_heights_um))
+        start_search(
+            parameters, self.settings.search, lambda: self._levels_printing(level_heights_um, self.asked)
+        )
 
     def baselines(self) -> dict[str, dict[str, float]]:
         """Errors of the nominal layout, of the best affine correction, and of levels of any height."""
@@ -119,11 +127,13 @@ class ReliefTask(Task):
         gain = (printed[-1] - printed[0]) / (nominal[-1] - nominal[0])
         # A layout of uniform gain, from the one of wide fields to the one of the finest detail.
         affine = [
-            self._score_of_levels(self._levels_printing([factor * gain * one for one in nominal]))
+            self._score_of_levels(
+                self._levels_printing([factor * gain * one for one in nominal], self.target)
+            )
             for factor in _AFFINE_FACTORS
         ]
         return {
-            "uncorrected": self._score_of_levels(self._levels_printing(nominal)),
+            "uncorrected": self._score_of_levels(self._levels_printing(nominal, self.target)),
             "best affine": min(affine, key=lambda one: one["rms_nm"]),
             "free levels": self.figures(self._free_print),
         }
@@ -134,7 +144,7 @@ class ReliefTask(Task):
 
     def arrays(self, height_um: Tensor) -> dict[str, np.ndarray]:
         """Also what is left of the target with levels of any height: no layout of this range prints it."""
-        left = self.target - self._free_print
+        left = self.asked - self._free_print
         return super().arrays(height_um) | {UNPRINTABLE_FILE: (left - left.mean()).cpu().numpy()}
 
     @cached_property
@@ -142,7 +152,7 @@ class ReliefTask(Task):
         """The print of levels that need not be whole, of the lowest loss, µm."""
         search = self.settings.search
         free = DirectLevels(self.settings.layout).to(self.printer.device)
-        free.start_from(self._levels_printing(self.printer.level_heights_um()))
+        free.start_from(self._levels_printing(self.printer.level_heights_um(), self.asked))
         optimiser = torch.optim.Adam(free.parameters(), lr=search.learning_rate)
         best, lowest = None, math.inf
         for _ in range(_FREE_ITERATIONS):
@@ -157,12 +167,12 @@ class ReliefTask(Task):
         assert best is not None
         return best
 
-    def _levels_printing(self, level_heights_um: Sequence[float]) -> Tensor:
-        """Real levels (*cells) that have the wanted heights where level k is ``level_heights_um[k]`` high.
+    def _levels_printing(self, level_heights_um: Sequence[float], relief_um: Tensor) -> Tensor:
+        """Real levels (*cells) that have a relief's heights where level k is ``level_heights_um[k]`` high.
 
         Zero is free: the middle of the relief lies in the middle of the levels.
         """
-        heights, target = np.asarray(level_heights_um), self.inputs["relief_um"]
+        heights, target = np.asarray(level_heights_um), relief_um.cpu().numpy()
         middle = (heights[0] + heights[-1] - target.min() - target.max()) / 2
         levels = np.interp(target + middle, heights, np.arange(len(heights)))
         return self.cells.average(torch.from_numpy(levels).float().to(self.printer.device))

@@ -2,27 +2,54 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from litho_design.optics import Optics, centred_grid, element_field, intensity_share, make_propagator
+from litho_design.optics.source import coherent_parts
 from litho_design.printers.layout import LayoutSettings
 
 
 class ElementBench(nn.Module):
-    """Light through a printed element onto the image plane (element and window of equal size)."""
+    """Light of a source through a printed element onto the image plane (element and window of equal size).
+
+    ``propagator`` is that of the middle of the source.
+    """
 
     def __init__(self, layout: LayoutSettings, optics: Optics, *, dtype: torch.dtype = torch.complex64):
         super().__init__()
         self.optics = optics
         self.grid = self.window = centred_grid((layout.size_px, layout.size_px), layout.pitch_um)
-        self.propagator = make_propagator(self.grid, self.grid, optics, dtype=dtype)
+        self.parts = coherent_parts(optics, layout.size_um)
+        colours = {optics.wavelength_um: optics} | {part.wavelength_um: part for _, part in self.parts}
+        # Neither direction nor resin changes how light travels behind the element.
+        self.carried = nn.ModuleDict(
+            {_key(um): make_propagator(self.grid, self.grid, one, dtype=dtype) for um, one in colours.items()}
+        )
+
+    @property
+    def propagator(self) -> Any:
+        """From the element to the image plane, for the middle wavelength."""
+        return self.carried[_key(self.optics.wavelength_um)]
+
+    def waves(self, height_um: Tensor) -> Iterator[tuple[float, Tensor]]:
+        """Plane waves of the source in the image plane (..., size, size), with their shares of the light."""
+        for share, part in self.parts:
+            wave = element_field(height_um, self.grid, part)
+            yield share, self.carried[_key(part.wavelength_um)](wave)
 
     def forward(self, height_um: Tensor) -> Tensor:
         """Share of the incident power on each pixel of the window, of heights (..., size, size) in µm."""
-        return intensity_share(self.propagator(element_field(height_um, self.grid, self.optics)), self.grid)
+        found = [share * intensity_share(wave, self.grid) for share, wave in self.waves(height_um)]
+        return sum(found[1:], found[0])
+
+
+def _key(wavelength_um: float) -> str:
+    # A name of a module has no dot.
+    return wavelength_um.hex().replace(".", "_")
 
 
 class ViewsBench(nn.Module):

@@ -17,6 +17,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import record_sha256
 from litho_design.optimisation.budget import Budget, measure_budget
 from litho_design.optimisation.fabrication import outside
+from litho_design.optimisation.parameters import Parametrisation
 from litho_design.optimisation.polish import polish_levels
 from litho_design.optimisation.robust import measure_disagreement
 from litho_design.optimisation.search import (
@@ -28,6 +29,7 @@ from litho_design.optimisation.search import (
 )
 from litho_design.printers.layout import printability
 from litho_design.printers.printer import Printer
+from litho_design.printers.source import load_printer
 from litho_design.printers.training import OutOfDistribution, out_of_distribution
 from litho_design.tasks.design import (
     HEIGHT_FILE,
@@ -76,18 +78,21 @@ def run_design(task: Task, out: str | Path, report: Report, *, announce: bool = 
     _check_printers(task.printers)
     folder = Path(out)
     hashes_before = [printer.weights_sha256() for printer in task.printers]
+    draft = _draft_of(task)
+    drafted_with = [draft.printer.weights_sha256()] if draft else []
     target = task.target_record.model_dump(mode="json") if task.target_record else None
     fingerprint = record_sha256(
-        [task.name, settings.model_dump(mode="json"), hashes_before, target, task.inputs_sha256()]
-    )
+        [task.name, settings.model_dump(mode="json"), hashes_before + drafted_with, target,
+         task.inputs_sha256()]
+    )  # fmt: skip
     finished = finished_design(folder, fingerprint, settings)
     if finished is not None:
         return finished
     heights = task.printer.level_heights_um()
     with ExitStack() as precisions:
-        for printer in task.printers:
+        for printer in [*task.printers, *([draft.printer] if draft else [])]:
             precisions.enter_context(printer.at_precision(settings.search.precision))
-        outcome = _optimise(task, folder, fingerprint, heights, announce)
+        outcome = _optimise(task, draft, folder, fingerprint, heights, announce)
     cells = make_parametrisation(settings.layout, settings.search).to(outcome.levels.device).cells
     layout_level = cells(outcome.levels)
     level = layout_level[None, None].float()
@@ -179,11 +184,41 @@ def _check_printers(printers: Sequence[Printer]) -> None:
             )
 
 
-def _optimise(task: Task, folder: Path, fingerprint: str, heights: list[float], announce: bool) -> _Outcome:
+def _draft_of(task: Task) -> Task | None:
+    """The task through the model of the first stage of its search; None where there is no such stage."""
+    settings = task.settings
+    if not settings.search.draft:
+        return None
+    printer = load_printer(settings.search.draft, settings.layout, device=task.printer.device)
+    _check_printers([printer])
+    return task.reopened(settings.model_dump(), task.inputs, printer)
+
+
+def _draft(draft: Task, parameters: Parametrisation) -> None:
+    """Start ``parameters`` where a short search through the model of ``draft`` ends."""
+    search = draft.settings.search
+    draft.start(parameters, draft.printer.level_heights_um())
+    short = search.model_copy(update={"iterations": search.draft_iterations})
+    levels = search_layout(parameters, draft.objective, short, what="drafting").best_levels
+    assert levels is not None
+    parameters.start_from(levels.float())
+
+
+def _optimise(
+    task: Task,
+    draft: Task | None,
+    folder: Path,
+    fingerprint: str,
+    heights: list[float],
+    announce: bool,
+) -> _Outcome:
     started = time.monotonic()
     layout, search = task.settings.layout, task.settings.search
     parameters = make_parametrisation(layout, search).to(task.printer.device)
-    task.start(parameters, heights)
+    if draft is None:
+        task.start(parameters, heights)
+    else:
+        _draft(draft, parameters)
     with torch.no_grad():
         start_loss = float(task.objective(parameters.cells(parameters.best_levels())[None, None].float())[0])
     budget = measure_budget(parameters, task.objective, search)

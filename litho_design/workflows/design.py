@@ -12,6 +12,8 @@ from litho_data.foundation.errors import InputError
 from litho_design.holograms.settings import HologramSettings, hologram_settings
 from litho_design.holograms.task import HologramTask
 from litho_design.images.targets import Target, load_target
+from litho_design.judging.loaded import load_design
+from litho_design.judging.measured import MeasuredSource, measured_print
 from litho_design.lenses.objects import with_objects
 from litho_design.lenses.settings import LensSettings, lens_settings
 from litho_design.lenses.task import lens_task
@@ -20,7 +22,7 @@ from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 from litho_design.printers.source import Device, load_printer, load_printers
 from litho_design.reliefs.settings import ReliefSettings, relief_settings
-from litho_design.reliefs.targets import load_relief
+from litho_design.reliefs.targets import load_relief, print_off_um
 from litho_design.reliefs.task import ReliefTask
 from litho_design.reports.design import write_design_report
 from litho_design.tasks.design import Design
@@ -113,6 +115,8 @@ def correct(
     out: str | Path,
     *,
     settings: ReliefSettings | None = None,
+    after: str | Path | None = None,
+    scan: MeasuredSource | None = None,
     ensemble: Iterable[str | Printer] = (),
     device: Device = "cpu",
     extrapolate: bool = False,
@@ -125,21 +129,44 @@ def correct(
             of heights in µm (see ``load_relief``).
         model, out: as for ``design_hologram``.
         settings: layout, height, search and process window; ``relief_settings()`` by default.
+        after: folder of a first correction whose print was measured; ``scan``: that measurement. What the
+            print was off from its expectation is expected again.
         ensemble, device, extrapolate, announce: as for ``design_hologram``.
 
     Returns:
         The record written to ``out/design.json``; what no layout prints is in ``unprintable_um.npy``.
 
     Raises:
-        InputError: what ``load_relief`` refuses, or ``design_hologram`` of models and folders.
+        InputError: what ``load_relief`` refuses, or ``design_hologram`` of models and folders; ``after``
+            without ``scan`` or the reverse, a first element of another layout, or a scan that is not its.
     """
     made = _of_kind(settings or relief_settings(), ReliefSettings)
 
     def task(printer: Printer, others: list[Printer]) -> Task:
         heights, record = load_relief(relief, made.layout, made.height_um)
-        return ReliefTask(made, printer, inputs={"relief_um": heights}, ensemble=others, record=record)
+        inputs = {"relief_um": heights} | _print_off(made, after, scan)
+        return ReliefTask(made, printer, inputs=inputs, ensemble=others, record=record)
 
     return _designed(task, made.layout, out, announce, model, ensemble, device, extrapolate)
+
+
+def _print_off(
+    settings: ReliefSettings, after: str | Path | None, scan: MeasuredSource | None
+) -> dict[str, np.ndarray]:
+    """What the measured print of a first element was off, as an input of the second; none without a first."""
+    if after is None and scan is None:
+        return {}
+    if after is None or scan is None:
+        given = "a first element without a scan" if scan is None else "a scan without its element"
+        raise InputError("second round", got=given, wanted="both: --after and --scan")
+    first = load_design(after)
+    if first.record.layout != settings.layout:
+        raise InputError(
+            f"design {after}", got="another layout", wanted="the size, pitch and levels of this one"
+        )
+    printed_um, _ = measured_print(first, scan)
+    blur_px = settings.off_blur_um / settings.layout.pitch_um
+    return {"off_um": print_off_um(printed_um.numpy(), first.expected_um.numpy(), blur_px)}
 
 
 def design(

@@ -26,6 +26,7 @@ from litho_design.large.score import (
     print_from_disk,
 )
 from litho_design.lenses.settings import LensSettings, lens_settings
+from litho_design.optics.source import require_one_wave
 from litho_design.optimisation.stitching import Stitching
 from litho_design.printers.printer import Printer
 from litho_design.printers.source import Device, load_printer, load_printers
@@ -123,6 +124,7 @@ def score_from_disk(
     if record.task != "hoe" or optics.element != "thin":
         got, hint = f"{record.task}, {optics.element}", "without --stream" if record.in_rings else ""
         raise InputError("design to score from disk", got=got, wanted="a hologram, thin", hint=hint)
+    require_one_wave(optics, "a design to score from disk")
     level, expected, seen, target = (
         read_array(folder, name, on_disk=True) for name in (LEVELS_FILE, HEIGHT_FILE, IMAGE_FILE, TARGET_FILE)
     )

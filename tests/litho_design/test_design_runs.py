@@ -54,6 +54,30 @@ def test_a_design_beats_its_start_and_leaves_the_model_alone(tmp_path, small_set
     assert own.rms_height_difference_um == pytest.approx(0, abs=1e-7)
 
 
+def test_a_draft_is_a_search_through_another_model_where_the_search_starts(
+    tmp_path, small_settings, make_printer, target
+):
+    search = small_settings.search.model_copy(update={"draft": "none", "draft_iterations": 20})
+    settings = small_settings.model_copy(update={"search": search})
+    printer = make_printer(settings.layout)
+    made = design_hologram(target, printer, tmp_path / "draft", settings=settings, announce=False)
+    # The start is the layout that such a search ends with, printed by the model of the design.
+    alone = search.model_copy(update={"draft": "", "iterations": 20, "polish_rounds": 0})
+    nominal = Printer(None, settings.layout, source="none")
+    design_hologram(
+        target, nominal, tmp_path / "alone",
+        settings=settings.model_copy(update={"search": alone}), announce=False,
+    )  # fmt: skip
+    levels = torch.from_numpy(read_array(tmp_path / "alone", "layout_level.npy"))[None, None].float()
+    with torch.no_grad():
+        loss, _ = HologramTask(settings, printer, target).objective(levels)
+    assert made.start_loss == pytest.approx(float(loss), rel=1e-5)
+    assert made.polished_loss < made.start_loss
+    undrafted = settings.model_copy(update={"search": small_settings.search})
+    with pytest.raises(InputError, match="draft"):
+        design_hologram(target, printer, tmp_path / "draft", settings=undrafted, announce=False)
+
+
 @pytest.mark.parametrize("parametrisation", ["direct", "gumbel"])
 def test_an_interrupted_run_ends_as_if_it_had_never_stopped(
     tmp_path, small_settings, make_printer, target, monkeypatch, parametrisation

@@ -12,7 +12,9 @@ import torch
 from benchmarks import photographs
 from benchmarks.photographs import Camera
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import Record
 from litho_data.register.geometry import ORIENTATIONS, orient
+from litho_design.images.noise import freed_of_noise
 from litho_design.images.similarity import si_psnr_db
 from litho_design.images.targets import load_target
 from litho_design.judging.loaded import LoadedDesign
@@ -192,6 +194,36 @@ def test_a_photograph_is_within_a_third_of_a_decibel_of_its_light_or_refused(tmp
     ):
         with pytest.raises(InputError, match=why):
             scored(**camera)
+
+
+class Power(Record):
+    """A figure that is linear in what is measured, and one that is not."""
+
+    mean: float
+    power: float
+
+
+def test_figures_are_freed_of_what_noise_adds_on_average():
+    """Noise of sd s adds s^2 to a mean of squares and nothing to a mean, whatever the figure it falls on."""
+    generator = np.random.default_rng(0)
+    truth, sd = generator.uniform(0, 1, 4000), 0.3
+    drawn, freed = [], []
+    for _ in range(40):
+        seen = truth + sd * generator.standard_normal(truth.shape)
+        noise = sd * generator.standard_normal((4, *truth.shape))
+        pairs = [seen + sign * one for one in noise for sign in (1, -1)]
+        measured = Power(mean=seen.mean(), power=np.square(seen).mean())
+        figures, spread = freed_of_noise(
+            lambda one: Power(mean=one.mean(), power=np.square(one).mean()), measured, pairs
+        )
+        assert figures["mean"] == pytest.approx(measured.mean, abs=1e-12)
+        drawn.append(measured.power)
+        freed.append(figures["power"])
+    wanted = np.square(truth).mean()
+    # The mean of 40 is known to sqrt((4 s^2 <x^2> + 2 s^4) / 4000 / 40) = 9e-4.
+    assert np.mean(drawn) - wanted == pytest.approx(sd**2, abs=4e-3)
+    assert np.mean(freed) == pytest.approx(wanted, abs=4e-3)
+    assert spread["mean"] == pytest.approx(sd / np.sqrt(4000), rel=0.8)
 
 
 def test_the_page_quotes_the_photographs_that_were_scored():

@@ -10,6 +10,8 @@ import torch
 from litho_data.foundation.errors import InputError
 from litho_design.optimisation.parameters import CellMap, DirectLevels, GumbelLevels
 from litho_design.optimisation.phases import nearest_levels
+from litho_design.optimisation.search import make_parametrisation
+from litho_design.optimisation.settings import SearchSettings
 from litho_design.printers.layout import LayoutSettings
 
 SQUARE = LayoutSettings(size_px=16, cell_um=0.4, levels=5)
@@ -100,3 +102,34 @@ def test_cells_must_fill_the_element():
         CellMap(LayoutSettings(size_px=10, cell_um=0.4))
     with pytest.raises(InputError, match="cell_um"):
         CellMap(LayoutSettings(size_px=16, cell_um=0.25))
+
+
+@pytest.mark.parametrize("layout", [SQUARE.model_copy(update={"size_px": 44}), RINGS])
+def test_a_filter_over_the_cells_is_gaussian_in_the_levels_and_in_their_gradient(layout):
+    """One free cell moves its neighbours by the kernel, and takes its gradient from them by the same."""
+    filtered = layout.model_copy(update={"cell_filter_um": 0.8 * layout.cell_um})
+    parameters = DirectLevels(filtered)
+    middle = tuple(side // 2 for side in parameters.cells.cells)
+    with torch.no_grad():
+        parameters.height[middle] = 4.0
+    level = parameters.cells.average(parameters.sample(0.5, hard=False, seed=0)[0, 0])
+    kernel = torch.exp(-((torch.arange(-4, 5) / 0.8) ** 2) / 2)
+    kernel = kernel / kernel.sum()
+    wanted = 4 * (kernel if level.dim() == 1 else kernel[:, None] * kernel)
+    around = tuple(slice(one - 4, one + 5) for one in middle)
+    # The kernel ends at four sigma, where 6e-5 of it is left.
+    assert torch.allclose(level[around], wanted, atol=1e-3)
+    sample = parameters.sample(0.5, hard=True, seed=0)
+    assert torch.equal(sample, sample.round())
+    assert sample.min() >= 0
+    assert sample.max() <= 4
+    (gradient,) = torch.autograd.grad(sample[0, 0].sum(), parameters.height)
+    # Every pixel counts once: a filter of sum 1 hands all of it on.
+    assert float(gradient.sum()) == pytest.approx(sample.numel(), rel=1e-5)
+    assert torch.equal(DirectLevels(layout)._kept(), DirectLevels(layout).height)
+
+
+def test_a_filter_needs_neighbours():
+    layout = SQUARE.model_copy(update={"cell_filter_um": 0.4})
+    with pytest.raises(InputError, match="no neighbours"):
+        make_parametrisation(layout, SearchSettings(parametrisation="gumbel"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -14,6 +15,7 @@ from benchmarks import relief as benchmark
 from litho_data.foundation.errors import InputError
 from litho_design import correct, load_design
 from litho_design.cli.app import main
+from litho_design.judging.measured import MeasuredSource, measured_print
 from litho_design.optimisation.process_window import measure_yield
 from litho_design.reliefs.settings import relief_settings
 from litho_design.reliefs.targets import load_relief
@@ -72,6 +74,52 @@ def test_the_zero_of_a_print_decides_no_yield(make_printer):
     )
     # A gain is no offset: 5 % of a staircase of 0.2 µm rms is more than the error as modelled.
     assert passed(settings.window.model_copy(update={"gain_sd": 0.05}))[1].share < 0.5
+
+
+def test_a_second_round_takes_off_what_the_first_print_was_off(tmp_path, make_printer, refused):
+    """A printer that its model does not know: smoothly less gain to one side, by up to 20 %."""
+    settings = relief_settings(TINY | {"off_blur_um": 0.2})
+    model = make_printer(settings.layout, sigma_um=0.15)
+    cells = torch.from_numpy(np.random.default_rng(0).integers(3, 10, (24, 24))).float()
+    pixels = cells.repeat_interleave(2, 0).repeat_interleave(2, 1)[None, None]
+    side = torch.linspace(1.1, 0.9, 48)
+
+    def printed_um(folder):
+        levels = torch.from_numpy(np.load(folder / "layout_level.npy"))[None, None].float()
+        with torch.no_grad():
+            return (side * model(levels)[0, 0]).numpy()
+
+    with torch.no_grad():
+        wanted = model(pixels)[0, 0].numpy()
+    first, again = tmp_path / "first", tmp_path / "again"
+    correct(wanted, model, first, settings=settings, announce=False)
+    np.savetxt(tmp_path / "scan.txt", printed_um(first) * 1e-6)
+    scan = MeasuredSource(tmp_path / "scan.txt", "m", (4.8, 4.8), "none", aligned=True)
+    made = correct(wanted, model, again, settings=settings, after=first, scan=scan, announce=False)
+
+    def rms_nm(folder):
+        return 1e3 * (printed_um(folder) - wanted).std()
+
+    # What a level costs stays, 62 nm for a tenth of the cells; the slope of 50 nm rms goes.
+    assert rms_nm(first) > 30
+    assert rms_nm(again) < rms_nm(first) / 3
+    # Figures are those of the print as the model has it, against what is wanted.
+    expected = np.load(again / "predicted_height_um.npy")
+    assert made.predicted["rms_nm"] == pytest.approx(1e3 * (expected - wanted).std(), rel=1e-4)
+    assert made.predicted["rms_nm"] > 30
+    assert made.baselines["uncorrected"] == load_design(first).record.baselines["uncorrected"]
+    # So small an element cannot be registered, and one of another size does not lie on its pixels.
+    with pytest.raises(InputError, match="--scan-aligned"):
+        measured_print(load_design(first), replace(scan, aligned=False))
+    with pytest.raises(InputError, match="pixels of the element"):
+        measured_print(load_design(first), replace(scan, size_um=(5.0, 5.0)))
+    with pytest.raises(InputError, match="--after and --scan"):
+        correct(wanted, model, tmp_path / "no", settings=settings, after=first)
+    other = relief_settings(TINY | {"layout.size_px": 44})
+    with pytest.raises(InputError, match="another layout"):
+        correct(wanted[:44, :44], model, tmp_path / "no", settings=other, after=first, scan=scan)
+    words = ["correct", "lens", "--model", "none", "--size-px", "48", "--out", tmp_path / "no"]
+    assert "a scan without its element" in refused(*words, "--scan", tmp_path / "scan.txt")
 
 
 def test_what_no_layout_prints_is_shown_beside_it(tmp_path, monkeypatch, capsys):

@@ -49,6 +49,8 @@ def other(leaf: Leaf):
         return leaf.value[::-1]
     if leaf.kind is float:
         return leaf.value / 2 if leaf.value else 0.25
+    if leaf.kind is str:
+        return "none"
     assert leaf.kind is int, leaf
     return leaf.value + 7
 

@@ -1,0 +1,86 @@
+"""Light that is not one plane wave of one colour: a source of some width and bandwidth, incoherent."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError
+from litho_design.optics.thin_element import Optics
+
+# Points of a source per (wavelength / side)^2 of its area in sines: closer than an element tells apart.
+_POINTS_PER_AREA = 3
+_FEWEST = 8
+_MOST = 128
+_GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
+
+
+def coherent_parts(optics: Optics, size_um: float) -> list[tuple[float, Optics]]:
+    """Plane waves of one colour whose images add up to that of the source, each with its share of the light.
+
+    Colours are those of a Gaussian spectrum, by Gauss-Hermite quadrature; directions lie on a disc of sines
+    around that of ``optics``, evenly. Images of neighbours are closer than lambda z / D, the finest detail of
+    an element of side D. Light of a point of one colour is one part, unchanged.
+
+    Args:
+        size_um: side of the element.
+
+    Raises:
+        InputError: a source too wide, or of too many colours, for so fine an element.
+    """
+    directions = _directions(optics, size_um)
+    return [
+        (share / len(directions), one.model_copy(update={"incidence_x": x, "incidence_y": y}))
+        for share, one in _colours(optics, size_um)
+        for x, y in directions
+    ]
+
+
+def _colours(optics: Optics, size_um: float) -> list[tuple[float, Optics]]:
+    if not optics.bandwidth_um:
+        return [(1.0, optics)]
+    # Detail at the edge of the image moves by D / 2 x (relative change of the wavelength).
+    widths = optics.bandwidth_um * size_um**2 / (2 * optics.wavelength_um**2 * optics.distance_um)
+    nodes, weights = np.polynomial.hermite_e.hermegauss(_checked(3 + 2 * math.ceil(2 * widths), "bandwidth"))
+    return [
+        (weight, optics.at_wavelength(optics.wavelength_um + optics.bandwidth_um * node))
+        for node, weight in zip(nodes.tolist(), (weights / weights.sum()).tolist(), strict=True)
+    ]
+
+
+def _directions(optics: Optics, size_um: float) -> list[tuple[float, float]]:
+    middle = (optics.incidence_x, optics.incidence_y)
+    if not optics.source_sine:
+        return [middle]
+    area = math.pi * (optics.source_sine * size_um / optics.wavelength_um) ** 2
+    count = _checked(max(_FEWEST, math.ceil(_POINTS_PER_AREA * area)), "width")
+    number = np.arange(count)
+    # The seeds of a sunflower: every one has the same area.
+    disc = optics.source_sine * np.sqrt((number + 0.5) / count) * np.exp(1j * _GOLDEN_ANGLE * number)
+    disc += complex(*middle) - disc.mean()
+    return [(one.real, one.imag) for one in disc.tolist()]
+
+
+def _checked(count: int, what: str) -> int:
+    if count > _MOST:
+        raise InputError(
+            f"{what} of the source",
+            got=f"{count} waves, as so large an element tells them apart",
+            wanted=f"at most {_MOST}",
+        )
+    return count
+
+
+def require_one_wave(optics: Optics, what: str) -> None:
+    """Refuse a source of some width or bandwidth where one plane wave is computed.
+
+    Raises:
+        InputError: such a source.
+    """
+    if optics.bandwidth_um or optics.source_sine:
+        raise InputError(
+            f"source of {what}",
+            got=f"bandwidth {optics.bandwidth_um:g} µm, sine {optics.source_sine:g}",
+            wanted="a point of one colour: 0, 0",
+        )
