@@ -4,8 +4,8 @@
 
 Nothing is measured: the models of the cost are those of docs/results/large, the time of a scan is that of
 docs/results/build/cluster.json. A bound for GPUs is what their data sheet allows for the sums of the areawise
-network and for what an iteration has to move and to send; no program can be faster, and most are slower.
-The tables go into docs/cost.md.
+network, in float32 over all neighbours, and for what an iteration has to move and to send. The tables go into
+docs/cost.md.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ def of_gpus(gpu: Gpu, pbl: PblConfig) -> str:
 
 
 def least_s(size_px: int, count: int, gpu: Gpu, pbl: PblConfig) -> float:
-    """Below this an iteration cannot be: its sums, what its transforms move, and what they send."""
+    """Of an iteration: its sums, what its transforms move, and what they send."""
     sums = _PRINTS_PER_ITERATION * areawise_gflop(pbl, size_px**2) / gpu.gflops
     sent = sent_gib(size_px, count) * 2**30 / 1e9 / gpu.sent_gb_per_s
     return (sums + moved_gb(size_px) / gpu.gb_per_s) / count + sent
