@@ -38,3 +38,13 @@ def die_once(job: tuple[int, Path]) -> int:
 
 def die(_: int) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
+
+
+def new_pages(mib: int) -> int:
+    """Pages that this process is given while it makes and frees an array of so many MiB twenty times."""
+    import resource
+
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(20):
+        bytearray(mib << 20)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before

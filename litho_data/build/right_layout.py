@@ -7,7 +7,7 @@ another dose. One that does not register may show another layout of the set.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from hashlib import sha256
 from typing import Any
@@ -23,6 +23,8 @@ _BLUR_PX = 3.0
 _SIDE_PX = 128
 # Another layout must explain a scan this much better, in correlation.
 _BETTER = 0.02
+# Correlations by matrix products in float32 are right to this; so many scans are in one product.
+_ROUNDING, _AT_ONCE = 1e-3, 64
 # A print of another layout reaches 0.3 to 0.5 at its best shift, one of this layout 0.9.
 _FITS, _LEAD = 0.6, 0.15
 MIRRORED = ("flip-x", "flip-y", "transpose", "anti-transpose")
@@ -33,15 +35,16 @@ _CLEAR_SIGMA = 4.0
 
 @dataclass(frozen=True)
 class _Print:
-    """One registered scan: its heights on its layout, and where it belongs.
+    """One registered scan: its heights and its blurred layout at a few points, and where it belongs.
 
     ``turned``: whether the card says that it lay turned. ``group`` is what should share a gain: the dose, if
-    the card gives it, or the printed block.
+    the card gives it, or the printed block. ``response``: see ``_response``.
     """
 
     id: str
     topography: np.ndarray
     height: np.ndarray
+    response: tuple[float, float]
     layout: str
     dihedral: str
     turned: bool
@@ -91,14 +94,17 @@ def fitting_layout(
 
 
 def _print(record: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> _Print:
-    level, height = arrays["mask_level"], arrays["height_um"]
+    level = arrays["mask_level"]
     step = max(1, -(-max(level.shape) // _SIDE_PX))
     sparse = (slice(step // 2, None, step),) * 2
+    topography, height = predicted_topography(level, _BLUR_PX)[sparse], arrays["height_um"][sparse]
     dose = record["columns"].get("dose")
     return _Print(
         id=record["id"],
-        topography=predicted_topography(level, _BLUR_PX)[sparse],
-        height=height[sparse].astype(np.float64),
+        # Copies: a view would keep the whole.
+        topography=topography[::2, ::2].copy(),
+        height=height[::2, ::2].copy(),
+        response=_response(topography, height),
         layout=sha256(level.tobytes()).hexdigest(),
         dihedral=str(record["quality"]["dihedral"]),
         turned=bool(record["columns"].get("turned_deg")),
@@ -109,23 +115,44 @@ def _print(record: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> _Prin
 def _other_layouts(prints: Sequence[_Print]) -> list[tuple[str, str]]:
     """Scans that another layout of the set explains better, at the warp that was found for their own."""
     said = []
-    for one in prints:
-        sparse = (slice(None, None, 2),) * 2
-        height = one.height[sparse]
-        seen = np.isfinite(height)
-        own = pearson(height[seen], one.topography[sparse][seen])
-        others = {
-            other.id: pearson(height[seen], other.topography[sparse][seen])
-            for other in prints
-            if other.layout != one.layout and other.topography.shape == one.topography.shape
-        }
-        best = max(others, key=lambda name: others[name], default="")
-        if best and others[best] > own + _BETTER:
-            text = (
-                f"its heights fit the layout of {best} better: correlation {others[best]:.3f}, own {own:.3f}"
-            )
-            said.append((one.id, text))
+    for shape in {one.topography.shape for one in prints}:
+        alike = [one for one in prints if one.topography.shape == shape]
+        # A layout that was printed more than once goes by its first id.
+        distinct = list({one.layout: one for one in reversed(alike)}.values())
+        place = {one.layout: k for k, one in enumerate(distinct)}
+        for one, found in zip(alike, _correlations(alike, distinct), strict=True):
+            own = found[place[one.layout]]
+            found[place[one.layout]] = -1.0
+            best = distinct[int(found.argmax())]
+            if found.max() > own + _BETTER - _ROUNDING:
+                fits, fits_own = _correlation(one, best), _correlation(one, one)
+                if fits > fits_own + _BETTER:
+                    better = f"correlation {fits:.3f}, own {fits_own:.3f}"
+                    said.append((one.id, f"its heights fit the layout of {best.id} better: {better}"))
     return said
+
+
+def _correlations(prints: Sequence[_Print], layouts: Sequence[_Print]) -> Iterator[np.ndarray]:
+    """Per scan its correlation with each layout, within ``_ROUNDING``: sums over pairs as matrix products."""
+    of_layouts = np.stack([one.topography.ravel() for one in layouts]).astype(np.float32)
+    of_layouts -= of_layouts.mean(axis=1, keepdims=True)
+    squares = of_layouts**2
+    for start in range(0, len(prints), _AT_ONCE):
+        height = np.stack([one.height.ravel() for one in prints[start : start + _AT_ONCE]])
+        seen = np.isfinite(height)
+        count = np.maximum(seen.sum(axis=1), 1)
+        height = np.where(seen, height, 0).astype(np.float32)
+        height = np.where(seen, height - (height.sum(axis=1) / count)[:, None], 0).astype(np.float32)
+        mask = seen.astype(np.float32)
+        spread = mask @ squares.T - (mask @ of_layouts.T) ** 2 / count[:, None]
+        energy = spread * (height**2).sum(axis=1)[:, None]
+        yield from (height @ of_layouts.T) / np.sqrt(np.where(energy > 0, energy, np.inf))
+
+
+def _correlation(one: _Print, other: _Print) -> float:
+    """Of the heights of one scan with the layout of another."""
+    seen = np.isfinite(one.height)
+    return pearson(one.height[seen].astype(np.float64), other.topography[seen])
 
 
 def _orientations(prints: Sequence[_Print]) -> list[tuple[str, str]]:
@@ -152,8 +179,7 @@ def _gains(prints: Sequence[_Print]) -> list[tuple[str, str]]:
     same_layout = Counter(one.layout for one in prints)
     repeated = len(prints) > 0 and min(same_layout.values()) > 1
     scatter = _SCATTER_SAME if repeated else _SCATTER_OTHER
-    responses = [_response(one) for one in prints]
-    logs = np.array([np.log(max(abs(gain), 1e-12)) for gain, _ in responses])
+    logs = np.array([np.log(max(abs(one.response[0]), 1e-12)) for one in prints])
     if repeated:
         logs -= [
             np.median([logs[k] for k, other in enumerate(prints) if other.layout == one.layout])
@@ -173,7 +199,7 @@ def _gains(prints: Sequence[_Print]) -> list[tuple[str, str]]:
             percent = 100 * np.expm1(logs[k] - middle[one.group])
             text = f"height per level {percent:+.0f} % off the others of {one.group}, as in {nearest}"
             said.append((one.id, f"{text}: is its id or dose the right one?"))
-    growth = np.array([growth for _, growth in responses])
+    growth = np.array([one.response[1] for one in prints])
     rising = {
         group: (middle[group], int(members.sum()))
         for group, members in groups.items()
@@ -183,7 +209,7 @@ def _gains(prints: Sequence[_Print]) -> list[tuple[str, str]]:
     return said + [(one.id, traded[one.group]) for one in prints if one.group in traded]
 
 
-def _response(one: _Print) -> tuple[float, float]:
+def _response(topography: np.ndarray, height: np.ndarray) -> tuple[float, float]:
     """Height per level, µm: the slope of the heights over the blurred layout; and how it grows with the dose.
 
     Level times dose is the exposure, so that the curve of the heights over the levels tells what a larger
@@ -191,8 +217,8 @@ def _response(one: _Print) -> tuple[float, float]:
     the blurred levels. Of a parabola that is one plus the share that its square has in the slope; in a
     saturated print it is negative.
     """
-    seen = np.isfinite(one.height)
-    level, height = one.topography[seen].astype(np.float64), one.height[seen]
+    seen = np.isfinite(height)
+    level, height = topography[seen].astype(np.float64), height[seen].astype(np.float64)
     from_mean = level - level.mean()
     slope = float((from_mean * height).sum())
     square = float(np.polyfit(level, height, 2)[0]) * float((from_mean * level**2).sum())

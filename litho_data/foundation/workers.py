@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import pickle
 import threading
@@ -194,11 +195,13 @@ def _dask(address: str) -> Iterator[Pool]:
     except ImportError as error:
         raise InputError("dask", got="not installed", wanted="pip install 'litholoop[cluster]'") from error
     try:
+        _require_scheduler(address)
         client = Client(address, timeout=_CONNECT_S, set_as_default=False)
-    except (OSError, ValueError, TimeoutError, MemoryError) as error:
+    except (OSError, ValueError, MemoryError) as error:
         # MemoryError: another program answers there, and its words are taken for sizes.
+        said = str(error) or f"no answer in {_CONNECT_S:g} s"
         raise InputError(
-            "Dask scheduler", got=f"none at {address} ({error})", wanted="for example tcp://host:8786"
+            "Dask scheduler", got=f"none at {address} ({said})", wanted="for example tcp://host:8786"
         ) from error
 
     def count() -> int:
@@ -222,3 +225,16 @@ def _dask(address: str) -> Iterator[Pool]:
             )
         finally:
             executor.shutdown(wait=False)
+
+
+def _require_scheduler(address: str) -> None:
+    """Ask who is there: a client that meets another program waits long, and its end is a traceback."""
+    from distributed.core import rpc
+
+    async def ask() -> None:
+        async with rpc(address) as scheduler:
+            await asyncio.wait_for(scheduler.identity(), _CONNECT_S)
+
+    # In a thread of its own: a notebook has a loop already.
+    with ThreadPoolExecutor(1) as thread:
+        thread.submit(asyncio.run, ask()).result()

@@ -62,9 +62,7 @@ class CostModel(Record):
 
     def memory_of_rank_gib(self, size_px: int, ranks: int = 1) -> float:
         """Peak memory of each process."""
-        own = size_px**2 / ranks
-        per_px = _IN_USE_BYTES_PER_PX + (_EXCHANGE_BYTES_PER_PX if ranks > 1 else 0)
-        return self.memory_gib + per_px * own / _GIB
+        return self.memory_gib + memory_in_use_gib(size_px, ranks)
 
     def search_s(self, size_px: int, settings: HologramSettings, ranks: int = 1) -> float:
         """Time of the start and the search."""
@@ -76,6 +74,12 @@ class CostModel(Record):
             + search.iterations * self.iteration_s(size_px, ranks)
             + evaluations * self.evaluation_s(size_px, ranks)
         )
+
+
+def memory_in_use_gib(size_px: int, ranks: int = 1) -> float:
+    """What each process holds of an element at the peak of an iteration."""
+    per_px = _IN_USE_BYTES_PER_PX + (_EXCHANGE_BYTES_PER_PX if ranks > 1 else 0)
+    return per_px * size_px**2 / ranks / _GIB
 
 
 def sent_gib(size_px: int, ranks: int) -> float:

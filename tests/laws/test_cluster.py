@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -38,7 +39,7 @@ from litho_models.loop.run import _trainer
 from litho_models.loop.selection.contest import _fitted
 from litho_models.loop.study import Study, deal, fit_state
 from litho_models.models import build_model
-from tests.jobs import die, die_once, large, refuse, told
+from tests.jobs import die, die_once, large, new_pages, refuse, told
 from tests.litho_data.campaigns import write_campaign
 from tests.litho_models.loop_scans import printed_scans, true_model
 from tests.litho_models.prints import make_scans, write_store
@@ -69,6 +70,19 @@ def test_jobs_know_command_folder_and_large_objects(
         assert entry == job[0]
         # Dask gives its workers one thread unless the environment says otherwise.
         assert facts == ("litho-data build card.toml", str(tmp_path), os.environ.get("OMP_NUM_THREADS", "1"))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="settings of the C library of Linux")
+def test_a_worker_uses_freed_memory_again() -> None:
+    """Dask has its workers give it back at once, so that an array of 1 MiB is 256 new pages every time."""
+    with (
+        distributed.LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=":0") as cluster,
+        distributed.Client(cluster, set_as_default=False) as client,
+    ):
+        before = client.submit(new_pages, 1, pure=False).result()
+        after = [pages for _, pages in run_jobs(new_pages, [1] * 3, Workers(dask=cluster.scheduler_address))]
+    assert before >= 20 * 250
+    assert max(after) <= 2 * 256  # where the first array grew the memory, and something else beside
 
 
 def test_what_is_bad_there_is_said_here(address: str) -> None:

@@ -11,8 +11,10 @@ import pytest
 import tifffile
 from scipy.ndimage import gaussian_filter
 
+from litho_data.build import right_layout
 from litho_data.build.build import build_dataset
 from litho_data.build.right_layout import doubts
+from litho_data.register.topography import pearson
 from litho_data.store import open_store
 from tests.litho_data.campaigns import MARGIN_PX, height_of, layout_of, write_campaign
 
@@ -49,11 +51,12 @@ def doses(layouts: int, seed: int) -> dict[str, dict[str, Any]]:
 
 
 def doubts_of(prints: dict[str, dict[str, Any]]) -> dict[str, str]:
-    records = [
-        {"id": name, "print": name[1], "columns": {"dose": one["dose"]}, "quality": {"dihedral": "identity"}}
-        for name, one in prints.items()
-    ]
-    return doubts(records, lambda name: prints[name])
+    return doubts([record_of(name, one) for name, one in prints.items()], lambda name: prints[name])
+
+
+def record_of(name: str, one: dict[str, Any]) -> dict[str, Any]:
+    quality = {"dihedral": "identity"}
+    return {"id": name, "print": name[1], "columns": {"dose": one["dose"]}, "quality": quality}
 
 
 def swap_heights(prints: dict[str, dict[str, Any]], one: str, other: str) -> None:
@@ -154,3 +157,24 @@ def test_a_scan_of_a_similar_layout_is_named(tmp_path: Path) -> None:
     warnings, _ = built(card)
     assert doubted(warnings) == {"P12"}
     assert "fit the layout of P11 better" in warnings["P12"]
+
+
+def test_correlations_of_all_pairs_are_those_of_each_over_what_was_measured() -> None:
+    rng = np.random.default_rng(3)
+    # More scans than one product takes; one of them flat.
+    count = right_layout._AT_ONCE + 3
+    prints = {}
+    for k in range(count):
+        level = layout_of(k, SHAPE)
+        height_um = 2 + 0.08 * level + rng.normal(0, 0.1, SHAPE)
+        height_um[: rng.integers(0, 40)] = np.nan
+        height_um[:, : k % 7] = np.nan
+        prints[f"P{k:03}"] = {"mask_level": level, "height_um": height_um.astype(np.float32), "dose": 1.0}
+    prints["P000"]["height_um"][:] = 0.5
+    held = [right_layout._print(record_of(name, one), one) for name, one in prints.items()]
+    for one, row in zip(held, right_layout._correlations(held, held), strict=True):
+        seen = np.isfinite(one.height)
+        height = one.height[seen].astype(float)
+        alone = [pearson(height, other.topography[seen]) for other in held]
+        # float32 sums of about 3,000 terms: below 1e-4 of a correlation, ten times less than is allowed for.
+        assert np.abs(row - alone).max() < 0.1 * right_layout._ROUNDING

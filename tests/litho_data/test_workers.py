@@ -5,8 +5,12 @@ On a cluster: tests/laws/test_cluster.py.
 
 from __future__ import annotations
 
+import contextlib
 import os
+import socket
+import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -104,6 +108,32 @@ def test_an_address_without_scheduler_is_one_line_in_a_few_seconds(monkeypatch: 
         ) as said:
             list(run_jobs(double, [1], Workers(dask=wrong)))
         assert "\n" not in str(said.value)
+
+
+@pytest.mark.parametrize("words", [b"", b"HTTP/1.1 400 Bad Request\r\n\r\n"])
+def test_another_program_at_the_address_is_one_line_and_nothing_after(words: bytes, tmp_path: Path) -> None:
+    """In a process of its own: what Dask says too much, it says when it ends."""
+    pytest.importorskip("distributed")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def answer() -> None:
+            with contextlib.suppress(OSError):
+                while True:
+                    others.append(server.accept()[0])
+                    others[-1].sendall(words)
+
+        others: list[socket.socket] = []
+        threading.Thread(target=answer, daemon=True).start()
+        card = write_campaign(tmp_path, count=1)
+        address = "tcp://{}:{}".format(*server.getsockname())
+        command = [sys.executable, "-c", "from litho_data.cli.app import main; main()", "build", str(card)]
+        command += ["--out", str(tmp_path / "prints.zarr"), "--dask", address]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+        for other in others:
+            other.close()
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1, done.stderr
+    assert f"got none at {address} (" in done.stderr
 
 
 def test_without_dask_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
