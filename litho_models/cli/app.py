@@ -25,10 +25,10 @@ zoo = typer.Typer(help="The models that come with the package: list, or show NAM
 app.add_typer(zoo, name="zoo")
 
 StorePath = Annotated[Path, typer.Argument(help="dataset store made by `litho-data build`")]
-Out = Annotated[Path, typer.Option(help="folder of the result")]
+Out = Annotated[Path, typer.Option(help="folder of the result; one that holds anything else is refused")]
 PolicyOption = Annotated[
     Literal["none", "offset", "offset-gain", "full", "full+rows"],
-    typer.Option(help="nuisances that a scan is freed of in mae_datum_free"),
+    typer.Option(help="terms fitted to each scan for its datum-free error"),
 ]
 BackgroundOption = Annotated[
     Literal["training", "none"],
@@ -45,7 +45,9 @@ NoiseOption = Annotated[
 ]
 RecipeOption = Annotated[
     Literal["fast", "paper"],
-    typer.Option(help="fast: one-cycle with nuisances fitted jointly; paper: 4,000 epochs of Adam"),
+    typer.Option(
+        help="fast: one-cycle, with the terms of each scan fitted jointly; paper: 4,000 epochs of Adam"
+    ),
 ]
 VariantOption = Annotated[
     Literal["default", "paper", "authors"],
@@ -153,7 +155,7 @@ def benchmark(
     split: Annotated[
         Literal["grouped", "paper", "leave-one-print-out"], typer.Option(help="what is held out")
     ] = "grouped",
-    models: Annotated[str | None, typer.Option(help="names, separated by commas; all by default")] = None,
+    models: Annotated[str | None, typer.Option(help="names, comma-separated; all by default")] = None,
     recipe: RecipeOption = "fast",
     variant: VariantOption = "default",
     steps: Steps = None,
@@ -274,7 +276,7 @@ def compare(
     first: Annotated[Path, typer.Argument(help="benchmark.json or evaluation.json")],
     second: Annotated[Path, typer.Argument(help="another one, of the same protocol")],
 ) -> None:
-    """Difference of two results, paired by scan; refuses different data, folds or nuisances.
+    """Difference of two results, paired by scan; refuses different data, folds or per-scan terms.
 
     Example: litho-models compare one/benchmark.json other/benchmark.json
     """
