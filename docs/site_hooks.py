@@ -16,7 +16,7 @@ _LINK = re.compile(r"\]\((?P<place>\.\./[^)#\s]+)(?P<anchor>#[^)\s]*)?\)")
 # Words of the glossary that pages also use in their everyday sense: the glossary alone explains them.
 _EVERYDAY = {"arm", "effect", "fold", "judge", "knob", "probe", "stroke"}
 # A cell of more words than this is given room on a telephone; the rest of its table scrolls.
-_LONG_CELL = 60
+_LONG_CELL = 40
 # Spaces inside a figure, outside code: 19.1 nm, (18.2 … 19.9), ± 0.2, → 15.6, 20 of 20, p = 0.03.
 _INSIDE_FIGURE = re.compile(
     r"<(pre|code)\b.*?</\1>|<[^>]*>|(?<=\d) (?=(?:nm|µm|dB|px|ms|s|MiB|GiB)\b|[%…±]|of \d)"

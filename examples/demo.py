@@ -2,7 +2,7 @@
 
 Without a dataset the prints come from the virtual fab, where effects are hidden that no model declares;
 with ``--dataset neural-lithography`` they are the measured prints. Every step is one of the project's own
-commands, printed as it runs. A step whose result exists is skipped: a killed demo goes on where it stopped.
+commands, printed as it runs. A step whose result exists is skipped: a killed demo resumes.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ def check(
         model: folder of a frozen model, or ``zoo:NAME``.
         store: dataset store of the new prints; locked scans of the model's own prints are left out.
         out: result folder.
-        reference: store of unchanged prints; by default those that the card of the model tells of.
+        reference: store of unchanged prints; by default those in the model's card.
         new: names of prints of ``store`` that are new; its others are then the reference.
         residuals: folders of ``litho-models benchmark`` on the reference prints: its predictions, of prints
             that no fit had seen, take the place of the model's.
