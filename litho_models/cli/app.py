@@ -224,7 +224,7 @@ def predict(
     """
     from litho_models.frozen.on_store import predict_file
 
-    frozen = litho_models.load_frozen(litho_models.zoo.model_folder(model), extrapolate=extrapolate)
+    frozen = litho_models.load_frozen(model, extrapolate=extrapolate)
     height = predict_file(frozen, layout, out)
     lowest, highest = height.min(), height.max()
     typer.echo(f"{height.shape[0]} x {height.shape[1]} px, {lowest:.3f} to {highest:.3f} µm high: {out}")
@@ -242,7 +242,7 @@ def export(
     """
     from litho_models.frozen.exporting import export_model
 
-    frozen = litho_models.load_frozen(litho_models.zoo.model_folder(model))
+    frozen = litho_models.load_frozen(model)
     difference_um = export_model(frozen, out, size_px)
     typer.echo(
         f"{out}: layouts of {size_px} x {size_px} px, (1, 1, y, x) float32 µm; differs by "
@@ -256,8 +256,8 @@ def list_zoo() -> None:
 
     Example: litho-models zoo list
     """
-    for name in litho_models.zoo.list():
-        typer.echo(f"{litho_models.zoo.PREFIX}{name:10} {litho_models.zoo.load(name)}")
+    for name in (f"{litho_models.zoo.PREFIX}{one}" for one in litho_models.zoo.list()):
+        typer.echo(f"{name:14} {litho_models.load_frozen(name)}")
 
 
 @zoo.command("show")
