@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -37,8 +37,9 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
     shown = headline(result.task)
     page = Page(
         "The design-to-manufacturing gap",
-        f"{capitalised(what)}: designed with {len(result.arms)} models or none, {_many(result.seeds)}, "
-        f"{result.settings.search.iterations} iterations each; layouts are scored as they would be printed.",
+        f"{capitalised(what)}, designed with {_listed(result.arms)}; {result.settings.search.iterations} "
+        f"iterations each, seed{'s' * (len(result.seeds) > 1)} {_listed(result.seeds)}. Layouts are scored "
+        "as they would be printed.",
         run=result,
         facts={"seeds": ", ".join(map(str, result.seeds))}
         | {f"{name}, SHA-256": one.sha256 for name, one in result.judges.items() if one.sha256},
@@ -50,7 +51,7 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
     judged = _judged(folder, result, printers)
     page.figure(
         _pictures(result, judged),
-        f"Seed {result.seeds[0]}. Rows: designed with; columns: printed by. "
+        f"Seed {result.seeds[0]}. Above each image: what it was designed with, and what printed it. "
         + (
             "Square root of the PSF over its peak." if result.task.startswith("lens-") else "Scaled to match."
         ),
@@ -134,8 +135,9 @@ def _label(figure: str) -> str:
     return _LABELS.get(figure) or named(figure)
 
 
-def _many(seeds: Sequence[int]) -> str:
-    return f"seed{'s' * (len(seeds) > 1)} {', '.join(map(str, seeds))}"
+def _listed(things: Iterable[object]) -> str:
+    *first, last = map(str, things)
+    return f"{', '.join(first)} and {last}" if first else last
 
 
 def _matrix(result: GapResult, figure: str) -> list[dict[str, Any]]:
