@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from litho_data.foundation.files import atomic_file
-from litho_data.foundation.report import Page, Words
+from litho_data.foundation.report import Page
 from litho_data.foundation.report_pictures import colour_bar_png, coloured_png
 from litho_data.store.read import PrintedScan, Store, open_store
 
@@ -28,7 +28,7 @@ _STAGES = {
     "registered (nm)": "cividis",
     "residual (nm)": "RdBu_r",
 }
-_TABLE: Words = {
+_TABLE: dict[str, tuple[str, str]] = {
     "scan": ("scan", ""),
     "model": ("transform", "kind of transform from scan to layout"),
     "ncc_before": ("correlation, centred", "of height and layout, the scan laid in the middle of its layout"),
@@ -59,7 +59,7 @@ _TABLE: Words = {
         "standard deviation of the surface that levelling removed",
     ),
 }
-_BUDGET: Words = {
+_BUDGET: dict[str, tuple[str, str]] = {
     "scan": ("scan", ""),
     "sigma_nm": ("all (nm)", "the parts to the right, added in squares"),
     "sigma_pixel_nm": ("pixel noise (nm)", "noise of single pixels"),

@@ -41,6 +41,8 @@ def write_check_report(result: Check, out: str | Path) -> Path:
 
 def control_chart(result: Check, one: FigureCheck) -> Figure:
     """The figure of every print against the reference: dots of prints, small dots of scans, spread, steps."""
+    from matplotlib.ticker import MaxNLocator
+
     figure = new_figure(8.5, 3.4)
     axes = figure.subplots()
     watched = figure_of(one)
@@ -64,7 +66,7 @@ def control_chart(result: Check, one: FigureCheck) -> Figure:
     for sign in (-1, 1):
         axes.axhline(sign * 100 * one.tolerance, color="#d99b00", ls="--", lw=1)
     axes.axvline(one.reference_prints - 0.5, color="#1c2430", lw=0.8, ls=":")
-    axes.xaxis.get_major_locator().set_params(integer=True)
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set(xlabel="print, in printing order", ylabel="against the reference, %")
     axes.set_title(watched.words, fontsize=10)
     axes.grid(alpha=0.3)
