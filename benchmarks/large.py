@@ -94,7 +94,7 @@ def as_markdown(record: Mapping[str, Any]) -> str:
     )
     limit, none = ("| at the rate of a copy ", "| ") if rate else ("", "")
     head = f"| `{record['model']}`: side, px | iteration | transforms in it {limit}| evaluation | memory |"
-    last = f"| foretold of the last | {time_s} | {none}| {evaluation} | {memory} |"
+    last = f"| predicted for the last, relative to it | {time_s} | {none}| {evaluation} | {memory} |"
     lines = [head, "|---" * (head.count("|") - 1) + "|", *rows, last]
     where = f"{record['gpu']}; a large copy moves {rate:,.0f} GB/s, read and written.\n\n" if rate else ""
     return where + "\n".join(lines)

@@ -13,6 +13,16 @@ from mkdocs.structure.files import File, Files
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("litho_data", "litho_models", "litho_design")
 _LINK = re.compile(r"\]\((?P<place>\.\./[^)#\s]+)(?P<anchor>#[^)\s]*)?\)")
+# Words of the glossary that pages also use in their everyday sense: the glossary alone explains them.
+_EVERYDAY = {"arm", "effect", "fold", "judge", "knob", "probe", "stroke"}
+# A cell of more words than this is given room on a telephone; the rest of its table scrolls.
+_LONG_CELL = 40
+# Spaces inside a figure, outside code: 19.1 nm, (18.2 … 19.9), ± 0.2, → 15.6, 20 of 20, p = 0.03.
+_INSIDE_FIGURE = re.compile(
+    r"<(pre|code)\b.*?</\1>|<[^>]*>|(?<=\d) (?=(?:nm|µm|dB|px|ms|s|MiB|GiB)\b|[%…±]|of \d)"
+    r"|(?<=[…±→=]) (?=[-−+\d])|(?<=\d of) (?=\d)|(?<=\b[kp]) (?==)",
+    re.DOTALL,
+)
 _LANGUAGES = {".py": "python", ".toml": "toml", ".json": "json"}
 
 
@@ -45,15 +55,36 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
 
 
 def on_page_content(html: str, page: Any, config: Any, files: Files) -> str:
-    """Sphinx's roles in docstrings are only code here; long names may break after / and _."""
+    """Lines break after / and _ of a name, not in options and figures; a click on a picture shows it whole.
+
+    Sphinx's roles in docstrings are only code here.
+    """
     html = re.sub(r":(?:func|class|mod|meth|data):<code>~?", "<code>", html)
+    html = re.sub(r"<td>(.*?)</td>", _roomy, html, flags=re.DOTALL)
+    html = _INSIDE_FIGURE.sub(lambda found: "\u00a0" if found[0] == " " else found[0], html)
+    html = re.sub(r"<a [^>]*>\s*<img.*?</a>|<img [^>]*>", _opened, html, flags=re.DOTALL)
     return re.sub(r"<pre>.*?</pre>|(?<=<code>)[^<]+(?=</code>)", _breakable, html, flags=re.DOTALL)
 
 
 def _breakable(code: re.Match[str]) -> str:
     if code[0].startswith("<pre>"):
         return code[0]
-    return re.sub(r"(?<=\w)([/_])(?=\w)", r"\1<wbr>", code[0])
+    broken = re.sub(r"(?<=\w)([/_])(?=\w)", r"\1<wbr>", code[0])
+    return re.sub(r"(?<![\w-])--[a-z][a-z0-9-]*", r'<span class="option">\g<0></span>', broken)
+
+
+def _roomy(cell: re.Match[str]) -> str:
+    words = re.sub(r"<[^>]+>", "", cell[1])
+    return f'<td class="long">{cell[1]}</td>' if len(words) > _LONG_CELL else cell[0]
+
+
+def _opened(picture: re.Match[str]) -> str:
+    place = re.search(r'src="([^"]+\.(?:jpg|png))"', picture[0])
+    return (
+        picture[0]
+        if place is None or picture[0].startswith("<a ")
+        else f'<a href="{place[1]}">{picture[0]}</a>'
+    )
 
 
 def _outside(page: str, text: str) -> set[str]:
@@ -92,5 +123,6 @@ def _abbreviations() -> str:
         f"*[{word}]: {re.sub(r'[`*]', '', meaning)}"
         for words, meaning in rows[1:]
         for word in words.split(", ")
+        if word not in _EVERYDAY
     ]
     return "\n\n" + "\n".join(found) + "\n"

@@ -75,6 +75,11 @@ class Scan:
             f"{missing} px missing>"
         )
 
+    def _repr_html_(self) -> str:
+        from litho_data.foundation.report_pictures import shown_html
+
+        return shown_html(repr(self), height_um=self.height_um)
+
     @property
     def shape(self) -> tuple[int, int]:
         """(ny, nx) in pixels."""

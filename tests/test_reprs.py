@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 import litho_data
+import litho_design
 import litho_models
 from litho_models.evaluation.results import Benchmark
 from tests.litho_models.prints import make_scan, make_scans, write_store
@@ -20,7 +21,31 @@ def test_objects_are_shown_in_a_line(tmp_path):
     assert "'made', 3 scans" in repr(store)
     shown = store._repr_html_()
     assert "<td>P1F0</td>" in shown
-    assert repr(litho_models.zoo.load("pbl")).startswith("<FrozenSimulator pbl: 82,724 parameters")
+    assert repr(litho_models.load_frozen("zoo:pbl")).startswith("<FrozenSimulator pbl: 82,724 parameters")
+
+
+def test_a_notebook_shows_maps_and_the_card_of_a_model(tmp_path):
+    scan = litho_data.Scan(np.arange(6.0).reshape(2, 3), (0.1, 0.2), name="<P11>")
+    shown = scan._repr_html_()
+    assert "&lt;P11&gt;" in shown
+    assert "height, µm: 0 … 5" in shown
+    assert shown.count("data:image/png") == 1
+    assert make_scan(1)._repr_html_().count("data:image/png") == 2
+    assert "<td>82724</td>" in litho_models.load_frozen("zoo:pbl")._repr_html_()
+    settings = litho_design.hologram_settings(
+        changes={
+            "layout.size_px": 64,
+            "optics.distance_um": 12,
+            "search.iterations": 1,
+            "search.polish_rounds": 0,
+            "window.yield_draws": 2,
+        }
+    )
+    litho_design.design_hologram("ring", "none", tmp_path / "ring", settings=settings)
+    design = litho_design.load_design(tmp_path / "ring")
+    assert repr(design).startswith("<LoadedDesign hoe in ")
+    assert repr(design).endswith(": 64 px of 0.1 µm, designed through none>")
+    assert design._repr_html_().count("data:image/png") == 2
 
 
 def test_a_result_is_shown_by_what_it_is_of_and_how_much_it_holds():

@@ -17,7 +17,7 @@ from litho_models.effects.chain import EffectChain
 from litho_models.models import build_model
 
 OUT = Path(__file__).parent / "effects.jpg"
-SIZE_PX, BORDER_PX, PITCH_UM, LEVEL_HEIGHT_UM, LEVELS, COLUMNS = 176, 24, 0.1, 0.1, 13, 7
+SIZE_PX, BORDER_PX, PITCH_UM, LEVEL_HEIGHT_UM, LEVELS, COLUMNS = 176, 24, 0.1, 0.1, 13, 5
 STRENGTH = 2.0
 _LAST_IN_ORDER, _CORNER_UM = 0.5, 8.0
 
@@ -38,18 +38,19 @@ def main() -> None:
     )
     base = build_model("physics", pitch_um=PITCH_UM, level_height_um=LEVEL_HEIGHT_UM, levels=LEVELS)
     rows = -(-(len(CATALOGUE) + 1) // COLUMNS)
-    figure = new_figure(2.1 * COLUMNS, 2.25 * rows)
+    # On the page 690 px wide, where ten points then have nine pixels.
+    figure = new_figure(2.1 * COLUMNS, 2.3 * rows)
     panels = figure.subplots(rows, COLUMNS).ravel()
     panels[0].imshow(level[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX], cmap="viridis")
-    panels[0].set_title("layout", fontsize=9)
+    panels[0].set_title("layout", fontsize=10)
     for panel, effect in zip(panels[1:], CATALOGUE.values(), strict=False):
         change = 1e3 * signature(effect, base, layout, context)
         limit = max(float(np.quantile(np.abs(change), 0.99)), 1e-3)
         panel.imshow(change, cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="nearest")
-        panel.set_title(f"{effect.name}\n± {limit:.0f} nm", fontsize=8)
+        panel.set_title(f"{effect.name}\n± {limit:.0f} nm", fontsize=10)
     for panel in panels:
         panel.set_axis_off()
-    figure.savefig(OUT, dpi=60, pil_kwargs={"quality": 70})
+    figure.savefig(OUT, dpi=90, pil_kwargs={"quality": 60})
 
 
 def signature(

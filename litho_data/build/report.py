@@ -28,34 +28,49 @@ _STAGES = {
     "registered (nm)": "cividis",
     "residual (nm)": "RdBu_r",
 }
-_TABLE = {
-    "scan": "scan",
-    "model": "transform",
-    "ncc_before": "correlation, centred",
-    "ncc_after": "correlation, registered",
-    "reprojection_px": "reprojection (px)",
-    "tre_median_nm": "held-out error, median (nm)",
-    "tre_p95_nm": "held-out error, p95 (nm)",
-    "corner_sd_nm": "corner spread (nm)",
-    "overlap": "overlap",
-    "bend_um": "bend (µm)",
-    "rotation_deg": "rotation (°)",
-    "singular_min": "scale, smallest",
-    "singular_max": "scale, largest",
-    "noise_x_nm": "noise along x (nm)",
-    "noise_y_nm": "noise along y (nm)",
-    "row_step_nm": "row steps (nm)",
-    "removed_sd_nm": "removed by levelling, sd (nm)",
+_TABLE: dict[str, tuple[str, str]] = {
+    "scan": ("scan", ""),
+    "model": ("transform", "kind of transform from scan to layout"),
+    "ncc_before": ("correlation, centred", "of height and layout, the scan laid in the middle of its layout"),
+    "ncc_after": ("correlation, registered", "the same where registration put the scan"),
+    "reprojection_px": (
+        "reprojection (px)",
+        "rms distance of matching details that the first fit used",
+    ),
+    "tre_median_nm": (
+        "held-out error, median (nm)",
+        "distance of details that were kept out of the fit: half of them are closer",
+    ),
+    "tre_p95_nm": ("held-out error, p95 (nm)", "the same: 95 % of them are closer"),
+    "corner_sd_nm": (
+        "corner spread (nm)",
+        "standard deviation of the least certain corner when blocks of the scan are drawn anew",
+    ),
+    "overlap": ("overlap", "share of the layout with a measured height"),
+    "bend_um": ("bend (µm)", "how far the scan is bent at most"),
+    "rotation_deg": ("rotation (°)", "angle of the scan on its layout, in its middle"),
+    "singular_min": ("scale, smallest", "stretch of the scan along the direction with the least; 1 is none"),
+    "singular_max": ("scale, largest", "stretch along the direction with the most"),
+    "noise_x_nm": ("noise along x (nm)", "noise of pixels, from differences along x"),
+    "noise_y_nm": ("noise along y (nm)", "noise of pixels, from differences along y"),
+    "row_step_nm": ("row steps (nm)", "standard deviation of the steps from one line to the next"),
+    "removed_sd_nm": (
+        "removed by levelling, sd (nm)",
+        "standard deviation of the surface that levelling removed",
+    ),
 }
-_BUDGET = {
-    "scan": "scan",
-    "sigma_nm": "all",
-    "sigma_pixel_nm": "pixel noise",
-    "sigma_line_nm": "line noise",
-    "sigma_resampling_nm": "resampling",
-    "sigma_registration_nm": "registration",
-    "sigma_levelling_nm": "levelling",
-    "sigma_calibration_nm": "z calibration",
+_BUDGET: dict[str, tuple[str, str]] = {
+    "scan": ("scan", ""),
+    "sigma_nm": ("all (nm)", "the parts to the right, added in squares"),
+    "sigma_pixel_nm": ("pixel noise (nm)", "noise of single pixels"),
+    "sigma_line_nm": ("line noise (nm)", "what scan lines lie too high or too low"),
+    "sigma_resampling_nm": ("resampling (nm)", "what the interpolation onto the layout's grid may be off"),
+    "sigma_registration_nm": (
+        "registration (nm)",
+        "the slope of the print times the uncertainty of its place",
+    ),
+    "sigma_levelling_nm": ("levelling (nm)", "what the removed surface may be off"),
+    "sigma_calibration_nm": ("z calibration (nm)", "height times the uncertainty of the z scale in the card"),
 }
 
 
@@ -66,6 +81,7 @@ def write_report(result: BuildResult, store_path: Path, folder: Path) -> Path:
         f"Dataset {store.name}",
         "Raw scans read, levelled, registered onto their layouts and stored.",
         facts={"dataset": store.sha256},
+        words=_TABLE | _BUDGET,
     )
     _summary(page, result, store)
     _pictures(page, store)
@@ -100,7 +116,7 @@ def _summary(page: Page, result: BuildResult, store: Store) -> None:
 def _verdict(result: BuildResult, quality: pd.DataFrame) -> str:
     left = len(result.skipped) + len(result.unpaired)
     stored = f"All {result.n_scans} scans are" if not left else f"{result.n_scans} scans are"
-    parts = {"refused": len(result.skipped), "half of a pair": len(result.unpaired)}
+    parts = {"refused": len(result.skipped), "without a partner": len(result.unpaired)}
     why = ", ".join(f"{count} {reason}" for reason, count in parts.items() if count)
     text = f"{stored} in the store" + (f"; {left} ids are not ({why})" if left else "")
     warned = int(quality["warning"].astype(bool).sum()) if "warning" in quality else 0
@@ -121,19 +137,20 @@ def _left_out(page: Page, result: BuildResult) -> None:
 def _warnings(page: Page, quality: pd.DataFrame) -> None:
     if "warning" in quality and (warned := quality["warning"].astype(bool)).any():
         page.heading("Passed with a warning")
-        page.table(quality.loc[warned, ["scan", "warning"]], "What to know about these scans", "warnings.csv")
+        alike = quality[warned].groupby("warning", sort=False)["scan"].agg(", ".join).reset_index()
+        page.table(alike, "What to know about these scans", "warnings.csv")
 
 
 def _quality(page: Page, quality: pd.DataFrame) -> None:
     page.heading("Quality of every scan, in numbers", folded=True)
-    shown = quality[[name for name in _TABLE if name in quality]].rename(columns=_TABLE)
+    shown = quality[[name for name in _TABLE if name in quality]]
     page.table(
         shown, "Registration and noise of every scan; quality.csv has all figures", "summary.csv", digits=3
     )
     if "sigma_nm" in quality:
         page.table(
-            quality[list(_BUDGET)].rename(columns=_BUDGET),
-            "What the uncertainty of the heights is made of: root mean square over a scan [nm], its offset "
+            quality[list(_BUDGET)],
+            "What the uncertainty of the heights is made of: root mean square over a scan, its offset "
             "aside. z calibration is 0 if the card has none: the error of the z scale is then not contained",
             "uncertainty.csv",
             digits=2,

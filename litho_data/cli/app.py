@@ -98,7 +98,7 @@ def build(
 
 @app.command()
 def calibrate(
-    card: Annotated[Path, typer.Argument(help="dataset card (TOML) with a [calibration] table")],
+    card: Annotated[Path, typer.Argument(help="dataset card (TOML) with a `calibration` table")],
     data_dir: DataDir = None,
 ) -> None:
     """Measure the card's gratings and step, and show the scales that a build would apply.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import html
 import io
 import re
 import textwrap
@@ -52,6 +53,8 @@ _FURTHER_COLOURS = ("#cc4f8f", "#0e8f86", "#9a63c9", "#7d8a1d", "#b56b4c", "#a87
 _NARROW_INCH = 4.2
 _PICTURE_DPI = 110
 _COLOURS = 255
+# Side of a map in a notebook.
+_NOTEBOOK_PX = 220
 _GAP = 255  # the last entry of the palette, transparent
 
 
@@ -204,6 +207,27 @@ def coloured_png(image: np.ndarray, colours: str, low: float, high: float) -> st
 def colour_bar_png(colours: str) -> str:
     """The colours from low to high, one pixel high, to be stretched."""
     return coloured_png(np.linspace(0, 1, _COLOURS)[None, :], colours, 0.0, 1.0)
+
+
+def shown_html(line: str, **images: np.ndarray) -> str:
+    """What a notebook shows of an object with maps: the line of its ``repr``, and each map with its range.
+
+    Args:
+        line: the line.
+        images: maps (ny, nx) by what they show.
+    """
+    figures = []
+    for name, values in images.items():
+        image = np.where(np.isfinite(values), values, np.nan)
+        step = max(1, -(-max(image.shape) // _NOTEBOOK_PX))
+        low, high = float(np.nanmin(image)), float(np.nanmax(image))
+        png = coloured_png(image[::step, ::step], "viridis", low, high)
+        caption = f"{name.replace('_um', ', µm').replace('_', ' ')}: {low:.3g} … {high:.3g}"
+        figures.append(
+            f'<figure style="display:inline-block;margin:.3em"><img src="{png}" alt="{name}" '
+            f'style="width:{_NOTEBOOK_PX}px"><figcaption>{caption}</figcaption></figure>'
+        )
+    return f"<p>{html.escape(line)}</p>{''.join(figures)}"
 
 
 def _base64(data: bytes) -> str:

@@ -97,6 +97,11 @@ class PrintedScan:
             f"{self.levels} levels of {self.level_height_um:g} µm, {self.valid.mean():.1%} valid>"
         )
 
+    def _repr_html_(self) -> str:
+        from litho_data.foundation.report_pictures import shown_html
+
+        return shown_html(repr(self), layout_um=self.layout_um, height_um=self.height_um)
+
     @property
     def quarter_turns(self) -> int:
         """How often ``rot90`` turns the layout's grid into the scan's, 0 to 3, by its registration."""

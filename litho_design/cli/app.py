@@ -89,7 +89,7 @@ def score(
     ] = 0.0,
     task_file: Annotated[
         Path | None,
-        typer.Option(help="Python file that registers the task of the design, one of your own; it is run"),
+        typer.Option(help="file in Python that registers the task of the design, one of your own; it is run"),
     ] = None,
     stream: Annotated[
         bool,

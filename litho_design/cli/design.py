@@ -115,8 +115,8 @@ def hoe(
         bool,
         typer.Option(
             "--large",
-            help="In bands of rows, for elements beyond the memory of a process; `torchrun --no-python` "
-            "shares them among processes.",
+            help="in bands of rows, for elements beyond the memory of a process; `torchrun --no-python` "
+            "shares them among processes",
         ),
     ] = False,
     band_px: BandPx = 512,

@@ -16,7 +16,7 @@ from pydantic import BaseModel
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.settings import Leaf, assigned, flattened, leaves, read_settings
 
-Out = Annotated[Path, typer.Option(help="folder of the result")]
+Out = Annotated[Path, typer.Option(help="folder of the result; one that holds anything else is refused")]
 Device = Annotated[str, typer.Option(help="cpu, cuda, cuda:0 …")]
 Extrapolate = Annotated[
     bool,
@@ -164,10 +164,12 @@ def as_toml(settings: BaseModel) -> str:
 def _parameter(name: str, same: Sequence[Leaf], presets: int) -> inspect.Parameter:
     """One option for a setting that one or several presets have."""
     leaf = same[0]
+    described = _described(leaf)
     values = list(dict.fromkeys(_shown(one.value) for one in same))
     option = typer.Option(
         *leaf.options,
-        help=_described(leaf),
+        # In the style of the other options; in a file of settings it starts a line.
+        help=described[:1].lower() + described[1:],
         show_default=" or ".join(values),
         rich_help_panel=leaf.group or None,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -130,6 +131,9 @@ def _too_fine(target: np.ndarray, settings: HologramSettings) -> list[str]:
     if stroke_um >= finest_um:
         return []
     near_um = stroke_um / finest_um * optics.distance_um
+    # Two digits, rounded down: at the distance that is advised nothing is too fine.
+    digit_um = 10.0 ** (math.floor(math.log10(near_um)) - 1)
+    near_um = math.floor(near_um / digit_um) * digit_um
     return [
         f"strokes of the target are about {stroke_um:.2g} µm wide, narrower than λz/D = {finest_um:.2g} µm, "
         f"the finest detail that an element of {layout.size_um:.4g} µm draws at {optics.distance_um:g} µm: "

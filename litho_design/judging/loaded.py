@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from litho_data.foundation.report_pictures import shown_html
 from litho_data.foundation.results import Record
 from litho_design.holograms.task import HologramTask
 from litho_design.lenses.task import LensTask
@@ -63,6 +64,17 @@ class LoadedDesign:
         )
         self.bench = self.task.bench
         self.target = self.task.target if isinstance(self.task, HologramTask) else None
+
+    def __repr__(self) -> str:
+        pitch_um, printer = self.record.layout.pitch_um, self.record.printer.name
+        return (
+            f"<LoadedDesign {self.record.task} in {self.folder}: {len(self.level)} px of {pitch_um:g} µm, "
+            f"designed through {printer}>"
+        )
+
+    def _repr_html_(self) -> str:
+        maps = {"layout (level)": self.level, "expected_height_um": self.expected_um}
+        return shown_html(repr(self), **{name: one.cpu().numpy().astype(float) for name, one in maps.items()})
 
     @torch.no_grad()
     def printed_um(self, judge: Printer) -> Tensor:

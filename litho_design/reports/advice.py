@@ -24,8 +24,8 @@ WORDS: Words = {
         "mae_calibrated": "MAE, print's own PSF",
     }.items()
 }
-# Figures whose loss is told in dB: already in dB (0), shares of power (10), lengths (20).
-_IN_DB = {"si_psnr_db": 0, "eff_signal": 10, "focusing_efficiency": 10, "rms_nm": -20}
+# Figures whose loss is told in dB: already in dB (0), shares of power (10).
+_IN_DB = {"si_psnr_db": 0, "eff_signal": 10, "focusing_efficiency": 10}
 _EFFICIENCIES = ("eff_signal", "focusing_efficiency")
 # Reflection alone takes 4.6 %.
 _THICK_SHARE = 0.1
@@ -58,8 +58,8 @@ def distribution_warning(design: Design) -> str:
     if not gauge.flagged:
         return ""
     text = (
-        f"out of distribution: {100 * gauge.level_distance:.0f} % of the pixels would have to change level "
-        "to match the training layouts of the model; its prediction is an extrapolation"
+        f"far from the training layouts of the model: {100 * gauge.level_distance:.0f} % of the pixels would "
+        "have to change level to match them, and the prediction is an extrapolation"
     )
     text += f": {'; '.join(gauge.unusual)}" if gauge.unusual else ""
     return text + _cost_of_staying_inside(design)

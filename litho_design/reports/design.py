@@ -38,6 +38,8 @@ _TITLES = {
     "lens-computational": "Multi-level diffractive lens with deconvolution",
     "relief": "Corrected relief",
 }
+# Units that stand with the value of a tile.
+_UNITS = ("nm", "µm", "dB")
 _PSF = " The PSF is in decibels below its peak."
 
 
@@ -110,7 +112,9 @@ def _tiles(design: Design, task: Task) -> list[tuple[str, str]]:
         more = f" (black image {black[name]:.3f})" if name in black and name.startswith("ssim") else ""
         ceiling = design.predicted.get(f"{name}_ceiling")
         more += f" (ceiling {ceiling:.3g})" if ceiling else ""
-        tiles.append((f"{value:.1f}" if abs(value) >= 10 else f"{value:.3f}", label + more))
+        what, _, unit = label.rpartition(", ")
+        of, unit = (what, f" {unit}") if unit in _UNITS else (label, "")
+        tiles.append((f"{value:.1f}{unit}" if abs(value) >= 10 else f"{value:.3f}{unit}", of + more))
     return tiles
 
 
@@ -139,7 +143,10 @@ def _pictures(
         error = 1000 * (height_um - task.inputs["relief_um"])
         rest = 1000 * np.load(folder / UNPRINTABLE_FILE)
         limit = 2 * float(np.std(error)) + 1e-9
-        for title, off in (("error, offset free", error - error.mean()), ("no layout prints", rest)):
+        for title, off in (
+            ("error, offset free", error - error.mean()),
+            ("the part that no layout prints", rest),
+        ):
             panels.append((title, off, "RdBu_r", (-limit, limit), "nm", side))
     elif isinstance(task, HologramTask):
         target = np.load(folder / TARGET_FILE)

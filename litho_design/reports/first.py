@@ -45,7 +45,7 @@ def write_first_report(folder: Path, result: GapResult, printers: Mapping[str, P
     )
     page.figure(
         draw_images(designs, printers[DESIGNER], scores),
-        "Left: the wanted image. Middle and right: what the printed holograms would show, at matched scale.",
+        "First the wanted image, then what the printed holograms would show, at matched scale.",
     )
     page.note(*(f"{capitalised(note)}." for note in designs[WITHOUT].record.notes))
     page.paragraph(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from litho_design.judging.gap import GapResult, PairedDifference, design_folder,
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.lenses.score import ImagingLensScore
 from litho_design.printers.printer import Printer
-from litho_design.reports.advice import WORDS, baseline_line, less_is_better
+from litho_design.reports.advice import WORDS, baseline_line, less_is_better, named
 from litho_design.reports.parts import image_grid, meanings
 from litho_design.tasks.design import Design
 
@@ -29,12 +29,17 @@ _LABELS = meanings(HologramScore) | meanings(ImagingLensScore)
 
 def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Printer]) -> Path:
     """Write ``report.html`` and one CSV per table."""
-    what = f"hologram of “{result.target}”" if result.task == "hoe" else result.task.replace("-", ", ")
+    what = (
+        f"hologram of “{result.target}”"
+        if result.task == "hoe"
+        else result.task.replace("lens-", "lens, ").replace("-", " ")
+    )
     shown = headline(result.task)
     page = Page(
         "The design-to-manufacturing gap",
-        f"{capitalised(what)}: {len(result.arms)} arms, seeds {', '.join(map(str, result.seeds))}, "
-        f"{result.settings.search.iterations} iterations each; layouts are scored as they would be printed.",
+        f"{capitalised(what)}, designed with {_listed(result.arms)}; {result.settings.search.iterations} "
+        f"iterations each, seed{'s' * (len(result.seeds) > 1)} {_listed(result.seeds)}. Layouts are scored "
+        "as they would be printed.",
         run=result,
         facts={"seeds": ", ".join(map(str, result.seeds))}
         | {f"{name}, SHA-256": one.sha256 for name, one in result.judges.items() if one.sha256},
@@ -46,7 +51,7 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
     judged = _judged(folder, result, printers)
     page.figure(
         _pictures(judged),
-        f"Seed {result.seeds[0]}. Rows: designed with; columns: printed by. "
+        f"Seed {result.seeds[0]}. Above each image: what it was designed with, and what printed it. "
         + (
             "Square root of the PSF over its peak." if result.task.startswith("lens-") else "Scaled to match."
         ),
@@ -78,7 +83,7 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
         )
     page.figure(
         _bars(result, "ssim" if result.task == "hoe" else shown[0]),
-        "Left: expected in design (circles) and after each judge's print (bars), means over seeds. Right: "
+        "First: expected in design (circles) and after each judge's print (bars), means over seeds. Second: "
         "design minus print, the gap.",
     )
     page.heading("Arm against arm", folded=True)
@@ -109,7 +114,7 @@ def _verdict(result: GapResult, figure: str) -> str:
                 pair, len(result.seeds)
             )
         told.append(f"{text}.")
-    return f"{' '.join(told)} The figure is the {_LABELS.get(figure, figure)}."
+    return f"{' '.join(told)} The figure is the {_label(figure)}."
 
 
 def _chance(pair: PairedDifference, seeds: int) -> str:
@@ -122,7 +127,17 @@ def _chance(pair: PairedDifference, seeds: int) -> str:
 
 def _caption(figure: str) -> str:
     better = "less" if less_is_better(figure) else "more"
-    return f"{_LABELS.get(figure, figure)}: mean over seeds [95 % interval]; {better} is better."
+    return f"{capitalised(_label(figure))}: mean over seeds [95 % interval]; {better} is better."
+
+
+def _label(figure: str) -> str:
+    """What a figure is; those of tasks of one's own have a name only."""
+    return _LABELS.get(figure) or named(figure)
+
+
+def _listed(things: Iterable[object]) -> str:
+    *first, last = map(str, things)
+    return f"{', '.join(first)} and {last}" if first else last
 
 
 def _matrix(result: GapResult, figure: str) -> list[dict[str, Any]]:

@@ -81,7 +81,7 @@ def add_lens_window(page: Page, bench: LensBench, height_um: Tensor) -> None:
     figure.colorbar(shown, ax=axes[2], label="peak over the best of the sweep")
     for axis in axes:
         axis.set_xlabel("defocus, µm")
-    page.figure(figure, "Left and middle: one curve per gain. Right: the window, its 80 % line in white.")
+    page.figure(figure, "First and second: one curve per gain. Third: the window, its 80 % line in white.")
     rows = [
         {"gain": gain, "defocus_um": shift, "strehl": strehl[row, column], "fwhm_um": width[row, column]}
         for row, gain in enumerate(window.gain)

@@ -27,10 +27,10 @@ zoo = typer.Typer(help="The models that come with the package: list, or show NAM
 app.add_typer(zoo, name="zoo")
 
 StorePath = Annotated[Path, typer.Argument(help="dataset store made by `litho-data build`")]
-Out = Annotated[Path, typer.Option(help="folder of the result")]
+Out = Annotated[Path, typer.Option(help="folder of the result; one that holds anything else is refused")]
 PolicyOption = Annotated[
     Literal["none", "offset", "offset-gain", "full", "full+rows"],
-    typer.Option(help="nuisances that a scan is freed of in mae_datum_free"),
+    typer.Option(help="terms fitted to each scan for its datum-free error"),
 ]
 BackgroundOption = Annotated[
     Literal["training", "none"],
@@ -47,7 +47,9 @@ NoiseOption = Annotated[
 ]
 RecipeOption = Annotated[
     Literal["fast", "paper"],
-    typer.Option(help="fast: one-cycle with nuisances fitted jointly; paper: 4,000 epochs of Adam"),
+    typer.Option(
+        help="fast: one-cycle, with the terms of each scan fitted jointly; paper: 4,000 epochs of Adam"
+    ),
 ]
 VariantOption = Annotated[
     Literal["default", "paper", "authors"],
@@ -165,7 +167,7 @@ def benchmark(
     split: Annotated[
         Literal["grouped", "paper", "leave-one-print-out"], typer.Option(help="what is held out")
     ] = "grouped",
-    models: Annotated[str | None, typer.Option(help="names, separated by commas; all by default")] = None,
+    models: Annotated[str | None, typer.Option(help="names, comma-separated; all by default")] = None,
     recipe: RecipeOption = "fast",
     variant: VariantOption = "default",
     steps: Steps = None,
@@ -237,7 +239,7 @@ def predict(
     """
     from litho_models.frozen.on_store import predict_file
 
-    frozen = litho_models.load_frozen(litho_models.zoo.model_folder(model), extrapolate=extrapolate)
+    frozen = litho_models.load_frozen(model, extrapolate=extrapolate)
     height = predict_file(frozen, layout, out)
     lowest, highest = height.min(), height.max()
     typer.echo(f"{height.shape[0]} x {height.shape[1]} px, {lowest:.3f} to {highest:.3f} µm high: {out}")
@@ -255,7 +257,7 @@ def export(
     """
     from litho_models.frozen.exporting import export_model
 
-    frozen = litho_models.load_frozen(litho_models.zoo.model_folder(model))
+    frozen = litho_models.load_frozen(model)
     difference_um = export_model(frozen, out, size_px)
     typer.echo(
         f"{out}: layouts of {size_px} x {size_px} px, (1, 1, y, x) float32 µm; differs by "
@@ -269,8 +271,8 @@ def list_zoo() -> None:
 
     Example: litho-models zoo list
     """
-    for name in litho_models.zoo.list():
-        typer.echo(f"{litho_models.zoo.PREFIX}{name:10} {litho_models.zoo.load(name)}")
+    for name in (f"{litho_models.zoo.PREFIX}{one}" for one in litho_models.zoo.list()):
+        typer.echo(f"{name:14} {litho_models.load_frozen(name)}")
 
 
 @zoo.command("show")
@@ -289,7 +291,7 @@ def compare(
     first: Annotated[Path, typer.Argument(help="benchmark.json or evaluation.json")],
     second: Annotated[Path, typer.Argument(help="another one, of the same protocol")],
 ) -> None:
-    """Difference of two results, paired by scan; refuses different data, folds or nuisances.
+    """Difference of two results, paired by scan; refuses different data, folds or per-scan terms.
 
     Example: litho-models compare one/benchmark.json other/benchmark.json
     """

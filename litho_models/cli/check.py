@@ -21,7 +21,7 @@ def check(
     ] = None,
     new: Annotated[
         list[str] | None,
-        typer.Option(help="a print of STORE that is new (repeatable); the others are the reference"),
+        typer.Option(help="a print of STORE that is new, the others are the reference; repeatable"),
     ] = None,
     residuals: Annotated[
         list[Path] | None,
@@ -34,7 +34,7 @@ def check(
     ] = 0.005,
     tolerance: Annotated[
         float | None,
-        typer.Option(help="largest drift of a figure, 0.05 is 5 %; three times its spread by default"),
+        typer.Option(help="largest drift of a figure, 0.05 is 5 %; by default three times its spread"),
     ] = None,
     strict: Annotated[
         bool, typer.Option("--strict", help=f"end with exit code {EXIT_ALARM} on an alarm")

@@ -36,7 +36,7 @@ def noise(
         list[str] | None,
         typer.Option(
             help="folder of `benchmark`, for the noise budget and σ(x), or a frozen model (a folder, "
-            "zoo:NAME), for σ(x) alone; several are an ensemble (repeatable)"
+            "zoo:NAME), for σ(x) alone; several are an ensemble; repeatable"
         ),
     ] = None,
     model: Annotated[

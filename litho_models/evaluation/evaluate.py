@@ -13,7 +13,6 @@ from litho_data.store.lock_box import ids_sha256
 from litho_models.evaluation.diagnostics import device_of, tile_consistency
 from litho_models.evaluation.reports import write_evaluation_report
 from litho_models.evaluation.results import Evaluation, ModelRecord
-from litho_models.frozen import zoo
 from litho_models.frozen.files import load_frozen
 from litho_models.frozen.on_store import (
     card_background,
@@ -68,7 +67,7 @@ def evaluate(
     """
     dataset = open_store(store)
     floor = stated_floor(dataset.name, noise)
-    frozen = load_frozen(zoo.model_folder(model), device=device, extrapolate=extrapolate)
+    frozen = load_frozen(model, device=device, extrapolate=extrapolate)
     frozen.check_geometry(dataset.pitch_um, dataset.level_height_um)
     subject = {"dataset.name": dataset.name, "model.name": frozen.name}
     require_own_folder(out, Evaluation.FILE_NAME, subject=subject)

@@ -73,21 +73,24 @@ def residual_maps(
     panels = len(predictions_um) + 1
     columns = min(4, panels)
     rows = -(-panels // columns)
-    figure = new_figure(2.9 * columns, 2.9 * rows)
+    # Beside the panels, two scales.
+    figure = new_figure(2.7 * columns + 1.8, 2.9 * rows)
     grid = np.atleast_1d(figure.subplots(rows, columns)).ravel()
     extent = (0, scan.shape[1] * scan.pitch_um, scan.shape[0] * scan.pitch_um, 0)
     image = grid[0].imshow(scan.height_um, extent=extent, cmap="viridis")
     grid[0].set_title(f"{scan.id}: measured, µm", fontsize=9)
-    figure.colorbar(image, ax=grid[0], shrink=0.8)
+    grid[0].set(xlabel="x, µm", ylabel="y, µm")
+    figure.colorbar(image, ax=grid[0], shrink=0.6)
     for axes, (name, prediction) in zip(grid[1:], predictions_um.items(), strict=False):
         error = NM_PER_UM * residual_um(scan, prediction, protocol)
         image = axes.imshow(
             error, extent=extent, cmap="RdBu_r", vmin=-_RESIDUAL_RANGE_NM, vmax=_RESIDUAL_RANGE_NM
         )
         axes.set_title(f"{name}: {np.nanmean(np.abs(error)):.1f} nm", fontsize=9)
-        axes.set_xlabel("µm", fontsize=8)
+        axes.set_xlabel("x, µm", fontsize=9)
+        axes.tick_params(labelleft=False)
     if panels > 1:
-        figure.colorbar(image, ax=grid[1:panels].tolist(), shrink=0.6, label="measured - predicted, nm")
+        figure.colorbar(image, ax=grid[1:panels].tolist(), shrink=0.6, label="measured − predicted, nm")
     for axes in grid[panels:]:
         axes.set_axis_off()
     return figure

@@ -47,7 +47,7 @@ def headline_table(
         for s in scores
     ]
     known = {
-        "model": f"noise floor ({floor.kind})",
+        "model": f"noise floor ({floor.kind.replace('-', ' ')})",
         "mae_datum_free_nm": least,
         "mae_datum_free_ci95_nm": interval_text(below.mae_ci95_nm if below else None),
         "rmse_datum_free_nm": below.rmse_nm if below else floor.rmse_nm if least is not None else None,
@@ -71,7 +71,13 @@ def policy_table(scores: Sequence[ModelScores], protocol: NuisanceProtocol, floo
                 rows.append({"model": s.model, "background": background, **named, **lines})
     if floor.by_policy:
         below = {f"{row.policy}_mae_nm": row.mae_nm for row in floor.by_policy}
-        rows.append({"model": f"noise floor ({floor.kind})", "background": protocol.background, **below})
+        rows.append(
+            {
+                "model": f"noise floor ({floor.kind.replace('-', ' ')})",
+                "background": protocol.background,
+                **below,
+            }
+        )
     return rows
 
 

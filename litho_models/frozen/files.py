@@ -22,6 +22,7 @@ from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.outputs import require_replaceable_folder
 from litho_data.foundation.results import first_error
 from litho_data.foundation.run_facts import run_facts
+from litho_models.frozen import zoo
 from litho_models.frozen.card import CARD_FILE, EffectValues, ModelCard
 from litho_models.frozen.readme import model_readme
 from litho_models.frozen.simulator import FrozenSimulator
@@ -87,19 +88,20 @@ def save_frozen(
 
 
 def load_frozen(
-    folder: str | Path, device: str | torch.device = "cpu", extrapolate: bool = False
+    source: str | Path, device: str | torch.device = "cpu", extrapolate: bool = False
 ) -> FrozenSimulator:
     """Load a frozen model: eval mode, weights without gradients, effects of the printer included.
 
     Args:
-        folder: what ``save_frozen`` wrote.
+        source: what ``save_frozen`` wrote, or ``zoo:NAME``.
         device: where to put it.
         extrapolate: accept heights beyond the calibrated range.
 
     Raises:
-        InputError: no such folder, or a card or weights that are damaged, foreign or do not fit.
+        InputError: no such folder or model of the zoo, or a card or weights that are damaged, foreign or
+            do not fit.
     """
-    path = Path(folder)
+    path = zoo.model_folder(source)
     card = ModelCard.read(path)
     _check_effects(card)
     simulator = load_simulator(path, card)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.report_pictures import shown_html
 from litho_models.frozen.card import ModelCard
 from litho_models.layers.precision import Precision, network_precision, warn_where_slower
 from litho_models.prediction.tiles import predict_field, predict_interior
@@ -116,6 +117,9 @@ class FrozenSimulator(nn.Module):
             f"{card['levels']} levels of {card['level_height_um']:g} µm, "
             f"heights from {self._lowest_um:g} to {self._highest_um:g} µm>"
         )
+
+    def _repr_html_(self) -> str:
+        return shown_html(repr(self)) + ModelCard.model_validate(self.card)._repr_html_()
 
     @property
     def has_interior(self) -> bool:

@@ -1,18 +1,12 @@
-"""Frozen models that come with the package: one call from nothing to a printed height."""
+"""Frozen models that come with the package: their names and folders; ``load_frozen("zoo:pbl")`` opens one."""
 
 from __future__ import annotations
 
 import builtins
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from litho_data.foundation.errors import unknown_name
-
-if TYPE_CHECKING:
-    import torch
-
-    from litho_models.frozen.simulator import FrozenSimulator
 
 ZOO_FOLDER = Path(__file__).parent / "zoo_data"
 LARGEST_ZOO_BYTES = 8_000_000
@@ -54,28 +48,6 @@ def model_folder(source: str | Path, other: Iterable[str] = ()) -> Path:
         known = [*(f"{PREFIX}{name}" for name in list()), *other]
         raise unknown_name("model", text, known, also="the folder of a model")
     return Path(source)
-
-
-def load(
-    name: str,
-    device: str | torch.device = "cpu",
-    extrapolate: bool = False,
-    root: str | Path = ZOO_FOLDER,
-) -> FrozenSimulator:
-    """Load a zoo model: ``load("pbl")(layout_um, pitch_um=0.1)``; its card is in ``.card``.
-
-    Args:
-        name: one of ``list()``.
-        device: where to put it.
-        extrapolate: accept heights beyond the calibrated range.
-        root: another zoo, by default the one in the package.
-
-    Raises:
-        InputError: no such model, or a damaged one.
-    """
-    from litho_models.frozen.files import load_frozen
-
-    return load_frozen(folder(name, root), device=device, extrapolate=extrapolate)
 
 
 def size_bytes(root: str | Path = ZOO_FOLDER) -> int:

@@ -9,7 +9,6 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.outputs import require_own_folder
 from litho_data.foundation.run_facts import run_info
 from litho_data.store import open_store
-from litho_models.frozen import zoo
 from litho_models.frozen.files import load_frozen
 from litho_models.monitoring import wording
 from litho_models.monitoring.inputs import gather
@@ -37,7 +36,7 @@ def check(
         model: folder of a frozen model, or ``zoo:NAME``.
         store: dataset store of the new prints; locked scans of the model's own prints are left out.
         out: result folder.
-        reference: store of unchanged prints; by default those that the card of the model tells of.
+        reference: store of unchanged prints; by default those in the model's card.
         new: names of prints of ``store`` that are new; its others are then the reference.
         residuals: folders of ``litho-models benchmark`` on the reference prints: its predictions, of prints
             that no fit had seen, take the place of the model's.
@@ -53,7 +52,7 @@ def check(
     if tolerance is not None and not 0 < tolerance < 1:
         raise InputError("tolerance", got=tolerance, wanted="between 0 and 1: 0.05 is 5 %")
     dataset = open_store(store)
-    frozen = load_frozen(zoo.model_folder(model), device=device)
+    frozen = load_frozen(model, device=device)
     subject = {"dataset.name": dataset.name, "model.name": frozen.name}
     require_own_folder(out, Check.FILE_NAME, subject=subject)
     found = gather(frozen, dataset, reference, new, residuals)

@@ -96,7 +96,7 @@ def _within(
 
 
 def _of_card(frozen: FrozenSimulator, dataset: Store, dropped: list[str]) -> Figures:
-    """All prints of a store against those that the card of the model tells of."""
+    """All prints of a store against those in the model's card."""
     hint = "--reference STORE takes the prints of a store, --new PRINT the other prints of this one"
     if not frozen.card["baseline"]:
         raise InputError(

@@ -21,11 +21,11 @@ def write_check_report(result: Check, out: str | Path) -> Path:
     """Render the result into ``out``; returns the page."""
     page = Page(f"Check of {result.model.name} on {result.dataset.name}", run=result.run)
     page.verdict(result.verdict[0])
+    for one in result.figures:
+        page.figure(control_chart(result, one), _chart_text(one))
     for sentence in result.verdict[1:]:
         page.paragraph(sentence)
     page.note(*result.notes)
-    for one in result.figures:
-        page.figure(control_chart(result, one), _chart_text(one))
     page.heading("In numbers", folded=True)
     page.table(
         _figures_table(result),
@@ -40,6 +40,8 @@ def write_check_report(result: Check, out: str | Path) -> Path:
 
 def control_chart(result: Check, one: FigureCheck) -> Figure:
     """The figure of every print against the reference: dots of prints, small dots of scans, spread, steps."""
+    from matplotlib.ticker import MaxNLocator
+
     figure = new_figure(8.5, 3.4)
     axes = figure.subplots()
     watched = figure_of(one)
@@ -51,7 +53,7 @@ def control_chart(result: Check, one: FigureCheck) -> Figure:
         prints = print_values(rows, watched)
         place = np.arange(start, start + len(prints.values))
         of_scans = [(place[prints.names.index(row.print)], _relative(watched.of(row), one)) for row in rows]
-        axes.plot(*np.array(of_scans).T, ".", color=colour, alpha=0.35, ms=4)
+        axes.plot(*np.array(of_scans).T, ".", color=colour, alpha=0.6, ms=5)
         axes.plot(place, _relative(prints.values, one), "o", color=colour, label=label)
         if rows is result.new_scans and one.alarm is not None:
             since = start + prints.names.index(one.alarm.since)
@@ -63,6 +65,7 @@ def control_chart(result: Check, one: FigureCheck) -> Figure:
     for sign in (-1, 1):
         axes.axhline(sign * 100 * one.tolerance, color="#d99b00", ls="--", lw=1)
     axes.axvline(one.reference_prints - 0.5, color="#1c2430", lw=0.8, ls=":")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set(xlabel="print, in printing order", ylabel="against the reference, %")
     axes.set_title(watched.words, fontsize=10)
     axes.grid(alpha=0.3)

@@ -43,7 +43,7 @@ def surfaces(references: Sequence[Reference]) -> Figure:
         profile.plot(x_um, height_nm[ny // 2], color="#0b6aa2", lw=0.8)
         if bound is not None:
             profile.set_ylim(-bound, bound)
-        profile.set_xlabel("x, µm", fontsize=8)
+        profile.set_xlabel("x, µm", fontsize=9)
         profile.grid(alpha=0.3)
     grid[1, 0].set_ylabel("middle row, nm")
     return figure
@@ -91,7 +91,7 @@ def dose(found: DoseMatrix) -> Figure:
             label=f"{row.dose:.3g}",
         )
     left.set(xlabel="level", ylabel="printed height above the lowest level, nm")
-    left.legend(fontsize=7, title="dose", title_fontsize=7)
+    left.legend(fontsize=8, title="dose", title_fontsize=8)
     middle.plot(doses, [row.roughness_nm for row in found.rows], "o-", color="#c23b22", ms=4)
     middle.set_ylabel("roughness, nm")
     right.plot(doses, [row.worst_readability for row in found.rows], "o-", color="#0b6aa2", ms=4)
@@ -136,7 +136,7 @@ def calibration(found: SpreadAnalysis) -> Figure:
         edges = np.linspace(0, 1, len(described.pit) + 1)
         right.stairs(np.array(described.pit) * len(described.pit), edges, color=f"C{number}", lw=1.2)
     scans = [row.scan for row in found.calibrations[0].scans]
-    left.set_xticks(range(len(scans)), scans, rotation=90, fontsize=6)
+    left.set_xticks(range(len(scans)), scans, rotation=90, fontsize=8)
     left.axhline(90, color="#9aa7b5", lw=1)
     left.set_ylabel("pixels inside the 90 % interval, %")
     left.legend(fontsize=8)

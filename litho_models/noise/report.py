@@ -21,6 +21,15 @@ if TYPE_CHECKING:
     from litho_models.noise.references import Reference
     from litho_models.noise.result import NoiseAnalysis
 
+# What each policy fits to a scan first, in words.
+_FREE = {
+    "none": "nothing fitted",
+    "offset": "the zero of each scan free",
+    "offset-gain": "zero and gain of each scan free",
+    "full": "zero, gain, tilt and bow of each scan free",
+    "full+rows": "zero, gain, tilt, bow and lines of each scan free",
+}
+
 
 def write_noise_report(result: NoiseAnalysis, references: Sequence[Reference], out: str | Path) -> Path:
     """Render the result into ``out``; returns the page."""
@@ -142,14 +151,14 @@ def _dose(page: Page, found: DoseMatrix) -> None:
 
 def _spread(page: Page, found: SpreadAnalysis) -> None:
     page.heading(f"Uncertainty of {found.model}")
-    origin = "out of fold" if found.held_out else "of scans that the model was trained on: too small"
+    origin = "no fit has seen" if found.held_out else "the model was trained on, so they are too small"
     shared = "with" if found.nuisance.background == "training" else "without"
     background = f"{shared} the background that the training scans share"
     page.paragraph(
-        f"Residuals {origin}, each scan freed by policy {found.nuisance.policy}, {background}: RMS "
-        f"{found.residual_rms_nm:.2f} nm, MAE {found.residual_mae_nm:.2f} nm. They hold the noise and what "
-        f"the model lacks. σ(x) is fitted on other {found.left_out} than it is judged on; its shape is "
-        f"{_shape(found.variance.freedom)}."
+        f"Errors on scans that {origin}, with {_FREE[found.nuisance.policy]}, {background}: RMS "
+        f"{found.residual_rms_nm:.2f} nm, MAE {found.residual_mae_nm:.2f} nm. They are the noise and what "
+        f"the model lacks. σ(x), the uncertainty at a pixel, is fitted on other {found.left_out} than it is "
+        f"judged on; its shape is {_shape(found.variance.freedom)}."
     )
     if found.epistemic_rms_nm is not None:
         page.paragraph(

@@ -253,12 +253,12 @@ def test_the_page_shows_what_was_measured_and_the_model_meets_the_size_left_out(
     assert as_markdown(record) == text
     *fitted, unused = [MeasuredSize.model_validate(one) for one in record["measured"]]
     cost, size = fit_cost(fitted), unused.size_px
-    for foretold, found in (
+    for predicted, found in (
         (cost.iteration_s(size), unused.iteration_s),
         (cost.evaluation_s(size), unused.evaluation_s),
         (cost.memory_of_rank_gib(size), unused.peak_memory_gib),
     ):
-        assert foretold == pytest.approx(found, rel=0.25)
+        assert predicted == pytest.approx(found, rel=0.25)
 
 
 def test_the_page_of_costs_is_what_follows_from_the_results():

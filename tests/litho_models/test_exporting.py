@@ -28,7 +28,7 @@ def layout(seed: int, size_px: int = SIZE_PX) -> torch.Tensor:
 def frozen(name: str, folder: Path) -> FrozenSimulator:
     """One of the zoo, or a baseline whose weights are drawn."""
     if name in zoo.list():
-        return zoo.load(name)
+        return load_frozen(f"zoo:{name}")
     torch.manual_seed(0)
     model = build_model(name)
     for weights in model.parameters():
@@ -71,9 +71,9 @@ def test_onnxruntime_prints_the_same(name: str, tmp_path: Path) -> None:
 def test_what_cannot_leave_says_why_and_leaves_no_file(tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime")
     with pytest.raises(InputError, match="complex numbers"):
-        export_model(zoo.load("fno"), tmp_path / "fno.onnx", SIZE_PX)
+        export_model(load_frozen("zoo:fno"), tmp_path / "fno.onnx", SIZE_PX)
     with pytest.raises(InputError, match=r"wanted \.pt2 or \.onnx"):
-        export_model(zoo.load("physics"), tmp_path / "physics.pth", SIZE_PX)
+        export_model(load_frozen("zoo:physics"), tmp_path / "physics.pth", SIZE_PX)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from litho_models.fitting import TrainingConfig, fit_in_cache, pixels
-from litho_models.frozen import zoo
+from litho_models.frozen.files import load_frozen
 from litho_models.models import build_model
 from litho_models.models.pbl import Pbl, PblConfig
 from litho_models.prediction.tiles import predict_scan
@@ -105,7 +105,7 @@ def test_a_finished_chain_is_found_in_the_cache_and_the_networks_are_fitted_to_t
 
 
 def test_older_cards_and_the_published_variants_have_the_chain_alone():
-    older = zoo.load("pbl").card["hyper_parameters"]
+    older = load_frozen("zoo:pbl").card["hyper_parameters"]
     assert "surroundings" not in older
     for config in (PblConfig.model_validate(older), PblConfig.of_variant("paper"), PblConfig()):
         model = Pbl(config)

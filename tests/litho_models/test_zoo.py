@@ -11,7 +11,7 @@ import torch
 from typer.testing import CliRunner
 
 from litho_data.foundation.errors import InputError
-from litho_models import save_frozen
+from litho_models import load_frozen, save_frozen
 from litho_models.cli.app import app
 from litho_models.evaluation.zoo_making import HELD_OUT, OUT_OF_FOLD, TRAINED_ON, differing_metrics, make_zoo
 from litho_models.frozen import zoo
@@ -42,7 +42,7 @@ def small_zoo(tmp_path_factory):
 
 def check_model(name, root):
     """A zoo model loads, predicts finite heights near the nominal ones, and refuses another pitch."""
-    frozen = zoo.load(name, root=root)
+    frozen = load_frozen(zoo.folder(name, root))
     assert frozen.name == name
     layout = torch.full((1, 1, 90, 110), 0.6, requires_grad=True)
     height = frozen(layout, pitch_um=0.1)
@@ -69,7 +69,7 @@ def test_every_shipped_model_works_and_says_where_it_comes_from(name):
 
 
 def test_a_physics_model_frozen_before_there_was_a_gain_prints_as_it_did():
-    model = zoo.load("physics")
+    model = load_frozen("zoo:physics")
     assert "gain_init" not in model.card["hyper_parameters"]
     y = torch.arange(120.0)
     wave = torch.sin(y[:, None] / 7) * torch.cos(y[None, :] / 11)
@@ -99,14 +99,16 @@ def test_an_empty_zoo_lists_nothing_and_says_so(tmp_path):
     assert zoo.list(tmp_path) == []
     assert zoo.list(tmp_path / "absent") == []
     with pytest.raises(InputError, match="make_zoo"):
-        zoo.load("pbl", root=tmp_path)
+        zoo.folder("pbl", tmp_path)
 
 
 def test_unknown_names_and_paths_are_refused(small_zoo):
     assert zoo.list(small_zoo) == ["fno", "pbl", "physics"]
     for name in ("resnet", "../pbl", ""):
         with pytest.raises(InputError, match="fno, pbl, physics"):
-            zoo.load(name, root=small_zoo)
+            zoo.folder(name, small_zoo)
+        with pytest.raises(InputError, match="fno, pbl, physics"):
+            load_frozen(f"zoo:{name}")
 
 
 def test_every_command_that_takes_a_frozen_model_takes_it_from_the_zoo(store, tmp_path):

@@ -65,8 +65,8 @@ def write_report(findings: LoopFindings, result: CloseLoop, folder: Path) -> Pat
     )
     page.figure(
         staircase_figure(_steps_frame(findings)),
-        "Held-out mean absolute error, step by step; bars are 95 % bootstrap intervals over scans. Pale: "
-        "terms of each scan on the base model. Full: with the effects added.",
+        "Held-out mean absolute error, step by step, with 95 % bootstrap intervals over scans. Grey: the "
+        "base model with more and more terms of each scan fitted. Blue: the same with the effects added.",
     )
     _decision_section(page, result)
     page.note(*warnings_for(findings, result))
