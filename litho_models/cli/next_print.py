@@ -41,7 +41,7 @@ def next_print(
     if plan is None:
         typer.echo(f"nothing is open in {loop}: no print is needed")
         return
-    typer.echo(f"{plan.prints} prints, {len(plan.scans)} scans with the references")
+    typer.echo(f"{plan.prints} print{'s' * (plan.prints > 1)}, {len(plan.scans)} scans with the references")
     for question in plan.questions:
         needed = f", {question.prints_needed} prints for 0.95" if question.prints_needed else ""
         power = f"power {question.power[plan.prints - 1]:.2f}{needed}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -44,7 +45,8 @@ def write_report(
     """Write ``report.html`` and ``questions.csv``; ``shown``: the print on which rivals are pictured."""
     page = Page(
         f"What to print next: {plan.dataset.name}",
-        f"{plan.prints} prints of {plan.field_um:g} µm in {len(plan.scans)} scans, three of them references.",
+        f"{plan.prints} print{'s' * (plan.prints > 1)} of {plan.field_um:g} µm in {len(plan.scans)} scans, "
+        "three of them references.",
         run=plan.run,
         facts={"dataset": plan.dataset.sha256},
         words=_WORDS,
@@ -52,7 +54,7 @@ def write_report(
     decided = [_asked(q) for q in plan.questions if q.status == "decides"]
     page.verdict(
         f"These prints decide {len(decided)} of {len(plan.questions)} open questions with a chance of "
-        f"{ENOUGH} or more of being right" + (f": {'; '.join(decided)}." if decided else ".")
+        f"{ENOUGH} or more of being right" + (f": {'; '.join(decided)}." if decided else ".") + _wanting(plan)
     )
     page.tiles(
         [
@@ -96,6 +98,18 @@ def _asked(question: PlannedQuestion) -> str:
     return f"{first}: the printer's or the microscope's"
 
 
+def _wanting(plan: NextPrint) -> str:
+    """What no print answers."""
+    names = [question.name for question in plan.questions if question.kind == "fact"]
+    return f" A fact on the card, and no print, answers {' and '.join(names)}." if names else ""
+
+
+def _needed(question: PlannedQuestion) -> str:
+    if question.kind == "fact":
+        return "–"
+    return f"over {len(question.power)}" if question.prints_needed is None else str(question.prints_needed)
+
+
 def _sentence(text: str) -> str:
     return f"{capitalised(text)}."
 
@@ -105,9 +119,9 @@ def _table(plan: NextPrint) -> list[dict[str, Any]]:
         {
             "question": q.name,
             "status": q.status,
-            "power": q.power[plan.prints - 1],
-            "random_power": q.random_power[plan.prints - 1],
-            "prints_needed": f"over {len(q.power)}" if q.prints_needed is None else str(q.prints_needed),
+            "power": math.nan if q.kind == "fact" else q.power[plan.prints - 1],
+            "random_power": math.nan if q.kind == "fact" else q.random_power[plan.prints - 1],
+            "prints_needed": _needed(q),
             "difference_nm": np.nan if q.difference_nm is None else q.difference_nm,
             "noise_nm": np.nan if q.noise_nm is None else q.noise_nm,
             "form_nm": np.nan if q.form_nm is None else q.form_nm,
