@@ -1,6 +1,6 @@
 """How far is the SI-PSNR of a photograph from that of the light that was photographed?
 
-    python -m benchmarks.photographs --out runs/photographs [--photographs 24] [--publish]
+    python -m benchmarks.photographs --out runs/photographs [--photographs 30] [--publish]
 
 Two holograms are designed through the zoo's physics model, and prints unlike the expected ones photographed
 by cameras that are turned, moved, tilted, mirrored, noisy and darker in their corners at random; every sixth
@@ -158,7 +158,7 @@ def main() -> None:
     """Design, photograph, score, print, write."""
     parser = options(__doc__, "write record and text into docs")
     parser.add_argument("--out", type=Path, required=True, help="folder of designs and photographs")
-    parser.add_argument("--photographs", type=int, default=24, help="of each hologram")
+    parser.add_argument("--photographs", type=int, default=30, help="of each hologram")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     rows = []

@@ -23,8 +23,8 @@ from litho_design.lenses.objects import object_name, object_stack, read_object
 from litho_design.lenses.task import LensTask
 from litho_design.optics.imaging import Blur
 
-# Noise that adds this much again to the error has added as much already.
-_LARGEST_SD_DB = 0.2
+# Three standard deviations are the 0.3 dB that a score is to be trusted to.
+_LARGEST_SD_DB = 0.1
 
 
 @dataclass(frozen=True)
