@@ -77,7 +77,7 @@ def test_the_result_is_complete_on_disk(result):
     record, out = result
     assert Benchmark.read(out) == record
     table = pd.read_csv(out / "benchmark.csv").set_index("model")
-    floor = f"noise floor ({record.noise_floor.kind})"
+    floor = f"noise floor ({record.noise_floor.kind.replace('-', ' ')})"
     assert list(table.index) == [*MODELS, floor]
     assert table.loc[floor, "mae_datum_free_nm"] == pytest.approx(record.noise_floor.mae_nm)
     scans = pd.read_csv(out / "scans.csv")
