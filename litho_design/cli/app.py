@@ -20,6 +20,7 @@ from litho_design.cli.options import (
     ScanLevelling,
     ScanSizeUm,
     ScanUnit,
+    measured_source,
 )
 
 if TYPE_CHECKING:
@@ -105,7 +106,6 @@ def score(
 
     Example: litho-design score hologram --judge zoo:physics --out score
     """
-    from litho_design.judging.measured import MeasuredSource
     from litho_design.judging.photographs import PhotoSource
     from litho_design.optimisation.stitching import Stitching
     from litho_design.tasks.task import register_tasks_of
@@ -140,14 +140,14 @@ def score(
         raise InputError("--camera-object", got="no --camera", wanted="the photograph of it")
     if task_file is not None:
         register_tasks_of(task_file)
-    size = None if scan_size_um is None else (scan_size_um, scan_size_um)
+    measured = measured_source(
+        scan, scan_unit, scan_size_um, scan_levelling, scale_sd=scan_scale_sd, aligned=scan_aligned
+    )
     result = score_design(
         design,
         out,
         judges=judge or (),
-        scan=None
-        if scan is None
-        else MeasuredSource(scan, scan_unit, size, scan_levelling, scan_scale_sd, scan_aligned),
+        scan=measured,
         camera=None
         if camera is None
         else PhotoSource(

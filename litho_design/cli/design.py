@@ -25,6 +25,7 @@ from litho_design.cli.options import (
     ScanSizeUm,
     ScanUnit,
     as_toml,
+    measured_source,
     takes_settings,
 )
 from litho_design.holograms.settings import HologramSettings, hologram_settings
@@ -185,13 +186,9 @@ def correct(
     Second round: litho-design correct blaze --model zoo:pbl --after blaze --scan print.gwy --out again
     """
     settings = _settings(given, relief_settings, "correct", spread_of, roughness_of)
-    from litho_design.judging.measured import MeasuredSource
     from litho_design.workflows.design import correct as correct_relief
 
-    size = None if scan_size_um is None else (scan_size_um, scan_size_um)
-    print_of = None
-    if scan is not None:
-        print_of = MeasuredSource(scan, scan_unit, size, scan_levelling, aligned=scan_aligned)
+    print_of = measured_source(scan, scan_unit, scan_size_um, scan_levelling, aligned=scan_aligned)
     design = correct_relief(
         relief, model, out, settings=settings, after=after, scan=print_of,
         ensemble=ensemble or (), device=device, extrapolate=extrapolate,

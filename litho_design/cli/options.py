@@ -8,13 +8,16 @@ import json
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
 
 import typer
 from pydantic import BaseModel
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.settings import Leaf, assigned, flattened, leaves, read_settings
+
+if TYPE_CHECKING:
+    from litho_design.judging.measured import MeasuredSource
 
 Out = Annotated[Path, typer.Option(help="folder of the result; one that holds anything else is refused")]
 Device = Annotated[str, typer.Option(help="cpu, cuda, cuda:0 …")]
@@ -44,6 +47,23 @@ ScanAligned = Annotated[
         help="it lies on the pixels of the element, upright: for one that looks alike in several places",
     ),
 ]
+
+
+def measured_source(
+    scan: Path | None,
+    unit: str | None,
+    size_um: float | None,
+    levelling: Literal["none", "plane", "bow"],
+    **further: Any,
+) -> MeasuredSource | None:
+    """The measured print of the options of a scan, and further fields of it; None without a scan."""
+    if scan is None:
+        return None
+    from litho_design.judging.measured import MeasuredSource
+
+    return MeasuredSource(scan, unit, None if size_um is None else (size_um, size_um), levelling, **further)
+
+
 _Config = Annotated[
     Path | None,
     typer.Option(
