@@ -155,7 +155,7 @@ class _Sample:
 
 
 def _jacobian(model: Simulator, sample: _Sample) -> np.ndarray:
-    """Derivatives (parameters, y, x) of the window, one column per parameter in forward mode, float64."""
+    """Derivatives (parameters, y, x) of the window, float64: in forward mode, all parameters in one pass."""
     prediction = _WindowPrediction(model, sample)
     named = {f"model.{name}": parameter for name, parameter in model.named_parameters()}
     sizes = [parameter.numel() for parameter in named.values()]
@@ -166,8 +166,7 @@ def _jacobian(model: Simulator, sample: _Sample) -> np.ndarray:
         return torch.func.functional_call(prediction, values, ())
 
     here = torch.nn.utils.parameters_to_vector(list(named.values())).detach()
-    columns = [torch.func.jvp(predict, (here,), (direction,))[1] for direction in torch.eye(here.numel())]
-    return torch.stack(columns).detach().double().numpy()
+    return torch.func.jacfwd(predict)(here).movedim(-1, 0).detach().double().numpy()
 
 
 def _vector(model: Simulator) -> np.ndarray:

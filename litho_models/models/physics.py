@@ -7,6 +7,7 @@ shrinkage, height bias; arXiv:2309.17343, appendix "Parameterized physics model"
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -113,52 +114,56 @@ class Physics(Simulator):
     def reach_px(self) -> int | None:
         if self.config.shrinkage != "fixed-reference":
             return None
-        return sum(self._radii_px())
+        return sum(self._radii_px(self.values))
 
     @property
     def _reference_um(self) -> float:
         return self.config.reference_height_um or self.config.full_height_um
 
     def interior(self, layout_um: Tensor) -> Tensor:
-        optical, diffusion = self._radii_px()
+        values = self.values
+        optical, diffusion = self._radii_px(values)
         sigma_optical = torch.tensor(self.config.sigma_optical_um / self.pitch_um, device=layout_um.device)
         aerial = blur_interior(layout_um / self._reference_um, sigma_optical, optical)
-        initial = self._project(aerial)
-        dose = blur_interior(initial, self.values["sigma_diffusion_um"] / self.pitch_um, diffusion)
-        return self._develop(crop_border(initial, diffusion), dose)
+        initial = self._project(aerial, values)
+        dose = blur_interior(initial, values["sigma_diffusion_um"] / self.pitch_um, diffusion)
+        return self._develop(crop_border(initial, diffusion), dose, values)
 
     def forward(self, layout_um: Tensor) -> Tensor:
         """Height of the whole field, (batch, 1, y, x) µm."""
-        edge, (optical, diffusion) = self.config.edge, self._radii_px()
+        edge, values = self.config.edge, self.values
+        optical, diffusion = self._radii_px(values)
         # A continued layout, blurred, is itself continued from the radius of the optical blur on.
         margin = optical if edge == "replicate" else 0
         relative = pad_field(layout_um, margin, margin) / self._reference_um
-        sigma_optical, sigma_diffusion = self.config.sigma_optical_um, self.values["sigma_diffusion_um"]
+        sigma_optical, sigma_diffusion = self.config.sigma_optical_um, values["sigma_diffusion_um"]
         aerial = gaussian_blur(relative, sigma_optical, self.pitch_um, edge=edge, radius_px=optical)
-        initial = self._project(aerial)
+        initial = self._project(aerial, values)
         dose = gaussian_blur(initial, sigma_diffusion, self.pitch_um, edge=edge, radius_px=diffusion)
-        return self._develop(crop_border(initial, margin), crop_border(dose, margin))
+        return self._develop(crop_border(initial, margin), crop_border(dose, margin), values)
 
-    def _radii_px(self) -> tuple[int, int]:
-        config, diffusion = self.config, float(self.values["sigma_diffusion_um"].detach())
+    # The parts take the values, which a pass works out once: in forward mode a sum with a number is slow.
+
+    def _radii_px(self, values: Mapping[str, Tensor]) -> tuple[int, int]:
+        config, diffusion = self.config, float(values["sigma_diffusion_um"].detach())
         optical, diffused = (
             supported_radius_px(sigma / self.pitch_um, config.kernel_support, config.kernel_cap_px)
             for sigma in (config.sigma_optical_um, diffusion)
         )
         return optical, diffused
 
-    def _project(self, aerial: Tensor) -> Tensor:
-        alpha, eta = self.values["alpha"], self.values["eta"]
+    def _project(self, aerial: Tensor, values: Mapping[str, Tensor]) -> Tensor:
+        alpha, eta = values["alpha"], values["eta"]
         low = torch.tanh(alpha * eta)
         return (low + torch.tanh(alpha * (aerial - eta))) / (low + torch.tanh(alpha * (1 - eta)))
 
-    def _develop(self, initial: Tensor, dose: Tensor) -> Tensor:
+    def _develop(self, initial: Tensor, dose: Tensor, values: Mapping[str, Tensor]) -> Tensor:
         if self.config.shrinkage == "image-range":
             lowest, highest = dose.amin((-2, -1), keepdim=True), dose.amax((-2, -1), keepdim=True)
             dose = (dose - lowest) / (highest - lowest).clamp(min=torch.finfo(dose.dtype).eps)
         elif self.config.shrinkage == "image-maximum":
             dose = dose / dose.amax((-2, -1), keepdim=True).clamp(min=torch.finfo(dose.dtype).eps)
-        kappa_min = self.values["kappa_min"]
+        kappa_min = values["kappa_min"]
         remaining = kappa_min + (1 - kappa_min) * dose
         height = self._reference_um * initial * remaining
-        return self.values.get("gain", 1.0) * height + self.values["bias_um"]
+        return values.get("gain", 1.0) * height + values["bias_um"]
