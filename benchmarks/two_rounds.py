@@ -1,6 +1,6 @@
 """Two rounds on the virtual fab: a loop, the prints that it asks for, and what they decide.
 
-    python -m benchmarks.two_rounds --out runs/two-rounds [--trials 48] [--seed 20271] [--knobs …] [--publish]
+    python -m benchmarks.two_rounds --out runs/two-rounds [--trials 48] [--seed 20271] [--knobs …] [--rms-nm 12 30] [--publish]
 
 Each trial plants one knob, of a size between 12 and 30 nm rms, in a fab of its own; what is planted is drawn
 from the seed before anything is run. The first round is a loop on 14 scans of random layouts. Its open
@@ -73,13 +73,14 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of the trials")
     parser.add_argument("--trials", type=int, default=48)
     parser.add_argument("--seed", type=int, default=20271, help="of everything that is drawn")
-    parser.add_argument("--knobs", nargs="+", choices=DEALT, default=DEALT, help="what is planted, in turn")
+    parser.add_argument("--knobs", nargs="+", choices=KNOBS, default=DEALT, help="what is planted, in turn")
+    parser.add_argument("--rms-nm", nargs=2, type=float, default=RMS_NM, help="smallest and largest size")
     parser.add_argument("--size", type=int, default=192, help="side of a layout, pixels")
     parser.add_argument("--publish", action="store_true", help="write the figures into the page")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     trials = []
-    for draw in draws(arguments.trials, arguments.seed, arguments.knobs):
+    for draw in draws(arguments.trials, arguments.seed, arguments.knobs, arguments.rms_nm):
         folder = arguments.out / f"{draw['number']:02d}"
         kept = folder / "trial.json"
         if not kept.is_file():
@@ -98,14 +99,16 @@ def main() -> None:
     conclude(record, summary(trials), out, PAGE, f"two-rounds-{arguments.seed}", published=arguments.publish)
 
 
-def draws(count: int, seed: int, knobs: Sequence[str] = DEALT) -> list[dict[str, Any]]:
+def draws(
+    count: int, seed: int, knobs: Sequence[str] = DEALT, rms_nm: Sequence[float] = RMS_NM
+) -> list[dict[str, Any]]:
     """What is planted in each trial: knobs dealt in turn, sizes log-uniform, a seed of its own."""
     random = np.random.default_rng([seed, 17])
     return [
         {
             "number": number,
             "knob": knobs[number % len(knobs)],
-            "rms_nm": float(np.exp(random.uniform(*np.log(RMS_NM)))),
+            "rms_nm": float(np.exp(random.uniform(*np.log(rms_nm)))),
             "seed": int(random.integers(1, 2**20)),
         }
         for number in range(count)
