@@ -1,6 +1,6 @@
 """Two rounds on the virtual fab: a loop, the prints that it asks for, and what they decide.
 
-    python -m benchmarks.two_rounds --out runs/two-rounds [--trials 48] [--seed 20271] [--knobs …] [--rms-nm 12 30] [--publish]
+    python -m benchmarks.two_rounds --out runs/two-rounds [--trials 48] [--seed 20271] [--knobs …] [--publish]
 
 Each trial plants one knob, of a size between 12 and 30 nm rms, in a fab of its own; what is planted is drawn
 from the seed before anything is run. The first round is a loop on 14 scans of random layouts. Its open
@@ -16,7 +16,7 @@ import argparse
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -25,6 +25,7 @@ from scipy.stats import binomtest
 from benchmarks.markdown_table import markdown_table
 from benchmarks.record import conclude, origin, write_record
 from litho_data.build.build import build_dataset
+from litho_data.build.gratings import grating_scans
 from litho_data.foundation.commands import run_script
 from litho_data.foundation.errors import InputError
 from litho_data.store import open_store
@@ -63,6 +64,7 @@ RMS_NM = (12.0, 30.0)
 # Bins of the predicted power.
 POWERS = ((0.0, 0.2), (0.2, 0.95), (0.95, 1.01))
 Arm = Literal["optimised", "random"]
+ARMS: tuple[Arm, ...] = get_args(Arm)
 
 
 def main() -> None:
@@ -75,6 +77,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=20271, help="of everything that is drawn")
     parser.add_argument("--knobs", nargs="+", choices=KNOBS, default=DEALT, help="what is planted, in turn")
     parser.add_argument("--rms-nm", nargs=2, type=float, default=RMS_NM, help="smallest and largest size")
+    parser.add_argument("--arms", nargs="+", choices=ARMS, default=ARMS, help="layouts of the second round")
     parser.add_argument("--size", type=int, default=192, help="side of a layout, pixels")
     parser.add_argument("--publish", action="store_true", help="write the figures into the page")
     arguments = parser.parse_args()
@@ -84,7 +87,7 @@ def main() -> None:
         folder = arguments.out / f"{draw['number']:02d}"
         kept = folder / "trial.json"
         if not kept.is_file():
-            write_record(kept, run_trial(draw, folder, arguments.size, print))
+            write_record(kept, run_trial(draw, folder, arguments.size, arguments.arms, print))
         trials.append(json.loads(kept.read_text(encoding="utf-8")))
         if not draw.items() <= trials[-1].items():
             raise InputError(
@@ -116,16 +119,19 @@ def draws(
 
 
 def run_trial(
-    draw: dict[str, Any], folder: Path, size_px: int, report: Callable[[str], None]
+    draw: dict[str, Any],
+    folder: Path,
+    size_px: int,
+    arms: Sequence[Arm],
+    report: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Both rounds of one trial, with optimised and with random layouts."""
+    """Both rounds of one trial, with optimised and with random layouts, or with one of these."""
     report(f"trial {draw['number']}: {draw['knob']}")
     found = strength_for_rms(draw["knob"], draw["rms_nm"], seed=draw["seed"])
     card = simulate(folder / "fab", count=SCANS, size_px=size_px, seed=draw["seed"], knobs=[found.setting])
     build_dataset(card, folder / "first.zarr")
     findings, questions = first_round(folder)
     answers: dict[str, Any] = {}
-    arms: tuple[Arm, ...] = ("optimised", "random")
     for arm in arms:
         plan = next_print(
             folder / "loop",
@@ -141,10 +147,12 @@ def run_trial(
             folder / f"plan-{arm}", folder / "fab", folder / f"fab-{arm}", seed=draw["seed"] + 1
         )
         build_dataset(printed, folder / f"{arm}.zarr")
-        new = prepare_scans(open_store(folder / f"{arm}.zarr").scans())
+        store = open_store(folder / f"{arm}.zarr")
+        new, gratings = prepare_scans(store.scans()), grating_scans(store)
         planned = {q.name: q for q in plan.questions}
         answers[arm] = [
-            judged(one, planned[one.question], draw["knob"]) for one in decide(findings, questions, new)
+            judged(one, planned[one.question], draw["knob"])
+            for one in decide(findings, questions, new, gratings=gratings)
         ]
     return {**draw, "strength": found.setting.strength, "reached_rms_nm": found.rms_nm, "answers": answers}
 
@@ -204,9 +212,8 @@ def line_of(trial: dict[str, Any]) -> str:
 
 def summary(trials: list[dict[str, Any]]) -> str:
     """How many questions were decided rightly, by arm and by predicted power."""
-    arms: tuple[Arm, ...] = ("optimised", "random")
     rows = []
-    for arm in arms:
+    for arm in (one for one in ARMS if any(one in trial["answers"] for trial in trials)):
         every = [one for trial in trials for one in trial["answers"].get(arm, [])]
         asked = [one for one in every if one["counts"]]
         stray = sum(one["wrong"] for one in every if not one["counts"])

@@ -94,9 +94,9 @@ def _unevenly_written(nominal: np.ndarray, canvas: Canvas, strength: float) -> n
     inside = np.clip(at_um, 0, side_um)
     meant_um = 2 * inside / (onwards + np.sqrt(onwards**2 - 4 * strength * inside / side_um))
     rows, columns = np.indices(nominal.shape, dtype=np.float64)
-    columns += (meant_um - inside) / canvas.pitch_um
+    meant = columns + (meant_um - inside) / canvas.pitch_um
     # The spot smooths what a cubic overshoots at the edges of levels.
-    return scipy.ndimage.map_coordinates(nominal, [rows, columns], order=3, mode="nearest")
+    return scipy.ndimage.map_coordinates(nominal, [rows, meant], order=3, mode="nearest")
 
 
 def field_starts(size_px: int, side_px: int) -> list[int]:

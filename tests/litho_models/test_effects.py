@@ -306,7 +306,7 @@ def test_uneven_scanners_of_printer_and_microscope_are_one_formula_until_the_sca
     assert float((across - printed).abs().max()) > 1e-3
     back = scanned.as_scanned(square, values, replace(context, backward=True))
     assert torch.allclose(back, written(square, {"strength": -0.03}, context), rtol=0, atol=1e-12)
-    # A part of a larger write field is bent as that field is: by c x² / 2R, here with 2R of four times its size.
+    # A part of a write field of four times its size is bent as that field is, by c x² / 2R.
     wide = written(square, {"strength": 0.12}, replace(context, field_radius_um=4 * context.radius_um()))
     assert torch.allclose(wide, printed, rtol=0, atol=1e-12)
 

@@ -333,7 +333,9 @@ def test_a_plan_is_a_dataset_in_waiting_and_resumes(tmp_path: Path) -> None:
     jobs = {job.id: job for job in jobs_of_card(tmp_path / "plan" / "card.toml", first=5)}
     assert jobs["N1F2"].turned_deg == 90
     assert jobs["N1F1"].printed == jobs["N1F2"].printed != jobs["N2F1"].printed
-    assert {jobs[name].use for name in ("N0F1", "N0F2", "N0F3")} == {"substrate", "flat", "steps"}
+    references = [jobs[f"N0F{n}"] for n in (1, 2, 3, 4)]
+    assert [one.use for one in references] == ["substrate", "flat", "steps", "grating"]
+    assert references[-1].grating_um == 1.0
     assert (tmp_path / "plan" / "microscope.md").read_text("utf-8").count("90°") >= 2
     assert not (tmp_path / "plan-cache").exists()
 
@@ -660,3 +662,22 @@ def test_a_plan_is_printed_by_the_same_machine_with_new_chance() -> None:
     assert abs(agreement(first.height_um, other.height_um)) < 0.6
     sharp = scan_job(fab, Job("N1F3", level, index=13, print_index=12, tip=2.0))
     assert not np.array_equal(again.height_um, sharp.height_um)
+
+
+def test_a_grating_is_a_second_answer_to_whose_a_distortion_is() -> None:
+    from litho_data.build.gratings import GratingScan
+    from litho_models.loop.second_answer import said_by_gratings
+
+    rivals = [
+        Rival(
+            name=name, effects={name: {"strength": 0.04}}, scan_frame=[], vector=[0.04], information=[[1.0]]
+        )
+        for name in ("galvo-nonlinearity", "piezo-nonlinearity")
+    ]
+    question = slope_question().model_copy(update={"rivals": rivals})
+    for bow_um, told in ((0.2, "it is the scanner's"), (0.0, "it is not the scanner's"), (0.11, "too near")):
+        # 0.04 of 20 µm is 0.2 µm in the middle; a line twice as long is bent four times as much.
+        one = GratingScan(id="G", period_um=2.0, line_um=40.0, bow_um=4 * bow_um, bow_sd_um=0.04)
+        assert told in said_by_gratings(question, [one], 20.0)
+    assert said_by_gratings(slope_question(), [one], 20.0) == ""
+    assert said_by_gratings(question, [one.model_copy(update={"bow_um": None})], 20.0) == ""
