@@ -154,7 +154,13 @@ def run_trial(
             judged(one, planned[one.question], draw["knob"])
             for one in decide(findings, questions, new, gratings=gratings)
         ]
-    return {**draw, "strength": found.setting.strength, "reached_rms_nm": found.rms_nm, "answers": answers}
+    return {
+        **draw,
+        "strength": found.setting.strength,
+        "reached_rms_nm": found.rms_nm,
+        "named": findings.search.names,
+        "answers": answers,
+    }
 
 
 def first_round(folder: Path) -> tuple[LoopFindings, OpenQuestions]:
