@@ -210,12 +210,14 @@ def _base_model(base: str, store: Store) -> tuple[Simulator, str]:
 
 
 def _attributed(result: CloseLoop) -> dict[str, str]:
-    """Whose an effect is where the catalogue does not know it and new prints have decided."""
+    """Whose an effect is where new prints have decided, and not the catalogue."""
     sides = {"process": "printer", "measurement": "microscope"}
     return {
         effect.name: sides[effect.role]
         for effect in result.effects
-        if effect.role in sides and get_effect(effect.name).role == "undetermined"
+        if effect.role in sides
+        and not get_effect(effect.name).per_scan
+        and get_effect(effect.name).role != effect.role
     }
 
 

@@ -25,7 +25,7 @@ from litho_models.loop.linear import ALL_FREE
 from litho_models.loop.open_questions import as_scanned
 from litho_models.loop.parameters import chain_at, get_vector
 from litho_models.loop.prepared import PreparedScan
-from litho_models.loop.result.questions import IN_SCAN, OpenQuestions, Question, Rival
+from litho_models.loop.result.questions import IN_PRINT, IN_SCAN, OpenQuestions, Question, Rival, effect_of
 from litho_models.loop.result.record import AddedEffect, CloseLoop, Comparison, Decided, Decision
 from litho_models.loop.rival_fits import fit_rivals
 from litho_models.loop.second_answer import said_by_gratings
@@ -82,11 +82,13 @@ def with_decisions(result: CloseLoop, decisions: list[Decision]) -> CloseLoop:
 
     def decided(effect: AddedEffect) -> AddedEffect:
         left = named.get(effect.name, "")
-        if left.removesuffix(IN_SCAN) != effect.name:
+        if effect_of(left) != effect.name:
             return effect
         changes: dict[str, Any] = {"verdict": "explained", "confusable_with": []}
         if effect.role == "undetermined":
             changes["role"] = "measurement" if left.endswith(IN_SCAN) else "process"
+        elif left.endswith(IN_PRINT):
+            changes["role"] = "process"
         return effect.model_copy(update=changes)
 
     return result.model_copy(
@@ -95,7 +97,7 @@ def with_decisions(result: CloseLoop, decisions: list[Decision]) -> CloseLoop:
 
 
 def _among_rivals(findings: LoopFindings, question: Question, new: Sequence[PreparedScan]) -> Decision:
-    own = {rival.name.removesuffix(IN_SCAN) for rival in question.rivals}
+    own = {effect_of(rival.name) for rival in question.rivals}
     names = [rival.name for rival in question.rivals]
     chains = [_chain(findings, rival) for rival in question.rivals]
     starts = [np.array(rival.vector) for rival in question.rivals]
@@ -119,6 +121,7 @@ def _chain(findings: LoopFindings, rival: Rival, *, without: Collection[str] = (
         full_height_um=chain.full_height_um,
         pitch_um=chain.pitch_um,
         scan_frame=[name for name in rival.scan_frame if name in kept],
+        print_frame=[name for name in rival.print_frame if name in kept],
     )
 
 

@@ -28,16 +28,17 @@ from litho_data.virtual_fab.printer import Job
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 from litho_models.effects import FieldContext, get_effect
 from litho_models.effects.chain import EffectChain
+from litho_models.effects.registry import TIP
 from litho_models.fitting.least_squares import fit_least_squares
 from litho_models.frozen.files import save_frozen
 from litho_models.loop.decision_error import Z_DECIDED, surely_better
 from litho_models.loop.fold_fits import RULES, ChainProblem
-from litho_models.loop.open_questions import _screened
+from litho_models.loop.open_questions import _frames, _screened
 from litho_models.loop.parameters import chain_at, get_vector
 from litho_models.loop.prepared import prepare_scans
 from litho_models.loop.residual_spectrum import NoiseSpectrum, residual_spectrum
 from litho_models.loop.result.exporting import part_of
-from litho_models.loop.result.questions import IN_SCAN, OpenQuestions, Question, Rival
+from litho_models.loop.result.questions import IN_PRINT, IN_SCAN, OpenQuestions, Question, Rival
 from litho_models.loop.result.record import AddedEffect, CloseLoop, Decision
 from litho_models.loop.rival_fits import fit_rivals
 from litho_models.loop.run import _attributed, _new_scans
@@ -385,10 +386,19 @@ def test_the_plan_for_the_measured_prints_is_ready_and_of_the_published_loop() -
 # --- the second round
 
 
-def second_round(frame: tuple[str, ...], seed: int) -> list:
+def second_round(
+    frame: tuple[str, ...], seed: int, effects: dict = SLOPE, print_frame: tuple[str, ...] = ()
+) -> list:
     """Two prints, each scanned at 0 and 90 degrees, slope loss by the printer or by the microscope."""
     random = np.random.default_rng(seed)
-    chain = EffectChain(true_model({}).base, SLOPE, full_height_um=1.2, pitch_um=0.1, scan_frame=frame)
+    chain = EffectChain(
+        true_model({}).base,
+        effects,
+        full_height_um=1.2,
+        pitch_um=0.1,
+        scan_frame=frame,
+        print_frame=print_frame,
+    )
     turned = np.array([[0.0, -1.0, 6.4], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     scans = []
     for number, plain in enumerate(printed_scans(size_px=64, count=2, noise_um=0, seed=seed)):
@@ -416,6 +426,36 @@ def test_two_turned_prints_say_whose_a_loss_on_slopes_is(frame: tuple[str, ...])
     decision = decide(findings, opened([slope_question()]), prepare_scans(second_round(frame, 5)))[0]
     assert decision.verdict == "decided"
     assert decision.left == ["slope-thinning" + IN_SCAN * bool(frame)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("printers", [False, True])
+def test_two_turned_prints_say_whether_an_asymmetric_tip_is_one(printers: bool) -> None:
+    """In one orientation a print whose flanks stand proud along one axis looks the same."""
+    effects = {TIP: {"radius_um": 0.6, "along": 1.0, "across": 0.25}}
+    start = true_model(effects)
+    assert _frames(TIP, start.values()[TIP]) == ["", IN_PRINT]
+    assert _frames(TIP, {**start.values()[TIP], "across": 1.0}) == [""]
+    rivals = [
+        rival(TIP + suffix, effects, []).model_copy(update={"print_frame": [TIP] * bool(suffix)})
+        for suffix in ("", IN_PRINT)
+    ]
+    findings = SimpleNamespace(
+        search=SimpleNamespace(state=SimpleNamespace(fits=SimpleNamespace(chain=start))),
+        development=prepare_scans(printed_scans(effects, size_px=64, count=4)),
+        study=SimpleNamespace(blocks=Blocks()),
+    )
+    question = slope_question().model_copy(update={"name": TIP, "rivals": rivals})
+    new = second_round((), 5, effects, print_frame=(TIP,) * printers)
+    decision = decide(findings, opened([question]), prepare_scans(new))[0]
+    assert decision.verdict == "decided"
+    assert decision.left == [TIP + IN_PRINT * printers]
+    effect = AddedEffect.model_construct(
+        name=TIP, role="measurement", verdict="explained", confusable_with=[]
+    )
+    decided = with_decisions(CloseLoop.model_construct(effects=[effect]), [decision])
+    assert part_of(decided.effects[0]) == ("process" if printers else "measurement")
+    assert _attributed(decided) == ({TIP: "printer"} if printers else {})
 
 
 @pytest.mark.parametrize(("share", "verdict"), [(0.005, "still open"), (0.03, "decided")])
