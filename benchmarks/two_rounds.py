@@ -16,7 +16,7 @@ import argparse
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -25,6 +25,7 @@ from scipy.stats import binomtest
 from benchmarks.markdown_table import markdown_table
 from benchmarks.record import conclude, origin, write_record
 from litho_data.build.build import build_dataset
+from litho_data.build.gratings import grating_scans
 from litho_data.foundation.commands import run_script
 from litho_data.foundation.errors import InputError
 from litho_data.store import open_store
@@ -63,6 +64,7 @@ RMS_NM = (12.0, 30.0)
 # Bins of the predicted power.
 POWERS = ((0.0, 0.2), (0.2, 0.95), (0.95, 1.01))
 Arm = Literal["optimised", "random"]
+ARMS: tuple[Arm, ...] = get_args(Arm)
 
 
 def main() -> None:
@@ -73,17 +75,19 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of the trials")
     parser.add_argument("--trials", type=int, default=48)
     parser.add_argument("--seed", type=int, default=20271, help="of everything that is drawn")
-    parser.add_argument("--knobs", nargs="+", choices=DEALT, default=DEALT, help="what is planted, in turn")
+    parser.add_argument("--knobs", nargs="+", choices=KNOBS, default=DEALT, help="what is planted, in turn")
+    parser.add_argument("--rms-nm", nargs=2, type=float, default=RMS_NM, help="smallest and largest size")
+    parser.add_argument("--arms", nargs="+", choices=ARMS, default=ARMS, help="layouts of the second round")
     parser.add_argument("--size", type=int, default=192, help="side of a layout, pixels")
     parser.add_argument("--publish", action="store_true", help="write the figures into the page")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     trials = []
-    for draw in draws(arguments.trials, arguments.seed, arguments.knobs):
+    for draw in draws(arguments.trials, arguments.seed, arguments.knobs, arguments.rms_nm):
         folder = arguments.out / f"{draw['number']:02d}"
         kept = folder / "trial.json"
         if not kept.is_file():
-            write_record(kept, run_trial(draw, folder, arguments.size, print))
+            write_record(kept, run_trial(draw, folder, arguments.size, arguments.arms, print))
         trials.append(json.loads(kept.read_text(encoding="utf-8")))
         if not draw.items() <= trials[-1].items():
             raise InputError(
@@ -98,14 +102,16 @@ def main() -> None:
     conclude(record, summary(trials), out, PAGE, f"two-rounds-{arguments.seed}", published=arguments.publish)
 
 
-def draws(count: int, seed: int, knobs: Sequence[str] = DEALT) -> list[dict[str, Any]]:
+def draws(
+    count: int, seed: int, knobs: Sequence[str] = DEALT, rms_nm: Sequence[float] = RMS_NM
+) -> list[dict[str, Any]]:
     """What is planted in each trial: knobs dealt in turn, sizes log-uniform, a seed of its own."""
     random = np.random.default_rng([seed, 17])
     return [
         {
             "number": number,
             "knob": knobs[number % len(knobs)],
-            "rms_nm": float(np.exp(random.uniform(*np.log(RMS_NM)))),
+            "rms_nm": float(np.exp(random.uniform(*np.log(rms_nm)))),
             "seed": int(random.integers(1, 2**20)),
         }
         for number in range(count)
@@ -113,16 +119,19 @@ def draws(count: int, seed: int, knobs: Sequence[str] = DEALT) -> list[dict[str,
 
 
 def run_trial(
-    draw: dict[str, Any], folder: Path, size_px: int, report: Callable[[str], None]
+    draw: dict[str, Any],
+    folder: Path,
+    size_px: int,
+    arms: Sequence[Arm],
+    report: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Both rounds of one trial, with optimised and with random layouts."""
+    """Both rounds of one trial, with optimised and with random layouts, or with one of these."""
     report(f"trial {draw['number']}: {draw['knob']}")
     found = strength_for_rms(draw["knob"], draw["rms_nm"], seed=draw["seed"])
     card = simulate(folder / "fab", count=SCANS, size_px=size_px, seed=draw["seed"], knobs=[found.setting])
     build_dataset(card, folder / "first.zarr")
     findings, questions = first_round(folder)
     answers: dict[str, Any] = {}
-    arms: tuple[Arm, ...] = ("optimised", "random")
     for arm in arms:
         plan = next_print(
             folder / "loop",
@@ -138,12 +147,20 @@ def run_trial(
             folder / f"plan-{arm}", folder / "fab", folder / f"fab-{arm}", seed=draw["seed"] + 1
         )
         build_dataset(printed, folder / f"{arm}.zarr")
-        new = prepare_scans(open_store(folder / f"{arm}.zarr").scans())
+        store = open_store(folder / f"{arm}.zarr")
+        new, gratings = prepare_scans(store.scans()), grating_scans(store)
         planned = {q.name: q for q in plan.questions}
         answers[arm] = [
-            judged(one, planned[one.question], draw["knob"]) for one in decide(findings, questions, new)
+            judged(one, planned[one.question], draw["knob"])
+            for one in decide(findings, questions, new, gratings=gratings)
         ]
-    return {**draw, "strength": found.setting.strength, "reached_rms_nm": found.rms_nm, "answers": answers}
+    return {
+        **draw,
+        "strength": found.setting.strength,
+        "reached_rms_nm": found.rms_nm,
+        "named": findings.search.names,
+        "answers": answers,
+    }
 
 
 def first_round(folder: Path) -> tuple[LoopFindings, OpenQuestions]:
@@ -201,9 +218,8 @@ def line_of(trial: dict[str, Any]) -> str:
 
 def summary(trials: list[dict[str, Any]]) -> str:
     """How many questions were decided rightly, by arm and by predicted power."""
-    arms: tuple[Arm, ...] = ("optimised", "random")
     rows = []
-    for arm in arms:
+    for arm in (one for one in ARMS if any(one in trial["answers"] for trial in trials)):
         every = [one for trial in trials for one in trial["answers"].get(arm, [])]
         asked = [one for one in every if one["counts"]]
         stray = sum(one["wrong"] for one in every if not one["counts"])

@@ -34,8 +34,8 @@ _PRINTER_RANGES = {
 # The plan of boards up to seed 20266: shares of the trials; what rounding leaves over goes to single effects.
 EARLIER_RMS_NM = (4.0, 60.0)
 FEWEST_TRIALS = 4
-# Knobs that came after the earlier boards, which are drawn as they were.
-_LATER = ("stitching",)
+# Knobs that came after the boards that are published, which are drawn as they were.
+_LATER = ("stitching", "galvo-nonlinearity", "asymmetric-tip")
 _SHARES: dict[Kind, float] = {"two": 0.15, "none": 0.1, "off-catalogue": 0.15}
 
 
@@ -50,7 +50,7 @@ def draw_board(seed: int) -> list[Draw]:
         InputError: a negative seed.
     """
     rng = _rng(seed)
-    named = [knob for knob in KNOBS.values() if knob.effect != OFF_CATALOGUE]
+    named = [one for one in KNOBS.values() if one.effect != OFF_CATALOGUE and one.name not in _LATER]
     aliases = [knob.name for knob in named if knob.nuisance_span or knob.refit_absorbs]
     in_form = [knob.name for knob in named if knob.name not in {*aliases, *_NOT_DEALT}]
     decks: dict[Kind, Iterator[str]] = {
@@ -87,10 +87,9 @@ def draw_earlier(count: int, seed: int) -> list[Draw]:
     some: list[Kind] = [kind for kind, share in _SHARES.items() for _ in range(max(1, round(share * count)))]
     singles: list[Kind] = ["single"] * (count - len(some))
     kinds = [*some, *singles]
-    catalogue = _deal([name for name, knob in KNOBS.items() if knob.effect != OFF_CATALOGUE], rng)
-    outside = _deal(
-        [name for name, knob in KNOBS.items() if knob.effect == OFF_CATALOGUE and name not in _LATER], rng
-    )
+    known = {name: knob.effect != OFF_CATALOGUE for name, knob in KNOBS.items() if name not in _LATER}
+    catalogue = _deal([name for name, inside in known.items() if inside], rng)
+    outside = _deal([name for name, inside in known.items() if not inside], rng)
     trials = []
     for number, place in enumerate(rng.permutation(count)):
         kind = kinds[place]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from litho_data.build.gratings import GratingScan, grating_scans
 from litho_data.foundation.files import atomic_file
 from litho_data.foundation.report import Page
 from litho_data.foundation.report_pictures import colour_bar_png, coloured_png
@@ -72,6 +73,18 @@ _BUDGET: dict[str, tuple[str, str]] = {
     "sigma_levelling_nm": ("levelling (nm)", "what the removed surface may be off"),
     "sigma_calibration_nm": ("z calibration (nm)", "height times the uncertainty of the z scale in the card"),
 }
+_GRATING: dict[str, tuple[str, str]] = {
+    "id": ("scan", ""),
+    "scale_x": ("scale along x", "what a stated length has to be multiplied by to be true"),
+    "scale_x_sd": ("its uncertainty", "standard uncertainty, with that of the period"),
+    "scale_y": ("scale along y", "the same across the lines"),
+    "scale_y_sd": ("its uncertainty, y", "standard uncertainty, with that of the period"),
+    "bow_um": ("bow of a line (µm)", "how far the middle of a line lies too far, against its ends"),
+    "bow_sd_um": ("its uncertainty (µm)", "standard uncertainty, from the scatter along the line"),
+    "tip_um": ("tip radius (µm)", "of the tip's end"),
+    "tip_bound": ("at most", "whether the radius is only the most that it can be"),
+    "problem": ("not measured", "why the grating does not show its figures"),
+}
 
 
 def write_report(result: BuildResult, store_path: Path, folder: Path) -> Path:
@@ -81,12 +94,13 @@ def write_report(result: BuildResult, store_path: Path, folder: Path) -> Path:
         f"Dataset {store.name}",
         "Raw scans read, levelled, registered onto their layouts and stored.",
         facts={"dataset": store.sha256},
-        words=_TABLE | _BUDGET,
+        words=_TABLE | _BUDGET | _GRATING,
     )
     _summary(page, result, store)
     _pictures(page, store)
     _left_out(page, result)
     _warnings(page, store.quality)
+    _gratings(page, grating_scans(store))
     _quality(page, store.quality)
     result.write(folder)
     with atomic_file(folder / "quality.csv") as temporary:
@@ -154,6 +168,20 @@ def _quality(page: Page, quality: pd.DataFrame) -> None:
             "aside. z calibration is 0 if the card has none: the error of the z scale is then not contained",
             "uncertainty.csv",
             digits=2,
+        )
+
+
+def _gratings(page: Page, scans: Sequence[GratingScan]) -> None:
+    import pandas as pd
+
+    if scans:
+        page.heading("What the grating says about the microscope")
+        page.table(
+            pd.DataFrame([{name: getattr(one, name) for name in _GRATING} for one in scans]),
+            "Scales, unevenness of a line and tip, from the known period of the grating; no other scan is "
+            "corrected by them",
+            "gratings.csv",
+            digits=4,
         )
 
 

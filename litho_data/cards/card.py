@@ -14,7 +14,7 @@ from litho_data.foundation.results import Record, first_error
 from litho_data.foundation.units import um_per
 from litho_data.readers.registry import formats, reader_of
 
-Use = Literal["dataset", "flat", "substrate", "steps"]
+Use = Literal["dataset", "flat", "substrate", "steps", "grating"]
 Registration = Literal["affine", "homography", "ladder"]
 
 
@@ -205,6 +205,13 @@ class Write(Record):
     field_um: Length | None = None
 
 
+class KnownGrating(Record):
+    """The grating that scans of the use ``grating`` show: period along both axes, from its certificate."""
+
+    period_um: Length
+    uncertainty_um: float = Field(default=0.0, ge=0, allow_inf_nan=False)
+
+
 class Planned(Record):
     """Prints that were planned: the hash of the dataset whose open questions they are to decide."""
 
@@ -232,6 +239,7 @@ class Card(Record):
     write: Write | None = None
     plan: Planned | None = None
     calibration: Calibration | None = None
+    grating: KnownGrating | None = None
     source: Source | None = None
 
 

@@ -122,6 +122,12 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
                 columns={name: float(row[name]) for name in OPTIONAL_COLUMNS if name in row},
             )
         )
+    if card.grating is None and (unknown := [one.id for one in fields if one.use == "grating"]):
+        raise InputError(
+            f"card {file}: period of the grating of {unknown[0]}",
+            got="no [grating]",
+            wanted="period_um in that table, from its certificate",
+        )
     if not any(one.use == "dataset" for one in fields):
         shown = "; ".join(f"{one.id}: {one.reason}" for one in aside[:3]) or "no ids"
         raise InputError(f"card {file}: no field to build", got=shown, wanted="a layout and a scan of one id")

@@ -34,6 +34,7 @@ class CardText:
         write_field_um: side of the write field, µm, or None if it is not stated.
         plan_of: hash of the dataset that the layouts were planned from, or empty.
         scan_format: of the files of the microscope.
+        grating_um: period of the grating that scans of this use show, or None.
     """
 
     name: str
@@ -48,6 +49,7 @@ class CardText:
     write_field_um: float | None = None
     plan_of: str = ""
     scan_format: str = "text-matrix"
+    grating_um: float | None = None
 
     def toml(self) -> str:
         """The card's text."""
@@ -81,6 +83,8 @@ class CardText:
                 lines.append(f"field_um = {float(self.write_field_um)}")
         if self.plan_of:
             lines += ["", "[plan]", f"dataset_sha256 = {json.dumps(self.plan_of)}"]
+        if self.grating_um is not None:
+            lines += ["", "[grating]", f"period_um = {float(self.grating_um)}"]
         return "\n".join(lines) + "\n"
 
     def write(self, folder: Path) -> Path:

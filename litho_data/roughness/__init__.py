@@ -15,7 +15,7 @@ from litho_data.roughness.areal import (
     high_pass,
     low_pass,
 )
-from litho_data.roughness.grating import Scale, Wave, axis_scales, find_wave
+from litho_data.roughness.grating import Scale, Wave, axis_scales, find_wave, line_bow
 from litho_data.roughness.levelling_bias import (
     exponential_correlation,
     gaussian_correlation,
@@ -51,6 +51,7 @@ __all__ = [
     "gaussian_correlation",
     "groove_depth",
     "high_pass",
+    "line_bow",
     "line_direction",
     "line_period",
     "low_pass",

@@ -77,6 +77,29 @@ def find_wave(height_um: np.ndarray, pitch_um: tuple[float, float], period_um: f
     return Wave(float(x), float(y), error)
 
 
+def line_bow(height_um: np.ndarray, pitch_um: tuple[float, float], wave: Wave) -> tuple[float, float]:
+    """By how much the middle of a line lies too far along x, against its ends, µm; and its uncertainty.
+
+    A pixel at x of a line of length L shows what lies at x + 4 b (x / L) (1 - x / L), up to shift and scale.
+
+    Args:
+        height_um: (ny, nx) of a grating along x; ``pitch_um``: stated (y, x).
+        wave: as ``find_wave`` measured it.
+    """
+    y, x = (np.arange(n) * step for n, step in zip(height_um.shape, pitch_um, strict=True))
+    flat = np.nan_to_num(height_um - np.nanmean(height_um))
+    across = (flat * np.exp(-2j * np.pi * wave.y_per_um * y[:, None])).mean(axis=0)
+    places, phases = _phases(across * np.exp(-2j * np.pi * wave.x_per_um * x), x, 1 / wave.x_per_um)
+    displaced_um = phases / (2 * np.pi * wave.x_per_um)
+    from_middle = 2 * (places - x.mean()) / (len(x) * pitch_um[1])
+    design = np.column_stack([np.ones_like(places), from_middle, -(from_middle**2)])
+    weights, *_ = np.linalg.lstsq(design, displaced_um, rcond=None)
+    rest = displaced_um - design @ weights
+    freedom = max(len(places) - 3, 1)
+    variance = float(rest @ rest) / freedom * _OVERLAP_VARIANCE * np.linalg.inv(design.T @ design)[2, 2]
+    return float(weights[2]), _wider(freedom) * float(np.sqrt(variance))
+
+
 def axis_scales(waves: Sequence[tuple[Wave, float, float]], axes: Sequence[Axis]) -> dict[Axis, Scale]:
     """Scales of the axes whose gratings were measured, for a scanner without shear.
 
@@ -146,6 +169,10 @@ def _line(places: np.ndarray, phases: np.ndarray) -> tuple[float, float, float]:
     rest = phases - phases.mean() - slope * centred
     freedom = max(len(places) - 2, 1)
     scatter = float(np.sqrt(rest @ rest / freedom))
-    # The scatter of a few phases is uncertain itself: Student's t with this freedom is that much wider.
-    wider = (freedom / (freedom - 2)) ** 0.5 if freedom > 2 else 3.0
-    return slope, wider * scatter * float(np.sqrt(_OVERLAP_VARIANCE / (centred @ centred))), scatter
+    error = _wider(freedom) * scatter * float(np.sqrt(_OVERLAP_VARIANCE / (centred @ centred)))
+    return slope, error, scatter
+
+
+def _wider(freedom: int) -> float:
+    """The scatter of a few phases is uncertain itself: Student's t with this freedom is that much wider."""
+    return (freedom / (freedom - 2)) ** 0.5 if freedom > 2 else 3.0

@@ -234,12 +234,21 @@ class Store:
         return {row["scan"]: row["sha256"] for row in rows if json.loads(row["read"] or "{}")}
 
     def references(self) -> dict[str, str]:
-        """Scans outside the dataset: id and use (flat, substrate, steps); ``scan_frame`` has the heights."""
+        """Scans outside the dataset: id and use, such as flat; ``scan_frame`` has the heights."""
         if not has_child(self.root, "scans"):
             return {}
         groups = groups_in(group_of(self.root, "scans"))
         uses = {name: str(group.attrs["use"]) for name, group in groups.items()}
         return {name: use for name, use in sorted(uses.items()) if use != "dataset"}
+
+    def recorded_pitches_um(self) -> dict[str, tuple[float, float]]:
+        """Pitch (y, x) of the scans, references too, as their reader recorded it."""
+        pitches = {}
+        for row in self.manifest.get("files", []):
+            pitch = json.loads(row["read"] or "{}").get("pitch_um")
+            if pitch:
+                pitches[row["scan"]] = (float(pitch[0]), float(pitch[1]))
+        return pitches
 
     @cached_property
     def manifest(self) -> dict[str, Any]:

@@ -34,7 +34,11 @@ def scan_surface(
     """
     height, scan_index = surface_um, job.index
     if strength := (job.tip == 1) * knobs["tip-dilation"]:
-        height = _dilate_by_tip(height, frame.pitch_um, strength)
+        height = _dilate_by_tip(height, frame.pitch_um, (strength, strength))
+    if strength := (job.tip == 1) * knobs["asymmetric-tip"]:
+        rng = knobs.machine_rng("asymmetric-tip")
+        radii_um = rng.permutation([strength, strength / rng.uniform(3, 6)])
+        height = _dilate_by_tip(height, frame.pitch_um, (radii_um[0], radii_um[1]))
     if strength := knobs["feedback-lag"]:
         onwards = slice(None, None, int(job.direction))
         lag_um = strength * job.pixel_size
@@ -55,11 +59,11 @@ def scan_surface(
     return height
 
 
-def _dilate_by_tip(height: np.ndarray, pitch_um: float, radius_um: float) -> np.ndarray:
-    """Path of a paraboloid tip: ``max_u h(x − u) − u²/2R``, also between pixels."""
+def _dilate_by_tip(height: np.ndarray, pitch_um: float, radii_um: tuple[float, float]) -> np.ndarray:
+    """Path of a paraboloid tip of radii along y and x: ``max_u h(x − u) − u²/2R``, also between pixels."""
     # A paraboloid is a sum of two parabolas, so the maximum can be taken axis by axis.
-    columns_done = _dilate_columns(height, pitch_um, radius_um)
-    return _dilate_columns(columns_done.T, pitch_um, radius_um).T
+    columns_done = _dilate_columns(height, pitch_um, radii_um[0])
+    return _dilate_columns(columns_done.T, pitch_um, radii_um[1]).T
 
 
 def _dilate_columns(height: np.ndarray, pitch_um: float, radius_um: float) -> np.ndarray:

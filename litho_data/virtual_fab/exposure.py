@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy.ndimage
 import scipy.signal
 
 from litho_data.layouts.random_layout import random_layout
@@ -64,6 +65,8 @@ def accumulate_dose(
         rng = knobs.scan_rng("stitching", scan_index)
         offset_px = rng.standard_normal((len(starts[0]), len(starts[1]), 2)) * (strength / canvas.pitch_um)
         nominal = write_in_fields(nominal, starts, offset_px)
+    if strength := knobs["galvo-nonlinearity"]:
+        nominal = _unevenly_written(nominal, canvas, strength)
     line_energy = relative_dose * (1 + knobs["laser-drift"] * order) * _field_response(canvas, knobs)
     spot = _spot_transfer(canvas, printer, knobs)
     dose = apply_transfer(nominal * line_energy, spot)
@@ -80,6 +83,20 @@ def accumulate_dose(
     if strength := knobs["dose-exponent"]:
         dose = dose ** (1 + strength)
     return dose
+
+
+def _unevenly_written(nominal: np.ndarray, canvas: Canvas, strength: float) -> np.ndarray:
+    """Exposure with every point of a hatch line at x + strength·x(1 − x/L), 0 ≤ x ≤ L the write field."""
+    side_um = canvas.write_field_um
+    at_um = canvas.field_offset_um()[1] + side_um / 2
+    # Which point came to lie here: the root of x + strength·x(1 − x/L) = at that is 0 at 0.
+    onwards = 1 + strength
+    inside = np.clip(at_um, 0, side_um)
+    meant_um = 2 * inside / (onwards + np.sqrt(onwards**2 - 4 * strength * inside / side_um))
+    rows, columns = np.indices(nominal.shape, dtype=np.float64)
+    meant = columns + (meant_um - inside) / canvas.pitch_um
+    # The spot smooths what a cubic overshoots at the edges of levels.
+    return scipy.ndimage.map_coordinates(nominal, [rows, meant], order=3, mode="nearest")
 
 
 def field_starts(size_px: int, side_px: int) -> list[int]:

@@ -169,6 +169,7 @@ def jobs_of_card(path: str | Path, *, first: int = 0, printer: Printer | None = 
                 field_um=(float(row.get("field_y_um", 0.0)), float(row.get("field_x_um", 0.0))),
                 write_field_um=card.write.field_um if card.write else None,
                 use=cast(Use, row.get("use", "dataset")),
+                grating_um=card.grating.period_um if card.grating else None,
             )
         )
     return jobs

@@ -130,6 +130,8 @@ _TABLE = (
          "share of the dose lost to radicals left by earlier lines; the seed draws the decay, 1–4 µm"),
     Knob("galvo-lag", "galvo-lag", "exposure", "process", "µm", 1.5,
          "distance by which the beam lags along each hatch line"),
+    Knob("galvo-nonlinearity", "galvo-nonlinearity", "exposure", "process", "1", 0.1,
+         "bulge of the hatch lines, zero at both ends of the write field: displacement strength·x(1 − x/L)"),
     Knob("vignetting", "vignetting", "exposure", "process", "1", 0.9,
          "dose lost at the corner of the write field, growing with the squared distance from its centre"),
     Knob("field-curvature", "field-curvature", "exposure", "process", "µm", 0.5,
@@ -180,6 +182,9 @@ _TABLE = (
          "sd of a creep that decays over the first lines of each scan"),
     Knob("tip-dilation", "tip-dilation", "measurement", "measurement", "µm", 2.0,
          "radius of the tip's paraboloid"),
+    Knob("asymmetric-tip", "tip-dilation", "measurement", "measurement", "µm", 2.0,
+         "radius of the tip along its blunt axis; the seed draws the axis of the scan, and how much sharper "
+         "it is along the other one, 3–6 times"),
     Knob("feedback-lag", "feedback-lag", "measurement", "measurement", "µm", 2.0,
          "distance by which the feedback lags on falling edges; a third of it on rising ones"),
     Knob("registration-residual", "registration-residual", "measurement", "measurement", "µm", 1.0,

@@ -15,9 +15,11 @@ from litho_data.virtual_fab.random_curves import gaussian_field, line_roughness
 from litho_data.virtual_fab.resist import develop
 from litho_data.virtual_fab.settings import Noise, Printer
 
-Use = Literal["dataset", "flat", "substrate", "steps"]
+Use = Literal["dataset", "flat", "substrate", "steps", "grating"]
 
 _SUBSTRATE_GRAIN_UM = 0.3
+# Of a square calibration grating: height, and width of its flanks.
+_GRATING_UM, _FLANK_UM = 0.5, 0.2
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,8 @@ class Job:
         dose: two-photon dose relative to the recipe's.
         field_um: (y, x) centre of the layout in its write field, µm.
         write_field_um: side of the write field, µm; None for a field as large as the layout.
-        use: what the scan is for; nothing is printed for ``substrate``.
+        use: what the scan is for; nothing is printed for ``substrate``, nor for ``grating``, a standard.
+        grating_um: period of that standard, µm.
         print_index: number of the print in its set where one is scanned more than once; ``index`` if None.
         turned_deg: by how much the print lies turned under the microscope, whole quarters.
         direction: 1 for lines recorded on the way there, -1 on the way back.
@@ -48,6 +51,7 @@ class Job:
     field_um: tuple[float, float] = (0.0, 0.0)
     write_field_um: float | None = None
     use: Use = "dataset"
+    grating_um: float | None = None
     print_index: int | None = None
     turned_deg: float = 0.0
     direction: float = 1.0
@@ -91,6 +95,10 @@ def print_clean(job: Job, printer: Printer, knobs: KnobBoard, cause: Cause | Non
     canvas = job.canvas(printer.pitch_um)
     if job.use == "substrate":
         return np.zeros(canvas.level.shape)
+    if job.use == "grating" and job.grating_um is not None:
+        return _GRATING_UM * np.minimum(
+            *(_bars(at_um, job.grating_um) for at_um in (canvas.y_um, canvas.x_um))
+        )
     dose = accumulate_dose(
         canvas, printer, knobs, relative_dose=job.dose, order=job.order, scan_index=job.printed
     )
@@ -103,13 +111,19 @@ def print_clean(job: Job, printer: Printer, knobs: KnobBoard, cause: Cause | Non
     return cause.on_surface(height, canvas, job)
 
 
+def _bars(at_um: np.ndarray, period_um: float) -> np.ndarray:
+    """1 on bars of half a period, 0 between them, straight flanks."""
+    away_um = np.abs(at_um % period_um - period_um / 2)
+    return np.clip(0.5 + (away_um - period_um / 4) / _FLANK_UM, 0.0, 1.0)
+
+
 def surface_noise(
     job: Job, printer: Printer, noise: Noise, knobs: KnobBoard, rng: np.random.Generator
 ) -> np.ndarray:
     """Roughness of the surface, on the canvas, µm."""
     canvas = job.canvas(printer.pitch_um)
     shape = canvas.level.shape
-    if job.use == "substrate":
+    if job.use in ("substrate", "grating"):
         grain_psd = gaussian_transfer(shape, printer.pitch_um, _SUBSTRATE_GRAIN_UM) ** 2
         return 1e-3 * noise.substrate_nm * gaussian_field(grain_psd, rng, shape)
     rough_nm = noise.roughness_nm * line_roughness(shape, printer.pitch_um, rng)

@@ -120,6 +120,7 @@ def simulate(
         rows: list[tuple[object, ...]] = []
         scans: list[ScanTruth] = []
         size_um = (0.0, 0.0)
+        grating_um: float | None = None
         for job in progress(source, "printing and scanning", total):
             scan = scan_job(fab, job)
             write_layout(raw, job.id, job.level)
@@ -127,10 +128,12 @@ def simulate(
             np.save(hidden / "prints" / f"{job.id}.npy", scan.clean_um.astype(np.float32))
             np.save(hidden / "surfaces" / f"{job.id}.npy", scan.surface_um.astype(np.float32))
             size_um = scan.frame.size_um
-            write_field_um = job.write_field_um
+            write_field_um, grating_um = job.write_field_um, job.grating_um
             rows.append(_row(job, len(rows)))
             scans.append(_scan_truth(scan))
-        _write_card(raw, fab, name, size_um, rows, metadata, write_field_um, plan_of, print_pattern)
+        _write_card(
+            raw, fab, name, size_um, rows, metadata, write_field_um, plan_of, print_pattern, grating_um
+        )
         Truth(**facts, scans=scans).write(hidden)
     return Path(out) / "raw" / "card.toml"
 
@@ -192,6 +195,7 @@ def _write_card(
     write_field_um: float | None,
     plan_of: str,
     print_pattern: str,
+    grating_um: float | None,
 ) -> None:
     full = metadata == "full"
     in_prints = all(re.fullmatch(print_pattern, str(row[0])) for row in rows)
@@ -212,6 +216,7 @@ def _write_card(
         scan_format=fab.microscope.files,
         slow_axis="y" if full else "",
         write_field_um=write_field_um if full else None,
+        grating_um=grating_um if full else None,
     ).write(raw)
 
 

@@ -21,7 +21,8 @@ class EffectChain(nn.Module):
         full_height_um: nominal height of the highest level, µm.
         pitch_um: lateral sampling, µm.
         scan_frame: height effects that act as the microscope's do, whatever the catalogue says: turned with
-            the scan. Those of the stage ``measurement`` always do.
+            the scan. Those of the stage ``measurement`` do,
+        print_frame: but for these, which keep to the print.
     """
 
     def __init__(
@@ -32,12 +33,14 @@ class EffectChain(nn.Module):
         full_height_um: float,
         pitch_um: float,
         scan_frame: Collection[str] = (),
+        print_frame: Collection[str] = (),
     ):
         super().__init__()
         self.base = base
         self.full_height_um = full_height_um
         self.pitch_um = pitch_um
         self.scan_frame = frozenset(scan_frame)
+        self.print_frame = frozenset(print_frame)
         self.names = tuple(in_forward_order(list(effects)))
         self.fitted: list[tuple[str, str]] = []
         for name in self.names:
@@ -80,14 +83,21 @@ class EffectChain(nn.Module):
 
     def with_effects(self, effects: Mapping[str, Mapping[str, float]]) -> EffectChain:
         """The same base (shared, not copied) with other effects."""
-        geometry = {"full_height_um": self.full_height_um, "pitch_um": self.pitch_um}
-        return EffectChain(self.base, effects, **geometry, scan_frame=self.scan_frame)
+        return EffectChain(
+            self.base,
+            effects,
+            full_height_um=self.full_height_um,
+            pitch_um=self.pitch_um,
+            scan_frame=self.scan_frame,
+            print_frame=self.print_frame,
+        )
 
     def _run_stage(self, acts_on: str, field: Tensor, context: FieldContext) -> Tensor:
         for name in self.names:
             effect = get_effect(name)
             if effect.acts_on == acts_on:
                 scanned = effect.stage == "measurement" or name in self.scan_frame
+                scanned = scanned and name not in self.print_frame
                 apply = effect.as_scanned if scanned else effect.apply
                 field = apply(field, self._tensors(effect), context)
         return field

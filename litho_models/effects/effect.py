@@ -230,10 +230,10 @@ class Effect:
                 )
 
     def __call__(self, array: Tensor, values: Mapping[str, float | Tensor], context: FieldContext) -> Tensor:
-        """Apply the effect; numbers become tensors on the array's device."""
+        """Apply the effect; numbers become tensors on the array's device, parameters not named are off."""
         tensors = {
             name: torch.as_tensor(value, dtype=array.dtype, device=array.device)
-            for name, value in values.items()
+            for name, value in {**self.off_values(), **values}.items()
         }
         return self.apply(array, tensors, context)
 

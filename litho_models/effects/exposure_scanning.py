@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from litho_models.effects.effect import Effect, FieldContext, Parameter, Values, of_exposure
-from litho_models.effects.filters import add_filtered, centred_lag, trailing_response
+from litho_models.effects.filters import add_filtered, add_warp, centred_lag, trailing_response
 
 _TAIL_LENGTHS = 6
 # A slower wave is no ripple: maps of the field look like it.
@@ -26,6 +26,20 @@ def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
 
     reach = _TAIL_LENGTHS * float(length.detach()) + context.pitch_um
     return add_filtered(layout, transfer_minus_one, context.pitch_um, reach)
+
+
+def galvo_nonlinearity(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """M(x + c (r² / 3 - x²) / 2R) along the written lines, x from the centre of a field of half width r.
+
+    That is c x (1 - x / 2R) over the write field, R its half width, without what registration has taken out.
+    """
+    lines_along_x = context.slow_axis == "y"
+    y, x = context.scan_position()
+    half_um = context.whole_shape()[1 if lines_along_x else 0] * context.pitch_um / 2
+    bulge_um = values["strength"] * half_um**2 / (2 * context.radius_um())
+    along = bulge_um * (1 / 3 - (x if lines_along_x else y) ** 2)
+    shifts = (0 * y, along) if lines_along_x else (along, 0 * x)
+    return add_warp(layout, *shifts, context.pitch_um)
 
 
 def write_order_memory(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -75,6 +89,15 @@ EFFECTS = (
         source="first-order lag of the deflection, l = speed x time constant",
         separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
         linear=True,
+    ),
+    of_exposure(
+        name="galvo-nonlinearity",
+        title="scanner of the printer running unevenly along the written lines",
+        parameters={"strength": Parameter("1", -0.05, 0.05, 0.005)},
+        apply=galvo_nonlinearity,
+        trials=({"strength": 0.005},),
+        source="distortion of the write field by a galvo or a stage, quadratic along the line",
+        separating="scan each print at 0 and 90 degrees; scan a calibration grating",
     ),
     Effect(
         name="write-order-memory",

@@ -13,16 +13,22 @@ from litho_models.effects.effect import FieldContext, Parameter, Values, of_micr
 # Cubic interpolation half-way between four neighbours.
 _MIDDLE = (-1 / 16, 9 / 16, 9 / 16, -1 / 16)
 _SHARPEST_UM = 1e-3
+# Of the radius, along the sharper axis of an asymmetric tip.
+_SHARPER = 0.25
 
 
 def tip_dilation(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """max over u of H(x - u) - u² / 2R, the path of a paraboloid; H + R |grad H|² / 2 to first order."""
+    """max over u of H(x - u) - u² / 2R, the path of a paraboloid; H + R |grad H|² / 2 to first order.
+
+    A tip may be sharper along the scan lines or across them: ``along`` and ``across`` are shares of R.
+    """
     radius = values["radius_um"]
     # The formula divides by the radius: a sharper tip is taken in proportion, down to none at all.
     blunt = radius.clamp(min=_SHARPEST_UM)
     # A paraboloid is the sum of two parabolas: the axes take their maxima one after the other.
-    columns_done = _dilate_rows(height.transpose(-1, -2), blunt, context.pitch_um).transpose(-1, -2)
-    dilated = _dilate_rows(columns_done, blunt, context.pitch_um)
+    across, along = blunt * values["across"], blunt * values["along"]
+    columns_done = _dilate_rows(height.transpose(-1, -2), across, context.pitch_um).transpose(-1, -2)
+    dilated = _dilate_rows(columns_done, along, context.pitch_um)
     return height + radius / blunt * (dilated - height)
 
 
@@ -74,11 +80,20 @@ EFFECTS = (
     of_microscope(
         name="tip-dilation",
         title="tip of finite radius widening tops",
-        parameters={"radius_um": Parameter("µm", 0.0, 2.0, 0.04)},
+        parameters={
+            "radius_um": Parameter("µm", 0.0, 2.0, 0.04),
+            "along": Parameter("1", _SHARPER, 1.0, 1.0, kind="choice"),
+            "across": Parameter("1", _SHARPER, 1.0, 1.0, kind="choice"),
+        },
         apply=tip_dilation,
-        trials=({"radius_um": 0.04}, {"radius_um": 0.4}),
-        source="dilation by a paraboloid; a worn tip is far blunter than a new one",
-        separating="scan again with a new tip; scan a tip characteriser",
+        trials=(
+            {"radius_um": 0.04},
+            {"radius_um": 0.4},
+            {"radius_um": 0.4, "across": _SHARPER},
+            {"radius_um": 0.4, "along": _SHARPER},
+        ),
+        source="dilation by a paraboloid; a worn tip is far blunter than a new one, often along one axis",
+        separating="scan again with a new tip, or turned if it is asymmetric; scan a tip characteriser",
         of_tip=True,
     ),
 )

@@ -24,6 +24,7 @@ _FORWARD_ORDER = (
     "dose-exponent",
     "elliptical-psf",
     "galvo-lag",
+    "galvo-nonlinearity",
     "vignetting",
     "laser-drift",
     "long-range-proximity",

@@ -6,13 +6,14 @@ again to all scans. A generic term of unknown role is kept as two: it goes with 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import CATALOGUE, get_effect
+from litho_models.effects.registry import TIP
 from litho_models.fitting.least_squares import eliminated_sum
 from litho_models.loop.explainable import GENERIC_TERMS, Learner
 from litho_models.loop.findings import LoopFindings
@@ -24,7 +25,15 @@ from litho_models.loop.probes import AddedProbe
 from litho_models.loop.probes.layout import LAYOUT_FEATURES
 from litho_models.loop.probes.probe import Probe
 from litho_models.loop.residual_spectrum import NoiseSpectrum, residual_spectrum
-from litho_models.loop.result.questions import IN_SCAN, Doing, OpenQuestions, Question, Rival, Turning
+from litho_models.loop.result.questions import (
+    IN_PRINT,
+    IN_SCAN,
+    Doing,
+    OpenQuestions,
+    Question,
+    Rival,
+    Turning,
+)
 from litho_models.loop.result.record import CloseLoop
 from litho_models.loop.rival_fits import fit_rivals
 from litho_models.loop.screening.score_test import FAMILY_P, Screened
@@ -88,8 +97,8 @@ def _of_named(
     """The set of a named effect, or whose it is."""
     entry = next(a for a in findings.search.added if a.effect.name == name)
     members = [other for other in entry.confusable_with if not get_effect(other).per_scan]
-    alone = get_effect(name).role == "undetermined"
-    if not members and not alone:
+    either = len(_frames(name, findings.search.state.fits.chain.values()[name])) > 1
+    if not members and not either:
         return []
     report(f"fitting the rivals of {name}")
     rivals = _rivals(findings, name, [name, *members])
@@ -172,21 +181,30 @@ def _rivals(findings: LoopFindings, replaced: str | None, names: Sequence[str]) 
     rivals = []
     for name, own, vector in zip(names, started, vectors, strict=True):
         linear = ChainProblem(own, windows).linearise(vector)
-        frames: list[list[str]] = [[]]
-        if get_effect(name).role == "undetermined":
-            frames.append([name])
+        effects = chain_at(own, vector).values()
         rivals += [
             Rival(
-                name=name + IN_SCAN * bool(frame),
-                effects=chain_at(own, vector).values(),
-                scan_frame=frame,
+                name=name + suffix,
+                effects=effects,
+                scan_frame=[name] * (suffix == IN_SCAN),
+                print_frame=[name] * (suffix == IN_PRINT),
                 vector=vector.tolist(),
                 information=(stands_for * eliminated_sum(linear, TERM_WEIGHT)[0]).tolist(),
                 covariance=robust_covariance(linear).tolist(),
             )
-            for frame in frames
+            for suffix in _frames(name, effects[name])
         ]
     return rivals
+
+
+def _frames(name: str, values: Mapping[str, float]) -> list[str]:
+    """What an effect is called as whose it may be: none, or two names where one orientation cannot say.
+
+    A tip that is sharper along one axis looks as a print whose flanks stand proud along one.
+    """
+    if name == TIP and values["along"] != values["across"]:
+        return ["", IN_PRINT]
+    return ["", IN_SCAN] if get_effect(name).role == "undetermined" else [""]
 
 
 def _screened(findings: LoopFindings, name: str, replaced: str | None) -> Screened:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from torch import nn
 
+from litho_data.build.gratings import grating_scans
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_folder
 from litho_data.foundation.outputs import require_replaceable_folder, require_same_settings
@@ -114,7 +115,8 @@ def close_loop_on_store(
     shares = level_share([scan.stored for scan in findings.development])
     questions = open_questions(findings, result, shares, report)
     if new:
-        decisions = decide(findings, questions, prepare_scans(new), report)
+        gratings = [scan for one in further for scan in grating_scans(one)]
+        decisions = decide(findings, questions, prepare_scans(new), report, gratings)
         result = with_decisions(result, decisions)
     with atomic_folder(out) as folder:
         result.write(folder)
@@ -208,12 +210,14 @@ def _base_model(base: str, store: Store) -> tuple[Simulator, str]:
 
 
 def _attributed(result: CloseLoop) -> dict[str, str]:
-    """Whose an effect is where the catalogue does not know it and new prints have decided."""
+    """Whose an effect is where new prints have decided, and not the catalogue."""
     sides = {"process": "printer", "measurement": "microscope"}
     return {
         effect.name: sides[effect.role]
         for effect in result.effects
-        if effect.role in sides and get_effect(effect.name).role == "undetermined"
+        if effect.role in sides
+        and not get_effect(effect.name).per_scan
+        and get_effect(effect.name).role != effect.role
     }
 
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import f as f_distribution
 
+from litho_data.build.gratings import GratingScan
 from litho_models.effects.chain import EffectChain
 from litho_models.loop.decision_error import Z_DECIDED, surely_better
 from litho_models.loop.findings import LoopFindings
@@ -24,9 +25,10 @@ from litho_models.loop.linear import ALL_FREE
 from litho_models.loop.open_questions import as_scanned
 from litho_models.loop.parameters import chain_at, get_vector
 from litho_models.loop.prepared import PreparedScan
-from litho_models.loop.result.questions import IN_SCAN, OpenQuestions, Question, Rival
+from litho_models.loop.result.questions import IN_PRINT, IN_SCAN, OpenQuestions, Question, Rival, effect_of
 from litho_models.loop.result.record import AddedEffect, CloseLoop, Comparison, Decided, Decision
 from litho_models.loop.rival_fits import fit_rivals
+from litho_models.loop.second_answer import said_by_gratings
 from litho_models.loop.selection.confirming import BINOMIAL_P, SMALLEST_SHARE
 from litho_models.loop.single_scans.nested_tests import scan_parameters
 from litho_models.loop.study import Score, score
@@ -45,12 +47,14 @@ def decide(
     open_: OpenQuestions,
     new: Sequence[PreparedScan],
     report: Callable[[str], None] = lambda message: None,
+    gratings: Sequence[GratingScan] = (),
 ) -> list[Decision]:
     """Judge every declared question on the new scans.
 
     Args:
         findings: of the first round.
         open_: what it declared; ``new``: scans that were in no fit so far.
+        gratings: scanned beside them; what they say stands in the evidence, and decides nothing.
     """
     decisions = []
     for question in open_.questions:
@@ -58,7 +62,11 @@ def decide(
             continue
         report(f"deciding on {question.name}")
         if len(question.rivals) > 1:
-            decisions.append(_among_rivals(findings, question, new))
+            decision = _among_rivals(findings, question, new)
+            line_um = new[0].stored.shape[1] * new[0].stored.pitch_um
+            said = said_by_gratings(question, gratings, line_um)
+            evidence = "; ".join(filter(None, (decision.evidence, said)))
+            decisions.append(decision.model_copy(update={"evidence": evidence}))
         elif question.kind == "generic":
             decisions.append(_of_generic(findings, question, new))
         elif question.kind == "lines":
@@ -74,11 +82,13 @@ def with_decisions(result: CloseLoop, decisions: list[Decision]) -> CloseLoop:
 
     def decided(effect: AddedEffect) -> AddedEffect:
         left = named.get(effect.name, "")
-        if left.removesuffix(IN_SCAN) != effect.name:
+        if effect_of(left) != effect.name:
             return effect
         changes: dict[str, Any] = {"verdict": "explained", "confusable_with": []}
         if effect.role == "undetermined":
             changes["role"] = "measurement" if left.endswith(IN_SCAN) else "process"
+        elif left.endswith(IN_PRINT):
+            changes["role"] = "process"
         return effect.model_copy(update=changes)
 
     return result.model_copy(
@@ -87,7 +97,7 @@ def with_decisions(result: CloseLoop, decisions: list[Decision]) -> CloseLoop:
 
 
 def _among_rivals(findings: LoopFindings, question: Question, new: Sequence[PreparedScan]) -> Decision:
-    own = {rival.name.removesuffix(IN_SCAN) for rival in question.rivals}
+    own = {effect_of(rival.name) for rival in question.rivals}
     names = [rival.name for rival in question.rivals]
     chains = [_chain(findings, rival) for rival in question.rivals]
     starts = [np.array(rival.vector) for rival in question.rivals]
@@ -111,6 +121,7 @@ def _chain(findings: LoopFindings, rival: Rival, *, without: Collection[str] = (
         full_height_um=chain.full_height_um,
         pitch_um=chain.pitch_um,
         scan_frame=[name for name in rival.scan_frame if name in kept],
+        print_frame=[name for name in rival.print_frame if name in kept],
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -56,7 +55,7 @@ class ReferencePrints(Record):
 
 def store_references(store: Store) -> list[Reference]:
     """The substrate, flat and step scans of a store, levelled, in their own frame."""
-    pitches = _recorded_pitches(store)
+    pitches = store.recorded_pitches_um()
     return [
         Reference(
             scan_id,
@@ -65,6 +64,7 @@ def store_references(store: Store) -> list[Reference]:
             pitches.get(scan_id, (store.pitch_um, store.pitch_um)),
         )
         for scan_id, use in store.references().items()
+        if use != "grating"
     ]
 
 
@@ -104,16 +104,6 @@ def _has_texture(one: Reference) -> bool:
     """Enough lines, on square pixels."""
     pitch_y_um, pitch_x_um = one.pitch_um
     return min(one.height_um.shape) >= FEWEST_LINES and abs(pitch_y_um / pitch_x_um - 1) < _SQUARE_WITHIN
-
-
-def _recorded_pitches(store: Store) -> dict[str, tuple[float, float]]:
-    """Pitch (y, x) of the scans as their reader recorded it, µm."""
-    pitches = {}
-    for row in store.manifest.get("files", []):
-        pitch = json.loads(row["read"] or "{}").get("pitch_um")
-        if pitch:
-            pitches[row["scan"]] = (float(pitch[0]), float(pitch[1]))
-    return pitches
 
 
 class RepeatedPrints(Record):

@@ -32,6 +32,8 @@ _USES = {
     "flat": "one level everywhere: the noise floor",
     "steps": "a stair: height against level",
 }
+# Periods that are sold, µm; of fewer than so many in a field the period is not found.
+_PERIODS_UM, _FEWEST_PERIODS = (10.0, 5.0, 3.0, 2.0, 1.0), 8
 
 
 def write_plan(
@@ -59,11 +61,17 @@ def write_plan(
         slow_axis="y",
         write_field_um=write_field_um,
         plan_of=plan.dataset.sha256,
+        grating_um=_grating_um(plan),
     ).write(folder)
     plan.write(folder)
     for name, text in ((PRINTER_SHEET, _printer_sheet(plan)), (MICROSCOPE_SHEET, _microscope_sheet(plan))):
         with atomic_file(folder / name) as temporary:
             temporary.write_text(text, encoding="utf-8")
+
+
+def _grating_um(plan: NextPrint) -> float:
+    fitting = [period for period in _PERIODS_UM if _FEWEST_PERIODS * period <= plan.field_um]
+    return max(fitting, default=_PERIODS_UM[-1])
 
 
 def _first_scans(plan: NextPrint) -> list[PlannedScan]:
@@ -85,6 +93,8 @@ def _printer_sheet(plan: NextPrint) -> str:
         "|---|---|---|---|---|",
     ]
     for scan in _first_scans(plan):
+        if scan.use == "grating":
+            continue
         what = "print" if scan.use == "dataset" else _USES[scan.use]
         place = f"{scan.field_x_um:g}, {scan.field_y_um:g}"
         lines.append(f"| {scan.order} | layouts/{scan.id}.tif | {place} | {scan.dose:g} | {what} |")
@@ -105,6 +115,10 @@ def _microscope_sheet(plan: NextPrint) -> str:
         "`scans/ID.txt`, heights in metres (or change `[scan]` of `card.toml` to your format and size). A "
         "margin of 1 to 2 µm around the print helps. Take the print out and put it back between two scans of "
         "it. Leave the file as the microscope shows it: do not turn it back.",
+        "",
+        f"The grating is a standard, no print: a square one of {_grating_um(plan):g} µm, or another of which "
+        "eight periods fit into a scan, laid along the axes of the scan. Put its period and its uncertainty "
+        "into `[grating]` of `card.toml` (`period_um`, `uncertainty_um`). Without one leave its file out.",
         "",
         "| order | scan | print | turned | direction | tip | pixels | why |",
         "|---|---|---|---|---|---|---|---|",

@@ -15,7 +15,7 @@ from litho_data.foundation.report_pictures import new_figure
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.layouts.statistics_report import layouts_figure
 from litho_models.effects import CATALOGUE
-from litho_models.loop.result.questions import IN_SCAN
+from litho_models.loop.result.questions import effect_of
 from litho_models.planning.power import ENOUGH
 from litho_models.planning.record import NextPrint, PlannedQuestion
 from litho_models.planning.rivalry import PlannedPrint, Rivalry
@@ -89,7 +89,7 @@ def write_report(
 
 def _asked(question: PlannedQuestion) -> str:
     """The question in words; an effect of which it is open whose it is stands twice among the rivals."""
-    names = dict.fromkeys(rival.removesuffix(IN_SCAN) for rival in question.rivals) or [question.name]
+    names = dict.fromkeys(effect_of(rival) for rival in question.rivals) or [question.name]
     first, *others = [CATALOGUE[name].title if name in CATALOGUE else name for name in names]
     if others:
         return f"which is at work, {', '.join([first, *others[:-1]])} or {others[-1]}"

@@ -314,9 +314,14 @@ class Rivalry:
         return solve_damped(normal, right, _DAMPING, room(chain, get_vector(chain)))
 
     def _chain(self, rival: Rival, base: Simulator) -> EffectChain:
-        full = self.printing.highest * self.printing.level_height_um
-        geometry = {"full_height_um": full, "pitch_um": self.printing.pitch_um}
-        chain = EffectChain(base, rival.effects, **geometry, scan_frame=rival.scan_frame)
+        chain = EffectChain(
+            base,
+            rival.effects,
+            full_height_um=self.printing.highest * self.printing.level_height_um,
+            pitch_um=self.printing.pitch_um,
+            scan_frame=rival.scan_frame,
+            print_frame=rival.print_frame,
+        )
         return chain_at(chain, np.array(rival.vector))
 
 

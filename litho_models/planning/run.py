@@ -177,6 +177,13 @@ def schedule(
         ("flat", flat((size_px, size_px), level=(limits.lowest + limits.highest) // 2), "the noise floor"),
         ("steps", ladder, "height against level; on a step standard of known height the microscope's gain"),
     ]
+    references.append(
+        (
+            "grating",
+            np.zeros((size_px, size_px), np.uint8),
+            "scales and unevenness of the scanner, and the tip",
+        )
+    )
     rows: list[tuple[str, str, Use, Way, float, float, str, np.ndarray]] = []
     for number, (use, level, why) in enumerate(references, start=1):
         rows.append((f"N0F{number}", "0", use, Way(), 0.0, 1.0, why, level))

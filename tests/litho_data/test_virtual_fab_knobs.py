@@ -24,13 +24,14 @@ from litho_data.virtual_fab.geometry import place_scan
 from litho_data.virtual_fab.jobs import Plan, random_jobs
 from litho_data.virtual_fab.knobs import KnobBoard
 
-# The effects catalogue has 34 entries; this is the list that a truth file may name besides `off-catalogue`.
+# The effects catalogue has 35 entries; this is the list that a truth file may name besides `off-catalogue`.
 CATALOGUE = {
     "elliptical-psf",
     "long-range-proximity",
     "dose-exponent",
     "write-order-memory",
     "galvo-lag",
+    "galvo-nonlinearity",
     "vignetting",
     "field-curvature",
     "laser-drift",
@@ -213,6 +214,50 @@ class TestSignatures:
             found = scan_surface(surface, frame, Noise.off(), board, job, np.random.default_rng(0))
             # Contact is searched on a grid of 0.01 µm per axis: (0.005 µm)²/2R short at most, twice.
             np.testing.assert_allclose(found[20:-20, 20:-20], expected[20:-20, 20:-20], atol=7e-5)
+
+    def test_an_asymmetric_tip_has_another_radius_along_each_axis(self):
+        frame = place_scan((96, 96), 0.1, Microscope.aligned(), np.random.default_rng(0))
+        y_um, x_um = (np.indices(frame.shape) - 50) * 0.1
+        job = Job("slope", np.zeros(frame.shape, np.uint8))
+        blunt = set()
+        for seed in range(8):
+            board = KnobBoard([KnobSetting("asymmetric-tip", 0.6, seed)], 0)
+            radii_um = []
+            for slope in (0.2 * y_um, 0.2 * x_um):
+                found = scan_surface(slope, frame, Noise.off(), board, job, np.random.default_rng(0))
+                # On a slope s along one axis it rides R s²/2 above it, R the radius along that axis.
+                lifts = (found - slope)[30:-30, 30:-30]
+                radii_um.append(2 * float(lifts.mean()) / 0.2**2)
+            # Contact is searched on a grid of 0.01 µm: (0.005 µm)²/2R short, 0.01 µm of a radius of 0.1 µm.
+            assert max(radii_um) == pytest.approx(0.6, abs=0.01)
+            assert 0.1 - 0.01 <= min(radii_um) <= 0.2 + 0.01
+            blunt.add(int(np.argmax(radii_um)))
+        assert blunt == {0, 1}
+
+    def test_an_uneven_printer_moves_its_lines_by_the_closed_form(self):
+        # Three bars of four pixels, at a quarter, half and three quarters of a field of 19.2 µm.
+        level = np.zeros((96, 192), np.uint8)
+        for middle in (48, 96, 144):
+            level[:, middle - 2 : middle + 2] = 8
+        even, uneven = (
+            scan(Job("a", level), *knobs).clean_um[48]
+            for knobs in ((), (KnobSetting("galvo-nonlinearity", 0.05),))
+        )
+        for middle in (48, 96, 144):
+            near = slice(middle - 16, middle + 16)
+            x_um = (np.arange(192)[near] + 0.5) * 0.1
+            was, now = (
+                float(x_um @ h[near] / h[near].sum()) for h in (even - even.min(), uneven - uneven.min())
+            )
+            # Its bow shortens a bar by 2 %; the window keeps 1.6 µm on either side of it.
+            assert now - was == pytest.approx(0.05 * was * (1 - was / 19.2), abs=0.02)
+        across = np.ascontiguousarray(level[:, :96].T)
+        plain, bent = (
+            scan(Job("a", across), *knobs).clean_um
+            for knobs in ((), (KnobSetting("galvo-nonlinearity", 0.05),))
+        )
+        # Lines across the hatch are not moved.
+        np.testing.assert_allclose(bent, plain, atol=1e-9)
 
     def test_feedback_lag_trails_along_the_fast_axis_only(self):
         level = np.zeros((96, 96), np.uint8)

@@ -28,16 +28,17 @@ from litho_data.virtual_fab.printer import Job
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 from litho_models.effects import FieldContext, get_effect
 from litho_models.effects.chain import EffectChain
+from litho_models.effects.registry import TIP
 from litho_models.fitting.least_squares import fit_least_squares
 from litho_models.frozen.files import save_frozen
 from litho_models.loop.decision_error import Z_DECIDED, surely_better
 from litho_models.loop.fold_fits import RULES, ChainProblem
-from litho_models.loop.open_questions import _screened
+from litho_models.loop.open_questions import _frames, _screened
 from litho_models.loop.parameters import chain_at, get_vector
 from litho_models.loop.prepared import prepare_scans
 from litho_models.loop.residual_spectrum import NoiseSpectrum, residual_spectrum
 from litho_models.loop.result.exporting import part_of
-from litho_models.loop.result.questions import IN_SCAN, OpenQuestions, Question, Rival
+from litho_models.loop.result.questions import IN_PRINT, IN_SCAN, OpenQuestions, Question, Rival
 from litho_models.loop.result.record import AddedEffect, CloseLoop, Decision
 from litho_models.loop.rival_fits import fit_rivals
 from litho_models.loop.run import _attributed, _new_scans
@@ -333,7 +334,9 @@ def test_a_plan_is_a_dataset_in_waiting_and_resumes(tmp_path: Path) -> None:
     jobs = {job.id: job for job in jobs_of_card(tmp_path / "plan" / "card.toml", first=5)}
     assert jobs["N1F2"].turned_deg == 90
     assert jobs["N1F1"].printed == jobs["N1F2"].printed != jobs["N2F1"].printed
-    assert {jobs[name].use for name in ("N0F1", "N0F2", "N0F3")} == {"substrate", "flat", "steps"}
+    references = [jobs[f"N0F{n}"] for n in (1, 2, 3, 4)]
+    assert [one.use for one in references] == ["substrate", "flat", "steps", "grating"]
+    assert references[-1].grating_um == 1.0
     assert (tmp_path / "plan" / "microscope.md").read_text("utf-8").count("90°") >= 2
     assert not (tmp_path / "plan-cache").exists()
 
@@ -383,10 +386,19 @@ def test_the_plan_for_the_measured_prints_is_ready_and_of_the_published_loop() -
 # --- the second round
 
 
-def second_round(frame: tuple[str, ...], seed: int) -> list:
+def second_round(
+    frame: tuple[str, ...], seed: int, effects: dict = SLOPE, print_frame: tuple[str, ...] = ()
+) -> list:
     """Two prints, each scanned at 0 and 90 degrees, slope loss by the printer or by the microscope."""
     random = np.random.default_rng(seed)
-    chain = EffectChain(true_model({}).base, SLOPE, full_height_um=1.2, pitch_um=0.1, scan_frame=frame)
+    chain = EffectChain(
+        true_model({}).base,
+        effects,
+        full_height_um=1.2,
+        pitch_um=0.1,
+        scan_frame=frame,
+        print_frame=print_frame,
+    )
     turned = np.array([[0.0, -1.0, 6.4], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     scans = []
     for number, plain in enumerate(printed_scans(size_px=64, count=2, noise_um=0, seed=seed)):
@@ -414,6 +426,36 @@ def test_two_turned_prints_say_whose_a_loss_on_slopes_is(frame: tuple[str, ...])
     decision = decide(findings, opened([slope_question()]), prepare_scans(second_round(frame, 5)))[0]
     assert decision.verdict == "decided"
     assert decision.left == ["slope-thinning" + IN_SCAN * bool(frame)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("printers", [False, True])
+def test_two_turned_prints_say_whether_an_asymmetric_tip_is_one(printers: bool) -> None:
+    """In one orientation a print whose flanks stand proud along one axis looks the same."""
+    effects = {TIP: {"radius_um": 0.6, "along": 1.0, "across": 0.25}}
+    start = true_model(effects)
+    assert _frames(TIP, start.values()[TIP]) == ["", IN_PRINT]
+    assert _frames(TIP, {**start.values()[TIP], "across": 1.0}) == [""]
+    rivals = [
+        rival(TIP + suffix, effects, []).model_copy(update={"print_frame": [TIP] * bool(suffix)})
+        for suffix in ("", IN_PRINT)
+    ]
+    findings = SimpleNamespace(
+        search=SimpleNamespace(state=SimpleNamespace(fits=SimpleNamespace(chain=start))),
+        development=prepare_scans(printed_scans(effects, size_px=64, count=4)),
+        study=SimpleNamespace(blocks=Blocks()),
+    )
+    question = slope_question().model_copy(update={"name": TIP, "rivals": rivals})
+    new = second_round((), 5, effects, print_frame=(TIP,) * printers)
+    decision = decide(findings, opened([question]), prepare_scans(new))[0]
+    assert decision.verdict == "decided"
+    assert decision.left == [TIP + IN_PRINT * printers]
+    effect = AddedEffect.model_construct(
+        name=TIP, role="measurement", verdict="explained", confusable_with=[]
+    )
+    decided = with_decisions(CloseLoop.model_construct(effects=[effect]), [decision])
+    assert part_of(decided.effects[0]) == ("process" if printers else "measurement")
+    assert _attributed(decided) == ({TIP: "printer"} if printers else {})
 
 
 @pytest.mark.parametrize(("share", "verdict"), [(0.005, "still open"), (0.03, "decided")])
@@ -660,3 +702,22 @@ def test_a_plan_is_printed_by_the_same_machine_with_new_chance() -> None:
     assert abs(agreement(first.height_um, other.height_um)) < 0.6
     sharp = scan_job(fab, Job("N1F3", level, index=13, print_index=12, tip=2.0))
     assert not np.array_equal(again.height_um, sharp.height_um)
+
+
+def test_a_grating_is_a_second_answer_to_whose_a_distortion_is() -> None:
+    from litho_data.build.gratings import GratingScan
+    from litho_models.loop.second_answer import said_by_gratings
+
+    rivals = [
+        Rival(
+            name=name, effects={name: {"strength": 0.04}}, scan_frame=[], vector=[0.04], information=[[1.0]]
+        )
+        for name in ("galvo-nonlinearity", "piezo-nonlinearity")
+    ]
+    question = slope_question().model_copy(update={"rivals": rivals})
+    for bow_um, told in ((0.2, "it is the scanner's"), (0.0, "it is not the scanner's"), (0.11, "too near")):
+        # 0.04 of 20 µm is 0.2 µm in the middle; a line twice as long is bent four times as much.
+        one = GratingScan(id="G", period_um=2.0, line_um=40.0, bow_um=4 * bow_um, bow_sd_um=0.04)
+        assert told in said_by_gratings(question, [one], 20.0)
+    assert said_by_gratings(slope_question(), [one], 20.0) == ""
+    assert said_by_gratings(question, [one.model_copy(update={"bow_um": None})], 20.0) == ""

@@ -12,7 +12,13 @@ from litho_models.loop.residual_spectrum import NoiseSpectrum
 
 Kind = Literal["set", "suspects", "role", "generic", "per-scan", "lines", "fact"]
 Doing = Literal["turned scan", "early print scanned late"]
-IN_SCAN = " as the microscope's"
+# What an answer is called whose effect is not whose the catalogue says, or could be either's.
+IN_SCAN, IN_PRINT = " as the microscope's", " as the printer's"
+
+
+def effect_of(answer: str) -> str:
+    """The effect that an answer names, whosever it is."""
+    return answer.removesuffix(IN_SCAN).removesuffix(IN_PRINT)
 
 
 class Rival(Record):
@@ -20,7 +26,8 @@ class Rival(Record):
 
     ``vector``: all fitted numbers, ``loop.parameters.get_vector``; ``information``: (p, p), normal matrix of
     the fit over all pixels that it stands for, µm²; ``covariance``: (p, p) of the numbers, robust over scans,
-    empty in older files. ``scan_frame``: effects that turn with the scan.
+    empty in older files. ``scan_frame``: effects that turn with the scan; ``print_frame``: effects of the
+    microscope that keep to the print.
     """
 
     name: str
@@ -29,6 +36,7 @@ class Rival(Record):
     vector: list[float]
     information: list[list[float]]
     covariance: list[list[float]] = Field(default_factory=list)
+    print_frame: list[str] = Field(default_factory=list)
 
 
 class Turning(Record):

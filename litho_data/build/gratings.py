@@ -1,0 +1,74 @@
+"""What scans of a grating of known size say about the microscope: its scales, its unevenness, its tip."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from litho_data.cards.card import KnownGrating
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import Record
+from litho_data.roughness import axis_scales, find_wave, line_bow
+from litho_data.store.read import Store
+from litho_data.tip.radius import peak_radius
+
+
+class GratingScan(Record):
+    """One scan of a grating; figures are None where it does not show them, and ``problem`` says why.
+
+    Args:
+        scale_x, scale_y: what a stated length has to be multiplied by; ``_sd``: standard uncertainties.
+        bow_um: by how much the middle of a line lies too far along x, against its ends.
+        line_um: length of a line.
+        tip_um: radius of the tip, or the most that it can be: then ``tip_bound``.
+    """
+
+    id: str
+    period_um: float
+    line_um: float
+    scale_x: float | None = None
+    scale_x_sd: float | None = None
+    scale_y: float | None = None
+    scale_y_sd: float | None = None
+    bow_um: float | None = None
+    bow_sd_um: float | None = None
+    tip_um: float | None = None
+    tip_sd_um: float | None = None
+    tip_bound: bool = True
+    problem: str = ""
+
+
+def grating_scans(store: Store) -> list[GratingScan]:
+    """The gratings among the references of a store, fast axis x, measured in the scans as they were read."""
+    known = store.manifest.get("card", {}).get("grating")
+    if known is None:
+        return []
+    pitches = store.recorded_pitches_um()
+    return [
+        grating_scan(
+            scan_id, store.scan_frame(scan_id, "raw_height_um"), pitches[scan_id], KnownGrating(**known)
+        )
+        for scan_id, use in store.references().items()
+        if use == "grating"
+    ]
+
+
+def grating_scan(
+    scan_id: str, height_um: np.ndarray, pitch_um: tuple[float, float], known: KnownGrating
+) -> GratingScan:
+    """One scan, heights (ny, nx) in µm of a stated (y, x) pitch."""
+    height_um = height_um.astype(np.float64)
+    found = GratingScan(id=scan_id, period_um=known.period_um, line_um=height_um.shape[1] * pitch_um[1])
+    tip = peak_radius(height_um, pitch_um)
+    figures: dict[str, Any] = {"tip_um": tip.radius_um, "tip_sd_um": tip.sd_um, "tip_bound": bool(tip.reason)}
+    try:
+        waves = [find_wave(height_um, pitch_um, known.period_um, axis) for axis in ("x", "y")]
+        scales = axis_scales([(one, known.period_um, known.uncertainty_um) for one in waves], ["x", "y"])
+        bow_um, bow_sd_um = line_bow(height_um, pitch_um, waves[0])
+        figures |= {"bow_um": bow_um, "bow_sd_um": bow_sd_um}
+        for axis, scale in scales.items():
+            figures |= {f"scale_{axis}": scale.factor, f"scale_{axis}_sd": scale.uncertainty}
+    except InputError as error:
+        figures["problem"] = str(error)
+    return found.model_copy(update=figures)
