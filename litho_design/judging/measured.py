@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -14,6 +14,7 @@ from torch import Tensor
 from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Record
+from litho_data.scan import Scan
 from litho_design.images.noise import DRAWS, white_noise
 from litho_design.judging.loaded import LoadedDesign
 
@@ -103,47 +104,15 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
             resemble the print that the design expects.
     """
     from litho_data.readers import read_scan
-    from litho_data.register import register_scan, resample_to_layout
 
     require_known("levelling", source.levelling, get_args(Levelling))
     if not source.scale_sd >= 0:
         raise InputError("uncertainty of the height scale", got=source.scale_sd, wanted="0 or more")
-    scan = read_scan(source.path, unit=source.unit, size_um=source.size_um)
-    pitch = scan.require_pitch()
     layout = loaded.record.layout
-    levels = loaded.level.cpu().numpy()
-    orientation, warning, position_sd_um = "identity", "", 0.0
-    if source.aligned:
-        height, valid = scan.height_um, np.isfinite(scan.height_um)
-        if height.shape != levels.shape or not np.allclose(pitch, layout.pitch_um, rtol=1e-3):
-            raise InputError(
-                f"aligned scan {source.path}",
-                got=f"{height.shape} px of {pitch[0]:g} µm",
-                wanted=f"the pixels of the element: {levels.shape} of {layout.pitch_um:g} µm",
-            )
-    else:
-        registration = register_scan(
-            scan.height_um, levels, scan_pitch_um=pitch, layout_pitch_um=layout.pitch_um, model="affine"
-        )
-        quality = registration.quality
-        if not quality.passed:
-            raise InputError(
-                f"scan {source.path} on the layout of the design",
-                got=quality.reason,
-                wanted="a match",
-                hint="--scan-aligned, if it lies on the pixels of the element",
-            )
-        orientation, warning = quality.dihedral, quality.warning
-        position_sd_um = quality.corner_sd_nm / 1000
-        height, valid = resample_to_layout(
-            scan.height_um,
-            registration.scan_to_layout,
-            levels.shape,
-            scan_pitch_um=pitch,
-            layout_pitch_um=layout.pitch_um,
-            bend_um=registration.bend_um,
-        )
-    coverage = float(valid.mean())
+    scan = read_scan(source.path, unit=source.unit, size_um=source.size_um)
+    place = _as_it_lies if source.aligned else _registered
+    placed = place(scan, loaded.level.cpu().numpy(), layout.pitch_um)
+    height, valid, coverage = placed.height_um, placed.valid, float(placed.valid.mean())
     if coverage < _SMALLEST_COVERAGE:
         raise InputError(
             f"scan {source.path}",
@@ -171,16 +140,56 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
         registration_ncc=ncc,
         height_offset_um=offset,
         aligned=source.aligned,
-        orientation=orientation,
-        warning=warning,
+        orientation=placed.orientation,
+        warning=placed.warning,
         levelling=source.levelling,
         tilt_um_per_um=background.tilt_um_per_um,
         bow_um=background.bow_um,
         noise_um=white_noise(complete - expected),
-        position_sd_um=position_sd_um,
+        position_sd_um=placed.position_sd_um,
         scale_sd=source.scale_sd,
     )
     return torch.from_numpy(complete).to(loaded.device), record
+
+
+class _Placed(NamedTuple):
+    """A scan on the pixels of the layout (ny, nx): heights, where measured; how it came there, how surely."""
+
+    height_um: np.ndarray
+    valid: np.ndarray
+    orientation: str = "identity"
+    warning: str = ""
+    position_sd_um: float = 0.0
+
+
+def _as_it_lies(scan: Scan, level: np.ndarray, pitch_um: float) -> _Placed:
+    own_pitch = scan.require_pitch()
+    if scan.height_um.shape != level.shape or not np.allclose(own_pitch, pitch_um, rtol=1e-3):
+        raise InputError(
+            f"aligned scan {scan.source}",
+            got=f"{scan.height_um.shape} px of {own_pitch[0]:g} µm",
+            wanted=f"the pixels of the element: {level.shape} of {pitch_um:g} µm",
+        )
+    return _Placed(scan.height_um, np.isfinite(scan.height_um))
+
+
+def _registered(scan: Scan, level: np.ndarray, pitch_um: float) -> _Placed:
+    from litho_data.register import register_scan, resample_to_layout
+
+    pitches: Any = {"scan_pitch_um": scan.require_pitch(), "layout_pitch_um": pitch_um}
+    found = register_scan(scan.height_um, level, **pitches, model="affine")
+    quality = found.quality
+    if not quality.passed:
+        raise InputError(
+            f"scan {scan.source} on the layout of the design",
+            got=quality.reason,
+            wanted="a match",
+            hint="--scan-aligned, if it lies on the pixels of the element",
+        )
+    height, valid = resample_to_layout(
+        scan.height_um, found.scan_to_layout, level.shape, **pitches, bend_um=found.bend_um
+    )
+    return _Placed(height, valid, quality.dihedral, quality.warning, quality.corner_sd_nm / 1000)
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ def _built(out: Path, workers: int) -> tuple[str, int, float, float]:
     return sha256, scans, seconds, own + (workers * child if workers > 1 else 0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.measured
 def test_all_measured_scans_build_in_bounded_memory(measured_prints: Path, tmp_path: Path) -> None:
     sha256, scans, seconds, peak_mib = _built(tmp_path / "prints.zarr", workers=2)

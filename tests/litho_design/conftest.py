@@ -13,6 +13,7 @@ from torch import nn
 from litho_design.cli.app import main
 from litho_design.holograms.settings import HologramSettings, hologram_settings
 from litho_design.optics import Optics
+from litho_design.optimisation.process_window import ProcessWindow
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 
@@ -38,7 +39,7 @@ class BlurPrinter(nn.Module):
         return self.gain * F.conv2d(rows, self.kernel.view(1, 1, -1, 1)) + self.offset_um
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_printer():
     def make(layout: LayoutSettings, **arguments) -> Printer:
         return Printer(BlurPrinter(**arguments), layout, source="closed form")
@@ -46,9 +47,12 @@ def make_printer():
     return make
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def small_settings() -> HologramSettings:
-    """A hologram of 12.8 µm at 30 µm, 30 iterations from a random start, which leaves all to the search."""
+    """A hologram of 12.8 µm at 30 µm, 30 iterations from a random start, which leaves all to the search.
+
+    Its yield is of ten prints, not of a hundred, which would take longer than the search.
+    """
     default = hologram_settings("default")
     return default.model_copy(
         update={
@@ -57,6 +61,7 @@ def small_settings() -> HologramSettings:
             "search": default.search.model_copy(
                 update={"start": "random", "iterations": 30, "checkpoint_every": 10, "polish_rounds": 3}
             ),
+            "window": ProcessWindow(yield_draws=10),
         }
     )
 

@@ -10,7 +10,13 @@ from litho_design import design_hologram, first, hologram_settings
 from litho_design.images.targets import load_target, stroke_width_px
 from litho_design.workflows.first import _SMALL
 
-TINY = {"layout.size_px": 64, "optics.distance_um": 12, "search.iterations": 2, "search.polish_rounds": 0}
+TINY = {
+    "layout.size_px": 64,
+    "optics.distance_um": 12,
+    "search.iterations": 2,
+    "search.polish_rounds": 0,
+    "window.yield_draws": 5,
+}
 
 
 def test_both_designs_are_printed_by_the_same_model_and_shown_on_one_page(tmp_path):

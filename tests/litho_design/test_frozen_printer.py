@@ -25,7 +25,7 @@ from litho_design.tasks.design import Design
 from litho_models import save_frozen
 from litho_models.models import model_class
 
-SMALL = ("--size-px", "128", "--distance-um", "30", "--iterations", "20")
+SMALL = ("--size-px", "128", "--distance-um", "30", "--iterations", "20", "--yield-draws", "5")
 
 
 @pytest.fixture

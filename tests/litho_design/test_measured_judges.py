@@ -27,9 +27,9 @@ from litho_design.workflows.score import score as score_design
 from tests.quoted import require_quoted
 
 
-@pytest.fixture
-def printed_design(tmp_path, small_settings, make_printer):
-    folder = tmp_path / "design"
+@pytest.fixture(scope="module")
+def printed_design(tmp_path_factory, small_settings, make_printer):
+    folder = tmp_path_factory.mktemp("printed") / "design"
     design_hologram(
         load_target("ring", 128),
         make_printer(small_settings.layout),

@@ -25,7 +25,7 @@ from litho_design.workflows.score import score as score_design
 
 SMALL = (
     *("--size-px", "128", "--window-px", "64", "--object-px", "32", "--iterations", "2"),
-    *("--model", "none", "--task", "computational", "--focal-length-um", "40"),
+    *("--model", "none", "--task", "computational", "--focal-length-um", "40", "--yield-draws", "5"),
 )
 
 
@@ -41,6 +41,7 @@ def settings():
             ),
             "view": default.view.model_copy(update={"window_px": 64}),
             "imaging": default.imaging.model_copy(update={"object_px": 32, "iterations": 5}),
+            "window": default.window.model_copy(update={"yield_draws": 5}),
         }
     )
 

@@ -27,6 +27,7 @@ TINY = {
     "search.iterations": 12,
     "search.polish_rounds": 1,
     "window.defocus_sd_um": 0.5,
+    "window.yield_draws": 10,
 }
 
 

@@ -29,15 +29,15 @@ from litho_models.loop.study import State, Study
 from litho_models.scan_terms import POLICIES, TermPixels, Terms, term_maps
 from tests.litho_models.loop_scans import printed_scans, true_model
 
-COUNT, SIZE_PX, NOISE_UM = 10, 128, 0.006
+COUNT, SIZE_PX, NOISE_UM = 10, 96, 0.006
 FOLD_OF = np.arange(COUNT) % 5
 
 
 def scene(
-    change: Callable[[PreparedScan], np.ndarray] | None = None, seed: int = 3
+    change: Callable[[PreparedScan], np.ndarray] | None = None, seed: int = 3, size_px: int = SIZE_PX
 ) -> tuple[list[PreparedScan], list[np.ndarray]]:
     """Scans of a known model with a change added to their height, and the known model's predictions."""
-    scans = printed_scans(count=COUNT, size_px=SIZE_PX, noise_um=NOISE_UM, seed=seed)
+    scans = printed_scans(count=COUNT, size_px=size_px, noise_um=NOISE_UM, seed=seed)
     chain = true_model({})
     predictions = []
     for scan in prepare_scans(scans):
@@ -108,7 +108,7 @@ def test_nothing_is_taken_where_nothing_is_missing() -> None:
 @pytest.mark.slow
 def test_a_response_displaced_from_the_layout_comes_back_in_place_and_size() -> None:
     """A ghost of 3 % of the layout, 0.8 µm down and 0.6 µm to the left."""
-    found = probed(*scene(lambda f: 0.03 * np.roll(f.stored.layout_um, (8, -6), (0, 1))))
+    found = probed(*scene(lambda f: 0.03 * np.roll(f.stored.layout_um, (8, -6), (0, 1)), size_px=128))
     assert found.added[0].probe.name == "missing-kernel"
     entry = found.added[0]
     values = {name: value for name, (value, _, _) in with_intervals(entry.probe, entry.estimate).items()}
@@ -121,7 +121,10 @@ def test_a_response_displaced_from_the_layout_comes_back_in_place_and_size() -> 
 
 def test_a_copy_far_from_the_layout_comes_back_in_place_and_size() -> None:
     """3 % of the layout again 5 µm away: the kernel reaches 1.6 µm on fields of 12.8 µm."""
-    found = probed(*scene(lambda f: 0.03 * shift(f.stored.layout_um, (40, -30), order=0, mode="nearest")))
+    moved = (40, -30)
+    found = probed(
+        *scene(lambda f: 0.03 * shift(f.stored.layout_um, moved, order=0, mode="nearest"), size_px=128)
+    )
     entry = found.added[0]
     assert entry.probe.name == "displaced-copy"
     values = {name: value for name, (value, _, _) in with_intervals(entry.probe, entry.estimate).items()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 
+from litho_models.effects import get_effect
 from litho_models.evaluation.benchmark import benchmark
 from litho_models.loop import LoopConfig, close_loop_on_store
 from tests.litho_models.prints import make_scans, write_store
@@ -13,7 +14,10 @@ STEPS = 2
 
 @pytest.mark.slow
 @pytest.mark.parametrize("base", ["physics", pytest.param("pbl", marks=pytest.mark.long)])
-def test_the_loop_starts_where_the_benchmark_ends(base: str, tmp_path) -> None:
+def test_the_loop_starts_where_the_benchmark_ends(base: str, tmp_path, monkeypatch) -> None:
+    # What the loop looks for afterwards takes time and changes nothing of its start.
+    drift = get_effect("laser-drift")
+    monkeypatch.setattr("litho_models.loop.selection.search.screened_effects", lambda tip_radius_um: [drift])
     store = write_store(tmp_path / "s.zarr", make_scans(4, size_px=80, bow_um=0.02))
     settings = {"steps": STEPS} if base == "pbl" else None
     scored = benchmark(store, tmp_path / "b", models=[base], folds=2, settings=settings).scores[0]

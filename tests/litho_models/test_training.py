@@ -429,8 +429,8 @@ def test_any_number_of_processes_has_the_mean_gradient_of_one(world, monkeypatch
     torch.testing.assert_close(sum(own for _, own in every) / world, sums)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("world", [2, *(pytest.param(n, marks=pytest.mark.long) for n in (3, 5))])
+@pytest.mark.long
+@pytest.mark.parametrize("world", [2, 3, 5])
 def test_several_processes_give_the_loss_curve_of_one(world, tmp_path):
     from litho_models.fitting.runs import TrainingRun
 
