@@ -73,10 +73,12 @@ def tell(page: Page, out: Path) -> None:
     page.figure(_gains(loop, set(planted)), "What each effect takes off the error; blue if it was planted.")
     page.links([("close-loop/report.html", "The closed loop, with its evidence")])
     page.heading("3. The error before and after, at equal freedom")
+    over = terms.over_scans
+    interval = "" if over.ci95_nm is None else " ({:.2f} … {:.2f}, resampling scans)".format(*over.ci95_nm)
     page.paragraph(
-        f"Mean absolute error of {terms.over_scans.count} scans, each predicted without being fitted to, "
+        f"Mean absolute error of {over.count} scans, each predicted without being fitted to, "
         f"with {terms.before.k:g} term per scan free before and {terms.after.k:g} after: "
-        f"{terms.gain_nm:.2f} nm less, better in {terms.over_scans.positive} scans."
+        f"{terms.gain_nm:.2f} nm less{interval}, better in {over.positive} of {over.count} scans."
     )
     pairs = {"before": terms.before, "after": terms.after}
     page.figure(

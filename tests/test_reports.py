@@ -63,7 +63,7 @@ def every_part() -> Page:
     page = Page("Every part", "a lead", facts={"dataset": "0123456789abcdef" * 4}, words=words)
     page.verdict("pbl is best.")
     page.tiles([("1 nm", "error"), ("2", "scans")])
-    page.note("Do not overlook this.")
+    page.note("Do not overlook that less < more with --one-option.")
     page.heading("Folded", folded=True)
     page.code("x" * 200)
     values = [3.0, 20.0, float("nan"), 100.0]
@@ -156,6 +156,11 @@ def test_the_comparison_leads_to_every_design(reports):
     links = re.findall(r'href="(designs/[^"]+)"', gap.read_text("utf-8"))
     assert sorted(links) == [f"designs/{arm}/seed0/report.html" for arm in ("none", "physics")]
     assert all((gap.parent / link).is_file() for link in links)
+
+
+def test_an_option_in_a_sentence_stays_in_one_piece_and_signs_are_escaped(reports):
+    text = reports["every part"].read_text("utf-8")
+    assert 'less &lt; more with <span class="option">--one-option</span>.' in text
 
 
 def test_the_foot_says_how_the_page_was_made(reports):
