@@ -16,6 +16,8 @@ import pytest
 from tests.browser import DESK_PX, FAULTS, PHONE_PX, Browser, browser_path
 
 ROOT = Path(__file__).parents[1]
+# The site changes its colours by a script, and gradually.
+COLOURED = "new Promise(done => setTimeout(() => done(document.body.dataset.mdColorScheme), 300))"
 
 
 class Quiet(http.server.SimpleHTTPRequestHandler):
@@ -44,6 +46,7 @@ def test_every_page_of_the_site_is_sound_on_every_screen(tmp_path):
                 browser.show(address, width_px, dark=False)
                 for dark in (False, True):
                     browser.screen(width_px, dark)
+                    assert browser.run(COLOURED) == ("slate" if dark else "default")
                     name = f"{page.stem}, {width_px} px, {'dark' if dark else 'light'}"
                     found[name] = browser.run(FAULTS) + browser.errors
         server.shutdown()
