@@ -15,7 +15,7 @@ PACKAGES = ("litho_data", "litho_models", "litho_design")
 _LINK = re.compile(r"\]\((?P<place>\.\./[^)#\s]+)(?P<anchor>#[^)\s]*)?\)")
 # Words of the glossary that pages also use in their everyday sense: the glossary alone explains them.
 _EVERYDAY = {"arm", "effect", "fold", "judge", "knob", "probe", "stroke"}
-# A cell of more words than this is given room on a telephone; the rest of its table scrolls.
+# A cell of more letters than this is given room, on a telephone or at the head; the table scrolls.
 _LONG_CELL = 40
 # Spaces inside a figure, outside code: 19.1 nm, (18.2 … 19.9), ± 0.2, → 15.6, 20 of 20, p = 0.03.
 _INSIDE_FIGURE = re.compile(
@@ -60,7 +60,7 @@ def on_page_content(html: str, page: Any, config: Any, files: Files) -> str:
     Sphinx's roles in docstrings are only code here.
     """
     html = re.sub(r":(?:func|class|mod|meth|data):<code>~?", "<code>", html)
-    html = re.sub(r"<td>(.*?)</td>", _roomy, html, flags=re.DOTALL)
+    html = re.sub(r"<(t[dh])>(.*?)</t[dh]>", _roomy, html, flags=re.DOTALL)
     html = _INSIDE_FIGURE.sub(lambda found: "\u00a0" if found[0] == " " else found[0], html)
     html = re.sub(r"<a [^>]*>\s*<img.*?</a>|<img [^>]*>", _opened, html, flags=re.DOTALL)
     return re.sub(r"<pre>.*?</pre>|(?<=<code>)[^<]+(?=</code>)", _breakable, html, flags=re.DOTALL)
@@ -74,8 +74,9 @@ def _breakable(code: re.Match[str]) -> str:
 
 
 def _roomy(cell: re.Match[str]) -> str:
-    words = re.sub(r"<[^>]+>", "", cell[1])
-    return f'<td class="long">{cell[1]}</td>' if len(words) > _LONG_CELL else cell[0]
+    kind, content = cell.groups()
+    words = re.sub(r"<[^>]+>", "", content)
+    return f'<{kind} class="long">{content}</{kind}>' if len(words) > _LONG_CELL else cell[0]
 
 
 def _opened(picture: re.Match[str]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,7 +15,10 @@ from litho_data.virtual_fab import Truth
 from litho_design import load_printer
 from litho_design.judging.gap import GapResult, design_folder
 from litho_design.judging.loaded import LoadedDesign
+from litho_design.reports.parts import BRIGHTEST
+from litho_models.effects import get_effect
 from litho_models.evaluation.results import Benchmark
+from litho_models.evaluation.wording import benchmark_verdict
 from litho_models.loop.result.record import CloseLoop
 
 if TYPE_CHECKING:
@@ -28,6 +31,8 @@ CORRECTED = "corrected"
 # Found in all scans: the fab gives each its own zero, as an AFM does, without being asked to.
 ZERO = "datum-offset"
 PLANTED, OTHER = "#2a7ab8", "#b0b0b0"
+# Images behind every element on one scale, so that a dim one looks dim.
+IMAGE = {"cmap": "inferno", "vmin": 0.0, "vmax": BRIGHTEST}
 
 
 def tell(page: Page, out: Path) -> None:
@@ -57,9 +62,8 @@ def tell(page: Page, out: Path) -> None:
         f"{psnr['none']:.1f} dB designed without a model. One run, so nothing is said about chance."
     )
     page.heading("1. What was planted")
-    page.paragraph(
-        f"In the virtual fab, and in no file that the programs read: {'; '.join(planted.values())}."
-    )
+    told = [f"{get_effect(name).title} ({knob})" for name, knob in planted.items()]
+    page.paragraph(f"In the virtual fab, and in no file that the programs read: {'; '.join(told)}.")
     page.figure(_first_scan(out / "store.zarr"), "The first field: its layout, its scan, and the difference.")
     page.links([("store-report/report.html", "The dataset, scan by scan")])
     page.heading("2. What was found")
@@ -69,16 +73,22 @@ def tell(page: Page, out: Path) -> None:
     page.figure(_gains(loop, set(planted)), "What each effect takes off the error; blue if it was planted.")
     page.links([("close-loop/report.html", "The closed loop, with its evidence")])
     page.heading("3. The error before and after, at equal freedom")
+    over = terms.over_scans
+    interval = "" if over.ci95_nm is None else " ({:.2f} … {:.2f}, resampling scans)".format(*over.ci95_nm)
     page.paragraph(
-        f"Mean absolute error of {terms.over_scans.count} scans, each predicted without being fitted to, "
+        f"Mean absolute error of {over.count} scans, each predicted without being fitted to, "
         f"with {terms.before.k:g} term per scan free before and {terms.after.k:g} after: "
-        f"{terms.gain_nm:.2f} nm less, better in {terms.over_scans.positive} scans."
+        f"{terms.gain_nm:.2f} nm less{interval}, better in {over.positive} of {over.count} scans."
     )
     pairs = {"before": terms.before, "after": terms.after}
-    page.figure(_bars({name: one.mae_nm for name, one in pairs.items()}, "error, nm"), "Before and after.")
+    page.figure(
+        _bars({name: one.mae_nm for name, one in pairs.items()}, "error, nm", [OTHER, PLANTED]),
+        "Before: the model as it was trained. After: with the effects that the loop found.",
+    )
     page.heading("4. Which model predicts best")
-    scores = {one.model: one.mae_datum_free_nm for one in Benchmark.read(out / "benchmark").scores}
-    page.paragraph(f"On scans that no fit had seen, {min(scores, key=lambda name: scores[name])} does.")
+    benchmark = Benchmark.read(out / "benchmark")
+    scores = {one.model: one.mae_datum_free_nm for one in benchmark.scores}
+    page.paragraph(benchmark_verdict(benchmark))
     colours = [model_colour(name) for name in scores]
     page.figure(
         _bars(scores, "error, nm", colours),
@@ -113,12 +123,10 @@ def _also(names: list[str]) -> str:
 def _first_scan(store: Path) -> Figure:
     scan = open_store(store).scans()[0]
     measured = np.where(scan.valid, scan.height_um, np.nan)
-    maps = {
-        "layout, µm": scan.layout_um,
-        "scan, µm": measured,
-        "scan - layout, nm": 1000 * (measured - scan.layout_um),
-    }
-    return _row(maps)
+    off_nm = 1000 * (measured - scan.layout_um)
+    most_nm = float(np.nanmax(np.abs(off_nm)))
+    maps = {"layout, µm": scan.layout_um, "scan, µm": measured, "scan - layout, nm": off_nm}
+    return _row(maps, {"scan - layout, nm": {"cmap": "RdBu_r", "vmin": -most_nm, "vmax": most_nm}})
 
 
 def _gains(loop: CloseLoop, planted: set[str]) -> Figure:
@@ -133,7 +141,7 @@ def _gains(loop: CloseLoop, planted: set[str]) -> Figure:
     return figure
 
 
-def _bars(values: dict[str, float], label: str, colours: str | list[str] = PLANTED) -> Figure:
+def _bars(values: dict[str, float], label: str, colours: list[str]) -> Figure:
     figure = new_figure(8.0, 0.6 + 0.45 * len(values))
     axis = figure.subplots()
     drawn = axis.barh(list(values), list(values.values()), color=colours)
@@ -150,13 +158,15 @@ def _hologram(folder: Path, fab: Path) -> Figure:
     printed = design.printed_um(load_printer(fab, design.record.layout))
     assert design.target is not None
     shown = {"wanted": design.target, "printed, µm": printed, "image": design.display(design.image(printed))}
-    return _row({title: np.asarray(picture) for title, picture in shown.items()})
+    maps = {title: np.asarray(picture) for title, picture in shown.items()}
+    return _row(maps, {"wanted": IMAGE, "image": IMAGE})
 
 
-def _row(maps: dict[str, np.ndarray]) -> Figure:
+def _row(maps: dict[str, np.ndarray], scales: dict[str, dict[str, Any]]) -> Figure:
+    """Maps side by side; those without a scale of their own from least to most."""
     figure = new_figure(10.5, 3.6)
     for axis, (title, picture) in zip(figure.subplots(1, len(maps)), maps.items(), strict=True):
-        figure.colorbar(axis.imshow(picture), ax=axis, shrink=0.75)
+        figure.colorbar(axis.imshow(picture, **scales.get(title, {})), ax=axis, shrink=0.75)
         axis.set_title(title)
         axis.set_axis_off()
     return figure

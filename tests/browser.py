@@ -27,6 +27,41 @@ OPTIONS = (
     "--remote-debugging-pipe",
 )
 
+PHONE_PX, DESK_PX = 390, 1280
+# What is wrong with the page as it is shown: WCAG 2 contrast (AA: 4.5, large letters 3), and pictures without
+# content, which are drawn small and have their colours counted.
+FAULTS = """(async () => {
+  const found = [], channel = v => (v /= 255) <= .04045 ? v / 12.92 : ((v + .055) / 1.055) ** 2.4;
+  const light = ([r, g, b]) => .2126 * channel(r) + .7152 * channel(g) + .0722 * channel(b);
+  const rgb = text => text.match(/[\\d.]+/g).map(Number);
+  const over = (colour, ground) => [0, 1, 2].map(i => ground[i] + (colour[3] ?? 1) * (colour[i] - ground[i]));
+  const dark = matchMedia("(prefers-color-scheme: dark)").matches;
+  const paper = e => e ? over(rgb(getComputedStyle(e).backgroundColor), paper(e.parentElement))
+    : dark ? [18, 18, 18] : [255, 255, 255];
+  const walk = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+  for (let node; node = walk.nextNode();) {
+    const element = node.parentElement;
+    const seen = element.checkVisibility({opacityProperty: true, visibilityProperty: true})
+      && element.getBoundingClientRect().right > 0;
+    if (!node.textContent.trim() || !seen || element.tagName === "SCRIPT") continue;
+    const style = getComputedStyle(element), size = parseFloat(style.fontSize);
+    const ground = paper(element), ink = over(rgb(style.color), ground);
+    const [a, b] = [light(ink), light(ground)].sort((x, y) => y - x);
+    const wanted = size >= 24 || (size >= 18.66 && style.fontWeight >= 700) ? 3 : 4.5;
+    if ((a + .05) / (b + .05) < wanted) found.push(`contrast of "${node.textContent.trim().slice(0, 40)}"`);
+  }
+  if (document.documentElement.scrollWidth > innerWidth) found.push("wider than the screen");
+  for (const image of document.images) {
+    if (!image.complete || !image.naturalWidth) { found.push("picture not decoded"); continue; }
+    if (!image.checkVisibility() || image.clientHeight < 4) { found.push("picture not shown"); continue; }
+    const canvas = document.createElement("canvas"); canvas.width = canvas.height = 64;
+    const context = canvas.getContext("2d"); context.drawImage(image, 0, 0, 64, 64);
+    const colours = new Set(new Uint32Array(context.getImageData(0, 0, 64, 64).data.buffer));
+    if (colours.size < 8) found.push("picture without content");
+  }
+  return found;
+})()"""
+
 
 def browser_path() -> str | None:
     """The browser of this machine, or None."""
@@ -70,12 +105,12 @@ class Browser:
         os.close(self._read)
         self._profile.cleanup()
 
-    def show(self, page: Path, width_px: int, dark: bool) -> None:
-        """Load a page and wait for it; what it complains about is in ``errors``."""
+    def show(self, page: Path | str, width_px: int, dark: bool) -> None:
+        """Load a file or an address and wait for it; what it complains about is in ``errors``."""
         self.errors = []
         self.screen(width_px, dark)
         self._loaded = False
-        self.ask("Page.navigate", url=page.resolve().as_uri())
+        self.ask("Page.navigate", url=page if isinstance(page, str) else page.resolve().as_uri())
         while not self._loaded:
             self._take(self._receive())
         # Pictures far down are decoded when they are needed: ask for all, and for the layout with them.

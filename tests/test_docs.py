@@ -70,6 +70,13 @@ def test_a_list_stands_apart_from_the_text_before_it(page):
     assert re.findall(r"^(?![-*|#<]|\d+\. | |$).*\n(?:[-*]|\d+\.) .*$", text, re.MULTILINE) == []
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_what_belongs_to_a_point_is_indented_by_four(page):
+    """With fewer spaces the site's Markdown ends the list there, and runs its further points together."""
+    text = _FENCED.sub("", page.read_text("utf-8"))
+    assert re.findall(r"\n\n {1,3}(\S.*)", text) == []
+
+
 def test_every_page_is_on_the_site():
     nav = (ROOT / "mkdocs.yml").read_text("utf-8").partition("\nnav:\n")[2]
     named = re.findall(r": (\S+\.md)$", nav, re.MULTILINE)
@@ -104,3 +111,31 @@ def test_a_tutorial_runs_and_its_page_shows_its_code(renderer, name, tmp_path, m
     outputs = re.findall(r"^```text\n(.*?)\n```", page, re.MULTILINE | re.DOTALL)
     assert len(outputs) == len([said for said, _ in ran if said])
     assert page.count("](" + name + "-") == len([value for _, value in ran if hasattr(value, "savefig")]) > 0
+
+
+SHORT = [page for page in PAGES if "**In short" in page.read_text("utf-8")]
+
+
+def figures(text: str) -> set[str]:
+    return {one.replace(",", "") for one in re.findall(r"\d+(?:,\d{3})*(?:\.\d+)?", text)}
+
+
+def not_said_again(text: str, linked: str) -> set[str]:
+    """Figures of the short answer of a page that neither its other words nor the linked pages have."""
+    short, _, rest = text.partition("**In short")[2].partition("\n\n")
+    found = figures(f"{rest} {linked}")
+    rounded = {f"{float(one):.{places}f}" for one in found for places in (1, 2)}
+    return figures(re.sub(r"\]\([^)]*\)", "]", short)) - found - rounded
+
+
+@pytest.mark.parametrize("page", SHORT, ids=lambda page: page.name)
+def test_the_short_answer_has_no_figure_of_its_own(page):
+    """What stands above everything is written by hand: a figure that is no longer true would stay there."""
+    text = page.read_text("utf-8")
+    links = re.findall(r"\]\(([\w./-]+\.md)", text.partition("**In short")[2].partition("\n\n")[0])
+    linked = "".join((page.parent / link).read_text("utf-8") for link in links)
+    assert not_said_again(text, linked) == set()
+
+
+def test_a_figure_that_only_the_short_answer_has_is_found():
+    assert not_said_again("**In short:** 18.53 nm of 20 scans.\n\nNoise, 18.53 nm.", "of 21 scans") == {"20"}

@@ -20,10 +20,9 @@ from litho_data.foundation.report_pictures import (
 )
 from litho_design import compare, hologram_settings
 from litho_models.evaluation.benchmark import benchmark
-from tests.browser import Browser, browser_path
+from tests.browser import DESK_PX, FAULTS, PHONE_PX, Browser, browser_path
 from tests.litho_models.prints import make_scans, write_store
 
-PHONE_PX, DESK_PX = 390, 1280
 # Screens of a telephone before the folded part.
 MOST_SCREENS = 6
 TINY = {
@@ -33,35 +32,6 @@ TINY = {
     "search.polish_rounds": 0,
     "window.yield_draws": 5,
 }
-# What is wrong with the page as it is shown: WCAG 2 contrast (AA: 4.5, large letters 3), and pictures without
-# content, which are drawn small and have their colours counted.
-FAULTS = """(async () => {
-  const found = [], channel = v => (v /= 255) <= .04045 ? v / 12.92 : ((v + .055) / 1.055) ** 2.4;
-  const light = ([r, g, b]) => .2126 * channel(r) + .7152 * channel(g) + .0722 * channel(b);
-  const rgb = text => text.match(/[\\d.]+/g).map(Number);
-  const paper = element => { for (let e = element; e; e = e.parentElement) {
-    const colour = rgb(getComputedStyle(e).backgroundColor); if (colour[3] !== 0) return colour; }
-    return matchMedia("(prefers-color-scheme: dark)").matches ? [18, 18, 18] : [255, 255, 255]; };
-  const walk = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
-  for (let node; node = walk.nextNode();) {
-    const element = node.parentElement;
-    if (!node.textContent.trim() || !element.checkVisibility() || element.tagName === "SCRIPT") continue;
-    const style = getComputedStyle(element), size = parseFloat(style.fontSize);
-    const [a, b] = [light(rgb(style.color)), light(paper(element))].sort((x, y) => y - x);
-    const wanted = size >= 24 || (size >= 18.66 && style.fontWeight >= 700) ? 3 : 4.5;
-    if ((a + .05) / (b + .05) < wanted) found.push(`contrast of "${node.textContent.trim().slice(0, 40)}"`);
-  }
-  if (document.documentElement.scrollWidth > innerWidth) found.push("wider than the screen");
-  for (const image of document.images) {
-    if (!image.complete || !image.naturalWidth) { found.push("picture not decoded"); continue; }
-    if (!image.checkVisibility() || image.clientHeight < 4) { found.push("picture not shown"); continue; }
-    const canvas = document.createElement("canvas"); canvas.width = canvas.height = 64;
-    const context = canvas.getContext("2d"); context.drawImage(image, 0, 0, 64, 64);
-    const colours = new Set(new Uint32Array(context.getImageData(0, 0, 64, 64).data.buffer));
-    if (colours.size < 8) found.push("picture without content");
-  }
-  return found;
-})()"""
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +63,7 @@ def every_part() -> Page:
     page = Page("Every part", "a lead", facts={"dataset": "0123456789abcdef" * 4}, words=words)
     page.verdict("pbl is best.")
     page.tiles([("1 nm", "error"), ("2", "scans")])
-    page.note("Do not overlook this.")
+    page.note("Do not overlook that less < more with --one-option.")
     page.heading("Folded", folded=True)
     page.code("x" * 200)
     values = [3.0, 20.0, float("nan"), 100.0]
@@ -179,6 +149,18 @@ def test_tables_have_names_for_people_and_the_csv_keeps_the_keys(reports):
     assert "how far off it is" in text
     assert "mae_abs_nm" in (reports["every part"].parent / "table.csv").read_text("utf-8")
     assert spelt_out("a_rough_edge_um") == "a rough edge (µm)"
+
+
+def test_the_comparison_leads_to_every_design(reports):
+    gap = reports["gap"]
+    links = re.findall(r'href="(designs/[^"]+)"', gap.read_text("utf-8"))
+    assert sorted(links) == [f"designs/{arm}/seed0/report.html" for arm in ("none", "physics")]
+    assert all((gap.parent / link).is_file() for link in links)
+
+
+def test_an_option_in_a_sentence_stays_in_one_piece_and_signs_are_escaped(reports):
+    text = reports["every part"].read_text("utf-8")
+    assert 'less &lt; more with <span class="option">--one-option</span>.' in text
 
 
 def test_the_foot_says_how_the_page_was_made(reports):

@@ -17,6 +17,7 @@ from litho_data.foundation.run_facts import RunFacts, run_facts
 if TYPE_CHECKING:
     import jinja2
     import pandas as pd
+    from markupsafe import Markup
     from matplotlib.figure import Figure
 
     Table = pd.DataFrame | Mapping[str, Any] | Iterable[Mapping[str, Any] | BaseModel]
@@ -199,7 +200,18 @@ def _template() -> jinja2.Template:
     import jinja2
 
     text = Path(__file__).with_name("report_page.html.jinja").read_text(encoding="utf-8")
-    return jinja2.Environment(autoescape=True, trim_blocks=True).from_string(text)
+    environment = jinja2.Environment(autoescape=True, trim_blocks=True)
+    environment.filters["whole_options"] = _whole_options
+    return environment.from_string(text)
+
+
+def _whole_options(text: str) -> Markup:
+    """Options of commands in a sentence do not break over two lines."""
+    from markupsafe import Markup, escape
+
+    return Markup(
+        re.sub(r"(?<![\w-])--[a-z][a-z-]*", r'<span class="option">\g<0></span>', str(escape(text)))
+    )
 
 
 def capitalised(text: str) -> str:

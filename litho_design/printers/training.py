@@ -86,5 +86,6 @@ def _excess(share: np.ndarray, trained: np.ndarray, what: str, of: str) -> list[
         return []
     runs = np.split(many, np.flatnonzero(np.diff(many) > 1) + 1)
     names = ", ".join(f"{run[0]}" if run.size == 1 else f"{run[0]} to {run[-1]}" for run in runs)
+    what = what.replace("levels {}", "level {}") if many.size == 1 else what
     here, there = (100 * float(one[many].sum()) for one in (share, trained))
     return [f"{what.format(names)}: {here:.2g} % {of}, {there:.2g} % in the training layouts"]

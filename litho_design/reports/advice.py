@@ -78,10 +78,9 @@ def _cost_of_staying_inside(design: Design) -> str:
             more = "less" if lost >= 0 else "more"
             told.append(f"{abs(lost):.2f} dB {more} {named(name).removesuffix(' (dB)')}")
     if not told:
-        told = [
-            f"{named(key)} {now:.4g}, not {design.predicted[key]:.4g}" for key, now in gauge.inside.items()
-        ]
-        told = told[:2]
+        for key, now in list(gauge.inside.items())[:2]:
+            name, _, unit = named(key).partition(" (")
+            told.append(f"{name} {now:.3g} {unit.rstrip(')')} instead of {design.predicted[key]:.3g}")
     return (
         f". A short search that stays closer ({100 * gauge.inside_distance:.0f} % of the pixels) ends "
         f"with {', '.join(told)}, as the model prints both (--inside-weight searches so from the start)"

@@ -109,7 +109,7 @@ def _draw_prints(designs: Mapping[str, LoadedDesign], printer: Printer) -> Figur
             extent = (0, layout.size_um, layout.size_um, 0)
             shown = axis.imshow(height_um.cpu().numpy(), vmin=0, vmax=highest_um, extent=extent)
             axis.set_title(title, fontsize=9)
-        row[0].set_ylabel(f"{_NAMES[arm]}\ny, µm")
+        row[0].set_ylabel(_NAMES[arm])
     for axis in axes[-1]:
         axis.set_xlabel("x, µm")
     figure.colorbar(shown, ax=axes.ravel().tolist(), label="height, µm", shrink=0.8)

@@ -70,6 +70,16 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
     for figure in shown[1:]:
         page.table(_matrix(result, figure), _caption(figure), f"matrix_{figure}.csv", digits=3)
     page.heading("Layouts, prints and what they cost", folded=True)
+    page.links(
+        [
+            (
+                (design_folder(Path(), arm, seed) / "report.html").as_posix(),
+                f"Designed with {arm}, seed {seed}",
+            )
+            for arm in result.arms
+            for seed in result.seeds
+        ]
+    )
     page.figure(
         _prints(result, judged, printers),
         f"Seed {result.seeds[0]}: layout and prints in the middle of the element, heights in µm, each in the "
@@ -99,18 +109,21 @@ def _verdict(result: GapResult, figure: str) -> str:
     """The best arm under each judge that is none of the arms, or else under every judge."""
     judges = [name for name in result.judges if name not in result.arms] or list(result.judges)
     sign = -1 if less_is_better(figure) else 1
+    unit = " dB" if figure.endswith("_db") else ""
     told = []
     for judge in judges:
         found = {i.arm: i.judged_mean for i in result.summary if (i.judge, i.figure) == (judge, figure)}
         ranking = sorted(found, key=lambda arm: -sign * found[arm])
-        text = f"Printed by {judge}, layouts designed with {ranking[0]} are best: {found[ranking[0]]:.4g}"
+        text = (
+            f"Printed by {judge}, layouts designed with {ranking[0]} are best: {found[ranking[0]]:.4g}{unit}"
+        )
         if len(ranking) > 1:
             pair = next(
                 i
                 for i in result.paired
                 if (i.judge, i.figure) == (judge, figure) and {i.arm, i.against} == set(ranking[:2])
             )
-            text += f", against {found[ranking[1]]:.4g} with {ranking[1]}; " + _chance(
+            text += f", against {found[ranking[1]]:.4g}{unit} with {ranking[1]}; " + _chance(
                 pair, len(result.seeds)
             )
         told.append(f"{text}.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +26,7 @@ def write_score_report(
     """Write ``report.html`` and ``scores.csv``.
 
     Args:
-        pictures: image or PSF (m, m) behind each print, ``side_um`` wide.
+        pictures: wanted image, image or PSF (m, m) behind each print, ``side_um`` wide.
         photos: object, photograph and reconstructions of a lens (n, n), ``frame_um`` wide.
     """
     page = Page(
@@ -39,7 +40,8 @@ def write_score_report(
     page.verdict(_verdict(result))
     page.figure(
         image_grid([list(pictures.values())], [list(pictures)], [""], side_um),
-        "Behind each print: the image at matched scale, or the square root of the PSF.",
+        "The wanted image, and behind each print the image at matched scale; of a lens the square root of "
+        "the PSF.",
     )
     if photos:
         page.figure(
@@ -85,7 +87,17 @@ def _verdict(result: ScoreResult) -> str:
         )
     told = [
         f"{score.judge.name}: {headline(score.figures, score.uncertainty)}"
+        f"{_against(score.figures, result.designed)}"
         for score in result.scores
         if score.independent
     ]
     return f"{expected}Judged independently, by {'; by '.join(told)}."
+
+
+def _against(judged: Mapping[str, float], expected: Mapping[str, float]) -> str:
+    """How much worse or better than expected, in the figure that a hologram is compared by."""
+    name = "si_psnr_db"
+    if name not in judged or name not in expected:
+        return ""
+    more_db = judged[name] - expected[name]
+    return f" ({abs(more_db):.1f} dB {'more' if more_db > 0 else 'less'} than expected)"

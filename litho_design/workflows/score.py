@@ -67,7 +67,8 @@ def score(
         raise InputError("score", got="nothing to judge with", wanted="a judge, a scan or a photograph")
     judgement = judge_design(loaded, list(printers.values()), scan, camera, stitch)
     result = ScoreResult.of(loaded.folder, record, judgement.scores)
-    shown = {title: loaded.display(image) for title, image in judgement.pictures.items()}
+    wanted = {} if loaded.target is None else {"wanted": loaded.target.cpu().numpy()}
+    shown = wanted | {title: loaded.display(image) for title, image in judgement.pictures.items()}
     write_score_report(Path(out), result, shown, loaded.window_um, judgement.photos, loaded.frame_um)
     result.write(out)
     return result

@@ -10,7 +10,7 @@ from litho_data.foundation.outputs import require_own_folder
 from litho_data.foundation.run_facts import run_info
 from litho_data.readers import read_scan
 from litho_data.store import open_store
-from litho_models.noise.budget import noise_budget
+from litho_models.noise.budget import NoiseBudget, noise_budget
 from litho_models.noise.calibration import analyse_spread
 from litho_models.noise.dose import dose_matrix
 from litho_models.noise.references import (
@@ -78,7 +78,7 @@ def analyse_noise(
         dose=dose,
         budget=budget,
         spread=analyse_spread(spread, seed) if spread is not None else None,
-        notes=[*_notes(found, repeats), *notes],
+        notes=[*_notes(found, repeats, budget), *notes],
     )
     result.write(out)
     write_noise_report(result, references, out)
@@ -127,13 +127,17 @@ def analyse_noise_of_files(
     return result
 
 
-def _notes(found: ReferencePrints, repeats: RepeatedPrints | None) -> list[str]:
+def _notes(found: ReferencePrints, repeats: RepeatedPrints | None, budget: NoiseBudget | None) -> list[str]:
     notes = []
     if not found.flats and repeats is None:
+        how = (
+            "estimated from what a model leaves, not measured"
+            if budget is not None
+            else "not measured; what a model leaves of unseen scans gives an estimate (--residuals)"
+        )
         notes.append(
-            "No flat and no repeated print in the store: the noise is not measured. It can be estimated "
-            "from the out-of-fold residuals of a model (--residuals); one flat print, or one repeat of any "
-            "layout, would measure it."
+            f"No flat and no repeated print in the store: the noise is {how}. One flat print, or one repeat "
+            "of any layout, would measure it."
         )
     if found.flats and not found.substrates:
         notes.append("No bare substrate: the flat print's roughness includes microscope and substrate.")

@@ -51,11 +51,7 @@ def write_report(
         facts={"dataset": plan.dataset.sha256},
         words=_WORDS,
     )
-    decided = [_asked(q) for q in plan.questions if q.status == "decides"]
-    page.verdict(
-        f"These prints decide {len(decided)} of {len(plan.questions)} open questions with a chance of "
-        f"{ENOUGH} or more of being right" + (f": {'; '.join(decided)}." if decided else ".") + _wanting(plan)
-    )
+    page.verdict(_verdict(plan))
     page.tiles(
         [
             (f"{plan.levels[0]} to {plan.levels[1]}", "levels used"),
@@ -96,6 +92,19 @@ def _asked(question: PlannedQuestion) -> str:
     if question.kind == "fact":
         return f"{first}: {question.text}"
     return f"{first}: the printer's or the microscope's"
+
+
+def _verdict(plan: NextPrint) -> str:
+    decided = [_asked(q) for q in plan.questions if q.status == "decides"]
+    asked = sum(question.kind != "fact" for question in plan.questions)
+    if not asked:
+        names = " and ".join(question.name for question in plan.questions)
+        return f"No print decides what is open: a fact on the card answers {names}."
+    told = f": {'; '.join(decided)}." if decided else "."
+    return (
+        f"These prints decide {len(decided)} of {asked} open questions with a chance of {ENOUGH} or more of "
+        f"being right{told}{_wanting(plan)}"
+    )
 
 
 def _wanting(plan: NextPrint) -> str:

@@ -76,7 +76,7 @@ def test_what_is_unusual_is_said():
     found = out_of_distribution(levels, LAYOUT, card)
     # Half of the pixels are at 5, a third in training: not twice as many. One step of 5 in 15 along x.
     assert found.unusual == [
-        "levels 0: 50 % of the pixels, 0 % in the training layouts",
+        "level 0: 50 % of the pixels, 0 % in the training layouts",
         "steps of 5 levels: 3.3 % of the neighbouring pixels, 0 % in the training layouts",
     ]
     found = out_of_distribution(np.tile(np.array([5, 9], np.uint8), (16, 8)), LAYOUT, card)

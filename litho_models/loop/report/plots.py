@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
+from litho_data.foundation.report import spelt_out
 from litho_data.foundation.report_pictures import LIGHT, new_figure
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.findings import LoopFindings
@@ -243,9 +244,8 @@ def profile_figure(profiles: Sequence[Profile]) -> Figure:
     for one, own in zip(profiles, axes.flat, strict=False):
         own.plot(one.held, one.rmse_nm, "o-", color=_AFTER, ms=3, lw=1.2)
         own.axvline(one.fitted, color=_BEFORE, lw=1)
-        unit = f" ({one.unit})" if one.unit != "1" else ""
         own.set_title(one.effect, fontsize=9)
-        own.set_xlabel(f"{one.parameter}{unit}", fontsize=8)
+        own.set_xlabel(spelt_out(one.parameter), fontsize=8)
         own.ticklabel_format(axis="both", useOffset=False)
         own.locator_params(axis="x", nbins=4)
         own.tick_params(labelsize=7)

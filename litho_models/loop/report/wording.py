@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from litho_data.foundation.report import capitalised
+from litho_data.foundation.report import capitalised, spelt_out
 from litho_models.effects import get_effect
 from litho_models.frozen.readme import bounds_text
 from litho_models.loop.findings import LoopFindings
@@ -238,5 +238,7 @@ def _estimate_text(effect: AddedEffect) -> str:
         if p.ci95 is None:
             continue
         unit = "" if p.unit == "1" else f" {p.unit}"
-        parts.append(f"{name} {p.value:.3g}{unit} [{p.ci95[0]:.3g}, {p.ci95[1]:.3g}]")
+        # The key ends with the unit, which stands behind the number.
+        words = spelt_out(name).partition(" (")[0]
+        parts.append(f"{words} {p.value:.3g}{unit} ({p.ci95[0]:.3g} … {p.ci95[1]:.3g})")
     return ", ".join(parts)
