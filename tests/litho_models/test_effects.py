@@ -311,6 +311,18 @@ def test_uneven_scanners_of_printer_and_microscope_are_one_formula_until_the_sca
     assert torch.allclose(wide, printed, rtol=0, atol=1e-12)
 
 
+def test_the_gradient_of_a_dilation_is_that_of_the_piece_on_which_the_tip_stands() -> None:
+    """Of a field whose maxima are not tied, so that a difference of 1e-6 leaves each tip on its piece."""
+    draw = torch.Generator().manual_seed(4)
+    surface = (0.3 * torch.rand(1, 1, 6, 12, generator=draw, dtype=torch.float64)).requires_grad_()
+    radius_um = torch.tensor(0.05, dtype=torch.float64, requires_grad=True)
+    context = FieldContext(surface.detach(), PITCH_UM, 1.2)
+    tip = get_effect("tip-dilation")
+    assert torch.autograd.gradcheck(
+        lambda height, radius: tip(height, {"radius_um": radius}, context), (surface, radius_um)
+    )
+
+
 def test_a_tip_on_a_hump_rests_as_the_closed_form_says() -> None:
     # max over u of a (1 - (x - u)² / w²) - u² / 2R is a parabola again: its curvature 1/q becomes 1/(q + R),
     # q = w² / 2a. Straight pieces of half a pixel lie below a parabola by (dx/2)² / 8q at most.
