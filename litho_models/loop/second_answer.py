@@ -47,7 +47,7 @@ def _of_bow(shown_um: float, sd_um: float, asked_um: float) -> str:
         told = "it is the scanner's" if towards > 0 else "it is not the scanner's"
     shown_nm, sd_nm, asked_nm = (NM_PER_UM * one for one in (shown_um, sd_um, asked_um))
     return (
-        f"a grating shows the middle of a line {shown_nm:.0f} ± {sd_nm:.0f} nm off, {SCANNER} asks for "
+        f"a grating shows the middle of a line {shown_nm:.1f} ± {sd_nm:.1f} nm off, {SCANNER} asks for "
         f"{asked_nm:.0f} nm: {told}"
     )
 
