@@ -13,6 +13,8 @@ from litho_data.roughness import axis_scales, find_wave, line_bow
 from litho_data.store.read import Store
 from litho_data.tip.radius import peak_radius
 
+_BOUND_SIGMA = 2.0
+
 
 class GratingScan(Record):
     """One scan of a grating; figures are None where it does not show them, and ``problem`` says why.
@@ -21,7 +23,8 @@ class GratingScan(Record):
         scale_x, scale_y: what a stated length has to be multiplied by; ``_sd``: standard uncertainties.
         bow_um: by how much the middle of a line lies too far along x, against its ends.
         line_um: length of a line.
-        tip_um: radius of the tip, or the most that it can be: then ``tip_bound``.
+        tip_at_most_um: the most that the radius of the tip can be. A tip so blunt that it bridges the gaps
+            between bars shows less of its curvature than it has.
     """
 
     id: str
@@ -33,9 +36,7 @@ class GratingScan(Record):
     scale_y_sd: float | None = None
     bow_um: float | None = None
     bow_sd_um: float | None = None
-    tip_um: float | None = None
-    tip_sd_um: float | None = None
-    tip_bound: bool = True
+    tip_at_most_um: float | None = None
     problem: str = ""
 
 
@@ -61,7 +62,10 @@ def grating_scan(
     height_um = height_um.astype(np.float64)
     found = GratingScan(id=scan_id, period_um=known.period_um, line_um=height_um.shape[1] * pitch_um[1])
     tip = peak_radius(height_um, pitch_um)
-    figures: dict[str, Any] = {"tip_um": tip.radius_um, "tip_sd_um": tip.sd_um, "tip_bound": bool(tip.reason)}
+    figures: dict[str, Any] = {}
+    if tip.radius_um is not None:
+        # A bound has that added already.
+        figures["tip_at_most_um"] = tip.radius_um + (0.0 if tip.reason else _BOUND_SIGMA * tip.sd_um)
     try:
         waves = [find_wave(height_um, pitch_um, known.period_um, axis) for axis in ("x", "y")]
         scales = axis_scales([(one, known.period_um, known.uncertainty_um) for one in waves], ["x", "y"])

@@ -81,8 +81,7 @@ _GRATING: dict[str, tuple[str, str]] = {
     "scale_y_sd": ("its uncertainty, y", "standard uncertainty, with that of the period"),
     "bow_um": ("bow of a line (µm)", "how far the middle of a line lies too far, against its ends"),
     "bow_sd_um": ("its uncertainty (µm)", "standard uncertainty, from the scatter along the line"),
-    "tip_um": ("tip radius (µm)", "of the tip's end"),
-    "tip_bound": ("at most", "whether the radius is only the most that it can be"),
+    "tip_at_most_um": ("tip radius, at most (µm)", "the most that the radius of the tip's end can be"),
     "problem": ("not measured", "why the grating does not show its figures"),
 }
 

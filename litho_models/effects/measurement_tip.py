@@ -45,17 +45,17 @@ def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
     steepest = max(float(s.detach().abs().max()) for s in slopes)
     reach_px = min(math.ceil(float(radius_um.detach()) * steepest / pitch_um) + 1, size)
     starts = [_continued(part, reach_px, "replicate") for part in (height, middles)]
-    slopes = [_continued(part, reach_px, "constant") for part in slopes]
+    rises = [_continued(part, reach_px, "constant") for part in slopes]
     # A maximum changes as the piece does on which it stands: the search needs no gradient, for which every
     # piece would have to be kept.
     with torch.no_grad():
         highest, on = height, torch.zeros_like(height, dtype=torch.int32)
-        touches = [radius_um * slope for slope in slopes]
+        touches = [radius_um * slope for slope in rises]
         bend = float(-0.5 / radius_um)
         for offset in range(-2 * reach_px, 2 * reach_px):
             away_px, middle = divmod(offset, 2)
             start, slope, touch = (
-                part[middle][..., reach_px + away_px :][..., :size] for part in (starts, slopes, touches)
+                part[middle][..., reach_px + away_px :][..., :size] for part in (starts, rises, touches)
             )
             near_um = offset * half_um
             touch = touch.clamp(near_um, near_um + half_um)
@@ -63,10 +63,10 @@ def _dilate_rows(height: Tensor, radius_um: Tensor, pitch_um: float) -> Tensor:
             on.masked_fill_(tip > highest, offset)
             highest = torch.maximum(highest, tip)
     piece = on + 2 * (torch.arange(size, device=height.device) + reach_px)
-    start, slope = (torch.stack(part, dim=-1).flatten(-2).gather(-1, piece) for part in (starts, slopes))
-    near_um = on.to(height.dtype) * half_um
-    touch = (radius_um * slope).clamp(near_um, near_um + half_um)
-    return start + slope * (touch - near_um) - touch**2 / (2 * radius_um)
+    start, slope = (torch.stack(part, dim=-1).flatten(-2).gather(-1, piece) for part in (starts, rises))
+    begins_um = on.to(height.dtype) * half_um
+    touch = (radius_um * slope).clamp(begins_um, begins_um + half_um)
+    return start + slope * (touch - begins_um) - touch**2 / (2 * radius_um)
 
 
 def _middles(rows: Tensor) -> Tensor:

@@ -28,8 +28,8 @@ def said_by_gratings(question: Question, gratings: Sequence[GratingScan], line_u
             continue
         own = rival.effects[rival.name]
         for one in gratings:
-            if rival.name == TIP and one.tip_um is not None:
-                told.append(_of_tip(one, one.tip_um, own["radius_um"]))
+            if rival.name == TIP and one.tip_at_most_um is not None:
+                told.append(_of_tip(one.tip_at_most_um, own["radius_um"]))
             elif rival.name == SCANNER and one.bow_um is not None and one.bow_sd_um is not None:
                 # A displacement that is quadratic grows with the square of the line.
                 scaled = (line_um / one.line_um) ** 2
@@ -47,18 +47,11 @@ def _of_bow(shown_um: float, sd_um: float, asked_um: float) -> str:
         told = "it is the scanner's" if towards > 0 else "it is not the scanner's"
     shown_nm, sd_nm, asked_nm = (NM_PER_UM * one for one in (shown_um, sd_um, asked_um))
     return (
-        f"a grating shows the middle of a line {shown_nm:.0f} ± {sd_nm:.0f} nm off, {SCANNER} asks for "
+        f"a grating shows the middle of a line {shown_nm:.1f} ± {sd_nm:.1f} nm off, {SCANNER} asks for "
         f"{asked_nm:.0f} nm: {told}"
     )
 
 
-def _of_tip(one: GratingScan, radius_um: float, asked_um: float) -> str:
-    sd_um = one.tip_sd_um or 0.0
-    shown = f"at most {radius_um:.2f}" if one.tip_bound else f"{radius_um:.2f} ± {sd_um:.2f}"
-    if radius_um + (0 if one.tip_bound else Z_DECIDED * sd_um) < asked_um / 2:
-        told = "it is not the tip's"
-    elif not one.tip_bound and radius_um - Z_DECIDED * sd_um > asked_um / 2:
-        told = "it may be the tip's"
-    else:
-        told = "it says no more"
-    return f"a grating shows a tip of {shown} µm, {TIP} asks for {asked_um:.2f} µm: {told}"
+def _of_tip(most_um: float, asked_um: float) -> str:
+    told = "it is not the tip's" if most_um < asked_um / 2 else "it says no more"
+    return f"a grating shows a tip of {most_um:.2f} µm at most, {TIP} asks for {asked_um:.2f} µm: {told}"

@@ -53,11 +53,16 @@ def test_the_scales_are_those_of_the_scan_within_their_uncertainty():
             assert sd < 0.005
 
 
-def test_a_blunt_tip_shows_on_the_grating():
-    radii = [scanned(*knobs)[1].tip_um for knobs in ((), (KnobSetting("tip-dilation", 0.8),))]
-    # Without a tip the corners of the bars bound it; a radius of 0.8 µm is found to the method's tenth.
-    assert radii[0] < 0.4
-    assert radii[1] == pytest.approx(0.8, rel=0.25)
+def test_a_grating_bounds_the_tip():
+    sharp, blunt, bridging = (
+        scanned(*(KnobSetting("tip-dilation", radius) for radius in radii))[1].tip_at_most_um
+        for radii in ((), (0.8,), (1.8,))
+    )
+    # Without a tip the flanks of the bars bound it. A tip of 0.8 µm reaches 0.9 µm, into bars of 1 µm.
+    assert sharp < 0.4
+    assert 0.8 < blunt < 1.25 * 0.8
+    # One of 1.8 µm bridges the gaps: what is left is a bound.
+    assert bridging > 1.8
 
 
 def test_no_grating_is_said_and_not_measured():
