@@ -36,6 +36,7 @@ ON_CPU = "float32, CPU"
 _CPU_ONLY = ("mixed",)
 # Side of the matrices whose product shows the highest rate.
 _MATRIX = {"cpu": 2048, "cuda": 8192}
+_PRODUCTS, _ENOUGH_S = 12, 10.0
 
 Arrays = Mapping[str, np.ndarray]
 Work = tuple[Callable[[], object], Callable[[], Arrays]]
@@ -163,12 +164,13 @@ def as_markdown(record: Mapping[str, Any]) -> str:
     )
 
 
-def peak_gflops(dtype: torch.dtype, device: torch.device, repeats: int = 12) -> float:
+def peak_gflops(dtype: torch.dtype, device: torch.device) -> float:
     """Best rate of a large matrix product on the threads in use or on a GPU, GFLOP/s."""
     size = _MATRIX[device.type]
     square = torch.randn(size, size, device=device).to(dtype)
-    seconds = []
-    for _ in range(repeats):
+    seconds: list[float] = []
+    # One product of a dtype for which the processor has no unit can take minutes.
+    while len(seconds) < _PRODUCTS and sum(seconds) < _ENOUGH_S:
         started = _now(device)
         square @ square
         seconds.append(_now(device) - started)

@@ -11,7 +11,7 @@ import torch
 from benchmarks import hoe_iteration, predict, train_step
 from benchmarks.plain_pbl import PlainPbl
 from benchmarks.record import NOT_MEASURED, published
-from benchmarks.side_by_side import PAGE, RESULTS, as_markdown, relative_percent
+from benchmarks.side_by_side import _MATRIX, PAGE, RESULTS, as_markdown, relative_percent
 from benchmarks.trained_pbl import areawise_gflop, random_layout
 from litho_models.frozen.files import save_frozen
 from litho_models.models import build_model
@@ -90,6 +90,8 @@ def test_relative_differences_are_of_root_mean_squares():
 def test_each_benchmark_measures_all_its_sides(benchmark, size_px, tmp_path, monkeypatch):
     model = save_frozen(make_pbl(), tmp_path / "pbl")
     out = tmp_path / "out.json"
+    # Without a bfloat16 unit one product of the usual size takes minutes.
+    monkeypatch.setitem(_MATRIX, "cpu", 128)
     options = ["--model", str(model), "--size-px", str(size_px), "--repeats", "1", "--threads", "1"]
     monkeypatch.setattr("sys.argv", [benchmark.NAME, *options, "--out", str(out)])
     benchmark.main()
