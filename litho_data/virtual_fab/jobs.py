@@ -10,12 +10,12 @@ from typing import cast
 
 import numpy as np
 
-from litho_data.cards.card import load_card
+from litho_data.cards.card import Use, load_card
 from litho_data.cards.tables import read_table
 from litho_data.foundation.errors import InputError
 from litho_data.layouts.random_layout import random_layout
 from litho_data.readers import read_layout
-from litho_data.virtual_fab.printer import Job, Use
+from litho_data.virtual_fab.printer import Job
 from litho_data.virtual_fab.settings import Printer
 
 # Columns of a card's table that say how a scan was made.

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
+from litho_data.cards.card import Use
 from litho_data.virtual_fab.canvas import Canvas, frame_layout, gaussian_transfer
 from litho_data.virtual_fab.exposure import accumulate_dose
 from litho_data.virtual_fab.geometry import ScanFrame
@@ -14,8 +14,6 @@ from litho_data.virtual_fab.knobs import KnobBoard
 from litho_data.virtual_fab.random_curves import gaussian_field, line_roughness
 from litho_data.virtual_fab.resist import develop
 from litho_data.virtual_fab.settings import Noise, Printer
-
-Use = Literal["dataset", "flat", "substrate", "steps", "grating"]
 
 _SUBSTRATE_GRAIN_UM = 0.3
 # Of a square calibration grating: height, and width of its flanks.

@@ -172,18 +172,13 @@ def schedule(
     ladder = random_level(limits, size_px, seed + 13)
     if size_px >= _LADDER_PX:
         ladder = framed_ladder(ladder, highest=limits.highest, lowest=limits.lowest, tread_px=_TREAD_PX)
+    unprinted = np.zeros((size_px, size_px), np.uint8)
     references: list[tuple[Use, np.ndarray, str]] = [
-        ("substrate", np.zeros((size_px, size_px), np.uint8), "zero, tilt and bow without a print"),
+        ("substrate", unprinted, "zero, tilt and bow without a print"),
         ("flat", flat((size_px, size_px), level=(limits.lowest + limits.highest) // 2), "the noise floor"),
         ("steps", ladder, "height against level; on a step standard of known height the microscope's gain"),
+        ("grating", unprinted, "scales and unevenness of the scanner, and the tip"),
     ]
-    references.append(
-        (
-            "grating",
-            np.zeros((size_px, size_px), np.uint8),
-            "scales and unevenness of the scanner, and the tip",
-        )
-    )
     rows: list[tuple[str, str, Use, Way, float, float, str, np.ndarray]] = []
     for number, (use, level, why) in enumerate(references, start=1):
         rows.append((f"N0F{number}", "0", use, Way(), 0.0, 1.0, why, level))
