@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -21,7 +21,14 @@ from litho_models.loop.probes.kernel import missing_kernel, off_centre_peak, res
 from litho_models.loop.probes.layout import LAYOUT_FEATURES, _rows, layout_features
 from litho_models.loop.probes.linear import Left, held_out_ridge
 from litho_models.loop.probes.places import PROFILE_SPLINES, SPLINES, _over, drawn, drawn_profile, shifts
-from litho_models.loop.probes.selection import GENERIC, SMALLEST_AGREEMENT, _anchor, _corrected, generic_terms
+from litho_models.loop.probes.probe import Probe
+from litho_models.loop.probes.selection import (
+    GENERIC,
+    SMALLEST_AGREEMENT,
+    _anchors,
+    _corrected,
+    generic_terms,
+)
 from litho_models.loop.probes.tables import SPOT_UM
 from litho_models.loop.probes.trend import order_trends
 from litho_models.loop.report.plots import probe_figure
@@ -60,6 +67,18 @@ def probed(scans: list[PreparedScan], predictions: list[np.ndarray]) -> Probed:
     )  # fmt: skip
 
 
+class _Planted(NamedTuple):
+    """A probe whose correction is given: (parameters, scan) -> (y, x) µm."""
+
+    given: Callable[[np.ndarray, PreparedScan], np.ndarray]
+    free: Terms
+
+    def correction(self, parameters: np.ndarray, scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
+        return self.given(parameters, scan)
+
+    at_samples = Probe.at_samples
+
+
 @pytest.mark.parametrize("free", [POLICIES["full"], ALL_FREE], ids=["full", "with warp"])
 def test_a_correction_moves_nothing_that_the_probe_was_estimated_free_of(free: Terms) -> None:
     scans = prepare_scans(printed_scans(count=3, size_px=64, seed=3))
@@ -71,12 +90,9 @@ def test_a_correction_moves_nothing_that_the_probe_was_estimated_free_of(free: T
     of = {f.id: (amounts @ s).reshape(64, 64) for f, s in zip(scans, shared, strict=True)}
     changes: list[list[np.ndarray]] = []
     for scale in (0.0, 1.0):
-        probe: Any = SimpleNamespace(
-            correction=lambda parameters, scan, prediction: parameters * own[scan.id] + of[scan.id],
-            free=free,
-        )
+        probe: Any = _Planted(lambda parameters, scan: parameters * own[scan.id] + of[scan.id], free)
         parameters = np.array(scale)
-        anchor = _anchor(probe, parameters, scans, predictions)
+        (anchor,) = _anchors(probe, parameters[None], scans, predictions)
         both = zip(scans, predictions, strict=True)
         changes.append([_corrected(probe, parameters, anchor, f, p) - p for f, p in both])
     # What is shared alone vanishes, to the float32 of a prediction.
@@ -95,6 +111,12 @@ def test_every_probe_is_found_under_its_name() -> None:
     scans, predictions = scene()
     defects = find_defects(scans, predictions)
     assert [probe.name for probe in generic_terms(scans, predictions, defects)] == list(GENERIC)
+    # What is summed at the sampled pixels is what is added there.
+    for probe in [*generic_terms(scans, predictions, defects, [*GENERIC, LAYOUT_FEATURES])]:
+        parameters = probe.held_out(np.arange(len(scans)) % 5).per_fold[:2]
+        added = [scans[0].at_sample(probe.correction(one, scans[0], predictions[0])) for one in parameters]
+        sampled = probe.at_samples(parameters, scans[0], predictions[0])
+        assert np.abs(sampled - added).max() < 1e-5 * max(np.abs(added).max(), 1e-3), probe.name
     for name in ("missing-kernel", "row-gain-profile"):
         assert [probe.name for probe in generic_terms(scans, predictions, defects, [name])] == [name]
 

@@ -18,7 +18,7 @@ from scipy.ndimage import gaussian_filter, shift
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.prepared import PreparedScan
 from litho_models.loop.probes.kernel import reach_um
-from litho_models.loop.probes.probe import Estimate
+from litho_models.loop.probes.probe import Estimate, Probe
 from litho_models.scan_terms import POLICIES, Terms, freed_um
 
 # Beyond two thirds of the field too few pixels see a copy of something printed.
@@ -29,7 +29,7 @@ _SAME_PLACE_UM = 0.5
 
 
 @dataclass(frozen=True)
-class DisplacedCopy:
+class DisplacedCopy(Probe):
     """Residual = amount · layout displaced by (y, x), the same for all scans.
 
     Attributes:

@@ -16,7 +16,7 @@ from scipy.signal import fftconvolve
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.loop.prepared import PreparedScan
-from litho_models.loop.probes.probe import Estimate, sums_by_fold
+from litho_models.loop.probes.probe import Estimate, Probe, sums_by_fold
 from litho_models.scan_terms import POLICIES, TermPixels, Terms, least_squares, term_maps
 
 SUPPORT_UM = 5.0
@@ -32,7 +32,7 @@ _PEAK_EDGE = 0.1
 
 
 @dataclass(frozen=True)
-class MissingKernel:
+class MissingKernel(Probe):
     """Residual = k * layout with one kernel for all scans.
 
     Attributes:

@@ -6,6 +6,7 @@ every cause. What it gains is a shared response to the layout that has neither a
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -35,17 +36,25 @@ def layout_features(left: Left) -> LinearProbe | None:
     if all(np.ptp(scan.stored.layout_um) == 0 for scan in left.scans):
         return None
     model = richest_features(left.scans[0])
-    spread = [feature_rows(model, scan.stored, scan.sample).var(axis=1) for scan in left.scans]
+    spread: list[np.ndarray] = []
+
+    def unscaled(scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
+        rows = feature_rows(model, scan.stored, scan.sample)
+        spread.append(rows.var(axis=1))
+        return rows
+
+    ones = np.ones(model.parameter_count)
+    map_of = partial(_correction, model=model, scale=ones)
+    measured = probe_of_rows(LAYOUT_FEATURES, unscaled, map_of, np.diag(ones), None, _no_numbers, left)
+    # To make features takes long: they are measured as they are, and their inner products scaled.
     scale = np.sqrt(np.mean(spread, axis=0))
     scale[scale == 0] = 1.0
-    return probe_of_rows(
-        LAYOUT_FEATURES,
-        partial(_rows, model=model, scale=scale),
-        partial(_correction, model=model, scale=scale),
-        np.eye(len(scale)),
-        None,
-        _no_numbers,
-        left,
+    return replace(
+        measured,
+        rows_of=partial(_rows, model=model, scale=scale),
+        map_of=partial(_correction, model=model, scale=scale),
+        grams=measured.grams / np.outer(scale, scale),
+        rights=measured.rights / scale,
     )
 
 

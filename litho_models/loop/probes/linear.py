@@ -43,6 +43,7 @@ class LinearProbe:
     """Residual = columns · coefficients, the same coefficients for all scans.
 
     Attributes:
+        rows_of: (scan, prediction (y, x) µm) -> columns at the sampled pixels (m, n).
         map_of: (coefficients (m,), scan, prediction (y, x) µm) -> height to add (y, x), µm.
         penalty: (m, m), what a ridge fit keeps small.
         shuffle: (generator, m) -> order of the columns of one scan under the probe's control; None turns the
@@ -53,6 +54,7 @@ class LinearProbe:
     """
 
     name: str
+    rows_of: ColumnsOf
     map_of: MapOf
     penalty: np.ndarray
     shuffle: Shuffle | None
@@ -98,6 +100,10 @@ class LinearProbe:
         """Height to add (y, x), µm."""
         return self.map_of(parameters, scan, prediction).astype(np.float32)
 
+    def at_samples(self, parameters: np.ndarray, scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
+        """Heights (p, n) at the sampled pixels, µm, of parameters (p, m)."""
+        return parameters @ self.rows_of(scan, prediction)
+
 
 def linear_probe(
     name: str,
@@ -124,8 +130,7 @@ def probe_of_rows(
     """Measure a probe's inner products with the residual on the sampled pixels.
 
     Args:
-        rows_of: (scan, prediction (y, x) µm) -> columns at the sampled pixels (m, n).
-        map_of: as of the probe.
+        rows_of, map_of: as of the probe.
     """
     grams, rights = [], []
     for scan, prediction, use in zip(*left, strict=True):
@@ -137,7 +142,8 @@ def probe_of_rows(
         grams.append(products[:-1, :-1])
         rights.append(products[:-1, -1])
     pixels = np.array([use.sum() for use in left.kept])
-    return LinearProbe(name, map_of, penalty, shuffle, summary, np.stack(grams), np.stack(rights), pixels)
+    products = np.stack(grams), np.stack(rights), pixels
+    return LinearProbe(name, rows_of, map_of, penalty, shuffle, summary, *products)
 
 
 def _sampled(scan: PreparedScan, prediction: np.ndarray, columns_of: ColumnsOf) -> np.ndarray:

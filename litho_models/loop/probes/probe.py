@@ -73,3 +73,7 @@ class Probe(Protocol):
 
     def correction(self, parameters: np.ndarray, scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
         """Height to add (y, x), µm, to a prediction (y, x), µm."""
+
+    def at_samples(self, parameters: np.ndarray, scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
+        """The same for several parameters (p, m), at the sampled pixels of the scan, (p, n) µm."""
+        return np.stack([scan.at_sample(self.correction(one, scan, prediction)) for one in parameters])

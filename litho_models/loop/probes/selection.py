@@ -185,7 +185,7 @@ def _best(
     Probes are estimated free of each scan's own gain and bow, so they are judged free of them too.
     """
     terms = terms | {"gain", "bow"}
-    fold_of, scans = study.fold_of, study.scans
+    fold_of = study.fold_of
     before = state.score(study, terms)
     estimates = [(probe, probe.held_out(fold_of)) for probe in candidates]
     for probe, estimate in sorted(estimates, key=lambda e: -e[1].mean_gain_nm2):
@@ -199,7 +199,7 @@ def _best(
         controls = probe.controls(fold_of, random, CONTROLS)
         limit = float(np.quantile(controls, CONTROL_QUANTILE))
         agreement = probe.agreement()
-        extended = _with_probe(state, study, probe, estimate)
+        extended, anchor = _with_probe(state, study, probe, estimate)
         after = extended.score(study, terms)
         confirmation = study.confirm(before, after, counted=False)
         reasons = [confirmation.reason] if confirmation.reason else []
@@ -210,7 +210,6 @@ def _best(
         tests[probe.name] = ProbeTest(probe.name, gain, limit, agreement, "; ".join(reasons))
         if not reasons:
             p_control = float((1 + (controls >= gain).sum()) / (CONTROLS + 1))
-            anchor = _anchor(probe, estimate.common, scans, state.predictions)
             return AddedProbe(probe, estimate, anchor, before, after, confirmation, p_control), extended
     return None
 
@@ -220,17 +219,20 @@ def with_generic_terms(state: State, study: Study, names: Sequence[str]) -> Stat
     defects = find_defects(study.scans, state.predictions)
     for name in names:
         for probe in generic_terms(study.scans, state.predictions, defects, [name]):
-            state = _with_probe(state, study, probe, probe.held_out(study.fold_of))
+            state, _ = _with_probe(state, study, probe, probe.held_out(study.fold_of))
     return state
 
 
-def _with_probe(state: State, study: Study, probe: Probe, estimate: Estimate) -> State:
-    anchors = [_anchor(probe, own, study.scans, state.predictions) for own in estimate.per_fold]
+def _with_probe(state: State, study: Study, probe: Probe, estimate: Estimate) -> tuple[State, np.ndarray]:
+    """The state with the probe, each scan corrected by the fit without it; the anchor of the fit to all."""
+    *anchors, common = _anchors(
+        probe, np.vstack([estimate.per_fold, estimate.common]), study.scans, state.predictions
+    )
 
     def correct(fold: int, scan: PreparedScan, prediction: np.ndarray) -> np.ndarray:
         return _corrected(probe, estimate.per_fold[fold], anchors[fold], scan, prediction)
 
-    return state.with_correction(correct, study)
+    return state.with_correction(correct, study), common
 
 
 def _corrected(
@@ -240,18 +242,21 @@ def _corrected(
     return prediction + probe.correction(parameters, scan, prediction) + shared.astype(np.float32)
 
 
-def _anchor(
+def _anchors(
     probe: Probe, parameters: np.ndarray, scans: Sequence[PreparedScan], predictions: Sequence[np.ndarray]
 ) -> np.ndarray:
-    """Minus what the correction has of the probe's free terms in the mean over scans, (k,).
+    """Minus what a correction has of the probe's free terms in the mean over scans, (p, k).
 
     A probe is estimated free of what every scan may have of these, so it says nothing about what all
     scans share of them; without this it would move height and place at random.
+
+    Args:
+        parameters: (p, m), one correction each.
     """
     products: list[tuple[np.ndarray, np.ndarray]] = []
     for scan, prediction in zip(scans, predictions, strict=True):
-        correction = scan.at_sample(probe.correction(parameters, scan, prediction))
-        columns = term_maps(TermPixels(prediction, at=scan.sample), probe.free)
-        products.append((columns @ columns.T / len(correction), columns @ correction / len(correction)))
+        columns = term_maps(TermPixels(prediction, at=scan.sample), probe.free) / np.sqrt(len(scan.sample))
+        corrections = probe.at_samples(parameters, scan, prediction) / np.sqrt(len(scan.sample))
+        products.append((columns @ columns.T, columns @ corrections.T))
     normal, right = (sum(part) for part in zip(*products, strict=True))
-    return -np.linalg.lstsq(normal, right, rcond=1e-10)[0]
+    return -np.linalg.lstsq(normal, right, rcond=1e-10)[0].T
