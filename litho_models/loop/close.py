@@ -118,7 +118,7 @@ def close_loop(
         if choice.probed.added
         else choice.left_by_named,
         explainable=_explainable(choice, learner),
-        weights=weigh_effects(search, choice.study, learner, fitted),
+        weights=weigh_effects(search, choice.probed.traced, choice.study, learner, fitted),
         locked_scores=scores_elsewhere(choice, locked) if config.open_lock_box and locked else None,
         observed=observe(choice.study, final.predictions, choice.terms, choice.probed.defects, rounding_um),
         identifiability=identifiability(search.state.fits),

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from litho_models.effects import get_effect
 from litho_models.loop.prepared import prepare_scans
-from litho_models.loop.result.added_effects import doubtful_effects
 from litho_models.loop.selection.confirming import confirm
 from litho_models.loop.selection.contest import Added
 from litho_models.loop.selection.search import FORM_ERROR, Search, rejection_reason
@@ -54,14 +51,3 @@ def test_an_effect_that_was_dropped_stands_in_nobodys_way(chosen) -> None:
     winner = added("field-curvature", 1000.0, 999.0)
     without = search.steps["slope-thinning"][0]
     assert "small beside" not in rejection_reason((winner, state), without, search, Study(scans, FOLDS))
-
-
-def test_what_a_doubtful_filter_took_up_was_left_by_the_filters_before_it() -> None:
-    memory, spot = added("write-order-memory", 400.0, 340.0), added("elliptical-psf", 340.0, 310.0)
-    # 4 nm2 are more than a tenth of 30, less than a tenth of 60: but then 34 were left by the first.
-    assert doubtful_effects([memory, spot], 4.0) == {"write-order-memory", "elliptical-psf"}
-    assert doubtful_effects([memory, spot], 2.0) == set()
-    assert doubtful_effects([memory], 4.0) == set()
-    # What is no filter is not doubted for what a filter could still do.
-    slopes = replace(memory, effect=get_effect("slope-thinning"))
-    assert doubtful_effects([slopes, spot], 4.0) == {"elliptical-psf"}

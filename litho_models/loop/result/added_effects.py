@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 from litho_models.effects import Effect
@@ -14,13 +13,7 @@ from litho_models.loop.result.record import AddedEffect, EffectVerdict, Paramete
 from litho_models.loop.selection.contest import Added
 from litho_models.loop.selection.search import separating_experiment
 from litho_models.loop.single_scans.nested_tests import MeasurementTest
-from litho_models.loop.structure import LINEAR_RESPONSE, is_structured
 from litho_models.scoring.pairs import over_prints
-
-# Verdicts on an effect that something without a name would do better: no design uses it.
-NEAR_A_CAUSE: tuple[EffectVerdict, ...] = ("partial", "traced-to-covariate")
-# Of what the effect gained.
-_DOUBTFUL_SHARE = 0.1
 
 
 def added_effects(findings: LoopFindings) -> list[AddedEffect]:
@@ -56,39 +49,8 @@ def _added_measurement(findings: LoopFindings, test: MeasurementTest) -> AddedEf
     )
 
 
-def doubtful_effects(added: Sequence[Added], left_nm2: float) -> set[str]:
-    """Names of added filters that leave another filter a good part of their own gain: near the cause, not it.
-
-    What a doubtful effect took up was left by those before it.
-
-    Args:
-        added: effects in the order in which they were added.
-        left_nm2: what a linear response to the layout would still gain.
-    """
-    doubtful: set[str] = set()
-    for entry in reversed(added):
-        if left_nm2 and entry.effect.linear and left_nm2 >= _DOUBTFUL_SHARE * entry.gain_nm2:
-            doubtful.add(entry.effect.name)
-            left_nm2 += entry.gain_nm2
-    return doubtful
-
-
-def _left_for_a_filter_nm2(findings: LoopFindings) -> float:
-    # A kernel added as a generic term takes it away; a table added before may bring it out.
-    left = [0.0]
-    for tests, state in (
-        (findings.left_by_named, findings.search.state),
-        (findings.structure, findings.final),
-    ):
-        share = sum(t.share for t in is_structured(tests) if t.name == LINEAR_RESPONSE)
-        left.append(share * float(findings.errors(state, findings.terms).mse_nm2.mean()))
-    return max(left)
-
-
 def verdict_on(findings: LoopFindings, entry: Added) -> EffectVerdict:
-    """Of an added effect: a cause, one of a set, near the cause, or a part of what is missing."""
-    if entry.effect.name in doubtful_effects(findings.search.added, _left_for_a_filter_nm2(findings)):
-        return "traced-to-covariate"
+    """Of an added effect: a cause, one of a set, or a part of what is missing."""
     if findings.weights[entry.effect.name].lacking:
         return "partial"
     return "confusable" if entry.confusable_with else "explained"
@@ -99,7 +61,7 @@ def _added_process(findings: LoopFindings, entry: Added) -> AddedEffect:
     return AddedEffect(
         name=effect.name,
         stage=effect.stage,
-        role="undetermined" if verdict in NEAR_A_CAUSE else effect.role,
+        role="undetermined" if verdict == "partial" else effect.role,
         verdict=verdict,
         prior_hypothesis=effect.name in findings.config.prior_hypotheses,
         parameters=_parameter_estimates(findings, effect),

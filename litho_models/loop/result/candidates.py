@@ -81,9 +81,7 @@ def _process_candidate(findings: LoopFindings, name: str, sets: dict[str, Added]
         reason = f"confirmed on {better} of {count} held-out scans"
         gain = entry.confirmation.gain_nm
         verdict = verdict_on(findings, entry)
-        if verdict == "traced-to-covariate":
-            reason += "; but what it leaves still follows the layout, so it is near the cause, not the cause"
-        elif verdict == "partial":
+        if verdict == "partial":
             reason += f"; but only a part of what is missing: {findings.weights[name].lacking}"
     elif name in search.absorbed:
         verdict, reason = "absorbed", search.absorbed[name]

@@ -11,12 +11,14 @@ from litho_data.foundation.files import atomic_file
 from litho_models.effects import get_effect
 from litho_models.effects.chain import EffectChain
 from litho_models.loop.findings import LoopFindings
-from litho_models.loop.result.added_effects import NEAR_A_CAUSE
-from litho_models.loop.result.record import AddedEffect, CloseLoop, Part
+from litho_models.loop.result.record import AddedEffect, CloseLoop, EffectVerdict, Part
 from litho_models.loop.single_scans.nested_tests import scan_parameters
 from litho_models.scan_terms import parameter_names
 
 EffectValues = dict[str, dict[str, float]]
+
+# No design uses these: a part of what is missing, and, in older results, a filter near the cause.
+_NO_CAUSE: tuple[EffectVerdict, ...] = ("partial", "traced-to-covariate")
 
 
 def exported_effects(chain: EffectChain, result: CloseLoop) -> dict[str, EffectValues]:
@@ -34,7 +36,7 @@ def exported_effects(chain: EffectChain, result: CloseLoop) -> dict[str, EffectV
 
 def part_of(effect: AddedEffect) -> Part:
     """Whose an added effect is: the printer's or the microscope's only if all that look like it are."""
-    if effect.verdict in NEAR_A_CAUSE:
+    if effect.verdict in _NO_CAUSE:
         return "undetermined"
     if get_effect(effect.name).per_scan:
         return "per-scan"
