@@ -1,9 +1,9 @@
 """The tests of numerics on this processor, and once more as if it were an older one.
 
-    python tests/processors.py [--all] [native] [avx2] [avx512]
+    python tests/processors.py [--all] [--after-native] [native] [avx2] [avx512]
 
 Without names as all of them; with --all every test, not only those of numerics that are quick. What this
-processor is anyway is not played where the tests run as it is.
+processor is anyway is not played where the tests run as it is, or, with --after-native, have just passed so.
 """
 
 from __future__ import annotations
@@ -74,23 +74,24 @@ def why_left_out(name: str, beside: Collection[str]) -> str:
         return "this processor has other instructions"
     known = torch.cpu.get_capabilities()
     if name != "native" and "native" in beside and not any(known.get(one) for one in PROCESSORS[name].beyond):
-        return "this processor is one, see native"
+        return "this processor is one, and they pass on it as it is"
     return ""
 
 
 def main(arguments: list[str]) -> int:
     """Run the tests as each of the named processors; the exit status is 1 where one of them fails."""
-    names = [argument for argument in arguments if argument != "--all"]
+    names = [argument for argument in arguments if not argument.startswith("--")]
+    passed = ["native"] if "--after-native" in arguments else []
     chosen, what = ([], "all tests") if "--all" in arguments else (_QUICK, "numerics")
-    unknown = set(names) - set(PROCESSORS)
+    unknown = set(arguments) - {*PROCESSORS, "--all", "--after-native"}
     if unknown:
-        got, wanted = ", ".join(sorted(unknown)), ", ".join(PROCESSORS)
+        got, wanted = ", ".join(sorted(unknown)), ", ".join([*PROCESSORS, "--all", "--after-native"])
         print(f"processors: got {got}, wanted {wanted}", file=sys.stderr)
         return 2
     outcomes = []
     names = names or list(PROCESSORS)
     for name in names:
-        if reason := why_left_out(name, names):
+        if reason := why_left_out(name, [*names, *passed]):
             outcomes.append((name, f"left out: {reason}"))
             continue
         print(f"== {what}, {name}", flush=True)

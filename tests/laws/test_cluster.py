@@ -139,6 +139,7 @@ def test_a_job_that_kills_every_worker_is_named_in_one_line(address: str) -> Non
     assert "\n" not in str(said.value)
 
 
+@pytest.mark.long
 def test_a_benchmark_is_the_same_to_the_bit(
     address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -46,6 +46,7 @@ def test_ripples_are_found_though_offsets_of_lines_could_hide_them() -> None:
     assert added_to(scans) == {"hatch-ripple": []}
 
 
+@pytest.mark.long
 def test_a_tilt_that_all_prints_share_is_found_though_every_scan_may_have_its_own() -> None:
     tilt = {"tilt_x_um": 0.06, "tilt_y_um": -0.04}
     scans = printed_scans({"field-curvature": tilt}, count=12, size_px=96, seed=5)
