@@ -73,7 +73,7 @@ def test_a_name_holds_where_its_law_leaves_nothing_to_be_learned(power: int, hol
     """The catalogue has a loss with the squared slope, which describes one with its cube nearly as well."""
     scans = [
         replace(f.stored, height_um=thinned_um(f, power))
-        for f in prepare_scans(printed_scans(count=10, size_px=64, seed=4))
+        for f in prepare_scans(printed_scans(count=10, size_px=64, noise_um=0.003, seed=4))
     ]
     study = Study(prepare_scans(scans), FOLD_OF)
     without, named = (fit_state(true_model(effects), study) for effects in ({}, SMALL))
