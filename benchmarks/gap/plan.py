@@ -30,7 +30,7 @@ class Effort(Record):
     hoe_iterations: int = 80
     lens_iterations: int = 100
     # Of the networks during the search; prints, judges and scores are float32 for every arm.
-    search_precision: str = "bfloat16"
+    search_precision: str = "float32"
     seeds: int = 3
     zoo_seeds: int = 1
     scans: int = 24

@@ -60,6 +60,10 @@ class Task:
         )  # fmt: skip
 
 
+# The comparison shows no yield, which would take longer than the search of most arms.
+_FEW_DRAWS = ("--yield-draws", 10)
+
+
 def tasks(out: Path, effort: Effort, zoo: Mapping[str, str], corrected: str | None) -> list[Task]:
     """The three tasks on the fab, and the hologram through models of measured prints.
 
@@ -72,11 +76,11 @@ def tasks(out: Path, effort: Effort, zoo: Mapping[str, str], corrected: str | No
     hoe = _options(
         "--target", "text", "--size-px", effort.hoe_px,
         "--distance-um", effort.hoe_distance_um, "--iterations", effort.hoe_iterations,
-        "--start", "gs", "--precision", effort.search_precision,
+        "--start", "gs", "--precision", effort.search_precision, *_FEW_DRAWS,
     )  # fmt: skip
     lens = _options(
         "--size-px", effort.lens_px, "--distance-um", effort.lens_distance_um,
-        "--iterations", effort.lens_iterations, "--precision", effort.search_precision,
+        "--iterations", effort.lens_iterations, "--precision", effort.search_precision, *_FEW_DRAWS,
     )  # fmt: skip
     camera = _options("--window-px", effort.window_px, "--object-px", effort.object_px)
     # No fab knows the measured printer: every arm's model judges the others' designs.

@@ -91,6 +91,8 @@ def _free_amplitude(bench: HologramBench, target: Tensor) -> Tensor:
     return wave / (wave.abs().square().sum() * area).sqrt()
 
 
+# A search of its own, whoever asks: scores are mostly taken without gradients.
+@torch.enable_grad()
 def _continuous_phase(
     bench: HologramBench, cells: CellMap, target: Tensor, settings: HologramSettings, counted: Tensor | None
 ) -> tuple[Tensor, float]:

@@ -10,7 +10,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from benchmarks.gap.cost import estimate
+from benchmarks.gap.cost import estimate, read_records, run_trial
 from benchmarks.gap.document import NAME, PAGE, RESULT_FILE, RESULTS
 from benchmarks.gap.jobs import Job, run_commands
 from benchmarks.gap.plan import ARMS, PRINT_KNOBS, Effort, open_plan
@@ -98,6 +98,14 @@ def test_finished_jobs_are_skipped_and_failed_ones_are_named(tmp_path):
     assert good.result.stat().st_mtime_ns == before
     with pytest.raises(InputError, match="silent"):
         run_commands([job("silent", "")], tmp_path / "logs")
+
+
+def test_a_trial_times_all_that_a_design_does(tmp_path):
+    (task,) = (one for one in tasks(tmp_path, TINY, {}, None) if one.name == "hoe")
+    run_trial(tmp_path, task, "none")
+    record = read_records(tmp_path)["hoe", "none"]
+    assert 0 < record["score_s"] < record["beside_s"]
+    assert min(record["iteration_s"], record["evaluation_s"], record["print_s"]) > 0
 
 
 def test_the_estimate_adds_up(tmp_path):
