@@ -10,7 +10,7 @@ DOCS_STAMP := .venv/.docs-installed
 CPUS ?=
 # Two test processes on two cores: one thread each.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
-PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n 2
+PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n 2 --dist worksteal
 
 .PHONY: help setup demo trials gap docs test test-fast test-cpus check check-all format clean
 
