@@ -158,6 +158,7 @@ def test_a_benchmark_is_the_same_to_the_bit(
         assert all((one == other).all() for one, other in zip(*pair, strict=True))
 
 
+@pytest.mark.long
 def test_candidates_and_trainings_of_folds_are_the_same_to_the_bit(address: str, tmp_path: Path) -> None:
     path = write_store(tmp_path / "made.zarr", printed_scans(count=6, size_px=48))
     store = open_store(path)

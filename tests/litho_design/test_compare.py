@@ -19,6 +19,7 @@ def test_interval_is_students():
     assert interval95(values[:1]) is None
 
 
+@pytest.mark.long
 def test_matrix_gap_and_resume(tmp_path, small_settings, make_printer):
     search = small_settings.search.model_copy(update={"iterations": 15, "polish_rounds": 0})
     settings = small_settings.model_copy(update={"search": search})

@@ -116,6 +116,7 @@ def test_more_levels_are_a_stated_guess(affine_folder):
     assert float(printer(torch.full((1, 1, 16, 16), 15.0)).mean()) == pytest.approx(0.62 * 1.5 + 0.164)
 
 
+@pytest.mark.long
 def test_commands_design_score_and_compare(tmp_path, affine_folder):
     from typer.testing import CliRunner
 

@@ -92,6 +92,7 @@ def test_loss_and_gradient_in_bands_are_those_of_the_whole():
     assert (slope - banded_slope).abs().max() < 1e-6 * slope.abs().max()
 
 
+@pytest.mark.long
 def test_ranks_give_the_layout_of_one_process(alone, tmp_path):
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["tests.litho_design.large_rank"])

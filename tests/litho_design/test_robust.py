@@ -77,6 +77,7 @@ def test_a_spread_that_reaches_the_element_is_refused_before_the_search(
     HologramTask(calm, make_printer(settings.layout), load_target("ring", 128))
 
 
+@pytest.mark.long
 def test_a_robust_search_lowers_the_risk_it_minimises(tmp_path, small_settings, make_printer):
     spread = ProcessWindow(gain_sd=0.08, blur_sd_um=0.05, defocus_sd_um=2.0, samples=6, risk="mean-sd")
     search = small_settings.search.model_copy(update={"iterations": 60})

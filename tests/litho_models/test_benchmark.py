@@ -234,7 +234,7 @@ def test_a_card_without_files_locks_its_ids_in_a_dataset_of_the_same_name(tmp_pa
     assert (run.lock_box[0] in scored) == (name == "other")
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_store_built_anew_from_the_same_files_keeps_its_lock_box_and_other_files_of_the_same_names_do_not(
     tmp_path,
 ):

@@ -13,7 +13,9 @@ EFFECT = {"vignetting": {"strength": 0.2}}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("carries_it", [False, True], ids=["lacks it", "carries it"])
+@pytest.mark.parametrize(
+    "carries_it", [pytest.param(False, marks=pytest.mark.long), True], ids=["lacks it", "carries it"]
+)
 def test_an_effect_is_added_to_or_absorbed_by_a_trained_model(carries_it: bool) -> None:
     scans = printed_scans(EFFECT, seed=1)
     trained = true_model(EFFECT if carries_it else {}).requires_grad_(False)

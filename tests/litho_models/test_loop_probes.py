@@ -141,6 +141,7 @@ def test_a_response_displaced_from_the_layout_comes_back_in_place_and_size() -> 
     assert entry.after.rmse_nm < 0.5 * (entry.before.rmse_nm + 1e3 * NOISE_UM)
 
 
+@pytest.mark.long
 def test_a_copy_far_from_the_layout_comes_back_in_place_and_size() -> None:
     """3 % of the layout again 5 µm away: the kernel reaches 1.6 µm on fields of 12.8 µm."""
     moved = (40, -30)

@@ -92,7 +92,7 @@ def thinned_um(scan: PreparedScan, power: int) -> np.ndarray:
     return (height - 0.012 * np.abs(slope) ** power).astype(np.float32)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_loop_gives_no_name_to_a_copy_beyond_its_kernel() -> None:
     scans = [
         replace(f.stored, height_um=(f.stored.height_um + far_copy(f)).astype(np.float32))
