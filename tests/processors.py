@@ -83,9 +83,9 @@ def main(arguments: list[str]) -> int:
     names = [argument for argument in arguments if not argument.startswith("--")]
     passed = ["native"] if "--after-native" in arguments else []
     chosen, what = ([], "all tests") if "--all" in arguments else (_QUICK, "numerics")
-    unknown = set(arguments) - {*PROCESSORS, "--all", "--after-native"}
-    if unknown:
-        got, wanted = ", ".join(sorted(unknown)), ", ".join([*PROCESSORS, "--all", "--after-native"])
+    known = [*PROCESSORS, "--all", "--after-native"]
+    if unknown := set(arguments) - set(known):
+        got, wanted = ", ".join(sorted(unknown)), ", ".join(known)
         print(f"processors: got {got}, wanted {wanted}", file=sys.stderr)
         return 2
     outcomes = []

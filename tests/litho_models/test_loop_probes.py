@@ -112,7 +112,7 @@ def test_every_probe_is_found_under_its_name() -> None:
     defects = find_defects(scans, predictions)
     assert [probe.name for probe in generic_terms(scans, predictions, defects)] == list(GENERIC)
     # What is summed at the sampled pixels is what is added there.
-    for probe in [*generic_terms(scans, predictions, defects, [*GENERIC, LAYOUT_FEATURES])]:
+    for probe in generic_terms(scans, predictions, defects, [*GENERIC, LAYOUT_FEATURES]):
         parameters = probe.held_out(np.arange(len(scans)) % 5).per_fold[:2]
         added = [scans[0].at_sample(probe.correction(one, scans[0], predictions[0])) for one in parameters]
         sampled = probe.at_samples(parameters, scans[0], predictions[0])

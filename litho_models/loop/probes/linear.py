@@ -142,8 +142,8 @@ def probe_of_rows(
         grams.append(products[:-1, :-1])
         rights.append(products[:-1, -1])
     pixels = np.array([use.sum() for use in left.kept])
-    products = np.stack(grams), np.stack(rights), pixels
-    return LinearProbe(name, rows_of, map_of, penalty, shuffle, summary, *products)
+    inner_products = np.stack(grams), np.stack(rights), pixels
+    return LinearProbe(name, rows_of, map_of, penalty, shuffle, summary, *inner_products)
 
 
 def _sampled(scan: PreparedScan, prediction: np.ndarray, columns_of: ColumnsOf) -> np.ndarray:
