@@ -8,6 +8,7 @@ PUBLISH ?=
 STAMP := .venv/.installed
 DOCS_STAMP := .venv/.docs-installed
 CPUS ?=
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
 # Two test processes on two cores: one thread each.
 ONE_THREAD := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 PYTEST := $(ONE_THREAD) $(BIN)/python -m pytest -n 2 --dist worksteal
@@ -19,9 +20,11 @@ help:              ## list the targets
 
 setup: $(STAMP)    ## make the environment
 
+# The pip of the constraints first: the one that comes with Python 3.11 takes three times as long to choose.
 $(STAMP): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
+	$(INSTALL) --upgrade pip
+	$(INSTALL) --editable '.[dev]'
 	@touch $@
 
 demo: $(STAMP)     ## run the whole path: make demo, or make demo DATASET=neural-lithography
@@ -39,7 +42,7 @@ docs: $(DOCS_STAMP) ## build the site of the documentation into runs/site; a bro
 	@echo "look at it: $(BIN)/python -m http.server --directory runs/site, then http://localhost:8000"
 
 $(DOCS_STAMP): $(STAMP)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[docs]'
+	$(INSTALL) --editable '.[docs]'
 	@touch $@
 
 test: $(STAMP)     ## pass all tests but the longest; the report is runs/tests/report.xml
