@@ -43,17 +43,21 @@ print(store.quality[columns].round(3).to_string(index=False))
 
 # %%
 
+import numpy as np
+
 from litho_data.foundation.report_pictures import new_figure
 
 printed = store.scan(store.ids[0])
 figure = new_figure(9, 3.2)
+off_um = printed.height_um - printed.layout_um
+most_um = np.nanmax(np.abs(off_um))
 panels = {
-    "layout, µm": printed.layout_um,
-    "measured height, µm": printed.height_um,
-    "measured − layout, µm": printed.height_um - printed.layout_um,
+    "layout, µm": (printed.layout_um, {}),
+    "measured height, µm": (printed.height_um, {}),
+    "measured − layout, µm": (off_um, {"cmap": "RdBu_r", "vmin": -most_um, "vmax": most_um}),
 }
-for axes, (title, image) in zip(figure.subplots(1, 3), panels.items(), strict=True):
-    shown = axes.imshow(image, cmap="viridis")
+for axes, (title, (image, scale)) in zip(figure.subplots(1, 3), panels.items(), strict=True):
+    shown = axes.imshow(image, **scale)
     axes.set_title(title, fontsize=10)
     axes.set_axis_off()
     figure.colorbar(shown, ax=axes, shrink=0.8)
