@@ -174,6 +174,9 @@ def benchmark(
     precision: PrecisionOption = None,
     weights: WeightsOption = "uniform",
     folds: Annotated[int, typer.Option(min=2, help="folds of the grouped split")] = 5,
+    first_folds: Annotated[
+        int | None, typer.Option(min=1, help="only so many of the folds, to compare seeds; all by default")
+    ] = None,
     policy: PolicyOption = "offset",
     background: BackgroundOption = "training",
     noise: NoiseOption = None,
@@ -208,6 +211,7 @@ def benchmark(
         models=[name.strip() for name in models.split(",") if name.strip()] if models else DEFAULT_MODELS,
         settings=settings,
         folds=folds,
+        first_folds=first_folds,
         policy=policy,
         background=background,
         noise=noise,

@@ -50,6 +50,7 @@ def benchmark(
     models: Sequence[str] = DEFAULT_MODELS,
     settings: dict[str, Any] | None = None,
     folds: int = GROUPED_FOLDS,
+    first_folds: int | None = None,
     policy: Policy = "offset",
     background: BackgroundUse = "training",
     noise: str | Path | None = None,
@@ -68,6 +69,7 @@ def benchmark(
         models: names of models; baselines cost next to nothing.
         settings: fields of ``TrainingConfig`` that replace the recipe's.
         folds: number of folds of ``grouped``, at most the number of development scans.
+        first_folds: fit and score only so many of the folds, to compare seeds or settings; None for all.
         policy: nuisances of ``mae_datum_free_nm``.
         background: whether each fit's background, learned on its training scans, is added to its predictions.
         noise: ``noise.json`` of this dataset, or its folder: its floor is shown beside the errors. Without it
@@ -78,12 +80,11 @@ def benchmark(
 
     Raises:
         InputError: no model, an unknown one or one twice, a store that cannot be read or is too small for
-            the split or for a lock box to open, a noise analysis of other data, a damaged cache, or an
-            ``out`` with a benchmark that this one would not contain.
+            the split or for a lock box to open, more first folds than there are, a noise analysis of other
+            data, a damaged cache, or an ``out`` with a benchmark that this one would not contain.
     """
     require_models(models)
     dataset = open_store(store)
-    _require_same_benchmark(Path(out), dataset.name, models, split, seed)
     scans = dataset.scans()
     floor = stated_floor(dataset.name, noise)
     locked = dataset.locked_ids
@@ -91,6 +92,12 @@ def benchmark(
     made = sum(not fold.locked for fold in plan)
     if split == "grouped" and made < folds:
         print(f"{made} folds instead of {folds}: one for each scan that is not locked", file=sys.stderr)
+    if first_folds is not None:
+        if not 1 <= first_folds <= made:
+            raise InputError("first folds", got=first_folds, wanted=f"1 to {made}, the number of folds")
+        plan = [fold for fold in plan if fold.locked or fold.number < first_folds]
+    scored = [scan for fold in plan if not fold.locked for scan in fold.held_out]
+    _require_same_benchmark(Path(out), dataset.name, models, split, seed, scored)
     configs = {name: _config(name, settings, seed) for name in models}
     fits: dict[tuple[str, int], FitRecord] = {}
     predicted: dict[tuple[str, bool], dict[str, Prediction]] = {}
@@ -118,7 +125,6 @@ def benchmark(
             for scan, height in zip(fold.held_out, heights, strict=True)
         )
     protocol = NuisanceProtocol.of_policy(policy, seed, background)
-    scored = [scan for fold in plan if not fold.locked for scan in fold.held_out]
     boxed = [scan for fold in plan if fold.locked for scan in fold.held_out]
 
     def score(name: str, judged: Sequence[PrintedScan], locked: bool) -> ModelScores:
@@ -138,6 +144,7 @@ def benchmark(
             kind=split,
             folds=made,
             seed=seed,
+            first_folds=first_folds,
             scored_ids=ids,
             scored_ids_sha256=ids_sha256(ids),
             lock_box=locked,
@@ -173,7 +180,12 @@ def _settings(name: str, config: TrainingConfig, scans: Sequence[PrintedScan]) -
 
 
 def _require_same_benchmark(
-    out: Path, dataset: str, models: Sequence[str], split: SplitKind, seed: int
+    out: Path,
+    dataset: str,
+    models: Sequence[str],
+    split: SplitKind,
+    seed: int,
+    scored: Sequence[PrintedScan],
 ) -> None:
     """A result may be made again or extended; one of something else is not replaced."""
     require_own_folder(out, Benchmark.FILE_NAME, CACHE_FOLDER)
@@ -192,6 +204,8 @@ def _require_same_benchmark(
     ]
     if lost:
         other.append(f"model {', '.join(lost)}")
+    if not other and (more := set(old.split.scored_ids) - {scan.id for scan in scored}):
+        other.append(f"{len(more)} scans more")
     if other:
         raise InputError(
             "output",

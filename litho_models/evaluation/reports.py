@@ -75,6 +75,8 @@ def write_benchmark_report(
     on_paper_data = result.dataset.name == _PAPER_DATASET
     page = Page(f"Benchmark on {result.dataset.name}", run=result.run, facts=_facts(result), words=COLUMNS)
     page.verdict(benchmark_verdict(result))
+    if result.split.first_folds is not None:
+        page.note(f"Only {result.split.first_folds} of {result.split.folds} folds were fitted and scored.")
     if len(best.scans) < 8:
         page.note(f"Only {len(best.scans)} scans: intervals over scans are rough.")
     page.figure(

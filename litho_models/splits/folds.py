@@ -31,9 +31,13 @@ class Split(Record):
 
 
 class ScoredSplit(Split):
-    """Which scans were scored; ``lock_box_opened``: whether any locked one was."""
+    """Which scans were scored; ``lock_box_opened``: whether any locked one was.
+
+    ``first_folds``: so many of the folds were made; None for all.
+    """
 
     seed: int = 0
+    first_folds: int | None = None
     scored_ids: list[str]
     scored_ids_sha256: str
     lock_box_opened: bool = False

@@ -290,6 +290,21 @@ def test_other_folds_are_another_protocol_and_another_training_seed_is_not(resul
     assert list(compare(out, tmp_path / "reseeded")["first"]) == ["affine"]
 
 
+def test_first_folds_are_those_of_the_whole_and_never_replace_it(result, store, tmp_path):
+    whole, _ = result
+    part = benchmark(store, tmp_path / "part", models=["affine"], folds=3, first_folds=2, settings=SETTINGS)
+    of_all = {scan.scan: scan for scores in whole.scores if scores.model == "affine" for scan in scores.scans}
+    assert all(scan == of_all[scan.scan] for scan in part.scores[0].scans)
+    assert 0 < len(part.scores[0].scans) < len(of_all)
+    assert (part.split.folds, part.split.first_folds, len(part.fits)) == (3, 2, 2)
+    assert "Only 2 of 3 folds" in (tmp_path / "part" / "report.html").read_text()
+    with pytest.raises(InputError, match=r"first folds.*got 4, wanted 1 to 3"):
+        benchmark(store, tmp_path / "none", models=["affine"], folds=3, first_folds=4, settings=SETTINGS)
+    benchmark(store, tmp_path / "part", models=["affine"], folds=3, settings=SETTINGS)
+    with pytest.raises(InputError, match=r"holds a benchmark of \d+ scans more"):
+        benchmark(store, tmp_path / "part", models=["affine"], folds=3, first_folds=2, settings=SETTINGS)
+
+
 def test_a_training_error_is_not_compared_with_a_held_out_one(store, tmp_path):
     run = train(store, "affine", tmp_path / "run", settings=SETTINGS)
     evaluate(tmp_path / "run" / "model", store, tmp_path / "seen", scan_ids=run.training_ids[:1])
