@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from benchmarks.gap.jobs import Job, command, design_command
-from benchmarks.gap.plan import ARMS, PRINT_KNOBS, SCAN_KNOBS, Effort, model, store
+from benchmarks.gap.plan import ARMS, FROZEN_WITH, PRINT_KNOBS, SCAN_KNOBS, Effort, model, store
 
 # The machine is one and the same in training and test prints: its draws have a seed of their own.
 _MACHINE_SEED = 0
@@ -38,7 +38,8 @@ def fab_jobs(out: Path, effort: Effort) -> list[list[Job]]:
 
 def model_jobs(out: Path, effort: Effort) -> list[list[Job]]:
     """Train, freeze and test every arm; the longest training first."""
-    names = [arm for arm in reversed(ARMS) if arm != "none"]
+    arms = [arm for arm in reversed(ARMS) if arm != "none"]
+    trained = {arm: FROZEN_WITH.get(arm, (arm, ())) for arm in arms}
     train = [
         Job(
             f"train-{name}",
@@ -48,26 +49,26 @@ def model_jobs(out: Path, effort: Effort) -> list[list[Job]]:
             ),
             out / "runs" / name / "run.json",
         )
-        for name in names
+        for name in dict.fromkeys(name for name, _ in trained.values())
     ]  # fmt: skip
     freeze = [
         Job(
-            f"freeze-{name}",
-            command("litho-models", "freeze", out / "runs" / name, "--out", model(out, name)),
-            model(out, name) / "card.json",
+            f"freeze-{arm}",
+            command("litho-models", "freeze", out / "runs" / name, *told, "--out", model(out, arm)),
+            model(out, arm) / "card.json",
         )
-        for name in names
+        for arm, (name, told) in trained.items()
     ]
     test = [
         Job(
-            f"test-{name}",
+            f"test-{arm}",
             command(
-                "litho-models", "evaluate", model(out, name), store(out, "test-fab"),
-                "--out", out / "test" / name,
+                "litho-models", "evaluate", model(out, arm), store(out, "test-fab"),
+                "--out", out / "test" / arm,
             ),
-            out / "test" / name / "evaluation.json",
+            out / "test" / arm / "evaluation.json",
         )
-        for name in names
+        for arm in arms
     ]  # fmt: skip
     return [train, freeze, test]
 

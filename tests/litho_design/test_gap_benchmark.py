@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 from benchmarks.gap.cost import estimate, read_records, run_trial
 from benchmarks.gap.document import NAME, PAGE, RESULT_FILE, RESULTS
 from benchmarks.gap.jobs import Job, run_commands
-from benchmarks.gap.plan import ARMS, PRINT_KNOBS, Effort, open_plan
+from benchmarks.gap.plan import ARMS, FROZEN_WITH, PRINT_KNOBS, Effort, model, open_plan
+from benchmarks.gap.steps import model_jobs
 from benchmarks.gap.tables import as_markdown
 from benchmarks.gap.tasks import Task, chosen, tasks
 from benchmarks.record import published
@@ -49,6 +50,17 @@ def test_every_arm_has_the_same_budget(tmp_path):
         assert len(task.designs(tmp_path)) == task.seeds * len(task.models)
         assert task.iterations <= (300 if task.kind == "hoe" else 200)
         assert task.name == "hoe-measured" or tuple(task.models) == ARMS
+
+
+def test_another_part_of_a_model_is_frozen_from_the_same_run(tmp_path):
+    train, freeze, test = model_jobs(tmp_path, TINY)
+    assert len(train) == len(ARMS) - 1 - len(FROZEN_WITH)
+    assert len(freeze) == len(test) == len(ARMS) - 1
+    commands = {job.name: " ".join(job.command) for job in freeze}
+    for arm, (name, told) in FROZEN_WITH.items():
+        assert commands[f"freeze-{arm}"] == commands[f"freeze-{name}"].replace(
+            f"--out {model(tmp_path, name)}", f"{' '.join(told)} --out {model(tmp_path, arm)}"
+        )
 
 
 def test_tasks_are_chosen_by_name(tmp_path):
@@ -114,9 +126,10 @@ def test_the_estimate_adds_up(tmp_path):
     cost |= {"beside_s": 30.0, "score_s": 4.0}
     records = dict.fromkeys([("direct", arm) for arm in ARMS], cost)
     rows = estimate(records, planned, Effort())
-    # Search and polish, evaluations, what is beside the search; six prints, seven scores (also the fab's).
+    # Search and polish, evaluations, what is beside the search; a print by every arm, a score by these and the fab.
+    prints, scores = len(ARMS), len(ARMS) + 1
     n, seeds = planned[0].iterations, planned[0].seeds
-    expected = seeds * ((n + 11) * 2.0 + n / 10 * 1.0 + 30.0 + 6 * 3.0 + 7 * 4.0) / 60
+    expected = seeds * ((n + 11) * 2.0 + n / 10 * 1.0 + 30.0 + prints * 3.0 + scores * 4.0) / 60
     assert [row["minutes"] for row in rows[1:]] == pytest.approx([expected] * len(ARMS))
 
 
