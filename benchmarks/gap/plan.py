@@ -10,8 +10,8 @@ from litho_data.foundation.results import Record, Result
 
 ARMS = ("none", "affine", "affine-mtf", "physics", "fno", "pbl", "pbl-scan-axis")
 # Arms that are another part of a trained model, and what `freeze` is told. Only PBL tells apart what lies
-# along the scan lines, and leaves it out of its printer: scans of one orientation cannot say whose it is. The
-# other models have it in them. This fab has it in the printer, so that PBL needs it to know as much as they do.
+# along the scan lines, and leaves it out of its printer: scans of one orientation cannot say whose it is.
+# The other models have it in them. This fab has it in the printer, so that PBL needs it to know as much.
 FROZEN_WITH = {"pbl-scan-axis": ("pbl", ("--attribute", "scan-axis=printer"))}
 # Stated before any design was made, by one rule: each effect of the print changes the training prints by
 # 10 nm rms after offset, gain, plane and bow of single scans. The physics model has none of them; two are

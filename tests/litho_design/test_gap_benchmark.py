@@ -126,7 +126,7 @@ def test_the_estimate_adds_up(tmp_path):
     cost |= {"beside_s": 30.0, "score_s": 4.0}
     records = dict.fromkeys([("direct", arm) for arm in ARMS], cost)
     rows = estimate(records, planned, Effort())
-    # Search and polish, evaluations, what is beside the search; a print by every arm, a score by these and the fab.
+    # Search and polish, evaluations, what is beside it; a print by each arm, a score by each and the fab.
     prints, scores = len(ARMS), len(ARMS) + 1
     n, seeds = planned[0].iterations, planned[0].seeds
     expected = seeds * ((n + 11) * 2.0 + n / 10 * 1.0 + 30.0 + prints * 3.0 + scores * 4.0) / 60
