@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -20,15 +21,14 @@ from benchmarks.measured_models import (
     benchmark_table,
     coverage_table,
     design_table,
-    extrapolation_table,
     further_table,
     headline_table,
     in_one,
     noise_table,
     paired_table,
-    paper_table,
     texture_table,
 )
+from benchmarks.measured_splits import extrapolation_table, paper_table, seeds_table
 from benchmarks.record import publish
 from examples.demo import PAPER_SEEDS, SMALL_BASES
 from litho_data.foundation.commands import run_script
@@ -38,12 +38,19 @@ from litho_models.frozen.card import ModelCard
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "results" / "neural-lithography"
+SEEDED, FURTHER_SEEDS = ("pbl",), (1, 2)
 RESULTS = {
     "benchmark.json": "benchmark/benchmark.json",
     "benchmark_least_squares.json": "benchmark-small/benchmark.json",
     "benchmark_pbl.json": "benchmark-pbl/benchmark.json",
     **{f"benchmark_paper_{seed}.json": f"benchmark-paper-{seed}/benchmark.json" for seed in PAPER_SEEDS},
     "benchmark_prints.json": "leave-one-print-out/benchmark.json",
+    "benchmark_prints_pbl.json": "leave-one-print-out-pbl/benchmark.json",
+    **{
+        f"benchmark_{name}_seed{seed}.json": f"benchmark-{name}-seed{seed}/benchmark.json"
+        for name in SEEDED
+        for seed in FURTHER_SEEDS
+    },
     "noise.json": "noise/noise.json",
     "close_loop.json": "close-loop/close_loop.json",
     **{f"close_loop_{base}.json": f"close-loop-{base}/close_loop.json" for base in (*SMALL_BASES, "pbl")},
@@ -52,10 +59,10 @@ RESULTS = {
     "gap.json": "compare/gap.json",
     "score.json": "score/score.json",
 }
-NAMES = ("benchmark", "paper split", "loop", "loop with PBL", "locked scans", "design")
+NAMES = ("benchmark", "paper split", "loop", "loop with PBL", "locked scans", "design", "equal freedom")
 PAGES = {
     ROOT / "README.md": ("headline",),
-    FOLDER / "README.md": (*NAMES, "equal freedom", "whole prints", "paired differences", "further figures"),
+    FOLDER / "README.md": (*NAMES, "whole prints", "seeds", "paired differences", "further figures"),
     ROOT / "docs" / "noise.md": ("noise", "texture", "coverage"),
 }
 
@@ -69,6 +76,7 @@ def texts(folder: Path) -> dict[str, str]:
     # The draws of the paper's split are of the models of that run.
     first = found("benchmark.json")
     networks = in_one(found("benchmark.json"), found("benchmark_pbl.json"))
+    by_print = in_one(found("benchmark_prints_pbl.json"), found("benchmark_prints.json"))
     benchmark = in_one(networks, found("benchmark_least_squares.json"))
     return {
         "headline": headline_table(benchmark, found("noise.json")),
@@ -77,7 +85,14 @@ def texts(folder: Path) -> dict[str, str]:
         ),
         "benchmark": benchmark_table(benchmark, found("noise.json")),
         "paper split": paper_table([found(f"benchmark_paper_{seed}.json") for seed in PAPER_SEEDS], first),
-        "whole prints": extrapolation_table(found("benchmark_prints.json"), benchmark, found("noise.json")),
+        "whole prints": extrapolation_table(by_print, benchmark, found("noise.json")),
+        "seeds": seeds_table(
+            networks,
+            [
+                reduce(in_one, (found(f"benchmark_{name}_seed{seed}.json") for name in SEEDED))
+                for seed in FURTHER_SEEDS
+            ],
+        ),
         "paired differences": paired_table(benchmark),
         "further figures": further_table(benchmark),
         "noise": noise_table(found("noise.json")),
@@ -102,10 +117,14 @@ def main() -> None:
     )
     parser.add_argument("runs", type=Path, help="folder of `make demo DATASET=neural-lithography`")
     runs = parser.parse_args().runs
-    for name, source in RESULTS.items():
-        shutil.copyfile(runs / source, FOLDER / name)
+    made = [name for name, source in RESULTS.items() if (runs / source).exists()]
+    for name in made:
+        shutil.copyfile(runs / RESULTS[name], FOLDER / name)
     draw_steps(FOLDER / "close_loop_errors.csv", FOLDER / "loop_steps.png")
-    draw_prediction(runs / "store.zarr", runs / "benchmark-pbl", FOLDER / "prediction.jpg")
+    if "benchmark_pbl.json" in made:
+        draw_prediction(runs / "store.zarr", runs / "benchmark-pbl", FOLDER / "prediction.jpg")
+    if kept := [name for name in RESULTS if name not in made]:
+        print(f"not in {runs}, left as they were: {', '.join(kept)}")
     written = texts(FOLDER)
     for page, names in PAGES.items():
         for name in names:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Sequence
 from itertools import combinations
 from typing import Any
@@ -66,14 +65,14 @@ def benchmark_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
         without, relaxed = f"{bare['offset']:.2f} nm", f"{policies['full']:.2f} nm"
         rows.append((score["model"], free, without, relaxed, absolute, f"{parameters[score['model']]:,}"))
     floor = noise["noise_floor"]
-    rows.append(_floor_row(floor, "offset", None, "full", "none", None))
+    rows.append(floor_row(floor, "offset", None, "full", "none", None))
     split = benchmark["split"]
     return markdown_table(
         heads,
         rows,
         f"Mean absolute error on held-out scans ({len(split['scored_ids'])} scans, {split['folds']} folds "
         f"by scan, seed {split['seed']}; {len(split['lock_box'])} locked scans are in no fold and in no "
-        f"figure of this table; {_steps(benchmark)}), with 95 % bootstrap intervals over scans. Per-scan "
+        f"figure of this table; {steps_text(benchmark)}), with 95 % bootstrap intervals over scans. Per-scan "
         "terms are fitted on pixels that are not scored. The shared background is what levelling leaves in "
         "every map: five numbers from the training scans, added to predictions of measured maps and to no "
         "design. The noise is an upper estimate ([how](../../noise.md)), its intervals are over prints. "
@@ -91,7 +90,7 @@ def headline_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
         full = next(entry["mae_nm"] for entry in score["by_policy"] if entry["policy"] == "full")
         free = with_interval(score["mae_datum_free_nm"], score["mae_datum_free_ci95_nm"])
         rows.append((name, f"{parameters[name]:,}", free, f"{full:.2f} nm"))
-    no_model = _floor_row(noise["noise_floor"], None, "offset", "full")
+    no_model = floor_row(noise["noise_floor"], None, "offset", "full")
     rows.append(("noise that no model can predict, at most", *no_model[1:]))
     rows.append(("PBL in the paper: other split, levelling and zero", "–", "24.35 nm, not comparable", "–"))
     split = benchmark["split"]
@@ -134,63 +133,6 @@ def _over_prints(units: dict[str, Any] | None) -> str:
         return "not recorded"
     interval = "" if units["ci95_nm"] is None else "{:.2f} … {:.2f}, ".format(*units["ci95_nm"])
     return f"{interval}p = {units['p']:.3f} ({units['count']} prints)"
-
-
-def paper_table(draws: Sequence[dict[str, Any]], grouped: dict[str, Any]) -> str:
-    """Errors on every draw of the paper's split, one row per model, and how far the models are apart."""
-    heads = ("model", *(f"draw {own['split']['seed']}" for own in draws))
-    heads += ("absolute error, mean over draws", "whole scans held out")
-    rows = []
-    whole = {score["model"]: score["mae_datum_free_nm"] for score in grouped["scores"]}
-    for name in [score["model"] for score in draws[0]["scores"]]:
-        scores = [score for own in draws for score in own["scores"] if score["model"] == name]
-        free = [with_interval(own["mae_datum_free_nm"], own["mae_datum_free_ci95_nm"]) for own in scores]
-        absolute = sum(own["mae_abs_nm"] for own in scores) / len(scores)
-        rows.append((name, *free, f"{absolute:.2f} nm", f"{whole[name]:.2f} nm"))
-    for pairs in zip(*(own["paired"] for own in draws), strict=True):
-        if not {pairs[0]["first"], pairs[0]["second"]} <= PAPER_MODELS:
-            continue
-        apart = [with_interval(pair["mean_nm"], pair["ci95_nm"]) for pair in pairs]
-        rows.append((f"{pairs[0]['first']} − {pairs[0]['second']}", *apart, "–", "–"))
-    split = draws[0]["split"]
-    return markdown_table(
-        heads,
-        rows,
-        f"Datum-free error (zero of each quadrant free). A draw holds out {len(split['scored_ids'])} of 96 "
-        f"quadrants at random and trains on the others ({_steps(draws[0])}); its number is the seed of split "
-        f"and training. Leaky, as the paper's split is; the last column has the split by scan beside it. "
-        f"{_order_of_draws(draws)} Quadrants of the "
-        f"{len(split['lock_box'])} locked scans take part, in training and in the errors.",
-    )
-
-
-def extrapolation_table(by_print: dict[str, Any], by_scan: dict[str, Any], noise: dict[str, Any]) -> str:
-    """Errors where every scan of a print is held out, beside those where other scans of it are seen."""
-    seen = {score["model"]: score for score in by_scan["scores"]}
-    rows = []
-    for score in by_print["scores"]:
-        other = seen[score["model"]]
-        rows.append(
-            (
-                score["model"],
-                with_interval(score["mae_datum_free_nm"], score["mae_datum_free_ci95_nm"]),
-                f"{other['mae_datum_free_nm']:.2f} nm",
-                with_interval(score["mae_abs_nm"], score["mae_abs_ci95_nm"]),
-                f"{other['mae_abs_nm']:.2f} nm",
-            )
-        )
-    heads = ("model", "datum-free error, whole prints held out", "whole scans held out")
-    heads += ("absolute error, whole prints held out", "whole scans held out")
-    rows.append(_floor_row(noise["noise_floor"], "offset", "offset", "none", "none"))
-    split = by_print["split"]
-    missing = [name for name in seen if name not in {score["model"] for score in by_print["scores"]}]
-    left_out = f" Not run: {', '.join(missing)}." if missing else ""
-    return markdown_table(
-        heads,
-        rows,
-        f"{split['folds']} folds, one per print, {len(split['scored_ids'])} scans; "
-        f"the {len(split['lock_box'])} locked scans are in no fold.{left_out}",
-    )
 
 
 def further_table(benchmark: dict[str, Any]) -> str:
@@ -354,21 +296,7 @@ def design_table(gap: dict[str, Any]) -> str:
     )
 
 
-def _order_of_draws(draws: Sequence[dict[str, Any]]) -> str:
-    """Which model is ahead of which, and in how many draws."""
-    orders = Counter(
-        ", ".join(
-            score["model"]
-            for score in sorted(own["scores"], key=lambda score: score["mae_datum_free_nm"])
-            if score["model"] in PAPER_MODELS
-        )
-        for own in draws
-    )
-    counted = "; ".join(f"{order} in {count} of {len(draws)} draws" for order, count in orders.most_common())
-    return f"From best to worst: {counted}."
-
-
-def _floor_row(floor: dict[str, Any], *policies: str | None) -> tuple[str, ...]:
+def floor_row(floor: dict[str, Any], *policies: str | None) -> tuple[str, ...]:
     """The noise under columns of errors, each with the scan terms of its column; None: nothing to compare."""
     rows = {row["policy"]: row for row in floor["by_policy"]}
     cells = [with_interval(rows[p]["mae_nm"], rows[p]["mae_ci95_nm"]) if p else "–" for p in policies]
@@ -386,7 +314,7 @@ def _above(benchmark: dict[str, Any], floor: dict[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def _steps(benchmark: dict[str, Any]) -> str:
+def steps_text(benchmark: dict[str, Any]) -> str:
     """Optimiser steps of the networks."""
     steps = {name: own["steps"] for name, own in benchmark["training"].items() if name in ("pbl", "fno")}
     return ", ".join(f"{name.upper()}: {count:,} steps" for name, count in steps.items())
