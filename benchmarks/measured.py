@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
-from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +37,7 @@ from litho_models.frozen.card import ModelCard
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "results" / "neural-lithography"
-SEEDED, FURTHER_SEEDS = ("pbl",), (1, 2)
+PBL_SEEDS = (1, 2)
 RESULTS = {
     "benchmark.json": "benchmark/benchmark.json",
     "benchmark_least_squares.json": "benchmark-small/benchmark.json",
@@ -46,11 +45,7 @@ RESULTS = {
     **{f"benchmark_paper_{seed}.json": f"benchmark-paper-{seed}/benchmark.json" for seed in PAPER_SEEDS},
     "benchmark_prints.json": "leave-one-print-out/benchmark.json",
     "benchmark_prints_pbl.json": "leave-one-print-out-pbl/benchmark.json",
-    **{
-        f"benchmark_{name}_seed{seed}.json": f"benchmark-{name}-seed{seed}/benchmark.json"
-        for name in SEEDED
-        for seed in FURTHER_SEEDS
-    },
+    **{f"benchmark_pbl_seed{seed}.json": f"benchmark-pbl-seed{seed}/benchmark.json" for seed in PBL_SEEDS},
     "noise.json": "noise/noise.json",
     "close_loop.json": "close-loop/close_loop.json",
     **{f"close_loop_{base}.json": f"close-loop-{base}/close_loop.json" for base in (*SMALL_BASES, "pbl")},
@@ -59,10 +54,11 @@ RESULTS = {
     "gap.json": "compare/gap.json",
     "score.json": "score/score.json",
 }
-NAMES = ("benchmark", "paper split", "loop", "loop with PBL", "locked scans", "design", "equal freedom")
+OF_MODELS = ("benchmark", "paired differences", "seeds", "whole prints", "paper split", "further figures")
+OF_LOOPS = ("equal freedom", "loop", "loop with PBL", "locked scans", "design")
 PAGES = {
     ROOT / "README.md": ("headline",),
-    FOLDER / "README.md": (*NAMES, "whole prints", "seeds", "paired differences", "further figures"),
+    FOLDER / "README.md": (*OF_MODELS, *OF_LOOPS),
     ROOT / "docs" / "noise.md": ("noise", "texture", "coverage"),
 }
 
@@ -86,13 +82,7 @@ def texts(folder: Path) -> dict[str, str]:
         "benchmark": benchmark_table(benchmark, found("noise.json")),
         "paper split": paper_table([found(f"benchmark_paper_{seed}.json") for seed in PAPER_SEEDS], first),
         "whole prints": extrapolation_table(by_print, benchmark, found("noise.json")),
-        "seeds": seeds_table(
-            networks,
-            [
-                reduce(in_one, (found(f"benchmark_{name}_seed{seed}.json") for name in SEEDED))
-                for seed in FURTHER_SEEDS
-            ],
-        ),
+        "seeds": seeds_table(networks, [found(f"benchmark_pbl_seed{seed}.json") for seed in PBL_SEEDS]),
         "paired differences": paired_table(benchmark),
         "further figures": further_table(benchmark),
         "noise": noise_table(found("noise.json")),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from itertools import combinations
 from statistics import mean, stdev
 from typing import Any
 
@@ -79,8 +78,6 @@ def seeds_table(whole: dict[str, Any], others: Sequence[dict[str, Any]]) -> str:
     split, names = others[0]["split"], [score["model"] for score in others[0]["scores"]]
     runs = (whole, *others)
     errors = {name: [_mean_error(run, name, split["scored_ids"]) for run in runs] for name in names}
-    for first, second in combinations(names, 2):
-        errors[f"{first} − {second}"] = [a - b for a, b in zip(errors[first], errors[second], strict=True)]
     seeds = [run["training"][names[0]]["seed"] for run in runs]
     return markdown_table(
         ("model", *(f"seed {seed}" for seed in seeds), "σ over seeds"),

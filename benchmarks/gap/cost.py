@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from benchmarks.gap.jobs import Job, module_command
-from benchmarks.gap.plan import FROZEN_WITH, Effort
+from benchmarks.gap.plan import Effort, trained_as
 from benchmarks.gap.tasks import Task
 from benchmarks.record import write_record
 from litho_models.frozen.card import ModelCard
@@ -154,7 +154,7 @@ def _untrained(arm: str, folder: Path) -> Path:
     from litho_models.models import build_model
 
     torch.manual_seed(0)
-    return save_frozen(build_model(FROZEN_WITH.get(arm, (arm, ()))[0]), folder)
+    return save_frozen(build_model(trained_as(arm)[0]), folder)
 
 
 def _task(task: Task, source: str) -> tuple[Any, Any]:

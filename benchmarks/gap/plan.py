@@ -106,6 +106,11 @@ def store(out: Path, name: str) -> Path:
     return out / f"{name}.zarr"
 
 
+def trained_as(arm: str) -> tuple[str, tuple[str, ...]]:
+    """The model that an arm is a part of, and what ``freeze`` is told."""
+    return FROZEN_WITH.get(arm, (arm, ()))
+
+
 def model(out: Path, name: str) -> Path:
     """The frozen model of an arm."""
     return out / "models" / name

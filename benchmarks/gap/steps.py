@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from benchmarks.gap.jobs import Job, command, design_command
-from benchmarks.gap.plan import ARMS, FROZEN_WITH, PRINT_KNOBS, SCAN_KNOBS, Effort, model, store
+from benchmarks.gap.plan import ARMS, PRINT_KNOBS, SCAN_KNOBS, Effort, model, store, trained_as
 
 # The machine is one and the same in training and test prints: its draws have a seed of their own.
 _MACHINE_SEED = 0
@@ -39,7 +39,7 @@ def fab_jobs(out: Path, effort: Effort) -> list[list[Job]]:
 def model_jobs(out: Path, effort: Effort) -> list[list[Job]]:
     """Train, freeze and test every arm; the longest training first."""
     arms = [arm for arm in reversed(ARMS) if arm != "none"]
-    trained = {arm: FROZEN_WITH.get(arm, (arm, ())) for arm in arms}
+    trained = {arm: trained_as(arm) for arm in arms}
     train = [
         Job(
             f"train-{name}",

@@ -85,6 +85,7 @@ def benchmark(
     """
     require_models(models)
     dataset = open_store(store)
+    old = _kept_benchmark(Path(out), dataset.name, models, split, seed)
     scans = dataset.scans()
     floor = stated_floor(dataset.name, noise)
     locked = dataset.locked_ids
@@ -97,7 +98,8 @@ def benchmark(
             raise InputError("first folds", got=first_folds, wanted=f"1 to {made}, the number of folds")
         plan = [fold for fold in plan if fold.locked or fold.number < first_folds]
     scored = [scan for fold in plan if not fold.locked for scan in fold.held_out]
-    _require_same_benchmark(Path(out), dataset.name, models, split, seed, scored)
+    if old is not None and (more := set(old.split.scored_ids) - {scan.id for scan in scored}):
+        raise _other_benchmark(Path(out), f"{len(more)} scans more")
     configs = {name: _config(name, settings, seed) for name in models}
     fits: dict[tuple[str, int], FitRecord] = {}
     predicted: dict[tuple[str, bool], dict[str, Prediction]] = {}
@@ -179,18 +181,13 @@ def _settings(name: str, config: TrainingConfig, scans: Sequence[PrintedScan]) -
     return config.used_by(build_model(name, config.variant, **common_geometry(scans)))
 
 
-def _require_same_benchmark(
-    out: Path,
-    dataset: str,
-    models: Sequence[str],
-    split: SplitKind,
-    seed: int,
-    scored: Sequence[PrintedScan],
-) -> None:
-    """A result may be made again or extended; one of something else is not replaced."""
+def _kept_benchmark(
+    out: Path, dataset: str, models: Sequence[str], split: SplitKind, seed: int
+) -> Benchmark | None:
+    """What the folder holds: it may be made again or extended; one of something else is not replaced."""
     require_own_folder(out, Benchmark.FILE_NAME, CACHE_FOLDER)
     if not (out / Benchmark.FILE_NAME).exists():
-        return
+        return None
     old = Benchmark.read(out)
     lost = [score.model for score in old.scores if score.model not in models]
     other = [
@@ -204,12 +201,15 @@ def _require_same_benchmark(
     ]
     if lost:
         other.append(f"model {', '.join(lost)}")
-    if not other and (more := set(old.split.scored_ids) - {scan.id for scan in scored}):
-        other.append(f"{len(more)} scans more")
     if other:
-        raise InputError(
-            "output",
-            got=f"{out}, which holds a benchmark of {'; '.join(other)}",
-            wanted="a folder of its own",
-            hint="choose another --out",
-        )
+        raise _other_benchmark(out, "; ".join(other))
+    return old
+
+
+def _other_benchmark(out: Path, what: str) -> InputError:
+    return InputError(
+        "output",
+        got=f"{out}, which holds a benchmark of {what}",
+        wanted="a folder of its own",
+        hint="choose another --out",
+    )
