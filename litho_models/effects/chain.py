@@ -83,8 +83,15 @@ class EffectChain(nn.Module):
 
     def with_effects(self, effects: Mapping[str, Mapping[str, float]]) -> EffectChain:
         """The same base (shared, not copied) with other effects."""
+        return self._like_this(self.base, effects)
+
+    def over(self, base: nn.Module) -> EffectChain:
+        """The same effects over another base."""
+        return self._like_this(base, self.values())
+
+    def _like_this(self, base: nn.Module, effects: Mapping[str, Mapping[str, float]]) -> EffectChain:
         return EffectChain(
-            self.base,
+            base,
             effects,
             full_height_um=self.full_height_um,
             pitch_um=self.pitch_um,

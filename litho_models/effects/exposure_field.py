@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from litho_models.effects.effect import Effect, FieldContext, Parameter, Values, of_exposure
+from litho_models.effects.filters import add_blur
 
 
 def vignetting(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -31,9 +32,16 @@ def laser_drift(layout: Tensor, values: Values, context: FieldContext) -> Tensor
     return layout * (1 + values["drift"] * context.order)
 
 
-def interface_offset(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """max(M + z0, 0): writing starts z0 above the interface; what would lie below it is never written."""
-    return layout + torch.relu(layout + values["offset_um"]) - torch.relu(layout)
+def interface_offset(height: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """max(H - z, H_s) where H > H_s, the substrate: writing starts below it, and that part is lost.
+
+    The part would have shrunk like the rest, z = z0 (1 - k (1 - u)), u the relative nominal height nearby.
+    """
+    substrate_um, length = values["substrate_um"], values["length_um"]
+    relative = context.layout_um / context.full_height_um
+    dose = add_blur(relative, length**2, context.pitch_um, 3 * float(length.detach()))
+    lost_um = values["depth_um"] * (1 - values["shrinkage"] * (1 - dose))
+    return torch.where(height > substrate_um, torch.maximum(height - lost_um, substrate_um), height)
 
 
 EFFECTS = (
@@ -75,12 +83,20 @@ EFFECTS = (
         separating="repeat one layout at the start, the middle and the end of the set; log the laser power",
         needs=("order",),
     ),
-    of_exposure(
+    Effect(
         name="interface-offset",
-        title="writing started above or below the substrate",
-        parameters={"offset_um": Parameter("µm", -0.5, 0.3, -0.05)},
+        title="writing started below the surface of the substrate",
+        stage="exposure",
+        role="process",
+        acts_on="height",
+        parameters={
+            "depth_um": Parameter("µm", 0.0, 0.8, 0.1),
+            "substrate_um": Parameter("µm", -0.3, 0.5, 0.05, kind="shape"),
+            "shrinkage": Parameter("1", 0.0, 0.9, 0.3, kind="shape"),
+            "length_um": Parameter("µm", 0.3, 3.0, 1.5, kind="shape"),
+        },
         apply=interface_offset,
-        trials=({"offset_um": -0.05}, {"offset_um": -0.15}, {"offset_um": -0.3}),
+        trials=tuple({"depth_um": depth} for depth in (0.05, 0.15, 0.3)),
         source="search of the interface before writing; clipping at the substrate",
         separating="leave bare substrate in every field",
     ),

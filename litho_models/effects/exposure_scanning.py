@@ -43,7 +43,7 @@ def galvo_nonlinearity(layout: Tensor, values: Values, context: FieldContext) ->
 
 
 def write_order_memory(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """D = M - e K_l * M, K_l one-sided along the slow axis: the lines before starve the resist."""
+    """D = max(M - e K_l * M, 0), K_l one-sided along the slow axis: the lines before starve the resist."""
     strength, length = values["strength"], values["length_um"]
     onwards = float(values["direction"]) > 0
 
@@ -52,7 +52,7 @@ def write_order_memory(layout: Tensor, values: Values, context: FieldContext) ->
         return -strength * trailing_response(along if onwards else -along, length, context.pitch_um)
 
     reach = _TAIL_LENGTHS * float(length.detach())
-    return add_filtered(layout, transfer_minus_one, context.pitch_um, reach)
+    return torch.relu(add_filtered(layout, transfer_minus_one, context.pitch_um, reach))
 
 
 def hatch_ripple(height: Tensor, values: Values, context: FieldContext) -> Tensor:

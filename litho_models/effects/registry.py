@@ -19,7 +19,6 @@ from litho_models.effects import (
 from litho_models.effects.effect import Effect
 
 _FORWARD_ORDER = (
-    "interface-offset",
     "layer-stacking",
     "dose-exponent",
     "elliptical-psf",
@@ -32,6 +31,7 @@ _FORWARD_ORDER = (
     "threshold-softness",
     "diffusion-blur",
     "height-saturation",
+    "interface-offset",
     "field-curvature",
     "hatch-ripple",
     "vertical-shrinkage",

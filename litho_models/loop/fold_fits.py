@@ -17,6 +17,7 @@ from torch import Tensor
 from litho_models.effects import get_effect
 from litho_models.effects.chain import EffectChain
 from litho_models.fitting.least_squares import (
+    LeastSquaresFit,
     Linearised,
     Loss,
     Problem,
@@ -39,6 +40,7 @@ from litho_models.loop.parameters import (
     get_vector,
     model_for,
     room,
+    starts_of,
     within_bounds,
 )
 from litho_models.loop.prepared import PreparedScan
@@ -118,12 +120,7 @@ def fit_folds(
             ]
         )
     else:
-        start = get_vector(chain)
-        if len(windows) > 2 * _START_EVERY:
-            start = fit_least_squares(
-                _problem(chain, windows[::_START_EVERY], weights), start, RULES[loss]
-            ).vector
-        fitted = fit_least_squares(_problem(chain, windows, weights), start, RULES[loss])
+        fitted = _fit_squares(chain, windows, weights)
         common, linear = fitted.vector, fitted.linear
         own_fits = [
             _fit_without(chain, common, [linear[i] for i in own], [windows[i] for i in own], weights)
@@ -235,6 +232,20 @@ def _fit_absolute(chain: EffectChain, scans: Sequence[PreparedScan], weights: We
     assert isinstance(fitted.base, Simulator)
     fit_small_model(fitted.base, [scan.stored for scan in scans], "full+rows", weights=weights)
     return get_vector(fitted)
+
+
+def _fit_squares(chain: EffectChain, windows: Sequence[PreparedScan], weights: Weights) -> LeastSquaresFit:
+    """The best of the fits from all starts; of many scans a third decides which one."""
+    starts = starts_of(chain)
+    if len(windows) > 2 * _START_EVERY:
+        some = _problem(chain, windows[::_START_EVERY], weights)
+        starts = [_best([fit_least_squares(some, start, RULES["squares"]) for start in starts]).vector]
+    every = _problem(chain, windows, weights)
+    return _best([fit_least_squares(every, start, RULES["squares"]) for start in starts])
+
+
+def _best(fits: Sequence[LeastSquaresFit]) -> LeastSquaresFit:
+    return min(fits, key=lambda fit: eliminated_sum(fit.linear, TERM_WEIGHT)[2])
 
 
 def _fit_without(

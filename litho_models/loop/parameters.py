@@ -43,6 +43,19 @@ def chain_at(chain: EffectChain, vector: np.ndarray) -> EffectChain:
     return moved
 
 
+def starts_of(chain: EffectChain) -> list[np.ndarray]:
+    """Where a fit of the chain may begin: where it stands, and with the base's numbers before any fit.
+
+    The best base without an effect is no good place to look for one beside it: what the base took of the
+    effect keeps it there, on the wrong side of a hill.
+    """
+    stands = get_vector(chain)
+    if not (chain.names and isinstance(chain.base, Simulator) and is_refitted(chain.base)):
+        return [stands]
+    unfitted = get_vector(chain.over(type(chain.base)(chain.base.config)))
+    return [stands] if np.array_equal(stands, unfitted) else [stands, unfitted]
+
+
 def model_for(base: nn.Module, scan_id: str, fold: int | None = None) -> nn.Module:
     """The model that predicts a scan: the base, or of one per fold that of ``fold``.
 

@@ -246,6 +246,17 @@ def test_slow_axis_turns_galvo_lag_and_memory() -> None:
         assert torch.allclose(across.transpose(-1, -2), straight, rtol=0, atol=1e-12)
 
 
+def test_what_the_lines_before_take_leaves_no_negative_dose() -> None:
+    layout = torch.zeros(1, 1, 60, 60, dtype=torch.float64)
+    layout[..., :30, :] = 1.2
+    values = {"strength": 0.5, "length_um": 1.0, "direction": 1.0}
+    dose = get_effect("write-order-memory")(layout, values, FieldContext(layout, PITCH_UM, 1.2))
+    # Below the written lines there is nothing to take from: bare stays bare, but for rounding.
+    assert float(dose[..., 30:, :].abs().max()) < 1e-12
+    # The tail is cut beyond the 3 lengths to the edge of the layout and 5.9 more: e^-8.9 is 1.4e-4.
+    assert float(dose[..., 29, 0]) == pytest.approx(0.6, rel=5e-4)
+
+
 def test_vignetting_reaches_its_strength_at_the_edge_of_the_write_field() -> None:
     layout = torch.ones(1, 1, 101, 101, dtype=torch.float64)
     context = FieldContext(layout, PITCH_UM, 1.2, field_radius_um=5.0)

@@ -35,7 +35,7 @@ def test_an_elliptical_spot_is_not_taken_for_diffusion() -> None:
 
 @pytest.mark.long
 def test_a_print_that_lost_its_foot_is_not_called_shrunk() -> None:
-    scans = printed_scans({"interface-offset": {"offset_um": -0.25}}, count=12, size_px=96, seed=3)
+    scans = printed_scans({"interface-offset": {"depth_um": 0.25}}, count=12, size_px=96, seed=3)
     assert "interface-offset" in {name for own, others in added_to(scans).items() for name in (own, *others)}
 
 
@@ -123,7 +123,14 @@ def test_slices_set_alike_in_wide_areas_and_differ_where_narrower_than_the_spot(
     assert line < -0.05 if share else line == 0.0
 
 
-def test_the_interface_cuts_the_layout_from_below() -> None:
-    layout = torch.tensor(np.linspace(0, 1.2, 13), dtype=torch.float32).reshape(1, 1, 1, 13)
-    cut = get_effect("interface-offset")(layout, {"offset_um": -0.25}, FieldContext(layout, 0.1, 1.2))
-    assert torch.allclose(cut, torch.clamp(layout - 0.25, min=0), atol=1e-6)
+def test_the_interface_cuts_the_print_from_below() -> None:
+    height = torch.tensor(np.linspace(0, 1.2, 13), dtype=torch.float32).reshape(1, 1, 1, 13)
+    values = {"depth_um": 0.25, "substrate_um": 0.05, "shrinkage": 0.0}
+    cut = get_effect("interface-offset")(height, values, FieldContext(height, 0.1, 1.2))
+    # What is not above the substrate stays; what is loses the depth and ends at the substrate.
+    assert float(cut[..., 0]) == 0
+    assert torch.allclose(cut[..., 1:], torch.clamp(height[..., 1:] - 0.25, min=0.05), atol=1e-6)
+    # Around a place half as dense as the densest, the lost part had shrunk by half of `shrinkage`.
+    half = FieldContext(torch.full_like(height, 0.6), 0.1, 1.2)
+    shrunk = get_effect("interface-offset")(height, {**values, "shrinkage": 0.4}, half)
+    assert torch.allclose(shrunk[..., 1:], torch.clamp(height[..., 1:] - 0.2, min=0.05), atol=1e-6)

@@ -57,6 +57,33 @@ def test_the_tip_enters_a_contest_at_the_radius_that_the_store_found(known_um, m
     assert tried == own + ([known_um] if known_um else [])
 
 
+@pytest.mark.parametrize(("gain_nm2", "named"), [(120.0, ["interface-offset"]), (80.0, [])])
+def test_after_a_refusal_another_is_named_only_if_it_does_as_much(gain_nm2, named, monkeypatch) -> None:
+    """A first candidate that a generic term beats hides no better one, and lets no smaller one in."""
+    chain = true_model({})
+    fits = FoldFits(chain, get_vector(chain), np.zeros((3, 1)), np.zeros(3), np.eye(1), [])
+    state = State(fits, [])
+    winners = {"dose-exponent": 100.0, "interface-offset": gain_nm2}
+
+    def hold(state: State, candidates, *_: object, **__: object) -> contest.Contest:
+        left = [effect for effect in candidates if effect.name in winners]
+        if not left:
+            return contest.Contest([])
+        added = SimpleNamespace(effect=left[0], gain_nm2=winners[left[0].name])
+        there = chain.with_effects({added.effect.name: {}})
+        return contest.Contest([], winner=(added, State(replace(fits, chain=there), [])))
+
+    def reason(winner, *_: object) -> str:
+        return "a table does the same" if winner[0].effect.name == "dose-exponent" else ""
+
+    monkeypatch.setattr(selection, "hold_contest", hold)
+    monkeypatch.setattr(selection, "rejection_reason", reason)
+    study = Study(prepare_scans(printed_scans(count=4, seed=9)), FOLD_OF)
+    found = selection.search_effects(state, study, frozenset({"offset"}), exclude={})
+    assert found.names == named
+    assert found.failures["dose-exponent"] == "a table does the same"
+
+
 @pytest.mark.parametrize(
     ("errors", "winner"),
     [

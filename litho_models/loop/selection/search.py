@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from litho_models.effects import get_effect, screened_effects
@@ -66,23 +66,34 @@ def search_effects(start: State, study: Study, terms: Terms, *, exclude: Mapping
     """
     found = Search(start)
 
-    def contest(state: State, holder: tuple[str, State] | None = None) -> Contest:
+    def contest(
+        state: State, holder: tuple[str, State] | None = None, without: Collection[str] = ()
+    ) -> Contest:
         effects = screened_effects(study.tip_radius_um)
-        candidates = [one for one in effects if one.name not in {*exclude, *state.fits.chain.names}]
+        absent = {*exclude, *without, *state.fits.chain.names}
+        candidates = [one for one in effects if one.name not in absent]
         return hold_contest(state, candidates, study, terms, holder=holder)
 
     def select() -> bool:
-        """Add winners while they earn a name; whether the last one was refused."""
+        """Add winners while they earn a name; whether the last ones were refused."""
+        refused: dict[str, float] = {}
         while len(found.added) < MOST_EFFECTS:
-            held = contest(found.state)
+            held = contest(found.state, without=refused)
             found.note(held)
             if held.winner is None:
-                return False
-            if rejected := rejection_reason(held.winner, found.state, found, study):
+                return bool(refused)
+            added, _ = held.winner
+            name = added.effect.name
+            if added.gain_nm2 < max(refused.values(), default=0.0):
                 # Smaller effects cannot be named while the largest part of what is missing has no name.
-                found.failures[held.winner[0].effect.name] = rejected
+                found.failures[name] = "gains less than another that got no name"
                 return True
+            if rejected := rejection_reason(held.winner, found.state, found, study):
+                found.failures[name] = rejected
+                refused[name] = added.gain_nm2
+                continue
             found.add(*held.winner, before=found.state)
+            refused.clear()
         return False
 
     refused = select()
