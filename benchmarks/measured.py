@@ -37,7 +37,7 @@ from litho_models.frozen.card import ModelCard
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "results" / "neural-lithography"
-PBL_SEEDS = (1, 2)
+TRAINING_SEEDS = (1, 2)
 RESULTS = {
     "benchmark.json": "benchmark/benchmark.json",
     "benchmark_least_squares.json": "benchmark-small/benchmark.json",
@@ -45,7 +45,11 @@ RESULTS = {
     **{f"benchmark_paper_{seed}.json": f"benchmark-paper-{seed}/benchmark.json" for seed in PAPER_SEEDS},
     "benchmark_prints.json": "leave-one-print-out/benchmark.json",
     "benchmark_prints_pbl.json": "leave-one-print-out-pbl/benchmark.json",
-    **{f"benchmark_pbl_seed{seed}.json": f"benchmark-pbl-seed{seed}/benchmark.json" for seed in PBL_SEEDS},
+    **{
+        f"benchmark_{network}_seed{seed}.json": f"benchmark-{network}-seed{seed}/benchmark.json"
+        for network in ("pbl", "fno")
+        for seed in TRAINING_SEEDS
+    },
     "noise.json": "noise/noise.json",
     "close_loop.json": "close-loop/close_loop.json",
     **{f"close_loop_{base}.json": f"close-loop-{base}/close_loop.json" for base in (*SMALL_BASES, "pbl")},
@@ -74,6 +78,10 @@ def texts(folder: Path) -> dict[str, str]:
     networks = in_one(found("benchmark.json"), found("benchmark_pbl.json"))
     by_print = in_one(found("benchmark_prints_pbl.json"), found("benchmark_prints.json"))
     benchmark = in_one(networks, found("benchmark_least_squares.json"))
+    seeds = [
+        in_one(*(found(f"benchmark_{network}_seed{seed}.json") for network in ("fno", "pbl")))
+        for seed in TRAINING_SEEDS
+    ]
     return {
         "headline": headline_table(benchmark, found("noise.json")),
         "equal freedom": equal_freedom_table(
@@ -82,7 +90,7 @@ def texts(folder: Path) -> dict[str, str]:
         "benchmark": benchmark_table(benchmark, found("noise.json")),
         "paper split": paper_table([found(f"benchmark_paper_{seed}.json") for seed in PAPER_SEEDS], first),
         "whole prints": extrapolation_table(by_print, benchmark, found("noise.json")),
-        "seeds": seeds_table(networks, [found(f"benchmark_pbl_seed{seed}.json") for seed in PBL_SEEDS]),
+        "seeds": seeds_table(networks, seeds),
         "paired differences": paired_table(benchmark),
         "further figures": further_table(benchmark),
         "noise": noise_table(found("noise.json")),
