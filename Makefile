@@ -33,9 +33,9 @@ demo: $(STAMP)     ## run the whole path: make demo, or make demo DATASET=neural
 trials: $(STAMP)   ## blind trials of the closed loop: make trials WORKERS=2, PUBLISH=1 writes them into docs/
 	$(BIN)/python -m benchmarks.blind_trials --out $(OUT)/blind-trials --workers $(WORKERS) $(if $(DASK),--dask $(DASK)) $(if $(PUBLISH),--publish)
 
-gap: $(STAMP)      ## the design-to-manufacturing gap at full size, hours: make gap WORKERS=2 [CORRECTED=DIR] [PROOF=1] [PUBLISH=1]
+gap: $(STAMP)      ## the design-to-manufacturing gap at full size, hours: make gap WORKERS=2 [CORRECTED=DIR] [PUBLISH=1]
 	$(BIN)/python -m benchmarks.gap --out $(OUT)/gap --workers $(WORKERS) $(if $(DASK),--dask $(DASK)) $(if $(CORRECTED),--corrected $(CORRECTED)) \
-		$(if $(PROOF),--proof) $(if $(PUBLISH),--publish)
+		$(if $(PUBLISH),--publish)
 
 docs: $(DOCS_STAMP) ## build the site of the documentation into runs/site; a broken link is an error
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict

@@ -21,7 +21,7 @@ from benchmarks.gap.cost import as_text, estimate, read_records, run_trial, tria
 from benchmarks.gap.document import publish_results, write_results
 from benchmarks.gap.jobs import run_commands
 from benchmarks.gap.plan import Effort, Plan, open_plan
-from benchmarks.gap.steps import fab_jobs, model_jobs, proof_jobs
+from benchmarks.gap.steps import fab_jobs, model_jobs
 from benchmarks.gap.tasks import Task, chosen, tasks
 from litho_data.foundation.commands import run_script
 from litho_data.foundation.errors import InputError
@@ -69,9 +69,6 @@ def _run(given: argparse.Namespace) -> None:
         print(f"{task.name}: {len(task.designs(out))} designs", flush=True)
         run_commands(task.designs(out), logs, workers)
     run_commands([task.compare(out) for task in todo], logs, workers)
-    if given.proof:
-        for job in proof_jobs(out, effort):
-            run_commands([job], logs)
     results = write_results(out, plan, todo, rows)
     print(f"{results} ({(time.monotonic() - started) / 3600:.2f} h in this run)")
     if given.publish:
@@ -109,7 +106,6 @@ def _arguments() -> argparse.Namespace:
     )
     parser.add_argument("--tasks", metavar="NAMES", help="only these, separated by commas; all by default")
     parser.add_argument("--estimate", action="store_true", help="trial iterations and estimate only")
-    parser.add_argument("--proof", action="store_true", help="then one hologram with 1,000 iterations of PBL")
     parser.add_argument("--publish", action="store_true", help="write tables and figures into docs/gap.md")
     parser.add_argument("--trial", help=argparse.SUPPRESS)
     return parser.parse_args()

@@ -12,12 +12,10 @@ import pandas as pd
 
 from benchmarks.gap.figures import draw_images, draw_lens
 from benchmarks.gap.plan import ARMS, Plan
-from benchmarks.gap.steps import proof_folders
-from benchmarks.gap.tables import SHOWN, as_markdown, figure_file
+from benchmarks.gap.tables import as_markdown, figure_file
 from benchmarks.gap.tasks import Task
 from benchmarks.record import origin, publish, usable_cores, write_record
 from litho_design.judging.gap import GapResult, design_folder, headline
-from litho_design.judging.score import ScoreResult
 from litho_design.tasks.design import Design
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -47,13 +45,12 @@ def write_results(
                 "iterations": gap.settings.search.iterations,
                 "seeds": gap.seeds,
                 "printers": {arm: used.sha256 for arm, used in gap.arms.items()},
-                "minutes": _minutes(out / name, gap.seeds),
+                "minutes": search_minutes(out / name, gap.seeds),
                 "paired": [item.model_dump(mode="json") for item in gap.paired if item.judge not in gap.arms],
                 "ceiling": _ceiling(out / name, gap),
             }
             for name, gap in gaps.items()
         },
-        "proof": _proof(out),
         "expected_minutes": {row["part"]: round(row["minutes"], 1) for row in expected},
         "summary": json.loads(summary.to_json(orient="records")),
     }
@@ -76,21 +73,6 @@ def publish_results(out: Path) -> None:
     publish(PAGE, NAME, as_markdown(record))
 
 
-def _proof(out: Path) -> dict[str, Any] | None:
-    """The long design, in design and by the fab; None if it was not made."""
-    design_folder, score_folder = proof_folders(out)
-    if not (score_folder / ScoreResult.FILE_NAME).exists():
-        return None
-    design, score = Design.read(design_folder), ScoreResult.read(score_folder)
-    return {
-        "designed_with": "pbl",
-        "iterations": design.iterations,
-        "start": design.settings["search"]["start"],
-        "designed": {name: design.predicted[name] for name in SHOWN["hoe"]},
-        "judged": {name: score.scores[0].figures[name] for name in SHOWN["hoe"]},
-    }
-
-
 def _models(out: Path) -> dict[str, dict[str, float]]:
     """Mean absolute error of every trained model on the prints of the test run."""
     errors = {}
@@ -109,7 +91,7 @@ def _ceiling(folder: Path, gap: GapResult) -> dict[str, float] | None:
     return (design.baselines or {}).get("continuous phase")
 
 
-def _minutes(folder: Path, seeds: Sequence[int]) -> dict[str, float]:
+def search_minutes(folder: Path, seeds: Sequence[int]) -> dict[str, float]:
     """Minutes of search per arm, over the judged seeds, as the designs recorded them."""
     minutes: dict[str, float] = {}
     for place in sorted(place for seed in seeds for place in (folder / "designs").glob(f"*/seed{seed}")):

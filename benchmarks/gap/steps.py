@@ -1,10 +1,10 @@
-"""What is done around the designs: the fab prints, every arm is trained and tested, one proof at the end."""
+"""What is done around the designs: the fab prints, every arm is trained and tested."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from benchmarks.gap.jobs import Job, command, design_command
+from benchmarks.gap.jobs import Job, command
 from benchmarks.gap.plan import ARMS, PRINT_KNOBS, SCAN_KNOBS, Effort, model, store, trained_as
 
 # The machine is one and the same in training and test prints: its draws have a seed of their own.
@@ -71,27 +71,6 @@ def model_jobs(out: Path, effort: Effort) -> list[list[Job]]:
         for arm in arms
     ]  # fmt: skip
     return [train, freeze, test]
-
-
-def proof_jobs(out: Path, effort: Effort) -> list[Job]:
-    """One hologram through PBL with the 1,000 iterations of the paper, and what the fab prints of it."""
-    folder, score_folder = proof_folders(out)
-    design = design_command(
-        "hoe", "--model", model(out, "pbl"), "--target", "text", "--size-px", effort.hoe_px,
-        "--distance-um", effort.hoe_distance_um, "--iterations", 1000, "--start", "random",
-        "--precision", effort.search_precision, "--out", folder,
-    )  # fmt: skip
-    judge = ("--judge", f"fab={out / 'fab' / 'truth'}")
-    score = design_command("score", folder, *judge, "--out", score_folder)
-    return [
-        Job("proof", design, folder / "design.json"),
-        Job("proof-score", score, score_folder / "score.json"),
-    ]
-
-
-def proof_folders(out: Path) -> tuple[Path, Path]:
-    """Where the proof's design and its score go."""
-    return out / "proof" / "design", out / "proof" / "score"
 
 
 def _knob_options() -> list[str]:

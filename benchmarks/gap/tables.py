@@ -11,7 +11,7 @@ SHOWN = {
     "lens-direct": {"cbr": +1, "strehl": +1, "focusing_efficiency": +1},
     "lens-computational": {"mae_calibrated": -1, "mae_design": -1, "strehl": +1},
 }
-_LABELS = {
+LABELS = {
     "si_psnr_db": "SI-PSNR, dB",
     "ssim": "SSIM",
     "eff_signal": "power on the signal",
@@ -26,7 +26,7 @@ _FIGURES = {
     "lens-direct": "PSF and its spectrum in design and after printing",
     "lens-computational": "PSF and its spectrum in design and after printing",
 }
-_TITLES = {
+TITLES = {
     "hoe": "Hologram",
     "lens-direct": "Lens, direct imaging",
     "lens-computational": "Lens, computational imaging",
@@ -46,8 +46,6 @@ def as_markdown(record: Mapping[str, Any]) -> str:
     ]
     for name, task in record["tasks"].items():
         parts.append(_task_part(name, task, [row for row in record["summary"] if row["task"] == name]))
-    if proof := record.get("proof"):
-        parts.append(_proof_part(proof))
     minutes = sum(sum(task["minutes"].values()) for task in record["tasks"].values())
     designs = sum(len(task["seeds"]) * len(task["minutes"]) for task in record["tasks"].values())
     parts.append(
@@ -68,7 +66,7 @@ def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, A
         judges = [judge for judge in dict.fromkeys(row["judge"] for row in rows) if judge != "none"]
         shown = dict(list(shown.items())[:1])
     # Judged by one printer, the expectation stands beside it; by several, each is a column.
-    heads = [f"{_LABELS[figure]}, in design → by {judge}" for judge in judges for figure in shown]
+    heads = [f"{LABELS[figure]}, in design → by {judge}" for judge in judges for figure in shown]
     # A perfect lens has a Strehl ratio of 1: what is missing is the gap to the ceiling. A hologram's is a
     # continuous phase, and what is left of its image is measured as rms error, which SI-PSNR is in dB.
     ceiling = task.get("ceiling") if independent else None
@@ -76,7 +74,9 @@ def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, A
     heads += [f"rms error of the image above a continuous phase's, by {judge}" for judge in judges if ceiling]
     lines = [f"| designed with | {' | '.join(heads)} |", "|---" * (1 + len(heads)) + "|"]
     for arm in arms:
-        cells = [_cell(values[arm, judge, figure], _digits(figure)) for judge in judges for figure in shown]
+        cells = [
+            _cell(values[arm, judge, figure], figure_digits(figure)) for judge in judges for figure in shown
+        ]
         if "strehl" in shown:
             cells.append(f"{100 * (1 - values[arm, judges[0], 'strehl']['judged']):.1f} %")
         if ceiling:
@@ -87,9 +87,9 @@ def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, A
         lines.append(f"| {arm} | {' | '.join(cells)} |")
     seeds = len(task["seeds"])
     told = f"{seeds} seed{'s' * (seeds > 1)}"
-    head = f"### {_TITLES[name]}\n\n{task['iterations']} iterations for every arm, {told}."
+    head = f"### {TITLES[name]}\n\n{task['iterations']} iterations for every arm, {told}."
     if ceiling:
-        reached = ", ".join(f"{_LABELS[figure]} {ceiling[figure]:.3f}" for figure in SHOWN[kind])
+        reached = ", ".join(f"{LABELS[figure]} {ceiling[figure]:.3f}" for figure in SHOWN[kind])
         head += f" A continuous phase on the same grid, without printer or levels: {reached}."
     head += "\n\n"
     verdict = ""
@@ -100,24 +100,12 @@ def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, A
     return "\n\n".join(part for part in (head + "\n".join(lines), verdict, figure) if part)
 
 
-def _proof_part(proof: Mapping[str, Any]) -> str:
-    figures = "; ".join(
-        f"{_LABELS[name]} {proof['designed'][name]:.3f} → {proof['judged'][name]:.3f}"
-        for name in SHOWN["hoe"]
-    )
-    return (
-        f"### {proof['iterations']:,} iterations\n\n"
-        f"One hologram with as many iterations as in the paper, otherwise with our search, through "
-        f"{proof['designed_with']}, start {proof['start']}, in design → by fab: {figures}."
-    )
-
-
 def figure_file(name: str) -> str:
     """Name of a task's figure."""
     return f"{name}.{'jpg' if name.startswith('hoe') else 'png'}"
 
 
-def _digits(figure: str) -> int:
+def figure_digits(figure: str) -> int:
     """Decimals: an error of an image is a few hundredths, and arms differ by a hundredth of that."""
     return 5 if figure.startswith("mae") else 3
 
@@ -138,7 +126,7 @@ def _verdict(
 ) -> str:
     """Who wins by the first figure, and by how much against every other arm, paired by seed."""
     figure, sign = figure_sign
-    digits = _digits(figure)
+    digits = figure_digits(figure)
     best = max(arms, key=lambda arm: sign * values[arm, judge, figure]["judged"])
     against = []
     for other in arms:
@@ -151,7 +139,7 @@ def _verdict(
                 open_ = "" if low * high > 0 else ", which includes 0"
                 interval = f"[{low:+.{digits}f}, {high:+.{digits}f}]"
                 against.append(f"over {other} {turn * item['mean']:+.{digits}f} {interval}{open_}")
-    return f"Printed by {judge}, {best} is best in {_LABELS[figure]}. Its lead: " + "; ".join(against) + "."
+    return f"Printed by {judge}, {best} is best in {LABELS[figure]}. Its lead: " + "; ".join(against) + "."
 
 
 def _model_table(models: Mapping[str, Mapping[str, float]]) -> str:

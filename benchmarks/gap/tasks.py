@@ -73,16 +73,16 @@ def tasks(out: Path, effort: Effort, zoo: Mapping[str, str], corrected: str | No
     """
     models = {arm: "none" if arm == "none" else str(model(out, arm)) for arm in ARMS}
     fab = {"fab": str(out / "fab" / "truth")}
-    hoe = _options(
+    hoe = task_options(
         "--target", "text", "--size-px", effort.hoe_px,
         "--distance-um", effort.hoe_distance_um, "--iterations", effort.hoe_iterations,
         "--start", "gs", "--precision", effort.search_precision, *_FEW_DRAWS,
     )  # fmt: skip
-    lens = _options(
+    lens = task_options(
         "--size-px", effort.lens_px, "--distance-um", effort.lens_distance_um,
         "--iterations", effort.lens_iterations, "--precision", effort.search_precision, *_FEW_DRAWS,
     )  # fmt: skip
-    camera = _options("--window-px", effort.window_px, "--object-px", effort.object_px)
+    camera = task_options("--window-px", effort.window_px, "--object-px", effort.object_px)
     # No fab knows the measured printer: every arm's model judges the others' designs.
     measured = {arm: zoo.get(arm, "none") for arm in ZOO_ARMS}
     measured |= {} if corrected is None else {"closed-loop": corrected}
@@ -108,5 +108,6 @@ def chosen(every: Sequence[Task], names: str | None) -> list[Task]:
     return [task for task in every if task.name in wanted]
 
 
-def _options(*words: object) -> tuple[str, ...]:
+def task_options(*words: object) -> tuple[str, ...]:
+    """Options of a command, in words."""
     return tuple(map(str, words))

@@ -10,6 +10,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
+from benchmarks.gap import paper_search
 from benchmarks.gap.cost import estimate, read_records, run_trial
 from benchmarks.gap.document import NAME, PAGE, RESULT_FILE, RESULTS
 from benchmarks.gap.jobs import Job, run_commands
@@ -17,7 +18,7 @@ from benchmarks.gap.plan import ARMS, FROZEN_WITH, PRINT_KNOBS, Effort, model, o
 from benchmarks.gap.steps import model_jobs
 from benchmarks.gap.tables import as_markdown
 from benchmarks.gap.tasks import Task, chosen, tasks
-from benchmarks.record import published
+from benchmarks.record import NOT_MEASURED, published
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.workers import Workers
 from litho_data.virtual_fab import KnobSetting, knob_rms_nm
@@ -172,14 +173,7 @@ def test_the_tables_name_the_winner_and_what_is_undecided():
         },
         "summary": rows,
     }  # fmt: skip
-    figures = {"si_psnr_db": 15.5, "ssim": 0.5, "eff_signal": 0.4}
-    record["proof"] = {
-        "designed_with": "pbl", "iterations": 1000, "start": "random",
-        "designed": figures, "judged": figures | {"si_psnr_db": 14.5},
-    }  # fmt: skip
     text = as_markdown(record)
-    assert "1,000 iterations" in text
-    assert "SI-PSNR, dB 15.500 → 14.500" in text
     assert "| none | 16.000 → 12.000 ± 0.100 |" in text
     # 6 and 4 dB below the ceiling: the error is 10^(6/20) and 10^(4/20) times as large.
     assert "| 100 % |" in text
@@ -191,3 +185,40 @@ def test_the_tables_name_the_winner_and_what_is_undecided():
 def test_the_page_quotes_the_committed_comparison():
     record = json.loads((RESULTS / RESULT_FILE).read_text("utf-8"))
     assert published(PAGE, NAME) == as_markdown(record)
+
+
+def test_the_papers_search_and_ours_get_the_same_iterations_arms_and_judges(tmp_path):
+    found = {task.name: task for task in paper_search.paper_tasks(tmp_path, TINY)}
+    assert len(found) == 12
+    for name, task in found.items():
+        kind, search, iterations = name.rsplit("-", 2)
+        other = found[f"{kind}-{'ours' if search == 'paper' else 'paper'}-{iterations}"]
+        assert (task.models, task.judges, task.seeds) == (other.models, other.judges, other.seeds)
+        assert task.iterations == int(iterations)
+        assert ("--variant" in task.options) == (search == "paper")
+        # A third of the iterations three times costs what all of them cost once.
+        assert task.iterations * task.seeds == pytest.approx(1000, rel=2e-3)
+
+
+def test_the_table_of_the_papers_search_says_what_is_not_made(tmp_path):
+    task = next(
+        task for task in paper_search.paper_tasks(tmp_path, TINY) if task.name == "lens-direct-paper-333"
+    )
+    summary = [
+        {
+            "arm": arm, "judge": judge, "figure": "cbr",
+            "designed_mean": 100.0, "judged_mean": 50.0, "judged_ci95": [45.0, 55.0],
+        }
+        for arm in task.models for judge in task.judges
+    ]  # fmt: skip
+    done = {"iterations": 333, "seeds": 3, "minutes": {"none": 1.2}, "summary": summary}
+    text = paper_search.as_markdown({"tasks": {task.name: done}})
+    assert "| none | fab | not made yet | not made yet | 100.000 → 50.000 ± 5.000 | not made yet |" in text
+    assert "paper 333: none 1." in text
+
+
+def test_the_page_quotes_the_papers_search():
+    text = published(PAGE, paper_search.NAME)
+    file = RESULTS / paper_search.FILE_NAME
+    record = json.loads(file.read_text("utf-8")) if file.exists() else None
+    assert text == (NOT_MEASURED if record is None else paper_search.as_markdown(record))

@@ -1,0 +1,165 @@
+"""The paper's own search beside ours, with equal iterations, through the models of the comparison.
+
+    python -m benchmarks.gap.paper_search --out runs/gap --workers 2 [--tasks hoe-paper-333] [--publish]
+
+The search of the paper is the preset ``--variant paper``: Gumbel-Softmax at its temperature, its rates and
+losses, a random start, 1,000 iterations, the last layout. It starts where ``python -m benchmarks.gap`` ended:
+the fab's frozen models lie in ``--out``. Finished designs are kept and interrupted ones resume; what is not
+finished yet is said in the table.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.gap.document import PAGE, RESULTS, search_minutes
+from benchmarks.gap.jobs import run_commands
+from benchmarks.gap.plan import Effort, model
+from benchmarks.gap.tables import LABELS, SHOWN, TITLES, figure_digits
+from benchmarks.gap.tasks import Task, chosen, task_options
+from benchmarks.markdown_table import markdown_table
+from benchmarks.record import origin, publish, usable_cores, write_record
+from litho_data.foundation.commands import run_script
+from litho_data.foundation.workers import Workers
+from litho_design.judging.gap import GapResult
+from litho_models.frozen import zoo
+
+NAME, FILE_NAME = "paper-search", "paper_search.json"
+# Iterations of a design, and seeds: all of the paper's once, a third of them three times.
+SEEDS_OF = {1000: 1, 333: 3}
+SEARCHES = {"paper": ("--variant", "paper"), "ours": ()}
+# PBL with all it predicts, as the paper's: what lies along the scan lines is in the other models, too.
+ARMS = ("none", "physics", "fno", "pbl-scan-axis")
+# An iteration of the hologram through the FNO, tile by tile, takes 15 s of a core: 18 hours for its designs.
+LEFT_OUT = {"hoe": ("fno",)}
+MEASURED = "measured-pbl"
+_NAMES = {"hoe": "hoe", "direct": "lens-direct", "computational": "lens-computational"}
+
+
+def main() -> None:
+    """Make the designs that are missing, judge them, write the table."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--out", type=Path, required=True, help="folder of the comparison")
+    parser.add_argument("--workers", type=int, default=1, help="processes side by side, one thread each")
+    parser.add_argument("--tasks", metavar="NAMES", help="only these, separated by commas; all by default")
+    parser.add_argument("--publish", action="store_true", help="write the table into docs/gap.md")
+    given = parser.parse_args()
+    every = paper_tasks(given.out, Effort())
+    todo, workers, logs = chosen(every, given.tasks), Workers(given.workers), given.out / "logs"
+    run_commands([job for task in todo for job in task.designs(given.out)], logs, workers)
+    run_commands([task.compare(given.out) for task in todo], logs, workers)
+    record = {
+        "schema": "litho-design/benchmark-paper-search/1",
+        "machine": {"cores": usable_cores(), "threads_per_process": 1},
+        **origin(),
+        "tasks": {task.name: _found(given.out, task) for task in every if task.compare(given.out).done},
+    }
+    text = as_markdown(record)
+    print(text)
+    write_record(given.out / "results" / FILE_NAME, record)
+    if given.publish:
+        write_record(RESULTS / FILE_NAME, record)
+        publish(PAGE, NAME, text)
+
+
+def paper_tasks(out: Path, effort: Effort) -> list[Task]:
+    """Hologram and lenses, each by both searches with both budgets; the short ones first."""
+    return [
+        _task(out, effort, kind, search, iterations)
+        for iterations in sorted(SEEDS_OF)
+        for kind in ("direct", "computational", "hoe")
+        for search in SEARCHES
+    ]
+
+
+def as_markdown(record: Mapping[str, Any]) -> str:
+    """A table per kind of element, the searches side by side."""
+    return "\n\n".join(_table(kind, record["tasks"]) for kind in _NAMES)
+
+
+def _task(out: Path, effort: Effort, kind: str, search: str, iterations: int) -> Task:
+    hologram = kind == "hoe"
+    size_px, distance_um = (
+        (effort.hoe_px, effort.hoe_distance_um) if hologram else (effort.lens_px, effort.lens_distance_um)
+    )
+    options = task_options(
+        *SEARCHES[search], "--size-px", size_px, "--distance-um", distance_um, "--iterations", iterations,
+        "--yield-draws", 10,
+    )  # fmt: skip
+    if hologram:
+        options += ("--target", "text", *(("--start", "gs") if search == "ours" else ()))
+    elif kind == "computational":
+        options += task_options("--window-px", effort.window_px, "--object-px", effort.object_px)
+    arms = [arm for arm in ARMS if arm not in LEFT_OUT.get(kind, ())]
+    models = {arm: "none" if arm == "none" else str(model(out, arm)) for arm in arms}
+    judges = {"fab": str(out / "fab" / "truth"), MEASURED: str(zoo.folder("pbl"))}
+    name = f"{_NAMES[kind]}-{search}-{iterations}"
+    return Task(name, kind, options, models, judges, SEEDS_OF[iterations])
+
+
+def _found(out: Path, task: Task) -> dict[str, Any]:
+    """The figures of a finished task, by arm and judge."""
+    gap = GapResult.read(out / task.name)
+    shown = SHOWN[_NAMES[task.kind]]
+    return {
+        "iterations": task.iterations,
+        "seeds": len(gap.seeds),
+        "minutes": search_minutes(out / task.name, gap.seeds),
+        "summary": [
+            item.model_dump(mode="json")
+            for item in gap.summary
+            if item.figure in shown and item.judge in task.judges
+        ],
+    }
+
+
+def _table(kind: str, tasks: Mapping[str, Mapping[str, Any]]) -> str:
+    """One row per arm and judge; a column per search and budget."""
+    figure = next(iter(SHOWN[_NAMES[kind]]))
+    columns = [(search, iterations) for iterations in SEEDS_OF for search in SEARCHES]
+    heads = [
+        f"{search}, {iterations:,} iterations, {seeds} seed{'s' * (seeds > 1)}"
+        for search, iterations in columns
+        for seeds in (SEEDS_OF[iterations],)
+    ]
+    found = [tasks.get(f"{_NAMES[kind]}-{search}-{iterations}") for search, iterations in columns]
+    arms = [arm for arm in ARMS if arm not in LEFT_OUT.get(kind, ())]
+    rows = [(arm, judge, *_cells(found, arm, judge, figure)) for judge in ("fab", MEASURED) for arm in arms]
+    return f"#### {TITLES[_NAMES[kind]]}: {LABELS[figure]}\n\n" + markdown_table(
+        ("designed with", "printed by", *heads), rows, _minutes_text(columns, found)
+    )
+
+
+def _cells(found: Sequence[Mapping[str, Any] | None], arm: str, judge: str, figure: str) -> Iterator[str]:
+    for task in found:
+        if task is None:
+            yield "not made yet"
+            continue
+        row = next(
+            row
+            for row in task["summary"]
+            if (row["arm"], row["judge"], row["figure"]) == (arm, judge, figure)
+        )
+        digits, interval = figure_digits(figure), row["judged_ci95"]
+        spread = f" ± {(interval[1] - interval[0]) / 2:.{digits}f}" if interval else ""
+        yield f"{row['designed_mean']:.{digits}f} → {row['judged_mean']:.{digits}f}{spread}"
+
+
+def _minutes_text(columns: Sequence[tuple[str, int]], found: Sequence[Mapping[str, Any] | None]) -> str:
+    """What the searches took."""
+    told = [
+        f"{search} {iterations:,}: "
+        + ", ".join(f"{arm} {minutes:.0f}" for arm, minutes in task["minutes"].items())
+        for (search, iterations), task in zip(columns, found, strict=True)
+        if task is not None
+    ]
+    return f"In design → as printed. Minutes of search, all seeds, one thread each: {'; '.join(told)}."
+
+
+if __name__ == "__main__":
+    run_script(main)
