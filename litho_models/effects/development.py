@@ -97,7 +97,6 @@ EFFECTS = (
         trials=({"fraction": 0.05},),
         source="Meisel 2006, cited in the paper",
         separating="a step standard for the microscope, then a printed staircase",
-        linear=True,
     ),
     of_development(
         name="dose-dependent-shrinkage",

@@ -171,7 +171,6 @@ class Effect:
         separating: the experiment that tells it apart from what looks alike.
         needs: facts about the print without which it cannot be tested.
         per_scan: its parameters belong to one scan and have no value shared by all.
-        linear: a filter of layout or height, so that what it fails to explain is a filter too.
         along_lines: it depends on the line alone, so offsets of single lines would hide it.
         reverses: parameters whose sign is the other way round on lines recorded on the way back.
         of_tip: it belongs to the tip, and a new one does not have it.
@@ -189,7 +188,6 @@ class Effect:
     trials: tuple[Mapping[str, float], ...] = ()
     needs: tuple[Literal["order", "levels"], ...] = ()
     per_scan: bool = False
-    linear: bool = False
     along_lines: bool = False
     reverses: tuple[str, ...] = ()
     of_tip: bool = False

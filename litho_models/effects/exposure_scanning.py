@@ -52,7 +52,10 @@ def write_order_memory(layout: Tensor, values: Values, context: FieldContext) ->
         return -strength * trailing_response(along if onwards else -along, length, context.pitch_um)
 
     reach = _TAIL_LENGTHS * float(length.detach())
-    return torch.relu(add_filtered(layout, transfer_minus_one, context.pitch_um, reach))
+    starved = add_filtered(layout, transfer_minus_one, context.pitch_um, reach)
+    # Where another effect has left a negative dose, that is not for this one to mend.
+    least = layout.clamp(max=0)
+    return least + torch.relu(starved - least)
 
 
 def hatch_ripple(height: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -88,7 +91,6 @@ EFFECTS = (
         ),
         source="first-order lag of the deflection, l = speed x time constant",
         separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
-        linear=True,
     ),
     of_exposure(
         name="galvo-nonlinearity",
@@ -118,7 +120,6 @@ EFFECTS = (
         ),
         source="oxygen and radical depletion along the slow writing axis, y unless the card says x",
         separating="print the same layout with the writing order reversed",
-        linear=True,
     ),
     Effect(
         name="hatch-ripple",

@@ -95,7 +95,6 @@ EFFECTS = (
         ),
         source="Gaussian spot of the paper, with a full second-moment matrix",
         separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
-        linear=True,
     ),
     of_exposure(
         name="long-range-proximity",
@@ -108,7 +107,6 @@ EFFECTS = (
         trials=tuple({"weight": 0.1, "length_um": length} for length in (1.0, 2.0, 4.0, 8.0)),
         source="proximity sum of two Gaussians, as in electron-beam writing; weights signed",
         separating="print one feature alone and inside dense surroundings of three sizes",
-        linear=True,
     ),
     of_exposure(
         name="dose-exponent",

@@ -82,7 +82,6 @@ EFFECTS = (
         ),
         source="first-order feedback loop; a probe that parachutes loses the surface on the way down",
         separating="compare trace and retrace; scan at 0 and 90 degrees",
-        linear=True,
         reverses=("direction",),
     ),
     of_microscope(
@@ -118,6 +117,5 @@ EFFECTS = (
         trials=({"variance_um2": 0.0025}, {"variance_um2": 0.04}),
         source="kernels are 0.03 to 0.06 µm wide at 0.1 µm per pixel; some microscopes are slower",
         separating="register with two interpolation kernels; scan with half the pixel size",
-        linear=True,
     ),
 )

@@ -48,7 +48,6 @@ EFFECTS = (
         trials=({"variance_um2": 0.01}, {"variance_um2": 0.09}),
         source="Lang 2022, arXiv:2205.14891; the paper's diffusion kernel",
         separating="step edges of two heights, scanned with two pixel sizes and a new tip",
-        linear=True,
     ),
     of_resist(
         name="threshold-softness",

@@ -50,10 +50,11 @@ def starts_of(chain: EffectChain) -> list[np.ndarray]:
     effect keeps it there, on the wrong side of a hill.
     """
     stands = get_vector(chain)
-    if not (chain.names and isinstance(chain.base, Simulator) and is_refitted(chain.base)):
+    if not (isinstance(chain.base, Simulator) and is_refitted(chain.base)):
         return [stands]
     unfitted = get_vector(chain.over(type(chain.base)(chain.base.config)))
-    return [stands] if np.array_equal(stands, unfitted) else [stands, unfitted]
+    same = unfitted.shape != stands.shape or np.array_equal(unfitted, stands)
+    return [stands] if same else [stands, unfitted]
 
 
 def model_for(base: nn.Module, scan_id: str, fold: int | None = None) -> nn.Module:

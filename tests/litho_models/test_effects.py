@@ -246,6 +246,13 @@ def test_slow_axis_turns_galvo_lag_and_memory() -> None:
         assert torch.allclose(across.transpose(-1, -2), straight, rtol=0, atol=1e-12)
 
 
+def test_a_negative_dose_of_another_effect_is_kept_by_one_that_is_off() -> None:
+    layout, context = field()
+    layout = layout - 0.3
+    effect = get_effect("write-order-memory")
+    assert torch.allclose(effect(layout, effect.off_values(), context), layout, rtol=0, atol=1e-12)
+
+
 def test_what_the_lines_before_take_leaves_no_negative_dose() -> None:
     layout = torch.zeros(1, 1, 60, 60, dtype=torch.float64)
     layout[..., :30, :] = 1.2

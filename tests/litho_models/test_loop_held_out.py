@@ -65,23 +65,31 @@ def test_after_a_refusal_another_is_named_only_if_it_does_as_much(gain_nm2, name
     state = State(fits, [])
     winners = {"dose-exponent": 100.0, "interface-offset": gain_nm2}
 
-    def hold(state: State, candidates, *_: object, **__: object) -> contest.Contest:
-        left = [effect for effect in candidates if effect.name in winners]
+    def hold(state: State, candidates, *_: object, refused=(), **__: object) -> contest.Contest:
+        taking_part = [effect for effect in candidates if effect.name in winners]
+        screened = [SimpleNamespace(effect=effect) for effect in taking_part]
+        left = [effect for effect in taking_part if effect.name not in refused]
         if not left:
-            return contest.Contest([])
-        added = SimpleNamespace(effect=left[0], gain_nm2=winners[left[0].name])
-        there = chain.with_effects({added.effect.name: {}})
-        return contest.Contest([], winner=(added, State(replace(fits, chain=there), [])))
+            return contest.Contest(screened)
+        there = State(replace(fits, chain=chain.with_effects({left[0].name: {}})), [])
+        return contest.Contest(screened, winner=(SimpleNamespace(effect=left[0]), there))
+
+    def gain(before: State, after: State, *_: object) -> float:
+        return winners[after.fits.chain.names[0]]
 
     def reason(winner, *_: object) -> str:
         return "a table does the same" if winner[0].effect.name == "dose-exponent" else ""
 
     monkeypatch.setattr(selection, "hold_contest", hold)
+    monkeypatch.setattr(selection, "_gain_nm2", gain)
     monkeypatch.setattr(selection, "rejection_reason", reason)
     study = Study(prepare_scans(printed_scans(count=4, seed=9)), FOLD_OF)
     found = selection.search_effects(state, study, frozenset({"offset"}), exclude={})
     assert found.names == named
+    # What was refused is still a suspect, with its reason.
+    assert "dose-exponent" in found.last
     assert found.failures["dose-exponent"] == "a table does the same"
+    assert ("interface-offset" in found.failures) == (not named)
 
 
 @pytest.mark.parametrize(

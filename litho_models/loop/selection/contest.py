@@ -7,7 +7,7 @@ a good part of the best gain are fitted in full before one is chosen.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -89,6 +89,7 @@ def hold_contest(
     terms: Terms,
     *,
     holder: tuple[str, State] | None = None,
+    refused: Collection[str] = (),
 ) -> Contest:
     """Screen the candidates, fit those that stand out, and confirm the one the training sets agree on.
 
@@ -97,13 +98,14 @@ def hold_contest(
         candidates: effects that are not in it.
         terms: scan terms of the scoring.
         holder: a candidate that takes part whatever its screening says, and the fitted model with it.
+        refused: candidates that are screened with the others and take no part.
     """
     if not candidates:
         return Contest([])
     directions = measure_directions(state.fits, study.windows, held_out_residuals(state, study), candidates)
     found = Contest(screen(directions, study.fold_of))
     mse_nm2 = float(state.score(study, terms).mse_nm2.mean())
-    eligible = [s for s in found.screened if is_eligible(s, mse_nm2)]
+    eligible = [s for s in found.screened if is_eligible(s, mse_nm2) and s.effect.name not in refused]
     study.report(f"{len(eligible)} of {len(found.screened)} candidates stand out")
     worth = WORTH_FITTING * SMALLEST_SHARE * mse_nm2
     for s in eligible:
@@ -114,7 +116,7 @@ def hold_contest(
     if holder is not None:
         entrants.append(Entrant(next(s for s in found.screened if s.effect.name == holder[0]), holder[1]))
     for _ in range(HEATS):
-        entered = {e.name for e in entrants}
+        entered = {*refused, *(e.name for e in entrants)}
         entering, relatives = (
             [s for s in group if s.effect.name not in entered]
             for group in shortlist(found.screened, remaining, directions)

@@ -67,32 +67,33 @@ def search_effects(start: State, study: Study, terms: Terms, *, exclude: Mapping
     found = Search(start)
 
     def contest(
-        state: State, holder: tuple[str, State] | None = None, without: Collection[str] = ()
+        state: State, holder: tuple[str, State] | None = None, refused: Collection[str] = ()
     ) -> Contest:
         effects = screened_effects(study.tip_radius_um)
-        absent = {*exclude, *without, *state.fits.chain.names}
-        candidates = [one for one in effects if one.name not in absent]
-        return hold_contest(state, candidates, study, terms, holder=holder)
+        candidates = [one for one in effects if one.name not in {*exclude, *state.fits.chain.names}]
+        return hold_contest(state, candidates, study, terms, holder=holder, refused=refused)
 
     def select() -> bool:
         """Add winners while they earn a name; whether the last ones were refused."""
         refused: dict[str, float] = {}
         while len(found.added) < MOST_EFFECTS:
-            held = contest(found.state, without=refused)
+            held = contest(found.state, refused=refused)
             found.note(held)
             if held.winner is None:
                 return bool(refused)
-            added, _ = held.winner
-            name = added.effect.name
-            if added.gain_nm2 < max(refused.values(), default=0.0):
+            name = held.winner[0].effect.name
+            gain_nm2 = _gain_nm2(found.state, held.winner[1], study, terms)
+            if gain_nm2 < max(refused.values(), default=0.0):
                 # Smaller effects cannot be named while the largest part of what is missing has no name.
                 found.failures[name] = "gains less than another that got no name"
                 return True
             if rejected := rejection_reason(held.winner, found.state, found, study):
                 found.failures[name] = rejected
-                refused[name] = added.gain_nm2
+                refused[name] = gain_nm2
                 continue
             found.add(*held.winner, before=found.state)
+            for other in refused:
+                found.failures.pop(other)
             refused.clear()
         return False
 
@@ -105,6 +106,11 @@ def search_effects(start: State, study: Study, terms: Terms, *, exclude: Mapping
         # What it was refused for may be gone.
         select()
     return found
+
+
+def _gain_nm2(before: State, after: State, study: Study, terms: Terms) -> float:
+    """Mean gain in squared error on scans left out, by the terms that all candidates are compared with."""
+    return float((before.score(study, terms).mse_nm2 - after.score(study, terms).mse_nm2).mean())
 
 
 def rejection_reason(winner: tuple[Added, State], before: State, found: Search, study: Study) -> str:
