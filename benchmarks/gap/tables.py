@@ -41,7 +41,7 @@ def as_markdown(record: Mapping[str, Any]) -> str:
     parts = [
         f"Effects of the fab, 10 nm rms each: {knobs}. The models were trained on {effort['scans']} scans "
         f"of its prints, {effort['scan_px']} px wide, the networks for {effort['training_steps']:,} steps. "
-        f"Searches ran in {effort['search_precision']}, prints and scores in float32.\n\n"
+        f"{_precision_text(effort['search_precision'])}\n\n"
         + _model_table(record["models"])
     ]
     for name, task in record["tasks"].items():
@@ -53,6 +53,12 @@ def as_markdown(record: Mapping[str, Any]) -> str:
         "other work. Intervals are Student's, 95 %, over seeds."
     )
     return "\n\n".join(parts)
+
+
+def _precision_text(search: str) -> str:
+    if search == "float32":
+        return "Searches, prints and scores ran in float32."
+    return f"Searches ran in {search}, prints and scores in float32."
 
 
 def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, Any]]) -> str:
