@@ -41,8 +41,7 @@ def as_markdown(record: Mapping[str, Any]) -> str:
     parts = [
         f"Effects of the fab, 10 nm rms each: {knobs}. The models were trained on {effort['scans']} scans "
         f"of its prints, {effort['scan_px']} px wide, the networks for {effort['training_steps']:,} steps. "
-        f"{_precision_text(effort['search_precision'])}\n\n"
-        + _model_table(record["models"])
+        f"{_precision_text(effort['search_precision'])}\n\n" + _model_table(record["models"])
     ]
     for name, task in record["tasks"].items():
         parts.append(_task_part(name, task, [row for row in record["summary"] if row["task"] == name]))
