@@ -68,7 +68,7 @@ def fit_feature_networks(
 
     def heights(features: Tensor) -> Tensor:
         both = zip(model.feature_networks, features.split(sizes, dim=1), strict=True)
-        return torch.stack([network.at_pixels(own) for network, own in both]).sum(dim=0)
+        return torch.stack([network.at_pixels(own.T) for network, own in both]).sum(dim=0)
 
     features = torch.cat([part.features for part in parts])
     weight = torch.cat([part.weight for part in parts])

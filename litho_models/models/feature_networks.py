@@ -14,6 +14,7 @@ from typing import ClassVar
 import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
+from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
 from litho_models.layers.gaussian import kernel_radius_px
@@ -25,7 +26,7 @@ from litho_models.simulator import crop_border
 # has a derivative: 2 nm.
 _LEAST_SLOPE = 2e-3
 # Pixels that go through the network at once: some hundred bytes each, whatever the size of the field.
-_PIXELS_AT_ONCE = 2**16
+_PIXELS_AT_ONCE = 2**14
 
 Widths = tuple[float, ...]
 
@@ -91,20 +92,30 @@ class FeatureNetwork(nn.Module, ABC):
 
     def forward(self, field_um: Tensor) -> Tensor:
         """What the network adds to the height of the interior, (b, 1, y - 2r, x - 2r) µm."""
-        features = torch.stack([feature[:, 0] for feature in self.features(field_um)], dim=-1)
-        pixels = features.flatten(0, -2).split(_PIXELS_AT_ONCE)
+        features = self.features(field_um)
+        pixels = zip(*(feature.flatten().split(_PIXELS_AT_ONCE) for feature in features), strict=True)
         with torch.autocast(device_type=field_um.device.type, enabled=False):
             if torch.is_grad_enabled():
                 # Computed again for a gradient: the hidden units of a field would take gigabytes.
-                parts = [checkpoint(self.at_pixels, part, use_reentrant=False) for part in pixels]
+                parts = [checkpoint(self._at_pixels, *part, use_reentrant=False) for part in pixels]
             else:
-                parts = [self.at_pixels(part) for part in pixels]
-        return torch.cat(parts).view(features.shape[:-1])[:, None]
+                parts = [self._at_pixels(*part) for part in pixels]
+        return torch.cat(parts).view_as(features[0])
+
+    def _at_pixels(self, *features: Tensor) -> Tensor:
+        return self.at_pixels(torch.stack(features))
 
     def at_pixels(self, features: Tensor) -> Tensor:
-        """The same from features (n, features): (n,) µm."""
-        standard = (features - self.centre) / self.scale
-        return (self.linear(standard) + self.layers(standard))[:, 0]
+        """The same from features (features, n): (n,) µm."""
+        first, *others, last = (layer for layer in self.layers if isinstance(layer, nn.Linear))
+        # What standardises the features is in the weights: one pass over the pixels less, and its gradient.
+        weight = torch.cat([self.linear.weight, first.weight]) / self.scale
+        straight = self.linear.bias if self.has_constant else self.scale.new_zeros(1)
+        bias = torch.cat([straight, first.bias]) - weight @ self.centre
+        total, hidden = torch.addmm(bias[:, None], weight, features).tensor_split((1,))
+        for layer in others:
+            hidden = torch.addmm(layer.bias[:, None], layer.weight, functional.silu(hidden))
+        return (total + last.weight @ functional.silu(hidden))[0]
 
     def standardise(self, centre: Tensor, scale: Tensor) -> None:
         """State mean and standard deviation (features,) of what the network sees."""
@@ -171,7 +182,7 @@ class ScanAxis(FeatureNetwork):
     has_constant = False
 
     def at_pixels(self, features: Tensor) -> Tensor:
-        return super().at_pixels(features) - super().at_pixels(torch.zeros_like(features[:1]))
+        return super().at_pixels(features) - super().at_pixels(torch.zeros_like(features[:, :1]))
 
     @property
     def feature_count(self) -> int:
