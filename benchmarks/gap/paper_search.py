@@ -3,26 +3,28 @@
     python -m benchmarks.gap.paper_search --out runs/gap --workers 2 [--tasks hoe-paper-333] [--publish]
 
 The search of the paper is the preset ``--variant paper``: Gumbel-Softmax at its temperature, its rates and
-losses, a random start, 1,000 iterations, the last layout. It starts where ``python -m benchmarks.gap`` ended:
-the fab's frozen models lie in ``--out``. Finished designs are kept and interrupted ones resume; what is not
-finished yet is said in the table.
+losses, a random start, 1,000 iterations, the last layout. The models are those of ``benchmarks.gap`` in the
+same ``--out``; what it has not made yet is made here. Finished designs are kept and interrupted ones resume.
+The page keeps the tasks that it has and says which are not made yet.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from benchmarks.gap.document import PAGE, RESULTS, search_minutes
 from benchmarks.gap.jobs import run_commands
-from benchmarks.gap.plan import Effort, Plan, model
+from benchmarks.gap.plan import Effort, Plan, model, open_plan
+from benchmarks.gap.steps import fab_jobs, model_jobs
 from benchmarks.gap.tables import LABELS, SHOWN, TITLES, figure_digits
 from benchmarks.gap.tasks import Task, chosen, task_options
 from benchmarks.markdown_table import markdown_table
-from benchmarks.record import origin, publish, usable_cores, write_record
-from litho_data.foundation.commands import run_script
+from benchmarks.record import publish, usable_cores, write_record
+from litho_data.foundation.commands import command_line, run_script
 from litho_data.foundation.workers import Workers
 from litho_design.judging.gap import GapResult
 from litho_models.frozen import zoo
@@ -52,22 +54,27 @@ def main() -> None:
     parser.add_argument("--tasks", metavar="NAMES", help="only these, separated by commas; all by default")
     parser.add_argument("--publish", action="store_true", help="write the table into docs/gap.md")
     given = parser.parse_args()
-    every = paper_tasks(given.out, Plan.read(given.out).effort)
-    todo, workers, logs = chosen(every, given.tasks), Workers(given.workers), given.out / "logs"
-    run_commands([job for task in todo for job in task.designs(given.out)], logs, workers)
-    run_commands([task.compare(given.out) for task in todo], logs, workers)
+    out, workers, logs = given.out, Workers(given.workers), given.out / "logs"
+    found = (out / Plan.FILE_NAME).exists()
+    effort = (Plan.read(out) if found else open_plan(out, Effort(), corrected=None)).effort
+    every = paper_tasks(out, effort)
+    todo = chosen(every, given.tasks)
+    for stage in (*fab_jobs(out, effort), *model_jobs(out, effort)):
+        run_commands(stage, logs, workers)
+    run_commands([job for task in todo for job in task.designs(out)], logs, workers)
+    run_commands([task.compare(out) for task in todo], logs, workers)
     record = {
         "schema": "litho-design/benchmark-paper-search/1",
         "machine": {"cores": usable_cores(), "threads_per_process": 1},
-        **origin(),
-        "tasks": {task.name: _found(given.out, task) for task in every if task.compare(given.out).done},
+        "command": command_line(),
+        "tasks": {task.name: _found(out, task) for task in every if task.compare(out).done},
     }
-    text = as_markdown(record)
-    print(text)
-    write_record(given.out / FILE_NAME, record)
+    print(as_markdown(record))
+    write_record(out / FILE_NAME, record)
     if given.publish:
+        record["tasks"] = _published_tasks() | record["tasks"]
         write_record(RESULTS / FILE_NAME, record)
-        publish(PAGE, NAME, text)
+        publish(PAGE, NAME, as_markdown(record))
 
 
 def paper_tasks(out: Path, effort: Effort) -> list[Task]:
@@ -107,13 +114,21 @@ def _task(out: Path, effort: Effort, kind: str, search: str, iterations: int) ->
     return Task(name, kind, options, models, judges, SEEDS_OF[iterations])
 
 
+def _published_tasks() -> dict[str, Any]:
+    """Those of earlier calls, which may have had another folder."""
+    file = RESULTS / FILE_NAME
+    return json.loads(file.read_text(encoding="utf-8"))["tasks"] if file.exists() else {}
+
+
 def _found(out: Path, task: Task) -> dict[str, Any]:
     """The figures of a finished task, by arm and judge."""
     gap = GapResult.read(out / task.name)
     shown = SHOWN[_NAMES[task.kind]]
     return {
+        **gap.model_dump(mode="json", include={"commit", "dirty", "versions"}),
         "iterations": task.iterations,
         "seeds": len(gap.seeds),
+        "printers": {arm: used.sha256 for arm, used in gap.arms.items()},
         "minutes": search_minutes(out / task.name, gap.seeds),
         "summary": [
             item.model_dump(mode="json")
