@@ -1,10 +1,10 @@
-"""The fast recipe against itself in bfloat16, another seed, and the first epochs of the paper's, on one draw.
+"""The paper's recipe on the paper's models, its learning curves, and the fast recipe beside it, on one draw.
 
     python -m benchmarks.recipes STORE [--runs paper-pbl] --publish
 
-``--fast`` is the result of `litho-models benchmark STORE --split paper` with the fast recipe in float32. An
-interrupted run resumes. The page shows all runs that are published, those of earlier calls too. All epochs of
-the paper, ``--epochs 4000``, are a task for a GPU.
+``--fast`` is the result of `litho-models benchmark STORE --split paper` with the fast recipe in float32; two
+runs repeat it in bfloat16 and from another seed. An interrupted run resumes. The page shows all runs that are
+published, those of earlier calls too. All epochs of the paper, ``--epochs 4000``, are a task for a GPU.
 """
 
 from __future__ import annotations
@@ -13,12 +13,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks.learning_curves import STEPS_PER_EPOCH, curve_table, draw_curves
 from benchmarks.markdown_table import markdown_table, with_interval
 from benchmarks.record import options, publish
 from litho_data.foundation.commands import run_script
 from litho_models.evaluation.benchmark import benchmark
+from litho_models.evaluation.fit_cache import FitRecord
 from litho_models.evaluation.results import Benchmark
-from litho_models.fitting.config import PAPER_BATCH, PAPER_CROPS, PAPER_EPOCHS
+from litho_models.fitting.config import PAPER_BATCH, PAPER_EPOCHS
 from litho_models.scoring.pairs import paired_scores
 from litho_models.scoring.records import ModelScores
 
@@ -27,16 +29,15 @@ FOLDER = ROOT / "docs" / "results" / "recipes"
 FAST = ROOT / "docs" / "results" / "neural-lithography" / "benchmark_paper_0.json"
 PAGE, MARK = ROOT / "docs" / "evaluation.md", "recipes"
 # What is compared with the fast recipe in float32: models and settings of each run. In bfloat16 a step of PBL
-# takes half as long; the paper's own FNO takes a whole quadrant at once, where ours blends tiles.
+# takes half as long. The paper's models are as its appendix states them, and train in float32.
 RUNS: dict[str, tuple[tuple[str, ...], dict[str, Any]]] = {
     "reduced": (("pbl",), {"precision": "bf16-mixed"}),
     "reseeded": (("pbl",), {"seed": 1}),
-    "paper": (("physics", "pbl"), {"recipe": "paper", "precision": "bf16-mixed"}),
     "paper-physics": (("physics",), {"recipe": "paper", "variant": "paper"}),
     "paper-pbl": (("pbl",), {"recipe": "paper", "variant": "paper"}),
     "paper-fno": (("fno",), {"recipe": "paper", "variant": "paper"}),
 }
-STEPS_PER_EPOCH = PAPER_CROPS // PAPER_BATCH
+CURVES = "learning_curves.png"
 
 
 def main() -> None:
@@ -49,12 +50,12 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/recipes"))
     given = parser.parse_args()
     fast = Benchmark.read(given.fast)
-    results = {}
+    runs = published_runs()
     for name in given.runs.split(","):
         models, settings = RUNS[name]
         if settings.get("recipe") == "paper":
             settings = {**settings, "steps": given.epochs * STEPS_PER_EPOCH}
-        results[name] = benchmark(
+        runs[name] = benchmark(
             given.store,
             given.out / name,
             split="paper",
@@ -62,21 +63,31 @@ def main() -> None:
             settings=settings,
             seed=fast.split.seed,
         )
-    print(recipe_text(fast, list(results.values())))
+    shown = [runs[name] for name in RUNS if name in runs]
+    print(recipe_text(fast, shown))
     if given.publish:
-        for name, result in results.items():
+        for name, result in runs.items():
             result.write(FOLDER / name)
-        publish(PAGE, MARK, recipe_text(fast, published_runs()))
+        draw_curves(_paper_fits(shown), FOLDER / CURVES)
+        publish(PAGE, MARK, recipe_text(fast, shown))
 
 
-def published_runs() -> list[Benchmark]:
-    """The committed results, in the order of `RUNS`."""
-    return [Benchmark.read(FOLDER / name) for name in RUNS if (FOLDER / name).is_dir()]
+def published_runs() -> dict[str, Benchmark]:
+    """The committed results by name, in the order of `RUNS`."""
+    return {name: Benchmark.read(FOLDER / name) for name in RUNS if (FOLDER / name).is_dir()}
 
 
 def recipe_text(fast: Benchmark, others: Sequence[Benchmark]) -> str:
     """What the page shows: other ways of training beside the fast one; the models trained the paper's way."""
-    return f"{recipe_table(fast, others)}\n\n{paper_order(others)}"
+    picture = f"![Error by epoch of the models trained the paper's way](results/recipes/{CURVES})"
+    curves = curve_table(_paper_fits(others))
+    return "\n\n".join((recipe_table(fast, others), paper_order(others), picture, curves))
+
+
+def _paper_fits(results: Sequence[Benchmark]) -> list[FitRecord]:
+    return [
+        fit for result in results for fit in result.fits if result.training[fit.model]["recipe"] == "paper"
+    ]
 
 
 def recipe_table(fast: Benchmark, others: Sequence[Benchmark]) -> str:

@@ -31,8 +31,8 @@ from litho_data.foundation.commands import run_script
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.workers import Workers
 
-# Drawn from once the loop was finished; development uses seeds 0 and 1.
-REPORTED_SEED = 20267
+# Of the last board, drawn from once the loop was finished; development uses other seeds.
+REPORTED_SEED = 20270
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE, RESULTS = DOCS / "blind_trials.md", DOCS / "results" / "blind-trials"
 
