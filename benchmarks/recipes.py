@@ -50,8 +50,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs/recipes"))
     given = parser.parse_args()
     fast = Benchmark.read(given.fast)
-    runs = published_runs()
-    for name in given.runs.split(","):
+    runs, wanted = published_runs(), given.runs.split(",")
+    for name in wanted:
         models, settings = RUNS[name]
         if settings.get("recipe") == "paper":
             settings = {**settings, "steps": given.epochs * STEPS_PER_EPOCH}
@@ -66,8 +66,8 @@ def main() -> None:
     shown = [runs[name] for name in RUNS if name in runs]
     print(recipe_text(fast, shown))
     if given.publish:
-        for name, result in runs.items():
-            result.write(FOLDER / name)
+        for name in wanted:
+            runs[name].write(FOLDER / name)
         draw_curves(_paper_fits(shown), FOLDER / CURVES)
         publish(PAGE, MARK, recipe_text(fast, shown))
 
