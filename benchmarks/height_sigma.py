@@ -86,7 +86,7 @@ def measure(
             error_um -= error_um.mean()
             ratios.append(error_um / scan.height_sigma_um[scan.valid])
             errors_nm.append(1e3 * float(error_um.std()))
-        budget = {name: store.quality[name] for name in store.quality if name.startswith("sigma_")}
+        budget = {name: store.quality[name] for name in map(str, store.quality) if name.startswith("sigma_")}
     pooled, each = np.concatenate(ratios), [float(one.std()) for one in ratios]
     return {
         "scans": len(ratios),

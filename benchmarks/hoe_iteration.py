@@ -24,7 +24,7 @@ from torch import Tensor
 
 from benchmarks import side_by_side
 from benchmarks.plain_pbl import PlainPbl
-from benchmarks.predict import SIDES, gradient_gflop
+from benchmarks.predict import REDUCED, SIDES, gradient_gflop
 from benchmarks.side_by_side import Arrays, Work
 from benchmarks.trained_pbl import load_pbl
 from litho_data.foundation.commands import run_script
@@ -76,7 +76,7 @@ def _work(side: str, arguments: argparse.Namespace) -> Work:
     else:
         printer = load_printer(str(arguments.model), layout, device=device)
         prints, objective = printer, HologramTask(settings, printer, target).objective
-        reduced = partial(printer.at_precision, side)
+        reduced = partial(printer.at_precision, REDUCED[side])
 
     def once() -> None:
         parameters.zero_grad(set_to_none=True)

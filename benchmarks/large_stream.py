@@ -67,7 +67,7 @@ def _layout(folder: Path, size_px: int) -> None:
     levels = np.random.default_rng(0).integers(0, layout.levels, (cells, cells), np.uint8)
     levels = levels.repeat(layout.cell_px, 0).repeat(layout.cell_px, 1)
     aim = draw_target("ring", 1024).repeat(step, 0).repeat(step, 1)
-    files = {}
+    files: dict[str, str] = {}
     for name, array in ((LEVELS_FILE, levels), (TARGET_FILE, aim), (IMAGE_FILE, aim)):
         files |= write_arrays(folder, {name: array})
     del aim

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,7 @@ from litho_data.level import (
     remove_scars,
 )
 from litho_data.level.facet import facet_pass
+from litho_data.level.rows import RowMethod
 from litho_data.readers import read_scan
 
 PAGE = Path(__file__).parents[1] / "docs" / "levelling.md"
@@ -128,7 +130,7 @@ def cases(z: np.ndarray) -> dict[str, Callable[[], object]]:
     layout = np.clip(np.round(z / z.max() * 12), 0, 12)
     slope_x, slope_y = (np.diff(z, axis=axis)[:539, :539].ravel() / 0.1 for axis in (1, 0))
     scars = mark_scars(align_rows(z, method="median").height)
-    methods = {
+    methods: dict[str, RowMethod] = {
         "median": "median",
         "median of differences": "median-of-differences",
         "trimmed mean": "trimmed-mean",
@@ -146,7 +148,7 @@ def cases(z: np.ndarray) -> dict[str, Callable[[], object]]:
         "polynomial 2, 2": lambda: level_polynomial(z, x_degree=2, y_degree=2),
         "polynomial 2, 2, masked": lambda: level_polynomial(z, x_degree=2, y_degree=2, mask=mask),
         **{
-            f"rows: {name}": lambda method=method: align_rows(z, method=method, pitch_um=PITCH_UM)
+            f"rows: {name}": partial(align_rows, z, method=method, pitch_um=PITCH_UM)
             for name, method in methods.items()
         },
         "rows: median, masked": lambda: align_rows(z, method="median", mask=mask),

@@ -44,8 +44,9 @@ def draw_prediction(store: Path, benchmark: Path, path: Path, model: str = "pbl"
     difference -= np.nanmedian(difference)
     measured = np.where(scan.valid, scan.height_um, np.nan)
     # Layout and print on scales of their own: a print is lower than its layout and has a zero of its own.
-    printed = np.nanpercentile(measured, (0.1, 99.9))
-    panels = [
+    low, high = np.nanpercentile(measured, (0.1, 99.9))
+    printed = float(low), float(high)
+    panels: list[tuple[str, np.ndarray, str, tuple[float, float]]] = [
         ("layout (µm)", scan.layout_um, "viridis", (0, 1.2)),
         ("measured (µm)", measured, "viridis", printed),
         (f"{model}, not trained on this scan (µm)", prediction, "viridis", printed),

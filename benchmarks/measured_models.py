@@ -55,7 +55,7 @@ def benchmark_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
         "absolute error",
         "parameters",
     )
-    rows = []
+    rows: list[tuple[str, ...]] = []
     parameters = {fit["model"]: fit["parameters"] for fit in benchmark["fits"]}
     for score in benchmark["scores"]:
         policies = {entry["policy"]: entry["mae_nm"] for entry in score["by_policy"]}
@@ -84,7 +84,7 @@ def headline_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
     """The errors of a few models, the noise and the paper's figure, for the project's page."""
     parameters = {fit["model"]: fit["parameters"] for fit in benchmark["fits"]}
     scores = {score["model"]: score for score in benchmark["scores"]}
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for name in ("affine", "physics", "linear", "pbl", "fno", "features", "random-features"):
         score = scores[name]
         full = next(entry["mae_nm"] for entry in score["by_policy"] if entry["policy"] == "full")
@@ -137,9 +137,9 @@ def _over_prints(units: dict[str, Any] | None) -> str:
 
 def further_table(benchmark: dict[str, Any]) -> str:
     """Phase, similarity, edges, crops, and training against held-out error, one row per model."""
-    heads = ("model", "phase", "SSIM", "edges, mean", "edges, P95", "edges without partner")
+    heads: tuple[str, ...] = ("model", "phase", "SSIM", "edges, mean", "edges, P95", "edges without partner")
     heads += ("other crop, largest", "on training scans", "on inner validation", "held out")
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for score in benchmark["scores"]:
         found = [fit["diagnostics"] for fit in benchmark["fits"] if fit["model"] == score["model"]]
         lost = score["edge_unmatched"] / (score["edge_matched"] + score["edge_unmatched"])
@@ -204,7 +204,7 @@ def noise_table(noise: dict[str, Any]) -> str:
 
 def texture_table(textures: Sequence[dict[str, Any]], *notes: str) -> str:
     """Direction and strongest period of the roughness, one row an axis."""
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for one in textures:
         for lines in one["lines"]:
             period = lines["period"]
@@ -250,7 +250,7 @@ def coverage_table(noise: dict[str, Any]) -> str:
         return f"{100 * value:.1f} %{ends}"
 
     total = spread["bins"][0]["pixels"]
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for row in spread["bins"]:
         if row["covariate"] not in ("all", "level", "slope") or row["pixels"] < 0.01 * total:
             continue

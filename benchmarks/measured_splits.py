@@ -15,7 +15,7 @@ def paper_table(draws: Sequence[dict[str, Any]], grouped: dict[str, Any]) -> str
     """Errors on every draw of the paper's split, one row per model, and how far the models are apart."""
     heads = ("model", *(f"draw {own['split']['seed']}" for own in draws))
     heads += ("absolute error, mean over draws", "whole scans held out")
-    rows = []
+    rows: list[tuple[str, ...]] = []
     whole = {score["model"]: score["mae_datum_free_nm"] for score in grouped["scores"]}
     for name in [score["model"] for score in draws[0]["scores"]]:
         scores = [score for own in draws for score in own["scores"] if score["model"] == name]
@@ -42,7 +42,7 @@ def paper_table(draws: Sequence[dict[str, Any]], grouped: dict[str, Any]) -> str
 def extrapolation_table(by_print: dict[str, Any], by_scan: dict[str, Any], noise: dict[str, Any]) -> str:
     """Errors where every scan of a print is held out, beside those where other scans of it are seen."""
     seen = {score["model"]: score for score in by_scan["scores"]}
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for score in by_print["scores"]:
         other = seen[score["model"]]
         rows.append(
@@ -54,7 +54,7 @@ def extrapolation_table(by_print: dict[str, Any], by_scan: dict[str, Any], noise
                 f"{other['mae_abs_nm']:.2f} nm",
             )
         )
-    heads = ("model", "datum-free error, whole prints held out", "whole scans held out")
+    heads: tuple[str, ...] = ("model", "datum-free error, whole prints held out", "whole scans held out")
     heads += ("absolute error, whole prints held out", "whole scans held out")
     rows.append(floor_row(noise["noise_floor"], "offset", "offset", "none", "none"))
     split = by_print["split"]

@@ -74,7 +74,8 @@ class Camera:
         edge = np.square(np.linspace(-1, 1, side))
         seen *= (1 - self.vignetting * (edge[:, None] + edge) / 2) / seen.max()
         seen += np.random.default_rng(seed).normal(0, self.noise, seen.shape)
-        counts = WHITE * self.exposure * seen.clip(0 if self.gamma != 1 else None) ** self.gamma + DARK
+        bent = seen if self.gamma == 1 else seen.clip(0) ** self.gamma
+        counts = WHITE * self.exposure * bent + DARK
         return counts.round().clip(0, RANGE).astype(np.uint16)
 
 
@@ -90,13 +91,14 @@ def drawn_camera(generator: np.random.Generator, fault: Mapping[str, float]) -> 
         "vignetting": generator.uniform(0, 0.3),
         "noise": 10 ** generator.uniform(-3, -1.3),
     }
-    return Camera(**given | fault)
+    return Camera(**{**given, **fault})
 
 
 def photographed(loaded: LoadedDesign, count: int, folder: Path) -> list[dict[str, Any]]:
     """One row per photograph of a print that is not quite the expected one."""
     assert loaded.target is not None
-    pitch_um, rows = loaded.record.layout.pitch_um, []
+    pitch_um = loaded.record.layout.pitch_um
+    rows: list[dict[str, Any]] = []
     names = list(ORIENTATIONS)
     for number in range(count):
         generator = np.random.default_rng([count, number])

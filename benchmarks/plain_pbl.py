@@ -68,6 +68,6 @@ def _with_activations(
         outputs, inputs, size, _ = weight.shape
         convolution = nn.Conv2d(inputs, outputs, size, padding=padding)
         convolution.weight.data = weight.detach().clone(memory_format=torch.contiguous_format)
-        convolution.bias.data = bias.detach().clone()
+        convolution.bias = nn.Parameter(bias.detach().clone())
         yield convolution
         yield nn.LeakyReLU(slope)

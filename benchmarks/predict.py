@@ -22,10 +22,12 @@ from benchmarks.side_by_side import Arrays, Work
 from benchmarks.trained_pbl import areawise_gflop, load_pbl, random_layout
 from litho_data.foundation.commands import run_script
 from litho_models import load_frozen
+from litho_models.layers.precision import Precision
 from litho_models.models.pbl import PblConfig
 
 NAME = "predict"
-SIDES = (side_by_side.PLAIN, "float32", "mixed", "bfloat16")
+REDUCED: dict[str, Precision] = {"float32": "float32", "mixed": "mixed", "bfloat16": "bfloat16"}
+SIDES = (side_by_side.PLAIN, *REDUCED)
 
 
 def main() -> None:
@@ -62,7 +64,7 @@ def _work(side: str, arguments: argparse.Namespace) -> Work:
         model: torch.nn.Module = PlainPbl(pbl).to(device).requires_grad_(False)
     else:
         model = frozen = load_frozen(arguments.model, device=device)
-        reduced = partial(frozen.at_precision, side)
+        reduced = partial(frozen.at_precision, REDUCED[side])
 
     def once() -> None:
         with reduced():

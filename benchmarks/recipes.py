@@ -92,7 +92,7 @@ def _paper_fits(results: Sequence[Benchmark]) -> list[FitRecord]:
 
 def recipe_table(fast: Benchmark, others: Sequence[Benchmark]) -> str:
     """What other ways of training reach on the draw of the fast recipe, the paper's among them."""
-    heads = ("model", "recipe", "steps", "10⁶ pixels seen", "on training scans", "held out")
+    heads: tuple[str, ...] = ("model", "recipe", "steps", "10⁶ pixels seen", "on training scans", "held out")
     heads += ("more than fast", "p")
     rows = []
     for base in fast.scores:

@@ -206,7 +206,7 @@ def creeping(
 
 def as_markdown(record: Mapping[str, Any]) -> str:
     """Two tables of phantoms, and of measured scans the changes."""
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for name in ("clean", *DEFECTS):
         own = [case for case in record["defects"] if case["what"] == name]
         named = sum(case["defect_share"] > 0 for case in own)
@@ -217,10 +217,11 @@ def as_markdown(record: Mapping[str, Any]) -> str:
     text = markdown_table(heads, rows, note)
     rows = []
     for creep_um in CREEP_UM:
-        own = {case["what"]: case for case in record["creep"] if case["creep_um"] == creep_um}
-        errors = [f"{own[name]['straight_px']:.2f} → {own[name]['error_px']:.2f}" for name in SETTLING]
-        reported = sum(case["reported"] for case in own.values())
-        rows.append((f"{creep_um:g}", *errors, f"{reported} of {len(own)}"))
+        by_name = {case["what"]: case for case in record["creep"] if case["creep_um"] == creep_um}
+        own = [by_name[name] for name in SETTLING]
+        errors = [f"{case['straight_px']:.2f} → {case['error_px']:.2f}" for case in own]
+        reported = sum(case["reported"] for case in by_name.values())
+        rows.append((f"{creep_um:g}", *errors, f"{reported} of {len(by_name)}"))
     note = "Creep along x, 0.4 of it along y, the same phantoms; straight fit alone → as registered, px."
     text += "\n\n" + markdown_table(("creep, µm", *SETTLING, "reported"), rows, note)
     if record["measured"]:

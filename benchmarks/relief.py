@@ -25,7 +25,7 @@ from benchmarks.record import conclude, options, origin, write_record
 from litho_data.build.build import build_dataset
 from litho_data.foundation.commands import run_script
 from litho_data.foundation.errors import InputError
-from litho_data.virtual_fab import simulate
+from litho_data.virtual_fab import Noise, simulate
 from litho_data.virtual_fab.truth import Truth
 from litho_design import correct
 from litho_design.printers.fab import FabSimulator
@@ -104,7 +104,7 @@ def of_seed(folder: Path, seed: int, model: str, settings: ReliefSettings) -> li
         freeze(folder / "run", frozen)
     truth = Truth.read(folder / "fab" / "truth")
     rough = FabSimulator(truth)
-    smooth = FabSimulator(truth.model_copy(update={"noise": dict.fromkeys(truth.noise, 0.0)}))
+    smooth = FabSimulator(truth.model_copy(update={"noise": Noise.off()}))
     rows = []
     for relief in RELIEFS:
         kept = folder / f"{relief}.json"

@@ -251,7 +251,7 @@ def _answer(worker: subprocess.Popen[str], request: str) -> str:
     worker.stdin.flush()
     answer = worker.stdout.readline()
     if not answer:
-        raise SystemExit(f"one side ended early: {worker.args}")
+        raise SystemExit(f"one side ended early: {worker.args!r}")
     return answer
 
 
@@ -262,7 +262,7 @@ def _serve(
     for request in sys.stdin:
         if request.strip() == "end":
             peak_gib = peak_memory_gib(device)
-            np.savez(arrays, **made())
+            np.savez(arrays, allow_pickle=False, **made())
             print(json.dumps(peak_gib), flush=True)
             return
         started = _now(device)

@@ -44,6 +44,7 @@ from litho_models.loop.second_round import MICROSCOPE, PRINTER, decide
 from litho_models.models import build_model
 from litho_models.planning.record import PlannedQuestion
 from litho_models.planning.run import next_print
+from litho_models.simulator import Simulator
 
 PAGE = Path(__file__).parents[1] / "docs" / "next_print.md"
 RESULTS = PAGE.parent / "results" / "two-rounds"
@@ -175,7 +176,9 @@ def first_round(folder: Path) -> tuple[LoopFindings, OpenQuestions]:
     questions = open_questions(findings, result, shares)
     (folder / "loop").mkdir(exist_ok=True)
     questions.write(folder / "loop")
-    save_frozen(findings.search.state.fits.chain.base, folder / "loop" / MODEL_FOLDER, name="first round")
+    fitted = findings.search.state.fits.chain.base
+    assert isinstance(fitted, Simulator)
+    save_frozen(fitted, folder / "loop" / MODEL_FOLDER, name="first round")
     return findings, questions
 
 

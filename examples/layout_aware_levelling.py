@@ -34,10 +34,10 @@ def compare(store: Store, scan_id: str) -> dict[str, float]:
     """Range of both planes over the field, and rms difference of both second-degree backgrounds, nm."""
     print_ = store.scan(scan_id)
     height_um = store.scan_frame(scan_id, "raw_height_um").astype(np.float64)
-    figures = store.quality.set_index("scan").loc[scan_id]
-    pitch_um = (figures["scan_pitch_y_um"], figures["scan_pitch_x_um"])
+    own = store.quality["scan"] == scan_id
+    pitch_y_um, pitch_x_um = store.quality.loc[own, ["scan_pitch_y_um", "scan_pitch_x_um"]].to_numpy()[0]
     layout = layout_in_scan_frame(
-        print_.mask_level, print_.scan_to_layout, height_um.shape, pitch_um, print_.pitch_um
+        print_.mask_level, print_.scan_to_layout, height_um.shape, (pitch_y_um, pitch_x_um), print_.pitch_um
     )
     plane_aware = level_layout_aware(height_um, layout_level=layout)
     plane_plain = level_polynomial(height_um, total_degree=1)

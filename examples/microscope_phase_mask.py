@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 
+import numpy as np
 import torch
 
 import litho_design
@@ -63,8 +64,8 @@ def main() -> None:
     scope, judge = Microscope(words.size_px, words.depth_um), litho_design.Element(words.model, layout)
     for name, iterations in (("none", 0), ("none", words.iterations), (words.model, words.iterations)):
         element = litho_design.Element(name, layout)
-        start = torch.linspace(0, 1, words.size_px)[:, None].expand(-1, words.size_px)
-        element.start_from_levels(0 * start if not iterations else 4 + 4 * start.numpy())
+        ramp = np.linspace(0, 1, words.size_px)[:, None].repeat(words.size_px, axis=1)
+        element.start_from_levels(4 + 4 * ramp if iterations else 0 * ramp)
         optimiser = torch.optim.Adam(element.free.parameters(), lr=0.2)
         for _ in range(iterations):
             optimiser.zero_grad()

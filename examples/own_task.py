@@ -62,9 +62,13 @@ def main() -> None:
         "search.iterations": words.iterations,
     }
     settings = litho_design.design_settings(changes)
-    task = {"task": ColoursInPlanes, "inputs": {"targets": spots(words.size_px)}}
     result = litho_design.compare(
-        settings, {"none": "none", "model": words.model}, words.out, seeds=(0,), **task
+        settings,
+        {"none": "none", "model": words.model},
+        words.out,
+        seeds=(0,),
+        task=ColoursInPlanes,
+        inputs={"targets": spots(words.size_px)},
     )
     for item in result.summary:
         if item.figure == "worst_on_spots" and item.judge == "model":

@@ -6,7 +6,6 @@ The rules are written down in docs/blind_trials.md, before a board is run.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields
 
 import numpy as np
 
@@ -25,7 +24,7 @@ from benchmarks.blind_trials.records import (
 )
 from litho_data.register.resample import resample_to_layout
 from litho_data.store import Store
-from litho_data.virtual_fab import Fab, Job, KnobSetting, Microscope, Noise, Printer, Truth, scan_job
+from litho_data.virtual_fab import Fab, Job, Noise, Truth, scan_job
 from litho_data.virtual_fab.knobs import KnobBoard
 from litho_models.effects import CATALOGUE
 from litho_models.loop.prepared import prepare_scans
@@ -177,12 +176,10 @@ def true_floor(
 
 
 def _without_noise(truth: Truth, draw: Draw, planted: Sequence[Planted]) -> Fab:
-    knobs = [KnobSetting(k.name, k.strength, k.seed) for k in truth.knobs if k.name not in _UNFORESEEABLE]
-    printer = {f.name: truth.printer[f.name] for f in fields(Printer)}
-    printer["levels"] = int(printer["levels"])
+    knobs = [knob.setting for knob in truth.knobs if knob.name not in _UNFORESEEABLE]
     return Fab(
-        printer=Printer(**printer),  # type: ignore[arg-type]
-        microscope=Microscope(**truth.microscope),
+        printer=truth.printer,
+        microscope=truth.microscope,
         noise=Noise.off(),
         knobs=KnobBoard(knobs, truth.seed),
         seed=truth.seed,

@@ -50,7 +50,7 @@ def run_trial(out: Path, task: Task, arm: str) -> None:
         iteration_s = min(_cpu_s(lambda: _iterate(design, parameters)) for _ in range(_TRIALS))
     level = design.cells(parameters.best_levels())[None, None].float()
     with torch.no_grad():
-        record = {
+        record: dict[str, Any] = {
             "kind": task.kind,
             "arm": arm,
             "iteration_s": iteration_s,

@@ -63,7 +63,7 @@ def main() -> None:
         run_commands(stage, logs, workers)
     run_commands([job for task in todo for job in task.designs(out)], logs, workers)
     run_commands([task.compare(out) for task in todo], logs, workers)
-    record = {
+    record: dict[str, Any] = {
         "schema": "litho-design/benchmark-paper-search/1",
         "machine": {"cores": usable_cores(), "threads_per_process": 1},
         "command": command_line(),

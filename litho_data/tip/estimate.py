@@ -99,7 +99,6 @@ def estimate_tip(scans: Sequence[Scan]) -> TipEstimate:
     half_px = int(np.clip(math.ceil(reach_px or 0) + 1, _SMALLEST_HALF_PX, _LARGEST_HALF_PX))
     blind = blind_tip(heights, half_px, threshold_um)
     return TipEstimate(
-        schema=TipEstimate.SCHEMA,
         **run_facts(),
         kind="upper bound" if found.reason else "estimate",
         radius_um=found.radius_um,

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from litho_data.cards.card import load_card
 from litho_data.foundation.errors import InputError
 from litho_data.layouts.card_text import CARD_NAME
 from litho_data.virtual_fab.jobs import jobs_of_card
-from litho_data.virtual_fab.knobs import KnobSetting
 from litho_data.virtual_fab.printer import Cause
-from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 from litho_data.virtual_fab.simulate import simulate
 from litho_data.virtual_fab.truth import Truth
 
@@ -40,22 +36,16 @@ def simulate_plan(
     if seed == truth.seed:
         raise InputError("seed", got=seed, wanted="another than the earlier run's: the prints are new")
     about = load_card(card)
-    microscope: dict[str, Any] = dict(truth.microscope)
     return simulate(
         out,
-        jobs=jobs_of_card(card, first=len(truth.scans), printer=_printer(truth)),
+        jobs=jobs_of_card(card, first=len(truth.scans), printer=truth.printer),
         seed=seed,
-        knobs=[KnobSetting(knob.name, knob.strength, knob.seed) for knob in truth.knobs],
+        knobs=[knob.setting for knob in truth.knobs],
         cause=cause,
-        noise=Noise(**truth.noise),
-        microscope=Microscope(**microscope),
-        printer=_printer(truth),
+        noise=truth.noise,
+        microscope=truth.microscope,
+        printer=truth.printer,
         name=about.name,
         print_pattern=about.ids.print or "",
         plan_of=about.plan.dataset_sha256 if about.plan else "",
     )
-
-
-def _printer(truth: Truth) -> Printer:
-    lengths: dict[str, Any] = {name: value for name, value in truth.printer.items() if name != "levels"}
-    return replace(Printer(levels=int(truth.printer["levels"])), **lengths)

@@ -8,6 +8,7 @@ import numpy as np
 
 from litho_data.foundation.results import Record, Result
 from litho_data.virtual_fab.knobs import KNOBS, KnobSetting
+from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 
 
 class KnobTruth(Record):
@@ -34,6 +35,11 @@ class KnobTruth(Record):
             unit=knob.unit,
             seed=run_seed if setting.seed is None else setting.seed,
         )
+
+    @property
+    def setting(self) -> KnobSetting:
+        """The knob with the seed that was used, to turn it again."""
+        return KnobSetting(self.name, self.strength, self.seed)
 
 
 class ScanTruth(Record):
@@ -63,9 +69,9 @@ class Truth(Result):
     FILE_NAME: ClassVar[str] = "truth.json"
 
     seed: int
-    printer: dict[str, float]
-    microscope: dict[str, float | str]
-    noise: dict[str, float]
+    printer: Printer
+    microscope: Microscope
+    noise: Noise
     knobs: list[KnobTruth]
     settings: dict[str, Any] | None = None
     scans: list[ScanTruth]

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from litho_data.foundation.errors import InputError
-from litho_data.virtual_fab import Job, KnobSetting, Noise, Printer, Truth
+from litho_data.virtual_fab import Job, Truth
 from litho_data.virtual_fab.canvas import GUARD_PX, Canvas, cut_layout
 from litho_data.virtual_fab.knobs import KnobBoard
 from litho_data.virtual_fab.printer import print_clean, surface_noise
@@ -48,9 +47,8 @@ class FabSimulator(nn.Module):
 
     def __init__(self, truth: Truth):
         super().__init__()
-        self.printer, self.noise = Printer(**_whole(truth.printer)), Noise(**truth.noise)
-        settings = [KnobSetting(knob.name, knob.strength, knob.seed) for knob in truth.knobs]
-        self.knobs = KnobBoard(settings, truth.seed)
+        self.printer, self.noise = truth.printer, truth.noise
+        self.knobs = KnobBoard([knob.setting for knob in truth.knobs], truth.seed)
         self.scans, self.seed = len(truth.scans), truth.seed
         # Everything that decides the print; its hash identifies the fab as weights identify a model.
         text = truth.model_dump_json(include={"printer", "noise", "knobs", "seed"})
@@ -93,8 +91,3 @@ def load_fab(source: str | Path, layout: LayoutSettings) -> FabSimulator:
     if layout.levels > fab.printer.levels:
         raise InputError("levels of the layout", got=layout.levels, wanted=f"at most {fab.printer.levels}")
     return fab
-
-
-def _whole(printer: dict[str, float]) -> dict[str, Any]:
-    """Printer settings of a truth file with their number of levels as an integer again."""
-    return {**printer, "levels": int(printer["levels"])}
