@@ -88,8 +88,13 @@ def paper_tasks(out: Path, effort: Effort) -> list[Task]:
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
-    """A table per kind of element, the searches side by side."""
-    return "\n\n".join(_table(kind, record["tasks"]) for kind in _NAMES)
+    """A table per kind of element, the searches side by side; of kinds without a result the names."""
+    tasks = record["tasks"]
+    made = [kind for kind, name in _NAMES.items() if any(task.startswith(f"{name}-") for task in tasks)]
+    texts = [_table(kind, tasks) for kind in made]
+    if missing := [TITLES[name].lower() for kind, name in _NAMES.items() if kind not in made]:
+        texts.append(f"Not made yet: {'; '.join(missing)}.")
+    return "\n\n".join(texts)
 
 
 def _task(out: Path, effort: Effort, kind: str, search: str, iterations: int) -> Task:
