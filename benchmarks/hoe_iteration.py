@@ -16,6 +16,7 @@ import math
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
+from typing import cast
 
 import numpy as np
 import torch
@@ -24,7 +25,7 @@ from torch import Tensor
 
 from benchmarks import side_by_side
 from benchmarks.plain_pbl import PlainPbl
-from benchmarks.predict import REDUCED, SIDES, gradient_gflop
+from benchmarks.predict import SIDES, gradient_gflop
 from benchmarks.side_by_side import Arrays, Work
 from benchmarks.trained_pbl import load_pbl
 from litho_data.foundation.commands import run_script
@@ -34,6 +35,7 @@ from litho_design.holograms.task import HologramTask
 from litho_design.images.targets import load_target
 from litho_design.optimisation.search import make_parametrisation
 from litho_design.printers.source import load_printer
+from litho_models.layers.precision import Precision
 
 NAME = "hoe_iteration"
 
@@ -76,7 +78,7 @@ def _work(side: str, arguments: argparse.Namespace) -> Work:
     else:
         printer = load_printer(str(arguments.model), layout, device=device)
         prints, objective = printer, HologramTask(settings, printer, target).objective
-        reduced = partial(printer.at_precision, REDUCED[side])
+        reduced = partial(printer.at_precision, cast(Precision, side))
 
     def once() -> None:
         parameters.zero_grad(set_to_none=True)

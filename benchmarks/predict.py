@@ -12,6 +12,7 @@ import argparse
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
+from typing import cast, get_args
 
 import numpy as np
 import torch
@@ -26,8 +27,7 @@ from litho_models.layers.precision import Precision
 from litho_models.models.pbl import PblConfig
 
 NAME = "predict"
-REDUCED: dict[str, Precision] = {"float32": "float32", "mixed": "mixed", "bfloat16": "bfloat16"}
-SIDES = (side_by_side.PLAIN, *REDUCED)
+SIDES = (side_by_side.PLAIN, *get_args(Precision))
 
 
 def main() -> None:
@@ -64,7 +64,7 @@ def _work(side: str, arguments: argparse.Namespace) -> Work:
         model: torch.nn.Module = PlainPbl(pbl).to(device).requires_grad_(False)
     else:
         model = frozen = load_frozen(arguments.model, device=device)
-        reduced = partial(frozen.at_precision, REDUCED[side])
+        reduced = partial(frozen.at_precision, cast(Precision, side))
 
     def once() -> None:
         with reduced():

@@ -64,12 +64,13 @@ def main() -> None:
             seed=fast.split.seed,
         )
     shown = [runs[name] for name in RUNS if name in runs]
-    print(recipe_text(fast, shown))
+    text = recipe_text(fast, shown)
+    print(text)
     if given.publish:
         for name in wanted:
             runs[name].write(FOLDER / name)
         draw_curves(_paper_fits(shown), FOLDER / CURVES)
-        publish(PAGE, MARK, recipe_text(fast, shown))
+        publish(PAGE, MARK, text)
 
 
 def published_runs() -> dict[str, Benchmark]:
@@ -100,9 +101,7 @@ def recipe_table(fast: Benchmark, others: Sequence[Benchmark]) -> str:
         rows += [_row(fast, base, ("", ""))] if compared else []
         for other, own in compared:
             rows.append(_row(other, own, _paired(own, base)))
-    steps = max(
-        own["steps"] for other in others for own in other.training.values() if own["recipe"] == "paper"
-    )
+    steps = max(fit.steps[-1] for fit in _paper_fits(others))
     return markdown_table(
         heads,
         rows,

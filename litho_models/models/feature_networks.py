@@ -14,7 +14,6 @@ from typing import ClassVar
 import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
-from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
 from litho_models.layers.gaussian import kernel_radius_px
@@ -107,15 +106,16 @@ class FeatureNetwork(nn.Module, ABC):
 
     def at_pixels(self, features: Tensor) -> Tensor:
         """The same from features (features, n): (n,) µm."""
-        first, *others, last = (layer for layer in self.layers if isinstance(layer, nn.Linear))
+        first, *later = self.layers
+        assert isinstance(first, nn.Linear)
         # What standardises the features is in the weights: one pass over the pixels less, and its gradient.
         weight = torch.cat([self.linear.weight, first.weight]) / self.scale
         straight = self.linear.bias if self.has_constant else self.scale.new_zeros(1)
         bias = torch.cat([straight, first.bias]) - weight @ self.centre
         total, hidden = torch.addmm(bias[:, None], weight, features).tensor_split((1,))
-        for layer in others:
-            hidden = torch.addmm(layer.bias[:, None], layer.weight, functional.silu(hidden))
-        return (total + last.weight @ functional.silu(hidden))[0]
+        for layer in later:
+            hidden = _across(layer, hidden) if isinstance(layer, nn.Linear) else layer(hidden)
+        return (total + hidden)[0]
 
     def standardise(self, centre: Tensor, scale: Tensor) -> None:
         """State mean and standard deviation (features,) of what the network sees."""
@@ -213,3 +213,10 @@ class ScanAxis(FeatureNetwork):
         _, _, left, right = neighbours(height, 1)
         per_px = sigma_um / self.pitch_um
         return (right - left) * (per_px / 2), (left + right - 2 * crop_border(height, 1)) * per_px**2
+
+
+def _across(layer: nn.Linear, values: Tensor) -> Tensor:
+    """The layer over values (inputs, n), pixels last: (outputs, n)."""
+    if layer.bias is None:
+        return layer.weight @ values
+    return torch.addmm(layer.bias[:, None], layer.weight, values)
