@@ -93,6 +93,13 @@ class Simulator(nn.Module, ABC):
         reach = self.reach_px or 0
         return self.interior(pad_field(layout_um, reach, reach))
 
+    def inside(self, layout_um: Tensor, border_px: int) -> Tensor:
+        """Height of the whole field without its outermost ``border_px``, µm.
+
+        A model that sees the whole image overrides it where it can leave out the border's cost.
+        """
+        return crop_border(self(layout_um), border_px)
+
     def printer(self) -> Simulator:
         """The model without what it knows of the microscope; itself where it knows nothing of it."""
         return self

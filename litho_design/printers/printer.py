@@ -6,7 +6,7 @@ import hashlib
 import math
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -78,10 +78,6 @@ class Printer(nn.Module):
         self.name = name or ("none" if simulator is None else str(simulator.name))
         borders_px = (0, 0, 0) if simulator is None else _borders_px(simulator, layout.pitch_um)
         self.guard_px, self.halo_px, self.strip_halo_px = borders_px
-        # The guard ring is cut off again: a model that can skip it does not compute it.
-        self._interior: Callable[..., Tensor] | None = None
-        if getattr(simulator, "has_interior", False):
-            self._interior = cast(Any, simulator).interior
         if simulator is not None:
             simulator.eval().requires_grad_(False)
 
@@ -217,8 +213,10 @@ class Printer(nn.Module):
 
     def _inside(self, height_um: Tensor, border_px: int) -> Tensor:
         """Print of ``height_um`` without its outer ``border_px``."""
-        if border_px and self._interior is not None:
-            return self._interior(height_um, pitch_um=self.layout.pitch_um)
+        # A frozen model computes of the border only what the rest needs.
+        inside: Callable[..., Tensor] | None = getattr(self.simulator, "inside", None)
+        if inside is not None:
+            return inside(height_um, border_px, pitch_um=self.layout.pitch_um)
         return F.pad(self._printed(height_um), (-border_px,) * 4)
 
     def _printed(self, height_um: Tensor) -> Tensor:

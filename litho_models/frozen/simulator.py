@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -14,8 +15,8 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.report_pictures import shown_html
 from litho_models.frozen.card import ModelCard
 from litho_models.layers.precision import Precision, network_precision, warn_where_slower
-from litho_models.prediction.tiles import predict_field, predict_interior
-from litho_models.simulator import Simulator, Tile
+from litho_models.prediction.tiles import predict_field, predict_inside
+from litho_models.simulator import Simulator, Tile, crop_border
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -121,23 +122,19 @@ class FrozenSimulator(nn.Module):
     def _repr_html_(self) -> str:
         return shown_html(repr(self)) + ModelCard.model_validate(self.card)._repr_html_()
 
-    @property
-    def has_interior(self) -> bool:
-        """Whether ``interior`` can be asked for: a finite receptive radius, no effects behind the model."""
-        return isinstance(self.simulator, Simulator) and self.simulator.reach_px is not None
+    def inside(self, layout_um: Tensor, border_px: int, pitch_um: float | None = None) -> Tensor:
+        """As ``forward`` without the outermost ``border_px``, (b, 1, y - 2 border, x - 2 border) µm.
 
-    def interior(self, layout_um: Tensor, pitch_um: float | None = None) -> Tensor:
-        """As ``forward``, of the pixels farther than the receptive radius r from the edge only.
-
-        Nothing beyond the edge is assumed, and nothing is computed there: (b, 1, y - 2r, x - 2r), µm.
+        What only the border needs is not computed; from the receptive radius on nothing is assumed beyond it.
 
         Raises:
-            InputError: as ``forward``, or a model without ``has_interior``.
+            InputError: as ``forward``.
         """
         self._check_layout(layout_um, pitch_um, None)
-        if not isinstance(self.simulator, Simulator):
-            raise InputError(f"interior of a print by {self.name}", wanted="a model without added effects")
-        return self._in_precision(predict_interior, self.simulator, layout_um)
+        if isinstance(self.simulator, Simulator):
+            inside = partial(predict_inside, border_px=border_px)
+            return self._in_precision(inside, self.simulator, layout_um)
+        return crop_border(self._in_precision(self.simulator, layout_um), border_px)
 
     def _in_precision(self, predict: Callable[..., Tensor], *given: Any) -> Tensor:
         if self._precision == "float32":

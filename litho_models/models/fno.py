@@ -17,10 +17,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from litho_models.prediction.tiles import blend_tiles
-from litho_models.simulator import Simulator, SimulatorConfig, Tile
+from litho_models.simulator import Simulator, SimulatorConfig, Tile, crop_border
 
 # Ninety times the paper's, 0.5 GB of weights: more no card may ask of the machine that loads it.
 _MOST_MATRIX_ENTRIES = 30_000_000
+_ALL = slice(None)
 
 
 class FnoConfig(SimulatorConfig):
@@ -94,8 +95,11 @@ class Fno(Simulator):
         size = self.config.tile_px
         return None if size is None else Tile(size, self.config.overlap_px)
 
-    def interior(self, layout_um: Tensor) -> Tensor:
-        """Height of an image taken as a whole, the same size, (batch, 1, y, x) µm."""
+    def interior(self, layout_um: Tensor, rows: slice = _ALL) -> Tensor:
+        """Height of an image taken as a whole, the same size, (batch, 1, y, x) µm, or of some ``rows`` of it.
+
+        They need all rows of all layers but the last, and nothing of what follows beside them.
+        """
         config = self.config
         ny, nx = layout_um.shape[-2:]
         # Heights need full precision where they enter and leave, also under autocast. Channels last:
@@ -106,30 +110,37 @@ class Fno(Simulator):
         padding = [config.padding_px + round(config.padding_fraction * size) for size in (nx, ny)]
         if any(padding):
             features = functional.pad(features, (0, 0, 0, padding[0], 0, padding[1]))
+        rows = slice(*rows.indices(ny))
         for number, (spectral, local) in enumerate(zip(self.spectral, self.local, strict=True)):
-            features = spectral(features) + local(features)
-            if number < config.layers - 1:
+            last = number == config.layers - 1
+            wanted = rows if last else _ALL
+            features = spectral(features, wanted) + local(features, wanted)
+            if not last:
                 features = functional.gelu(features)
-        if any(padding):
-            features = features[:, :ny, :nx]
+        features = features[:, :, :nx]
         features = functional.gelu(_pointwise(self.hidden, features))
         with torch.autocast(device_type=layout_um.device.type, enabled=False):
             height = _pointwise(self.last, features.to(self.last.weight.dtype)).permute(0, 3, 1, 2)
-        return layout_um + height if config.starts_as_layout else height
+        return layout_um[..., rows, :] + height if config.starts_as_layout else height
 
     def forward(self, layout_um: Tensor) -> Tensor:
         """Height of the whole field, (batch, 1, y, x) µm."""
+        return self.inside(layout_um, 0)
+
+    def inside(self, layout_um: Tensor, border_px: int) -> Tensor:
         if self.tile is None:
-            return self.interior(layout_um)
-        return blend_tiles(self.interior, layout_um, self.tile)
+            return crop_border(self.interior(layout_um), border_px)
+        return blend_tiles(self.interior, layout_um, self.tile, border_px)
 
 
 class PeriodicConvolution(nn.Conv2d):
-    """A convolution of a periodic image, (b, y, x, channels) to the same shape."""
+    """A convolution of a periodic image, (b, y, x, channels) to the same shape, or to some rows of it."""
 
-    def forward(self, features: Tensor) -> Tensor:
+    def forward(self, features: Tensor, rows: slice = _ALL) -> Tensor:
         margin = self.kernel_size[0] // 2
         wide = _Continued.apply(features, margin) if margin else features
+        start, stop, _ = rows.indices(features.shape[1])
+        wide = wide[:, start : stop + 2 * margin]
         return super().forward(wide.permute(0, 3, 1, 2)).permute(0, 2, 3, 1)
 
 
@@ -168,8 +179,10 @@ class SpectralConvolution(nn.Module):
         super().__init__()
         self.weight = nn.Parameter(torch.rand(2, channels, channels, *modes, 2) / channels**2)
 
-    def forward(self, field: Tensor) -> Tensor:
-        """(b, y, x, channels) to the same shape; an image smaller than the modes keeps those it has.
+    def forward(self, field: Tensor, rows: slice = _ALL) -> Tensor:
+        """(b, y, x, channels) to the same shape, or to some rows of it.
+
+        An image smaller than the modes keeps those it has.
 
         So few frequencies are kept that products with the matrices of the discrete Fourier transform
         cost less than fast transforms, which compute them all.
@@ -198,9 +211,10 @@ class SpectralConvolution(nn.Module):
                 shares[-1] /= 2
             parts = torch.cat([mixed.real * shares, mixed.imag * shares], dim=-2)
             back_x = torch.cat([torch.cat([cos_x, -sin_x]), torch.cat([sin_x, cos_x])], dim=1).T
-            rows = (back_x @ parts).reshape(-1, 2 * kept_y, 2, nx * channels).transpose(1, 2)
-            back_y = torch.cat([cos_y, -sin_y]).T
-            return (back_y @ rows.reshape(-1, 4 * kept_y, nx * channels)).reshape(-1, ny, nx, channels)
+            lines = (back_x @ parts).reshape(-1, 2 * kept_y, 2, nx * channels).transpose(1, 2)
+            back_y = torch.cat([cos_y, -sin_y]).T[rows]
+            field = back_y @ lines.reshape(-1, 4 * kept_y, nx * channels)
+            return field.reshape(-1, len(back_y), nx, channels)
 
 
 def _waves(frequencies: Tensor, size: int, like: Tensor) -> tuple[Tensor, Tensor]:

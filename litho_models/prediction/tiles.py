@@ -14,7 +14,7 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.layers.gaussian import pad_field
-from litho_models.simulator import Simulator, Tile
+from litho_models.simulator import Simulator, Tile, crop_border
 
 TILE_PX = 1024
 
@@ -68,38 +68,69 @@ def predict_interior(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX
     return torch.cat(rows, dim=-2)
 
 
-def blend_tiles(function: Callable[[Tensor], Tensor], layout_um: Tensor, tile: Tile) -> Tensor:
+def predict_inside(model: Simulator, layout_um: Tensor, border_px: int) -> Tensor:
+    """Height of the pixels farther than ``border_px`` from the edge, µm; gradients flow to the layout.
+
+    As ``predict_field`` without its border, which is not computed where the model can do without.
+    """
+    reach = model.reach_px
+    if reach is None:
+        return model.inside(layout_um, border_px)
+    if border_px < reach:
+        return crop_border(predict_field(model, layout_um), border_px)
+    return predict_interior(model, crop_border(layout_um, border_px - reach))
+
+
+def blend_tiles(
+    function: Callable[[Tensor, slice], Tensor], layout_um: Tensor, tile: Tile, border_px: int = 0
+) -> Tensor:
     """Weighted mean of ``function`` over overlapping tiles; the weights at each pixel sum to one.
 
     The first tile starts ``overlap_px`` before the field, whose outermost pixels are continued, so
     that every pixel of the field has its full set of tiles.
 
     Args:
-        function: (b, 1, T, T) to the same shape.
+        function: tiles (b, 1, T, T) and a slice of n of their rows to these rows, (b, 1, n, T).
         layout_um: (b, 1, y, x), any size, µm.
         tile: side T and overlap.
+        border_px: outermost pixels that are left out of the result; tiles of nothing else are not computed.
 
     Raises:
         InputError: an overlap of more than half a tile.
     """
     size, overlap = tile
     stride = size - overlap
-    batch, _, ny, nx = layout_um.shape
-    rows, columns = (-(-(length + overlap) // stride) for length in (ny, nx))
-    bottom, right = (
-        (count - 1) * stride + size - overlap - length for count, length in ((rows, ny), (columns, nx))
-    )
-    whole = functional.pad(layout_um, (overlap, right, overlap, bottom), mode="replicate")
     window = blending_window(tile, layout_um)
-    blended = torch.zeros_like(whole)
-    for row in range(rows):
-        y = row * stride
-        strip = whole[..., y : y + size, :]
-        tiles = strip.unfold(-1, size, stride).permute(0, 3, 1, 2, 4).reshape(-1, 1, size, size)
-        heights = (function(tiles) * window).reshape(batch, columns, size * size).transpose(1, 2)
-        folded = functional.fold(heights, strip.shape[-2:], size, stride=stride)
-        blended[..., y : y + size, :] += folded
-    return blended[..., overlap : overlap + ny, overlap : overlap + nx]
+    # All positions count from the first tile that a whole field would have.
+    (top, bottom), (left, right) = (
+        (overlap + border_px, overlap + length - border_px) for length in layout_um.shape[-2:]
+    )
+    rows, columns = (
+        range(max(0, (start - size) // stride + 1), (stop - 1) // stride + 1)
+        for start, stop in ((top, bottom), (left, right))
+    )
+    missing = [
+        max(0, wanted[-1] * stride + size - overlap - length)
+        for wanted, length in zip((columns, rows), layout_um.shape[:-3:-1], strict=True)
+    ]
+    whole = functional.pad(layout_um, (overlap, missing[0], overlap, missing[1]), mode="replicate")
+    first = columns[0] * stride
+    strips = whole[..., first : columns[-1] * stride + size]
+    batch, width = len(layout_um), strips.shape[-1]
+    blended = layout_um.new_zeros(batch, 1, bottom - top, width)
+    for y in (row * stride for row in rows):
+        tiles = strips[..., y : y + size, :].unfold(-1, size, stride).permute(0, 3, 1, 2, 4)
+        kept = slice(max(0, top - y), min(size, bottom - y))
+        heights = function(tiles.reshape(-1, 1, size, size), kept) * window[kept]
+        count = kept.stop - kept.start
+        folded = functional.fold(
+            heights.reshape(batch, len(columns), count * size).transpose(1, 2),
+            (count, width),
+            (count, size),
+            stride=(count, stride),
+        )
+        blended[..., y + kept.start - top : y + kept.stop - top, :] += folded
+    return blended[..., left - first : right - first]
 
 
 def blending_window(tile: Tile, like: Tensor) -> Tensor:

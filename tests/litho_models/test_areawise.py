@@ -159,7 +159,6 @@ def test_a_frozen_pbl_prints_what_the_trained_one_does(tmp_path):
     frozen = load_frozen(save_frozen(model, tmp_path / "pbl"))
     assert torch.allclose(frozen(layout), trained.detach(), atol=1e-6)
     reach = model.reach_px
-    assert frozen.has_interior
-    inside = frozen.interior(layout)
+    inside = frozen.inside(layout, reach)
     assert inside.shape == (1, 1, 230 - 2 * reach, 240 - 2 * reach)
     assert torch.allclose(inside, trained.detach()[..., reach:-reach, reach:-reach], atol=1e-6)

@@ -104,13 +104,38 @@ def test_a_field_moved_by_whole_strides_moves_its_print():
 @pytest.mark.parametrize("shape", [(5, 90), (64, 33)])
 def test_blending_weights_sum_to_one(tile, shape):
     field = torch.rand(2, 1, *shape, dtype=torch.float64)
-    assert torch.allclose(blend_tiles(lambda tiles: tiles, field, tile), field, atol=1e-14, rtol=0)
+    assert torch.allclose(blend_tiles(_rows, field, tile), field, atol=1e-14, rtol=0)
+    for border in (1, 2):
+        inside = field[..., border:-border, border:-border]
+        found = blend_tiles(_rows, field, tile, border)
+        assert torch.allclose(found, inside, atol=1e-14, rtol=0)
     assert float(blending_window(tile, field).max()) <= 1
+
+
+def test_a_patch_without_its_border_leaves_out_the_tiles_of_the_border():
+    tile, seen = Tile(32, 8), []
+
+    def count(tiles: torch.Tensor, rows: slice) -> torch.Tensor:
+        seen.append(len(tiles))
+        return _rows(tiles, rows)
+
+    blend_tiles(count, torch.rand(1, 1, 160, 160), tile)
+    whole = sum(seen)
+    seen.clear()
+    blend_tiles(count, torch.rand(1, 1, 160, 160), tile, border_px=64)
+    # 32 px of the middle touch two tiles of stride 24, or three, along each axis, of the whole field's seven.
+    assert whole == 49
+    assert sum(seen) <= 9
+
+
+def _rows(tiles: torch.Tensor, rows: slice) -> torch.Tensor:
+    """The identity, as a function of tiles."""
+    return tiles[..., rows, :]
 
 
 def test_an_overlap_beyond_half_a_tile_is_refused():
     with pytest.raises(InputError, match="half a tile"):
-        blend_tiles(lambda tiles: tiles, torch.rand(1, 1, 40, 40), Tile(32, 17))
+        blend_tiles(_rows, torch.rand(1, 1, 40, 40), Tile(32, 17))
 
 
 def test_the_variants_are_those_of_paper_and_code():
@@ -161,10 +186,10 @@ def test_training_sees_whole_tiles_and_the_continued_edge(monkeypatch):
     shapes = []
     interior = Fno.interior
 
-    def watched(self, layout_um):
+    def watched(self, layout_um, rows=slice(None)):
         if torch.is_grad_enabled():
             shapes.append(tuple(layout_um.shape[-2:]))
-        return interior(self, layout_um)
+        return interior(self, layout_um, rows)
 
     monkeypatch.setattr(Fno, "interior", watched)
     # Scans narrower than a tile, and a crop size that is not the tile's.

@@ -64,11 +64,9 @@ def test_a_frozen_model_states_its_tile_and_reach_also_with_effects(pbl, tmp_pat
         plain = load_frozen(save_frozen(model, tmp_path / model.name))
         assert plain.tile == model.tile
         assert plain.reach_um == model.reach_um
-        assert plain.has_interior == (model is pbl)
     with_effects = load_frozen(save_frozen(fno, tmp_path / "effects", process_effects=SHRINKAGE))
     assert with_effects.tile == fno.tile
     assert with_effects.reach_um is None
-    assert not with_effects.has_interior
 
 
 @pytest.mark.parametrize(
