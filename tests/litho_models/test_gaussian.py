@@ -119,3 +119,21 @@ def test_a_wide_field_blurs_like_a_narrow_one(sigma_px):
     assert torch.allclose(of_part[0][..., 100:500, 150:600], of_narrow[0], rtol=0, atol=1e-12)
     for a, b in zip(of_part[1:], of_narrow[1:], strict=True):
         assert torch.allclose(a, b, rtol=1e-10)
+
+
+def test_it_is_differentiable_forward_and_reverse_in_batches_and_twice():
+    generator = torch.Generator().manual_seed(0)
+    # Two blocks along y, the second not full, and one along x.
+    field = torch.rand(2, 1, 41, 11, dtype=torch.float64, generator=generator, requires_grad=True)
+    widths = [torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in (0.6, 1.1)]
+
+    def blur(field: torch.Tensor, y: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
+        return blur_interior(field, (y, x), (3, 4))
+
+    assert torch.autograd.gradcheck(blur, (field, *widths), fast_mode=True, check_forward_ad=True)
+    fixed = [width.detach() for width in widths]
+    assert torch.autograd.gradgradcheck(lambda f: blur(f, *fixed).square(), (field,), fast_mode=True)
+    for argument in range(3):
+        given = (field.detach()[:1, :, :34], *fixed)
+        forward, reverse = (way(blur, argument)(*given) for way in (torch.func.jacfwd, torch.func.jacrev))
+        assert torch.allclose(forward, reverse, rtol=0, atol=1e-12)

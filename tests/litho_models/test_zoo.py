@@ -69,15 +69,15 @@ def test_every_shipped_model_works_and_says_where_it_comes_from(name):
 
 
 def test_a_physics_model_frozen_before_there_was_a_gain_prints_as_it_did():
-    model = load_frozen("zoo:physics")
+    model = load_frozen("zoo:physics").double()
     assert "gain_init" not in model.card["hyper_parameters"]
     y = torch.arange(120.0)
     wave = torch.sin(y[:, None] / 7) * torch.cos(y[None, :] / 11)
-    height = model((torch.floor(6.5 + 6 * wave) * 0.1)[None, None], pitch_um=0.1)[0, 0]
-    # Heights by the code of before, to 1e-4 nm; a float32 of this size is known to 6e-5 nm.
+    height = model((torch.floor(6.5 + 6 * wave).double() * 0.1)[None, None], pitch_um=0.1)[0, 0]
+    # Heights by the code of before; double precision leaves 1e-15 of sums of 200 terms, digits are 1e-10.
     places = ((0, 0), (60, 60), (13, 90), (119, 40))
-    before = [0.6176856, 0.7219032, 0.4331597, 0.8068057]
-    assert [float(height[at]) for at in places] == pytest.approx(before, abs=2e-7)
+    before = [0.6176855003, 0.7219032894, 0.4331598336, 0.8068056102]
+    assert [float(height[at]) for at in places] == pytest.approx(before, abs=1e-10)
 
 
 def test_the_shipped_zoo_stays_small():
