@@ -96,7 +96,8 @@ class Simulator(nn.Module, ABC):
     def inside(self, layout_um: Tensor, border_px: int) -> Tensor:
         """Height of the whole field without its outermost ``border_px``, µm.
 
-        A model that sees the whole image overrides it where it can leave out the border's cost.
+        A model without a receptive radius overrides it where it can leave out the border's cost; of any
+        other ``predict_inside`` computes what is needed.
         """
         return crop_border(self(layout_um), border_px)
 

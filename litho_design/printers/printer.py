@@ -229,8 +229,8 @@ class Printer(nn.Module):
 def _borders_px(simulator: nn.Module, pitch_um: float) -> tuple[int, int, int]:
     """Guard ring, and what a patch, and two rows of pixels, need around them.
 
-    A model that runs on tiles needs a whole tile around a patch. Around two rows it would only add tiles
-    whose print is cut off again: there the strip has to be two rows of tiles high.
+    A model that runs on tiles needs a whole tile around a patch. Two rows of pixels lie where two rows of
+    tiles are blended, whose mean errs less than one of them.
     """
     reach_um = getattr(simulator, "reach_um", None)
     # The reach is a whole number of pixels times the pitch, up to rounding.

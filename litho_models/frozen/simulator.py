@@ -125,12 +125,19 @@ class FrozenSimulator(nn.Module):
     def inside(self, layout_um: Tensor, border_px: int, pitch_um: float | None = None) -> Tensor:
         """As ``forward`` without the outermost ``border_px``, (b, 1, y - 2 border, x - 2 border) µm.
 
-        What only the border needs is not computed; from the receptive radius on nothing is assumed beyond it.
+        A border as wide as the receptive radius, or of a model on tiles, is computed only as far as the rest
+        needs it. With such a radius nothing is then assumed beyond the edge of the layout.
 
         Raises:
-            InputError: as ``forward``.
+            InputError: as ``forward``, or a border that leaves nothing.
         """
         self._check_layout(layout_um, pitch_um, None)
+        if not 0 <= 2 * border_px < min(layout_um.shape[-2:]):
+            raise InputError(
+                f"border of a print by {self.name}",
+                got=f"{border_px} px of a layout of {tuple(layout_um.shape[-2:])} px",
+                wanted="0 or more, less than half the layout",
+            )
         if isinstance(self.simulator, Simulator):
             inside = partial(predict_inside, border_px=border_px)
             return self._in_precision(inside, self.simulator, layout_um)

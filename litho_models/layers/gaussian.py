@@ -18,8 +18,9 @@ from litho_data.foundation.errors import InputError
 SUPPORT_SIGMAS = 4.0
 # A narrower Gaussian has no weight left on the next pixel (exp(-50)); it also keeps 1/sigma finite.
 _SMALLEST_SIGMA_PX = 0.1
-# Pixels of a block. Wider blocks multiply more zeros of the band, narrower ones are slower products.
-_BLOCK_PX = 32
+# Pixels of a block, and of one from a radius of as many on. Wider blocks multiply more zeros of the band,
+# narrower ones are slower products.
+_BLOCK_PX, _WIDE_BLOCK_PX = 32, 64
 # Wider than any field that is printed; a wider one would take the memory of a machine.
 _LARGEST_RADIUS_PX = 4096
 
@@ -49,10 +50,12 @@ def gaussian_blur(
         radius_px: of the kernel on each side; four sigma by default.
 
     Raises:
-        InputError: a pitch that is not positive.
+        InputError: a pitch that is not positive, or a field without pixels.
     """
     if not pitch_um > 0:
         raise InputError("pitch_um", got=pitch_um, wanted="a positive number")
+    if not field.numel():
+        raise InputError("field to blur", got=f"shape {tuple(field.shape)}", wanted="one pixel or more")
     along_y, along_x = sigma_um if isinstance(sigma_um, tuple) else (sigma_um, sigma_um)
     sigmas = [
         torch.as_tensor(sigma, dtype=field.dtype, device=field.device) / pitch_um
@@ -76,13 +79,17 @@ def blur_interior(
     # Heights need full precision: bfloat16 resolves only some nanometres at 1 µm.
     with torch.autocast(device_type=field.device.type, enabled=False):
         field = field.float() if field.dtype in (torch.bfloat16, torch.float16) else field
-        for axis in (-1, -2):
-            size, radius = field.shape[axis], radii[axis]
+        bands = []
+        for size, sigma, radius in zip(field.shape[-2:], sigmas, radii, strict=True):
             if size <= 2 * radius:
                 wanted = f"more than {2 * radius} px (twice the support)"
                 raise InputError("field to blur", got=f"{size} px", wanted=wanted)
-            field = _Blur.apply(field, _band(radius, sigmas[axis].to(field.dtype)), axis)
-        return field
+            bands.append(_band(radius, sigma.to(field.dtype)))
+        # Along x all lines of all samples are one image.
+        along_x = _Blur.apply(field.reshape(1, -1, field.shape[-1]), bands[1], -1)
+        samples = along_x.reshape(-1, field.shape[-2], along_x.shape[-1])
+        blurred = _Blur.apply(samples, bands[0], -2)
+        return blurred.reshape(*field.shape[:-2], *blurred.shape[-2:])
 
 
 def kernel_radius_px(sigma_px: float) -> int:
@@ -118,7 +125,7 @@ def pad_field(field: Tensor, rows_px: int, columns_px: int, edge: Edge = "replic
 
 
 class _Blur(torch.autograd.Function):
-    """One axis (-1 or -2) blurred by a band; linear in the field and in the band, forward and reverse.
+    """One axis (-1 or -2) of samples (s, y, x) blurred by a band; linear in both, forward and reverse.
 
     PyTorch's own way back through windows that overlap takes three times as long.
     """
@@ -126,45 +133,55 @@ class _Blur(torch.autograd.Function):
     generate_vmap_rule = True
 
     @staticmethod
-    def forward(field: Tensor, band: Tensor, axis: int) -> Tensor:
-        size = field.shape[axis] - band.shape[1] + band.shape[0]
-        windows = _windows(field, band, axis)
-        blocks = (windows @ band.mT).movedim(-3, -2) if axis == -1 else band @ windows.mT
-        return blocks.flatten(axis - 1, axis).narrow(axis, 0, size).contiguous()
+    def forward(samples: Tensor, band: Tensor, axis: int) -> Tensor:
+        size = samples.shape[axis] - band.shape[1] + band.shape[0]
+        found = []
+        for windows in _windows(samples, band, axis):
+            # (blocks, y, pixels of a block), or (blocks, pixels of a block, x).
+            blocks = (windows @ band.mT).movedim(0, 1) if axis == -1 else band @ windows.mT
+            line = (samples.shape[-2], -1) if axis == -1 else (-1, samples.shape[-1])
+            found.append(blocks.reshape(line).narrow(axis, 0, size))
+        return torch.stack(found)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, int], output: Tensor) -> None:
-        field, band, ctx.axis = inputs
+        samples, band, ctx.axis = inputs
         # The field is kept only where the width is learnt.
-        ctx.save_for_backward(band, field if ctx.needs_input_grad[1] else None)
-        ctx.save_for_forward(band, field)
+        ctx.save_for_backward(band, samples if ctx.needs_input_grad[1] else None)
+        ctx.save_for_forward(band, samples)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
-        band, field = ctx.saved_tensors
-        axis, of_field, of_band = ctx.axis, None, None
+        band, samples = ctx.saved_tensors
+        axis, of_samples, of_band = ctx.axis, None, None
         if ctx.needs_input_grad[0]:
             # The kernel is symmetric: the way back is the same blur, of zeros around the gradient.
-            of_field = _Blur.apply(_pad_axis(gradient, *(len(band.T) - len(band),) * 2, axis), band, axis)
-        if field is not None:
-            blocks = _windows(gradient, band[:, : len(band)], axis)
-            of_band = (blocks.mT @ _windows(field, band, axis)).flatten(0, -3).sum(0)
-        return of_field, of_band, None
+            reach = band.shape[1] - band.shape[0]
+            of_samples = _Blur.apply(_pad_axis(gradient, reach, reach, axis), band, axis)
+        if samples is not None:
+            pairs = zip(
+                _windows(gradient, band[:, : len(band)], axis), _windows(samples, band, axis), strict=True
+            )
+            of_band = torch.stack([(blocks.mT @ windows).sum(0) for blocks, windows in pairs]).sum(0)
+        return of_samples, of_band, None
 
     @staticmethod
-    def jvp(ctx: Any, field_change: Tensor | None, band_change: Tensor | None, _: None) -> Tensor:
-        band, field = ctx.saved_tensors
-        changes = [] if field_change is None else [_Blur.apply(field_change, band, ctx.axis)]
-        changes += [] if band_change is None else [_Blur.apply(field, band_change, ctx.axis)]
+    def jvp(ctx: Any, samples_change: Tensor | None, band_change: Tensor | None, _: None) -> Tensor:
+        band, samples = ctx.saved_tensors
+        changes = [] if samples_change is None else [_Blur.apply(samples_change, band, ctx.axis)]
+        changes += [] if band_change is None else [_Blur.apply(samples, band_change, ctx.axis)]
         return sum(changes[1:], changes[0])
 
 
-def _windows(field: Tensor, band: Tensor, axis: int) -> Tensor:
-    """What the blocks of the result are made of: (..., blocks, other axis, pixels of a window), views."""
+def _windows(samples: Tensor, band: Tensor, axis: int) -> tuple[Tensor, ...]:
+    """What the blocks of each sample are made of: (blocks, other axis, pixels of a window), views.
+
+    One sample at a time: a product would copy the windows of several, which overlap.
+    """
     block, window = band.shape
-    count = -(-(field.shape[axis] - window + block) // block)
-    whole = _pad_axis(field, 0, (count - 1) * block + window - field.shape[axis], axis)
-    return whole.unfold(axis, window, block).movedim(axis - 1, -3)
+    count = -(-(samples.shape[axis] - window + block) // block)
+    whole = _pad_axis(samples, 0, (count - 1) * block + window - samples.shape[axis], axis)
+    return whole.unfold(axis, window, block).movedim(axis - 1, -3).unbind()
 
 
 def _pad_axis(field: Tensor, before: int, after: int, axis: int) -> Tensor:
@@ -177,5 +194,6 @@ def _band(radius: int, sigma_px: Tensor) -> Tensor:
     sigma = sigma_px.clamp(min=_SMALLEST_SIGMA_PX)
     taps = torch.exp(-0.5 * (torch.arange(-radius, radius + 1, device=sigma.device) / sigma) ** 2)
     # All rows are windows on one symmetric kernel with zeros on both sides, the last row's first.
-    kernel = functional.pad(taps / taps.sum(), (_BLOCK_PX - 1,) * 2)
-    return kernel.unfold(0, _BLOCK_PX + 2 * radius, 1).flip(0)
+    block = _BLOCK_PX if radius < _WIDE_BLOCK_PX else _WIDE_BLOCK_PX
+    kernel = functional.pad(taps / taps.sum(), (block - 1,) * 2)
+    return kernel.unfold(0, block + 2 * radius, 1).flip(0)

@@ -98,7 +98,7 @@ class Fno(Simulator):
     def interior(self, layout_um: Tensor, rows: slice = _ALL) -> Tensor:
         """Height of an image taken as a whole, the same size, (batch, 1, y, x) µm, or of some ``rows`` of it.
 
-        They need all rows of all layers but the last, and nothing of what follows beside them.
+        All rows pass through every layer but the last; the last one, and what follows, see only ``rows``.
         """
         config = self.config
         ny, nx = layout_um.shape[-2:]

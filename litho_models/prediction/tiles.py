@@ -71,7 +71,8 @@ def predict_interior(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX
 def predict_inside(model: Simulator, layout_um: Tensor, border_px: int) -> Tensor:
     """Height of the pixels farther than ``border_px`` from the edge, µm; gradients flow to the layout.
 
-    As ``predict_field`` without its border, which is not computed where the model can do without.
+    As ``predict_field`` without its border, which is computed only as far as the rest needs it where the
+    model allows that: see ``FrozenSimulator.inside``.
     """
     reach = model.reach_px
     if reach is None:
@@ -90,10 +91,12 @@ def blend_tiles(
     that every pixel of the field has its full set of tiles.
 
     Args:
-        function: tiles (b, 1, T, T) and a slice of n of their rows to these rows, (b, 1, n, T).
+        function: maps tiles (b, 1, T, T) and a slice that picks n of their rows to the heights of these
+            rows, (b, 1, n, T).
         layout_um: (b, 1, y, x), any size, µm.
         tile: side T and overlap.
-        border_px: outermost pixels that are left out of the result; tiles of nothing else are not computed.
+        border_px: outermost pixels that are left out of the result, less than half the field; tiles that
+            lie wholly in them are not computed.
 
     Raises:
         InputError: an overlap of more than half a tile.

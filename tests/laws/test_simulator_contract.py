@@ -115,18 +115,22 @@ def test_gradient_equals_finite_difference(name, variant):
     assert difference == pytest.approx(directional, rel=2e-3, abs=1e-4)
 
 
-@pytest.mark.parametrize("border_px", [0, 3, 33])
+# The widest leaves out whole tiles of 32 px, and is wider than most receptive radii.
+@pytest.mark.parametrize("border_px", [0, 3, 60])
 @pytest.mark.parametrize(("name", "variant"), CASES)
 def test_a_print_without_its_border_is_the_print_cut(name, variant, border_px, tmp_path):
     model = load_frozen(save_frozen(make(name, variant), tmp_path / "model")).double()
-    field = (layout(100, 110).double()).requires_grad_()
-    inner = (..., slice(border_px, 100 - border_px), slice(border_px, 110 - border_px))
+    field = torch.cat([layout(140, 150, seed) for seed in (1, 2)]).double().requires_grad_()
+    inner = (..., slice(border_px, 140 - border_px), slice(border_px, 150 - border_px))
     cut, inside = model(field)[inner], model.inside(field, border_px)
     weight = torch.rand_like(cut)
     slopes = [torch.autograd.grad((weight * height).sum(), field)[0] for height in (cut, inside)]
     # Double precision, sums of some thousand products of order one; no rule of the edge gets into the middle.
     assert torch.allclose(inside, cut, atol=1e-10, rtol=0)
     assert torch.allclose(*slopes, atol=1e-10, rtol=0)
+    for impossible in (-1, 70):
+        with pytest.raises(InputError, match="border"):
+            model.inside(field, impossible)
 
 
 @pytest.mark.parametrize("name", [name for name in MODELS if list(build_model(name).parameters())])

@@ -101,9 +101,16 @@ def test_bad_pitch_is_refused():
         gaussian_blur(torch.zeros(8, 8), 0.1, 0.0)
 
 
+def test_a_field_without_pixels_is_refused():
+    with pytest.raises(InputError, match="one pixel or more"):
+        gaussian_blur(torch.zeros(0, 8), 0.1, 0.1)
+    with pytest.raises(InputError, match="more than 8 px"):
+        blur_interior(torch.zeros(8, 20), torch.tensor(1.0), 4)
+
+
 @pytest.mark.parametrize("sigma_px", [(1.3, 9.0), (17.0, 4.0)])
-def test_a_wide_field_blurs_like_a_narrow_one(sigma_px):
-    # The whole field runs in blocks, the strip of it at once; both sides of block borders are in it.
+def test_a_part_of_a_field_blurs_like_the_whole(sigma_px):
+    # Blocks of the part and of the whole begin at different pixels.
     radii = tuple(kernel_radius_px(sigma) for sigma in sigma_px)
     field = torch.rand(2, 1, 800, 830, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     strip = field[..., 100:500, 150:600]
@@ -121,10 +128,11 @@ def test_a_wide_field_blurs_like_a_narrow_one(sigma_px):
         assert torch.allclose(a, b, rtol=1e-10)
 
 
-def test_it_is_differentiable_forward_and_reverse_in_batches_and_twice():
+@pytest.mark.parametrize("samples", [1, 2])
+def test_it_is_differentiable_forward_and_reverse_in_batches_and_twice(samples):
     generator = torch.Generator().manual_seed(0)
     # Two blocks along y, the second not full, and one along x.
-    field = torch.rand(2, 1, 41, 11, dtype=torch.float64, generator=generator, requires_grad=True)
+    field = torch.rand(samples, 1, 41, 11, dtype=torch.float64, generator=generator, requires_grad=True)
     widths = [torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in (0.6, 1.1)]
 
     def blur(field: torch.Tensor, y: torch.Tensor, x: torch.Tensor) -> torch.Tensor:

@@ -67,6 +67,8 @@ def test_a_frozen_model_states_its_tile_and_reach_also_with_effects(pbl, tmp_pat
     with_effects = load_frozen(save_frozen(fno, tmp_path / "effects", process_effects=SHRINKAGE))
     assert with_effects.tile == fno.tile
     assert with_effects.reach_um is None
+    layout = torch.rand(1, 1, 150, 150)
+    assert torch.equal(with_effects.inside(layout, 5), with_effects(layout)[..., 5:-5, 5:-5])
 
 
 @pytest.mark.parametrize(

@@ -74,7 +74,7 @@ def test_a_physics_model_frozen_before_there_was_a_gain_prints_as_it_did():
     y = torch.arange(120.0)
     wave = torch.sin(y[:, None] / 7) * torch.cos(y[None, :] / 11)
     height = model((torch.floor(6.5 + 6 * wave).double() * 0.1)[None, None], pitch_um=0.1)[0, 0]
-    # Heights by the code of before; double precision leaves 1e-15 of sums of 200 terms, digits are 1e-10.
+    # Heights by the code of before, which in double precision agree to the ten digits given.
     places = ((0, 0), (60, 60), (13, 90), (119, 40))
     before = [0.6176855003, 0.7219032894, 0.4331598336, 0.8068056102]
     assert [float(height[at]) for at in places] == pytest.approx(before, abs=1e-10)
