@@ -94,7 +94,7 @@ class Simulator(nn.Module, ABC):
         return self.interior(pad_field(layout_um, reach, reach))
 
     def inside(self, layout_um: Tensor, border_px: int) -> Tensor:
-        """Height of the whole field without its outermost ``border_px``, µm.
+        """Height of the whole field without its outermost ``border_px``, less than half of it, µm.
 
         A model without a receptive radius overrides it where it can leave out the border's cost; of any
         other ``predict_inside`` computes what is needed.

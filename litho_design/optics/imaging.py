@@ -9,10 +9,10 @@ from torch.utils.checkpoint import checkpoint
 from litho_design.optics.sampling import fast_length
 
 _DARKEST = 1e-8
-# Steps of a block, computed again for its gradient. Nothing is where all steps keep less than so many bytes:
-# some twenty values for each pixel and step, with a PSF as wide as the image.
+# Steps of a block that the gradient computes again. Where all steps fit into the memory below they are kept
+# instead: some twenty values for each pixel and step.
 _STEPS_PER_CHECKPOINT = 10
-_KEPT_BYTES_PER_PIXEL, _MOST_KEPT_BYTES = 80, 2**28
+_KEPT_VALUES, _MOST_KEPT_BYTES = 20, 2**28
 
 
 class Blur:
@@ -29,9 +29,9 @@ class Blur:
         rows, columns = psf.shape
         assert rows % 2 == columns % 2 == 1, "a PSF of odd sides has a middle sample"
         self._frame = frame
-        # What wraps around reaches half a PSF into the zeros beyond the frame, which are cut off again; of a
-        # PSF wider than twice the frame the middle alone meets it.
-        # Even: of odd sizes a real transform takes nearly twice as long.
+        # Pixel i takes from j the PSF at i - j, and at i - j ± length. With a length of frame and half a PSF
+        # the latter lie beyond the PSF. The array also has to hold the PSF.
+        # Even: a real transform of odd length takes nearly twice as long.
         lengths = (max(n + k // 2, k) for n, k in zip(frame, (rows, columns), strict=True))
         self._size = [2 * fast_length(-(-length // 2)) for length in lengths]
         middle_first = torch.nn.functional.pad(psf, (0, self._size[1] - columns, 0, self._size[0] - rows))
@@ -69,8 +69,8 @@ def richardson_lucy(recorded: Tensor, psf: Tensor, *, iterations: int = 50) -> T
         psf: real (k, k) of odd sides, on the same pixels.
 
     Returns:
-        Estimate (..., ny, nx); gradients flow to both arguments. Of large images the steps are computed again
-        for them, block by block, so that memory does not grow with ``iterations``.
+        Estimate (..., ny, nx); gradients flow to both arguments. For large images the way back computes the
+        steps again, block by block, so that memory does not grow with ``iterations``.
     """
     blur = Blur(psf, (int(recorded.shape[-2]), int(recorded.shape[-1])))
     seen = recorded.clamp(min=_DARKEST)
@@ -84,8 +84,8 @@ def richardson_lucy(recorded: Tensor, psf: Tensor, *, iterations: int = 50) -> T
             current = current * blur.transpose(ratio).clamp(min=0) / weight
         return current
 
-    kept = torch.is_grad_enabled() and iterations * recorded.numel() * _KEPT_BYTES_PER_PIXEL
-    if kept < _MOST_KEPT_BYTES:
+    kept_bytes = iterations * recorded.numel() * _KEPT_VALUES * recorded.element_size()
+    if not torch.is_grad_enabled() or kept_bytes < _MOST_KEPT_BYTES:
         return steps(estimate, iterations)
     for done in range(0, iterations, _STEPS_PER_CHECKPOINT):
         count = min(_STEPS_PER_CHECKPOINT, iterations - done)

@@ -125,8 +125,8 @@ class FrozenSimulator(nn.Module):
     def inside(self, layout_um: Tensor, border_px: int, pitch_um: float | None = None) -> Tensor:
         """As ``forward`` without the outermost ``border_px``, (b, 1, y - 2 border, x - 2 border) µm.
 
-        A border as wide as the receptive radius, or of a model on tiles, is computed only as far as the rest
-        needs it. With such a radius nothing is then assumed beyond the edge of the layout.
+        Of a border at least as wide as the receptive radius, or of a model on tiles, only what the rest needs
+        is computed. In the first case nothing is assumed beyond the edge of the layout.
 
         Raises:
             InputError: as ``forward``, or a border that leaves nothing.

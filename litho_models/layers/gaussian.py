@@ -7,6 +7,7 @@ thousand pixels this is faster than a Fourier transform, and no period or paddin
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import torch
@@ -18,8 +19,8 @@ from litho_data.foundation.errors import InputError
 SUPPORT_SIGMAS = 4.0
 # A narrower Gaussian has no weight left on the next pixel (exp(-50)); it also keeps 1/sigma finite.
 _SMALLEST_SIGMA_PX = 0.1
-# Pixels of a block, and of one from a radius of as many on. Wider blocks multiply more zeros of the band,
-# narrower ones are slower products.
+# Pixels of a block; the wider one serves radii of 64 px and more. Wider blocks multiply more zeros of the
+# band, narrower ones are slower products.
 _BLOCK_PX, _WIDE_BLOCK_PX = 32, 64
 # Wider than any field that is printed; a wider one would take the memory of a machine.
 _LARGEST_RADIUS_PX = 4096
@@ -54,16 +55,10 @@ def gaussian_blur(
     """
     if not pitch_um > 0:
         raise InputError("pitch_um", got=pitch_um, wanted="a positive number")
-    if not field.numel():
-        raise InputError("field to blur", got=f"shape {tuple(field.shape)}", wanted="one pixel or more")
-    along_y, along_x = sigma_um if isinstance(sigma_um, tuple) else (sigma_um, sigma_um)
-    sigmas = [
-        torch.as_tensor(sigma, dtype=field.dtype, device=field.device) / pitch_um
-        for sigma in (along_y, along_x)
-    ]
+    pair = sigma_um if isinstance(sigma_um, tuple) else (sigma_um, sigma_um)
+    sigmas = [torch.as_tensor(sigma, dtype=field.dtype, device=field.device) / pitch_um for sigma in pair]
     radii = [kernel_radius_px(float(sigma.detach())) if radius_px is None else radius_px for sigma in sigmas]
-    padded = pad_field(field, radii[0], radii[1], edge)
-    return blur_interior(padded, (sigmas[0], sigmas[1]), (radii[0], radii[1]))
+    return _blur(field, sigmas, radii, edge)
 
 
 def blur_interior(
@@ -72,24 +67,33 @@ def blur_interior(
     """Blur and keep only the pixels whose whole support lies inside: (..., y - 2r, x - 2r).
 
     Raises:
-        InputError: a field that is no wider than the support.
+        InputError: a field narrower than the support, or without pixels.
     """
     sigmas = sigma_px if isinstance(sigma_px, tuple) else (sigma_px, sigma_px)
     radii = radius_px if isinstance(radius_px, tuple) else (radius_px, radius_px)
+    return _blur(field, sigmas, radii, None)
+
+
+def _blur(field: Tensor, sigmas: Sequence[Tensor], radii: Sequence[int], edge: Edge | None) -> Tensor:
+    """Along x, then along y; continued beyond the edge, or the interior alone."""
+    if not field.numel():
+        raise InputError("field to blur", got=f"shape {tuple(field.shape)}", wanted="one pixel or more")
     # Heights need full precision: bfloat16 resolves only some nanometres at 1 µm.
     with torch.autocast(device_type=field.device.type, enabled=False):
         field = field.float() if field.dtype in (torch.bfloat16, torch.float16) else field
-        bands = []
-        for size, sigma, radius in zip(field.shape[-2:], sigmas, radii, strict=True):
-            if size <= 2 * radius:
-                wanted = f"more than {2 * radius} px (twice the support)"
-                raise InputError("field to blur", got=f"{size} px", wanted=wanted)
-            bands.append(_band(radius, sigma.to(field.dtype)))
-        # Along x all lines of all samples are one image.
-        along_x = _Blur.apply(field.reshape(1, -1, field.shape[-1]), bands[1], -1)
-        samples = along_x.reshape(-1, field.shape[-2], along_x.shape[-1])
-        blurred = _Blur.apply(samples, bands[0], -2)
-        return blurred.reshape(*field.shape[:-2], *blurred.shape[-2:])
+        for axis in (-1, -2):
+            radius = radii[axis]
+            if edge is not None:
+                field = pad_field(field, *((radius, 0) if axis == -2 else (0, radius)), edge)
+            *samples, rows, columns = field.shape
+            if field.shape[axis] <= 2 * radius:
+                wanted = f"more than {2 * radius} px (twice the radius of the kernel)"
+                raise InputError("field to blur", got=f"{field.shape[axis]} px", wanted=wanted)
+            # Along x all lines of all samples are one image.
+            images = field.reshape(1, -1, columns) if axis == -1 else field.reshape(-1, rows, columns)
+            blurred = _Blur.apply(images, _band(radius, sigmas[axis].to(field.dtype)), axis)
+            field = blurred.reshape(*samples, *((rows, -1) if axis == -1 else (-1, columns)))
+        return field
 
 
 def kernel_radius_px(sigma_px: float) -> int:
@@ -125,7 +129,7 @@ def pad_field(field: Tensor, rows_px: int, columns_px: int, edge: Edge = "replic
 
 
 class _Blur(torch.autograd.Function):
-    """One axis (-1 or -2) of samples (s, y, x) blurred by a band; linear in both, forward and reverse.
+    """One axis (-1 or -2) of samples (s, y, x) blurred by a band of one symmetric kernel; linear in both.
 
     PyTorch's own way back through windows that overlap takes three times as long.
     """
@@ -146,14 +150,17 @@ class _Blur(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor, int], output: Tensor) -> None:
         samples, band, ctx.axis = inputs
+        ctx.set_materialize_grads(False)
         # The field is kept only where the width is learnt.
         ctx.save_for_backward(band, samples if ctx.needs_input_grad[1] else None)
         ctx.save_for_forward(band, samples)
 
     @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None, None]:
+    def backward(ctx: Any, gradient: Tensor | None) -> tuple[Tensor | None, Tensor | None, None]:
         band, samples = ctx.saved_tensors
         axis, of_samples, of_band = ctx.axis, None, None
+        if gradient is None:
+            return None, None, None
         if ctx.needs_input_grad[0]:
             # The kernel is symmetric: the way back is the same blur, of zeros around the gradient.
             reach = band.shape[1] - band.shape[0]

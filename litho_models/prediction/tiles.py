@@ -71,8 +71,8 @@ def predict_interior(model: Simulator, layout_um: Tensor, tile_px: int = TILE_PX
 def predict_inside(model: Simulator, layout_um: Tensor, border_px: int) -> Tensor:
     """Height of the pixels farther than ``border_px`` from the edge, µm; gradients flow to the layout.
 
-    As ``predict_field`` without its border, which is computed only as far as the rest needs it where the
-    model allows that: see ``FrozenSimulator.inside``.
+    The border is less than half the layout. As ``predict_field`` without its border, of which only what the
+    rest needs is computed where the model allows that: see ``FrozenSimulator.inside``.
     """
     reach = model.reach_px
     if reach is None:

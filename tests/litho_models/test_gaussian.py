@@ -104,6 +104,8 @@ def test_bad_pitch_is_refused():
 def test_a_field_without_pixels_is_refused():
     with pytest.raises(InputError, match="one pixel or more"):
         gaussian_blur(torch.zeros(0, 8), 0.1, 0.1)
+    with pytest.raises(InputError, match="one pixel or more"):
+        blur_interior(torch.zeros(0, 1, 20, 20), torch.tensor(1.0), 4)
     with pytest.raises(InputError, match="more than 8 px"):
         blur_interior(torch.zeros(8, 20), torch.tensor(1.0), 4)
 
