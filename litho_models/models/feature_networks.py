@@ -7,13 +7,14 @@ The features have no parameters, so that such a network is fitted to single pixe
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch.utils.checkpoint import checkpoint
 
 from litho_models.layers.gaussian import kernel_radius_px
@@ -92,8 +93,12 @@ class FeatureNetwork(nn.Module, ABC):
     def forward(self, field_um: Tensor) -> Tensor:
         """What the network adds to the height of the interior, (b, 1, y - 2r, x - 2r) µm."""
         features = self.features(field_um)
-        pixels = zip(*(feature.flatten().split(_PIXELS_AT_ONCE) for feature in features), strict=True)
+        learns = any(parameter.requires_grad for parameter in self.parameters())
         with torch.autocast(device_type=field_um.device.type, enabled=False):
+            if torch.is_grad_enabled() and not learns:
+                added: Tensor = _OfFixedWeights.apply(self.at_pixels, *features)
+                return added
+            pixels = zip(*(feature.flatten().split(_PIXELS_AT_ONCE) for feature in features), strict=True)
             if torch.is_grad_enabled():
                 # Computed again for a gradient: the hidden units of a field would take gigabytes.
                 parts = [checkpoint(self._at_pixels, *part, use_reentrant=False) for part in pixels]
@@ -213,6 +218,33 @@ class ScanAxis(FeatureNetwork):
         _, _, left, right = neighbours(height, 1)
         per_px = sigma_um / self.pitch_um
         return (right - left) * (per_px / 2), (left + right - 2 * crop_border(height, 1)) * per_px**2
+
+
+class _OfFixedWeights(torch.autograd.Function):
+    """A function of the features of each pixel, whose slopes are found along with the values.
+
+    They take as much memory as the features, and no second pass over the pixels.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, at_pixels: Callable[[Tensor], Tensor], *features: Tensor) -> Tensor:
+        parts = [feature.flatten().split(_PIXELS_AT_ONCE) for feature in features]
+        values: list[Tensor] = []
+        slopes: list[Tensor] = []
+        for part in zip(*parts, strict=True):
+            with torch.enable_grad():
+                seen = torch.stack(part).requires_grad_()
+                value = at_pixels(seen)
+                slopes += torch.autograd.grad(value.sum(), seen)
+            values.append(value.detach())
+        ctx.save_for_backward(torch.cat(slopes, dim=1))
+        return torch.cat(values).view_as(features[0])
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        (slopes,) = ctx.saved_tensors
+        return None, *(gradient * slope.view_as(gradient) for slope in slopes)
 
 
 def _across(layer: nn.Linear, values: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import torch
 
 from litho_models.fitting import TrainingConfig, fit_in_cache, pixels
 from litho_models.frozen.files import load_frozen
-from litho_models.models import build_model
+from litho_models.models import build_model, feature_networks
 from litho_models.models.pbl import Pbl, PblConfig
 from litho_models.prediction.tiles import predict_scan
 from tests.litho_models.prints import make_scan, make_scans, printed_height_um
@@ -56,6 +56,20 @@ def test_what_does_not_change_along_x_is_measured_as_it_is_printed():
     with torch.no_grad():
         assert torch.allclose(model(steps_along_y), model.printer()(steps_along_y), rtol=0, atol=1e-5)
         assert float((model(field) - model.printer()(field)).abs().max()) > 1e-3
+
+
+def test_fixed_weights_and_learnt_ones_have_the_same_heights_and_slopes(monkeypatch):
+    # Several blocks, the last not full.
+    monkeypatch.setattr(feature_networks, "_PIXELS_AT_ONCE", 700)
+    model, found = moved(narrow()).double(), []
+    for learns in (True, False):
+        field = layout().double().requires_grad_()
+        height = model.requires_grad_(learns)(field)
+        pull = torch.rand(height.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+        found.append((height.detach(), *torch.autograd.grad((pull * height).sum(), field)))
+    # Double precision, sums of some hundred products of order one.
+    for learnt, fixed in zip(*found, strict=True):
+        assert float((fixed - learnt).abs().max()) < 1e-11
 
 
 def test_pixels_tell_what_the_microscope_adds_along_x_from_what_is_printed(monkeypatch):
