@@ -132,6 +132,7 @@ def _found(out: Path, task: Task) -> dict[str, Any]:
     """The figures of a finished task, by arm and judge."""
     gap = GapResult.read(out / task.name)
     shown = SHOWN[_NAMES[task.kind]]
+    figure = next(iter(shown))
     return {
         **gap.model_dump(mode="json", include={"commit", "dirty", "versions"}),
         "iterations": task.iterations,
@@ -142,6 +143,18 @@ def _found(out: Path, task: Task) -> dict[str, Any]:
             item.model_dump(mode="json")
             for item in gap.summary
             if item.figure in shown and item.judge in task.judges
+        ],
+        # Means of three hide a start that the search did not leave.
+        "of_each_seed": [
+            {
+                "arm": entry.arm,
+                "judge": entry.judge,
+                "seed": entry.seed,
+                "designed": entry.designed[figure],
+                "judged": entry.judged[figure],
+            }
+            for entry in gap.entries
+            if entry.judge in task.judges
         ],
     }
 
