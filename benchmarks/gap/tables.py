@@ -112,6 +112,8 @@ def figure_file(name: str) -> str:
 
 def figure_digits(figure: str) -> int:
     """Decimals: an error of an image is a few hundredths, and arms differ by a hundredth of that."""
+    if figure == "cbr":  # a ratio of hundreds and thousands
+        return 0
     return 5 if figure.startswith("mae") else 3
 
 

@@ -213,7 +213,7 @@ def test_the_table_of_the_papers_search_says_what_is_not_made(tmp_path):
     ]  # fmt: skip
     done = {"iterations": 333, "seeds": 3, "minutes": {"none": 1.2}, "summary": summary}
     text = paper_search.as_markdown({"tasks": {task.name: done}})
-    assert "| none | fab | not made yet | not made yet | 100.000 → 50.000 ± 5.000 | not made yet |" in text
+    assert "| none | fab | not made yet | not made yet | 100 → 50 ± 5 | not made yet |" in text
     assert "paper 333: none 1." in text
 
 
