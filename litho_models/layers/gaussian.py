@@ -157,10 +157,10 @@ class _Blur(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor | None) -> tuple[Tensor | None, Tensor | None, None]:
-        band, samples = ctx.saved_tensors
-        axis, of_samples, of_band = ctx.axis, None, None
         if gradient is None:
             return None, None, None
+        band, samples = ctx.saved_tensors
+        axis, of_samples, of_band = ctx.axis, None, None
         if ctx.needs_input_grad[0]:
             # The kernel is symmetric: the way back is the same blur, of zeros around the gradient.
             reach = band.shape[1] - band.shape[0]

@@ -7,7 +7,7 @@ The features have no parameters, so that such a network is fitted to single pixe
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from typing import Any, ClassVar
 
@@ -95,10 +95,11 @@ class FeatureNetwork(nn.Module, ABC):
         features = self.features(field_um)
         learns = any(parameter.requires_grad for parameter in self.parameters())
         with torch.autocast(device_type=field_um.device.type, enabled=False):
-            if torch.is_grad_enabled() and not learns:
+            # Slopes take longer than values: they are found only where the field asks for them.
+            if features[0].requires_grad and not learns:
                 added: Tensor = _OfFixedWeights.apply(self.at_pixels, *features)
                 return added
-            pixels = zip(*(feature.flatten().split(_PIXELS_AT_ONCE) for feature in features), strict=True)
+            pixels = _in_blocks(features)
             if torch.is_grad_enabled():
                 # Computed again for a gradient: the hidden units of a field would take gigabytes.
                 parts = [checkpoint(self._at_pixels, *part, use_reentrant=False) for part in pixels]
@@ -228,10 +229,9 @@ class _OfFixedWeights(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, at_pixels: Callable[[Tensor], Tensor], *features: Tensor) -> Tensor:
-        parts = [feature.flatten().split(_PIXELS_AT_ONCE) for feature in features]
         values: list[Tensor] = []
         slopes: list[Tensor] = []
-        for part in zip(*parts, strict=True):
+        for part in _in_blocks(features):
             with torch.enable_grad():
                 seen = torch.stack(part).requires_grad_()
                 value = at_pixels(seen)
@@ -245,6 +245,11 @@ class _OfFixedWeights(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         (slopes,) = ctx.saved_tensors
         return None, *(gradient * slope.view_as(gradient) for slope in slopes)
+
+
+def _in_blocks(features: Sequence[Tensor]) -> Iterator[tuple[Tensor, ...]]:
+    """Block after block of pixels: the features of each block, each (n,)."""
+    return zip(*(feature.flatten().split(_PIXELS_AT_ONCE) for feature in features), strict=True)
 
 
 def _across(layer: nn.Linear, values: Tensor) -> Tensor:
