@@ -20,7 +20,7 @@ from benchmarks.gap.document import PAGE, RESULTS, search_minutes
 from benchmarks.gap.jobs import run_commands
 from benchmarks.gap.plan import Effort, Plan, model, open_plan
 from benchmarks.gap.steps import fab_jobs, model_jobs
-from benchmarks.gap.tables import LABELS, SHOWN, TITLES, figure_digits
+from benchmarks.gap.tables import LABELS, SHOWN, TITLES, figure_digits, lead_text
 from benchmarks.gap.tasks import Task, chosen, task_options
 from benchmarks.markdown_table import markdown_table
 from benchmarks.record import publish, usable_cores, write_record
@@ -144,6 +144,11 @@ def _found(out: Path, task: Task) -> dict[str, Any]:
             for item in gap.summary
             if item.figure in shown and item.judge in task.judges
         ],
+        "paired": [
+            item.model_dump(mode="json")
+            for item in gap.paired
+            if item.figure == figure and item.judge in task.judges
+        ],
         # Means of three hide a start that the search did not leave.
         "of_each_seed": [
             {
@@ -174,7 +179,10 @@ def _table(kind: str, tasks: Mapping[str, Mapping[str, Any]]) -> str:
     ]
     better = "more" if sign > 0 else "less"
     return f"### {TITLES[_NAMES[kind]]}: {LABELS[figure]}, {better} is better\n\n" + markdown_table(
-        ("designed with", "printed by", *heads), rows, _minutes_text(columns, found)
+        ("designed with", "printed by", *heads),
+        rows,
+        _minutes_text(columns, found),
+        *_leads(columns, found, figure, sign),
     )
 
 
@@ -191,6 +199,22 @@ def _cells(found: Sequence[Mapping[str, Any] | None], arm: str, judge: str, figu
         digits, interval = figure_digits(figure), row["judged_ci95"]
         spread = f" ± {(interval[1] - interval[0]) / 2:.{digits}f}" if interval else ""
         yield f"{row['designed_mean']:.{digits}f} → {row['judged_mean']:.{digits}f}{spread}"
+
+
+def _leads(
+    columns: Sequence[tuple[str, int]], found: Sequence[Mapping[str, Any] | None], figure: str, sign: int
+) -> Iterator[str]:
+    """The best arm of every search that ran from several seeds, by each printer."""
+    for (search, iterations), task in zip(columns, found, strict=True):
+        if task is None or task["seeds"] == 1:
+            continue
+        for judge in ("fab", MEASURED):
+            means = {
+                row["arm"]: row["judged_mean"]
+                for row in task["summary"]
+                if row["judge"] == judge and row["figure"] == figure
+            }
+            yield f"{search}, {iterations:,}: {lead_text(task['paired'], means, figure, sign, judge)}"
 
 
 def _minutes_text(columns: Sequence[tuple[str, int]], found: Sequence[Mapping[str, Any] | None]) -> str:

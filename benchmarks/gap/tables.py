@@ -100,9 +100,11 @@ def _task_part(name: str, task: Mapping[str, Any], rows: Sequence[Mapping[str, A
     verdict = ""
     # Among printers that are arms themselves each prefers its own design: nobody wins.
     if seeds > 1 and independent:
-        verdict = _verdict(task["paired"], values, arms, next(iter(shown.items())), judges[0])
-    figure = f"![{_FIGURES[kind]}](results/gap/{figure_file(name)})"
-    return "\n\n".join(part for part in (head + "\n".join(lines), verdict, figure) if part)
+        figure, sign = next(iter(shown.items()))
+        means = {arm: values[arm, judges[0], figure]["judged"] for arm in arms}
+        verdict = lead_text(task["paired"], means, figure, sign, judges[0])
+    picture = f"![{_FIGURES[kind]}](results/gap/{figure_file(name)})"
+    return "\n\n".join(part for part in (head + "\n".join(lines), verdict, picture) if part)
 
 
 def figure_file(name: str) -> str:
@@ -124,19 +126,14 @@ def _cell(row: Mapping[str, Any], digits: int) -> str:
     return f"{text} ± {(row['high'] - row['low']) / 2:.{digits}f}"
 
 
-def _verdict(
-    paired: Sequence[Mapping[str, Any]],
-    values: Mapping[tuple[str, str, str], Mapping[str, Any]],
-    arms: Sequence[str],
-    figure_sign: tuple[str, int],
-    judge: str,
+def lead_text(
+    paired: Sequence[Mapping[str, Any]], means: Mapping[str, float], figure: str, sign: int, judge: str
 ) -> str:
-    """Who wins by the first figure, and by how much against every other arm, paired by seed."""
-    figure, sign = figure_sign
+    """Which arm has the best mean of a figure, and by how much against every other one, paired by seed."""
     digits = figure_digits(figure)
-    best = max(arms, key=lambda arm: sign * values[arm, judge, figure]["judged"])
+    best = max(means, key=lambda arm: sign * means[arm])
     against = []
-    for other in arms:
+    for other in means:
         for item in paired:
             pair = {item["arm"], item["against"]}
             if item["judge"] == judge and item["figure"] == figure and pair == {best, other}:

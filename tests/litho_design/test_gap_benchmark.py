@@ -25,6 +25,7 @@ from litho_data.virtual_fab import KnobSetting, knob_rms_nm
 from litho_data.virtual_fab.settings import Printer
 from litho_data.virtual_fab.strength import default_fields
 from litho_design.cli.app import app
+from litho_design.judging.gap import GapEntry, paired_differences, summarise
 from litho_models import save_frozen
 from litho_models.models import build_model
 
@@ -200,21 +201,30 @@ def test_the_papers_search_and_ours_get_the_same_iterations_arms_and_judges(tmp_
         assert task.iterations * task.seeds == pytest.approx(1000, rel=2e-3)
 
 
-def test_the_table_of_the_papers_search_says_what_is_not_made(tmp_path):
+def test_the_table_of_the_papers_search_says_what_is_not_made_and_who_leads(tmp_path):
     task = next(
         task for task in paper_search.paper_tasks(tmp_path, TINY) if task.name == "lens-direct-paper-333"
     )
-    summary = [
-        {
-            "arm": arm, "judge": judge, "figure": "cbr",
-            "designed_mean": 100.0, "judged_mean": 50.0, "judged_ci95": [45.0, 55.0],
-        }
-        for arm in task.models for judge in task.judges
+    entries = [
+        GapEntry(
+            arm=arm, seed=seed, judge=judge, self_judged=False, rms_height_gap_um=0.0,
+            designed={"cbr": 100.0}, judged={"cbr": 50.0 + seed + (20 if arm == "physics" else 0)},
+        )
+        for arm in task.models for judge in task.judges for seed in range(task.seeds)
     ]  # fmt: skip
-    done = {"iterations": 333, "seeds": 3, "minutes": {"none": 1.2}, "summary": summary}
+    done = {
+        "iterations": 333,
+        "seeds": 3,
+        "minutes": {"none": 1.2},
+        "summary": [item.model_dump() for item in summarise(entries)],
+        "paired": [item.model_dump() for item in paired_differences(entries, ["cbr"])],
+    }
     text = paper_search.as_markdown({"tasks": {task.name: done}})
-    assert "| none | fab | not made yet | not made yet | 100 → 50 ± 5 | not made yet |" in text
+    # Student's t of three seeds one apart: 4.30 · 1 / √3 = 2.5. The pairs differ by the same each time.
+    assert "| none | fab | not made yet | not made yet | 100 → 51 ± 2 | not made yet |" in text
     assert "paper 333: none 1." in text
+    lead = "physics is best in centre-to-background ratio. Its lead: over none +20 [+20, +20]; over fno"
+    assert f"paper, 333: Printed by measured-pbl, {lead}" in text
 
 
 def test_the_page_quotes_the_papers_search():
