@@ -40,7 +40,7 @@ SAME_LENS = ("--set", "view.aperture=circle", "--set", "view.path=radial")
 ARMS = ("none", "physics", "fno", "pbl-scan-axis")
 # An iteration of the hologram through the FNO, tile by tile, takes 11 s of a core: 12 hours for its designs.
 LEFT_OUT = {"hoe": ("fno",)}
-MEASURED = "measured-pbl"
+FAB, MEASURED = "fab", "measured-pbl"
 _NAMES = {"hoe": "hoe", "direct": "lens-direct", "computational": "lens-computational"}
 
 
@@ -113,7 +113,7 @@ def _task(out: Path, effort: Effort, kind: str, search: str, iterations: int) ->
     if kind == "computational":
         options += task_options("--window-px", effort.window_px, "--object-px", effort.object_px)
     models = {arm: "none" if arm == "none" else str(model(out, arm)) for arm in _arms(kind)}
-    judges = {"fab": str(out / "fab" / "truth"), MEASURED: str(zoo.folder("pbl"))}
+    judges = {FAB: str(out / "fab" / "truth"), MEASURED: str(zoo.folder("pbl"))}
     name = f"{_NAMES[kind]}-{search}-{iterations}"
     return Task(name, kind, options, models, judges, SEEDS_OF[iterations])
 
@@ -175,7 +175,7 @@ def _table(kind: str, tasks: Mapping[str, Mapping[str, Any]]) -> str:
     ]
     found = [tasks.get(f"{_NAMES[kind]}-{search}-{iterations}") for search, iterations in columns]
     rows = [
-        (arm, judge, *_cells(found, arm, judge, figure)) for judge in ("fab", MEASURED) for arm in _arms(kind)
+        (arm, judge, *_cells(found, arm, judge, figure)) for judge in (FAB, MEASURED) for arm in _arms(kind)
     ]
     better = "more" if sign > 0 else "less"
     return f"### {TITLES[_NAMES[kind]]}: {LABELS[figure]}, {better} is better\n\n" + markdown_table(
@@ -191,11 +191,7 @@ def _cells(found: Sequence[Mapping[str, Any] | None], arm: str, judge: str, figu
         if task is None:
             yield "not made yet"
             continue
-        row = next(
-            row
-            for row in task["summary"]
-            if (row["arm"], row["judge"], row["figure"]) == (arm, judge, figure)
-        )
+        row = _rows_of_arms(task, judge, figure)[arm]
         digits, interval = figure_digits(figure), row["judged_ci95"]
         spread = f" ± {(interval[1] - interval[0]) / 2:.{digits}f}" if interval else ""
         yield f"{row['designed_mean']:.{digits}f} → {row['judged_mean']:.{digits}f}{spread}"
@@ -208,13 +204,14 @@ def _leads(
     for (search, iterations), task in zip(columns, found, strict=True):
         if task is None or task["seeds"] == 1:
             continue
-        for judge in ("fab", MEASURED):
-            means = {
-                row["arm"]: row["judged_mean"]
-                for row in task["summary"]
-                if row["judge"] == judge and row["figure"] == figure
-            }
+        for judge in (FAB, MEASURED):
+            means = {arm: row["judged_mean"] for arm, row in _rows_of_arms(task, judge, figure).items()}
             yield f"{search}, {iterations:,}: {lead_text(task['paired'], means, figure, sign, judge)}"
+
+
+def _rows_of_arms(task: Mapping[str, Any], judge: str, figure: str) -> dict[str, Mapping[str, Any]]:
+    """What one printer made of one figure, by the arm that it was designed with."""
+    return {row["arm"]: row for row in task["summary"] if (row["judge"], row["figure"]) == (judge, figure)}
 
 
 def _minutes_text(columns: Sequence[tuple[str, int]], found: Sequence[Mapping[str, Any] | None]) -> str:

@@ -133,16 +133,16 @@ def lead_text(
     digits = figure_digits(figure)
     best = max(means, key=lambda arm: sign * means[arm])
     against = []
-    for other in means:
-        for item in paired:
-            pair = {item["arm"], item["against"]}
-            if item["judge"] == judge and item["figure"] == figure and pair == {best, other}:
-                # Better counts upwards, also where less of a figure is better.
-                turn = sign if item["arm"] == best else -sign
-                low, high = sorted(turn * end for end in item["ci95"])
-                open_ = "" if low * high > 0 else ", which includes 0"
-                interval = f"[{low:+.{digits}f}, {high:+.{digits}f}]"
-                against.append(f"over {other} {turn * item['mean']:+.{digits}f} {interval}{open_}")
+    for item in paired:
+        pair = (item["arm"], item["against"])
+        if (item["judge"], item["figure"]) != (judge, figure) or best not in pair:
+            continue
+        # Better counts upwards, also where less of a figure is better.
+        other, turn = (pair[1], sign) if best == pair[0] else (pair[0], -sign)
+        low, high = sorted(turn * end for end in item["ci95"])
+        open_ = "" if low * high > 0 else ", which includes 0"
+        interval = f"[{low:+.{digits}f}, {high:+.{digits}f}]"
+        against.append(f"over {other} {turn * item['mean']:+.{digits}f} {interval}{open_}")
     return f"Printed by {judge}, {best} is best in {LABELS[figure]}. Its lead: " + "; ".join(against) + "."
 
 
