@@ -46,8 +46,7 @@ def hologram_settings(
     iterations at 0.1, expected levels). ``authors``: as in the published code (12 levels,
     temperature 1, wavelength 0.633 and index step 0.545; its efficiency term is constant and
     therefore left out; its truncated, half-pixel-shifted kernel is not reproduced). ``default``:
-    one height per cell with straight-through rounding from a Gerchberg-Saxton start, and a polish of
-    the printable layout.
+    one height per cell from a Gerchberg-Saxton start, and a polish of the printable layout.
 
     Args:
         variant: the preset; ``variant`` among the changes replaces it.

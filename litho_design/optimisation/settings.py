@@ -49,7 +49,7 @@ class SearchSettings(Record):
     temperature_start: float = setting(2.0, "Gumbel temperature at the start", gt=0)
     temperature_end: float = setting(0.1, "Gumbel temperature at the end", gt=0)
     hard_from: float = setting(
-        0.6, "Share of the iterations after which samples are whole levels", ge=0, le=1
+        1.0, "Share of the iterations after which samples are whole levels; 1 for never", ge=0, le=1
     )
     evaluate_every: int = setting(10, "Iterations between two evaluations of the printable layout", ge=1)
     keep: Literal["best", "last"] = setting("best", "Which evaluated layout is kept")
@@ -81,7 +81,6 @@ PAPER_SEARCH = SearchSettings(
     iterations=1000,
     temperature_start=0.5,
     temperature_end=0.5,
-    hard_from=1.0,
     keep="last",
     polish_rounds=0,
 )

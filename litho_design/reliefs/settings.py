@@ -15,7 +15,7 @@ class ReliefSettings(DesignSettings):
 
     layout: LayoutSettings = setting(LayoutSettings(size_px=256, cell_um=0.1), "Layout")
     search: SearchSettings = setting(
-        SearchSettings(start="inverse", iterations=60, learning_rate=0.3, hard_from=1.0, polish_rounds=150),
+        SearchSettings(start="inverse", iterations=60, learning_rate=0.3, polish_rounds=150),
         "Search",
     )
     height_um: float = setting(

@@ -162,6 +162,19 @@ def test_gerchberg_saxton_error_never_rises():
     assert errors[-1] < 0.85 * errors[0]
 
 
+def test_what_a_flat_plate_shows_is_made_by_a_flat_plate():
+    layout = LayoutSettings(size_px=96)
+    bench = HologramBench(layout, Optics(distance_um=25.0), dtype=torch.complex128)
+    seen = bench(torch.zeros(96, 96, dtype=torch.float64))
+    for weighted in (False, True):
+        phase, _ = gerchberg_saxton(
+            bench.propagator, seen / seen.max(), CellMap(layout), iterations=40, weighted=weighted, seed=1
+        )
+        # |mean exp(j phase)| is 1 for a flat plate, sin(1) / 1 = 0.84 for the first phase, which lies within
+        # 1 rad of its mean, and 1 / sqrt(cells) = 0.04 for phases of the whole circle.
+        assert float(torch.polar(torch.ones_like(phase), phase).mean().abs()) > 0.9
+
+
 def test_weighting_makes_the_image_more_even():
     layout = LayoutSettings(size_px=96)
     bench = HologramBench(layout, Optics(distance_um=25.0))
