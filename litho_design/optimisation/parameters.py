@@ -9,6 +9,8 @@ from torch import Tensor, nn
 from litho_design.optimisation.process_window import blurred
 from litho_design.printers.layout import LayoutSettings
 
+# A learning rate of 1 moves by one level of 13, and by as much of the height where there are more or fewer.
+_RATE_STEPS = 12
 # One level: the neighbours of the starting level can be reached from the first step.
 _START_SPREAD_LEVELS = 1.0
 
@@ -66,6 +68,9 @@ class GumbelLevels(nn.Module):
     sampled weights, the hard one is a level with the gradient of the soft one.
     """
 
+    # Of a learning rate: logits have no range.
+    rate_unit = 1.0
+
     def __init__(self, layout: LayoutSettings):
         super().__init__()
         self.cells = CellMap(layout)
@@ -112,6 +117,7 @@ class DirectLevels(nn.Module):
         super().__init__()
         self.cells = cells or CellMap(layout, rows)
         self.levels = layout.levels
+        self.rate_unit = (layout.levels - 1) / _RATE_STEPS
         self.height = nn.Parameter(torch.zeros(self.cells.cells))
         self.filter_cells = layout.cell_filter_um / layout.cell_um
 

@@ -85,7 +85,7 @@ def search_layout(
         InputError: the checkpoint in ``folder`` is of another task, or the loss is not finite.
     """
     optimiser_class = torch.optim.Adam if settings.optimiser == "adam" else torch.optim.AdamW
-    optimiser = optimiser_class(parameters.parameters(), lr=settings.learning_rate)
+    optimiser = optimiser_class(parameters.parameters(), lr=settings.learning_rate * parameters.rate_unit)
     state = SearchState()
     checkpoint = None if folder is None else _checkpoint(folder, part)
     if checkpoint is not None and checkpoint.exists():

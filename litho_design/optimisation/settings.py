@@ -44,7 +44,10 @@ class SearchSettings(Record):
     iterations: int = setting(300, "Iterations of the search", option="--iterations", ge=1)
     optimiser: Literal["adam", "adamw"] = setting("adam", "Optimiser")
     learning_rate: float = setting(
-        1.0, "Step of the optimiser, in levels (direct) or logits (gumbel)", option="--learning-rate", gt=0
+        1.0,
+        "Step of the optimiser, in twelfths of the range of levels (direct) or logits (gumbel)",
+        option="--learning-rate",
+        gt=0,
     )
     temperature_start: float = setting(2.0, "Gumbel temperature at the start", gt=0)
     temperature_end: float = setting(0.1, "Gumbel temperature at the end", gt=0)

@@ -153,7 +153,7 @@ class ReliefTask(Task):
         search = self.settings.search
         free = DirectLevels(self.settings.layout).to(self.printer.device)
         free.start_from(self._levels_printing(self.printer.level_heights_um(), self.asked))
-        optimiser = torch.optim.Adam(free.parameters(), lr=search.learning_rate)
+        optimiser = torch.optim.Adam(free.parameters(), lr=search.learning_rate * free.rate_unit)
         best, lowest = None, math.inf
         for _ in range(_FREE_ITERATIONS):
             print_um = self.printer(free.sample(1.0, False, 0))[0, 0]
