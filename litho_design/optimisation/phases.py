@@ -15,8 +15,8 @@ from litho_design.optimisation.parameters import CellMap
 # Amplitude, the element's being 1, below which a wave has no phase.
 _DARK = 1e-12
 # From random phases of the whole circle every sixth pair of neighbouring cells ends more than half a wave
-# apart, which no printer makes and no search mends. A plate that is nearly flat ends with a third fewer such
-# steps, and still leaves every seed its own way.
+# apart, which a print rounds off and a search does not mend. A plate that is nearly flat ends with a third
+# fewer such steps, and still leaves every seed its own way.
 _START_PHASE_RAD = 1.0
 
 
