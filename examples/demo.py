@@ -44,7 +44,6 @@ class Effort:
     element_px: int
     distance_um: int
     iterations: int
-    start: str
     seeds: int
 
 
@@ -58,7 +57,6 @@ QUICK = Effort(
     element_px=256,
     distance_um=25,
     iterations=50,
-    start="gs",
     seeds=1,
 )
 # As published in docs/results: at 75 µm the letters are blurred (1.9 µm).
@@ -70,7 +68,6 @@ MEASURED = Effort(
     element_px=256,
     distance_um=75,
     iterations=100,
-    start="random",
     seeds=1,
 )
 
@@ -198,7 +195,7 @@ def plan(out: Path, dataset: str) -> list[Step]:
     corrected = out / "models" / CORRECTED
     element = (
         "--size-px", effort.element_px, "--distance-um", effort.distance_um,
-        "--iterations", effort.iterations, "--start", effort.start,
+        "--iterations", effort.iterations,
     )  # fmt: skip
     # The printer itself, where it is a virtual one; then designs can be made through the corrected model too.
     judge = ("--judge", f"{FAB}={out / 'fab' / 'truth'}" if not dataset else f"corrected={corrected}")

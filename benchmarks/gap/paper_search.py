@@ -107,7 +107,7 @@ def _task(out: Path, effort: Effort, kind: str, search: str, iterations: int) ->
         "--yield-draws", 10,
     )  # fmt: skip
     if hologram:
-        options += ("--target", "text", *(("--start", "gs") if search == "ours" else ()))
+        options += ("--target", "text")
     else:
         options += SAME_LENS
     if kind == "computational":

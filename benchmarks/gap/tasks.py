@@ -76,7 +76,7 @@ def tasks(out: Path, effort: Effort, zoo: Mapping[str, str], corrected: str | No
     hoe = task_options(
         "--target", "text", "--size-px", effort.hoe_px,
         "--distance-um", effort.hoe_distance_um, "--iterations", effort.hoe_iterations,
-        "--start", "gs", "--precision", effort.search_precision, *_FEW_DRAWS,
+        "--precision", effort.search_precision, *_FEW_DRAWS,
     )  # fmt: skip
     lens = task_options(
         "--size-px", effort.lens_px, "--distance-um", effort.lens_distance_um,
