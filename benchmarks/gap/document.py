@@ -45,7 +45,7 @@ def write_results(
                 "iterations": gap.settings.search.iterations,
                 "seeds": gap.seeds,
                 "printers": {arm: used.sha256 for arm, used in gap.arms.items()},
-                "minutes": search_minutes(out / name, gap.seeds),
+                "minutes": search_minutes(out / name, gap),
                 "paired": [item.model_dump(mode="json") for item in gap.paired if item.judge not in gap.arms],
                 "ceiling": _ceiling(out / name, gap),
             }
@@ -91,13 +91,13 @@ def _ceiling(folder: Path, gap: GapResult) -> dict[str, float] | None:
     return (design.baselines or {}).get("continuous phase")
 
 
-def search_minutes(folder: Path, seeds: Sequence[int]) -> dict[str, float]:
+def search_minutes(folder: Path, gap: GapResult) -> dict[str, float]:
     """Minutes of search per arm, over the judged seeds, as the designs recorded them."""
-    minutes: dict[str, float] = {}
-    for place in sorted(place for seed in seeds for place in (folder / "designs").glob(f"*/seed{seed}")):
-        arm = place.parent.name
-        minutes[arm] = minutes.get(arm, 0.0) + Design.read(place).run.seconds / 60
-    return {arm: round(value, 2) for arm, value in minutes.items()}
+
+    def minutes(arm: str) -> float:
+        return sum(Design.read(design_folder(folder, arm, seed)).run.seconds for seed in gap.seeds) / 60
+
+    return {arm: round(minutes(arm), 2) for arm in sorted(gap.arms)}
 
 
 def _frame(name: str, gap: GapResult) -> pd.DataFrame:

@@ -138,7 +138,7 @@ def _found(out: Path, task: Task) -> dict[str, Any]:
         "iterations": task.iterations,
         "seeds": len(gap.seeds),
         "printers": {arm: used.sha256 for arm, used in gap.arms.items()},
-        "minutes": search_minutes(out / task.name, gap.seeds),
+        "minutes": search_minutes(out / task.name, gap),
         "summary": [
             item.model_dump(mode="json")
             for item in gap.summary
