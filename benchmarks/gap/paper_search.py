@@ -106,10 +106,7 @@ def _task(out: Path, effort: Effort, kind: str, search: str, iterations: int) ->
         *SEARCHES[search], "--size-px", size_px, "--distance-um", distance_um, "--iterations", iterations,
         "--yield-draws", 10,
     )  # fmt: skip
-    if hologram:
-        options += ("--target", "text")
-    else:
-        options += SAME_LENS
+    options += ("--target", "text") if hologram else SAME_LENS
     if kind == "computational":
         options += task_options("--window-px", effort.window_px, "--object-px", effort.object_px)
     models = {arm: "none" if arm == "none" else str(model(out, arm)) for arm in _arms(kind)}

@@ -39,8 +39,8 @@ def gerchberg_saxton(
     P^H (a exp(j arg P u) - P u)). Because the norm of P is at most one, this majorises the squared
     amplitude error, which therefore never rises (Gerchberg and Saxton 1972). The weighted form
     (Di Leonardo et al. 2007, doi:10.1364/OE.15.001913) raises the wanted amplitude where light is
-    missing; it trades that guarantee for uniformity. The first phase is half a turn, which lies in the middle
-    of the levels, and up to a radian more or less.
+    missing; it trades that guarantee for uniformity. The first phase is half a turn, the middle of levels
+    that make a full wave, and up to a radian more or less.
 
     Args:
         propagator: RSPropagator or ASMPropagator on square grids of the element's pixel pitch.
