@@ -7,17 +7,16 @@ The features have no parameters, so that such a network is fitted to single pixe
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
-from torch.utils.checkpoint import checkpoint
 
 from litho_models.layers.gaussian import kernel_radius_px
+from litho_models.layers.pixelwise import at_each_pixel
 from litho_models.models.baselines import blurred_interior
 from litho_models.models.features import neighbours
 from litho_models.simulator import crop_border
@@ -25,8 +24,6 @@ from litho_models.simulator import crop_border
 # Change over σ, relative to the highest level, below which the length of a slope is rounded off, so that it
 # has a derivative: 2 nm.
 _LEAST_SLOPE = 2e-3
-# Pixels that go through the network at once: some hundred bytes each, whatever the size of the field.
-_PIXELS_AT_ONCE = 2**14
 
 Widths = tuple[float, ...]
 
@@ -95,17 +92,8 @@ class FeatureNetwork(nn.Module, ABC):
         features = self.features(field_um)
         learns = any(parameter.requires_grad for parameter in self.parameters())
         with torch.autocast(device_type=field_um.device.type, enabled=False):
-            # Slopes take longer than values: they are found only where the field asks for them.
-            if features[0].requires_grad and not learns:
-                added: Tensor = _OfFixedWeights.apply(self.at_pixels, *features)
-                return added
-            pixels = _in_blocks(features)
-            if torch.is_grad_enabled():
-                # Computed again for a gradient: the hidden units of a field would take gigabytes.
-                parts = [checkpoint(self._at_pixels, *part, use_reentrant=False) for part in pixels]
-            else:
-                parts = [self._at_pixels(*part) for part in pixels]
-        return torch.cat(parts).view_as(features[0])
+            pixels = (feature.flatten() for feature in features)
+            return at_each_pixel(self._at_pixels, *pixels, learns=learns).view_as(features[0])
 
     def _at_pixels(self, *features: Tensor) -> Tensor:
         return self.at_pixels(torch.stack(features))
@@ -219,37 +207,6 @@ class ScanAxis(FeatureNetwork):
         _, _, left, right = neighbours(height, 1)
         per_px = sigma_um / self.pitch_um
         return (right - left) * (per_px / 2), (left + right - 2 * crop_border(height, 1)) * per_px**2
-
-
-class _OfFixedWeights(torch.autograd.Function):
-    """A function of the features of each pixel, whose slopes are found along with the values.
-
-    They take as much memory as the features, and no second pass over the pixels.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, at_pixels: Callable[[Tensor], Tensor], *features: Tensor) -> Tensor:
-        values: list[Tensor] = []
-        slopes: list[Tensor] = []
-        for part in _in_blocks(features):
-            with torch.enable_grad():
-                seen = torch.stack(part).requires_grad_()
-                value = at_pixels(seen)
-                slopes += torch.autograd.grad(value.sum(), seen)
-            values.append(value.detach())
-        ctx.save_for_backward(torch.cat(slopes, dim=1))
-        return torch.cat(values).view_as(features[0])
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        (slopes,) = ctx.saved_tensors
-        return None, *(gradient * slope.view_as(gradient) for slope in slopes)
-
-
-def _in_blocks(features: Sequence[Tensor]) -> Iterator[tuple[Tensor, ...]]:
-    """Block after block of pixels: the features of each block, each (n,)."""
-    return zip(*(feature.flatten().split(_PIXELS_AT_ONCE) for feature in features), strict=True)
 
 
 def _across(layer: nn.Linear, values: Tensor) -> Tensor:

@@ -16,6 +16,7 @@ from pydantic import Field, PositiveInt, model_validator
 from torch import Tensor, nn
 from torch.nn import functional
 
+from litho_models.layers.pixelwise import at_each_pixel
 from litho_models.prediction.tiles import blend_tiles
 from litho_models.simulator import Simulator, SimulatorConfig, Tile, crop_border
 
@@ -114,14 +115,24 @@ class Fno(Simulator):
         for number, (spectral, local) in enumerate(zip(self.spectral, self.local, strict=True)):
             last = number == config.layers - 1
             wanted = rows if last else _ALL
-            features = spectral(features, wanted) + local(features, wanted)
+            features = spectral(features, local(features, wanted), wanted)
             if not last:
                 features = functional.gelu(features)
         features = features[:, :, :nx]
-        features = functional.gelu(_pointwise(self.hidden, features))
-        with torch.autocast(device_type=layout_um.device.type, enabled=False):
-            height = _pointwise(self.last, features.to(self.last.weight.dtype)).permute(0, 3, 1, 2)
+        shape = features.shape[:3]
+        height = at_each_pixel(self._project, features.reshape(-1, config.width), learns=self._learns)
+        height = height.reshape(shape)[:, None]
         return layout_um[..., rows, :] + height if config.starts_as_layout else height
+
+    def _project(self, features: Tensor) -> Tensor:
+        """The last layers: a height (n,) from features (n, width)."""
+        hidden = functional.gelu(_pointwise(self.hidden, features))
+        with torch.autocast(device_type=features.device.type, enabled=False):
+            return _pointwise(self.last, hidden.to(self.last.weight.dtype))[:, 0]
+
+    @property
+    def _learns(self) -> bool:
+        return self.hidden.weight.requires_grad or self.last.weight.requires_grad
 
     def forward(self, layout_um: Tensor) -> Tensor:
         """Height of the whole field, (batch, 1, y, x) µm."""
@@ -153,8 +164,13 @@ class _Continued(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, features: Tensor, margin: int) -> Tensor:
         ctx.margin = margin
-        tall = torch.cat([features[:, -margin:], features, features[:, :margin]], dim=1)
-        return torch.cat([tall[:, :, -margin:], tall, tall[:, :, :margin]], dim=2)
+        batch, ny, nx, channels = features.shape
+        wide = features.new_empty(batch, ny + 2 * margin, nx + 2 * margin, channels)
+        wide[:, margin:-margin, margin:-margin] = features
+        tall = wide[:, margin:-margin]
+        tall[:, :, :margin], tall[:, :, -margin:] = features[:, :, -margin:], features[:, :, :margin]
+        wide[:, :margin], wide[:, -margin:] = wide[:, -2 * margin : -margin], wide[:, margin : 2 * margin]
+        return wide
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
@@ -179,8 +195,8 @@ class SpectralConvolution(nn.Module):
         super().__init__()
         self.weight = nn.Parameter(torch.rand(2, channels, channels, *modes, 2) / channels**2)
 
-    def forward(self, field: Tensor, rows: slice = _ALL) -> Tensor:
-        """(b, y, x, channels) to the same shape, or to some rows of it.
+    def forward(self, field: Tensor, onto: Tensor, rows: slice = _ALL) -> Tensor:
+        """Of a field (b, y, x, channels), added to ``onto``, which has its shape or that of some rows of it.
 
         An image smaller than the modes keeps those it has.
 
@@ -192,29 +208,43 @@ class SpectralConvolution(nn.Module):
         kept_x = min(self.weight.shape[4], nx // 2 + 1)
         with torch.autocast(device_type=field.device.type, enabled=False):
             field = field.to(self.weight.dtype)
-            cos_y, sin_y = _waves(torch.cat([torch.arange(kept_y), torch.arange(-kept_y, 0)]), ny, field)
+            cos_y, sin_y = _waves(torch.arange(kept_y + 1), ny, field)
             cos_x, sin_x = _waves(torch.arange(kept_x), nx, field)
+            waves_y, waves_x = torch.cat([cos_y, -sin_y]), torch.cat([cos_x, sin_x])
 
-            along_y = torch.cat([cos_y, -sin_y]) @ field.reshape(-1, ny, nx * channels)
-            along_x = torch.cat([cos_x, sin_x]) @ along_y.reshape(-1, 2, 2 * kept_y, nx, channels)
-            cosine, sine = along_x.split(kept_x, dim=-2)
-            spectrum = torch.complex(cosine[:, 0] + sine[:, 1], cosine[:, 1] - sine[:, 0])
-
-            weight = torch.view_as_complex(self.weight)[..., :kept_x]
-            weight = torch.cat([weight[0][:, :, :kept_y], weight[1][:, :, -kept_y:]], dim=2)
-            mixed = torch.einsum("byxi,ioyx->byxo", spectrum, weight)
+            along_y = (waves_y @ field.reshape(-1, ny, nx * channels)).reshape(
+                -1, 2, kept_y + 1, nx, channels
+            )
+            cosine, sine = (waves_x @ along_y).split(kept_x, dim=-2)
+            # The field is real: along y, that of -k_y is the conjugate of that of k_y.
+            above = torch.complex(cosine[:, 0] + sine[:, 1], cosine[:, 1] - sine[:, 0])
+            below = torch.complex(cosine[:, 0] - sine[:, 1], -cosine[:, 1] - sine[:, 0])
+            spectra = torch.stack([above, below])
+            mixed = torch.einsum("sbyxi,sioyx->sbyxo", spectra, self._matrices(kept_y, kept_x))
 
             # Every frequency along x but the first and the last possible one stands for its negative too.
             shares = torch.full((kept_x, 1), 2.0 / (ny * nx), dtype=field.dtype, device=field.device)
             shares[0] /= 2
             if 2 * (kept_x - 1) == nx:
                 shares[-1] /= 2
-            parts = torch.cat([mixed.real * shares, mixed.imag * shares], dim=-2)
-            back_x = torch.cat([torch.cat([cos_x, -sin_x]), torch.cat([sin_x, cos_x])], dim=1).T
-            lines = (back_x @ parts).reshape(-1, 2 * kept_y, 2, nx * channels).transpose(1, 2)
-            back_y = torch.cat([cos_y, -sin_y]).T[rows]
-            field = back_y @ lines.reshape(-1, 4 * kept_y, nx * channels)
-            return field.reshape(-1, len(back_y), nx, channels)
+            even, odd = shares * mixed.sum(0), shares * (mixed[0] - mixed[1])
+            real = torch.cat([cos_x, -sin_x]).T @ torch.cat([even.real, even.imag], dim=-2)
+            imaginary = torch.cat([sin_x, cos_x]).T @ torch.cat([odd.real, odd.imag], dim=-2)
+            lines = torch.cat([real, imaginary], dim=1).reshape(-1, 2 * (kept_y + 1), nx * channels)
+            back_y = waves_y.T[rows].expand(len(lines), -1, -1)
+            onto = onto.to(field.dtype).reshape(*back_y.shape[:2], nx * channels)
+            return torch.baddbmm(onto, back_y, lines).reshape(*back_y.shape[:2], nx, channels)
+
+    def _matrices(self, kept_y: int, kept_x: int) -> Tensor:
+        """Of k_y and of -k_y for k_y from 0 to ``kept_y``, complex (2, in, out, k_y, k_x).
+
+        The zeros: of 0 and -0 only one is kept, and of the highest only the negative.
+        """
+        positive, negative = torch.view_as_complex(self.weight)[..., :kept_x]
+        above = functional.pad(positive[:, :, :kept_y], (0, 0, 0, 1))
+        # The rows of negative frequencies end with -1.
+        below = functional.pad(negative[:, :, -kept_y:].flip(2), (0, 0, 1, 0))
+        return torch.stack([above, below])
 
 
 def _waves(frequencies: Tensor, size: int, like: Tensor) -> tuple[Tensor, Tensor]:

@@ -33,27 +33,44 @@ def trained(**fields):
     return model.eval()
 
 
-@pytest.mark.parametrize("shape", [(7, 8), (9, 6), (8, 2)])
+@pytest.mark.parametrize("shape", [(7, 8), (9, 6), (8, 2), (6, 5), (4, 3)])
 def test_the_spectral_layer_is_the_fourier_sum(shape):
     ny, nx = shape
     modes_y, modes_x, channels = 3, 2, 2
+    kept_y = min(modes_y, ny // 2)
     torch.manual_seed(1)
     layer = SpectralConvolution(channels, (modes_y, modes_x)).double()
     layer.weight.data.normal_()
-    field = torch.randn(1, ny, nx, channels, dtype=torch.float64)
+    field, onto = torch.randn(2, 1, ny, nx, channels, dtype=torch.float64)
     weight = torch.view_as_complex(layer.weight.detach()).numpy()
     y, x = np.meshgrid(np.arange(ny), np.arange(nx), indexing="ij")
-    wanted = np.zeros((channels, ny, nx))
-    frequencies = [(0, k, k) for k in range(modes_y)] + [(1, modes_y - k, -k) for k in range(1, modes_y + 1)]
+    wanted = onto[0].permute(2, 0, 1).numpy()
+    frequencies = [(0, k, k) for k in range(kept_y)] + [(1, modes_y - k, -k) for k in range(1, kept_y + 1)]
     for sign, row, ky in frequencies:
         for kx in range(modes_x):
             wave = np.exp(-2j * np.pi * (ky * y / ny + kx * x / nx))
             spectrum = (field[0].numpy() * wave[..., None]).sum(axis=(0, 1))
             mixed = spectrum @ weight[sign, :, :, row, kx]
             # A positive k_x stands for its mirror image too; the first and the last possible have none.
-            wanted += (1 if kx in (0, nx / 2) else 2) * (mixed[:, None, None] * wave.conj()).real / (ny * nx)
+            share = (1 if kx in (0, nx / 2) else 2) / (ny * nx)
+            wanted = wanted + share * (mixed[:, None, None] * wave.conj()).real
     with torch.no_grad():
-        assert np.abs(layer(field)[0].permute(2, 0, 1).numpy() - wanted).max() < 1e-12
+        found = layer(field, onto)[0].permute(2, 0, 1).numpy()
+        rows = layer(field, onto[:, 1:3], slice(1, 3))[0].permute(2, 0, 1).numpy()
+    # Sums of some dozen products of order one, in double precision.
+    assert np.abs(found - wanted).max() < 1e-12
+    assert np.abs(rows - wanted[:, 1:3]).max() < 1e-12
+
+
+def test_fixed_weights_have_the_gradient_of_weights_that_learn():
+    model = trained()
+    field = torch.rand(1, 1, 40, 50, dtype=torch.float64, requires_grad=True)
+    pull = torch.randn(1, 1, 40, 50, dtype=torch.float64)
+    learning = torch.autograd.grad((model(field) * pull).sum(), field)[0]
+    model.requires_grad_(False)
+    fixed = torch.autograd.grad((model(field) * pull).sum(), field)[0]
+    assert learning.abs().max() > 0.1
+    assert (learning - fixed).abs().max() < 1e-12
 
 
 @pytest.mark.parametrize(("shape", "side"), [((5, 7), 3), ((4, 3), 5), ((3, 3), 7)])
