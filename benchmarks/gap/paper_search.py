@@ -38,7 +38,7 @@ SEARCHES = {"paper": ("--variant", "paper"), "ours": ()}
 SAME_LENS = ("--set", "view.aperture=circle", "--set", "view.path=radial")
 # PBL with all it predicts, as the paper's: what lies along the scan lines is in the other models, too.
 ARMS = ("none", "physics", "fno", "pbl-scan-axis")
-# An iteration of the hologram through the FNO, tile by tile, takes 11 s of a core: 12 hours for its designs.
+# An iteration of the hologram through the FNO, tile by tile, takes 8 s of a core: 8 hours for its designs.
 LEFT_OUT = {"hoe": ("fno",)}
 FAB, MEASURED = "fab", "measured-pbl"
 _NAMES = {"hoe": "hoe", "direct": "lens-direct", "computational": "lens-computational"}

@@ -171,6 +171,7 @@ def design_in_rings(
     level = lens.cells(state.best_levels)
     with torch.no_grad():
         height = lens.printed_um(level.float()[None, None])
+    seconds = state.earlier_seconds + time.monotonic() - started
     rows = level.cpu().numpy().astype("uint8")
     design = Design.searched(
         settings,
@@ -179,7 +180,7 @@ def design_in_rings(
         state,
         task="lens-direct",
         fingerprint=fingerprint,
-        run=RunRecord.of(printer.device, time.monotonic() - started, budget.seconds_per_iteration),
+        run=RunRecord.of(printer.device, seconds, budget.seconds_per_iteration),
         printer_unchanged=printer.weights_sha256() == before,
         printability=printability(torch.cat([level.flip(0), level])[None].cpu().numpy(), layout),
         notes=["a lens in rings: levels and heights along one radius; no layout of the plane, no polish"],

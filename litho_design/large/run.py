@@ -92,7 +92,7 @@ def design_in_bands(
         state = search_layout(
             parameters, hologram.objective, search, folder=folder, fingerprint=fingerprint, part=part
         )
-    seconds = time.monotonic() - started
+    seconds = state.earlier_seconds + time.monotonic() - started
     assert state.best_levels is not None
     level = _pixels(parameters, state.best_levels)[0, 0]
     with torch.no_grad():

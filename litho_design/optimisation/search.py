@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import math
 import pickle
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -43,6 +44,8 @@ class SearchState:
     best_loss: float = math.inf
     best_levels: Tensor | None = None
     history: list[dict[str, float]] = field(default_factory=list)
+    # Of the search, in runs that were interrupted.
+    earlier_seconds: float = 0.0
 
 
 def make_parametrisation(layout: LayoutSettings, search: SearchSettings) -> Parametrisation:
@@ -90,6 +93,7 @@ def search_layout(
     checkpoint = None if folder is None else _checkpoint(folder, part)
     if checkpoint is not None and checkpoint.exists():
         state = _resume(checkpoint, parameters, optimiser, fingerprint)
+    started = time.monotonic() - state.earlier_seconds
     remaining = range(state.iteration, settings.iterations)
     for iteration in progress(remaining, what, total=len(remaining), estimate_of=0):
         step_loss = _step(parameters, objective, optimiser, settings, iteration)
@@ -97,7 +101,7 @@ def search_layout(
         if iteration % settings.evaluate_every == 0 or state.iteration == settings.iterations:
             _evaluate(parameters, objective, settings, state, step_loss)
         if checkpoint is not None and state.iteration % settings.checkpoint_every == 0:
-            _save(checkpoint, parameters, optimiser, state, fingerprint)
+            _save(checkpoint, parameters, optimiser, state, fingerprint, time.monotonic() - started)
     return state
 
 
@@ -165,6 +169,7 @@ def _save(
     optimiser: torch.optim.Optimizer,
     state: SearchState,
     fingerprint: str,
+    seconds: float,
 ) -> None:
     content = {
         "fingerprint": fingerprint,
@@ -174,6 +179,7 @@ def _save(
         "best_loss": state.best_loss,
         "best_levels": state.best_levels,
         "history": state.history,
+        "seconds": seconds,
     }
     with atomic_file(path) as temporary:
         torch.save(content, temporary)
@@ -195,7 +201,9 @@ def _resume(
     best_levels = content["best_levels"]
     if best_levels is not None:
         best_levels = best_levels.to(next(parameters.parameters()).device)
-    return SearchState(content["iteration"], content["best_loss"], best_levels, content["history"])
+    # Older checkpoints have no seconds.
+    seconds = content.get("seconds", 0.0)
+    return SearchState(content["iteration"], content["best_loss"], best_levels, content["history"], seconds)
 
 
 def _load(path: Path) -> dict[str, Any]:

@@ -38,7 +38,7 @@ DESIGNS = "designs"
 
 
 class RunRecord(RunFacts):
-    """Command, software, device and duration; older result files may have no commit."""
+    """Command, software, device, duration with interrupted runs; older result files may have no commit."""
 
     device: str
     threads: int

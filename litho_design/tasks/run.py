@@ -238,4 +238,5 @@ def _optimise(
             rounds=search.polish_rounds,
         )
         polished = losses[-1]
-    return _Outcome(levels, state, start_loss, polished, budget, time.monotonic() - started)
+    seconds = state.earlier_seconds + time.monotonic() - started
+    return _Outcome(levels, state, start_loss, polished, budget, seconds)

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from litho_data.foundation.errors import InputError
 from litho_design.holograms.task import HologramTask
 from litho_design.images.targets import load_target
 from litho_design.optics import Optics, RSPropagator, centred_grid, element_field, intensity_share
+from litho_design.optimisation import search as search_module
 from litho_design.optimisation.budget import Budget
 from litho_design.optimisation.parameters import CellMap
 from litho_design.optimisation.polish import polish_levels
@@ -107,6 +109,29 @@ def test_an_interrupted_run_ends_as_if_it_had_never_stopped(
     )
     assert resumed.files == whole.files
     assert resumed.predicted == whole.predicted
+
+
+def test_a_resumed_search_knows_what_the_interrupted_ones_took(tmp_path, monkeypatch):
+    clock, layout = itertools.count(), LayoutSettings(size_px=16)
+    seconds = [0]
+    monkeypatch.setattr(search_module, "time", SimpleNamespace(monotonic=lambda: seconds[0]))
+    settings = SearchSettings(iterations=30, checkpoint_every=10, evaluate_every=1000)
+
+    def objective(level):
+        seconds[0] += 1
+        if next(clock) in (15, 32):
+            raise KeyboardInterrupt
+        return level.square().mean(), {}
+
+    def run():
+        return search_layout(make_parametrisation(layout, settings), objective, settings, folder=tmp_path)
+
+    for _ in range(2):
+        with pytest.raises(KeyboardInterrupt):
+            run()
+    # An objective takes a second, and a step one objective; iteration 0 and the last are evaluated, too.
+    # Lost are those after the checkpoints, 4 of the first run and 7 of the second.
+    assert run().earlier_seconds == 21
 
 
 def test_a_damaged_checkpoint_is_refused(tmp_path, small_settings, make_printer, target):
