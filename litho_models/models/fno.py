@@ -212,10 +212,9 @@ class SpectralConvolution(nn.Module):
             cos_x, sin_x = _waves(torch.arange(kept_x), nx, field)
             waves_y, waves_x = torch.cat([cos_y, -sin_y]), torch.cat([cos_x, sin_x])
 
-            along_y = (waves_y @ field.reshape(-1, ny, nx * channels)).reshape(
-                -1, 2, kept_y + 1, nx, channels
-            )
-            cosine, sine = (waves_x @ along_y).split(kept_x, dim=-2)
+            along_y = waves_y @ field.reshape(-1, ny, nx * channels)
+            along_x = waves_x @ along_y.reshape(-1, 2, kept_y + 1, nx, channels)
+            cosine, sine = along_x.split(kept_x, dim=-2)
             # The field is real: along y, that of -k_y is the conjugate of that of k_y.
             above = torch.complex(cosine[:, 0] + sine[:, 1], cosine[:, 1] - sine[:, 0])
             below = torch.complex(cosine[:, 0] - sine[:, 1], -cosine[:, 1] - sine[:, 0])
@@ -243,7 +242,7 @@ class SpectralConvolution(nn.Module):
         positive, negative = torch.view_as_complex(self.weight)[..., :kept_x]
         above = functional.pad(positive[:, :, :kept_y], (0, 0, 0, 1))
         # The rows of negative frequencies end with -1.
-        below = functional.pad(negative[:, :, -kept_y:].flip(2), (0, 0, 1, 0))
+        below = functional.pad(negative.flip(2)[:, :, :kept_y], (0, 0, 1, 0))
         return torch.stack([above, below])
 
 

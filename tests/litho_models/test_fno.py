@@ -33,7 +33,7 @@ def trained(**fields):
     return model.eval()
 
 
-@pytest.mark.parametrize("shape", [(7, 8), (9, 6), (8, 2), (6, 5), (4, 3)])
+@pytest.mark.parametrize("shape", [(7, 8), (9, 6), (8, 2), (6, 5), (4, 3), (1, 6)])
 def test_the_spectral_layer_is_the_fourier_sum(shape):
     ny, nx = shape
     modes_y, modes_x, channels = 3, 2, 2
@@ -56,10 +56,10 @@ def test_the_spectral_layer_is_the_fourier_sum(shape):
             wanted = wanted + share * (mixed[:, None, None] * wave.conj()).real
     with torch.no_grad():
         found = layer(field, onto)[0].permute(2, 0, 1).numpy()
-        rows = layer(field, onto[:, 1:3], slice(1, 3))[0].permute(2, 0, 1).numpy()
+        rows = layer(field, onto[:, ny // 2 :], slice(ny // 2, ny))[0].permute(2, 0, 1).numpy()
     # Sums of some dozen products of order one, in double precision.
     assert np.abs(found - wanted).max() < 1e-12
-    assert np.abs(rows - wanted[:, 1:3]).max() < 1e-12
+    assert np.abs(rows - wanted[:, ny // 2 :]).max() < 1e-12
 
 
 def test_fixed_weights_have_the_gradient_of_weights_that_learn():
