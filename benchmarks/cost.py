@@ -76,7 +76,7 @@ def of_scans(record: Mapping[str, Any]) -> str:
     return "\n".join(
         [
             f"| {SCANS:,} scans of {record['size_px']} px | time | of the workers' processors "
-            "| memory of a worker |",
+            f"| memory of a worker after {record['scans']:,} |",
             "|---|---|---|---|",
             *rows,
         ]

@@ -145,14 +145,16 @@ def loop_table(loop: dict[str, Any], on_physics: dict[str, Any] | None = None) -
     return markdown_table(
         ("step", "what it is", "held-out error before", "after", "terms per scan", "scans better"),
         rows,
-        "A row need not begin where the last one ended: both sides of a process effect leave each scan's "
-        "shift, turn and stretch free, and both sides of one that acts as a gain go without the gain of "
-        "single scans.",
+        "Rows are the tests by which the steps were chosen, without the shared background. A row need not "
+        "begin where the last one ended: before `tilt-bow` stands the mean tilt and bow of the training "
+        "scans, both sides of a process effect leave each scan's shift, turn and stretch free, and both "
+        "sides of one that acts as a gain go without the gain of single scans.",
         *_absorbed(loop, on_physics),
         f"Base model {loop['base_model']}, {loop['split']['folds']} folds by scan: "
         f"{before['mae_datum_free_nm']:.2f} nm before with the zero of each scan free, "
         f"{after['mae_datum_free_nm']:.2f} nm after with the same. {_background([loop]).capitalize()}. "
         f"What is left: {loop['residual']['state']}" + (f"; {signature}." if signature else "."),
+        f"Made by `{loop['run']['command']}`.",
     )
 
 

@@ -100,10 +100,10 @@ def headline_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
         f"Mean absolute error over all valid pixels of {len(split['scored_ids'])} scans in {split['folds']} "
         "folds: each scan is predicted by models that were not trained on it, with the smooth background "
         "that their training scans share. k counts the terms fitted to each scan, on other pixels than those "
-        "scored. Intervals: 95 %, bootstrap over scans, which are not independent: they come from 6 prints; "
-        "for the noise, over these prints, of which a sign-flip test cannot go below p = 0.031. The noise is "
-        "an upper estimate, from what the best model leaves: what an error has above it is the least that a "
-        "better model could win.",
+        "scored. Intervals: 95 %, bootstrap over scans, for the noise over the 6 prints. Scans of a print "
+        "are not independent: with 6 prints no sign-flip test goes below p = 0.031. The noise is an upper "
+        "estimate, from what the best model leaves: a better model could win at least what an error has "
+        "above it.",
     )
 
 

@@ -22,7 +22,8 @@ low, high = scan.height_um.min(), scan.height_um.max()
 print(f"{scan.name}: {scan.height_um.shape} pixels, heights {low:.2f} … {high:.2f} µm")
 
 # %% [markdown]
-# One call reads all of them, levels them, finds each on its layout and stores the result with its history.
+# One call reads all of them, finds each on its layout and stores the result with its history. A levelling
+# recipe, if the card names one, is applied on the way.
 
 # %%
 result = litho_data.build_dataset(card, "prints.zarr")

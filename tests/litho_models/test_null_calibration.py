@@ -18,7 +18,12 @@ def test_the_page_quotes_the_committed_calibration() -> None:
     record = json.loads(null_calibration.RESULT.read_text(encoding="utf-8"))
     assert text == null_calibration.as_markdown(record)
     false = sum(bool(store["effects"] or store["probes"]) for store in record["stores"])
-    assert false <= null_calibration.ALLOWED
+    assert false <= null_calibration.most_at_the_rate(len(record["stores"]))
+
+
+def test_so_many_are_consistent_with_the_rate_and_one_more_is_not() -> None:
+    # Six or more of 40 have a probability of 0.014, five or more 0.048.
+    assert null_calibration.most_at_the_rate(40) == 5
 
 
 def test_scans_of_one_store_share_the_model_and_nothing_else() -> None:
