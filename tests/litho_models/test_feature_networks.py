@@ -10,7 +10,8 @@ import torch
 
 from litho_models.fitting import TrainingConfig, fit_in_cache, pixels
 from litho_models.frozen.files import load_frozen
-from litho_models.models import build_model, feature_networks
+from litho_models.layers import pixelwise
+from litho_models.models import build_model
 from litho_models.models.pbl import Pbl, PblConfig
 from litho_models.prediction.tiles import predict_scan
 from tests.litho_models.prints import make_scan, make_scans, printed_height_um
@@ -60,7 +61,7 @@ def test_what_does_not_change_along_x_is_measured_as_it_is_printed():
 
 def test_fixed_weights_and_learnt_ones_have_the_same_heights_and_slopes(monkeypatch):
     # Several blocks, the last not full.
-    monkeypatch.setattr(feature_networks, "_PIXELS_AT_ONCE", 700)
+    monkeypatch.setattr(pixelwise, "_PIXELS_AT_ONCE", 700)
     model, found = moved(narrow()).double(), []
     for learns in (True, False):
         field = layout().double().requires_grad_()
