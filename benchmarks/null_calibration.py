@@ -36,6 +36,7 @@ RESULT = PAGE.parent / "results" / "null-calibration" / "null_calibration.json"
 NAME = "null_calibration.json"
 SCANS, SIZE_PX, PITCH_UM, LEVELS, LEVEL_HEIGHT_UM = 12, 192, 0.1, 13, 0.1
 ROUGHNESS_UM, DATUM_SD_UM, TILT_SD_UM = 0.016, 0.03, 0.005
+# The rate that the loop claims, and how unlikely a count of false positives has to be to speak against it.
 RATE, UNLIKELY = 0.05, 0.025
 FIRST_SEED = 7000
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import torch
@@ -14,14 +14,15 @@ from torch.utils.checkpoint import checkpoint
 _PIXELS_AT_ONCE = 2**13
 
 
-def at_each_pixel(function: Callable[..., Tensor], *features: Tensor, learns: bool) -> Tensor:
+def at_each_pixel(function: Callable[..., Tensor], *features: Tensor, parameters: Iterable[Tensor]) -> Tensor:
     """``function`` of all pixels, (n,); gradients flow to the features.
 
     Args:
         function: maps features of any number m of pixels, (m, ...) each, to m values, (m,).
         features: (n, ...) each.
-        learns: whether gradients flow to what the function holds, too.
+        parameters: what the function holds; gradients flow to those that learn, too.
     """
+    learns = any(parameter.requires_grad for parameter in parameters)
     if not learns and any(feature.requires_grad for feature in features):
         values: Tensor = _WithSlopes.apply(function, *features)
         return values

@@ -90,10 +90,10 @@ class FeatureNetwork(nn.Module, ABC):
     def forward(self, field_um: Tensor) -> Tensor:
         """What the network adds to the height of the interior, (b, 1, y - 2r, x - 2r) µm."""
         features = self.features(field_um)
-        learns = any(parameter.requires_grad for parameter in self.parameters())
         with torch.autocast(device_type=field_um.device.type, enabled=False):
             pixels = (feature.flatten() for feature in features)
-            return at_each_pixel(self._at_pixels, *pixels, learns=learns).view_as(features[0])
+            added = at_each_pixel(self._at_pixels, *pixels, parameters=self.parameters())
+            return added.view_as(features[0])
 
     def _at_pixels(self, *features: Tensor) -> Tensor:
         return self.at_pixels(torch.stack(features))

@@ -119,9 +119,10 @@ class Fno(Simulator):
             if not last:
                 features = functional.gelu(features)
         features = features[:, :, :nx]
-        shape = features.shape[:3]
-        height = at_each_pixel(self._project, features.reshape(-1, config.width), learns=self._learns)
-        height = height.reshape(shape)[:, None]
+        pixels = features.reshape(-1, config.width)
+        parameters = (*self.hidden.parameters(), *self.last.parameters())
+        height = at_each_pixel(self._project, pixels, parameters=parameters)
+        height = height.reshape(features.shape[:3]).unsqueeze(1)
         return layout_um[..., rows, :] + height if config.starts_as_layout else height
 
     def _project(self, features: Tensor) -> Tensor:
@@ -129,10 +130,6 @@ class Fno(Simulator):
         hidden = functional.gelu(_pointwise(self.hidden, features))
         with torch.autocast(device_type=features.device.type, enabled=False):
             return _pointwise(self.last, hidden.to(self.last.weight.dtype))[:, 0]
-
-    @property
-    def _learns(self) -> bool:
-        return self.hidden.weight.requires_grad or self.last.weight.requires_grad
 
     def forward(self, layout_um: Tensor) -> Tensor:
         """Height of the whole field, (batch, 1, y, x) µm."""

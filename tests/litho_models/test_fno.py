@@ -73,6 +73,17 @@ def test_fixed_weights_have_the_gradient_of_weights_that_learn():
     assert (learning - fixed).abs().max() < 1e-12
 
 
+@pytest.mark.parametrize("name", ["hidden.bias", "last.bias"])
+def test_a_bias_that_learns_alone_has_its_gradient(name):
+    model = trained().requires_grad_(False)
+    bias = model.get_parameter(name).requires_grad_()
+    field = torch.rand(1, 1, 40, 50, dtype=torch.float64, requires_grad=True)
+    model(field).sum().backward()
+    # Whatever it does to the heights, all pixels see the same bias.
+    assert bias.grad is not None
+    assert bias.grad.abs().max() > 1
+
+
 @pytest.mark.parametrize(("shape", "side"), [((5, 7), 3), ((4, 3), 5), ((3, 3), 7)])
 def test_the_local_layer_is_periodic_and_so_is_its_gradient(shape, side):
     torch.manual_seed(2)

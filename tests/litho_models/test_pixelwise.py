@@ -29,7 +29,7 @@ def test_blocks_change_neither_values_nor_gradients(learns, monkeypatch):
     inputs = (wide, narrow, weight) if learns else (wide, narrow)
     wanted = function(wide, narrow)
     seen.clear()
-    found = at_each_pixel(function, wide, narrow, learns=learns)
+    found = at_each_pixel(function, wide, narrow, parameters=[weight])
     assert max(seen) == 16
     assert sum(seen) == 100
     assert torch.equal(found.detach(), wanted.detach())
@@ -43,5 +43,5 @@ def test_blocks_change_neither_values_nor_gradients(learns, monkeypatch):
 def test_fixed_weights_keep_nothing_of_the_hidden_values():
     features = torch.randn(1000, 3, requires_grad=True)
     hidden = torch.randn(3, 64)
-    found = at_each_pixel(lambda some: torch.tanh(some @ hidden).sum(-1), features, learns=False)
+    found = at_each_pixel(lambda some: torch.tanh(some @ hidden).sum(-1), features, parameters=[hidden])
     assert [kept.shape for kept in found.grad_fn.saved_tensors] == [features.shape]
