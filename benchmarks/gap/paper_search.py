@@ -36,6 +36,8 @@ SEARCHES = {"paper": ("--variant", "paper"), "ours": ()}
 # The paper's lens is square, ours a circle. Both searches make the circle, along a radius, which is exact
 # for it: on the plane an iteration through PBL or the FNO takes thirty times as long.
 SAME_LENS = ("--set", "view.aperture=circle", "--set", "view.path=radial")
+# The paper's display at its scale on the sensor, which is the preset's; for both searches.
+SAME_IMAGE = ("--set", "imaging.pixel_px=8", "--object-px", "128", "--window-px", "1024")
 # PBL with all it predicts, as the paper's: what lies along the scan lines is in the other models, too.
 ARMS = ("none", "physics", "fno", "pbl-scan-axis")
 # An iteration of the hologram through the FNO, tile by tile, takes 8 s of a core: 8 hours for its designs.
@@ -108,7 +110,7 @@ def _task(out: Path, effort: Effort, kind: str, search: str, iterations: int) ->
     )  # fmt: skip
     options += ("--target", "text") if hologram else SAME_LENS
     if kind == "computational":
-        options += task_options("--window-px", effort.window_px, "--object-px", effort.object_px)
+        options += SAME_IMAGE
     models = {arm: "none" if arm == "none" else str(model(out, arm)) for arm in _arms(kind)}
     judges = {FAB: str(out / "fab" / "truth"), MEASURED: str(zoo.folder("pbl"))}
     name = f"{_NAMES[kind]}-{search}-{iterations}"

@@ -44,8 +44,9 @@ def hologram_settings(
 
     ``paper``: as printed (13 levels, Gumbel-Softmax at temperature 0.5, random start, 1000 Adam
     iterations at 0.1, expected levels). ``authors``: as in the published code (12 levels,
-    temperature 1, wavelength 0.633 and index step 0.545; its efficiency term is constant and
-    therefore left out; its truncated, half-pixel-shifted kernel is not reproduced). ``default``:
+    temperature 1, a tenth of the rate after ten iterations without progress, wavelength 0.633 and index
+    step 0.545; its efficiency term is constant and therefore left out). What is not reproduced of
+    that code is in docs/optics.md. ``default``:
     one height per cell from a Gerchberg-Saxton start, and a polish of the printable layout.
 
     Args:
@@ -70,6 +71,9 @@ def _preset(variant: Variant) -> HologramSettings:
         variant="authors",
         layout=LayoutSettings(levels=12),
         optics=Optics(wavelength_um=0.633, index_step=0.545),
-        search=search.model_copy(update={"temperature_start": 1.0, "temperature_end": 1.0}),
+        search=search.model_copy(
+            update={"temperature_start": 1.0, "temperature_end": 1.0}
+            | {"rate_schedule": "plateau", "rate_factor": 0.1, "rate_iterations": 10}
+        ),
         loss=HologramLoss(efficiency_weight=0.0),
     )

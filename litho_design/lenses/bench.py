@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from litho_design.lenses.settings import LensView
+from litho_design.lenses.settings import ImagingSettings, LensView
 from litho_design.optics import (
     Optics,
     RadialPropagator,
@@ -138,12 +138,20 @@ def sensor_psf(psf: Tensor, pixel_px: int) -> Tensor:
     return bin_pixels(psf[..., first:last, first:last], pixel_px)
 
 
-def record(objects: Tensor, psf: Tensor, read_noise: float, seed: int) -> Tensor:
-    """Sensor images (n, size, size): psf * object plus Gaussian read noise drawn from ``seed``."""
+def record(objects: Tensor, psf: Tensor, imaging: ImagingSettings, seed: int) -> Tensor:
+    """Sensor images (n, size, size): psf * object plus read and photon noise drawn from ``seed``.
+
+    Photons are many here, so that their noise is Gaussian, too, with a variance in proportion to the signal.
+    The gradient takes its size as given.
+    """
     frame = (int(objects.shape[-2]), int(objects.shape[-1]))
     generator = torch.Generator().manual_seed(seed)
     noise = torch.randn(objects.shape, generator=generator).to(objects.device)
-    return Blur(psf, frame).forward(objects) + read_noise * noise
+    image = Blur(psf, frame).forward(objects)
+    if not imaging.photon_noise:
+        return image + imaging.read_noise * noise
+    variance = imaging.read_noise**2 + imaging.photon_noise * image.detach().clamp(min=0)
+    return image + variance.sqrt() * noise
 
 
 def reconstruct(recorded: Tensor, psf: Tensor, iterations: int) -> Tensor:

@@ -143,7 +143,7 @@ def imaging_score(
             rows.setdefault(f"ssim_{name}", []).append(found.ssim)
 
     for seed in _TEST_SEEDS:
-        seen = record(objects, real, settings.read_noise, seed)
+        seen = record(objects, real, settings, seed)
         scale = (seen * objects).sum((-2, -1)) / seen.square().sum((-2, -1))
         add("direct", seen * scale[:, None, None])
         add("design", reconstruct(seen, expected, settings.iterations))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
@@ -20,6 +21,9 @@ from litho_design.optimisation.settings import (
     check_variant,
 )
 from litho_design.printers.layout import LayoutSettings
+
+# Of a difference in grey, where white is 1: what the published code has.
+SMOOTH_BELOW = 0.1
 
 LensTaskName = Literal["direct", "computational"]
 
@@ -43,7 +47,8 @@ class ImagingSettings(Record):
 
     An object is the name of a drawing or the record of a picture (see ``with_objects``).
     ``read_noise`` is the standard deviation relative to a white object behind a lens that focuses
-    all light; the paper does not state its own.
+    all light; the paper does not state its own. The image of an object is ``object_px * pixel_px`` pixels
+    of the layout wide, and light that the PSF window leaves out does not reach it.
     """
 
     pixel_px: int = setting(2, "Side of a sensor pixel, in pixels of the layout", unit="px", ge=1)
@@ -57,6 +62,12 @@ class ImagingSettings(Record):
         ge=32,
     )
     read_noise: float = setting(0.01, "Read noise, relative to a white object", ge=0)
+    photon_noise: float = setting(
+        0.0, "Photon noise: variance over signal, both relative to a white object", ge=0
+    )
+    loss: Literal["l1", "smooth-l1"] = setting(
+        "l1", f"Error of a picture in the search: l1, or smooth-l1, a square below {SMOOTH_BELOW}"
+    )
     iterations: int = setting(50, "Iterations of the Richardson-Lucy deconvolution", ge=1)
 
     @model_validator(mode="after")
@@ -71,6 +82,10 @@ class ImagingSettings(Record):
         if not self.objects or len(self.test_objects) < 2:
             raise ValueError("at least one object for the design and two for the test are needed")
         return self
+
+
+# 36 mm of display at 140 mm, 400 µm behind the lens.
+PAPER_IMAGING = ImagingSettings(pixel_px=8, object_px=128)
 
 
 class LensSettings(DesignSettings):
@@ -96,9 +111,13 @@ def lens_settings(
     """A preset of the lens with ``changes`` by path; 120 µm, focal length 400 µm, rings of 0.1 µm.
 
     ``paper``: 13 levels, Gumbel-Softmax at temperature 0.5, 1000 AdamW iterations at 3, square
-    aperture; its rings are those of the published code, the text does not say. ``authors``: 12
-    levels, temperature 1, 2000 iterations at 1, their wavelength and index step. ``default``: a
-    circular aperture, the Fresnel phase as start, and the ring path in the search.
+    aperture; that it has rings is from the published code, the text does not say. Its display, 36 mm wide
+    at 140 mm, is 102.9 µm wide on the sensor: 128 pixels of 0.8 µm, and as wide a PSF window. The pixel is
+    ours: it samples the cut-off of NA 0.15, 2.1 µm, without aliasing. ``authors``: 12 levels, rings
+    as wide as the diagonal of a pixel, temperature 1, 2000 iterations at 1 with half the rate every 25,
+    smooth L1, read and photon noise, their wavelength and index step, objects as wide as the lens. What
+    is not reproduced of the published code is in docs/optics.md. ``default``: a circular aperture, the
+    Fresnel phase as start, and the ring path in the search.
 
     Args:
         task: focus light, or image and deconvolve; ``task`` among the changes replaces it.
@@ -117,14 +136,19 @@ def _preset(variant: Variant) -> LensSettings:
     if variant == "default":
         return default
     search = PAPER_SEARCH.model_copy(update={"optimiser": "adamw", "learning_rate": 3.0})
-    square = LensView(aperture="square", path="plane")
+    square = LensView(aperture="square", path="plane", window_px=1024)
     if variant == "paper":
-        return LensSettings(variant="paper", search=search, view=square)
-    temperature = {"temperature_start": 1.0, "temperature_end": 1.0}
+        return LensSettings(variant="paper", search=search, view=square, imaging=PAPER_IMAGING)
+    published = {"iterations": 2000, "learning_rate": 1.0, "temperature_start": 1.0, "temperature_end": 1.0}
+    halving = {"rate_schedule": "step", "rate_factor": 0.5, "rate_iterations": 25}
+    ring_um = round(math.sqrt(2) * default.layout.pitch_um, 6)
     return LensSettings(
         variant="authors",
-        layout=default.layout.model_copy(update={"levels": 12}),
+        layout=default.layout.model_copy(update={"levels": 12, "cell_um": ring_um}),
         optics=Optics(wavelength_um=0.633, index_step=0.545, distance_um=400.0),
-        search=search.model_copy(update={"iterations": 2000, "learning_rate": 1.0, **temperature}),
-        view=square,
+        search=search.model_copy(update=published | halving),
+        view=square.model_copy(update={"window_px": 1200}),
+        imaging=PAPER_IMAGING.model_copy(
+            update={"object_px": 150, "read_noise": 0.02, "photon_noise": 0.004, "loss": "smooth-l1"}
+        ),
     )

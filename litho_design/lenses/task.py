@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import smooth_l1_loss
 
 from litho_data.foundation.errors import InputError
 from litho_design.lenses.bench import (
@@ -28,7 +29,7 @@ from litho_design.lenses.score import (
     lens_score,
     score_lens,
 )
-from litho_design.lenses.settings import LensSettings
+from litho_design.lenses.settings import SMOOTH_BELOW, LensSettings
 from litho_design.optics import Optics
 from litho_design.optimisation.parameters import CellMap
 from litho_design.optimisation.starts import Scene
@@ -197,11 +198,15 @@ class ComputationalLensTask(LensTask):
     score_type = ImagingLensScore
 
     def loss(self, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
-        """The mean absolute error of the objects after Richardson-Lucy."""
+        """The error of the objects after Richardson-Lucy."""
         imaging = self.settings.imaging
         kernel = sensor_psf(seen, imaging.pixel_px)
-        image = record(self.objects, kernel, imaging.read_noise, _DESIGN_NOISE_SEED)
-        error = (reconstruct(image, kernel, imaging.iterations) - self.objects).abs().mean()
+        image = record(self.objects, kernel, imaging, _DESIGN_NOISE_SEED)
+        estimate = reconstruct(image, kernel, imaging.iterations)
+        if imaging.loss == "smooth-l1":
+            error = smooth_l1_loss(estimate, self.objects, beta=SMOOTH_BELOW)
+        else:
+            error = (estimate - self.objects).abs().mean()
         return error, {"cbr": float(self.bench.ratio(seen).detach()), "window": float(seen.detach().sum())}
 
 
@@ -225,7 +230,7 @@ def strip_rings(layout: LayoutSettings, halo_px: int, rings: int) -> Tensor:
     """
     along = torch.arange(-halo_px, layout.size_px // 2 + halo_px, dtype=torch.float64) + 0.5
     across = torch.arange(-halo_px - 1, halo_px + 1, dtype=torch.float64) + 0.5
-    ring = (torch.hypot(across[:, None], along[None, :]) / layout.cell_px).floor().long()
+    ring = (torch.hypot(across[:, None], along[None, :]) / layout.ring_px).floor().long()
     return ring.clamp(max=rings - 1)
 
 

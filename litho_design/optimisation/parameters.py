@@ -25,15 +25,15 @@ class CellMap(nn.Module):
 
     def __init__(self, layout: LayoutSettings, rows: range | None = None):
         super().__init__()
-        self.size_px, self.cell_px = layout.size_px, layout.cell_px
-        self.radial = layout.symmetry == "radial"
+        self.size_px, self.radial = layout.size_px, layout.symmetry == "radial"
         if self.radial:
             centre = torch.arange(self.size_px, dtype=torch.float64) - (self.size_px - 1) / 2
             radius_px = torch.hypot(centre[:, None], centre[None, :])
-            ring = (radius_px / self.cell_px).floor().long()
+            ring = (radius_px / layout.ring_px).floor().long()
             self.register_buffer("ring", ring, persistent=False)
             self.cells: tuple[int, ...] = (int(ring.max()) + 1,)
         else:
+            self.cell_px = layout.cell_px
             self.cells = (self.size_px // self.cell_px,) * 2
         self.of_all, self._own = self.cells, slice(None)
         if rows is not None:

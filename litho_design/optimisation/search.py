@@ -18,6 +18,7 @@ from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
 from litho_design.optimisation.parameters import DirectLevels, GumbelLevels, Parametrisation
+from litho_design.optimisation.rate import RateSchedule
 from litho_design.optimisation.settings import SearchSettings
 from litho_design.printers.layout import LayoutSettings
 
@@ -89,19 +90,21 @@ def search_layout(
     """
     optimiser_class = torch.optim.Adam if settings.optimiser == "adam" else torch.optim.AdamW
     optimiser = optimiser_class(parameters.parameters(), lr=settings.learning_rate * parameters.rate_unit)
+    rate = RateSchedule(optimiser, settings)
     state = SearchState()
     checkpoint = None if folder is None else _checkpoint(folder, part)
     if checkpoint is not None and checkpoint.exists():
-        state = _resume(checkpoint, parameters, optimiser, fingerprint)
+        state = _resume(checkpoint, parameters, optimiser, rate, fingerprint)
     started = time.monotonic() - state.earlier_seconds
     remaining = range(state.iteration, settings.iterations)
     for iteration in progress(remaining, what, total=len(remaining), estimate_of=0):
         step_loss = _step(parameters, objective, optimiser, settings, iteration)
+        rate.after_step(step_loss)
         state.iteration = iteration + 1
         if iteration % settings.evaluate_every == 0 or state.iteration == settings.iterations:
             _evaluate(parameters, objective, settings, state, step_loss)
         if checkpoint is not None and state.iteration % settings.checkpoint_every == 0:
-            _save(checkpoint, parameters, optimiser, state, fingerprint, time.monotonic() - started)
+            _save(checkpoint, parameters, optimiser, rate, state, fingerprint, time.monotonic() - started)
     return state
 
 
@@ -167,6 +170,7 @@ def _save(
     path: Path,
     parameters: Parametrisation,
     optimiser: torch.optim.Optimizer,
+    rate: RateSchedule,
     state: SearchState,
     fingerprint: str,
     seconds: float,
@@ -175,6 +179,7 @@ def _save(
         "fingerprint": fingerprint,
         "parameters": parameters.state_dict(),
         "optimiser": optimiser.state_dict(),
+        "rate": rate.state_dict(),
         "iteration": state.iteration,
         "best_loss": state.best_loss,
         "best_levels": state.best_levels,
@@ -186,7 +191,11 @@ def _save(
 
 
 def _resume(
-    path: Path, parameters: Parametrisation, optimiser: torch.optim.Optimizer, fingerprint: str
+    path: Path,
+    parameters: Parametrisation,
+    optimiser: torch.optim.Optimizer,
+    rate: RateSchedule,
+    fingerprint: str,
 ) -> SearchState:
     content = _load(path)
     if content["fingerprint"] != fingerprint:
@@ -198,10 +207,11 @@ def _resume(
         )
     parameters.load_state_dict(content["parameters"])
     optimiser.load_state_dict(content["optimiser"])
+    rate.load_state_dict(content.get("rate", {}))
     best_levels = content["best_levels"]
     if best_levels is not None:
         best_levels = best_levels.to(next(parameters.parameters()).device)
-    # Older checkpoints have no seconds.
+    # Older checkpoints have no seconds, and above no rate: theirs was constant.
     seconds = content.get("seconds", 0.0)
     return SearchState(content["iteration"], content["best_loss"], best_levels, content["history"], seconds)
 

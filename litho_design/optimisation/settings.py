@@ -49,6 +49,13 @@ class SearchSettings(Record):
         option="--learning-rate",
         gt=0,
     )
+    rate_schedule: Literal["constant", "step", "plateau"] = setting(
+        "constant",
+        "Learning rate over the iterations: constant; times rate_factor every rate_iterations (step); or "
+        "after more than as many whose samples have no lower loss (plateau)",
+    )
+    rate_factor: float = setting(0.5, "Factor of the learning rate at each of these times", gt=0, lt=1)
+    rate_iterations: int = setting(25, "Iterations between them, or without a lower loss", ge=1)
     temperature_start: float = setting(2.0, "Gumbel temperature at the start", gt=0)
     temperature_end: float = setting(0.1, "Gumbel temperature at the end", gt=0)
     hard_from: float = setting(

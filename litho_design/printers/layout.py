@@ -44,6 +44,20 @@ class LayoutSettings(Record):
         return self.size_px * self.pitch_um
 
     @property
+    def ring_px(self) -> float:
+        """Width of a ring in pixels; it need not be a whole number.
+
+        Raises:
+            InputError: rings narrower than a pixel.
+        """
+        # 0.7 / 0.1 is a little less than 7, and a pixel on the edge would change its ring.
+        width_px = round(self.cell_um / self.pitch_um, 9)
+        if width_px < 1:
+            wanted = f"rings of a pixel, {self.pitch_um} µm, or wider"
+            raise InputError("cell_um", got=f"{self.cell_um} µm", wanted=wanted)
+        return width_px
+
+    @property
     def cell_px(self) -> int:
         """Pixels per cell side.
 

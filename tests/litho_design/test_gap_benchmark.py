@@ -26,6 +26,7 @@ from litho_data.virtual_fab.settings import Printer
 from litho_data.virtual_fab.strength import default_fields
 from litho_design.cli.app import app
 from litho_design.judging.gap import GapEntry, paired_differences, summarise
+from litho_design.lenses.settings import lens_settings
 from litho_models import save_frozen
 from litho_models.models import build_model
 
@@ -197,6 +198,10 @@ def test_the_papers_search_and_ours_get_the_same_iterations_arms_and_judges(tmp_
         assert (task.models, task.judges, task.seeds) == (other.models, other.judges, other.seeds)
         assert task.iterations == int(iterations)
         assert ("--variant" in task.options) == (search == "paper")
+        if kind == "lens-computational":
+            preset, given = lens_settings("computational", "paper"), " ".join(task.options)
+            assert f"imaging.pixel_px={preset.imaging.pixel_px}" in given
+            assert f"--object-px {preset.imaging.object_px} --window-px {preset.view.window_px}" in given
         # A third of the iterations three times costs what all of them cost once.
         assert task.iterations * task.seeds == pytest.approx(1000, rel=2e-3)
 
