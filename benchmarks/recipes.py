@@ -1,10 +1,12 @@
 """The paper's recipe on the paper's models, its learning curves, and the fast recipe beside it, on one draw.
 
     python -m benchmarks.recipes STORE [--runs paper-pbl] --publish
+    python -m benchmarks.recipes STORE --runs paper-physics,paper-pbl,paper-fno --epochs 4000 --publish
 
 ``--fast`` is the result of `litho-models benchmark STORE --split paper` with the fast recipe in float32; two
 runs repeat it in bfloat16 and from another seed. An interrupted run resumes. The page shows all runs that are
-published, those of earlier calls too. All epochs of the paper, ``--epochs 4000``, are a task for a GPU.
+published, those of earlier calls too; those of the paper's recipe have equal epochs. All 4,000 epochs of
+the paper are a task for a GPU.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from benchmarks.learning_curves import STEPS_PER_EPOCH, curve_table, draw_curves
 from benchmarks.markdown_table import markdown_table, with_interval
 from benchmarks.record import options, publish
 from litho_data.foundation.commands import run_script
+from litho_data.foundation.errors import InputError
 from litho_models.evaluation.benchmark import benchmark
 from litho_models.evaluation.fit_cache import FitRecord
 from litho_models.evaluation.results import Benchmark
@@ -51,6 +54,8 @@ def main() -> None:
     given = parser.parse_args()
     fast = Benchmark.read(given.fast)
     runs, wanted = published_runs(), given.runs.split(",")
+    kept = [result for name, result in runs.items() if name not in wanted]
+    _require_equal_epochs(_paper_fits(kept), given.epochs)
     for name in wanted:
         models, settings = RUNS[name]
         if settings.get("recipe") == "paper":
@@ -71,6 +76,19 @@ def main() -> None:
             runs[name].write(FOLDER / name)
         draw_curves(_paper_fits(shown), FOLDER / CURVES)
         publish(PAGE, MARK, text)
+
+
+def _require_equal_epochs(kept: Sequence[FitRecord], epochs: int) -> None:
+    """Curves and errors stand side by side, so all are of as many epochs."""
+    others = {fit.steps[-1] // STEPS_PER_EPOCH for fit in kept} - {epochs}
+    if others:
+        paper = ",".join(name for name in RUNS if name.startswith("paper-"))
+        raise InputError(
+            f"--epochs {epochs}",
+            got=f"published runs of {min(others):,} epochs beside it",
+            wanted="the same for all runs of the paper's recipe",
+            hint=f"--runs {paper}",
+        )
 
 
 def published_runs() -> dict[str, Benchmark]:

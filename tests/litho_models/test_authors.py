@@ -7,6 +7,7 @@ import pytest
 import tifffile
 import torch
 from scipy.signal import fftconvolve
+from scipy.stats import norm
 
 from litho_data.foundation.errors import InputError
 from litho_models.models import build_model
@@ -110,6 +111,36 @@ def test_pbl_is_the_transcribed_equations(variant, knots, tolerance_um):
     dose = np.abs(dose) if variant == "authors" else dose
     wanted = areawise(initial * pointwise("shrink", dose))
     assert np.abs(in_double(model, layout_um()) - wanted).max() < tolerance_um
+
+
+@pytest.mark.parametrize("variant", ["paper", "authors"])
+def test_fno_is_the_transcribed_operator(variant):
+    torch.manual_seed(6)
+    model = build_model("fno", variant).double()
+    state = {name: value.numpy() for name, value in model.state_dict().items()}
+
+    def mapped(part: str, features: np.ndarray) -> np.ndarray:
+        weight, bias = state[f"{part}.weight"][:, :, 0, 0], state[f"{part}.bias"]
+        return np.tensordot(weight, features, 1) + bias[:, None, None]
+
+    def gelu(values: np.ndarray) -> np.ndarray:
+        return values * norm.cdf(values)
+
+    layout = layout_um()
+    ramp = np.linspace(0, 1, len(layout))
+    features = mapped("lift", np.stack([layout, *np.meshgrid(ramp, ramp, indexing="ij")]))
+    zeros = 9 if variant == "authors" else round(9 / 256 * len(layout))
+    features = np.pad(features, ((0, 0), (0, zeros), (0, zeros)))
+    for layer in range(4):
+        matrices = state[f"spectral.{layer}.weight"] @ [1, 1j]
+        spectrum = np.fft.rfft2(features)
+        kept = np.zeros_like(spectrum)
+        for rows, matrix in ((slice(0, 12), matrices[0]), (slice(-12, None), matrices[1])):
+            kept[:, rows, :12] = np.einsum("iyx,ioyx->oyx", spectrum[:, rows, :12], matrix)
+        features = np.fft.irfft2(kept, s=features.shape[1:]) + mapped(f"local.{layer}", features)
+        features = features if layer == 3 else gelu(features)
+    wanted = mapped("last", gelu(mapped("hidden", features[:, : len(layout), : len(layout)])))[0]
+    assert np.abs(in_double(model, layout) - wanted).max() < 1e-9
 
 
 def test_models_frozen_with_the_older_variants_print_as_they_did():

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks import recipes
 from benchmarks.learning_curves import STEPS_PER_EPOCH, curve_table
+from litho_data.foundation.errors import InputError
 from litho_models.evaluation.fit_cache import FitRecord
 
 
@@ -24,3 +26,9 @@ def test_a_power_law_goes_on_as_it_is_and_a_flat_curve_stays():
     assert float(rows[0][-1].split()[0]) == pytest.approx((900 * later**-0.5).mean(), abs=0.06)
     assert rows[0][2] == "45.00 nm, epoch 400"
     assert rows[1][3:] == ["20.00 ± 0.00 nm", "20.00 ± 0.00 nm", "20.0 nm |"]
+
+
+def test_runs_of_other_epochs_are_not_shown_side_by_side(monkeypatch):
+    monkeypatch.setattr("sys.argv", ["recipes", "no.zarr", "--runs", "paper-pbl", "--epochs", "4000"])
+    with pytest.raises(InputError, match="published runs of 400 epochs beside it"):
+        recipes.main()
