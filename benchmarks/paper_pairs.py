@@ -64,7 +64,8 @@ def bounds(store: Store, leave_out: tuple[str, ...] = ()) -> list[dict[str, Any]
             height - np.tensordot(fitted[own], one, 1)
             for height, one, own in zip(height_nm, used, prints, strict=True)
         ]
-        rows.append({"model": name, "terms": terms, "left_out": [*leave_out], **_errors(residuals, prints)})
+        row = {"model": name, "terms": terms, "left_out": [*leave_out], **_errors(residuals, prints)}
+        rows.append(row if held_out else row | {"gain": float(fitted[prints[0]][1])})
     return rows
 
 
