@@ -65,7 +65,7 @@ def bounds(store: Store, leave_out: tuple[str, ...] = ()) -> list[dict[str, Any]
             for height, one, own in zip(height_nm, used, prints, strict=True)
         ]
         row = {"model": name, "terms": terms, "left_out": [*leave_out], **_errors(residuals, prints)}
-        rows.append(row if held_out else row | {"gain": float(fitted[prints[0]][1])})
+        rows.append(row if held_out else row | {"gain": float(fitted[prints[0]][1]) / NM_PER_UM})
     return rows
 
 

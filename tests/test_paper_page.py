@@ -89,6 +89,7 @@ def test_the_bound_is_the_mean_size_of_the_planted_datums() -> None:
         allowed = 1 if found["terms"] == paper_pairs.AFFINE else 18
         assert found["datum_size"]["mean_nm"] == pytest.approx(30, abs=allowed)
         assert found["mae"]["mean_nm"] >= found["datum_size"]["mean_nm"]
+        assert found.get("gain", 0.8) == pytest.approx(0.8, abs=0.005)
         # Gaussian of 10 nm: 0.798 of it.
         assert found["mae_datum_freed"]["mean_nm"] == pytest.approx(7.98, abs=0.4)
 
