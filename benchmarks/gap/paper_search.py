@@ -98,7 +98,8 @@ def _task(out: Path, effort: Effort, kind: str, search: str, iterations: int) ->
     if kind == "computational":
         options += SAME_IMAGE
     models = {arm: "none" if arm == "none" else str(model(out, arm)) for arm in arms_of(kind)}
-    judges = {FAB: str(out / "fab" / "truth"), MEASURED: str(zoo.folder("pbl"))}
+    judges = {FAB: str(out / "fab" / "truth")}
+    judges |= {name: str(zoo.folder(model)) for name, model in MEASURED.items()}
     name = f"{NAMES[kind]}-{search}-{iterations}"
     return Task(name, kind, options, models, judges, SEEDS_OF[iterations])
 

@@ -15,7 +15,9 @@ SEARCHES = {"paper": ("--variant", "paper"), "ours": ()}
 ARMS = ("none", "physics", "fno", "pbl-scan-axis")
 # An iteration of the hologram through the FNO, tile by tile, takes 8 s of a core: 8 hours for its designs.
 LEFT_OUT = {"hoe": ("fno",)}
-FAB, MEASURED = "fab", "measured-pbl"
+FAB = "fab"
+# The models of the measured prints: machines that none of the arms knows.
+MEASURED = {f"measured-{name}": name for name in ("physics", "fno", "pbl")}
 NAMES = {"hoe": "hoe", "direct": "lens-direct", "computational": "lens-computational"}
 
 
@@ -44,43 +46,50 @@ def _table(kind: str, tasks: Mapping[str, Mapping[str, Any]]) -> str:
         for seeds in (SEEDS_OF[iterations],)
     ]
     found = [tasks.get(f"{NAMES[kind]}-{search}-{iterations}") for search, iterations in columns]
-    rows = [
-        (arm, judge, *_cells(found, arm, judge, figure)) for judge in (FAB, MEASURED) for arm in arms_of(kind)
+    judges = [
+        judge for judge in (FAB, *MEASURED) if any(task and _by_arm(task, judge, figure) for task in found)
     ]
+    rows = [(arm, judge, *_cells(found, arm, judge, figure)) for judge in judges for arm in arms_of(kind)]
     better = "more" if sign > 0 else "less"
     return f"### {TITLES[NAMES[kind]]}: {LABELS[figure]}, {better} is better\n\n" + markdown_table(
         ("designed with", "printed by", *heads),
         rows,
         _minutes_text(columns, found),
         *_layout_texts(columns, found),
-        *_leads(columns, found, figure, sign),
+        *_leads(columns, found, figure, sign, judges),
     )
 
 
 def _cells(found: Sequence[Mapping[str, Any] | None], arm: str, judge: str, figure: str) -> Iterator[str]:
     for task in found:
-        if task is None:
+        row = _by_arm(task, judge, figure).get(arm) if task else None
+        if row is None:
             yield "not made yet"
             continue
-        row = _rows_ofarms_of(task, judge, figure)[arm]
         digits, interval = figure_digits(figure), row["judged_ci95"]
         spread = f" ± {(interval[1] - interval[0]) / 2:.{digits}f}" if interval else ""
         yield f"{row['designed_mean']:.{digits}f} → {row['judged_mean']:.{digits}f}{spread}"
 
 
 def _leads(
-    columns: Sequence[tuple[str, int]], found: Sequence[Mapping[str, Any] | None], figure: str, sign: int
+    columns: Sequence[tuple[str, int]],
+    found: Sequence[Mapping[str, Any] | None],
+    figure: str,
+    sign: int,
+    judges: Sequence[str],
 ) -> Iterator[str]:
-    """The best arm of every search that ran from several seeds, by each printer."""
+    """The best arm of every search that ran from several seeds: by the fab its leads, else over the next."""
     for (search, iterations), task in zip(columns, found, strict=True):
         if task is None or task["seeds"] == 1:
             continue
-        for judge in (FAB, MEASURED):
-            means = {arm: row["judged_mean"] for arm, row in _rows_ofarms_of(task, judge, figure).items()}
+        for judge in judges:
+            means = {arm: row["judged_mean"] for arm, row in _by_arm(task, judge, figure).items()}
+            if judge != FAB:
+                means = dict(sorted(means.items(), key=lambda item: -sign * item[1])[:2])
             yield f"{search}, {iterations:,}: {lead_text(task['paired'], means, figure, sign, judge)}"
 
 
-def _rows_ofarms_of(task: Mapping[str, Any], judge: str, figure: str) -> dict[str, Mapping[str, Any]]:
+def _by_arm(task: Mapping[str, Any], judge: str, figure: str) -> dict[str, Mapping[str, Any]]:
     """What one printer made of one figure, by the arm that it was designed with."""
     return {row["arm"]: row for row in task["summary"] if (row["judge"], row["figure"]) == (judge, figure)}
 
