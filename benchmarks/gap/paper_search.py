@@ -18,7 +18,7 @@ from typing import Any
 
 from benchmarks.gap.document import PAGE, RESULTS, search_minutes
 from benchmarks.gap.jobs import run_commands
-from benchmarks.gap.paper_tables import FAB, MEASURED, NAMES, SEARCHES, SEEDS_OF, arms_of, as_markdown
+from benchmarks.gap.paper_tables import ARMS, FAB, MEASURED, NAMES, SEARCHES, SEEDS_OF, as_markdown
 from benchmarks.gap.plan import Effort, Plan, model, open_plan
 from benchmarks.gap.steps import fab_jobs, model_jobs
 from benchmarks.gap.tables import SHOWN
@@ -97,7 +97,7 @@ def _task(out: Path, effort: Effort, kind: str, search: str, iterations: int) ->
     options += ("--target", "text") if hologram else SAME_LENS
     if kind == "computational":
         options += SAME_IMAGE
-    models = {arm: "none" if arm == "none" else str(model(out, arm)) for arm in arms_of(kind)}
+    models = {arm: "none" if arm == "none" else str(model(out, arm)) for arm in ARMS}
     judges = {FAB: str(out / "fab" / "truth")}
     judges |= {name: str(zoo.folder(model)) for name, model in MEASURED.items()}
     name = f"{NAMES[kind]}-{search}-{iterations}"

@@ -13,17 +13,10 @@ SEEDS_OF = {1000: 1, 333: 3}
 SEARCHES = {"paper": ("--variant", "paper"), "ours": ()}
 # PBL with all it predicts, as the paper's: what lies along the scan lines is in the other models, too.
 ARMS = ("none", "physics", "fno", "pbl-scan-axis")
-# An iteration of the hologram through the FNO, tile by tile, takes 8 s of a core: 8 hours for its designs.
-LEFT_OUT = {"hoe": ("fno",)}
 FAB = "fab"
 # The models of the measured prints: machines that none of the arms knows.
 MEASURED = {f"measured-{name}": name for name in ("physics", "fno", "pbl")}
 NAMES = {"hoe": "hoe", "direct": "lens-direct", "computational": "lens-computational"}
-
-
-def arms_of(kind: str) -> list[str]:
-    """What a kind of element is designed with."""
-    return [arm for arm in ARMS if arm not in LEFT_OUT.get(kind, ())]
 
 
 def as_markdown(record: Mapping[str, Any]) -> str:
@@ -49,7 +42,7 @@ def _table(kind: str, tasks: Mapping[str, Mapping[str, Any]]) -> str:
     judges = [
         judge for judge in (FAB, *MEASURED) if any(task and _by_arm(task, judge, figure) for task in found)
     ]
-    rows = [(arm, judge, *_cells(found, arm, judge, figure)) for judge in judges for arm in arms_of(kind)]
+    rows = [(arm, judge, *_cells(found, arm, judge, figure)) for judge in judges for arm in ARMS]
     better = "more" if sign > 0 else "less"
     return f"### {TITLES[NAMES[kind]]}: {LABELS[figure]}, {better} is better\n\n" + markdown_table(
         ("designed with", "printed by", *heads),
