@@ -8,7 +8,7 @@ import numpy as np
 
 from litho_data.register.coarse import CoarseFit
 from litho_data.register.evidence import BlockShifts, bootstrap_corner_sd_px, match_blocks_of_field
-from litho_data.register.geometry import centre, linear_part, overlap_of
+from litho_data.register.geometry import apply_transform, centre, linear_part, overlap_of
 from litho_data.register.orientation import rival_alignment, rival_orientation
 from litho_data.register.pyramid import FineFit
 from litho_data.register.topography import quadratic_basis
@@ -41,13 +41,20 @@ def figures_of_fit(coarse: CoarseFit, fine: FineFit, pitch_um: float) -> dict[st
 def figures_of_warp(
     layout_to_scan: np.ndarray, layout_shape: tuple[int, int], pitch_um: float
 ) -> dict[str, Any]:
-    """Scale and rotation at the layout's middle; of a bent scan, those of the closest affine."""
-    linear = np.linalg.inv(linear_part(layout_to_scan, (centre(layout_shape) + 0.5) * pitch_um))
+    """Place, scale and rotation at the layout's middle; of a bent scan, those of the closest affine.
+
+    The place: where the middle lies in the scan less where it lies in the layout.
+    """
+    middle_um = (centre(layout_shape) + 0.5) * pitch_um
+    linear = np.linalg.inv(linear_part(layout_to_scan, middle_um))
+    shift_um = apply_transform(layout_to_scan, middle_um[None])[0] - middle_um
     left, singular, right = np.linalg.svd(linear)
     turn = left @ right
     return {
         "singular_max": float(singular[0]),
         "singular_min": float(singular[1]),
+        "shift_x_um": float(shift_um[0]),
+        "shift_y_um": float(shift_um[1]),
         "rotation_deg": float(np.degrees(np.arctan2(turn[1, 0], turn[0, 0]))),
     }
 

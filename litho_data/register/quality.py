@@ -51,6 +51,8 @@ class RegistrationQuality:
     corner_sd_nm: float
     singular_max: float
     singular_min: float
+    shift_x_um: float
+    shift_y_um: float
     rotation_deg: float
     layout_repeats: float
     second_alignment: float

@@ -74,6 +74,10 @@ def test_ladder_stops_at_the_rung_the_phantom_was_made_with(rung):
     assert found.quality.model == rung
     error = warp_error_px(found.scan_to_layout, true_scan_to_layout(warp, "identity", SCAN_SHAPE), SHAPE)
     assert error < 0.3
+    wanted_um = PITCH_UM * np.add((3.3, -4.6), MARGIN_PX)
+    # The same 0.3 px.
+    shift_um = (found.quality.shift_x_um, found.quality.shift_y_um)
+    assert shift_um == pytest.approx(wanted_um, abs=0.3 * PITCH_UM)
 
 
 def test_homography_model_recovers_a_perspective_that_an_affine_cannot():
