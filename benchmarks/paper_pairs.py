@@ -4,9 +4,9 @@
     litho-data import-pairs neural-lithography --out pairs.zarr
     python -m benchmarks.paper_pairs pairs.zarr --publish
 
-The mean of a quadrant's residual is its datum, and |mean r| ≤ mean |r|: the mean size of the datums bounds
-the error of a model from below. How large they are depends on the model: what it knows of a layout may
-tell its zero, because the published maps start at their lowest point.
+The mean of a quadrant's residual is its datum, and |mean r| ≤ mean |r|: no error is smaller than the mean
+size of the datums that a model leaves. What it knows of a layout may tell its zero, because the published
+maps start at their lowest point.
 """
 
 from __future__ import annotations
@@ -82,12 +82,13 @@ def _fit(
     features: Sequence[np.ndarray], height_nm: Sequence[np.ndarray], prints: Sequence[str], held_out: bool
 ) -> dict[str, np.ndarray]:
     """Least squares for each print: of the others, or of all."""
-    normal = [np.tensordot(one, one, ((1, 2), (1, 2))) for one in features]
-    right = [np.tensordot(one, h, ((1, 2), (0, 1))) for one, h in zip(features, height_nm, strict=True)]
-    found = {}
+    pairs = list(zip(features, height_nm, strict=True))
+    normal = np.array([np.tensordot(one, one, ((1, 2), (1, 2))) for one, _ in pairs])
+    right = np.array([np.tensordot(one, height, ((1, 2), (0, 1))) for one, height in pairs])
+    groups, found = np.array(prints), {}
     for own in set(prints):
-        used = [index for index, other in enumerate(prints) if not held_out or other != own]
-        found[own] = np.linalg.solve(sum(normal[k] for k in used), sum(right[k] for k in used))
+        used = groups != own if held_out else np.full(len(groups), True)
+        found[own] = np.linalg.solve(normal[used].sum(0), right[used].sum(0))
     return found
 
 

@@ -81,6 +81,16 @@ def first_difference(then: Mapping[str, Any], now: Mapping[str, Any], path: str 
     return ""
 
 
+def first_addition(then: Mapping[str, Any], now: Mapping[str, Any], path: str = "") -> str:
+    """The first setting of ``now`` that ``then`` does not have, by its path; "" if there is none."""
+    for name, after in now.items():
+        if name not in then:
+            return f"{path}{name}"
+        if isinstance(after, dict) and (deeper := first_addition(then[name] or {}, after, f"{path}{name}.")):
+            return deeper
+    return ""
+
+
 def require_own_folder(
     path: str | Path, record: str, *begun: str, subject: Mapping[str, object] | None = None
 ) -> None:

@@ -44,10 +44,10 @@ def hologram_settings(
 
     ``paper``: as printed (13 levels, Gumbel-Softmax at temperature 0.5, random start, 1000 Adam
     iterations at 0.1, expected levels). ``authors``: as in the published code (12 levels,
-    temperature 1, a tenth of the rate after ten iterations without progress, wavelength 0.633 and index
-    step 0.545; its efficiency term is constant and therefore left out). What is not reproduced of
-    that code is in docs/optics.md. ``default``:
-    one height per cell from a Gerchberg-Saxton start, and a polish of the printable layout.
+    temperature 1, a tenth of the rate after more than ten iterations without progress, wavelength 0.633
+    and index step 0.545; its efficiency term is constant and therefore left out). What is not reproduced
+    of that code is in docs/optics.md. ``default``: one height per cell from a Gerchberg-Saxton start, and
+    a polish of the printable layout.
 
     Args:
         variant: the preset; ``variant`` among the changes replaces it.

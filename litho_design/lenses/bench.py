@@ -141,8 +141,7 @@ def sensor_psf(psf: Tensor, pixel_px: int) -> Tensor:
 def record(objects: Tensor, psf: Tensor, imaging: ImagingSettings, seed: int) -> Tensor:
     """Sensor images (n, size, size): psf * object plus read and photon noise drawn from ``seed``.
 
-    Photons are many here, so that their noise is Gaussian, too, with a variance in proportion to the signal.
-    The gradient takes its size as given.
+    Photon noise is Gaussian here, too, with the variance of Poisson's; the gradient takes its size as given.
     """
     frame = (int(objects.shape[-2]), int(objects.shape[-1]))
     generator = torch.Generator().manual_seed(seed)

@@ -84,8 +84,8 @@ class ImagingSettings(Record):
         return self
 
 
-# 36 mm of display at 140 mm, 400 µm behind the lens.
-PAPER_IMAGING = ImagingSettings(pixel_px=8, object_px=128)
+# 36 mm of display at 140 mm are 102.9 µm at 400 µm. An object has a dark border of an eighth on each side.
+PAPER_IMAGING = ImagingSettings(pixel_px=10, object_px=137)
 
 
 class LensSettings(DesignSettings):
@@ -108,11 +108,11 @@ class LensSettings(DesignSettings):
 def lens_settings(
     task: LensTaskName = "direct", variant: Variant = "default", changes: Mapping[str, Any] | None = None
 ) -> LensSettings:
-    """A preset of the lens with ``changes`` by path; 120 µm, focal length 400 µm, rings of 0.1 µm.
+    """A preset of the lens with ``changes`` by path; 120 µm, focal length 400 µm, rings.
 
     ``paper``: 13 levels, Gumbel-Softmax at temperature 0.5, 1000 AdamW iterations at 3, square
     aperture; that it has rings is from the published code, the text does not say. Its display, 36 mm wide
-    at 140 mm, is 102.9 µm wide on the sensor: 128 pixels of 0.8 µm, and as wide a PSF window. The pixel is
+    at 140 mm, is 102.9 µm wide on the sensor: 103 pixels of 1 µm, and as wide a PSF window. The pixel is
     ours: it samples the cut-off of NA 0.15, 2.1 µm, without aliasing. ``authors``: 12 levels, rings
     as wide as the diagonal of a pixel, temperature 1, 2000 iterations at 1 with half the rate every 25,
     smooth L1, read and photon noise, their wavelength and index step, objects as wide as the lens. What
@@ -136,12 +136,12 @@ def _preset(variant: Variant) -> LensSettings:
     if variant == "default":
         return default
     search = PAPER_SEARCH.model_copy(update={"optimiser": "adamw", "learning_rate": 3.0})
-    square = LensView(aperture="square", path="plane", window_px=1024)
+    square = LensView(aperture="square", path="plane", window_px=1030)
     if variant == "paper":
         return LensSettings(variant="paper", search=search, view=square, imaging=PAPER_IMAGING)
     published = {"iterations": 2000, "learning_rate": 1.0, "temperature_start": 1.0, "temperature_end": 1.0}
     halving = {"rate_schedule": "step", "rate_factor": 0.5, "rate_iterations": 25}
-    ring_um = round(math.sqrt(2) * default.layout.pitch_um, 6)
+    ring_um = math.sqrt(2) * default.layout.pitch_um
     return LensSettings(
         variant="authors",
         layout=default.layout.model_copy(update={"levels": 12, "cell_um": ring_um}),
@@ -149,6 +149,6 @@ def _preset(variant: Variant) -> LensSettings:
         search=search.model_copy(update=published | halving),
         view=square.model_copy(update={"window_px": 1200}),
         imaging=PAPER_IMAGING.model_copy(
-            update={"object_px": 150, "read_noise": 0.02, "photon_noise": 0.004, "loss": "smooth-l1"}
+            update={"object_px": 160, "read_noise": 0.02, "photon_noise": 0.004, "loss": "smooth-l1"}
         ),
     )

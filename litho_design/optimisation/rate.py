@@ -7,7 +7,7 @@ from typing import Any
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import ReduceLROnPlateau, StepLR
 
-from litho_design.optimisation.settings import SearchSettings
+from litho_design.optimisation.settings import PROGRESS, SearchSettings
 
 
 class RateSchedule:
@@ -18,8 +18,13 @@ class RateSchedule:
         if settings.rate_schedule == "step":
             self._schedule = StepLR(optimiser, settings.rate_iterations, settings.rate_factor)
         elif settings.rate_schedule == "plateau":
+            # Relative to the loss, PyTorch's own, a threshold is none where a loss is negative.
             self._schedule = ReduceLROnPlateau(
-                optimiser, factor=settings.rate_factor, patience=settings.rate_iterations
+                optimiser,
+                factor=settings.rate_factor,
+                patience=settings.rate_iterations,
+                threshold=PROGRESS,
+                threshold_mode="abs",
             )
 
     def after_step(self, loss: float) -> None:

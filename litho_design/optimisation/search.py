@@ -207,13 +207,13 @@ def _resume(
         )
     parameters.load_state_dict(content["parameters"])
     optimiser.load_state_dict(content["optimiser"])
-    rate.load_state_dict(content.get("rate", {}))
+    rate.load_state_dict(content["rate"])
     best_levels = content["best_levels"]
     if best_levels is not None:
         best_levels = best_levels.to(next(parameters.parameters()).device)
-    # Older checkpoints have no seconds, and above no rate: theirs was constant.
-    seconds = content.get("seconds", 0.0)
-    return SearchState(content["iteration"], content["best_loss"], best_levels, content["history"], seconds)
+    return SearchState(
+        content["iteration"], content["best_loss"], best_levels, content["history"], content["seconds"]
+    )
 
 
 def _load(path: Path) -> dict[str, Any]:

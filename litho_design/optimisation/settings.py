@@ -14,6 +14,9 @@ from litho_design.optimisation.fabrication import Fabrication
 from litho_design.optimisation.process_window import ProcessWindow
 from litho_design.printers.layout import LayoutSettings
 
+# What a loss has to fall by, so that it counts.
+PROGRESS = 1e-4
+
 Variant = Literal["default", "paper", "authors"]
 StartName = Literal["random", "gs", "wgs", "fresnel", "inverse"]
 
@@ -52,10 +55,10 @@ class SearchSettings(Record):
     rate_schedule: Literal["constant", "step", "plateau"] = setting(
         "constant",
         "Learning rate over the iterations: constant; times rate_factor every rate_iterations (step); or "
-        "after more than as many whose samples have no lower loss (plateau)",
+        f"after more than as many in a row whose samples have no loss lower by {PROGRESS:g} (plateau)",
     )
     rate_factor: float = setting(0.5, "Factor of the learning rate at each of these times", gt=0, lt=1)
-    rate_iterations: int = setting(25, "Iterations between them, or without a lower loss", ge=1)
+    rate_iterations: int = setting(25, "Iterations between these times, or without a lower loss", ge=1)
     temperature_start: float = setting(2.0, "Gumbel temperature at the start", gt=0)
     temperature_end: float = setting(0.1, "Gumbel temperature at the end", gt=0)
     hard_from: float = setting(

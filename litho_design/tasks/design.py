@@ -12,7 +12,7 @@ from pydantic import Field
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file, writable
 from litho_data.foundation.hashes import file_sha256
-from litho_data.foundation.outputs import first_difference, require_own_folder
+from litho_data.foundation.outputs import first_addition, first_difference, require_own_folder
 from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import RunFacts, run_facts
 from litho_design.images.targets import TargetRecord
@@ -142,11 +142,16 @@ def finished_design(folder: Path, fingerprint: str, settings: DesignSettings) ->
         return None
     design = Design.read(folder)
     if design.fingerprint != fingerprint:
-        setting = first_difference(design.settings, settings.model_dump(mode="json"))
-        other = f"other settings, {setting}" if setting else "another target or model, or other bands"
+        asked = settings.model_dump(mode="json")
+        if setting := first_difference(design.settings, asked):
+            other = f"a design with other settings, {setting}"
+        elif setting := first_addition(design.settings, asked):
+            other = f"a design of a version without the setting {setting}"
+        else:
+            other = "a design with another target or model, or other bands"
         raise InputError(
             f"folder {folder}",
-            got=f"a design with {other}",
+            got=other,
             wanted="the same settings, target and model",
             hint="choose another --out",
         )

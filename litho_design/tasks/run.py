@@ -148,7 +148,7 @@ def _gauge(task: Task, levels: Tensor, layout_array: np.ndarray) -> OutOfDistrib
         return gauge
     search = settings.search.model_copy(
         update={"parametrisation": "direct", "optimiser": "adam", "learning_rate": 1.0, "iterations": trial,
-                "hard_from": 0.0, "evaluate_every": 5, "keep": "best"}
+                "rate_schedule": "constant", "hard_from": 0.0, "evaluate_every": 5, "keep": "best"}
     )  # fmt: skip
     parameters = make_parametrisation(settings.layout, search).to(levels.device)
     parameters.start_from(levels.float())

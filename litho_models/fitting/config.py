@@ -71,7 +71,7 @@ class TrainingConfig(BaseModel):
     def of_recipe(cls, recipe: Recipe, model_name: str, **settings: Any) -> Self:
         """The settings of a named recipe for a model; ``settings`` override single fields.
 
-        ``paper``: Adam, batch 4, L1, 4,000 epochs over 72 quadrants, the paper's learning rates, no
+        ``paper``: Adam, batch 4, L1, 4,000 epochs of 72 quadrants, the paper's learning rates, no
         nuisances. ``fast``: AdamW with a one-cycle schedule, random crops, nuisances fitted jointly, and
         ``FAST_STEPS``, or ``FAST_CHAIN`` for the default PBL.
 

@@ -198,10 +198,16 @@ def test_the_papers_search_and_ours_get_the_same_iterations_arms_and_judges(tmp_
         assert (task.models, task.judges, task.seeds) == (other.models, other.judges, other.seeds)
         assert task.iterations == int(iterations)
         assert ("--variant" in task.options) == (search == "paper")
+        if kind != "hoe":
+            # Both see as much of the focal plane.
+            view = paper_search.SAME_VIEW[kind.removeprefix("lens-")]
+            assert "--window-px" in view
+            assert task.options[-len(view) :] == view
         if kind == "lens-computational":
             preset, given = lens_settings("computational", "paper"), " ".join(task.options)
             assert f"imaging.pixel_px={preset.imaging.pixel_px}" in given
-            assert f"--object-px {preset.imaging.object_px} --window-px {preset.view.window_px}" in given
+            assert f"--object-px {preset.imaging.object_px}" in given
+            assert f"--window-px {preset.view.window_px}" in given
         # A third of the iterations three times costs what all of them cost once.
         assert task.iterations * task.seeds == pytest.approx(1000, rel=2e-3)
 
@@ -230,7 +236,11 @@ def test_the_table_of_the_papers_search_says_what_is_not_made_and_who_leads(tmp_
     # Student's t of three seeds one apart: 4.30 · 1 / √3 = 2.5. The pairs differ by the same each time.
     assert "| none | fab | not made yet | not made yet | 100 → 51 ± 2 | not made yet |" in text
     assert "paper 333: none 1." in text
-    assert "against those expected, rms: none 4.1 %, 274 nm; physics 1.3 %, 142 nm." in text
+    assert "those expected, rms: paper 333: none 4.1 % and 274 nm, physics 1.3 % and 142 nm." in text
+    # A task that has not been judged by all yet.
+    fab = [item for item in done["summary"] if item["judge"] == "fab"]
+    both = {task.name: done, "lens-direct-ours-333": {**done, "summary": fab}}
+    assert "| 100 → 51 ± 2 | not made yet |" in paper_search.as_markdown({"tasks": both})
     lead = "physics is best in centre-to-background ratio. Its lead: over none +20 [+20, +20]"
     assert f"paper, 333: Printed by fab, {lead}; over fno" in text
     # Of the many measured printers the next arm only.

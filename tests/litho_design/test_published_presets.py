@@ -10,13 +10,15 @@ import torch
 from litho_data.foundation.errors import InputError
 from litho_design.holograms.settings import hologram_settings
 from litho_design.lenses.bench import reconstruct, record, sensor_psf
+from litho_design.lenses.objects import object_stack
 from litho_design.lenses.settings import ImagingSettings, lens_settings
-from litho_design.lenses.task import lens_task
+from litho_design.lenses.task import lens_task, strip_rings
 from litho_design.optimisation.parameters import CellMap, GumbelLevels
 from litho_design.optimisation.rate import RateSchedule
 from litho_design.optimisation.search import make_parametrisation, search_layout
 from litho_design.optimisation.settings import SearchSettings
 from litho_design.printers.layout import LayoutSettings
+from litho_design.workflows.design import design_lens
 
 SEARCH = {
     "parametrisation": "gumbel", "start": "random", "keep": "last", "polish_rounds": 0, "hard_from": 1.0
@@ -87,24 +89,48 @@ def test_the_display_is_imaged_at_its_scale():
     """36 mm of display at 140 mm; the published code draws objects as wide as its lens of 120 µm."""
     for variant, image_um in (("paper", 36e3 * 0.4 / 140), ("authors", 120.0)):
         made = lens_settings("computational", variant)
-        side_um = made.imaging.object_px * made.imaging.pixel_px * made.layout.pitch_um
-        # Whole pixels of 0.8 µm.
-        assert side_um == pytest.approx(image_um, abs=0.8)
-        assert made.view.window_px * made.layout.pitch_um == pytest.approx(side_um)
+        frame_px, pixel_um = made.imaging.object_px, made.imaging.pixel_px * made.layout.pitch_um
+        # Inside the dark border, an eighth on each side. Whole pixels of 1 µm.
+        assert (frame_px - 2 * (frame_px // 8)) * pixel_um == pytest.approx(image_um, abs=0.5)
+        (chart,) = object_stack(["chart"], frame_px)
+        lit = chart.amax(0).nonzero()
+        assert lit.max() - lit.min() < image_um / pixel_um
+        assert made.view.window_px * made.layout.pitch_um == pytest.approx(image_um, abs=0.5)
         # Two pixels or more for a period of the cut-off.
         cut_off_um = made.optics.wavelength_um / (2 * 60 / math.hypot(60, 400))
-        assert made.imaging.pixel_px * made.layout.pitch_um < cut_off_um / 2
+        assert pixel_um < cut_off_um / 2
+
+
+@pytest.mark.parametrize("variant", ["paper", "authors"])
+@pytest.mark.parametrize("task", ["direct", "computational"])
+def test_a_small_lens_of_each_preset_can_be_searched(task, variant, make_printer, tmp_path):
+    changes = {
+        "layout.size_px": 60, "optics.distance_um": 30.0, "view.window_px": 60, "imaging.object_px": 32,
+        "imaging.pixel_px": 2, "search.iterations": 3, "window.yield_draws": 2,
+    }  # fmt: skip
+    made = lens_settings(task, variant, changes)
+    design = design_lens(make_printer(made.layout), tmp_path, settings=made, announce=False)
+    assert design.iterations == 3
+    assert design.settings["search"] == made.model_dump(mode="json")["search"]
 
 
 def test_rings_of_the_published_code_are_as_wide_as_the_diagonal_of_a_pixel():
     cells = CellMap(lens_settings("direct", "authors").layout)
     # The corner pixel is 599.5 √2 px from the middle.
     assert cells.cells == (600,)
-    along = torch.arange(600, dtype=torch.float64) + 0.5
-    assert torch.equal(cells.ring[600, 600:], (torch.hypot(along, along.new_tensor(0.5)) / 2**0.5).long())
+    y, x = torch.meshgrid(*[torch.arange(1200, dtype=torch.float64) - 599.5] * 2, indexing="ij")
+    assert torch.equal(cells.ring, (torch.hypot(y, x) / 2**0.5).long())
     narrow = LayoutSettings(size_px=16, cell_um=0.05, symmetry="radial")
     with pytest.raises(InputError, match="rings of a pixel"):
         CellMap(narrow)
+
+
+@pytest.mark.parametrize("cell_um", [0.1, 0.1 * 2**0.5, 0.25, 0.7])
+def test_a_strip_along_a_radius_has_the_rings_of_the_plane(cell_um):
+    layout = LayoutSettings(size_px=80, cell_um=cell_um, symmetry="radial")
+    cells = CellMap(layout)
+    strip = strip_rings(layout, 3, cells.cells[0])
+    assert torch.equal(strip[3:5, 3:43], cells.ring[39:41, 40:])
 
 
 @pytest.mark.parametrize("temperature", [0.5, 1.0])
@@ -138,6 +164,9 @@ def test_the_rate_halves_by_time_or_falls_where_nothing_is_gained():
     # Better at first, then three without progress: one more than two.
     waited = rates([3, 2, 1, 1, 1, 1, 1], rate_schedule="plateau", rate_factor=0.1, rate_iterations=2)
     assert waited == pytest.approx([8] * 6 + [0.8])
+    # A direct lens has a loss below zero.
+    below = rates([-7, -7, -6.9995, -6.999], rate_schedule="plateau", rate_factor=0.5, rate_iterations=1)
+    assert below == [8, 8, 8, 4]
     assert rates([1.0] * 3) == [8, 8, 8]
 
 

@@ -28,7 +28,18 @@ def test_a_power_law_goes_on_as_it_is_and_a_flat_curve_stays():
     assert rows[1][3:] == ["20.00 ± 0.00 nm", "20.00 ± 0.00 nm", "20.0 nm |"]
 
 
-def test_runs_of_other_epochs_are_not_shown_side_by_side(monkeypatch):
-    monkeypatch.setattr("sys.argv", ["recipes", "no.zarr", "--runs", "paper-pbl", "--epochs", "4000"])
-    with pytest.raises(InputError, match="published runs of 400 epochs beside it"):
+@pytest.mark.parametrize(
+    ("runs", "refused"),
+    [("paper-pbl", True), ("paper-physics,paper-pbl,paper-fno", False), ("reduced", False)],
+)
+def test_runs_of_other_epochs_are_not_shown_side_by_side(runs, refused, monkeypatch):
+    def ends_here(*_, **__):
+        raise KeyboardInterrupt
+
+    published = recipes.published_runs()
+    epochs = published["paper-fno"].fits[0].steps[-1] // STEPS_PER_EPOCH
+    monkeypatch.setattr(recipes, "benchmark", ends_here)
+    monkeypatch.setattr("sys.argv", ["recipes", "no.zarr", "--runs", runs, "--epochs", str(10 * epochs)])
+    with pytest.raises(InputError if refused else KeyboardInterrupt) as said:
         recipes.main()
+    assert refused == (f"published runs of {epochs:,} epochs beside it" in str(said.value))
