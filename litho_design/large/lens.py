@@ -50,21 +50,24 @@ from litho_design.tasks.design import (
 class RadiusMap(CellMap):
     """Free rings along one radius: what ``CellMap`` is for the pixels of a plane."""
 
+    area: Tensor
+
     def __init__(self, layout: LayoutSettings):
         nn.Module.__init__(self)
-        self.size_px, self.cell_px = layout.size_px, layout.cell_px
+        radius_px = torch.arange(layout.size_px // 2, dtype=torch.float64) + 0.5
+        self.register_buffer("ring", (radius_px / layout.ring_px).floor().long(), persistent=False)
+        self.register_buffer("area", radius_px, persistent=False)
         self._own = slice(None)
-        self.cells = self.of_all = (-(-layout.size_px // 2 // layout.cell_px),)
+        self.cells = self.of_all = (int(self.ring[-1]) + 1,)
 
     def forward(self, values: Tensor) -> Tensor:
         """(..., rings) to (..., pixels of the radius)."""
-        return values.repeat_interleave(self.cell_px, -1)[..., : self.size_px // 2]
+        return values[..., self.ring]
 
     def average(self, pixels: Tensor) -> Tensor:
         """Mean over the area of each ring of real or complex ``pixels`` along the radius."""
-        weight = (torch.arange(self.size_px // 2, device=pixels.device) + 0.5).to(pixels)
-        ring = torch.arange(self.size_px // 2, device=pixels.device) // self.cell_px
-        sums = [pixels.new_zeros(self.cells).index_add_(0, ring, one) for one in (pixels * weight, weight)]
+        area = self.area.to(pixels)
+        sums = [pixels.new_zeros(self.cells).index_add_(0, self.ring, one) for one in (pixels * area, area)]
         return sums[0] / sums[1]
 
 
@@ -102,7 +105,7 @@ class RingLens:
         check_printer(printer, Bands(layout.size_px, layout.size_px))
         self.settings, self.printer, self.tile_px = settings, printer, tile_px
         self.bench = bench or RadialLensBench(layout, settings.optics, settings.view).to(printer.device)
-        self.cells = RadiusMap(layout)
+        self.cells = RadiusMap(layout).to(printer.device)
         self._strip = strip_rings(layout, printer.halo_px, self.cells.cells[0]).to(printer.device)
 
     def printed_um(self, level: Tensor) -> Tensor:

@@ -9,6 +9,7 @@ import torch
 
 from litho_data.foundation.errors import InputError
 from litho_design.holograms.settings import hologram_settings
+from litho_design.large.lens import RadiusMap
 from litho_design.lenses.bench import reconstruct, record, sensor_psf
 from litho_design.lenses.objects import object_stack
 from litho_design.lenses.settings import ImagingSettings, lens_settings
@@ -130,6 +131,12 @@ def test_a_strip_along_a_radius_has_the_rings_of_the_plane(cell_um):
     cells = CellMap(layout)
     strip = strip_rings(layout, 3, cells.cells[0])
     assert torch.equal(strip[3:5, 3:43], cells.ring[39:41, 40:])
+    # Of a large lens, where the two central rows are the radius.
+    along = RadiusMap(layout)
+    radius_px = torch.arange(40) + 0.5
+    assert torch.equal(along(torch.arange(40)), (radius_px / (cell_um / 0.1)).floor().long())
+    rings = torch.arange(float(along.cells[0]))
+    assert torch.allclose(along.average(along(rings)), rings)
 
 
 @pytest.mark.parametrize("temperature", [0.5, 1.0])
