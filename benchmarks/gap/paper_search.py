@@ -38,8 +38,6 @@ SEARCHES = {"paper": ("--variant", "paper"), "ours": ()}
 SAME_LENS = ("--set", "view.aperture=circle", "--set", "view.path=radial")
 # PBL with all it predicts, as the paper's: what lies along the scan lines is in the other models, too.
 ARMS = ("none", "physics", "fno", "pbl-scan-axis")
-# An iteration of the hologram through the FNO, tile by tile, takes 8 s of a core: 8 hours for its designs.
-LEFT_OUT = {"hoe": ("fno",)}
 FAB, MEASURED = "fab", "measured-pbl"
 _NAMES = {"hoe": "hoe", "direct": "lens-direct", "computational": "lens-computational"}
 
@@ -109,14 +107,10 @@ def _task(out: Path, effort: Effort, kind: str, search: str, iterations: int) ->
     options += ("--target", "text") if hologram else SAME_LENS
     if kind == "computational":
         options += task_options("--window-px", effort.window_px, "--object-px", effort.object_px)
-    models = {arm: "none" if arm == "none" else str(model(out, arm)) for arm in _arms(kind)}
+    models = {arm: "none" if arm == "none" else str(model(out, arm)) for arm in ARMS}
     judges = {FAB: str(out / "fab" / "truth"), MEASURED: str(zoo.folder("pbl"))}
     name = f"{_NAMES[kind]}-{search}-{iterations}"
     return Task(name, kind, options, models, judges, SEEDS_OF[iterations])
-
-
-def _arms(kind: str) -> list[str]:
-    return [arm for arm in ARMS if arm not in LEFT_OUT.get(kind, ())]
 
 
 def _published_tasks() -> dict[str, Any]:
@@ -171,9 +165,7 @@ def _table(kind: str, tasks: Mapping[str, Mapping[str, Any]]) -> str:
         for seeds in (SEEDS_OF[iterations],)
     ]
     found = [tasks.get(f"{_NAMES[kind]}-{search}-{iterations}") for search, iterations in columns]
-    rows = [
-        (arm, judge, *_cells(found, arm, judge, figure)) for judge in (FAB, MEASURED) for arm in _arms(kind)
-    ]
+    rows = [(arm, judge, *_cells(found, arm, judge, figure)) for judge in (FAB, MEASURED) for arm in ARMS]
     better = "more" if sign > 0 else "less"
     return f"### {TITLES[_NAMES[kind]]}: {LABELS[figure]}, {better} is better\n\n" + markdown_table(
         ("designed with", "printed by", *heads),
