@@ -12,34 +12,34 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from benchmarks.gap.document import PAGE, RESULTS, search_minutes
 from benchmarks.gap.jobs import run_commands
+from benchmarks.gap.paper_tables import ARMS, FAB, MEASURED, NAMES, SEARCHES, SEEDS_OF, as_markdown
 from benchmarks.gap.plan import Effort, Plan, model, open_plan
 from benchmarks.gap.steps import fab_jobs, model_jobs
-from benchmarks.gap.tables import LABELS, SHOWN, TITLES, figure_digits, lead_text
+from benchmarks.gap.tables import SHOWN
 from benchmarks.gap.tasks import Task, chosen, task_options
-from benchmarks.markdown_table import markdown_table
 from benchmarks.record import publish, usable_cores, write_record
 from litho_data.foundation.commands import command_line, run_script
+from litho_data.foundation.units import NM_PER_UM
 from litho_data.foundation.workers import Workers
-from litho_design.judging.gap import GapResult
+from litho_design.judging.gap import GapResult, design_folder
+from litho_design.tasks.design import Design
 from litho_models.frozen import zoo
 
 NAME, FILE_NAME = "paper-search", "paper_search.json"
-# Iterations of a design, and seeds: all of the paper's once, a third of them three times.
-SEEDS_OF = {1000: 1, 333: 3}
-SEARCHES = {"paper": ("--variant", "paper"), "ours": ()}
 # The paper's lens is square, ours a circle. Both searches make the circle, along a radius, which is exact
 # for it: on the plane an iteration through PBL or the FNO takes thirty times as long.
 SAME_LENS = ("--set", "view.aperture=circle", "--set", "view.path=radial")
-# PBL with all it predicts, as the paper's: what lies along the scan lines is in the other models, too.
-ARMS = ("none", "physics", "fno", "pbl-scan-axis")
-FAB, MEASURED = "fab", "measured-pbl"
-_NAMES = {"hoe": "hoe", "direct": "lens-direct", "computational": "lens-computational"}
+# The paper's display at its scale on the sensor, which is the preset's; for both searches.
+SAME_IMAGE = ("--set", "imaging.pixel_px=8", "--object-px", "128", "--window-px", "1024")
+
+# Of lenses: what the paper shows as spectra of PSFs.
+OF_SPECTRA = ("mtf_volume_ratio",)
 
 
 def main() -> None:
@@ -85,16 +85,6 @@ def paper_tasks(out: Path, effort: Effort) -> list[Task]:
     ]
 
 
-def as_markdown(record: Mapping[str, Any]) -> str:
-    """A table per kind of element, the searches side by side; of kinds without a result the names."""
-    tasks = record["tasks"]
-    made = [kind for kind, name in _NAMES.items() if any(task.startswith(f"{name}-") for task in tasks)]
-    texts = [_table(kind, tasks) for kind in made]
-    if missing := [TITLES[name].lower() for kind, name in _NAMES.items() if kind not in made]:
-        texts.append(f"Not made yet: {'; '.join(missing)}.")
-    return "\n\n".join(texts)
-
-
 def _task(out: Path, effort: Effort, kind: str, search: str, iterations: int) -> Task:
     hologram = kind == "hoe"
     size_px, distance_um = (
@@ -106,10 +96,11 @@ def _task(out: Path, effort: Effort, kind: str, search: str, iterations: int) ->
     )  # fmt: skip
     options += ("--target", "text") if hologram else SAME_LENS
     if kind == "computational":
-        options += task_options("--window-px", effort.window_px, "--object-px", effort.object_px)
+        options += SAME_IMAGE
     models = {arm: "none" if arm == "none" else str(model(out, arm)) for arm in ARMS}
-    judges = {FAB: str(out / "fab" / "truth"), MEASURED: str(zoo.folder("pbl"))}
-    name = f"{_NAMES[kind]}-{search}-{iterations}"
+    judges = {FAB: str(out / "fab" / "truth")}
+    judges |= {name: str(zoo.folder(model)) for name, model in MEASURED.items()}
+    name = f"{NAMES[kind]}-{search}-{iterations}"
     return Task(name, kind, options, models, judges, SEEDS_OF[iterations])
 
 
@@ -122,18 +113,21 @@ def _published_tasks() -> dict[str, Any]:
 def _found(out: Path, task: Task) -> dict[str, Any]:
     """The figures of a finished task, by arm and judge."""
     gap = GapResult.read(out / task.name)
-    shown = SHOWN[_NAMES[task.kind]]
+    shown = SHOWN[NAMES[task.kind]]
     figure = next(iter(shown))
+    kept = {*shown, *OF_SPECTRA}
     return {
         **gap.model_dump(mode="json", include={"commit", "dirty", "versions"}),
         "iterations": task.iterations,
         "seeds": len(gap.seeds),
         "printers": {arm: used.sha256 for arm, used in gap.arms.items()},
         "minutes": search_minutes(out / task.name, gap),
+        "large_jump_share": _large_jump_shares(out / task.name, gap),
+        "height_gap_nm": _height_gaps_nm(task, gap),
         "summary": [
             item.model_dump(mode="json")
             for item in gap.summary
-            if item.figure in shown and item.judge in task.judges
+            if item.figure in kept and item.judge in task.judges
         ],
         "paired": [
             item.model_dump(mode="json")
@@ -155,66 +149,26 @@ def _found(out: Path, task: Task) -> dict[str, Any]:
     }
 
 
-def _table(kind: str, tasks: Mapping[str, Mapping[str, Any]]) -> str:
-    """One row per arm and judge; a column per search and budget."""
-    figure, sign = next(iter(SHOWN[_NAMES[kind]].items()))
-    columns = [(search, iterations) for iterations in SEEDS_OF for search in SEARCHES]
-    heads = [
-        f"{search}, {iterations:,} iterations, {seeds} seed{'s' * (seeds > 1)}"
-        for search, iterations in columns
-        for seeds in (SEEDS_OF[iterations],)
-    ]
-    found = [tasks.get(f"{_NAMES[kind]}-{search}-{iterations}") for search, iterations in columns]
-    rows = [(arm, judge, *_cells(found, arm, judge, figure)) for judge in (FAB, MEASURED) for arm in ARMS]
-    better = "more" if sign > 0 else "less"
-    return f"### {TITLES[_NAMES[kind]]}: {LABELS[figure]}, {better} is better\n\n" + markdown_table(
-        ("designed with", "printed by", *heads),
-        rows,
-        _minutes_text(columns, found),
-        *_leads(columns, found, figure, sign),
-    )
+def _large_jump_shares(folder: Path, gap: GapResult) -> dict[str, float]:
+    """Neighbouring pixels that differ by many levels, as a share of all pairs: means over seeds."""
+    return {
+        arm: fmean(
+            Design.read(design_folder(folder, arm, seed)).printability.large_jump_share for seed in gap.seeds
+        )
+        for arm in sorted(gap.arms)
+    }
 
 
-def _cells(found: Sequence[Mapping[str, Any] | None], arm: str, judge: str, figure: str) -> Iterator[str]:
-    for task in found:
-        if task is None:
-            yield "not made yet"
-            continue
-        row = _rows_of_arms(task, judge, figure)[arm]
-        digits, interval = figure_digits(figure), row["judged_ci95"]
-        spread = f" ± {(interval[1] - interval[0]) / 2:.{digits}f}" if interval else ""
-        yield f"{row['designed_mean']:.{digits}f} → {row['judged_mean']:.{digits}f}{spread}"
-
-
-def _leads(
-    columns: Sequence[tuple[str, int]], found: Sequence[Mapping[str, Any] | None], figure: str, sign: int
-) -> Iterator[str]:
-    """The best arm of every search that ran from several seeds, by each printer."""
-    for (search, iterations), task in zip(columns, found, strict=True):
-        if task is None or task["seeds"] == 1:
-            continue
-        for judge in (FAB, MEASURED):
-            means = {arm: row["judged_mean"] for arm, row in _rows_of_arms(task, judge, figure).items()}
-            yield f"{search}, {iterations:,}: {lead_text(task['paired'], means, figure, sign, judge)}"
-
-
-def _rows_of_arms(task: Mapping[str, Any], judge: str, figure: str) -> dict[str, Mapping[str, Any]]:
-    """What one printer made of one figure, by the arm that it was designed with."""
-    return {row["arm"]: row for row in task["summary"] if (row["judge"], row["figure"]) == (judge, figure)}
-
-
-def _minutes_text(columns: Sequence[tuple[str, int]], found: Sequence[Mapping[str, Any] | None]) -> str:
-    """What the searches took."""
-    told = [
-        f"{search} {iterations:,}: "
-        + ", ".join(f"{arm} {minutes:.0f}" for arm, minutes in task["minutes"].items())
-        for (search, iterations), task in zip(columns, found, strict=True)
-        if task is not None
-    ]
-    return (
-        "In design → as printed, means over seeds. Minutes of search, all seeds, one thread each: "
-        f"{'; '.join(told)}."
-    )
+def _height_gaps_nm(task: Task, gap: GapResult) -> dict[str, dict[str, float]]:
+    """By printer and arm: rms height of print less expected print, means over seeds."""
+    return {
+        judge: {
+            arm: NM_PER_UM
+            * fmean(e.rms_height_gap_um for e in gap.entries if (e.arm, e.judge) == (arm, judge))
+            for arm in sorted(gap.arms)
+        }
+        for judge in task.judges
+    }
 
 
 if __name__ == "__main__":

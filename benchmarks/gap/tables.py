@@ -129,13 +129,13 @@ def _cell(row: Mapping[str, Any], digits: int) -> str:
 def lead_text(
     paired: Sequence[Mapping[str, Any]], means: Mapping[str, float], figure: str, sign: int, judge: str
 ) -> str:
-    """Which arm has the best mean of a figure, and by how much against every other one, paired by seed."""
+    """Which arm of ``means`` has the best of a figure, and its lead over each other one, paired by seed."""
     digits = figure_digits(figure)
     best = max(means, key=lambda arm: sign * means[arm])
     against = []
     for item in paired:
         pair = (item["arm"], item["against"])
-        if (item["judge"], item["figure"]) != (judge, figure) or best not in pair:
+        if (item["judge"], item["figure"]) != (judge, figure) or best not in pair or not {*pair} <= {*means}:
             continue
         # Better counts upwards, also where less of a figure is better.
         other, turn = (pair[1], sign) if best == pair[0] else (pair[0], -sign)
