@@ -29,6 +29,9 @@ def as_markdown(record: Mapping[str, Any]) -> str:
     return "\n\n".join(texts)
 
 
+Made = Mapping[tuple[str, int], Mapping[str, Any]]
+
+
 def _table(kind: str, tasks: Mapping[str, Mapping[str, Any]]) -> str:
     """One row per arm and judge; a column per search and budget."""
     figure, sign = next(iter(SHOWN[NAMES[kind]].items()))
@@ -38,81 +41,77 @@ def _table(kind: str, tasks: Mapping[str, Mapping[str, Any]]) -> str:
         for search, iterations in columns
         for seeds in (SEEDS_OF[iterations],)
     ]
-    found = [tasks.get(f"{NAMES[kind]}-{search}-{iterations}") for search, iterations in columns]
+    names = {column: "-".join(map(str, (NAMES[kind], *column))) for column in columns}
+    made = {column: tasks[name] for column, name in names.items() if name in tasks}
+    repeated = {column: task for column, task in made.items() if task["seeds"] > 1}
     judges = [
-        judge for judge in (FAB, *MEASURED) if any(task and _by_arm(task, judge, figure) for task in found)
+        judge for judge in (FAB, *MEASURED) if any(_by_arm(task, judge, figure) for task in made.values())
     ]
-    rows = [(arm, judge, *_cells(found, arm, judge, figure)) for judge in judges for arm in ARMS]
+    rows = [
+        (arm, judge, *(_cell(made.get(column, {}), arm, judge, figure) for column in columns))
+        for judge in judges
+        for arm in ARMS
+    ]
     better = "more" if sign > 0 else "less"
     return f"### {TITLES[NAMES[kind]]}: {LABELS[figure]}, {better} is better\n\n" + markdown_table(
         ("designed with", "printed by", *heads),
         rows,
-        _minutes_text(columns, found),
-        *_layout_texts(columns, found),
-        *_leads(columns, found, figure, sign, judges),
+        _minutes_text(made),
+        *([_layouts_text(repeated)] if repeated else []),
+        *_leads(repeated, judges, figure, sign),
     )
-
-
-def _cells(found: Sequence[Mapping[str, Any] | None], arm: str, judge: str, figure: str) -> Iterator[str]:
-    for task in found:
-        row = _by_arm(task, judge, figure).get(arm) if task else None
-        if row is None:
-            yield "not made yet"
-            continue
-        digits, interval = figure_digits(figure), row["judged_ci95"]
-        spread = f" ± {(interval[1] - interval[0]) / 2:.{digits}f}" if interval else ""
-        yield f"{row['designed_mean']:.{digits}f} → {row['judged_mean']:.{digits}f}{spread}"
-
-
-def _leads(
-    columns: Sequence[tuple[str, int]],
-    found: Sequence[Mapping[str, Any] | None],
-    figure: str,
-    sign: int,
-    judges: Sequence[str],
-) -> Iterator[str]:
-    """The best arm of every search that ran from several seeds: by the fab its leads, else over the next."""
-    for (search, iterations), task in zip(columns, found, strict=True):
-        if task is None or task["seeds"] == 1:
-            continue
-        for judge in judges:
-            means = {arm: row["judged_mean"] for arm, row in _by_arm(task, judge, figure).items()}
-            if judge != FAB:
-                means = dict(sorted(means.items(), key=lambda item: -sign * item[1])[:2])
-            yield f"{search}, {iterations:,}: {lead_text(task['paired'], means, figure, sign, judge)}"
 
 
 def _by_arm(task: Mapping[str, Any], judge: str, figure: str) -> dict[str, Mapping[str, Any]]:
     """What one printer made of one figure, by the arm that it was designed with."""
-    return {row["arm"]: row for row in task["summary"] if (row["judge"], row["figure"]) == (judge, figure)}
+    rows = task.get("summary", ())
+    return {row["arm"]: row for row in rows if (row["judge"], row["figure"]) == (judge, figure)}
 
 
-def _layout_texts(
-    columns: Sequence[tuple[str, int]], found: Sequence[Mapping[str, Any] | None]
-) -> Iterator[str]:
-    """How rough the layouts are, and how far their prints are from what was expected."""
-    for (search, iterations), task in zip(columns, found, strict=True):
-        if task is not None and task["seeds"] > 1:
-            gaps = task["height_gap_nm"][FAB]
-            told = [
-                f"{arm} {100 * share:.1f} %, {gaps[arm]:.0f} nm"
-                for arm, share in task["large_jump_share"].items()
-            ]
-            yield (
-                f"{search}, {iterations:,}: neighbouring pixels of the layouts that differ by 8 levels or "
-                f"more, and the fab's prints against those expected, rms: {'; '.join(told)}."
-            )
+def _cell(task: Mapping[str, Any], arm: str, judge: str, figure: str) -> str:
+    row = _by_arm(task, judge, figure).get(arm)
+    if row is None:
+        return "not made yet"
+    digits, interval = figure_digits(figure), row["judged_ci95"]
+    spread = f" ± {(interval[1] - interval[0]) / 2:.{digits}f}" if interval else ""
+    return f"{row['designed_mean']:.{digits}f} → {row['judged_mean']:.{digits}f}{spread}"
 
 
-def _minutes_text(columns: Sequence[tuple[str, int]], found: Sequence[Mapping[str, Any] | None]) -> str:
+def _minutes_text(made: Made) -> str:
     """What the searches took."""
     told = [
         f"{search} {iterations:,}: "
         + ", ".join(f"{arm} {minutes:.0f}" for arm, minutes in task["minutes"].items())
-        for (search, iterations), task in zip(columns, found, strict=True)
-        if task is not None
+        for (search, iterations), task in made.items()
     ]
     return (
         "In design → as printed, means over seeds. Minutes of search, all seeds, one thread each: "
         f"{'; '.join(told)}."
     )
+
+
+def _layouts_text(made: Made) -> str:
+    """How rough the layouts are, and how far their prints are from what was expected."""
+    told = [
+        f"{search} {iterations:,}: "
+        + ", ".join(
+            f"{arm} {100 * share:.1f} % and {task['height_gap_nm'][FAB][arm]:.0f} nm"
+            for arm, share in task["large_jump_share"].items()
+        )
+        for (search, iterations), task in made.items()
+    ]
+    return (
+        "Neighbouring pixels of the layouts that differ by 8 levels or more, and the fab's prints against "
+        f"those expected, rms: {'; '.join(told)}."
+    )
+
+
+def _leads(made: Made, judges: Sequence[str], figure: str, sign: int) -> Iterator[str]:
+    """The best arm of every search, by each printer: by the fab its leads, else that over the next."""
+    for (search, iterations), task in made.items():
+        for judge in judges:
+            means = {arm: row["judged_mean"] for arm, row in _by_arm(task, judge, figure).items()}
+            if judge != FAB:
+                means = dict(sorted(means.items(), key=lambda item: -sign * item[1])[:2])
+            if means:
+                yield f"{search}, {iterations:,}: {lead_text(task['paired'], means, figure, sign, judge)}"
