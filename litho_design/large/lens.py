@@ -48,7 +48,7 @@ from litho_design.tasks.design import (
 
 
 class RadiusMap(CellMap):
-    """Free rings along one radius: what ``CellMap`` is for the pixels of a plane."""
+    """Free rings along one radius, (..., rings) to (..., pixels): ``CellMap`` for less than a plane."""
 
     area: Tensor
 
@@ -57,12 +57,9 @@ class RadiusMap(CellMap):
         radius_px = torch.arange(layout.size_px // 2, dtype=torch.float64) + 0.5
         self.register_buffer("ring", (radius_px / layout.ring_px).floor().long(), persistent=False)
         self.register_buffer("area", radius_px, persistent=False)
+        self.radial = True
         self._own = slice(None)
         self.cells = self.of_all = (int(self.ring[-1]) + 1,)
-
-    def forward(self, values: Tensor) -> Tensor:
-        """(..., rings) to (..., pixels of the radius)."""
-        return values[..., self.ring]
 
     def average(self, pixels: Tensor) -> Tensor:
         """Mean over the area of each ring of real or complex ``pixels`` along the radius."""
