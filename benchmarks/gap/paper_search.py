@@ -12,13 +12,14 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
 from benchmarks.gap.document import PAGE, RESULTS, search_minutes
 from benchmarks.gap.jobs import run_commands
+from benchmarks.gap.paper_picture import search_figure
 from benchmarks.gap.paper_tables import ARMS, FAB, MEASURED, NAMES, SEARCHES, SEEDS_OF, as_markdown
 from benchmarks.gap.plan import Effort, Plan, model, open_plan
 from benchmarks.gap.steps import fab_jobs, model_jobs
@@ -32,7 +33,7 @@ from litho_design.judging.gap import GapResult, design_folder
 from litho_design.tasks.design import Design
 from litho_models.frozen import zoo
 
-NAME, FILE_NAME = "paper-search", "paper_search.json"
+NAME, FILE_NAME, PICTURE = "paper-search", "paper_search.json", "paper_search.png"
 # The paper's lens is square, ours a circle. Both searches make the circle, along a radius, which is exact
 # for it: on the plane an iteration through PBL or the FNO takes thirty times as long. And both see as much of
 # the focal plane, and the paper's display at its scale on the sensor, as its preset has it.
@@ -75,10 +76,10 @@ def main() -> None:
         "tasks": {task.name: _found(out, task) for task in every if _is_judged(out, task)},
     }
     print(as_markdown(record))
-    write_record(out / FILE_NAME, record)
+    _write(out, record)
     if given.publish:
         record["tasks"] = _published_tasks(every) | record["tasks"]
-        write_record(RESULTS / FILE_NAME, record)
+        _write(RESULTS, record)
         publish(PAGE, NAME, as_markdown(record))
 
 
@@ -107,6 +108,11 @@ def _task(out: Path, effort: Effort, kind: str, search: str, iterations: int) ->
     judges |= {name: str(zoo.folder(model)) for name, model in MEASURED.items()}
     name = f"{NAMES[kind]}-{search}-{iterations}"
     return Task(name, kind, options, models, judges, SEEDS_OF[iterations])
+
+
+def _write(folder: Path, record: Mapping[str, Any]) -> None:
+    write_record(folder / FILE_NAME, record)
+    search_figure(record).savefig(folder / PICTURE, dpi=100)
 
 
 def _is_judged(out: Path, task: Task) -> bool:

@@ -14,6 +14,8 @@ from benchmarks.gap import paper_search
 from benchmarks.gap.cost import estimate, read_records, run_trial
 from benchmarks.gap.document import NAME, PAGE, RESULT_FILE, RESULTS
 from benchmarks.gap.jobs import Job, run_commands
+from benchmarks.gap.paper_picture import search_figure
+from benchmarks.gap.paper_tables import FAB, MEASURED
 from benchmarks.gap.plan import ARMS, FROZEN_WITH, PRINT_KNOBS, Effort, model, open_plan
 from benchmarks.gap.steps import model_jobs
 from benchmarks.gap.tables import as_markdown
@@ -245,6 +247,21 @@ def test_the_table_of_the_papers_search_says_what_is_not_made_and_who_leads(tmp_
     assert f"paper, 333: Printed by fab, {lead}; over fno" in text
     # Of the many measured printers the next arm only.
     assert f"paper, 333: Printed by measured-pbl, {lead}.\n" in text
+
+
+def test_the_picture_of_the_papers_search_shows_every_seed():
+    record = json.loads((RESULTS / paper_search.FILE_NAME).read_text("utf-8"))
+    panels = search_figure(record).axes
+    for column, judge in enumerate((FAB, *MEASURED)):
+        shown = {float(x) for line in panels[column].lines for x in line.get_xdata()}
+        runs = [
+            run
+            for name, task in record["tasks"].items() if name.startswith("hoe-")
+            for run in task["of_each_seed"] if run["judge"] == judge
+        ]  # fmt: skip
+        # Two searches, each with three seeds and one, through four arms.
+        assert len(runs) == 2 * (3 + 1) * 4
+        assert shown == {run[when] for run in runs for when in ("designed", "judged")}
 
 
 def test_the_page_quotes_the_papers_search():
