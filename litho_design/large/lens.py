@@ -26,13 +26,10 @@ from litho_design.lenses.score import LensScore, lens_score
 from litho_design.lenses.settings import LensSettings
 from litho_design.lenses.task import strip_rings
 from litho_design.optimisation.budget import measure_budget
+from litho_design.optimisation.checkpoint import finished_iterations, remove_checkpoint
 from litho_design.optimisation.parameters import CellMap, DirectLevels
 from litho_design.optimisation.phases import focusing_levels, printed_phase
-from litho_design.optimisation.search import (
-    finished_iterations,
-    remove_checkpoint,
-    search_layout,
-)
+from litho_design.optimisation.search import search_layout
 from litho_design.optimisation.starts import start_search
 from litho_design.printers.layout import LayoutSettings, printability
 from litho_design.printers.printer import Printer

@@ -19,13 +19,10 @@ from litho_design.large.hologram import BandedHologram
 from litho_design.large.printing import print_bands
 from litho_design.large.score import image_figures
 from litho_design.optimisation.budget import measure_budget
+from litho_design.optimisation.checkpoint import finished_iterations, remove_checkpoint
 from litho_design.optimisation.parameters import DirectLevels
 from litho_design.optimisation.phases import printed_phase
-from litho_design.optimisation.search import (
-    finished_iterations,
-    remove_checkpoint,
-    search_layout,
-)
+from litho_design.optimisation.search import search_layout
 from litho_design.optimisation.starts import start_levels, start_search
 from litho_design.printers.layout import printability
 from litho_design.printers.printer import Printer

@@ -2,51 +2,22 @@
 
 from __future__ import annotations
 
-import io
-import math
-import pickle
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import atomic_file
+from litho_design.optimisation.checkpoint import SearchState, checkpoint_path, resume, save_checkpoint
 from litho_design.optimisation.parameters import DirectLevels, GumbelLevels, Parametrisation
 from litho_design.optimisation.rate import RateSchedule
 from litho_design.optimisation.settings import SearchSettings
 from litho_design.printers.layout import LayoutSettings
 
 Objective = Callable[[Tensor], tuple[Tensor, dict[str, float]]]
-# What an interrupted run leaves, of all its parts.
-CHECKPOINTS = "checkpoint*.pt"
-# What torch raises for a damaged file depends on the place of the damage.
-_DAMAGED = (
-    RuntimeError,
-    pickle.UnpicklingError,
-    EOFError,
-    ValueError,
-    LookupError,
-    TypeError,
-    AttributeError,
-)
-
-
-@dataclass
-class SearchState:
-    """Everything a resumed search needs beside the settings."""
-
-    iteration: int = 0
-    best_loss: float = math.inf
-    best_levels: Tensor | None = None
-    history: list[dict[str, float]] = field(default_factory=list)
-    # Of the search, in runs that were interrupted.
-    earlier_seconds: float = 0.0
 
 
 def make_parametrisation(layout: LayoutSettings, search: SearchSettings) -> Parametrisation:
@@ -91,10 +62,11 @@ def search_layout(
     optimiser_class = torch.optim.Adam if settings.optimiser == "adam" else torch.optim.AdamW
     optimiser = optimiser_class(parameters.parameters(), lr=settings.learning_rate * parameters.rate_unit)
     rate = RateSchedule(optimiser, settings)
+    stateful = {"parameters": parameters, "optimiser": optimiser, "rate": rate}
     state = SearchState()
-    checkpoint = None if folder is None else _checkpoint(folder, part)
+    checkpoint = None if folder is None else checkpoint_path(folder, part)
     if checkpoint is not None and checkpoint.exists():
-        state = _resume(checkpoint, parameters, optimiser, rate, fingerprint)
+        state = resume(checkpoint, fingerprint, stateful, next(parameters.parameters()).device)
     started = time.monotonic() - state.earlier_seconds
     remaining = range(state.iteration, settings.iterations)
     for iteration in progress(remaining, what, total=len(remaining), estimate_of=0):
@@ -104,23 +76,8 @@ def search_layout(
         if iteration % settings.evaluate_every == 0 or state.iteration == settings.iterations:
             _evaluate(parameters, objective, settings, state, step_loss)
         if checkpoint is not None and state.iteration % settings.checkpoint_every == 0:
-            _save(checkpoint, parameters, optimiser, rate, state, fingerprint, time.monotonic() - started)
+            save_checkpoint(checkpoint, fingerprint, state, stateful, time.monotonic() - started)
     return state
-
-
-def finished_iterations(folder: Path, part: str = "") -> int:
-    """Finished iterations of an interrupted run in ``folder``; 0 without one."""
-    path = _checkpoint(folder, part)
-    return int(_load(path)["iteration"]) if path.exists() else 0
-
-
-def remove_checkpoint(folder: Path, part: str = "") -> None:
-    """Delete the checkpoint of a finished design."""
-    _checkpoint(folder, part).unlink(missing_ok=True)
-
-
-def _checkpoint(folder: Path, part: str) -> Path:
-    return folder / f"checkpoint{part}.pt"
 
 
 def _step(
@@ -164,68 +121,3 @@ def _evaluate(
     )
     if settings.keep == "last" or value < state.best_loss:
         state.best_loss, state.best_levels = value, levels.clone()
-
-
-def _save(
-    path: Path,
-    parameters: Parametrisation,
-    optimiser: torch.optim.Optimizer,
-    rate: RateSchedule,
-    state: SearchState,
-    fingerprint: str,
-    seconds: float,
-) -> None:
-    content = {
-        "fingerprint": fingerprint,
-        "parameters": parameters.state_dict(),
-        "optimiser": optimiser.state_dict(),
-        "rate": rate.state_dict(),
-        "iteration": state.iteration,
-        "best_loss": state.best_loss,
-        "best_levels": state.best_levels,
-        "history": state.history,
-        "seconds": seconds,
-    }
-    with atomic_file(path) as temporary:
-        torch.save(content, temporary)
-
-
-def _resume(
-    path: Path,
-    parameters: Parametrisation,
-    optimiser: torch.optim.Optimizer,
-    rate: RateSchedule,
-    fingerprint: str,
-) -> SearchState:
-    content = _load(path)
-    if content["fingerprint"] != fingerprint:
-        raise InputError(
-            f"checkpoint {path}",
-            got="a run with other settings",
-            wanted="the same settings, target and model",
-            hint="choose another --out, or delete the checkpoint to start again",
-        )
-    parameters.load_state_dict(content["parameters"])
-    optimiser.load_state_dict(content["optimiser"])
-    rate.load_state_dict(content["rate"])
-    best_levels = content["best_levels"]
-    if best_levels is not None:
-        best_levels = best_levels.to(next(parameters.parameters()).device)
-    return SearchState(
-        content["iteration"], content["best_loss"], best_levels, content["history"], content["seconds"]
-    )
-
-
-def _load(path: Path) -> dict[str, Any]:
-    """A checkpoint, loaded to the CPU, so that a full GPU is not taken for a damaged file."""
-    stored = path.read_bytes()
-    try:
-        content: dict[str, Any] = torch.load(io.BytesIO(stored), weights_only=True, map_location="cpu")
-    except _DAMAGED:
-        raise InputError(
-            f"checkpoint {path}",
-            got="a damaged file",
-            wanted="the checkpoint of an interrupted run",
-            hint="delete it to start again",
-        ) from None
-    return content

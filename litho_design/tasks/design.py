@@ -19,8 +19,8 @@ from litho_design.images.targets import TargetRecord
 from litho_design.optics import Optics
 from litho_design.optics.stroke import Stroke, measure_stroke
 from litho_design.optimisation.budget import peak_memory_gib
+from litho_design.optimisation.checkpoint import CHECKPOINTS, SearchState
 from litho_design.optimisation.robust import EnsembleRecord
-from litho_design.optimisation.search import CHECKPOINTS, SearchState
 from litho_design.optimisation.settings import DesignSettings
 from litho_design.printers.layout import LayoutSettings, Printability
 from litho_design.printers.printer import Printer, PrinterRecord, TilingCheck

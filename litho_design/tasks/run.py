@@ -16,17 +16,12 @@ from torch import Tensor
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import record_sha256
 from litho_design.optimisation.budget import Budget, measure_budget
+from litho_design.optimisation.checkpoint import SearchState, finished_iterations, remove_checkpoint
 from litho_design.optimisation.fabrication import outside
 from litho_design.optimisation.parameters import Parametrisation
 from litho_design.optimisation.polish import polish_levels
 from litho_design.optimisation.robust import measure_disagreement
-from litho_design.optimisation.search import (
-    SearchState,
-    finished_iterations,
-    make_parametrisation,
-    remove_checkpoint,
-    search_layout,
-)
+from litho_design.optimisation.search import make_parametrisation, search_layout
 from litho_design.printers.layout import printability
 from litho_design.printers.printer import Printer
 from litho_design.printers.source import load_printer

@@ -1,0 +1,122 @@
+"""What an interrupted search leaves in its folder, and how it goes on from there."""
+
+from __future__ import annotations
+
+import io
+import math
+import pickle
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import atomic_file
+
+# What an interrupted run leaves, of all its parts.
+CHECKPOINTS = "checkpoint*.pt"
+# What torch raises for a damaged file depends on the place of the damage.
+_DAMAGED = (
+    RuntimeError,
+    pickle.UnpicklingError,
+    EOFError,
+    ValueError,
+    LookupError,
+    TypeError,
+    AttributeError,
+)
+
+
+class Stateful(Protocol):
+    """A part of a search with a state of its own: its parameters, its optimiser, its rate."""
+
+    def state_dict(self) -> dict[str, Any]: ...
+    def load_state_dict(self, state_dict: dict[str, Any], /) -> Any: ...
+
+
+@dataclass
+class SearchState:
+    """What a search has found so far; all that a resumed one needs beside its settings and stateful parts."""
+
+    iteration: int = 0
+    best_loss: float = math.inf
+    best_levels: Tensor | None = None
+    history: list[dict[str, float]] = field(default_factory=list)
+    # Of the search, in runs that were interrupted.
+    earlier_seconds: float = 0.0
+
+
+def save_checkpoint(
+    path: Path, fingerprint: str, state: SearchState, stateful: Mapping[str, Stateful], seconds: float
+) -> None:
+    """Write the state of a search and of its parts; ``fingerprint`` says which task they belong to."""
+    content = {name: part.state_dict() for name, part in stateful.items()} | {
+        "fingerprint": fingerprint,
+        "iteration": state.iteration,
+        "best_loss": state.best_loss,
+        "best_levels": state.best_levels,
+        "history": state.history,
+        "seconds": seconds,
+    }
+    with atomic_file(path) as temporary:
+        torch.save(content, temporary)
+
+
+def resume(
+    path: Path, fingerprint: str, stateful: Mapping[str, Stateful], device: torch.device
+) -> SearchState:
+    """Load the parts from a checkpoint, in place, and return its state, on ``device``.
+
+    Raises:
+        InputError: a checkpoint of another task, or a damaged file.
+    """
+    content = _load(path)
+    if content["fingerprint"] != fingerprint:
+        raise InputError(
+            f"checkpoint {path}",
+            got="a run with other settings",
+            wanted="the same settings, target and model",
+            hint="choose another --out, or delete the checkpoint to start again",
+        )
+    for name, part in stateful.items():
+        part.load_state_dict(content[name])
+    best_levels = content["best_levels"]
+    if best_levels is not None:
+        best_levels = best_levels.to(device)
+    return SearchState(
+        content["iteration"], content["best_loss"], best_levels, content["history"], content["seconds"]
+    )
+
+
+def checkpoint_path(folder: Path, part: str = "") -> Path:
+    """Where a search in ``folder`` keeps its state; ``part`` is its part of a shared search."""
+    return folder / f"checkpoint{part}.pt"
+
+
+def finished_iterations(folder: Path, part: str = "") -> int:
+    """Finished iterations of an interrupted run in ``folder``; 0 without one."""
+    path = checkpoint_path(folder, part)
+    return int(_load(path)["iteration"]) if path.exists() else 0
+
+
+def remove_checkpoint(folder: Path, part: str = "") -> None:
+    """Delete the checkpoint of a finished design."""
+    checkpoint_path(folder, part).unlink(missing_ok=True)
+
+
+def _load(path: Path) -> dict[str, Any]:
+    """A checkpoint, loaded to the CPU, so that a full GPU is not taken for a damaged file."""
+    stored = path.read_bytes()
+    try:
+        content: dict[str, Any] = torch.load(io.BytesIO(stored), weights_only=True, map_location="cpu")
+    except _DAMAGED:
+        raise InputError(
+            f"checkpoint {path}",
+            got="a damaged file",
+            wanted="the checkpoint of an interrupted run",
+            hint="delete it to start again",
+        ) from None
+    return content
