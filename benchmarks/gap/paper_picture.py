@@ -33,7 +33,7 @@ def search_figure(record: Mapping[str, Any]) -> Figure:
                     _draw_runs(axes, [run for run in seeds if run["judge"] == judge], search, iterations)
             if kind == "computational":
                 axes.set_xscale("log")
-                axes.set_xticks(ticks := [0.05, 0.1, 0.2, 0.3], [f"{tick:g}" for tick in ticks])
+                axes.set_xticks(ticks := [0.01, 0.02, 0.05, 0.1], [f"{tick:g}" for tick in ticks])
                 axes.minorticks_off()
             axes.grid(axis="x", color="#d9dee5", linewidth=0.6)
             axes.spines[["top", "right", "left"]].set_visible(False)
