@@ -1,11 +1,11 @@
-"""The picture of the paper's own search beside ours: how far every element falls when it is printed."""
+"""The picture of the paper's own search beside ours: every element in design and in print."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from benchmarks.gap.paper_tables import ARMS, FAB, MEASURED, NAMES, SEARCHES, SEEDS_OF
+from benchmarks.gap.paper_tables import ARMS, FAB, MEASURED, NAMES, SEARCHES, SEEDS_OF, made_kinds
 from benchmarks.gap.tables import LABELS, SHOWN, TITLES
 from litho_data.foundation.report_pictures import new_figure
 
@@ -19,12 +19,13 @@ _OFFSETS = {("paper", 333): -0.3, ("paper", 1000): -0.12, ("ours", 333): 0.12, (
 
 
 def search_figure(record: Mapping[str, Any]) -> Figure:
-    """A row per kind of element, a column per printer: design (ring) and print (dot) of every seed."""
-    tasks = record["tasks"]
-    judges = (FAB, *MEASURED)
-    figure = new_figure(11, 8.2)
-    panels = figure.subplots(len(NAMES), len(judges), squeeze=False, sharex="row", sharey=True)
-    for row, (kind, name) in enumerate(NAMES.items()):
+    """A row per finished kind of element, a column per printer: every seed in design and in print."""
+    tasks, judges = record["tasks"], (FAB, *MEASURED)
+    kinds = made_kinds(tasks)
+    figure = new_figure(11, 0.6 + 2.5 * len(kinds))
+    panels = figure.subplots(len(kinds), len(judges), squeeze=False, sharex="row", sharey=True)
+    for row, kind in enumerate(kinds):
+        name = NAMES[kind]
         quantity = next(iter(SHOWN[name]))
         for axes, judge in zip(panels[row], judges, strict=True):
             for search in SEARCHES:

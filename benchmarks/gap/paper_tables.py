@@ -22,11 +22,16 @@ NAMES = {"hoe": "hoe", "direct": "lens-direct", "computational": "lens-computati
 def as_markdown(record: Mapping[str, Any]) -> str:
     """A table per kind of element, the searches side by side; of kinds without a result the names."""
     tasks = record["tasks"]
-    made = [kind for kind, name in NAMES.items() if any(task.startswith(f"{name}-") for task in tasks)]
+    made = made_kinds(tasks)
     texts = [_table(kind, tasks) for kind in made]
     if missing := [TITLES[name].lower() for kind, name in NAMES.items() if kind not in made]:
         texts.append(f"Not made yet: {'; '.join(missing)}.")
     return "\n\n".join(texts)
+
+
+def made_kinds(tasks: Mapping[str, Any]) -> list[str]:
+    """Kinds of elements with any finished task."""
+    return [kind for kind, name in NAMES.items() if any(task.startswith(f"{name}-") for task in tasks)]
 
 
 Made = Mapping[tuple[str, int], Mapping[str, Any]]

@@ -65,7 +65,7 @@ def save_checkpoint(
         torch.save(content, temporary)
 
 
-def resume(
+def load_checkpoint(
     path: Path, fingerprint: str, stateful: Mapping[str, Stateful], device: torch.device
 ) -> SearchState:
     """Load the parts from a checkpoint, in place, and return its state, on ``device``.

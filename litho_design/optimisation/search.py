@@ -11,7 +11,12 @@ from torch import Tensor
 
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError
-from litho_design.optimisation.checkpoint import SearchState, checkpoint_path, resume, save_checkpoint
+from litho_design.optimisation.checkpoint import (
+    SearchState,
+    checkpoint_path,
+    load_checkpoint,
+    save_checkpoint,
+)
 from litho_design.optimisation.parameters import DirectLevels, GumbelLevels, Parametrisation
 from litho_design.optimisation.rate import RateSchedule
 from litho_design.optimisation.settings import SearchSettings
@@ -66,7 +71,7 @@ def search_layout(
     state = SearchState()
     checkpoint = None if folder is None else checkpoint_path(folder, part)
     if checkpoint is not None and checkpoint.exists():
-        state = resume(checkpoint, fingerprint, stateful, next(parameters.parameters()).device)
+        state = load_checkpoint(checkpoint, fingerprint, stateful, next(parameters.parameters()).device)
     started = time.monotonic() - state.earlier_seconds
     remaining = range(state.iteration, settings.iterations)
     for iteration in progress(remaining, what, total=len(remaining), estimate_of=0):

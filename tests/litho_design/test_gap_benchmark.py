@@ -15,7 +15,7 @@ from benchmarks.gap.cost import estimate, read_records, run_trial
 from benchmarks.gap.document import NAME, PAGE, RESULT_FILE, RESULTS
 from benchmarks.gap.jobs import Job, run_commands
 from benchmarks.gap.paper_picture import search_figure
-from benchmarks.gap.paper_tables import FAB, MEASURED
+from benchmarks.gap.paper_tables import FAB, MEASURED, NAMES
 from benchmarks.gap.plan import ARMS, FROZEN_WITH, PRINT_KNOBS, Effort, model, open_plan
 from benchmarks.gap.steps import model_jobs
 from benchmarks.gap.tables import as_markdown
@@ -250,18 +250,22 @@ def test_the_table_of_the_papers_search_says_what_is_not_made_and_who_leads(tmp_
 
 
 def test_the_picture_of_the_papers_search_shows_every_seed():
-    record = json.loads((RESULTS / paper_search.FILE_NAME).read_text("utf-8"))
-    panels = search_figure(record).axes
-    for column, judge in enumerate((FAB, *MEASURED)):
-        shown = {float(x) for line in panels[column].lines for x in line.get_xdata()}
+    tasks = json.loads((RESULTS / paper_search.FILE_NAME).read_text("utf-8"))["tasks"]
+    panels = [(name, judge) for name in NAMES.values() for judge in (FAB, *MEASURED)]
+    axes = search_figure({"tasks": tasks}).axes
+    assert len(axes) == len(panels)
+    for (name, judge), panel in zip(panels, axes, strict=True):
         runs = [
             run
-            for name, task in record["tasks"].items() if name.startswith("hoe-")
-            for run in task["of_each_seed"] if run["judge"] == judge
+            for task, made in tasks.items() if task.startswith(f"{name}-")
+            for run in made["of_each_seed"] if run["judge"] == judge
         ]  # fmt: skip
         # Two searches, each with three seeds and one, through four arms.
         assert len(runs) == 2 * (3 + 1) * 4
+        shown = {float(x) for line in panel.lines for x in line.get_xdata()}
         assert shown == {run[when] for run in runs for when in ("designed", "judged")}
+    lenses = {task: made for task, made in tasks.items() if task.startswith("lens-direct-paper")}
+    assert len(search_figure({"tasks": lenses}).axes) == 1 + len(MEASURED)
 
 
 def test_the_page_quotes_the_papers_search():
