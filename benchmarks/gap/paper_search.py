@@ -20,7 +20,16 @@ from typing import Any
 from benchmarks.gap.document import PAGE, RESULTS, search_minutes
 from benchmarks.gap.jobs import run_commands
 from benchmarks.gap.paper_picture import search_figure
-from benchmarks.gap.paper_tables import ARMS, FAB, MEASURED, NAMES, SEARCHES, SEEDS_OF, as_markdown
+from benchmarks.gap.paper_tables import (
+    ARMS,
+    FAB,
+    MEASURED,
+    NAMES,
+    SEARCHES,
+    SEEDS_OF,
+    as_markdown,
+    task_name,
+)
 from benchmarks.gap.plan import Effort, Plan, model, open_plan
 from benchmarks.gap.steps import fab_jobs, model_jobs
 from benchmarks.gap.tables import SHOWN
@@ -106,8 +115,7 @@ def _task(out: Path, effort: Effort, kind: str, search: str, iterations: int) ->
     models = {arm: "none" if arm == "none" else str(model(out, arm)) for arm in ARMS}
     judges = {FAB: str(out / "fab" / "truth")}
     judges |= {name: str(zoo.folder(model)) for name, model in MEASURED.items()}
-    name = f"{NAMES[kind]}-{search}-{iterations}"
-    return Task(name, kind, options, models, judges, SEEDS_OF[iterations])
+    return Task(task_name(kind, search, iterations), kind, options, models, judges, SEEDS_OF[iterations])
 
 
 def _write(folder: Path, record: Mapping[str, Any]) -> None:

@@ -29,6 +29,11 @@ def as_markdown(record: Mapping[str, Any]) -> str:
     return "\n\n".join(texts)
 
 
+def task_name(kind: str, search: str, iterations: int) -> str:
+    """Name of a task in the comparison and in its record."""
+    return f"{NAMES[kind]}-{search}-{iterations}"
+
+
 def made_kinds(tasks: Mapping[str, Any]) -> list[str]:
     """Kinds of elements with any finished task."""
     return [kind for kind, name in NAMES.items() if any(task.startswith(f"{name}-") for task in tasks)]
@@ -46,7 +51,7 @@ def _table(kind: str, tasks: Mapping[str, Mapping[str, Any]]) -> str:
         for search, iterations in columns
         for seeds in (SEEDS_OF[iterations],)
     ]
-    names = {column: "-".join(map(str, (NAMES[kind], *column))) for column in columns}
+    names = {column: task_name(kind, *column) for column in columns}
     made = {column: tasks[name] for column, name in names.items() if name in tasks}
     repeated = {column: task for column, task in made.items() if task["seeds"] > 1}
     judges = [
