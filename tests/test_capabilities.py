@@ -1,0 +1,160 @@
+"""The list of what a user can do: nothing is missing, and every entry has its tests or says why not."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+import tomllib
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.main import get_command
+
+ROOT = Path(__file__).parents[1]
+LIST = ROOT / "tests" / "capabilities.toml"
+PACKAGES = ("litho_data", "litho_models", "litho_design")
+# Rooms whose `__all__` is for other rooms and on no page.
+INNER = {"litho_models.fast", "litho_models.fitting", "litho_models.loop.probes"}
+# Of every command by itself, and of torchrun.
+ANYWHERE = {"--help", "--version", "--install-completion", "--show-completion", "--no-python"}
+
+
+def entries() -> list[dict[str, Any]]:
+    groups = tomllib.loads(LIST.read_text("utf-8"))
+    return [entry for tasks in groups.values() for listed in tasks.values() for entry in listed]
+
+
+@cache
+def names_in_file(file: str) -> frozenset[str]:
+    """Names of the tests in a file, `Class::test_name` within a class; nothing is imported."""
+
+    def names(nodes: list[ast.stmt], place: str) -> Iterator[str]:
+        for node in nodes:
+            if isinstance(node, ast.ClassDef):
+                yield from names(node.body, f"{place}{node.name}::")
+            elif isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
+                yield place + node.name
+
+    path = ROOT / file
+    return frozenset(names(ast.parse(path.read_text("utf-8")).body, "")) if path.is_file() else frozenset()
+
+
+def faults(entry: dict[str, Any]) -> list[str]:
+    """What is wrong with an entry, in words."""
+    kinds = entry.keys() & {"test", "gone", "untested"}
+    found = []
+    if len(kinds) != 1 or entry.keys() - kinds != {"what", "how"}:
+        found.append(f"keys {sorted(entry)}, wanted what, how and one of test, gone, untested")
+    tests = entry.get("test", [])
+    tests = [tests] if isinstance(tests, str) else tests
+    texts = [value for key, value in entry.items() if key != "test"] + tests
+    if not all(isinstance(text, str) and text.strip() for text in texts) or ("test" in entry and not tests):
+        found.append("an empty text")
+    for test in tests:
+        file, _, name = test.partition("::")
+        if name not in names_in_file(file):
+            found.append(f"no test {test}")
+    return found
+
+
+def commands() -> dict[str, set[str]]:
+    """Every command of the three command lines with its options."""
+    found: dict[str, set[str]] = {}
+
+    def walk(command: Any, name: str) -> None:
+        for word, inner in getattr(command, "commands", {}).items():
+            walk(inner, f"{name} {word}")
+        if not hasattr(command, "commands"):
+            found[name] = {option for parameter in command.params for option in parameter.opts}
+
+    for package in PACKAGES:
+        app = importlib.import_module(f"{package}.cli.app").app
+        walk(get_command(app), package.replace("_", "-"))
+    return found
+
+
+def public_names() -> set[str]:
+    """`room.name` for all that the `__init__.py` of packages and rooms show, read from their source."""
+    names = set()
+    for file in (one for package in PACKAGES for one in (ROOT / package).rglob("__init__.py")):
+        room = ".".join(file.parent.relative_to(ROOT).parts)
+        for node in ast.walk(ast.parse(file.read_text("utf-8"))):
+            if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
+                names |= {f"{room}.{name}" for name in ast.literal_eval(node.value)}
+            elif isinstance(node, ast.Call) and ast.unparse(node.func) == "lazy_face":
+                names |= {f"{room}.{name}" for name in ast.literal_eval(node.args[1])}
+    return {name for name in names if name.rpartition(".")[0] not in INNER}
+
+
+def names_in(how: str) -> set[str]:
+    """Public names in a `how`: `room.name`, or `room: name, name`."""
+    named = set(re.findall(r"litho_\w+(?:\.\w+)+(?=[\s,;()]|$)", how))
+    for room, listed in re.findall(r"(litho_[\w.]+): ([^;]+)", how):
+        named |= {f"{room}.{name}" for name in re.findall(r"\w+", listed)}
+    return named
+
+
+@pytest.fixture(scope="module")
+def hows() -> list[str]:
+    return [entry["how"] for entry in entries()]
+
+
+def test_every_entry_has_tests_that_exist_or_says_why_not():
+    wrong = {entry.get("what"): faults(entry) for entry in entries() if faults(entry)}
+    assert not wrong
+    told = [entry["what"] for entry in entries()]
+    assert len(told) == len(set(told)) >= 150
+
+
+def test_a_fault_in_an_entry_is_found():
+    here = "tests/test_capabilities.py::test_a_fault_in_an_entry_is_found"
+    good = {"what": "Find faults", "how": "a list", "test": here}
+    assert faults(good) == faults({**good, "test": [here, here]}) == []
+    for spoiled, said in (
+        ({**good, "test": f"{here}_not"}, "no test"),
+        ({**good, "test": [here, "tests/test_nowhere.py::test_nothing"]}, "no test"),
+        # The test of a class is not one of the file.
+        ({**good, "test": "tests/litho_data/test_layouts.py::test_it_is_the_equation"}, "no test"),
+        ({**good, "test": ""}, "empty"),
+        ({**good, "test": []}, "empty"),
+        ({**good, "gone": "nobody misses it"}, "keys"),
+        ({"what": "Find faults", "how": "a list"}, "keys"),
+        ({"what": "Find faults", "how": "a list", "gone": " "}, "empty"),
+        ({**good, "tset": here}, "keys"),
+    ):
+        assert any(said in fault for fault in faults(spoiled)), spoiled
+
+
+def test_every_command_is_listed(hows):
+    words = " ".join(hows)
+    assert len(commands()) > 30
+    missing = [name for name in commands() if not re.search(rf"{name}(?![\w-])", words)]
+    assert not missing
+
+
+def test_every_public_name_is_listed(hows):
+    listed = {name for how in hows for name in names_in(how)}
+    assert len(public_names()) > 150
+    assert not public_names() - listed
+
+
+def test_what_the_list_names_is_there():
+    """A command, option or public name that has gone leaves an entry that says why nobody misses it."""
+    known, public = commands(), public_names()
+    options = ANYWHERE | {option for own in known.values() for option in own}
+    for how in (entry["how"] for entry in entries() if "gone" not in entry):
+        assert set(re.findall(r"--[a-z][a-z-]*", how)) <= options, how
+        for name in re.findall(r"litho-(?:data|models|design) [a-z-]+", how):
+            assert any(f"{command} ".startswith(f"{name} ") for command in known), how
+        for name in names_in(how):
+            parts = name.split(".")
+            prefixes = {".".join(parts[:end]) for end in range(1, len(parts) + 1)}
+            assert (
+                prefixes & public
+                or parts[-1] == "__version__"
+                or any(shown.startswith(f"{name}.") for shown in public)
+            ), f"{name} in {how}"
