@@ -26,12 +26,15 @@ from litho_models.layers.ranges import Range
 from litho_models.simulator import Simulator, SimulatorConfig, crop_border
 
 Shrinkage = Literal["fixed-reference", "image-range", "image-maximum"]
+Spot = Literal["given", "round", "elliptical"]
 
 
 class PhysicsConfig(SimulatorConfig):
     """The bare defaults are the form of models frozen before there was a gain; variants set the others."""
 
     sigma_optical_um: float = Field(0.2, gt=0, description="optical spot, standard deviation, µm")
+    spot: Spot = Field("given", description="widths of the spot that are fitted: none, one, or one an axis")
+    sigma_optical_max_um: float = Field(0.8, gt=0, description="upper bound of a fitted spot, µm")
     sigma_diffusion_max_um: float = Field(2.5, gt=0, description="upper bound of the diffusion, µm")
     # The start matters: from a steep threshold in mid-range a fit ends where the projection is a line.
     sigma_diffusion_init_um: float = Field(1.5, gt=0, description="diffusion before fitting, µm")
@@ -90,6 +93,8 @@ class Physics(Simulator):
         self.raw_kappa_min = nn.Parameter(self.ranges["raw_kappa_min"].raw(config.kappa_min_init))
         self.tau = nn.Parameter(self.ranges["tau"].raw(config.sigma_diffusion_init_um))
         self.bias_um = nn.Parameter(torch.tensor(config.bias_init_um))
+        for key in self._spot_keys:
+            self.register_parameter(key, nn.Parameter(self.ranges[key].raw(config.sigma_optical_um)))
         if config.gain_init is not None:
             self.raw_gain = nn.Parameter(self.ranges["raw_gain"].raw(config.gain_init))
 
@@ -101,12 +106,28 @@ class Physics(Simulator):
             "raw_eta": Range("eta", self.config.eta_min, 1.0),
             "raw_kappa_min": Range("kappa_min", 0.0, 1.0),
             "tau": Range("sigma_diffusion_um", 0.0, self.config.sigma_diffusion_max_um),
+            **{
+                key: Range(key.removeprefix("raw_"), 0.0, self.config.sigma_optical_max_um)
+                for key in self._spot_keys
+            },
             **gain,
         }
 
     @property
+    def _spot_keys(self) -> tuple[str, ...]:
+        keys = {"given": (), "round": ("raw_spot_um",), "elliptical": ("raw_spot_y_um", "raw_spot_x_um")}
+        return keys[self.config.spot]
+
+    def _spot_um(self, values: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+        """Standard deviation of the spot along y and along x, µm."""
+        keys = self._spot_keys or ("",)
+        given = torch.tensor(self.config.sigma_optical_um, device=self.bias_um.device)
+        widths = [values.get(key.removeprefix("raw_"), given) for key in keys]
+        return widths[0], widths[-1]
+
+    @property
     def values(self) -> dict[str, Tensor]:
-        """The physical values: alpha, eta, kappa_min, sigma_diffusion_um, bias_um, and the gain if any."""
+        """The physical values: alpha, eta, kappa_min, sigma_diffusion_um, bias_um; fitted widths and gain if any."""
         ranged = {own.name: own.value(getattr(self, key)) for key, own in self.ranges.items()}
         return {**ranged, "bias_um": self.bias_um}
 
@@ -123,8 +144,8 @@ class Physics(Simulator):
     def interior(self, layout_um: Tensor) -> Tensor:
         values = self.values
         optical, diffusion = self._radii_px(values)
-        sigma_optical = torch.tensor(self.config.sigma_optical_um / self.pitch_um, device=layout_um.device)
-        aerial = blur_interior(layout_um / self._reference_um, sigma_optical, optical)
+        along_y, along_x = (sigma / self.pitch_um for sigma in self._spot_um(values))
+        aerial = blur_interior(layout_um / self._reference_um, (along_y, along_x), optical)
         initial = self._project(aerial, values)
         dose = blur_interior(initial, values["sigma_diffusion_um"] / self.pitch_um, diffusion)
         return self._develop(crop_border(initial, diffusion), dose, values)
@@ -136,8 +157,8 @@ class Physics(Simulator):
         # A continued layout, blurred, is itself continued from the radius of the optical blur on.
         margin = optical if edge == "replicate" else 0
         relative = pad_field(layout_um, margin, margin) / self._reference_um
-        sigma_optical, sigma_diffusion = self.config.sigma_optical_um, values["sigma_diffusion_um"]
-        aerial = gaussian_blur(relative, sigma_optical, self.pitch_um, edge=edge, radius_px=optical)
+        spot, sigma_diffusion = self._spot_um(values), values["sigma_diffusion_um"]
+        aerial = gaussian_blur(relative, spot, self.pitch_um, edge=edge, radius_px=optical)
         initial = self._project(aerial, values)
         dose = gaussian_blur(initial, sigma_diffusion, self.pitch_um, edge=edge, radius_px=diffusion)
         return self._develop(crop_border(initial, margin), crop_border(dose, margin), values)
@@ -146,9 +167,10 @@ class Physics(Simulator):
 
     def _radii_px(self, values: Mapping[str, Tensor]) -> tuple[int, int]:
         config, diffusion = self.config, float(values["sigma_diffusion_um"].detach())
+        spot = max(float(sigma.detach()) for sigma in self._spot_um(values))
         optical, diffused = (
             supported_radius_px(sigma / self.pitch_um, config.kernel_support, config.kernel_cap_px)
-            for sigma in (config.sigma_optical_um, diffusion)
+            for sigma in (spot, diffusion)
         )
         return optical, diffused
 
