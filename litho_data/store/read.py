@@ -5,8 +5,9 @@ from __future__ import annotations
 import html
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -66,6 +67,7 @@ class PrintedScan:
         tip_radius_um: of the microscope's tip, or the most that it can be; None if the store does not say.
         height_sigma_um: float32 (ny, nx), µm, standard uncertainty of ``height_um``, the scan's offset aside;
             NaN where not valid, None if the store has none.
+        groups: what the card's pattern of ids says beside the print, such as the field; by name.
     """
 
     id: str
@@ -89,6 +91,7 @@ class PrintedScan:
     bend_um: Bend | None = None
     tip_radius_um: float | None = None
     height_sigma_um: np.ndarray | None = None
+    groups: Mapping[str, str] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         ny, nx = self.shape
@@ -192,7 +195,19 @@ class Store:
             bend_um=self._bend_um(row),
             tip_radius_um=self._tip_radius_um(row),
             height_sigma_um=self.sample(SIGMA.name, row) if SIGMA.name in self._arrays else None,
+            groups=self._groups(scan_id),
         )
+
+    def _groups(self, scan_id: str) -> dict[str, str]:
+        """Named groups of the card's pattern in an id, the print aside.
+
+        A pattern that repeats is not asked: one in a store from elsewhere might never come to an end.
+        """
+        pattern = self.manifest.get("card", {}).get("ids", {}).get("print") or ""
+        repeats = set("*+{?") & set(pattern.replace("(?", "("))
+        match = None if repeats else re.fullmatch(pattern, scan_id)
+        found = match.groupdict() if match else {}
+        return {name: value for name, value in found.items() if name != "print" and value is not None}
 
     def scans(self) -> list[PrintedScan]:
         """All scans in stored order, in memory."""

@@ -10,7 +10,9 @@ from torch.nn import functional
 from litho_models.effects.effect import Effect, FieldContext, Parameter, Values, of_development
 from litho_models.effects.filters import add_blur, add_warp, gradient
 
-_SLOPE_SOURCE = "empirical: loss proportional to the squared slope, one coefficient per axis"
+_SLOPE_SOURCE = "empirical: loss along a power of the slope, one coefficient per axis"
+# Slope below which a power of it is rounded off, so that it has a derivative.
+_LEAST_SLOPE = 1e-3
 
 
 def vertical_shrinkage(height: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -77,9 +79,16 @@ def _largest(field: Tensor, half_px: int) -> Tensor:
 
 
 def slope_thinning(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """H - cx (dH/dx)² - cy (dH/dy)²: height missing on slopes, by axis."""
-    along_y, along_x = gradient(height, context.pitch_um)
-    return height - values["along_x_um"] * along_x**2 - values["along_y_um"] * along_y**2
+    """H - cx |dH/dx|^p - cy |dH/dy|^p: height missing on slopes, by axis.
+
+    p = 1 is a loss on every edge by its height: to first order each edge stands back by c.
+    """
+    power = values["exponent"]
+    along_y, along_x = (
+        (slope**2 + _LEAST_SLOPE**2) ** (power / 2) - _LEAST_SLOPE**power
+        for slope in gradient(height, context.pitch_um)
+    )
+    return height - values["along_x_um"] * along_x - values["along_y_um"] * along_y
 
 
 _OF_NARROW = {
@@ -146,12 +155,13 @@ EFFECTS = (
         parameters={
             "along_x_um": Parameter("µm", 0.0, 2.0, 0.1),
             "along_y_um": Parameter("µm", 0.0, 2.0, 0.1),
+            "exponent": Parameter("1", 0.7, 3.0, 2.0, kind="shape"),
         },
         apply=slope_thinning,
-        trials=(
-            {"along_x_um": 0.1},
-            {"along_y_um": 0.1},
-            {"along_x_um": 0.1, "along_y_um": 0.1},
+        trials=tuple(
+            {**axes, "exponent": power}
+            for power in (1.0, 2.0)
+            for axes in ({"along_x_um": 0.1}, {"along_y_um": 0.1}, {"along_x_um": 0.1, "along_y_um": 0.1})
         ),
         source=_SLOPE_SOURCE,
         separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees, with two tips",

@@ -16,6 +16,8 @@ Stage = Literal["exposure", "resist", "development", "measurement"]
 Role = Literal["process", "measurement", "nuisance", "undetermined"]
 ActsOn = Literal["layout", "height"]
 Kind = Literal["amplitude", "shape", "choice"]
+# What it says to have found an effect: why, by which formula, or only where.
+Knowledge = Literal["cause", "law", "description"]
 
 Values = Mapping[str, Tensor]
 
@@ -174,6 +176,7 @@ class Effect:
         along_lines: it depends on the line alone, so offsets of single lines would hide it.
         reverses: parameters whose sign is the other way round on lines recorded on the way back.
         of_tip: it belongs to the tip, and a new one does not have it.
+        knowledge: a cause has a name; a law only a formula; a description only a covariate.
     """
 
     name: str
@@ -191,6 +194,7 @@ class Effect:
     along_lines: bool = False
     reverses: tuple[str, ...] = ()
     of_tip: bool = False
+    knowledge: Knowledge = "cause"
     amplitudes: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from litho_models.effects.effect import Effect, FieldContext, Parameter, Values, of_exposure
-from litho_models.effects.filters import add_filtered, add_warp, centred_lag, trailing_response
+from litho_models.effects.filters import add_filtered, add_warp, centred_lag, gradient, trailing_response
 
 _TAIL_LENGTHS = 6
 # A slower wave is no ripple: maps of the field look like it.
@@ -26,6 +26,15 @@ def galvo_lag(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
 
     reach = _TAIL_LENGTHS * float(length.detach()) + context.pitch_um
     return add_filtered(layout, transfer_minus_one, context.pitch_um, reach)
+
+
+def line_shortening(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
+    """M - δx |∂M/∂x| - δy |∂M/∂y|: every written line loses δ at both ends, or gains it.
+
+    What an edge loses is right in its area; the spot, which is wider than δ, makes its shape.
+    """
+    along_y, along_x = gradient(layout, context.pitch_um)
+    return layout - values["along_x_um"] * along_x.abs() - values["along_y_um"] * along_y.abs()
 
 
 def galvo_nonlinearity(layout: Tensor, values: Values, context: FieldContext) -> Tensor:
@@ -91,6 +100,18 @@ EFFECTS = (
         ),
         source="first-order lag of the deflection, l = speed x time constant",
         separating="print the same layout at 0 and 90 degrees, scan both at 0 and 90 degrees",
+    ),
+    of_exposure(
+        name="line-shortening",
+        title="written lines that begin and end too late",
+        parameters={
+            "along_x_um": Parameter("µm", -0.6, 0.6, 0.1),
+            "along_y_um": Parameter("µm", -0.6, 0.6, 0.1),
+        },
+        apply=line_shortening,
+        trials=({"along_x_um": 0.1}, {"along_y_um": 0.1}, {"along_x_um": 0.1, "along_y_um": 0.1}),
+        source="shutter delay times scan speed at both ends of a line; 40 mm/s x 5 µs = 0.2 µm",
+        separating="straight edges of several steepnesses, printed and scanned at 0 and 90 degrees",
     ),
     of_exposure(
         name="galvo-nonlinearity",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import get_args
 
 from litho_data.foundation.errors import InputError, require_known
 from litho_models.effects import (
@@ -16,10 +17,12 @@ from litho_models.effects import (
     measurement_tip,
     resist,
 )
-from litho_models.effects.effect import Effect
+from litho_models.effects.effect import Effect, Stage
+from litho_models.effects.laws import DESCRIPTIONS, LAWS
 
 _FORWARD_ORDER = (
     "layer-stacking",
+    "line-shortening",
     "dose-exponent",
     "elliptical-psf",
     "galvo-lag",
@@ -104,6 +107,8 @@ def get_effect(name: str) -> Effect:
     Raises:
         InputError: no such effect.
     """
+    if (nameless := LAWS.get(name) or DESCRIPTIONS.get(name)) is not None:
+        return nameless
     require_known("effect", name, CATALOGUE)
     return CATALOGUE[name]
 
@@ -115,7 +120,13 @@ def in_forward_order(names: Sequence[str]) -> list[str]:
         InputError: a name that is no effect's.
     """
     given = {get_effect(name).name for name in names}
-    return [name for name in CATALOGUE if name in given]
+    stages = list(get_args(Stage))
+    # What has no name acts on the finished print, before the microscope sees it.
+    print_ends = max(i for i, one in enumerate(CATALOGUE.values()) if one.stage != stages[-1])
+    known = list(CATALOGUE)
+    nameless = [name for name in (*LAWS, *DESCRIPTIONS) if name in given]
+    ordered = [*known[: print_ends + 1], *nameless, *known[print_ends + 1 :]]
+    return [name for name in ordered if name in given]
 
 
 def screened_effects(tip_radius_um: float | None = None) -> list[Effect]:

@@ -1,0 +1,142 @@
+"""One ridge for all that is fitted linearly to scans: columns with one strength for all, or one by group.
+
+Of each scan only the inner products of its residual and its columns are needed. From them follow the strengths
+on any scans, and the squared error on any others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from litho_models.scan_terms.groups import ALL, Labels
+
+# Of a unit diagonal: what columns that do the same are told apart by.
+_ALIKE = 1e-7
+
+
+@dataclass(frozen=True)
+class Block:
+    """Columns whose strengths are fitted together.
+
+    Attributes:
+        columns: their numbers in the inner products, from 1; 0 is the residual.
+        by: name of the grouping; each label has strengths of its own.
+        shrinking: so many scans' worth of evidence for no strength at all; 0 for none.
+    """
+
+    columns: tuple[int, ...]
+    by: str = ALL
+    shrinking: float = 0.0
+
+
+@dataclass(frozen=True)
+class Products:
+    """Inner products of the scans, and their groups.
+
+    Attributes:
+        grams: (scans, 1 + m, 1 + m), residual first, per pixel.
+        groups: by name of the grouping, a label for each scan.
+    """
+
+    grams: np.ndarray
+    groups: Mapping[str, Labels]
+
+    def strengths(self, blocks: Sequence[Block], scans: np.ndarray) -> list[dict[str, np.ndarray]]:
+        """Of each block, by label, the strengths that fit these scans best; labels not among them are absent."""
+        expanded = _Expanded(self, blocks, scans)
+        solved = expanded.solve([0])[:, 0]
+        return [
+            dict(zip(slot, solved[start:end].reshape(len(slot), -1), strict=True))
+            for slot, start, end in zip(
+                expanded.slots, expanded.starts[:-1], expanded.starts[1:], strict=True
+            )
+        ]
+
+    def squares(
+        self, blocks: Sequence[Block], strengths: Sequence[Mapping[str, np.ndarray]], scans: np.ndarray
+    ) -> np.ndarray:
+        """Mean squared residual of each of these scans with the strengths of its groups in place."""
+        left = np.empty(len(scans))
+        for number, scan in enumerate(scans):
+            vector = np.zeros(self.grams.shape[1])
+            vector[0] = 1.0
+            for block, known in zip(blocks, strengths, strict=True):
+                own = known.get(self.groups[block.by][scan])
+                if own is not None:
+                    vector[list(block.columns)] -= own
+            left[number] = vector @ self.grams[scan] @ vector
+        return left
+
+    def held_out(self, blocks: Sequence[Block], fold_of: np.ndarray) -> np.ndarray:
+        """Mean squared residual of each scan with the strengths fitted without its fold, (scans,)."""
+        left = np.empty(len(fold_of))
+        for fold in np.unique(fold_of):
+            own = np.flatnonzero(fold_of == fold)
+            fitted = self.strengths(blocks, np.flatnonzero(fold_of != fold))
+            left[own] = self.squares(blocks, fitted, own)
+        return left
+
+    def freed_of(self, blocks: Sequence[Block]) -> Products:
+        """The same, residual and columns freed of what these blocks do on all scans; their columns are zero."""
+        every = np.arange(len(self.grams))
+        expanded = _Expanded(self, blocks, every)
+        used = {column for block in blocks for column in block.columns}
+        rest = [c for c in range(self.grams.shape[1]) if c not in used]
+        solved = expanded.solve(rest)
+        freed = np.empty_like(self.grams)
+        for members, rows, columns in expanded.alike:
+            change = np.zeros(self.grams.shape[1:])
+            change[rest, rest] = 1.0
+            # Columns that several blocks share count for each of them.
+            np.subtract.at(change, (columns[:, None], np.array(rest)[None, :]), solved[rows])
+            freed[members] = change.T @ self.grams[members] @ change
+        return Products(freed, self.groups)
+
+
+class _Expanded:
+    """Normal equations with one row for each strength of each label."""
+
+    def __init__(self, products: Products, blocks: Sequence[Block], scans: np.ndarray):
+        self._products = products
+        labels = [products.groups[block.by] for block in blocks]
+        self.slots = [sorted({own[scan] for scan in scans}) for own in labels]
+        sizes = [len(slot) * len(block.columns) for slot, block in zip(self.slots, blocks, strict=True)]
+        self.starts = np.cumsum([0, *sizes])
+        self._columns = np.array([c for block in blocks for c in block.columns], np.intp)
+        by: dict[tuple[str, ...], list[int]] = {}
+        for scan in scans:
+            by.setdefault(tuple(own[scan] for own in labels), []).append(int(scan))
+        # Scans that are in the same groups, the rows of their strengths, and their columns.
+        self.alike = [
+            (np.array(members), self._rows(blocks, own), self._columns) for own, members in by.items()
+        ]
+        usual = np.einsum("sii->i", products.grams[scans]) / max(len(scans), 1)
+        self._shrunk = np.concatenate(
+            [
+                np.tile(block.shrinking * usual[list(block.columns)], len(slot))
+                for block, slot in zip(blocks, self.slots, strict=True)
+            ]
+            or [np.empty(0)]
+        )
+
+    def _rows(self, blocks: Sequence[Block], labels: Sequence[str]) -> np.ndarray:
+        rows = [
+            start + slot.index(label) * len(block.columns) + np.arange(len(block.columns))
+            for block, slot, start, label in zip(blocks, self.slots, self.starts[:-1], labels, strict=True)
+        ]
+        return np.concatenate(rows) if rows else np.empty(0, np.intp)
+
+    def solve(self, targets: Sequence[int]) -> np.ndarray:
+        """Strengths (rows, targets) that come closest to these columns, or to the residual."""
+        size = int(self.starts[-1])
+        matrix, right = np.diag(self._shrunk), np.zeros((size, len(targets)))
+        for members, rows, columns in self.alike:
+            gram = self._products.grams[members].sum(axis=0)
+            matrix[np.ix_(rows, rows)] += gram[np.ix_(columns, columns)]
+            right[rows] += gram[np.ix_(columns, targets)]
+        scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))[:, None]
+        normal = matrix / (scale * scale.T) + _ALIKE * np.eye(size)
+        return np.linalg.solve(normal, right / scale) / scale

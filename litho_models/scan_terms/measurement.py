@@ -1,0 +1,331 @@
+"""The measurement model: what microscope, registration and levelling make of a print, as scans share it.
+
+A scan shows the print levelled as its file was, displaced where the scanner ran unevenly, with a gain, on a
+background. What of this all scans have in common, or all scans of a group, is learned on training scans and
+added to the prediction of any other; nothing of it is fitted to a scan that is scored. It is no part of the
+printer: no design sees it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from numpy.polynomial import legendre
+from pydantic import ConfigDict
+from scipy.ndimage import map_coordinates
+
+from litho_data.foundation.results import Record
+from litho_data.store import PrintedScan
+from litho_models.scan_terms.grouped import Block, Products
+from litho_models.scan_terms.groups import ALL, groupings, label_of
+from litho_models.scan_terms.term import FloatMap
+from litho_models.splits.folds import grouped_folds
+
+Shared = Literal["background", "shift-x", "shift-y", "gain"]
+Levelling = Literal["none", "plane", "twist", "bow"]
+
+# Surfaces that a file may have been freed of, structure included: which of x, y, x², xy, y², by number from 1.
+LEVELLED: dict[Levelling, tuple[int, ...]] = {
+    "none": (),
+    "plane": (1, 2),
+    "twist": (1, 2, 4),
+    "bow": (1, 2, 3, 4, 5),
+}
+_HIGHEST, _LATERAL = 7, 3
+# What is tried, the most likely first. A background of degree 7 turns over 14 µm in a field of 54 µm.
+_OFFERS: tuple[tuple[Shared, int, bool], ...] = (
+    ("background", 2, False),
+    ("background", 4, False),
+    ("background", _HIGHEST, False),
+    ("background", 3, True),
+    ("background", _HIGHEST, True),
+    ("shift-x", _LATERAL, False),
+    ("shift-x", _LATERAL, True),
+    ("shift-y", _LATERAL, False),
+    ("shift-y", _LATERAL, True),
+    ("gain", 0, True),
+)
+# Scans' worth of evidence for no difference between groups: the spread within groups over that between them.
+_SHRINKING = (0.3, 1.0, 3.0)
+# A part stays if the held-out squared error falls in the mean by more than so many standard errors.
+_LEAST_Z = 1.5
+_SAMPLED_PX = 16384
+# Displacements are found by their derivative; the second time around it is taken at the displaced print.
+_ROUNDS = 2
+_INNER_FOLDS = 5
+_SAME_SIZE = 0.01
+
+
+class SharedPart(Record):
+    """One thing that scans have in common.
+
+    Attributes:
+        what: ``background`` and the displacements are sums of Legendre polynomials of x and y, -1 to 1 over
+            the field, of ``degree`` in all; the gain is one number, relative.
+        by: grouping; ``coefficients``: by label, µm, or 1 for the gain. A label that is not there adds nothing.
+    """
+
+    what: Shared
+    by: str
+    degree: int
+    shrinking: float
+    coefficients: dict[str, list[float]]
+
+    @property
+    def numbers(self) -> int:
+        """Fitted numbers."""
+        return sum(len(own) for own in self.coefficients.values())
+
+
+class MeasurementModel(Record):
+    """What scans share beside their prints.
+
+    Attributes:
+        levelling: surface that the files were freed of, structure included; taken off predictions alike.
+        parts: the rest, in the order in which it was found.
+        field_um: size (y, x) of the fields it was learned on; ``scans``: how many.
+    """
+
+    model_config = ConfigDict(allow_inf_nan=False)
+
+    levelling: Levelling
+    parts: list[SharedPart]
+    field_um: tuple[float, float]
+    scans: int
+
+    @property
+    def numbers(self) -> int:
+        """Fitted numbers."""
+        return sum(part.numbers for part in self.parts)
+
+    def fits(self, scan: PrintedScan) -> bool:
+        """Whether the scan's field has the size that this was learned on."""
+        return bool(np.allclose(_field_um(scan), self.field_um, rtol=_SAME_SIZE, atol=0))
+
+    def expected_um(self, scan: PrintedScan, prediction_um: np.ndarray) -> FloatMap:
+        """The map (ny, nx) that the microscope should show of a predicted print (ny, nx), µm.
+
+        A field of another size has its levelling only.
+        """
+        parts = self.parts if self.fits(scan) else []
+        seen = _displaced(scan, prediction_um, parts)
+        for part in parts:
+            own = part.coefficients.get(label_of(scan, part.by))
+            if own and part.what == "gain":
+                seen = seen + own[0] * (seen - seen.mean())
+        seen = _levelled(seen, scan.usable, self.levelling)
+        return seen + self.background_um(scan)
+
+    def between_groups(self) -> MeasurementModel:
+        """Only what differs between groups: the mean over the labels of a part is taken out of each of them.
+
+        Nor is a gain kept: what prints differ in may be the printer's.
+        """
+        kept = []
+        for part in self.parts:
+            if part.by == ALL or part.what == "gain":
+                continue
+            mean = np.mean([*part.coefficients.values()], axis=0)
+            own = {label: (np.array(one) - mean).tolist() for label, one in part.coefficients.items()}
+            kept.append(part.model_copy(update={"coefficients": own}))
+        return self.model_copy(update={"parts": kept, "levelling": "none"})
+
+    def background_um(self, scan: PrintedScan) -> FloatMap:
+        """The background alone on the scan's field, (ny, nx) µm."""
+        total = np.zeros(scan.shape)
+        for part in self.parts if self.fits(scan) else []:
+            own = part.coefficients.get(label_of(scan, part.by))
+            if own and part.what == "background":
+                total += np.tensordot(own, _polynomials(scan.shape, part.degree)[1:], axes=1)
+        return total
+
+
+def learn_measurement(
+    scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray], *, seed: int = 0
+) -> MeasurementModel:
+    """Choose and fit what these scans share beside the predicted prints (ny, nx), µm.
+
+    Parts are added one at a time as long as they lower the error on scans that they were not fitted to, dealt
+    into folds among these scans, and only if they do so beyond the scatter over scans.
+    """
+    parts: list[SharedPart] = []
+    levelling = _best_levelling(scans, predictions_um)
+    for _ in range(_ROUNDS):
+        model = MeasurementModel(
+            levelling=levelling, parts=parts, field_um=_field_um(scans[0]), scans=len(scans)
+        )
+        learner = _Learner(scans, predictions_um, model)
+        chosen = learner.choose(seed) if not parts else [learner.block_of(part) for part in parts]
+        parts = learner.moved(parts, chosen)
+    return model.model_copy(update={"parts": parts})
+
+
+class _Learner:
+    """Inner products of what could be shared, at a model of the measurement so far."""
+
+    def __init__(
+        self, scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray], model: MeasurementModel
+    ):
+        self._groups = groupings(scans, by_order=False)
+        self._ids = [scan.id for scan in scans]
+        grams = []
+        for scan, prediction in zip(scans, predictions_um, strict=True):
+            rows = self._rows(scan, prediction, model)
+            grams.append(rows @ rows.T / rows.shape[1])
+        self._products = Products(np.stack(grams), self._groups)
+
+    def choose(self, seed: int) -> list[tuple[Shared, int, Block]]:
+        """What to add, beginning with nothing."""
+        fold_of = _deal(self._ids, seed)
+        chosen: list[tuple[Shared, int, Block]] = []
+        left = self._products.held_out([], fold_of)
+        while True:
+            best, best_left = None, left
+            for offer in self._offers(chosen):
+                now = self._products.held_out([block for *_, block in (*chosen, offer)], fold_of)
+                if now.mean() < best_left.mean():
+                    best, best_left = offer, now
+            gain = left - best_left
+            error = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else np.inf
+            if best is None or gain.mean() <= _LEAST_Z * error:
+                return chosen
+            chosen.append(best)
+            left = best_left
+
+    def block_of(self, part: SharedPart) -> tuple[Shared, int, Block]:
+        """A part as it was chosen before."""
+        return part.what, part.degree, self._block(part.what, part.degree, part.by, part.shrinking)
+
+    def moved(
+        self, before: Sequence[SharedPart], chosen: Sequence[tuple[Shared, int, Block]]
+    ) -> list[SharedPart]:
+        """The parts with their strengths fitted, added to those that are in the residual already."""
+        every = np.arange(len(self._ids))
+        fitted = self._products.strengths([block for *_, block in chosen], every)
+        known = [part.coefficients for part in before] or [{}] * len(chosen)
+        return [
+            SharedPart(
+                what=what,
+                by=block.by,
+                degree=degree,
+                shrinking=block.shrinking,
+                coefficients={
+                    label: (own + np.array(old.get(label, np.zeros(len(own))))).tolist()
+                    for label, own in strengths.items()
+                },
+            )
+            for (what, degree, block), strengths, old in zip(chosen, fitted, known, strict=True)
+        ]
+
+    def _offers(self, chosen: Sequence[tuple[Shared, int, Block]]) -> list[tuple[Shared, int, Block]]:
+        taken = {(what, block.by) for what, _, block in chosen}
+        found = []
+        for what, degree, grouped in _OFFERS:
+            for by in [name for name in self._groups if (name != ALL) == grouped]:
+                if (what, by) not in taken:
+                    shrinking = _SHRINKING if grouped else _SHRINKING[:1]
+                    found += [(what, degree, self._block(what, degree, by, one)) for one in shrinking]
+        return found
+
+    def _block(self, what: Shared, degree: int, by: str, shrinking: float) -> Block:
+        return Block(_columns_of(what, degree), by, shrinking)
+
+    def _rows(self, scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel) -> FloatMap:
+        """Residual and columns (1 + m, n) at thinned pixels, each without its mean: the datum is free."""
+        at = _thinned(scan.usable)
+        seen = _displaced(scan, prediction_um, model.parts)
+        slope_y, slope_x = (slope.reshape(-1)[at] for slope in np.gradient(seen, scan.pitch_um))
+        shapes = _polynomials(scan.shape, _HIGHEST).reshape(_count(_HIGHEST), -1)[:, at]
+        residual = (scan.height_um - model.expected_um(scan, prediction_um)).reshape(-1)[at]
+        own = shapes[: _count(_LATERAL)]
+        moved = np.concatenate([own * slope_x, own * slope_y, seen.reshape(-1)[at][None]])
+        # A background is added after the levelling, so that it is not levelled itself.
+        surface = shapes[[0, *LEVELLED[model.levelling]]]
+        moved -= np.linalg.solve(surface @ surface.T, surface @ moved.T).T @ surface
+        rows = np.concatenate([residual[None], shapes[1:], moved])
+        return rows - rows.mean(axis=1, keepdims=True)
+
+
+def _columns_of(what: Shared, degree: int) -> tuple[int, ...]:
+    """Where the columns of a part lie among the rows of a scan."""
+    starts = {"background": 1, "shift-x": _count(_HIGHEST)}
+    starts["shift-y"] = starts["shift-x"] + _count(_LATERAL)
+    starts["gain"] = starts["shift-y"] + _count(_LATERAL)
+    count = {"background": _count(degree) - 1, "gain": 1}.get(what, _count(degree))
+    return tuple(range(starts[what], starts[what] + count))
+
+
+def _best_levelling(scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray]) -> Levelling:
+    """The levelling of predictions that comes closest to the scans, a shared bow and tilt taken out."""
+    errors: dict[Levelling, float] = {}
+    for name in LEVELLED:
+        model = MeasurementModel(levelling=name, parts=[], field_um=_field_um(scans[0]), scans=len(scans))
+        rests = []
+        for scan, prediction in zip(scans, predictions_um, strict=True):
+            at = _thinned(scan.usable)
+            rest = (scan.height_um - model.expected_um(scan, prediction)).reshape(-1)[at]
+            shapes = _polynomials(scan.shape, 2).reshape(_count(2), -1)[:, at]
+            rests.append(np.linalg.lstsq(shapes @ shapes.T, shapes @ rest, rcond=None)[0])
+        # Legendre polynomials are all but orthogonal over a field: their spread is the squared error.
+        weights = np.array([np.mean(shape**2) for shape in _polynomials(scans[0].shape, 2)])
+        errors[name] = float((np.var(rests, axis=0) * weights)[1:].sum())
+    return min(errors, key=lambda name: errors[name])
+
+
+def _displaced(scan: PrintedScan, prediction_um: np.ndarray, parts: Sequence[SharedPart]) -> FloatMap:
+    shifts_px = {"shift-x": 0.0, "shift-y": 0.0}
+    for part in parts:
+        own = part.coefficients.get(label_of(scan, part.by))
+        if own and part.what in shifts_px:
+            shapes = _polynomials(scan.shape, part.degree)
+            shifts_px[part.what] = shifts_px[part.what] + np.tensordot(own, shapes, axes=1) / scan.pitch_um
+    prediction = np.asarray(prediction_um, np.float64)
+    if all(np.ndim(shift) == 0 for shift in shifts_px.values()):
+        return prediction
+    y, x = np.meshgrid(*(np.arange(n, dtype=np.float64) for n in scan.shape), indexing="ij")
+    places = [y + shifts_px["shift-y"], x + shifts_px["shift-x"]]
+    return map_coordinates(prediction, places, order=3, mode="nearest")
+
+
+def _levelled(field: np.ndarray, usable: np.ndarray, levelling: Levelling) -> FloatMap:
+    """A field without the surface that fits it best on the usable pixels; its mean stays."""
+    if levelling == "none":
+        return field
+    shapes = _polynomials(field.shape, 2)[[0, *LEVELLED[levelling]]]
+    basis = shapes[:, usable]
+    fitted = np.linalg.solve(basis @ basis.T, basis @ field[usable])
+    return field - np.tensordot(fitted[1:], shapes[1:], axes=1)
+
+
+@lru_cache(maxsize=8)
+def _polynomials(shape: tuple[int, ...], degree: int) -> FloatMap:
+    """Products of Legendre polynomials of y and x up to a total degree, ordered by it: (k, ny, nx)."""
+    y, x = (legendre.legvander(np.linspace(-1, 1, n), degree).T for n in shape)
+    maps = [np.outer(y[by_y], x[total - by_y]) for total in range(degree + 1) for by_y in range(total + 1)]
+    found = np.stack(maps)
+    found.setflags(write=False)
+    return found
+
+
+def _count(degree: int) -> int:
+    return (degree + 1) * (degree + 2) // 2
+
+
+def _thinned(usable: np.ndarray) -> np.ndarray:
+    stride = max(1, round((usable.sum() / _SAMPLED_PX) ** 0.5))
+    lattice = np.zeros_like(usable)
+    lattice[stride // 2 :: stride, stride // 2 :: stride] = True
+    return np.flatnonzero(usable & lattice)
+
+
+def _deal(ids: Sequence[str], seed: int) -> np.ndarray:
+    folds = grouped_folds(ids, min(_INNER_FOLDS, len(ids)), seed)
+    fold = {one: number for number, members in enumerate(folds) for one in members}
+    return np.array([fold[one] for one in ids])
+
+
+def _field_um(scan: PrintedScan) -> tuple[float, float]:
+    return scan.shape[0] * scan.pitch_um, scan.shape[1] * scan.pitch_um

@@ -1,0 +1,97 @@
+"""Whether a name holds: does its formula leave what another formula of the same change would take?
+
+A cause that is missing beside a named one leaves a residual that has nothing to do with the named change. A name
+that only resembles the cause leaves one that is the named change in another shape: scaled with the height or
+the place, blurred, displaced, squared.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from litho_data.foundation.units import NM_PER_UM
+from litho_models.loop.prepared import PreparedScan
+from litho_models.scan_terms.grouped import Block, Products
+from litho_models.scan_terms.groups import ALL
+from litho_models.twin.fits import State, Study, without_terms
+from litho_models.twin.model import Twin
+
+_BLURS_UM = (0.2, 0.6, 1.6)
+# Evidence for no reshaping, in scans: as many numbers would else fit the noise of a few scans.
+_SHRINKING = 0.02
+
+
+@dataclass(frozen=True)
+class Adequacy:
+    """What the change by one cause leaves.
+
+    Attributes:
+        gain_nm2: what the cause takes from the squared error, the rest of the model in place.
+        reshaped_nm2: what its change in other shapes would take beside it, on held-out scans.
+        left_nm2: what all features of layout and place still explain beside the whole model.
+        without_nm2: the same without the cause.
+    """
+
+    gain_nm2: float
+    reshaped_nm2: float
+    left_nm2: float
+    without_nm2: float
+
+
+def reshaped_gain(without: State, state: State, study: Study) -> tuple[float, float]:
+    """Gain (nm²) of a cause's change in other shapes, and of the change itself scaled, on held-out scans.
+
+    Args:
+        without, state: the model without and with the cause.
+    """
+    grams = []
+    before, after = _of_folds(without.twin, without.per_fold), _of_folds(state.twin, state.per_fold)
+    for at, window in enumerate(study.windows):
+        fold = study.fold_of[at]
+        prediction = after[fold].height(window, fold)
+        change = prediction - before[fold].height(window, fold)
+        maps = _shapes(change, prediction, window)
+        columns = np.column_stack([state.held_out_um[at], *map(window.at_sample, maps)])
+        freed = without_terms(columns, window, prediction)
+        grams.append(freed.T @ freed / len(freed))
+    products = Products(np.stack(grams), {ALL: ("",) * len(grams)})
+    count = products.grams.shape[1]
+    left = products.held_out([], study.fold_of)
+    taken = left - products.held_out([Block(tuple(range(1, count)), ALL, _SHRINKING)], study.fold_of)
+    scaled = left - products.held_out([Block((1,))], study.fold_of)
+    return float(taken.mean()) * NM_PER_UM**2, float(scaled.mean()) * NM_PER_UM**2
+
+
+def _of_folds(twin: Twin, vectors: np.ndarray):
+    return [twin.at(vector).placed() for vector in vectors]
+
+
+def _shapes(change: np.ndarray, prediction: np.ndarray, window: PreparedScan) -> list[np.ndarray]:
+    pitch = window.context.pitch_um
+    blurred = [gaussian_filter(change, sigma / pitch) for sigma in _BLURS_UM]
+    layout = np.asarray(window.stored.layout_um, np.float64)
+    near, far = (gaussian_filter(layout, sigma / pitch) for sigma in (0.6, 2.0))
+    relative = prediction - prediction.mean()
+    slopes = np.gradient(change, pitch)
+    ny, nx = change.shape
+    y, x = np.linspace(-1, 1, ny)[:, None], np.linspace(-1, 1, nx)[None, :]
+    return [
+        change,
+        change * relative,
+        change * relative**2,
+        change * np.abs(change),
+        change * near,
+        change * far,
+        change * (near - layout),
+        *blurred,
+        *(one * relative for one in blurred),
+        *slopes,
+        np.abs(slopes[0]),
+        np.abs(slopes[1]),
+        change * x,
+        change * y,
+        change * (x * x + y * y),
+    ]

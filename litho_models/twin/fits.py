@@ -1,0 +1,215 @@
+"""Fits of a twin to scans: once to all of them, and once without each fold, which it then predicts.
+
+What single scans may add is projected out, so that it cannot pull the numbers of the printer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from litho_data.foundation.units import NM_PER_UM
+from litho_data.foundation.workers import HERE, Workers
+from litho_models.effects import get_effect
+from litho_models.fitting.least_squares import (
+    Linearised,
+    Rules,
+    eliminated,
+    eliminated_sum,
+    fit_least_squares,
+    orthonormal,
+    solve_damped,
+)
+from litho_models.loop.prepared import PreparedScan
+from litho_models.scan_terms import Terms
+from litho_models.scan_terms.groups import Labels, groupings
+from litho_models.twin.model import Placed, Twin, finished
+
+# What every scan may add in a fit: its gain is left to the process, which long-range effects act on.
+FREE_TERMS: Terms = frozenset({"offset", "bow", "warp"})
+# What a comparison of errors leaves to the single scans.
+ALL_FREE: Terms = FREE_TERMS | {"gain"}
+RULES = Rules("squares", steps=8, relative_gain=1e-3)
+# A fit without a fold starts at the common one and takes its derivatives.
+_FOLD_STEPS, _FOLD_GAIN, _FOLD_DAMPING = 6, 1e-4, 1e-6
+
+
+def _silent(message: str) -> None:
+    pass
+
+
+@dataclass(frozen=True)
+class Study:
+    """The scans, who holds each out, and how what is said of them is judged.
+
+    Attributes:
+        scans: prepared; ``fold_of``: (scans,) number of the fold that holds each out.
+        seed: of folds, calibration blocks and permutations.
+        workers: where independent fits are made; ``report``: told in a sentence what happens.
+    """
+
+    scans: Sequence[PreparedScan]
+    fold_of: np.ndarray
+    seed: int = 0
+    workers: Workers = HERE
+    report: Callable[[str], None] = _silent
+
+    def __getstate__(self) -> dict[str, object]:
+        """In another process a study has no workers of its own, and nobody to tell."""
+        return {**self.__dict__, "workers": HERE, "report": _silent}
+
+    @property
+    def folds(self) -> range:
+        return range(int(self.fold_of.max()) + 1)
+
+    @property
+    def windows(self) -> list[PreparedScan]:
+        """What fits and screening see of the scans."""
+        return [scan.window for scan in self.scans]
+
+    @property
+    def tip_radius_um(self) -> float | None:
+        """Radius of the tip, or the most that it can be, if the store knows: that of the first scan."""
+        known = (scan.stored.tip_radius_um for scan in self.scans)
+        return next((radius for radius in known if radius is not None), None)
+
+    @cached_property
+    def groups(self) -> dict[str, Labels]:
+        """The groups that the scans fall into."""
+        return groupings([scan.stored for scan in self.scans])
+
+
+@dataclass(frozen=True)
+class State:
+    """A fitted twin.
+
+    Attributes:
+        twin: at the numbers fitted to all scans; ``per_fold``: (folds, p), each without its own scans.
+        linear: each window at ``twin``: residual, derivatives, and what the scan may add by itself.
+        held_out_um: residual (n,) of each window by the fit that has not seen it.
+        training: (folds,) weighted sum of squares of each fit on its own scans, µm².
+        freed_nm2: (scans,) squared error per pixel of ``held_out_um``, free of what single scans may add.
+    """
+
+    twin: Twin
+    per_fold: np.ndarray
+    linear: list[Linearised]
+    held_out_um: list[np.ndarray]
+    training: np.ndarray
+    freed_nm2: np.ndarray
+
+    @property
+    def mse_nm2(self) -> float:
+        return float(self.freed_nm2.mean())
+
+    def covariance(self) -> np.ndarray:
+        """Covariance (p, p) of the numbers, by what each scan asks for at the optimum."""
+        parts = [eliminated(part, RULES.term_weight) for part in self.linear]
+        normal = np.sum([p[0] for p in parts], axis=0)
+        inverse = np.linalg.pinv(normal, rcond=1e-10, hermitian=True)
+        scores = np.stack([p[1] for p in parts])
+        return inverse @ (scores.T @ scores) @ inverse * len(parts) / max(len(parts) - 1, 1)
+
+
+class TwinProblem:
+    """A twin on windows of scans; derivatives are one-sided differences."""
+
+    def __init__(self, twin: Twin, windows: Sequence[PreparedScan]):
+        self._twin = twin
+        self._windows = windows
+
+    def linearise(self, vector: np.ndarray) -> list[Linearised]:
+        """Residuals, derivatives and free terms of all windows."""
+        here = self._twin.at(vector)
+        placed, steps = here.placed(), here.steps()
+        moved = [
+            here.at(vector + step * (np.arange(len(vector)) == i)).placed() for i, step in enumerate(steps)
+        ]
+        return [self._of_window(placed, moved, steps, window) for window in self._windows]
+
+    def _of_window(
+        self, placed: Placed, moved: Sequence[Placed], steps: np.ndarray, window: PreparedScan
+    ) -> Linearised:
+        twin, own = placed.twin, placed.twin.own
+        chain = placed.chain(window)
+        base = placed.base_height(chain, window)
+        prediction = finished(chain, base, window)
+        value = window.at_sample(prediction)
+        labels = set(twin.labels(window).values())
+        rows = np.zeros((len(steps), len(window.sample)))
+        for i, (other, step) in enumerate(zip(moved, steps, strict=True)):
+            slot = twin.slots[i - own] if i >= own else None
+            if slot is not None and slot.label is not None and slot.label not in labels:
+                continue
+            there = other.chain(window)
+            # What acts on the height leaves the height of the base, most of the work, as it is.
+            same = slot is not None and get_effect(slot.effect).acts_on == "height"
+            height = base if same else other.base_height(there, window)
+            rows[i] = (window.at_sample(finished(there, height, window)) - value) / step
+        basis = orthonormal(window.terms_at_sample(prediction, FREE_TERMS).T).T
+        return Linearised(window.height - value, rows, basis)
+
+    def residuals(self, vector: np.ndarray) -> list[np.ndarray]:
+        """Measured minus predicted of all windows, µm."""
+        placed = self._twin.at(vector).placed()
+        return [w.height - w.at_sample(placed.height(w)) for w in self._windows]
+
+    def room(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Effects stay within their range, the base does not go too far at once."""
+        return self._twin.at(vector).room()
+
+
+def fit_state(twin: Twin, study: Study) -> State:
+    """Fit a twin to all windows of a study, then without each fold in turn, from where it stands."""
+    windows = study.windows
+    fitted = fit_least_squares(TwinProblem(twin, windows), twin.vector, RULES)
+    common = twin.at(fitted.vector)
+    free = common.free()
+    linear = [replace(part, jacobian=part.jacobian * free[:, None]) for part in fitted.linear]
+    per_fold, training, held_out = [], [], [np.empty(0)] * len(windows)
+    freed = np.empty(len(windows))
+    for fold in study.folds:
+        own = [i for i, of in enumerate(study.fold_of) if of != fold]
+        vector, squares = _without(common, [fitted.linear[i] for i in own], [windows[i] for i in own])
+        per_fold.append(vector)
+        training.append(squares)
+        placed = common.at(vector).placed()
+        for i in np.flatnonzero(study.fold_of == fold):
+            prediction = placed.height(windows[i], fold)
+            held_out[i] = windows[i].height - windows[i].at_sample(prediction)
+            left = without_terms(held_out[i][:, None], windows[i], prediction)
+            freed[i] = NM_PER_UM**2 * float(np.mean(left**2))
+    return State(common, np.stack(per_fold), linear, held_out, np.array(training), freed)
+
+
+def without_terms(
+    columns: np.ndarray, window: PreparedScan, prediction_um: np.ndarray, terms: Terms = ALL_FREE
+) -> np.ndarray:
+    """Columns (n, m) at the sampled pixels, freed of what a single scan may add to a prediction (y, x), µm."""
+    basis = orthonormal(window.terms_at_sample(prediction_um, terms).T)
+    return columns - basis @ (basis.T @ columns)
+
+
+def _without(
+    common: Twin, linear: Sequence[Linearised], windows: Sequence[PreparedScan]
+) -> tuple[np.ndarray, float]:
+    """Fit on some of the windows with the derivatives of the common fit, and its weighted sum of squares."""
+    normal, right, total = eliminated_sum(linear, RULES.term_weight)
+    vector = common.vector
+    if not len(vector):
+        return vector, total
+    for _ in range(_FOLD_STEPS):
+        here = common.at(vector)
+        trial = vector + solve_damped(normal, right, _FOLD_DAMPING, here.room())
+        left = TwinProblem(common, windows).residuals(trial)
+        moved = [replace(part, residual=own) for part, own in zip(linear, left, strict=True)]
+        _, right, squares = eliminated_sum(moved, RULES.term_weight)
+        if squares > total:
+            break
+        vector, gained, total = trial, total - squares, squares
+        if gained <= _FOLD_GAIN * squares:
+            break
+    return vector, total

@@ -1,0 +1,234 @@
+"""The twin: a base model with effects, each with one strength for all scans or one for each group of them."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from litho_models.effects import get_effect
+from litho_models.effects.chain import EffectChain
+from litho_models.effects.registry import in_forward_order
+from litho_models.fitting.small_models import parameter_room
+from litho_models.loop.folded_base import FoldedBase
+from litho_models.loop.prepared import PreparedScan
+from litho_models.scan_terms.groups import ALL, label_of
+from litho_models.simulator import Simulator, is_small
+
+Values = dict[str, dict[str, float]]
+# Of the usual size of a number: a step of its difference quotient, and how near a bound is on it.
+_BASE_STEP, _EFFECT_STEP, _AT_BOUND = 5e-3, 0.05, 1e-6
+
+
+@dataclass(frozen=True)
+class Slot:
+    """One fitted number of an effect; ``label``: the group that has it, None for all scans."""
+
+    effect: str
+    parameter: str
+    label: str | None
+
+
+@dataclass(frozen=True)
+class Twin:
+    """Base and effects with their numbers; a fit moves ``vector`` and leaves the rest.
+
+    Attributes:
+        base: the model of the printer; its own numbers are refitted if they are few.
+        by: effect to the grouping in which its strength differs, ``all`` for one strength.
+        choices: effect to the values of parameters that are never fitted (a direction).
+        slots: the fitted numbers of the effects, in the order of ``vector``, after those of the base.
+        vector: all fitted numbers.
+        full_height_um, pitch_um: of the layouts.
+    """
+
+    base: nn.Module
+    by: Mapping[str, str]
+    choices: Mapping[str, Mapping[str, float]]
+    slots: tuple[Slot, ...]
+    vector: np.ndarray
+    full_height_um: float
+    pitch_um: float
+
+    @classmethod
+    def bare(cls, base: nn.Module, scan: PreparedScan) -> Twin:
+        """The base alone, for scans like this one."""
+        own = [p.detach().numpy().reshape(-1) for p in _parameters(base)]
+        vector = np.concatenate(own or [np.empty(0)]).astype(np.float64)
+        return cls(base, {}, {}, (), vector, scan.context.full_height_um, scan.context.pitch_um)
+
+    @property
+    def own(self) -> int:
+        """How many of the numbers are the base's."""
+        return len(self.vector) - len(self.slots)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The effects, as they act."""
+        return tuple(self.by)
+
+    def at(self, vector: np.ndarray) -> Twin:
+        """The same with other numbers."""
+        return Twin(self.base, self.by, self.choices, self.slots, vector, self.full_height_um, self.pitch_um)
+
+    def with_effect(self, name: str, by: str, values: Mapping[str, Mapping[str, float]]) -> Twin:
+        """One effect more, with starting values by label (``""`` for all scans)."""
+        effect = get_effect(name)
+        first = next(iter(values.values()))
+        slots, numbers = [], []
+        for parameter, facts in effect.parameters.items():
+            if facts.kind == "choice":
+                continue
+            labels = sorted(values) if facts.kind == "amplitude" and by != ALL else [None]
+            for label in labels:
+                slots.append(Slot(name, parameter, label))
+                numbers.append(first[parameter] if label is None else values[label][parameter])
+        chosen = {key: first[key] for key, facts in effect.parameters.items() if facts.kind == "choice"}
+        order = in_forward_order([*self.by, name])
+        return Twin(
+            self.base,
+            {one: {**self.by, name: by}[one] for one in order},
+            {**self.choices, name: chosen},
+            (*self.slots, *slots),
+            np.concatenate([self.vector, numbers]),
+            self.full_height_um,
+            self.pitch_um,
+        )
+
+    def without(self, name: str) -> Twin:
+        """The same without one of its effects."""
+        kept = [i for i, slot in enumerate(self.slots) if slot.effect != name]
+        return Twin(
+            self.base,
+            {one: by for one, by in self.by.items() if one != name},
+            {one: own for one, own in self.choices.items() if one != name},
+            tuple(self.slots[i] for i in kept),
+            np.concatenate([self.vector[: self.own], self.vector[self.own :][kept]]),
+            self.full_height_um,
+            self.pitch_um,
+        )
+
+    def over(self, base: nn.Module, scan: PreparedScan) -> Twin:
+        """The same effects over another base."""
+        bare = Twin.bare(base, scan)
+        vector = np.concatenate([bare.vector, self.vector[self.own :]])
+        return Twin(base, self.by, self.choices, self.slots, vector, self.full_height_um, self.pitch_um)
+
+    def values(self, label_in: Mapping[str, str]) -> Values:
+        """Parameter values of all effects for the scans with these labels, by grouping.
+
+        An amplitude of a label that was never fitted is the mean of those that were.
+        """
+        found: Values = {name: dict(self.choices[name]) for name in self.by}
+        alike: dict[tuple[str, str], dict[str | None, float]] = {}
+        for slot, number in zip(self.slots, self.vector[self.own :], strict=True):
+            alike.setdefault((slot.effect, slot.parameter), {})[slot.label] = float(number)
+        for (name, parameter), known in alike.items():
+            label = None if None in known else label_in.get(self.by[name], "")
+            found[name][parameter] = known.get(label, float(np.mean(list(known.values()))))
+        return found
+
+    def labels(self, scan: PreparedScan) -> dict[str, str]:
+        """The scan's label in every grouping in use."""
+        return {by: label_of(scan.stored, by) for by in set(self.by.values()) if by != ALL}
+
+    def placed(self) -> Placed:
+        """The model at its numbers, ready to predict."""
+        return Placed(self)
+
+    def steps(self) -> np.ndarray:
+        """Steps of difference quotients, pointing away from the nearer bound of an effect."""
+        steps = _BASE_STEP * np.maximum(np.abs(self.vector), 0.2)
+        for at, slot in enumerate(self.slots, self.own):
+            facts = get_effect(slot.effect).parameters[slot.parameter]
+            usual = facts.typical - (facts.null if facts.kind == "amplitude" else 0.0)
+            size = _EFFECT_STEP * abs(usual)
+            steps[at] = size if self.vector[at] + size <= facts.upper else -size
+        return steps
+
+    def room(self) -> tuple[np.ndarray, np.ndarray]:
+        """Smallest and largest step (p,) allowed from here: base and effects within their ranges."""
+        lowest, highest = np.zeros(len(self.vector)), np.zeros(len(self.vector))
+        if self.own:
+            lowest[: self.own], highest[: self.own] = parameter_room(self.base, self.vector[: self.own])
+        for at, slot in enumerate(self.slots, self.own):
+            facts = get_effect(slot.effect).parameters[slot.parameter]
+            lowest[at], highest[at] = facts.lower - self.vector[at], facts.upper - self.vector[at]
+        return np.minimum(lowest, 0), np.maximum(highest, 0)
+
+    def free(self) -> np.ndarray:
+        """True for numbers (p,) with room on both sides."""
+        lowest, highest = self.room()
+        return (lowest < -_AT_BOUND) & (highest > _AT_BOUND)
+
+    def at_bounds(self) -> dict[str, float]:
+        """Fitted values of base and effects that stand on a bound of their range, and that bound."""
+        placed = self.placed().base
+        found = dict(placed.at_bounds) if isinstance(placed, Simulator) and self.own else {}
+        for at, slot in enumerate(self.slots, self.own):
+            facts = get_effect(slot.effect).parameters[slot.parameter]
+            for bound in (facts.lower, facts.upper):
+                if abs(self.vector[at] - bound) < _AT_BOUND * max(1.0, abs(bound)):
+                    found[f"{slot.effect}: {slot.parameter}"] = bound
+        return found
+
+
+class Placed:
+    """A twin at its numbers; the base is a copy of its own."""
+
+    def __init__(self, twin: Twin):
+        self.twin = twin
+        self.base = copy.deepcopy(twin.base) if twin.own else twin.base
+        at = 0
+        for parameter in _parameters(self.base):
+            values = twin.vector[at : at + parameter.numel()]
+            parameter.data.copy_(torch.as_tensor(values, dtype=parameter.dtype).reshape(parameter.shape))
+            at += parameter.numel()
+        self._chains: dict[tuple[str, ...], EffectChain] = {}
+
+    def chain(self, scan: PreparedScan, extra: Values | None = None) -> EffectChain:
+        """The chain of effects as it is for one scan; ``extra`` effects are tried on top."""
+        labels = self.twin.labels(scan)
+        key = tuple(labels.values())
+        if extra is not None or key not in self._chains:
+            values = {**self.twin.values(labels), **(extra or {})}
+            chain = EffectChain(
+                self.base, values, full_height_um=self.twin.full_height_um, pitch_um=self.twin.pitch_um
+            )
+            if extra is not None:
+                return chain
+            self._chains[key] = chain
+        return self._chains[key]
+
+    def base_height(self, chain: EffectChain, scan: PreparedScan, fold: int | None = None) -> Tensor:
+        """Height (1, 1, y, x), µm, of the base on the layout with the effects that act on it."""
+        base = self.base
+        if isinstance(base, FoldedBase):
+            base = base.of_scan(scan.id) if fold is None else base.of_fold(fold)
+        with torch.no_grad():
+            return base(chain.before_base(scan.layout, scan.context))
+
+    def height(self, scan: PreparedScan, fold: int | None = None) -> np.ndarray:
+        """Predicted height of the print (y, x), µm."""
+        chain = self.chain(scan)
+        return finished(chain, self.base_height(chain, scan, fold), scan)
+
+
+def finished(chain: EffectChain, base_height: Tensor, scan: PreparedScan) -> np.ndarray:
+    """The height (y, x), µm, with the effects that act on it."""
+    with torch.no_grad():
+        return chain.after_base(base_height, scan.context)[0, 0].numpy()
+
+
+def is_refitted(base: nn.Module) -> bool:
+    """Whether the base has parameters, and few enough to be fitted together with the effects."""
+    trainable = any(p.requires_grad for p in base.parameters())
+    return trainable and is_small(base) and not isinstance(base, FoldedBase)
+
+
+def _parameters(base: nn.Module) -> Sequence[nn.Parameter]:
+    return [p for p in base.parameters() if p.requires_grad] if is_refitted(base) else []

@@ -1,0 +1,170 @@
+"""``close_loop.json``, schema 4: what was found, written once; report and tables read it."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field
+
+from litho_data.foundation.results import Record, Result
+from litho_data.foundation.run_facts import RunInfo
+from litho_data.store.schema import DatasetId
+from litho_models.effects.effect import Knowledge
+from litho_models.scan_terms.measurement import MeasurementModel
+from litho_models.scan_terms.policies import Policy
+from litho_models.scoring.pairs import OverUnits
+from litho_models.splits.folds import Split
+
+Verdict = Literal["traced", "described", "nothing-missing", "unexplained", "too-few-scans"]
+EffectVerdict = Literal["explained", "confusable", "lawful", "described"]
+CandidateVerdict = Literal[
+    "explained",
+    "confusable",
+    "resembles",
+    "contradicted",
+    "absorbed",
+    "not-testable",
+    "below-noise",
+    "too-few-scans",
+]
+Stage = Literal["base", "causes", "laws", "all"]
+MeasuredBy = Literal["print alone", "published", "shared"]
+
+
+class ErrorRow(Record):
+    """Error of one model on scans held out from it.
+
+    Attributes:
+        model: how much of what was found is in it.
+        measurement: what is added to the print: nothing, the smooth background that training scans share (the
+            published protocol), or the whole measurement model.
+        policy: terms of each scan, ``k`` of them, fitted on pixels that are not scored.
+        held_out: folds of scans; or whole folds or prints, without which everything was chosen anew.
+        printer_numbers: fitted numbers of the model; ``measurement_numbers``: of the measurement, the largest
+            of any fold.
+    """
+
+    model: Stage
+    measurement: MeasuredBy
+    policy: Policy
+    k: float
+    held_out: Literal["scans", "nested folds", "nested prints", "locked"]
+    printer_numbers: int
+    measurement_numbers: int
+    mae_nm: float
+    mae_ci95_nm: tuple[float, float] | None
+    rmse_nm: float
+    by_scan_nm: dict[str, float]
+
+
+class Strength(Record):
+    """A fitted number: its value for one label, and its interval over prints (over scans without prints)."""
+
+    label: str
+    value: float
+    unit: str
+    ci95: tuple[float, float] | None
+
+
+class FoundEffect(Record):
+    """Something added to the model.
+
+    Attributes:
+        by: the grouping in which its strength differs; ``all`` for one strength.
+        strengths: parameter to its numbers.
+        gain_nm2: what it takes from the squared error of held-out scans, the rest in place; scans and pixels
+            as they are fitted, free of seven terms and an affine shift per scan.
+        left_out_nm: by how much the mean absolute error grows when it is left out (k = 1).
+        family_p: of its screening, over all candidates; ``group_p``: of its grouping, by exchanged labels.
+        reshaped_share: what its change in other shapes would take beside it, of its own gain.
+        survives_on: bases on which it is confirmed as well.
+    """
+
+    name: str
+    title: str
+    knowledge: Knowledge
+    role: Literal["process", "measurement", "nuisance", "undetermined"]
+    stage: str
+    verdict: EffectVerdict
+    by: str
+    strengths: dict[str, list[Strength]]
+    confusable_with: list[str]
+    separating_experiment: str
+    gain_nm2: float
+    before_nm2: float
+    scans_improved: tuple[int, int]
+    p_confirm: float
+    family_p: float
+    group_p: float | None
+    reshaped_share: float | None
+    left_out_nm: float | None = None
+    survives_on: list[str] = Field(default_factory=list)
+
+
+class Candidate(Record):
+    """An effect that was not added, and why."""
+
+    name: str
+    verdict: CandidateVerdict
+    reason: str
+    p_screen: float | None = None
+    gain_nm2: float | None = None
+
+
+class Explained(Record):
+    """What features of layout and place still explain out of fold at one stage, nm²; ``matters`` beyond chance."""
+
+    stage: str
+    squared_error_nm2: float
+    explained_nm2: float
+    matters: bool
+
+
+class CloseLoop(Result):
+    """What the loop found.
+
+    ``errors``: see ``ErrorRow``; ``gain``: base minus all, k = 1, with the shared measurement, over scans and
+    over prints. ``chosen``: in nested selections, how often each effect was chosen.
+    """
+
+    SCHEMA: ClassVar[str] = "litho-models/close-loop/4"
+    FILE_NAME: ClassVar[str] = "close_loop.json"
+
+    run: RunInfo
+    dataset: DatasetId
+    base_model: str
+    base_values: dict[str, float]
+    corrected_values: dict[str, float]
+    settings: dict[str, Any]
+    at_bounds: dict[str, float]
+    split: Split
+    groups: dict[str, list[str]]
+    errors: list[ErrorRow]
+    gain_nm: float
+    over_scans: OverUnits
+    over_prints: OverUnits | None
+    effects: list[FoundEffect]
+    candidates: list[Candidate]
+    measurement: MeasurementModel
+    explained: list[Explained]
+    chosen: dict[str, int] = Field(default_factory=dict)
+    verdict: Verdict
+    fewest_scans: int
+
+    def error(
+        self,
+        model: Stage,
+        policy: Policy = "offset",
+        measurement: MeasuredBy = "shared",
+        held_out: str = "scans",
+    ) -> ErrorRow | None:
+        """One row of the errors; None if it was not measured."""
+        for row in self.errors:
+            if (row.model, row.policy, row.measurement, row.held_out) == (
+                model,
+                policy,
+                measurement,
+                held_out,
+            ):
+                return row
+        return None

@@ -1,0 +1,296 @@
+"""From what was found to its record: errors side by side, strengths with intervals, reasons for the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from litho_data.foundation.run_facts import run_info
+from litho_data.foundation.units import NM_PER_UM
+from litho_data.store import PrintedScan
+from litho_data.store.schema import DatasetId
+from litho_models.effects import CATALOGUE, UNTESTABLE, get_effect
+from litho_models.fitting.least_squares import eliminated
+from litho_models.scan_terms import POLICIES, Blocks, Policy, cross_fit
+from litho_models.scan_terms.groups import ALL
+from litho_models.scoring.pairs import over_prints, over_scans
+from litho_models.scoring.statistics import interval
+from litho_models.simulator import Simulator
+from litho_models.splits.folds import Split
+from litho_models.twin.closing import Closed
+from litho_models.twin.fits import RULES, State
+from litho_models.twin.judging import FAMILY_P, FEWEST_SCANS
+from litho_models.twin.model import Twin
+from litho_models.twin.record import (
+    Candidate,
+    CandidateVerdict,
+    CloseLoop,
+    EffectVerdict,
+    ErrorRow,
+    Explained,
+    FoundEffect,
+    MeasuredBy,
+    Stage,
+    Strength,
+    Verdict,
+)
+from litho_models.twin.screening import SMALLEST_RETAINED
+from litho_models.twin.search import Cause, separating
+
+REPORTED: tuple[Policy, ...] = ("none", "offset", "full")
+_BASE_ABSORBS = 1e-2
+
+
+def error_rows(
+    scans: Sequence[PrintedScan],
+    maps_um: Sequence[np.ndarray],
+    *,
+    model: Stage,
+    measurement: MeasuredBy,
+    held_out: Any,
+    numbers: tuple[int, int],
+    seed: int = 0,
+) -> list[ErrorRow]:
+    """Errors of maps (y, x) µm under each reported policy."""
+    rows = []
+    for policy in REPORTED:
+        fits = [
+            cross_fit(scan.height_um, own, scan.usable, POLICIES[policy], Blocks(seed=seed))
+            for scan, own in zip(scans, maps_um, strict=True)
+        ]
+        mae = [NM_PER_UM * float(np.nanmean(np.abs(fit.residual_um))) for fit in fits]
+        mse = [NM_PER_UM**2 * float(np.nanmean(fit.residual_um**2)) for fit in fits]
+        rows.append(
+            ErrorRow(
+                model=model,
+                measurement=measurement,
+                policy=policy,
+                k=float(np.mean([fit.degrees_of_freedom for fit in fits])),
+                held_out=held_out,
+                printer_numbers=numbers[0],
+                measurement_numbers=numbers[1],
+                mae_nm=float(np.mean(mae)),
+                mae_ci95_nm=interval(mae),
+                rmse_nm=float(np.sqrt(np.mean(mse))),
+                by_scan_nm={scan.id: own for scan, own in zip(scans, mae, strict=True)},
+            )
+        )
+    return rows
+
+
+def record(
+    closed: Closed,
+    errors: list[ErrorRow],
+    measurement: Any,
+    *,
+    dataset: DatasetId,
+    base_name: str,
+    settings: dict[str, Any],
+    split: Split,
+    dropped: list[str],
+    left_out_nm: Mapping[str, float],
+    survives: Mapping[str, list[str]],
+    chosen: Mapping[str, int],
+) -> CloseLoop:
+    """The record of one run.
+
+    Args:
+        closed: what was found; ``errors``: of ``error_rows``; ``measurement``: learned on all development scans.
+        left_out_nm, survives: of each effect, see ``FoundEffect``; ``chosen``: by nested selections.
+    """
+    study, scans = closed.study, closed.study.scans
+    effects = [
+        *(_found(closed, one, "causes", left_out_nm, survives) for one in closed.causes),
+        *(_found(closed, one, "laws", left_out_nm, survives) for one in closed.lawful.causes),
+        *(_found(closed, one, "all", left_out_nm, survives) for one in closed.described.causes),
+    ]
+    before, after = (
+        next(
+            row
+            for row in errors
+            if (row.model, row.policy, row.measurement, row.held_out) == (stage, "offset", "shared", "scans")
+        )
+        for stage in ("base", "all")
+    )
+    gains = [before.by_scan_nm[scan.id] - after.by_scan_nm[scan.id] for scan in scans]
+    prints = [scan.stored.print_id for scan in scans]
+    return CloseLoop(
+        run=run_info([study.seed], len(scans), dropped),
+        dataset=dataset,
+        base_model=base_name,
+        base_values=_values(closed.base.twin),
+        corrected_values=_values(closed.final.twin),
+        settings=settings,
+        at_bounds=closed.final.twin.at_bounds(),
+        split=split,
+        groups={name: list(labels) for name, labels in study.groups.items() if name != ALL},
+        errors=errors,
+        gain_nm=float(np.mean(gains)),
+        over_scans=over_scans(gains, study.seed),
+        over_prints=over_prints(gains, prints, study.seed),
+        effects=effects,
+        candidates=_candidates(closed, {one.name: one for one in effects}),
+        measurement=measurement,
+        explained=[
+            Explained(
+                stage=stage,
+                squared_error_nm2=float(rest.squares_nm2.mean()),
+                explained_nm2=rest.mean_nm2,
+                matters=rest.matters,
+            )
+            for stage, rest in closed.rests.items()
+        ],
+        chosen=dict(chosen),
+        verdict=_verdict(closed, effects),
+        fewest_scans=FEWEST_SCANS,
+    )
+
+
+def _verdict(closed: Closed, effects: Sequence[FoundEffect]) -> Verdict:
+    if any(one.knowledge != "description" for one in effects):
+        return "traced"
+    if effects:
+        return "described"
+    if [*closed.rests.values()][-1].matters or closed.named.refused:
+        return "unexplained"
+    return "too-few-scans" if len(closed.study.scans) < FEWEST_SCANS else "nothing-missing"
+
+
+def _values(twin: Twin) -> dict[str, float]:
+    """The base's numbers by their physical names; empty for a base that is not fitted."""
+    base = twin.placed().base
+    if not twin.own or not isinstance(base, Simulator):
+        return {}
+    known = getattr(base, "values", None)
+    if known is not None:
+        return {name: float(value.detach()) for name, value in known.items()}
+    return {
+        f"{name}{f' {i}' if p.numel() > 1 else ''}": float(value)
+        for name, p in base.named_parameters()
+        for i, value in enumerate(p.detach().reshape(-1))
+    }
+
+
+def _found(
+    closed: Closed,
+    cause: Cause,
+    stage: Stage,
+    left_out_nm: Mapping[str, float],
+    survives: Mapping[str, list[str]],
+) -> FoundEffect:
+    effect = get_effect(cause.name)
+    verdicts: dict[str, EffectVerdict] = {"law": "lawful", "description": "described"}
+    verdict = verdicts.get(effect.knowledge, "confusable" if cause.alike else "explained")
+    reshaped = next((c.reshaped_nm2 for c in closed.checked if c.cause.name == cause.name), None)
+    roles = {effect.role, *(get_effect(name).role for name in cause.alike)}
+    return FoundEffect(
+        name=cause.name,
+        title=effect.title,
+        knowledge=effect.knowledge,
+        role=effect.role if len(roles) == 1 else "undetermined",
+        stage=effect.stage,
+        verdict=verdict,
+        by=cause.by,
+        strengths=_strengths(closed.final, closed, cause.name),
+        confusable_with=list(cause.alike),
+        separating_experiment=separating([cause.name, *cause.alike]),
+        gain_nm2=cause.judgement.gain_nm2,
+        before_nm2=cause.judgement.before_nm2,
+        scans_improved=cause.judgement.improved,
+        p_confirm=cause.judgement.p,
+        family_p=cause.family_p,
+        group_p=cause.group_p,
+        reshaped_share=None if reshaped is None else reshaped / max(cause.judgement.gain_nm2, 1e-9),
+        left_out_nm=left_out_nm.get(cause.name),
+        survives_on=survives.get(cause.name, []),
+    )
+
+
+def _strengths(state: State, closed: Closed, name: str) -> dict[str, list[Strength]]:
+    """Numbers of an effect with intervals from what each print asks for (each scan, where prints are single)."""
+    from scipy.stats import t
+
+    twin, effect = state.twin, get_effect(name)
+    prints = [scan.stored.print_id for scan in closed.study.scans]
+    units = prints if 2 < len(set(prints)) < len(prints) else [scan.id for scan in closed.study.scans]
+    sd = np.sqrt(np.maximum(np.diag(clustered_covariance(state, units)), 0.0))
+    reach = float(t.ppf(0.975, max(len(set(units)) - 1, 1)))
+    found: dict[str, list[Strength]] = {}
+    for at, slot in enumerate(twin.slots, twin.own):
+        if slot.effect == name:
+            value, half = float(twin.vector[at]), reach * float(sd[at])
+            found.setdefault(slot.parameter, []).append(
+                Strength(
+                    label=slot.label or "",
+                    value=value,
+                    unit=effect.parameters[slot.parameter].unit,
+                    ci95=(value - half, value + half) if sd[at] else None,
+                )
+            )
+    for parameter, value in twin.choices[name].items():
+        found[parameter] = [
+            Strength(label="", value=value, unit=effect.parameters[parameter].unit, ci95=None)
+        ]
+    return found
+
+
+def clustered_covariance(state: State, units: Sequence[str]) -> np.ndarray:
+    """Covariance (p, p) of the fitted numbers, by what each unit (a scan, a print) asks for at the optimum."""
+    if not len(state.twin.vector):
+        return np.empty((0, 0))
+    parts = [eliminated(part, RULES.term_weight) for part in state.linear]
+    normal = np.sum([part[0] for part in parts], axis=0)
+    inverse = np.linalg.pinv(normal, rcond=1e-10, hermitian=True)
+    names = sorted(set(units))
+    scores = np.stack(
+        [np.sum([p[1] for p, own in zip(parts, units, strict=True) if own == name], axis=0) for name in names]
+    )
+    return inverse @ (scores.T @ scores) @ inverse * len(names) / max(len(names) - 1, 1)
+
+
+def _candidates(closed: Closed, added: Mapping[str, FoundEffect]) -> list[Candidate]:
+    sets = {other: one.name for one in added.values() for other in one.confusable_with}
+    untestable = {**UNTESTABLE, **closed.untestable}
+    found = [
+        Candidate(name=name, verdict="not-testable", reason=reason)
+        for name, reason in untestable.items()
+        if name not in added
+    ]
+    found += [
+        _candidate(closed, name, sets)
+        for name, effect in CATALOGUE.items()
+        if name not in {*added, *untestable} and not effect.per_scan
+    ]
+    return found
+
+
+def _candidate(closed: Closed, name: str, sets: Mapping[str, str]) -> Candidate:
+    named = closed.named
+    last = named.last.get(name) or named.first.get(name)
+    p = named.family_p.get(name)
+    verdict: CandidateVerdict
+    if name in sets:
+        verdict, reason = "confusable", f"cannot be told from {sets[name]}, which was added"
+    elif any(one.cause.name == name and not one.holds for one in closed.checked):
+        verdict, reason = "resembles", named.refused.get(name, "")
+    elif last is None:
+        verdict, reason = "not-testable", "not screened"
+    elif len(closed.study.scans) < FEWEST_SCANS:
+        verdict, reason = (
+            "too-few-scans",
+            f"{len(closed.study.scans)} scans to choose and confirm on, at least {FEWEST_SCANS} needed",
+        )
+    elif last.retained < _BASE_ABSORBS * last.beside_base:
+        verdict, reason = "absorbed", "numbers of the base do the same: its fit has taken it up"
+    elif last.retained < SMALLEST_RETAINED:
+        verdict, reason = "not-testable", "on these layouts it changes nothing that single scans do not"
+    elif not last.allowed and p is not None and p <= FAMILY_P:
+        verdict, reason = "contradicted", "its best strength has the wrong sign"
+    else:
+        verdict = "below-noise"
+        reason = named.refused.get(name, f"gains {last.gain_nm2:.1f} nm² of {named.state.mse_nm2:.0f} nm²")
+    return Candidate(
+        name=name, verdict=verdict, reason=reason, p_screen=p, gain_nm2=last.gain_nm2 if last else None
+    )

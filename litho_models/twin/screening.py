@@ -1,0 +1,272 @@
+"""What each candidate would gain on held-out scans, from its derivative at the model so far.
+
+A candidate is a set of columns: secants of an effect at some of its parameters, or maps along a covariate.
+Its strength is one for all scans or one by group. Of each scan only inner products are needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from litho_data.foundation.units import NM_PER_UM
+from litho_models.effects import Effect
+from litho_models.fitting.least_squares import gram_inside, orthonormal
+from litho_models.scan_terms.grouped import Block, Products
+from litho_models.scan_terms.groups import ALL, Labels
+from litho_models.scoring.statistics import sign_flips
+from litho_models.twin.fits import ALL_FREE, State, Study
+from litho_models.twin.model import finished
+
+# Of a direction's information, what must survive the projections for a test to mean anything.
+SMALLEST_RETAINED = 1e-5
+# A strength on the wrong side of its null counts as noise if it is smaller than this share of the largest.
+_NOISE_SHARE = 0.3
+PERMUTATIONS = 499
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Parameter sets of one effect of one shape and size; their amplitudes are fitted together."""
+
+    effect: Effect
+    sets: tuple[Mapping[str, float], ...]
+
+    def values(self, multiples: np.ndarray) -> dict[str, float]:
+        """Parameter values for these multiples of the amplitudes, within their ranges."""
+        values = dict(self.effect.off_values())
+        for multiple, trial in zip(multiples, self.sets, strict=True):
+            for name, value in trial.items():
+                facts = self.effect.parameters[name]
+                if facts.kind == "amplitude":
+                    values[name] += float(multiple) * (value - facts.null)
+                else:
+                    values[name] = value
+        return values
+
+    def allowed(self, multiples: np.ndarray) -> bool:
+        """No amplitude on the wrong side of a null that bounds it, unless noise may have put it there."""
+        values = self.values(multiples)
+        named = {n for trial in self.sets for n in trial} & set(self.effect.amplitudes)
+        facts = {name: self.effect.parameters[name] for name in named}
+        sizes = {n: abs(values[n] - f.null) / abs(f.typical - f.null) for n, f in facts.items()}
+        wrong = [
+            n for n, f in facts.items() if (values[n] < f.null <= f.lower) or (values[n] > f.null >= f.upper)
+        ]
+        return not any(sizes[n] > _NOISE_SHARE * max(sizes.values()) for n in wrong)
+
+    def reach(self, multiples: np.ndarray) -> float:
+        """Share of the step that stays within the ranges: a straight line from the null overshoots."""
+        values, share = self.values(multiples), 1.0
+        for name in self.effect.amplitudes:
+            facts = self.effect.parameters[name]
+            step = values[name] - facts.null
+            room = (facts.upper if step > 0 else facts.lower) - facts.null
+            if abs(room) < abs(step) and room != 0:
+                share = min(share, room / step)
+        return share
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A trial with a way in which its strength goes, and what it gains on scans held out.
+
+    Attributes:
+        trial: what is tried; ``by``: the grouping of its strength.
+        gains_nm2: (scans,) in squared error, strengths fitted without the scan's fold.
+        multiples: by label, of the trial's amplitudes, from all scans.
+        columns: of the trial in the inner products.
+        allowed: the strengths have a physical sign; ``retained``: share of the information that the terms of
+            single scans and the model's own numbers leave, ``beside_base``: what the terms alone leave.
+    """
+
+    trial: Trial
+    by: str
+    gains_nm2: np.ndarray
+    multiples: Mapping[str, np.ndarray]
+    columns: tuple[int, ...]
+    allowed: bool
+    retained: float
+    beside_base: float
+
+    @property
+    def name(self) -> str:
+        return self.trial.effect.name
+
+    @property
+    def gain_nm2(self) -> float:
+        return float(self.gains_nm2.mean())
+
+    @property
+    def numbers(self) -> int:
+        return len(self.columns) * len(self.multiples)
+
+    def start(self) -> dict[str, dict[str, float]]:
+        """Values by label from which a fit begins, no farther from the null than the largest trial."""
+        found = {}
+        for label, multiples in self.multiples.items():
+            values = self.trial.values(multiples * self.trial.reach(multiples))
+            for name in self.trial.effect.amplitudes:
+                facts = self.trial.effect.parameters[name]
+                far = max(abs(trial.get(name, facts.null) - facts.null) for trial in self.trial.effect.trials)
+                step = min(max(values[name] - facts.null, -far), far)
+                values[name] = min(max(facts.null + step, facts.lower), facts.upper)
+            found[label] = values
+        return found
+
+
+def trials_of(effects: Sequence[Effect]) -> list[Trial]:
+    """The trials of the effects by shape and size.
+
+    A second trial of the same amplitudes at the same shape is another size: what an effect does when it is
+    large need not be a multiple of what it does when it is small.
+    """
+    found = []
+    for effect in effects:
+        by_shape: dict[tuple[object, ...], list[Mapping[str, float]]] = {}
+        for trial in effect.trials:
+            shape = tuple(sorted((k, v) for k, v in trial.items() if k not in effect.amplitudes))
+            size = 0
+            while any(set(other) == set(trial) for other in by_shape.get((shape, size), [])):
+                size += 1
+            by_shape.setdefault((shape, size), []).append(trial)
+        found += [Trial(effect, tuple(own)) for own in by_shape.values()]
+    return found
+
+
+class Screening:
+    """Secants of all trials at a fitted state, and their inner products with what the state leaves.
+
+    Args:
+        state: the model so far; ``study``: its scans; ``effects``: candidates, none of them in the model.
+    """
+
+    def __init__(self, state: State, study: Study, effects: Sequence[Effect]):
+        self.study = study
+        self.trials = trials_of(effects)
+        twin = state.twin
+        self._own = len(twin.vector)
+        count = 1 + self._own + sum(len(trial.sets) for trial in self.trials)
+        grams = np.empty((len(study.scans), count, count))
+        raw = np.zeros(count)
+        self.pixels = np.array([len(window.sample) for window in study.windows])
+        placed = twin.placed()
+        for at, window in enumerate(study.windows):
+            chain = placed.chain(window)
+            base = placed.base_height(chain, window)
+            here = finished(chain, base, window)
+            columns = [state.held_out_um[at], *state.linear[at].jacobian]
+            for trial in self.trials:
+                for values in trial.sets:
+                    extra = {trial.effect.name: trial.effect.with_values(values)}
+                    moved = placed.chain(window, extra)
+                    height = base if trial.effect.acts_on == "height" else placed.base_height(moved, window)
+                    columns.append(window.at_sample(finished(moved, height, window) - here))
+            stacked = np.column_stack(columns)
+            basis = orthonormal(window.terms_at_sample(here, ALL_FREE).T)
+            whole = stacked.T @ stacked / len(stacked)
+            grams[at] = whole - gram_inside(stacked, basis) / len(stacked)
+            raw += np.diag(whole)
+        own = [Block((1 + i,)) for i in range(self._own)]
+        self._raw = np.maximum(raw, 1e-300)
+        self._beside_base = np.einsum("sii->i", grams) / self._raw
+        self.freed = Products(grams, study.groups).freed_of(own).grams
+        self._retained = np.einsum("sii->i", self.freed) / self._raw
+
+    @cached_property
+    def columns(self) -> list[tuple[int, ...]]:
+        """Of each trial, its columns in the inner products."""
+        found, at = [], 1 + self._own
+        for trial in self.trials:
+            found.append(tuple(range(at, at + len(trial.sets))))
+            at += len(trial.sets)
+        return found
+
+    @cached_property
+    def candidates(self) -> list[Candidate]:
+        """The best trial of each effect in each grouping, the largest gain first."""
+        found: dict[tuple[str, str], Candidate] = {}
+        for trial, columns in zip(self.trials, self.columns, strict=True):
+            for by in self.study.groups:
+                one = self._candidate(trial, columns, by)
+                best = found.get((one.name, by))
+                if best is None or (one.allowed, one.gain_nm2) > (best.allowed, best.gain_nm2):
+                    found[one.name, by] = one
+        return sorted(found.values(), key=lambda one: -one.gain_nm2)
+
+    def cosine(self, a: Candidate, b: Candidate) -> float:
+        """Alignment of what two candidates change, pooled over scans."""
+        groups = self.study.groups
+        inner = np.zeros((2, 2))
+        for scan, gram in enumerate(self.freed):
+            vectors = np.zeros((2, len(gram)))
+            for row, one in zip(vectors, (a, b), strict=True):
+                row[list(one.columns)] = one.multiples[groups[one.by][scan]]
+            inner += vectors @ gram @ vectors.T
+        return float(inner[0, 1] / max(np.sqrt(inner[0, 0] * inner[1, 1]), 1e-300))
+
+    def permutation_p(self, one: Candidate) -> float:
+        """Share of exchanges of the labels between scans that gain as much as the true ones."""
+        labels = np.array(self.study.groups[one.by])
+        rng = np.random.default_rng(self.study.seed)
+        beaten = 0
+        for _ in range(PERMUTATIONS):
+            drawn = tuple(labels[rng.permutation(len(labels))])
+            gains, _ = self._gains(one.trial, one.columns, drawn)
+            beaten += gains.mean() >= one.gain_nm2 * (1 - 1e-12)
+        return (1 + beaten) / (1 + PERMUTATIONS)
+
+    def family_p(self, one: Candidate) -> float:
+        """Share of flips of the signs of the scans whose largest gain of any candidate reaches this one's."""
+        return float(np.mean(self._largest >= one.gains_nm2.sum() * (1 - 1e-9)))
+
+    @cached_property
+    def _largest(self) -> np.ndarray:
+        """Largest sum of gains over the candidates of one strength, for each flip of the scans' signs."""
+        gains = np.stack([one.gains_nm2 for one in self.candidates if one.by == ALL], axis=1)
+        return (sign_flips(len(gains), self.study.seed) @ gains).max(axis=1)
+
+    def _candidate(self, trial: Trial, columns: tuple[int, ...], by: str) -> Candidate:
+        gains, multiples = self._gains(trial, columns, self.study.groups[by])
+        return Candidate(
+            trial=trial,
+            by=by,
+            gains_nm2=gains,
+            multiples=multiples,
+            columns=columns,
+            allowed=all(trial.allowed(own) for own in multiples.values()),
+            retained=float(self._retained[list(columns)].max()),
+            beside_base=float(self._beside_base[list(columns)].max()),
+        )
+
+    def _gains(
+        self, trial: Trial, columns: tuple[int, ...], labels: Labels
+    ) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """Held-out gains (scans,) nm², and the multiples by label from all scans."""
+        grams, fold_of = self.freed, self.study.fold_of
+        own = np.array(columns)
+        scores, infos = grams[:, own, 0], grams[:, own[:, None], own[None, :]]
+        gains, multiples = np.zeros(len(grams)), {}
+        members = np.array(labels)
+        for label in dict.fromkeys(labels):
+            inside = members == label
+            total_score, total_info = scores[inside].sum(axis=0), infos[inside].sum(axis=0)
+            multiples[label] = _solved(total_info, total_score)
+            for fold in np.unique(fold_of[inside]):
+                out = inside & (fold_of == fold)
+                kept = inside & (fold_of != fold)
+                if not kept.any():
+                    continue
+                found = _solved(total_info - infos[out].sum(axis=0), total_score - scores[out].sum(axis=0))
+                if not trial.allowed(found):
+                    continue
+                found = found * trial.reach(found)
+                gains[out] = 2 * scores[out] @ found - np.einsum("i,sij,j->s", found, infos[out], found)
+        return gains * NM_PER_UM**2, multiples
+
+
+def _solved(info: np.ndarray, score: np.ndarray) -> np.ndarray:
+    return np.linalg.lstsq(info, score, rcond=1e-8)[0]

@@ -1,0 +1,233 @@
+"""The joint search: causes are added while they gain on held-out scans, and each defends its place in the end.
+
+All candidates are screened at once, with strengths for all scans and by group. Those that promise about as much
+as the best are fitted in full beside each other before one is taken, because a derivative at the null only
+guesses what a large effect does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from litho_data.foundation.workers import run_jobs
+from litho_models.effects import CATALOGUE, Effect, get_effect
+from litho_models.scan_terms.groups import ALL
+from litho_models.twin.fits import State, Study, fit_state
+from litho_models.twin.judging import FAMILY_P, Judgement, judge, told_apart
+from litho_models.twin.screening import SMALLEST_RETAINED, Candidate, Screening
+
+MOST_EFFECTS = 8
+# Of the smallest gain that counts: the derivative at the null predicts the gain of a fit within a factor of three.
+WORTH_FITTING = 0.3
+# Rivals are fitted beside the best if they promise this share of its gain, and change much the same.
+RIVAL_SHARE, RIVAL_COSINE = 0.3, 0.5
+RIVALS = 3
+# What changes the held-out prediction so alike cannot be told apart by its shape.
+SAME_COSINE = 0.8
+
+
+@dataclass(frozen=True)
+class Cause:
+    """An effect in the model.
+
+    Attributes:
+        name, by: the effect, and the grouping of its strength.
+        alike: other effects that these scans cannot tell from it.
+        judgement: of its gain on held-out scans, the rest of the model in place.
+        family_p: of its screening, over all candidates; ``group_p``: of its grouping against exchanged labels.
+    """
+
+    name: str
+    by: str
+    alike: tuple[str, ...]
+    judgement: Judgement
+    family_p: float
+    group_p: float | None
+
+
+@dataclass
+class Found:
+    """What a search found: the model, its causes, and what is known of every other candidate."""
+
+    state: State
+    causes: list[Cause] = field(default_factory=list)
+    first: dict[str, Candidate] = field(default_factory=dict)
+    last: dict[str, Candidate] = field(default_factory=dict)
+    family_p: dict[str, float] = field(default_factory=dict)
+    refused: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def names(self) -> list[str]:
+        return [cause.name for cause in self.causes]
+
+
+def search(start: State, study: Study, candidates: Sequence[Effect], most: int = MOST_EFFECTS) -> Found:
+    """Add effects to a fitted model, at most so many.
+
+    Args:
+        start: the model so far; ``study``: scans, folds and groups; ``candidates``: what may be added.
+    """
+    found = Found(start)
+    while len(found.causes) < most and _add_one(found, study, candidates):
+        pass
+    _defend(found, study)
+    return found
+
+
+def _add_one(found: Found, study: Study, candidates: Sequence[Effect]) -> bool:
+    effects = [one for one in candidates if one.name not in found.state.twin.names]
+    if not effects:
+        return False
+    screening = Screening(found.state, study, effects)
+    standing = _standing(screening, found)
+    study.report(f"{len(standing)} of {len(effects)} candidates stand out")
+    tried: set[str] = set()
+    for best in standing:
+        if best.name in tried:
+            continue
+        rivals = [
+            one
+            for one in standing
+            if one.name not in {*tried, best.name}
+            and one.gain_nm2 >= RIVAL_SHARE * best.gain_nm2
+            and abs(screening.cosine(best, one)) >= RIVAL_COSINE
+        ][:RIVALS]
+        fitted = _fitted(found.state, [best, *rivals], study)
+        order = sorted(fitted, key=lambda name: float(fitted[name].freed_nm2.mean()))
+        entered = {one.name: one for one in (best, *rivals)}
+        for name in order:
+            if name in tried:
+                continue
+            tried.add(name)
+            state, one = fitted[name], entered[name]
+            judgement = judge(found.state.freed_nm2, state.freed_nm2, study)
+            grouped_p = None if one.by == ALL else screening.permutation_p(one)
+            if not judgement.passed(grouped=one.by != ALL):
+                found.refused[name] = judgement.reason(grouped=one.by != ALL)
+                continue
+            alike = [
+                other
+                for other in order
+                if other != name
+                and same_change(found.state, state, fitted[other])
+                and not told_apart(found.state.freed_nm2, state.freed_nm2, fitted[other].freed_nm2, study)
+            ]
+            alike += [
+                other.name
+                for other in screening.candidates
+                if other.by == one.by
+                and other.name not in {*fitted, *alike}
+                and other.allowed
+                and other.gain_nm2 >= 0.5 * one.gain_nm2
+                and abs(screening.cosine(one, other)) >= SAME_COSINE
+            ]
+            cause = Cause(
+                name, one.by, tuple(dict.fromkeys(alike)), judgement, screening.family_p(one), grouped_p
+            )
+            found.causes.append(cause)
+            found.state = state
+            found.refused.pop(name, None)
+            study.report(
+                f"adding {name}{'' if one.by == ALL else ' by ' + one.by}: {judgement.gain_nm2:.0f} nm² of "
+                f"{judgement.before_nm2:.0f} nm² on held-out scans"
+            )
+            return True
+    return False
+
+
+def _standing(screening: Screening, found: Found) -> list[Candidate]:
+    """The candidates that stand out, each with the grouping that its scans ask for; the largest gain first."""
+    by_name: dict[str, list[Candidate]] = {}
+    for one in screening.candidates:
+        by_name.setdefault(one.name, []).append(one)
+    mse = found.state.mse_nm2
+    worth = WORTH_FITTING * 0.01 * mse
+    standing = []
+    for name, own in by_name.items():
+        common = next(one for one in own if one.by == ALL)
+        found.first.setdefault(name, common)
+        found.last[name] = common
+        found.family_p.setdefault(name, screening.family_p(common))
+        chosen = _grouped(own, common, screening, mse) or common
+        if not chosen.allowed or chosen.retained < SMALLEST_RETAINED or chosen.gain_nm2 < worth:
+            continue
+        if chosen is common and screening.family_p(common) > FAMILY_P:
+            continue
+        standing.append(chosen)
+    return sorted(standing, key=lambda one: -one.gain_nm2)
+
+
+def _grouped(
+    own: Sequence[Candidate], common: Candidate, screening: Screening, mse_nm2: float
+) -> Candidate | None:
+    """The grouping of an effect's strength that gains beyond chance over one strength for all; None if none."""
+    groups = [one for one in own if one.by != ALL]
+    better = [one for one in groups if one.allowed and one.gain_nm2 - common.gain_nm2 > 0.01 * mse_nm2]
+    if not better:
+        return None
+    best = max(better, key=lambda one: one.gain_nm2)
+    # Of groupings that do nearly as well the one with the fewest numbers.
+    close = [one for one in better if one.gain_nm2 >= 0.95 * best.gain_nm2]
+    best = min(close, key=lambda one: (one.numbers, -one.gain_nm2))
+    return best if screening.permutation_p(best) * len(groups) <= FAMILY_P else None
+
+
+def _fitted(state: State, entering: Sequence[Candidate], study: Study) -> dict[str, State]:
+    jobs = [(one.name, state.twin.with_effect(one.name, one.by, one.start()), study) for one in entering]
+    return {name: own for (name, *_), own in run_jobs(_fit, jobs, study.workers, name=lambda job: job[0])}
+
+
+def _fit(job: tuple[str, object, Study]) -> State:
+    name, twin, study = job
+    study.report(f"fitting {name}")
+    return fit_state(twin, study)  # type: ignore[arg-type]
+
+
+def same_change(before: State, one: State, other: State) -> bool:
+    """Whether two states change the held-out prediction alike."""
+    inner = np.zeros((2, 2))
+    for old, a, b in zip(before.held_out_um, one.held_out_um, other.held_out_um, strict=True):
+        changes = np.stack([old - a, old - b])
+        changes -= changes.mean(axis=1, keepdims=True)
+        inner += changes @ changes.T
+    return bool(inner[0, 1] / max(np.sqrt(inner[0, 0] * inner[1, 1]), 1e-300) >= SAME_COSINE)
+
+
+def _defend(found: Found, study: Study) -> None:
+    """Each cause is taken out, the rest fitted again: what is not confirmed with all others in place goes."""
+    if len(found.causes) < 2:
+        return
+    for cause in list(found.causes):
+        study.report(f"deciding once more on {cause.name}")
+        without = fit_state(found.state.twin.without(cause.name), study)
+        judgement = judge(without.freed_nm2, found.state.freed_nm2, study)
+        at = found.causes.index(cause)
+        if judgement.passed(grouped=cause.by != ALL):
+            found.causes[at] = replace(cause, judgement=judgement)
+        else:
+            found.causes.pop(at)
+            found.refused[cause.name] = "not needed once the others were added"
+            found.state = without
+
+
+def untestable(study: Study) -> dict[str, str]:
+    """Effects that these scans cannot test, with the reason."""
+    reasons = {}
+    one_level = all(np.ptp(scan.stored.mask_level) == 0 for scan in study.scans)
+    for effect in CATALOGUE.values():
+        if effect.per_scan:
+            continue
+        if one_level:
+            reasons[effect.name] = "every layout has one level only: nothing in the print varies with it"
+        elif "order" in effect.needs and len({scan.context.order for scan in study.scans}) < 3:
+            reasons[effect.name] = "the writing order of the scans is not known"
+    return reasons
+
+
+def separating(names: Sequence[str]) -> str:
+    """What would tell the members of a set apart."""
+    texts = dict.fromkeys(get_effect(name).separating for name in names)
+    return "; ".join(text for text in texts if text)
