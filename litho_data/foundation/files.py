@@ -113,7 +113,7 @@ def locked(file: Path, target: Path) -> IO[str]:
     Raises:
         InputError: another process holds it, as the one that writes ``target``.
     """
-    stream = open(file, "a", encoding="utf-8")
+    stream = open(file, "a", encoding="utf-8")  # noqa: SIM115
     try:
         import fcntl
 

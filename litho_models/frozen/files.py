@@ -16,10 +16,9 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import atomic_folder
 from litho_data.foundation.hashes import file_sha256
-from litho_data.foundation.outputs import require_replaceable_folder
 from litho_data.foundation.results import first_error
 from litho_data.foundation.run_facts import run_facts
 from litho_models.frozen import zoo
@@ -57,9 +56,8 @@ def save_frozen(
     """
     state = {key: value.detach().cpu().contiguous() for key, value in simulator.state_dict().items()}
     _check_numbers(state, f"weights of {simulator.name}")
-    require_replaceable_folder(folder, WEIGHTS_FILE, CARD_FILE, README_FILE)
     config = simulator.config
-    with atomic_folder(folder) as temporary:
+    with whole_folder(folder, WEIGHTS_FILE, CARD_FILE, README_FILE) as temporary:
         # No metadata in the file: safetensors writes its entries in no fixed order, which moved the hash.
         save_file(state, temporary / WEIGHTS_FILE)
         try:
