@@ -57,7 +57,7 @@ def require_complete(path: Path) -> None:
             f"store {path}",
             got=f"no {name}",
             wanted="every file that it declares",
-            hint="`litho-data verify` names all of them; build or copy it again",
+            hint="copy or build it again; another program has to write empty chunks too",
         )
 
 
