@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import glob
 import os
 import shutil
 import tempfile
@@ -15,7 +17,7 @@ from litho_data.foundation.errors import InputError
 
 @contextmanager
 def atomic_file(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path beside ``path``; it replaces ``path`` only if the block succeeds.
+    """Yield a temporary path beside ``path``, of its suffix; it replaces ``path`` only if the block succeeds.
 
     Raises:
         InputError: ``path`` is a folder, or cannot be written.
@@ -23,17 +25,21 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
     target = Path(path)
     if target.is_dir():
         raise InputError(f"cannot write {target}", got="a folder of that name", wanted="a file")
+    prefix, suffix = f".{target.name}.", f".partial{target.suffix}"
     with writable(target):
         target.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".partial", dir=target.parent)
-    os.close(handle)
+        for left in target.parent.glob(f"{glob.escape(prefix)}*{glob.escape(suffix)}"):
+            _remove_unless_held(left)
+        handle, name = tempfile.mkstemp(prefix=prefix, suffix=suffix, dir=target.parent)
     temporary = Path(name)
-    try:
-        yield temporary
-        temporary.chmod(0o666 & ~_umask())
-        temporary.replace(target)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with os.fdopen(handle) as held:
+        _lock(held)
+        try:
+            yield temporary
+            temporary.chmod(0o666 & ~_umask())
+            temporary.replace(target)
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -87,7 +93,7 @@ def publish(new: Path, path: str | Path) -> None:
 
 def clear_leftovers(folder: Path) -> None:
     """Remove what a stopped process left of files and folders that it was writing below ``folder``."""
-    for left in sorted(folder.rglob(".*.partial")):
+    for left in sorted(folder.rglob(".*.partial*")):
         if left.is_dir():
             _put_back(left, left.parent / left.name[1:].removesuffix(".partial"))
             shutil.rmtree(left)
@@ -114,18 +120,30 @@ def locked(file: Path, target: Path) -> IO[str]:
         InputError: another process holds it, as the one that writes ``target``.
     """
     stream = open(file, "a", encoding="utf-8")  # noqa: SIM115
+    if not _lock(stream):
+        stream.close()
+        raise InputError(f"{target} is being written by another process", hint="wait for it, or stop it")
+    return stream
+
+
+def _lock(stream: IO[str]) -> bool:
+    """Whether the lock could be had; a system without such locks does without."""
     try:
         import fcntl
-
+    except ImportError:
+        return True
+    try:
         fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except ImportError:  # a system without such locks does without
-        pass
-    except BlockingIOError as error:
-        stream.close()
-        raise InputError(
-            f"{target} is being written by another process", hint="wait for it, or stop it"
-        ) from error
-    return stream
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _remove_unless_held(left: Path) -> None:
+    """Remove what a process that was stopped left of a file; another that is writing it holds its own."""
+    with contextlib.suppress(FileNotFoundError), open(left) as stream:
+        if _lock(stream):
+            left.unlink()
 
 
 @contextmanager
