@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import glob
 import os
 import shutil
@@ -144,6 +145,18 @@ def _remove_unless_held(left: Path) -> None:
     with contextlib.suppress(FileNotFoundError), open(left) as stream:
         if _lock(stream):
             left.unlink()
+
+
+def read_text(path: Path) -> str:
+    """The text of a file.
+
+    Raises:
+        OSError: none that can be read, also a pipe, which would keep its reader waiting.
+        UnicodeDecodeError: bytes that are no UTF-8.
+    """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise OSError(errno.EINVAL, "a pipe or a device, no file", str(path))
+    return path.read_text(encoding="utf-8")
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import read_text
 
 
 def require_replaceable_folder(path: str | Path, *holds: str) -> None:
@@ -162,6 +163,6 @@ def _is_record(file: Path) -> bool:
 def read_record(file: Path) -> Any:
     """The content of a JSON file; None where there is none."""
     try:
-        return json.loads(file.read_text(encoding="utf-8"))
+        return json.loads(read_text(file))
     except (OSError, ValueError, RecursionError):
         return None

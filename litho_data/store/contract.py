@@ -17,14 +17,12 @@ import numpy as np
 from litho_data.foundation.errors import InputError, damaged
 from litho_data.foundation.names import require_plain_name
 from litho_data.foundation.quantities import (
-    DOSE,
     HEIGHT_UM,
     LENGTH_UM,
     LEVEL_HEIGHT_UM,
     LEVELS,
     ORDER,
     PITCH_UM,
-    PLACE_UM,
     Range,
 )
 from litho_data.store.access import array_of, group_of, has_child, values_of
@@ -35,15 +33,6 @@ if TYPE_CHECKING:
 
 _DOCUMENT = "zarr.json"
 _LEADS_OUT = re.compile(r"(^|/)\.\.(/|$)|[\\:\x00]")
-_COLUMNS = {
-    "field_x_um": PLACE_UM,
-    "field_y_um": PLACE_UM,
-    "dose": DOSE,
-    "turned_deg": Range(0, 360, "degrees"),
-    "direction": Range(-1, 1),
-    "tip": ORDER,
-    "pixel_size": Range(1e-3, 1e3),
-}
 
 
 def require_complete(path: Path) -> None:
@@ -177,7 +166,9 @@ def checked_columns(root: zarr.Group, path: Path) -> dict[str, list[Any]]:
     for name in OPTIONAL_COLUMNS:
         if has_child(root, name):
             stated = [None if value != value else value for value in values_of(root, name).tolist()]
-            _COLUMNS[name].require(f"{name} of {path}", [value for value in stated if value is not None])
+            OPTIONAL_COLUMNS[name].require(
+                f"{name} of {path}", [value for value in stated if value is not None]
+            )
             columns[name] = [None if value is None else float(value) for value in stated]
     for name, values in columns.items():
         if len(values) != len(ids):

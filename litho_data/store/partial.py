@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +18,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, damaged
 from litho_data.foundation.files import atomic_file, publish, unfinished
 from litho_data.store.access import group_of, open_root, values_of
 from litho_data.store.schema import LAYOUT_VARIABLES, SCAN_VARIABLES, STORE_SCHEMA, VARIABLES
@@ -80,12 +80,13 @@ class PartialStore:
         """
         records = {}
         for path in sorted(self._pieces.glob("*.json")):
-            record = json.loads(path.read_text(encoding="utf-8"))
-            scan_id = record["id"]
-            if scan_id in keys and record["key"] == keys[scan_id]() and self._intact(root, record):
-                records[scan_id] = record
-            else:
-                path.unlink()
+            with suppress(InputError), damaged(str(path)):
+                record = json.loads(path.read_text(encoding="utf-8"))
+                scan_id = record["id"]
+                if scan_id in keys and record["key"] == keys[scan_id]() and self._intact(root, record):
+                    records[scan_id] = record
+                    continue
+            path.unlink()
         for path in (self.store / "scans").glob("*"):
             if path.is_dir() and path.name not in records:
                 shutil.rmtree(path)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from litho_data.foundation.hashes import array_sha256, record_sha256
+from litho_data.foundation.quantities import DOSE, ORDER, PLACE_UM, Range
 from litho_data.foundation.results import Record
 
 STORE_SCHEMA = "litho-data/store/1"
@@ -74,8 +75,16 @@ SCAN_VARIABLES = (
 # No unit for the whole of it; in hashes it counts as 1.
 MIXED_UNITS = {"scan_to_layout": "units of its rows: 1, 1, um; 1, 1, um; um-1, um-1, 1"}
 VARIABLES = {variable.name: variable for variable in (*LAYOUT_VARIABLES, *SCAN_VARIABLES)}
-OPTIONAL_COLUMNS = ("field_x_um", "field_y_um", "dose", "turned_deg", "direction", "tip", "pixel_size")
-"""Numbers per scan from the card's table; coordinates where the card has them, NaN where a row has not."""
+OPTIONAL_COLUMNS = {
+    "field_x_um": PLACE_UM,
+    "field_y_um": PLACE_UM,
+    "dose": DOSE,
+    "turned_deg": Range(0, 360, "degrees"),
+    "direction": Range(-1, 1),
+    "tip": ORDER,
+    "pixel_size": Range(1e-3, 1e3),
+}
+"""Numbers per scan from the card's table, and what they may be; NaN where a row has none."""
 
 
 def dataset_sha256(facts: Mapping[str, Any], scans: Sequence[Mapping[str, Any]]) -> str:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from pydantic import ValidationError
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor
 
 from litho_data.foundation.begun import whole_folder
@@ -59,7 +59,7 @@ def save_frozen(
     config = simulator.config
     with whole_folder(folder, WEIGHTS_FILE, CARD_FILE, README_FILE) as temporary:
         # No metadata in the file: safetensors writes its entries in no fixed order, which moved the hash.
-        save_file(state, temporary / WEIGHTS_FILE)
+        write_tensors(state, temporary / WEIGHTS_FILE)
         try:
             card = ModelCard(
                 name=name or simulator.name,
@@ -83,6 +83,11 @@ def save_frozen(
         card.write(temporary)
         (temporary / README_FILE).write_text(model_readme(card), encoding="utf-8")
     return Path(folder)
+
+
+def write_tensors(tensors: dict[str, Tensor], file: Path) -> None:
+    """A file of safetensors; an OSError, which theirs is not, where it cannot be written."""
+    file.write_bytes(save(tensors))
 
 
 def load_frozen(
