@@ -12,6 +12,7 @@ import numpy as np
 from pydantic import Field, ValidationError
 
 from litho_data.foundation.begun import growing_folder
+from litho_data.foundation.commands import say
 from litho_data.foundation.errors import require_known
 from litho_data.foundation.files import atomic_file
 from litho_data.foundation.results import Result
@@ -90,6 +91,8 @@ def train(
     # Under torchrun the first process writes.
     first = int(os.environ.get("RANK", "0")) == 0
     with growing_folder(folder, TrainingRun.FILE_NAME, facts) if first else nullcontext():
+        if first:
+            say(f"training {model} on {len(used)} scans")
         fitted = fit_with_record(model, used, config, checkpoint=folder / CHECKPOINT_FOLDER)
         record = TrainingRun(
             run=run_info([config.seed], len(used)),

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from litho_data.foundation.begun import growing_folder
+from litho_data.foundation.commands import say
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import run_info
 from litho_data.store import Store, open_store
@@ -56,6 +57,7 @@ def check(
     frozen = load_frozen(model, device=device)
     subject = {"dataset": {"name": dataset.name}, "model": {"name": frozen.name}}
     with growing_folder(out, Check.FILE_NAME, subject) as begun:
+        say(f"checking {len(dataset)} scans of {dataset.name}")
         result = _checked(frozen, dataset, reference, new, residuals, false_alarms, tolerance)
         write_check_report(result, begun.folder)
         result.write(begun.folder)

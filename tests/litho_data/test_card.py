@@ -68,6 +68,18 @@ def test_defaults_are_those_of_the_contract() -> None:
         ("process.registration", "rigid", r"process\.registration.*affine"),
         ("source", {"url": "file:///x", "registry": "a"}, r"source\.url"),
         ("name", "../x", r"name"),
+        *(
+            (key, before + path + after, rf"{key.replace('.', '[.]')}.*inside the data folder")
+            for key, after in (
+                ("layout.files", "/{id}.tif"),
+                ("scan.files", "/{id}.txt"),
+                ("scan.full_scale_file", "/max.txt"),
+                ("process.level", "/recipe.toml"),
+                ("ids.table", "/scans.csv"),
+            )
+            for before in ("", "a/")
+            for path in ("a/../../b", "b/..", "..\\b")
+        ),
     ],
 )
 def test_a_wrong_card_is_named(key: str, value: object, expected: str) -> None:
