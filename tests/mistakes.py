@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import io
+import json
 import os
 import shlex
 import shutil
@@ -17,6 +18,7 @@ import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -145,10 +147,12 @@ MISTAKES: dict[str, dict[str, str]] = {
 
 def build_world() -> None:
     """Files that the mistakes are made with, in the current folder: raw prints, stores, models, results."""
-    from litho_data import simulate
+    from litho_data import open_store, simulate
+    from litho_data.foundation.begun import BEGUN
     from litho_data.layouts import write_layout_set
     from litho_design import design_hologram, hologram_settings
     from litho_models import build_model, save_frozen, train
+    from litho_models.fitting.runs import TrainingRun, training_config
     from tests.litho_data.campaigns import write_campaign
     from tests.litho_models.prints import make_scans, write_store
 
@@ -180,6 +184,13 @@ def build_world() -> None:
     settings = hologram_settings(changes=small)
     design_hologram("text", "printer", "design", settings=settings, announce=False)
     Path("broken/checkpoint").mkdir(parents=True)
+    store = open_store("prints.zarr")
+    begun: dict[str, Any] = {"record": TrainingRun.FILE_NAME, "model": "pbl", "lock_box": store.locked_ids}
+    begun |= {"dataset": store.dataset_id.model_dump()}
+    begun |= {
+        "config": training_config("fast", "pbl", {"variant": "default", "seed": 0}).model_dump(mode="json")
+    }
+    Path("broken", BEGUN).write_text(json.dumps(begun), "utf-8")
     Path("broken/checkpoint/state.json").write_text('{"key":', "utf-8")
     for name in ("empty", "thesis"):
         Path(name).mkdir()

@@ -23,7 +23,7 @@ from litho_data.build.result import BuildResult, LeftOut, report_folder
 from litho_data.build.right_layout import doubts, fitting_layout
 from litho_data.cards.card import Card, with_tip
 from litho_data.cards.listing import Listing, list_fields
-from litho_data.foundation.commands import progress
+from litho_data.foundation.commands import progress, say
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import software_record
 from litho_data.foundation.workers import HERE, Workers, run_jobs
@@ -112,6 +112,7 @@ def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bo
             for scan_id, reason in skipped.items():
                 _report_skipped(scan_id, reason)
             todo = [job for job in source.jobs if job.id not in records]
+            say(f"building {source.card.name}: {len(todo)} of {len(source.jobs)} scans to do")
             making = functools.partial(finish, unfinished=partial)
             finished = run_jobs(making, todo, workers, name=lambda job: job.id)
             for job, outcome in progress(finished, f"building {source.card.name}", total=len(todo)):

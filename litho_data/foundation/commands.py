@@ -67,8 +67,13 @@ def progress(
             wanted = 0
 
 
+def say(what: str) -> None:
+    """One line on stderr, before the work that it names: whoever waits knows what for."""
+    print(what, file=sys.stderr, flush=True)
+
+
 def say_estimate(what: str, seconds: float) -> None:
     """One line on stderr before anything that takes more than a minute."""
     if seconds > _MINUTE_S:
         span = f"{seconds / 3600:.1f} h" if seconds > 3600 else f"{seconds / _MINUTE_S:.0f} min"
-        print(f"estimate: {what} takes about {span} more", file=sys.stderr)
+        say(f"estimate: {what} takes about {span} more")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Literal
 
+from litho_data.foundation.quantities import LENGTH_UM
 from litho_data.foundation.results import Record
 from litho_data.foundation.settings import setting
 from litho_design.optics.materials import Resin, refractive_index
@@ -23,9 +24,15 @@ if TYPE_CHECKING:
 class Optics(Record):
     """Wavelength, refractive index step and distance to the output plane."""
 
-    wavelength_um: float = setting(0.6328, "Wavelength", unit="µm", option="--wavelength-um", gt=0)
+    wavelength_um: float = setting(
+        0.6328, "Wavelength", unit="µm", option="--wavelength-um", gt=0, le=LENGTH_UM.high
+    )
     index_step: float = setting(
-        0.548, "Refractive index of the resist minus that of its surroundings", option="--index-step", gt=0
+        0.548,
+        "Refractive index of the resist minus that of its surroundings",
+        option="--index-step",
+        gt=0,
+        le=10,
     )
     distance_um: float = setting(
         300.0,
@@ -33,6 +40,7 @@ class Optics(Record):
         unit="µm",
         option=("--distance-um", "--focal-length-um"),
         gt=0,
+        le=LENGTH_UM.high,
     )
 
     incidence_x: float = setting(0.0, "Sine of the angle at which light falls in, along x", gt=-1, lt=1)
@@ -44,7 +52,11 @@ class Optics(Record):
         lt=1,
     )
     bandwidth_um: float = setting(
-        0.0, "Standard deviation of the wavelengths of the source; 0 for one colour", unit="µm", ge=0
+        0.0,
+        "Standard deviation of the wavelengths of the source; 0 for one colour",
+        unit="µm",
+        ge=0,
+        le=LENGTH_UM.high,
     )
     propagation: Literal["auto", "rayleigh-sommerfeld", "angular-spectrum"] = setting(
         "auto",

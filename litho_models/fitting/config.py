@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Literal, Self, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic import BaseModel, ConfigDict, Field
 
 from litho_data.foundation.errors import require_known
 from litho_models.fitting.pixel_weights import Weights
@@ -20,6 +20,8 @@ FAST_STEPS = {"pbl": 2000, "fno": 1000}
 FAST_CHAIN: dict[str, Any] = {"steps": 300, "rounds": 2, "validation_scans": 0}
 # What a fit by least squares depends on.
 LEAST_SQUARES_FIELDS = {"recipe", "variant", "seed", "nuisance", "free_gain", "weights"}
+# Nothing real needs more of anything, and beyond it sums lose digits or overflow.
+_MOST = 10**9
 PAPER_LEARNING_RATE = {"pbl": 5e-4, "fno": 1e-4, "physics": 1e-2}
 
 
@@ -34,38 +36,37 @@ class TrainingConfig(BaseModel):
 
     recipe: Recipe = "fast"
     variant: Variant = "default"
-    seed: int = Field(0, ge=0)
-    steps: int = Field(1000, ge=1, description="optimiser steps")
+    seed: int = Field(0, ge=0, lt=2**63)
+    steps: int = Field(1000, ge=1, le=_MOST, description="optimiser steps")
     rounds: int = Field(
-        4, ge=1, description="times that nuisances are re-estimated, validation runs, a checkpoint is kept"
+        4,
+        ge=1,
+        le=_MOST,
+        description="times that nuisances are re-estimated, validation runs, a checkpoint is kept",
     )
-    batch: int = Field(4, ge=1, description="crops per step")
+    batch: int = Field(4, ge=1, le=_MOST, description="crops per step")
     crop_px: int = Field(
-        128, ge=8, description="scored width and height of a crop; a model with tiles takes its own"
+        128, ge=8, le=_MOST, description="scored width and height of a crop; a model with tiles takes its own"
     )
     crops: Literal["random", "quadrants"] = "random"
     flips: bool = False
     optimiser: Literal["adamw", "adam"] = "adamw"
     schedule: Literal["one-cycle", "constant"] = "one-cycle"
-    learning_rate: float = Field(2e-3, gt=0)
-    weight_decay: float = Field(1e-3, ge=0)
+    learning_rate: float = Field(2e-3, gt=0, le=_MOST)
+    weight_decay: float = Field(1e-3, ge=0, le=_MOST)
     loss: Literal["l1", "smooth-l1"] = "l1"
-    smooth_l1_beta_um: float = Field(0.1, gt=0, description="width of the quadratic part of smooth-l1, µm")
+    smooth_l1_beta_um: float = Field(
+        0.1, gt=0, le=_MOST, description="width of the quadratic part of smooth-l1, µm"
+    )
     nuisance: Policy = "full+rows"
     free_gain: bool = Field(
         False, description="a gain per scan among the nuisances, where the policy has one"
     )
     weights: Weights = Field("uniform", description="what pixels count for: alike, or by 1 / σ of the height")
-    validation_scans: int = Field(2, ge=0, description="training scans that only choose the checkpoint")
+    validation_scans: int = Field(
+        2, ge=0, le=_MOST, description="training scans that only choose the checkpoint"
+    )
     precision: Literal["bf16-mixed", "32-true"] = "32-true"
-
-    @model_serializer(mode="wrap")
-    def _record(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Uniform weights go unsaid: what was recorded and kept before there were others stays the same."""
-        record: dict[str, Any] = write(self)
-        if record.get("weights") == "uniform":
-            del record["weights"]
-        return record
 
     @classmethod
     def of_recipe(cls, recipe: Recipe, model_name: str, **settings: Any) -> Self:

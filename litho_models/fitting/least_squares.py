@@ -7,7 +7,7 @@ are had is the problem's own business; where it may go is the problem's ``room``
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal, Protocol
 
@@ -84,14 +84,16 @@ class LeastSquaresFit:
     losses: list[float]
 
 
-def fit_least_squares(problem: Problem, start: np.ndarray, rules: Rules) -> LeastSquaresFit:
-    """Fit the parameters of a problem from ``start``; steps keep its dtype."""
+def fit_least_squares(
+    problem: Problem, start: np.ndarray, rules: Rules, shown: Callable[[range], Iterable[int]] = iter
+) -> LeastSquaresFit:
+    """Fit the parameters of a problem from ``start``; steps keep its dtype. ``shown``: counts the steps."""
     vector, linear = start, problem.linearise(start)
     if not len(start):
         return LeastSquaresFit(vector, linear, [])
     terms = np.zeros((len(linear), len(linear[0].basis))) if rules.loss == "absolute" else None
     damping, losses = _DAMPING_START, []
-    for _ in range(rules.steps):
+    for _ in shown(range(rules.steps)):
         equations = NormalEquations.at(linear, terms, rules)
         room = problem.room(vector)
         for _ in range(rules.tries):

@@ -5,11 +5,13 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
+from litho_data.foundation.commands import progress
 from litho_data.store import PrintedScan
 from litho_models.fitting.crops import Window, cut, stack
 from litho_models.fitting.least_squares import Linearised, Problem, Room, Rules, fit_least_squares
@@ -49,7 +51,8 @@ def fit_small_model(
     problem: Problem = ModelProblem(model, scans, terms)
     if weights != "uniform":
         problem = Weighted(problem, window_weights(scans, weights), "absolute")
-    fitted = fit_least_squares(problem, _vector(model), rules)
+    shown = partial(progress, what=f"fitting {model.name}")
+    fitted = fit_least_squares(problem, _vector(model), rules, shown)
     _load(model, fitted.vector)
     return fitted.losses
 

@@ -49,10 +49,10 @@ def test_defaults_are_those_of_the_contract() -> None:
         ("scan.unit", "furlong", r"scan\.unit = 'furlong'.*m, mm, µm"),
         ("scan.unit", "A", r"scan\.unit = 'A'"),
         ("scan.size_um", None, r"size_um is missing"),
-        ("scan.size_um", [54.0, -1.0], r"scan\.size_um\.1 = -1\.0.*positive"),
-        ("layout.pitch_um", 0.0, r"layout\.pitch_um = 0\.0.*positive"),
-        ("layout.pitch_um", -0.1, r"layout\.pitch_um = -0\.1.*positive"),
-        ("layout.pitch_um", float("inf"), r"layout\.pitch_um = inf.*positive"),
+        ("scan.size_um", [54.0, -1.0], r"scan\.size_um\.1 = -1\.0.*a number from"),
+        ("layout.pitch_um", 0.0, r"layout\.pitch_um = 0\.0.*a number from"),
+        ("layout.pitch_um", -0.1, r"layout\.pitch_um = -0\.1.*a number from"),
+        ("layout.pitch_um", float("inf"), r"layout\.pitch_um = inf.*a number from"),
         ("layout.pitch_um", True, r"layout\.pitch_um"),
         ("layout.pitch_um", None, r"layout\.pitch_um.*nothing"),
         ("layout.levels", 1, r"layout\.levels.*greater than or equal to 2"),
@@ -68,6 +68,18 @@ def test_defaults_are_those_of_the_contract() -> None:
         ("process.registration", "rigid", r"process\.registration.*affine"),
         ("source", {"url": "file:///x", "registry": "a"}, r"source\.url"),
         ("name", "../x", r"name"),
+        *(
+            (key, before + path + after, rf"{key.replace('.', '[.]')}.*inside the data folder")
+            for key, after in (
+                ("layout.files", "/{id}.tif"),
+                ("scan.files", "/{id}.txt"),
+                ("scan.full_scale_file", "/max.txt"),
+                ("process.level", "/recipe.toml"),
+                ("ids.table", "/scans.csv"),
+            )
+            for before in ("", "a/")
+            for path in ("a/../../b", "b/..", "..\\b")
+        ),
     ],
 )
 def test_a_wrong_card_is_named(key: str, value: object, expected: str) -> None:

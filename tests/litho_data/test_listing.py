@@ -69,6 +69,20 @@ def test_the_table_gives_order_position_dose_and_use(tmp_path: Path) -> None:
     assert by_id["bare"].layout is None
 
 
+def test_a_scan_without_its_order_is_left_aside_where_others_have_theirs(tmp_path: Path) -> None:
+    """A place that nobody stated would be taken for one in the order of writing."""
+    card = folder_with(tmp_path, PAIRS, more='table = "scans.csv"')
+    (tmp_path / "scans.csv").write_text("id,order\nP12,4\n", encoding="utf-8")
+    listing = list_fields(card)
+    assert [(one.id, one.order) for one in listing.fields] == [("P12", 4)]
+    (left,) = listing.left_aside
+    assert (left.id, left.unpaired) == ("P11", False)
+    assert left.reason == "not in scans.csv, which gives the order"
+    # Without an order in the table no scan has one, and all are kept in the order of their ids.
+    (tmp_path / "scans.csv").write_text("id,dose\nP12,1.5\n", encoding="utf-8")
+    assert [(one.id, one.order) for one in list_fields(card).fields] == [("P11", 0), ("P12", 1)]
+
+
 @pytest.mark.parametrize(
     ("table", "expected"),
     [
@@ -77,6 +91,12 @@ def test_the_table_gives_order_position_dose_and_use(tmp_path: Path) -> None:
         ("id,order\nP11,first\n", "whole number"),
         ("id,dose\nP11,high\n", "dose.*a number"),
         ("id,dose\nP11,nan\n", "dose.*a number"),
+        *(
+            (f"id,dose\nP11,{dose}\n", "dose.*a number from 0.001 to 1000")
+            for dose in ("-1", "0", "inf", "1e9")
+        ),
+        *((f"id,field_x_um\nP11,{place}\n", "field_x_um.*a number from") for place in ("1e308", "-1e9", "x")),
+        ("id,order\nP11," + "9" * 5000 + "\n", "whole number"),
         ("id,use\nP11,training\n", "dataset | flat"),
         ("id,speed\nP11,3\n", "columns of"),
         ("order\n1\n", "columns of"),

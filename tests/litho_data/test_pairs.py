@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from litho_data.exchange.pairs import export_pairs, import_pairs
 from litho_data.foundation.errors import InputError
 from litho_data.provenance.verify import verify
 from litho_data.store import open_store
+from litho_data.store.partial import PartialStore, Piece
 
 
 def test_a_store_survives_the_format_to_half_a_grey_value(campaign: Path, tmp_path: Path) -> None:
@@ -31,6 +33,33 @@ def test_a_store_survives_the_format_to_half_a_grey_value(campaign: Path, tmp_pa
         assert np.abs(difference).max() <= half_step_um + 0.5e-4 + 1e-6
         assert np.abs(difference.mean()) < 0.1 * half_step_um + 0.5e-4  # rounded, not cut off
     assert verify(tmp_path / "back.zarr").findings == ()
+
+
+@pytest.mark.parametrize(
+    "other",
+    [{"pitch_um": 0.2}, {"level_height_um": 0.2}, {"levels": 14}, {"name": "others"}],
+    ids=lambda one: next(iter(one)),
+)
+def test_what_was_begun_with_other_words_is_not_continued(
+    other: dict[str, Any], campaign: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two fields of one pitch and one of another would be one store."""
+    export_pairs(campaign / "prints.zarr", tmp_path / "pairs")
+    add, added = PartialStore.add, []
+
+    def add_two(partial: PartialStore, piece: Piece) -> None:
+        if len(added) == 2:
+            raise KeyboardInterrupt
+        added.append(piece.record["id"])
+        add(partial, piece)
+
+    monkeypatch.setattr(PartialStore, "add", add_two)
+    with pytest.raises(KeyboardInterrupt):
+        import_pairs(tmp_path / "pairs", tmp_path / "mixed.zarr")
+    monkeypatch.undo()
+    result = import_pairs(tmp_path / "pairs", tmp_path / "mixed.zarr", **other)
+    assert result.reused == 0
+    assert not verify(tmp_path / "mixed.zarr").findings
 
 
 def test_gaps_are_filled_with_a_note(own_campaign: Path, tmp_path: Path) -> None:

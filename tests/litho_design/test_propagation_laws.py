@@ -20,6 +20,7 @@ from litho_design.optics import (
     make_propagator,
     sampling_limit_um,
 )
+from litho_design.optics.angular_spectrum import spectrum_axes
 
 pytestmark = pytest.mark.numerics
 
@@ -74,6 +75,49 @@ def test_adjoint_and_gradient(name):
     assert (forward - backward).abs().item() < 1e-10 * forward.abs().item()
     forward.real.backward()
     assert torch.allclose(u.grad, propagate.adjoint(v), rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("distance", [900.0, 6000.0, -6000.0])
+@pytest.mark.parametrize("offset_um", [0.0, 240.0, -31.0])
+@pytest.mark.parametrize(
+    ("here", "there"), [((30, 33), (400, 21)), ((401, 64), (26, 333)), ((32, 32), (32, 32))]
+)
+def test_the_band_holds_the_rays_that_do_not_come_back_wrapped(here, there, offset_um, distance):
+    """A ray at f goes z tan; from any source point it and its copies a period on meet the target once."""
+    source, target = centred_grid(here, 0.4), centred_grid(there, 0.4, (offset_um, -offset_um))
+    for axis, band in enumerate(spectrum_axes(source, target, distance, WAVELENGTH_UM)):
+        sine = WAVELENGTH_UM * band.frequency.numpy()
+        step = distance * sine / np.sqrt(1 - sine**2)
+        period = 0.4 * len(sine)
+        from_centre_to_centre = offset_um if axis == 0 else -offset_um
+        room = period - 0.4 * (here[axis] + there[axis]) / 2
+        clear = np.abs(np.abs(step - from_centre_to_centre) - room) > 1e-6 * period
+        wanted = np.abs(step - from_centre_to_centre) <= room
+        assert np.array_equal(band.inside.numpy()[clear], wanted[clear])
+        assert band.start_um == pytest.approx(
+            (target.y_um if axis == 0 else target.x_um)[0] - (source.y_um if axis == 0 else source.x_um)[0]
+        )
+    if abs(distance) > 5000:
+        assert not band.inside.all(), "the period is long enough: nothing is tested"
+
+
+@pytest.mark.parametrize(
+    ("there", "offset"), [((70, 41), (3, -9)), ((25, 90), (0, 0)), ((31, 32), (-11, 20))]
+)
+def test_asm_to_a_part_of_a_plane_is_the_part_of_asm_to_the_plane(there, offset):
+    """Whatever its size and place, the target does not decide what arrives there."""
+    source = centred_grid((34, 45), 0.4)
+    whole = centred_grid((160, 170), 0.4)
+    row, column = ((n - m) // 2 + shift for n, m, shift in zip(whole.shape, there, offset, strict=True))
+    origin = whole.origin_um[0] + row * 0.4, whole.origin_um[1] + column * 0.4
+    y, x = torch.tensor(source.y_um)[:, None], torch.tensor(source.x_um)[None, :]
+    field = torch.exp(-(y**2 + x**2) / (2 * 1.5**2) + 1j * (1.1 * x - 0.7 * y))
+    options = {"distance_um": 60.0, "wavelength_um": WAVELENGTH_UM, "dtype": torch.complex128}
+    everywhere = ASMPropagator(source, whole, **options)(field)
+    part = ASMPropagator(source, PixelGrid(there, (0.4, 0.4), origin), **options)(field)
+    wanted = everywhere[row : row + there[0], column : column + there[1]]
+    # Nine decimals of the beam lie within the source, and all its rays within the band.
+    assert (part - wanted).abs().max() < 1e-6 * everywhere.abs().max()
 
 
 def test_asm_adjoint():

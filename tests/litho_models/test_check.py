@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 
 import numpy as np
@@ -252,6 +253,22 @@ def test_unchanged_prints_raise_no_alarm_and_a_datum_means_nothing(lab, tmp_path
     for first, second in zip(plain.figures, moved.figures, strict=True):
         # As above, at heights of float32.
         assert second.p == pytest.approx(first.p, rel=1e-3)
+
+
+def test_an_error_that_the_fit_has_made_small_is_not_judged(lab, tmp_path):
+    """Else new prints of an unchanged printer alarm, which no fit has seen."""
+    shutil.copytree(lab / "model", tmp_path / "model")
+    card = json.loads((tmp_path / "model" / "card.json").read_text())
+    honest = check(lab / "model", lab / "same.zarr", tmp_path / "honest")
+    (tmp_path / "model" / "card.json").write_text(json.dumps(card | {"parameters": 100_000}))
+    flexible = check(tmp_path / "model", lab / "same.zarr", tmp_path / "flexible")
+    names = [[figure.name for figure in result.figures] for result in (honest, flexible)]
+    assert [name for name in names[0] if name != "error"] == names[1]
+    assert "error" in names[0]
+    assert [any("error is not judged" in note for note in one.notes) for one in (honest, flexible)] == [
+        False,
+        True,
+    ]
 
 
 def test_taller_prints_end_the_strict_command_with_3(lab, tmp_path, monkeypatch, capsys):

@@ -1,0 +1,18 @@
+"""Grids on which no two axes can be taken for one another; all rooms test their axes on them.
+
+Fields are higher than wide and wider than high, even and odd along either axis, with pixels that are longer
+along one, and corners off the origin: a transposed pair, a size in the place of the other and half a pixel
+all show.
+"""
+
+from __future__ import annotations
+
+from litho_data.foundation.grid import PixelGrid
+
+UNEQUAL = {
+    "high, even and odd": PixelGrid((46, 33), (0.13, 0.08), (0.7, -1.1)),
+    "wide, odd and even": PixelGrid((37, 58), (0.07, 0.11), (-2.3, 0.4)),
+    "even": PixelGrid((40, 64), (0.1, 0.16), (0.05, 3.2)),
+    "odd": PixelGrid((51, 35), (0.12, 0.09), (-0.3, -0.9)),
+}
+SHAPES = [grid.shape for grid in UNEQUAL.values()]
