@@ -20,8 +20,8 @@ _USUAL_TOLERANCE = 1e-4
 # A number that no program is known for must stand this many spans of the other values away.
 _FAR = 100
 _FEWEST_VALUES = 8
-# Values are written with a few digits, or held as float32.
-_SAME = 1e-6
+# Values are held as float32, and the largest of all written with a few digits.
+_SAME, _SAME_OF_LARGE, _LARGE = 1e-6, 1e-3, 1e30
 # One value in so many pixels, where others are rare.
 _SHARE, _FEWEST, _TIMES = 0.002, 10, 20
 
@@ -49,7 +49,8 @@ def without_missing(
             raise InputError(f"{file} line {line}", got=shown, wanted="a number", hint=hint)
     values = np.array(values, dtype=np.float64)
     for number in (one for one in missing or () if not isinstance(one, str)):
-        values[np.isclose(values, number, rtol=_SAME, atol=0)] = np.nan
+        tolerance = _SAME_OF_LARGE if abs(number) > _LARGE else _SAME
+        values[np.isclose(values, number, rtol=tolerance, atol=0)] = np.nan
     if missing is None and (found := _marks(values)):
         shown = ", ".join(f"{value:g} in {count} pixels" for value, count in found)
         keys = ", ".join(f"{value:.8g}" for value, _ in found)

@@ -20,7 +20,7 @@ from litho_data.scan import Axis, Scan
 # Files state sizes rounded to a few digits.
 _SIZE_TOLERANCE = 1e-4
 # Sides of a scan that coordinates without a unit may have.
-_SMALLEST_UM, _LARGEST_UM = 0.1, 5000.0
+_SMALLEST_UM, _LARGEST_UM = 0.1, 1000.0
 
 
 def read_scan(
@@ -119,6 +119,8 @@ def _choose(file: Path, channels: list[Channel], name: str | None) -> Channel:
     if name is not None:
         for channel in channels:
             if channel.name == name:
+                if channel.problem:
+                    raise InputError(channel.problem)
                 if not channel.is_height:
                     raise InputError(f"{file}: channel {name!r} is no height", got=f"unit {channel.unit!r}")
                 return channel

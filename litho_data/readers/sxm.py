@@ -34,7 +34,7 @@ def read_channels(path: Path) -> list[Channel]:
     try:
         nx, ny = (int(one) for one in header["SCAN_PIXELS"].split())
         x_m, y_m = (float(one) for one in header["SCAN_RANGE"].split())
-        rows = [line.split("\t") for line in header["DATA_INFO"].splitlines()]
+        rows = [line.strip().split("\t") for line in header["DATA_INFO"].splitlines()]
         titles = [one.strip().lower() for one in rows[0]]
         signals = [dict(zip(titles, (one.strip() for one in row), strict=False)) for row in rows[1:]]
         images = [(one["name"], one["unit"], way) for one in signals for way in _ways(one["direction"])]
