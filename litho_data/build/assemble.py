@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from litho_data.build.jobs import Job
-from litho_data.build.operations import load_recipe
+from litho_data.build.operations import no_recipe
 from litho_data.cards.card import Card
 from litho_data.foundation.hashes import array_sha256, canonical_json, file_sha256, record_sha256
 from litho_data.store.schema import SAMPLE_VARIABLES, STORE_SCHEMA, dataset_sha256
@@ -36,7 +36,7 @@ class Source:
     jobs: Sequence[Job]
     data_dir: Path
     files: Mapping[str, Mapping[str, Path]]
-    recipe: Mapping[str, Any] = field(default_factory=lambda: load_recipe(None))
+    recipe: Mapping[str, Any] = field(default_factory=no_recipe)
     seed: int = 0
     standards: Mapping[str, Path] = field(default_factory=dict)
     assumptions: Sequence[str] = ()

@@ -17,7 +17,7 @@ from litho_data.build.assemble import Source, assemble, records_of_use
 from litho_data.build.calibration import measure_scales, standards_of
 from litho_data.build.day_tip import with_tip_found
 from litho_data.build.jobs import FieldJob, Job, Skipped, field_jobs, finish
-from litho_data.build.operations import UNREGISTERED, load_recipe
+from litho_data.build.operations import UNREGISTERED, load_recipe, no_recipe
 from litho_data.build.report import write_report
 from litho_data.build.result import BuildResult, LeftOut, report_folder
 from litho_data.build.right_layout import doubts, fitting_layout
@@ -71,12 +71,18 @@ def build_dataset(
     listing = list_fields(card_path, data_dir)
     if tip is not None:
         listing = replace(listing, card=with_tip(listing.card, tip))
-    level = listing.card.process.level
-    recipe = load_recipe(None if level is None else listing.card_path.parent / level)
+    recipe = _recipe(listing)
     places = Workers(workers, dask)
     jobs = with_tip_found(field_jobs(listing, recipe, seed), places)
     source = _source(listing, recipe, seed, jobs)
     return make_store(source, Path(out), workers=places, strict=strict)
+
+
+def _recipe(listing: Listing) -> dict[str, Any]:
+    level = listing.card.process.level
+    if level is None and listing.card.scan.levelled:
+        return no_recipe()
+    return load_recipe(None if level is None else listing.card_path.parent / level)
 
 
 def _source(listing: Listing, recipe: Mapping[str, Any], seed: int, jobs: Sequence[Job]) -> Source:

@@ -153,7 +153,7 @@ class LayoutAware(_PlaneByDefault):
     op: Literal["layout-aware"] = "layout-aware"
     function = staticmethod(level_layout_aware)
     needs = ("layout_level",)
-    blur_px: float = Field(default=3.0, ge=0)
+    blur_px: float | None = Field(default=None, ge=0)
 
 
 class AlignRows(Step):

@@ -22,7 +22,9 @@ _APPLIED = ("scale_factor", "add_offset")
 _MISSING = ("_FillValue", "missing_value")
 _RANGE = ("valid_min", "valid_max", "valid_range")
 # Other attributes with numbers that would change the values, if one knew how.
-_UNKNOWN = re.compile(r"scal(e|ing)|offset|gain|calib|slope|intercept|factor|multipl|conver|_unsigned|lsb", re.I)
+_UNKNOWN = re.compile(
+    r"scal(e|ing)|offset|gain|calib|slope|intercept|factor|multipl|conver|_unsigned|lsb", re.I
+)
 _UNEVEN = 1e-3
 _OF_DIMENSIONS = ("DIMENSION_LIST", "REFERENCE_LIST", "CLASS", "NAME", "_Netcdf4Dimid", "_Netcdf4Coordinates")
 _NO_COORDINATE = b"This is a netCDF dimension but not"
@@ -72,7 +74,9 @@ def array_channel(
     says = {key: _plain(value) for key, value in attributes.items()}
     unknown = [f"{key} = {value}" for key, value in says.items() if _changes(key, value)]
     if unknown:
-        raise InputError("values", got=", ".join(unknown), wanted="scale_factor and add_offset, or plain values")
+        raise InputError(
+            "values", got=", ".join(unknown), wanted="scale_factor and add_offset, or plain values"
+        )
     if dtype.kind not in _NUMBERS:
         raise InputError("values", got=dtype, wanted="integers or real numbers")
     turned = dims[0].lower().startswith("x") and not dims[1].lower().startswith("x")
@@ -138,7 +142,9 @@ def _channels(path: Path, kind: str, made: Iterator[tuple[str, Callable[[], Chan
 def read_hdf5(path: Path, file: Any) -> list[Channel]:
     """One channel per two-dimensional dataset of an open HDF5 file; MATLAB's are stored column by column."""
     datasets: list[Any] = []
-    file.visititems(lambda name, item: datasets.append(item) if len(getattr(item, "shape", ())) == 2 else None)
+    file.visititems(
+        lambda name, item: datasets.append(item) if len(getattr(item, "shape", ())) == 2 else None
+    )
     matlab = b"MATLAB" in path.open("rb").read(16)
     maps = [item for item in datasets if min(item.shape) > 1 and item.dtype.kind in _NUMBERS]
     named = [(item.name.strip("/"), partial(_hdf5_channel, path, item, matlab)) for item in maps]
@@ -148,7 +154,9 @@ def read_hdf5(path: Path, file: Any) -> list[Channel]:
 def _hdf5_channel(path: Path, item: Any, matlab: bool) -> Channel:
     raw = partial(_dataset, path, item.name)
     scales = [list(item.dims[axis].values()) for axis in (0, 1)]
-    dims = [item.dims[k].label or (at[0].name.rsplit("/", 1)[-1] if at else "") for k, at in enumerate(scales)]
+    dims = [
+        item.dims[k].label or (at[0].name.rsplit("/", 1)[-1] if at else "") for k, at in enumerate(scales)
+    ]
     if matlab:
         dims = ["x", "y"]
     held = {
@@ -157,7 +165,9 @@ def _hdf5_channel(path: Path, item: Any, matlab: bool) -> Channel:
         if at and not bytes(at[0].attrs.get("NAME", b"")).startswith(_NO_COORDINATE)
     }
     attributes = {key: value for key, value in item.attrs.items() if key not in _OF_DIMENSIONS}
-    return array_channel(item.name.strip("/"), item.dtype, item.shape, raw, attributes, (dims[0], dims[1]), held)
+    return array_channel(
+        item.name.strip("/"), item.dtype, item.shape, raw, attributes, (dims[0], dims[1]), held
+    )
 
 
 def _dataset(path: Path, name: str) -> np.ndarray:
@@ -172,7 +182,9 @@ def _coordinate(values: np.ndarray, attributes: Mapping[str, Any]) -> Coordinate
     length = attributes.get("length")
     numbers = np.asarray(values, dtype=np.float64) if np.asarray(values).dtype.kind in _NUMBERS else None
     return Coordinate(
-        numbers, None if unit is None else str(_plain(unit)), None if length is None else float(_plain(length))
+        numbers,
+        None if unit is None else str(_plain(unit)),
+        None if length is None else float(_plain(length)),
     )
 
 
@@ -215,7 +227,9 @@ def read_matlab(path: Path) -> list[Channel]:
     with foreign_parser(path, "MATLAB"):
         held = {name: one for name, one in loadmat(path).items() if isinstance(one, np.ndarray)}
     maps = {name: one for name, one in held.items() if one.ndim == 2 and min(one.shape) > 1}
-    named = ((name, partial(_in_memory, name, one, {})) for name, one in maps.items() if one.dtype.kind in "uifc")
+    named = (
+        (name, partial(_in_memory, name, one, {})) for name, one in maps.items() if one.dtype.kind in "uifc"
+    )
     return _channels(path, "MATLAB", named)
 
 
@@ -224,5 +238,7 @@ NETCDF_READER = Reader(
     "netcdf", lambda path, head: head.startswith((b"CDF\x01", b"CDF\x02")), confined(read_netcdf, _IMPORTS)
 )
 MATLAB_READER = Reader(
-    "matlab", lambda path, head: head.startswith(b"MATLAB "), confined(read_matlab, _IMPORTS), self_describing=False
+    "matlab",
+    lambda path, head: head.startswith(b"MATLAB "),
+    confined(read_matlab, _IMPORTS),
 )

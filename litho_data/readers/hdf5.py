@@ -133,7 +133,9 @@ def _nanosurf_channel(path: Path, item: Any, says: dict[str, Any], name: str) ->
         raise InputError(f"{item.name}: shape", got=item.shape, wanted=f"{ny} lines of {nx} points")
     low, high, unit = (_first(item.attrs, names) for names in (_LOW, _HIGH, _UNIT))
     if item.dtype.kind not in "iu" or low is None or high is None or unit is None:
-        raise InputError(f"{item.name}: calibration", got=f"{item.dtype}, {low} to {high} {unit}", wanted="counts")
+        raise InputError(
+            f"{item.name}: calibration", got=f"{item.dtype}, {low} to {high} {unit}", wanted="counts"
+        )
     return Channel(
         name=name,
         shape=(ny, nx),

@@ -83,5 +83,7 @@ def extreme_note(values: np.ndarray) -> str:
         return ""
     least = max(_FEWEST, _SHARE * counts.sum(), _TIMES * counts.sum() / len(numbers))
     said = [f"{numbers[end]:.6g} in {counts[end]} pixels" for end in (0, -1) if counts[end] >= least]
-    what = f"its {'lowest' if counts[0] >= least else 'highest'} value stands in many pixels ({'; '.join(said)})"
+    what = (
+        f"its {'lowest' if counts[0] >= least else 'highest'} value stands in many pixels ({'; '.join(said)})"
+    )
     return f"{what}: cut off by the instrument, or a mark of missing pixels?" if said else ""

@@ -94,5 +94,5 @@ def _is_archive(head: bytes) -> bool:
     return head.startswith(_ZIP_MAGIC) and head[_NAME_AT : _NAME_AT + length].endswith(b".npy")
 
 
-ARCHIVE_READER = Reader("npz", lambda path, head: _is_archive(head), read_archive, self_describing=False)
-READER = Reader("npy", lambda path, head: head.startswith(b"\x93NUMPY"), read_channels, self_describing=False)
+ARCHIVE_READER = Reader("npz", lambda path, head: _is_archive(head), read_archive)
+READER = Reader("npy", lambda path, head: head.startswith(b"\x93NUMPY"), read_channels)

@@ -101,9 +101,7 @@ def _read_channels(reader: Reader, file: Path) -> list[Channel]:
     for channel in channels:
         if channel.shape[0] * channel.shape[1] > MOST_BYTES_PER_PACKED_BYTE * size:
             got = f"{size} bytes for {channel.shape[0]} x {channel.shape[1]} pixels"
-            raise InputError(
-                f"{file} ({reader.name})", got=got, wanted="more", hint=DAMAGED
-            )
+            raise InputError(f"{file} ({reader.name})", got=got, wanted="more", hint=DAMAGED)
     return channels
 
 

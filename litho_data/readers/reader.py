@@ -100,14 +100,11 @@ class Reader:
         name: as in ``format = "…"`` of a card and ``--format`` of the commands.
         recognises: ``recognises(path, head)``: whether a file has this format; ``head`` is its first 64 KiB.
         read_channels: the channels of a file, in the order of the file; InputError where it is damaged.
-        self_describing: whether such files can state the unit of their heights and their size; where they
-            cannot, a card has to.
     """
 
     name: str
     recognises: Callable[[Path, bytes], bool]
     read_channels: Callable[[Path], list[Channel]]
-    self_describing: bool = True
 
 
 def one_by_one(path: Path, kind: str, name: str, make: Callable[[], Channel]) -> Channel:
@@ -177,5 +174,7 @@ def foreign_parser(path: Path, kind: str) -> Iterator[None]:
     except Exception as error:
         reason = f"{type(error).__name__}: {error}"
         cut = isinstance(error, _OF_CUT_FILES) or _CUT.search(reason)
-        what = f"cannot read {path} as {kind}" if cut else f"{path} is not read: kind of channel, format {kind}"
+        what = (
+            f"cannot read {path} as {kind}" if cut else f"{path} is not read: kind of channel, format {kind}"
+        )
         raise InputError(what, got=reason[:_LONGEST_MESSAGE], hint=DAMAGED if cut else "") from error

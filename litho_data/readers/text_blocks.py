@@ -29,9 +29,19 @@ _HEIGHTS = ("height", "höhe", "hauteur", "altezza", "alto", "altura", "výška"
 _CHANNELS = ("channel", "kanal", "canal", "canale", "kanál", "channel name")
 _UNITS = ("value units", "value unit", "einheiten", "unités", "unità valore", "unidades de valor",
           "jednotky hodnot", "z-unit", "z unit", "zunit", "z units", "data unit")  # fmt: skip
-_MISSING = ("nodata_value", "nodata value", "nodata", "no data", "missing value", "invalid value", "void pixels")
+_MISSING = (
+    "nodata_value",
+    "nodata value",
+    "nodata",
+    "no data",
+    "missing value",
+    "invalid value",
+    "void pixels",
+)
 _TO_METRES = "height conversion factor (-> m)"
-_SCALES = re.compile(r"bit2nm|scale_?factor|(z|height|value|data)[ _-]?(scale|factor|multiplier|gain|offset)$")
+_SCALES = re.compile(
+    r"bit2nm|scale_?factor|(z|height|value|data)[ _-]?(scale|factor|multiplier|gain|offset)$"
+)
 
 
 @dataclass

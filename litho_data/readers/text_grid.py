@@ -17,7 +17,9 @@ _FEWEST_STEPS = 3
 # One axis alone, or uneven ones, need more numbers.
 _FEWEST_ALONE = 6
 _FEWEST_POINTS = 32
-_COLUMN = re.compile(r"\b([xyz])\b[^\[(xyz]{0,20}[\[(]\s*([^\])\s]{1,12})\s*[\])]|\b([xyz])\s+in\s+(\S{1,12})", re.IGNORECASE)
+_COLUMN = re.compile(
+    r"\b([xyz])\b[^\[(xyz]{0,20}[\[(]\s*([^\])\s]{1,12})\s*[\])]|\b([xyz])\s+in\s+(\S{1,12})", re.IGNORECASE
+)
 
 
 @dataclass(frozen=True)
@@ -120,4 +122,6 @@ def map_of_points(points: np.ndarray, words: Sequence[str]) -> Map | None:
     values[row if down else len(y) - 1 - row, column] = points[:, 2]
     extent = (step_y * len(y), step_x * len(x))
     note = f"points of a grid, the rows as in the file: y {'grows' if down else 'falls'} downwards"
-    return Map(values, extent, x_is="the first column of points", notes=(note,), **_units(words, extent, False))
+    return Map(
+        values, extent, x_is="the first column of points", notes=(note,), **_units(words, extent, False)
+    )

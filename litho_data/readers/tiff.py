@@ -106,7 +106,9 @@ def _may_hold_heights(tag: Any, shape: tuple[int, int]) -> bool:
     return unknown and tag.valuebytecount >= shape[0] * shape[1]
 
 
-def _calibration(what: str, page: Any, imagej: dict[str, Any]) -> tuple[float, float, str | None, float | None]:
+def _calibration(
+    what: str, page: Any, imagej: dict[str, Any]
+) -> tuple[float, float, str | None, float | None]:
     """Scale, offset, unit and no-data value of a page.
 
     Raises:
@@ -173,7 +175,11 @@ def _load(path: Path, index: int, scale: float, offset: float, missing: float | 
     if (scale, offset, missing) == (1, 0, None):
         return pixels, None
     values = pixels.astype(np.float64)
-    bad = np.isclose(values, missing, rtol=1e-7, atol=0) if missing is not None else np.zeros(values.shape, bool)
+    bad = (
+        np.isclose(values, missing, rtol=1e-7, atol=0)
+        if missing is not None
+        else np.zeros(values.shape, bool)
+    )
     return np.where(bad, np.nan, values * scale + offset), None
 
 
@@ -202,4 +208,6 @@ def is_tiff(head: bytes) -> bool:
     return head.startswith(_MAGIC)
 
 
-READER = Reader("tiff", lambda path, head: is_tiff(head), confined(read_channels, ("tifffile", "imagecodecs")))
+READER = Reader(
+    "tiff", lambda path, head: is_tiff(head), confined(read_channels, ("tifffile", "imagecodecs"))
+)

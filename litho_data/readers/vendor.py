@@ -83,7 +83,9 @@ def read_channels(path: Path) -> list[Channel]:
     header = _vendor_header(path, kind)
     with foreign_parser(path, kind), _open(path, kind) as reader:
         maps = [info for info in reader.channels if info.dim == 2 and min(info.nb_grid_pts) > 1]
-        channels = [one_by_one(path, kind, str(one.name), partial(_channel, path, kind, one, header)) for one in maps]
+        channels = [
+            one_by_one(path, kind, str(one.name), partial(_channel, path, kind, one, header)) for one in maps
+        ]
     if not channels:
         raise InputError(f"{path} ({kind}) holds no two-dimensional channel")
     names = _layer_names(path, kind)
@@ -179,7 +181,9 @@ def _channel(path: Path, kind: str, info: Any, header: dict[str, str]) -> Channe
         load=partial(_load, path, kind, info.index, sizes is None),
         fast_axis=_fast_axis(header),
         header=header or dict(_flatten(info.info.get("raw_metadata", info.info))),
-        notes=(f"read by SurfaceTopography as {kind}, which no test here covers",) if kind in _UNTESTED else (),
+        notes=(f"read by SurfaceTopography as {kind}, which no test here covers",)
+        if kind in _UNTESTED
+        else (),
     )
 
 

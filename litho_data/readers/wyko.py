@@ -64,7 +64,9 @@ def _channel(
     multiplier, aspect = (number(says.get(key, "1")) or 1.0 for key in ("Mult", "Aspect"))
     scale = 1.0 if in_nm else wavelength_nm / multiplier
     if name in _HEIGHTS and not np.isfinite(scale):
-        raise InputError(f"{path} (Wyko ASCII): Wavelength", got=says.get("Wavelength"), wanted="a number of nm")
+        raise InputError(
+            f"{path} (Wyko ASCII): Wavelength", got=says.get("Wavelength"), wanted="a number of nm"
+        )
     pitch_um = abs(pitch_mm) * 1e3
     return Channel(
         name=name,

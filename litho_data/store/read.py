@@ -29,6 +29,7 @@ from litho_data.store.schema import (
     OPTIONAL_COLUMNS,
     SAMPLE_VARIABLES,
     SIGMA,
+    TEXT_COLUMNS,
     VARIABLES,
     DatasetId,
     checked_arrays,
@@ -66,6 +67,9 @@ class PrintedScan:
         tip_radius_um: of the microscope's tip, or the most that it can be; None if the store does not say.
         height_sigma_um: float32 (ny, nx), µm, standard uncertainty of ``height_um``, the scan's offset aside;
             NaN where not valid, None if the store has none.
+        instrument: that scanned it, if the card's table names it.
+        surround: what lies around the printed field: ``substrate`` (bare), ``continues`` (more of the print)
+            or ``unknown``, if the card does not say.
     """
 
     id: str
@@ -89,6 +93,8 @@ class PrintedScan:
     bend_um: Bend | None = None
     tip_radius_um: float | None = None
     height_sigma_um: np.ndarray | None = None
+    instrument: str = ""
+    surround: str = "unknown"
 
     def __repr__(self) -> str:
         ny, nx = self.shape
@@ -151,7 +157,8 @@ class Store:
             raise InputError(f"scan ids of {path}", got="duplicates", wanted="unique ids")
         self._print_ids = [str(value) for value in values_of(root, "print")]
         self._order = [int(value) for value in values_of(root, "order")]
-        self._columns = {name: values_of(root, name) for name in OPTIONAL_COLUMNS if has_child(root, name)}
+        names = (*OPTIONAL_COLUMNS, *TEXT_COLUMNS)
+        self._columns = {name: values_of(root, name) for name in names if has_child(root, name)}
         self.shapes = true_shapes(root, len(self.ids), self._arrays["mask_level"].shape[1:])
         self._row = {scan_id: row for row, scan_id in enumerate(self.ids)}
 
@@ -192,6 +199,8 @@ class Store:
             bend_um=self._bend_um(row),
             tip_radius_um=self._tip_radius_um(row),
             height_sigma_um=self.sample(SIGMA.name, row) if SIGMA.name in self._arrays else None,
+            instrument=self._word("instrument", row),
+            surround=self._word("surround", row) or str((self.write or {}).get("surround", "unknown")),
         )
 
     def scans(self) -> list[PrintedScan]:
@@ -295,6 +304,7 @@ class Store:
             value = self._column(name, row)
             if value is not None:
                 identity[name] = value
+        identity |= {name: word for name in TEXT_COLUMNS if (word := self._word(name, row))}
         hashes = {v.name: v.sample_sha256(self.sample(v.name, row)) for v in SAMPLE_VARIABLES}
         bend_um = self._bend_um(row)
         if bend_um is not None:
@@ -316,6 +326,9 @@ class Store:
             return None
         value = float(self.quality["tip_radius_um"].iloc[row])
         return None if math.isnan(value) else value
+
+    def _word(self, name: str, row: int) -> str:
+        return str(self._columns[name][row]) if name in self._columns else ""
 
     def _column(self, name: str, row: int) -> float | None:
         value = float(self._columns[name][row]) if name in self._columns else math.nan

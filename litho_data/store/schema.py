@@ -83,6 +83,8 @@ MIXED_UNITS = {"scan_to_layout": "units of its rows: 1, 1, um; 1, 1, um; um-1, u
 VARIABLES = {variable.name: variable for variable in (*LAYOUT_VARIABLES, *SCAN_VARIABLES)}
 OPTIONAL_COLUMNS = ("field_x_um", "field_y_um", "dose", "turned_deg", "direction", "tip", "pixel_size")
 """Numbers per scan from the card's table; coordinates where the card has them, NaN where a row has not."""
+TEXT_COLUMNS = ("instrument", "surround")
+"""Words per scan from the card's table; coordinates where the card has them, empty where a row has not."""
 
 
 def dataset_sha256(facts: Mapping[str, Any], scans: Sequence[Mapping[str, Any]]) -> str:

@@ -15,6 +15,7 @@ from litho_data.store.schema import (
     SAMPLE_VARIABLES,
     SCAN_VARIABLES,
     SIGMA,
+    TEXT_COLUMNS,
     VARIABLES,
 )
 
@@ -85,6 +86,9 @@ def write_samples(
             values = [scan["columns"].get(name, np.nan) for scan in scans]
             unit = {"units": "um" if name.endswith("_um") else "degree" if name.endswith("_deg") else "1"}
             write_numbers(root, name, np.array(values), "scan", attributes=unit)
+    for name in TEXT_COLUMNS:
+        if any(name in scan["columns"] for scan in scans):
+            write_strings(root, name, [str(scan["columns"].get(name, "")) for scan in scans], "scan")
     for axis, count in (("y", ny), ("x", nx)):
         described = {"long_name": f"{axis} of the pixel centres, layout frame", "axis": axis.upper()}
         centres = pixel_centres_um(count, pitch_um)

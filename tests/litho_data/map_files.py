@@ -38,7 +38,11 @@ class MapFile:
     def in_unit(self) -> np.ndarray:
         """Heights in the file's unit, the mark in place of NaN."""
         values = self.height_um / um_per(self.unit)
-        return values if self.mark is None or isinstance(self.mark, str) else np.where(np.isnan(values), self.mark, values)
+        return (
+            values
+            if self.mark is None or isinstance(self.mark, str)
+            else np.where(np.isnan(values), self.mark, values)
+        )
 
     def needs(self, **arguments: Any) -> None:
         """The file cannot be read without these."""
@@ -80,7 +84,9 @@ Writer = Callable[[Path, MapFile, np.random.Generator], None]
 
 def text(path: Path, one: MapFile, rng: np.random.Generator) -> None:
     """A matrix, with or without a header, in one of the spellings that occur."""
-    separator, decimal = [("\t", "."), (" ", "."), (",", "."), (";", "."), (";", ","), ("\t", ",")][rng.integers(6)]
+    separator, decimal = [("\t", "."), (" ", "."), (",", "."), (";", "."), (";", ","), ("\t", ",")][
+        rng.integers(6)
+    ]
     lines = one.rows(separator, decimal)
     if rng.random() < 0.5:
         size_y, size_x = one.size_um
@@ -105,7 +111,12 @@ def text_of_two_channels(path: Path, one: MapFile, rng: np.random.Generator) -> 
     rows = one.rows()
     other = ["\t".join(f"{value:.3f}" for value in row) for row in np.nan_to_num(one.height_um) * 30]
     if rng.random() < 0.5:
-        head = ["# Channel: {}", f"# Width: {one.size_um[1]:.9f} µm", f"# Height: {one.size_um[0]:.9f} µm", "# Value units: {}"]
+        head = [
+            "# Channel: {}",
+            f"# Width: {one.size_um[1]:.9f} µm",
+            f"# Height: {one.size_um[0]:.9f} µm",
+            "# Value units: {}",
+        ]
         lines = [line.format(one.unit if "units" in line else "Topography") for line in head] + rows
         lines += ["", *(line.format("deg" if "units" in line else "Phase") for line in head), *other]
         one.says_size = True
@@ -122,7 +133,9 @@ def axes(path: Path, one: MapFile, rng: np.random.Generator) -> None:
     ny, nx = one.height_um.shape
     corner = ["0", "", "nan"][rng.integers(3)]
     head = ",".join([corner, *(f"{k * one.pitch_um:.6f}" for k in range(nx))])
-    path.write_text("\n".join([head, *(f"{k * one.pitch_um:.6f},{row}" for k, row in enumerate(rows))]) + "\n")
+    path.write_text(
+        "\n".join([head, *(f"{k * one.pitch_um:.6f},{row}" for k, row in enumerate(rows))]) + "\n"
+    )
     one.needs(unit=one.unit)
     one.needs_mark()
     one.says_size = one.unit == "um"
@@ -133,7 +146,9 @@ def frame(path: Path, one: MapFile, rng: np.random.Generator) -> None:
     import pandas as pd
 
     names = None if rng.random() < 0.5 else [f"c{k}" for k in range(one.height_um.shape[1])]
-    pd.DataFrame(one.in_unit(), columns=names).to_csv(path, na_rep="nan", sep=[",", ";", "\t"][rng.integers(3)])
+    pd.DataFrame(one.in_unit(), columns=names).to_csv(
+        path, na_rep="nan", sep=[",", ";", "\t"][rng.integers(3)]
+    )
     one.needs(unit=one.unit)
     if not isinstance(one.mark, str):
         one.needs_mark()
@@ -178,7 +193,14 @@ def esri(path: Path, one: MapFile, rng: np.random.Generator) -> None:
     """An ESRI grid, which names its mark."""
     one.mark = mark = one.mark if isinstance(one.mark, float) else -9999.0
     ny, nx = one.height_um.shape
-    head = [f"ncols {nx}", f"nrows {ny}", "xllcorner 0.0", "yllcorner 0.0", "cellsize 0.2", f"NODATA_value {mark}"]
+    head = [
+        f"ncols {nx}",
+        f"nrows {ny}",
+        "xllcorner 0.0",
+        "yllcorner 0.0",
+        "cellsize 0.2",
+        f"NODATA_value {mark}",
+    ]
     path.write_text("\n".join(head + one.rows(" ")) + "\n")
     one.needs(unit=one.unit)
 
@@ -227,7 +249,9 @@ def hdf5(path: Path, one: MapFile, rng: np.random.Generator) -> None:
     counts = np.where(np.isnan(one.height_um), -1, np.round(one.height_um * 1e4)).astype(np.int32)
     with h5py.File(path, "w") as file:
         data = file.create_dataset("scan/height", data=counts)
-        data.attrs.update({"scale_factor": 1e-4 / um_per(one.unit), "_FillValue": np.int32(-1), "units": one.unit})
+        data.attrs.update(
+            {"scale_factor": 1e-4 / um_per(one.unit), "_FillValue": np.int32(-1), "units": one.unit}
+        )
     one.mark = None
 
 
@@ -238,7 +262,11 @@ def netcdf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
     ny, nx = one.height_um.shape
     y, x = ((np.arange(n) + 0.5) * one.pitch_um for n in (ny, nx))
     array = xr.DataArray(
-        one.height_um / um_per(one.unit), dims=("y", "x"), coords={"y": y, "x": x}, attrs={"units": one.unit}, name="height"
+        one.height_um / um_per(one.unit),
+        dims=("y", "x"),
+        coords={"y": y, "x": x},
+        attrs={"units": one.unit},
+        name="height",
     )
     array.x.attrs["units"] = array.y.attrs["units"] = "um"
     if rng.random() < 0.5:
@@ -273,7 +301,9 @@ def nhf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
         segment.attrs["rect_axis_size"], segment.attrs["segment_name"] = [nx, ny], "Forward"
         segment.attrs["rect_axis_range"] = [nx * one.pitch_um * 1e-6, ny * one.pitch_um * 1e-6]
         for k, (name, limit, unit) in enumerate((("Position Z", 2e-6, "m"), ("Deflection", 10.0, "V"))):
-            data = segment.create_dataset(f"dataset_{k:04}", data=counts if rng.random() < 0.5 else counts.ravel())
+            data = segment.create_dataset(
+                f"dataset_{k:04}", data=counts if rng.random() < 0.5 else counts.ravel()
+            )
             data.attrs.update({"signal_name": name, "signal_calibration_unit": unit})
             data.attrs.update({"signal_calibration_min": -limit, "signal_calibration_max": limit})
     one.mark, one.says_size = None, True
@@ -306,7 +336,9 @@ def digital_surf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
         raw = path.read_bytes()
         parts = raw[512:700], raw[700:]
         packed = [zlib.compress(part) for part in parts]
-        sizes = b"".join(struct.pack("<2I", len(part), len(zipped)) for part, zipped in zip(parts, packed, strict=True))
+        sizes = b"".join(
+            struct.pack("<2I", len(part), len(zipped)) for part, zipped in zip(parts, packed, strict=True)
+        )
         path.write_bytes(b"DSCOMPRESSED" + raw[12:512] + struct.pack("<I", 2) + sizes + b"".join(packed))
     one.mark, one.atol_um = None, 1e-6
     one.says_size = False  # that of the other tests' writer
@@ -318,10 +350,24 @@ def park(path: Path, one: MapFile, rng: np.random.Generator) -> None:
     ny, nx = one.height_um.shape
     one.height_um = np.nan_to_num(one.height_um, nan=0.5)
     counts = np.round(one.height_um[::-1] * 1e4).astype("<i2")
-    values = struct.pack("<I", 0) + "Topography".encode("utf-16-le").ljust(64, b"\0") + "NC".encode("utf-16-le").ljust(16, b"\0")
-    values += struct.pack("<dII", 0, 0, 0) + struct.pack("<II", nx, ny) + struct.pack("<dId3I", 0, 0, 0, 1, 1, 0)
-    values += struct.pack("<6d", nx * one.pitch_um, ny * one.pitch_um, 0, 0, 1, 0) + bytes(16) + struct.pack("<2d", 0, 0)
-    values += struct.pack("<3d", 1e-4, 1.0, 0.0) + "um".encode("utf-16-le").ljust(16, b"\0") + struct.pack("<6i", 0, 1, 0, 0, 0, 0)
+    values = (
+        struct.pack("<I", 0)
+        + "Topography".encode("utf-16-le").ljust(64, b"\0")
+        + "NC".encode("utf-16-le").ljust(16, b"\0")
+    )
+    values += (
+        struct.pack("<dII", 0, 0, 0) + struct.pack("<II", nx, ny) + struct.pack("<dId3I", 0, 0, 0, 1, 1, 0)
+    )
+    values += (
+        struct.pack("<6d", nx * one.pitch_um, ny * one.pitch_um, 0, 0, 1, 0)
+        + bytes(16)
+        + struct.pack("<2d", 0, 0)
+    )
+    values += (
+        struct.pack("<3d", 1e-4, 1.0, 0.0)
+        + "um".encode("utf-16-le").ljust(16, b"\0")
+        + struct.pack("<6i", 0, 1, 0, 0, 0, 0)
+    )
     tags = [
         (50432, "I", 1, 0x0E031301, False), (50433, "I", 1, 0x1000001, False),
         (50434, "B", counts.nbytes, counts.tobytes(), False), (50435, "B", len(values), values, False),

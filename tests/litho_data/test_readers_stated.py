@@ -25,7 +25,9 @@ def refused(path: Path, message: str, **arguments: object) -> None:
 
 def test_a_calibration_that_is_no_line_is_refused_with_its_keys(tmp_path: Path) -> None:
     path = tmp_path / "scan.tif"
-    tifffile.imwrite(path, np.ones(SHAPE, np.uint16), imagej=True, metadata={"cf": 3, "c0": 1.0, "c1": 2.0, "c2": 3.0})
+    tifffile.imwrite(
+        path, np.ones(SHAPE, np.uint16), imagej=True, metadata={"cf": 3, "c0": 1.0, "c1": 2.0, "c2": 3.0}
+    )
     refused(path, "cf = 3, c0 = 1.0, c1 = 2.0, c2 = 3.0")
 
 
@@ -78,7 +80,9 @@ def test_a_field_without_its_size_is_a_field_all_the_same(tmp_path: Path) -> Non
     from gwyfile.objects import GwyContainer, GwyDataField, GwyObject, GwySIUnit
 
     path = tmp_path / "scan.gwy"
-    field = GwyDataField(HEIGHT_UM * 1e-6, si_unit_xy=GwySIUnit(unitstr="m"), si_unit_z=GwySIUnit(unitstr="m"))
+    field = GwyDataField(
+        HEIGHT_UM * 1e-6, si_unit_xy=GwySIUnit(unitstr="m"), si_unit_z=GwySIUnit(unitstr="m")
+    )
     for key in ("xreal", "yreal"):
         GwyObject.__delitem__(field, key)
     GwyContainer({"/0/data": field, "/1/data": GwyDataField(HEIGHT_UM)}).tofile(str(path))
@@ -91,9 +95,17 @@ def test_a_field_without_its_size_is_a_field_all_the_same(tmp_path: Path) -> Non
         (ROWS.replace("0.0310", "Bad"), "line 4, got 'Bad'.*missing = ", {"missing": ["Bad"]}),
         (ROWS.replace("0.0310", "--"), "line 4, got '--'.*missing = ", {"missing": ["--"]}),
         (ROWS.replace("0.0310", ""), "line 4, got an empty cell.*missing = ", {"missing": [""]}),
-        (ROWS.replace("0.0310", "-9999"), r"missing = \[-9999\]; if not: missing = \[\]", {"missing": [-9999]}),
+        (
+            ROWS.replace("0.0310", "-9999"),
+            r"missing = \[-9999\]; if not: missing = \[\]",
+            {"missing": [-9999]},
+        ),
         (ROWS.replace("0.0310", "3.4028e+38"), r"missing = \[3.4028e\+38\]", {"missing": [3.4028235e38]}),
-        (ROWS.replace("0.0310", "-77.5"), r"got -77.5 in 4 pixels.*missing = \[-77.5\]", {"missing": [-77.5]}),
+        (
+            ROWS.replace("0.0310", "-77.5"),
+            r"got -77.5 in 4 pixels.*missing = \[-77.5\]",
+            {"missing": [-77.5]},
+        ),
         (
             ROWS.replace("0.0310", "-9999").replace("0.0420", "1.70141e38"),
             r"missing = \[1.70141e\+38, -9999\]",
@@ -101,7 +113,9 @@ def test_a_field_without_its_size_is_a_field_all_the_same(tmp_path: Path) -> Non
         ),
     ],
 )
-def test_marks_of_missing_pixels_are_asked_about(tmp_path: Path, text: str, asked: str, arguments: dict) -> None:
+def test_marks_of_missing_pixels_are_asked_about(
+    tmp_path: Path, text: str, asked: str, arguments: dict
+) -> None:
     path = tmp_path / "scan.txt"
     path.write_text(text)
     refused(path, asked)
@@ -155,7 +169,14 @@ def test_axes_at_uneven_steps_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("unit", "step", "pitch_um"),
-    [("um", 0.2, 0.2), ("m", 2e-7, 0.2), ("nm", 200, 0.2), ("nm", 0.2, 0.2), ("m", 0.2, 0.2), ("nm", 20, None)],
+    [
+        ("um", 0.2, 0.2),
+        ("m", 2e-7, 0.2),
+        ("nm", 200, 0.2),
+        ("nm", 0.2, 0.2),
+        ("m", 0.2, 0.2),
+        ("nm", 20, None),
+    ],
 )
 def test_coordinates_without_a_unit(tmp_path: Path, unit: str, step: float, pitch_um: float | None) -> None:
     """They are µm or in the unit of the heights; where both make a scan, the size has to be given."""
