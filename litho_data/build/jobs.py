@@ -120,7 +120,8 @@ class FieldJob:
         quality: dict[str, Any] = {}
         for op in ("register", "uncertainty", "tip", "calibrate"):
             quality |= facts.get(op, {})
-        said = (quality.get("warning", ""), *facts["read-scan"].get("notes", ()))
+        notes = [note for op in ("read-scan", "level") for note in facts[op].get("notes", ())]
+        said = (quality.get("warning", ""), *notes)
         quality["warning"] = "; ".join(filter(None, said))
         quality |= noise_figures(arrays["raw_height_um"]) | levelling_figures(arrays["removed_um"])
         if "height_um" in arrays:
