@@ -112,6 +112,12 @@ class FieldJob:
         described = {"standards": [dict(one) for one in self.standards.described]}
         return OPERATIONS["calibrate"].run(described, self.standards.files, {})
 
+    def register_params(self, pitch_um: Sequence[float], fast_axis: str | None) -> dict[str, Any]:
+        """Parameters of a registration of scans with this (y, x) pitch."""
+        pitches = {"scan_pitch_um": pitch_um, "layout_pitch_um": self.card.layout.pitch_um}
+        lines = {"fast_axis": "y"} if fast_axis == "y" else {}  # otherwise the lines are rows
+        return {**pitches, "model": self.card.process.registration, "seed": self.seed, **lines}
+
     def run(self) -> Piece:
         """The finished scan; InputError if its files do not allow it."""
         steps = list(self._steps())
@@ -135,6 +141,7 @@ class FieldJob:
             "columns": dict(self.field.columns),
             "steps": [done.step.to_record() for done in steps],
             "quality": quality,
+            "notes": notes,
             "read": facts["read-scan"],
             "pitch_um": scaled_pitch_um(facts["read-scan"]["pitch_um"], facts.get("calibrate", {})),
             "software": software_record(),
@@ -157,9 +164,7 @@ class FieldJob:
             pitch_um = scaled_pitch_um(pitch_um, done.facts)
         pitch = {"scan_pitch_um": pitch_um}
         pitches = {**pitch, "layout_pitch_um": self.card.layout.pitch_um}
-        register_params = {**pitches, "model": self.card.process.registration, "seed": self.seed}
-        if read.facts["fast_axis"] == "y":
-            register_params["fast_axis"] = "y"  # otherwise the lines are rows
+        register_params = self.register_params(pitch_um, read.facts["fast_axis"])
 
         level_inputs, recipe = {**read.arrays, **calibration}, dict(self.recipe)
         if not layout:

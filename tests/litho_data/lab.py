@@ -55,16 +55,19 @@ def scan_of(scan_id: str, side_px: int = SIDE_PX) -> np.ndarray:
     return height + 0.002 * rng.standard_normal(height.shape)
 
 
-def write_lab(folder: Path, side_px: int = SIDE_PX, **changed: str) -> Path:
+def write_lab(
+    folder: Path, side_px: int = SIDE_PX, ids: tuple[str, ...] = IDS, **changed: str
+) -> Path:
     """Layouts, scans, table and card; ``changed`` replaces TOML values of the card by their keys."""
     (folder / "layouts").mkdir(parents=True)
     (folder / "scans").mkdir()
-    for scan_id in IDS:
+    for scan_id in ids:
         tifffile.imwrite(folder / "layouts" / f"{scan_id}.tif", layout_of(scan_id, side_px))
         _write(folder / "scans", scan_id, scan_of(scan_id, side_px))
-    size_um = (side_px + 2 * MARGIN_PX) * PITCH_UM
-    table = ["id;unit;size_um;instrument", f"A1;nm;{size_um:g}".replace(".", ",") + ";Dimension", f"B3;m;{size_um:g};Cypher"]
-    (folder / "scans.csv").write_text("\n".join([*table, *(f"{one};;;Dimension" for one in ("A2", "A3", "B1", "B2"))]))
+    size = f"{(side_px + 2 * MARGIN_PX) * PITCH_UM:g}".replace(".", ",")
+    rows = {"A1": f"A1;nm;{size};Dimension", "B3": f"B3;m;{size};Cypher"}
+    table = ["id;unit;size_um;instrument", *(rows.get(one, f"{one};;;Dimension") for one in ids)]
+    (folder / "scans.csv").write_text("\n".join(table))
     says = {"pitch_um": str(PITCH_UM), "level_height_um": str(LEVEL_HEIGHT_UM), "levels": str(LEVELS), "more": ""} | changed
     (folder / "card.toml").write_text(
         'name = "lab"\n[layout]\nfiles = "layouts/{id}.*"\n'
