@@ -14,7 +14,7 @@ from litho_data.build.jobs import Job
 from litho_data.build.operations import no_recipe
 from litho_data.cards.card import Card
 from litho_data.foundation.hashes import array_sha256, canonical_json, file_sha256, record_sha256
-from litho_data.store.schema import SAMPLE_VARIABLES, STORE_SCHEMA, dataset_sha256
+from litho_data.store.schema import SAMPLE_VARIABLES, STORE_SCHEMA, WRITE, dataset_sha256
 from litho_data.store.write import consolidate, write_samples, write_table
 
 if TYPE_CHECKING:
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     import zarr
 
 Record = Mapping[str, Any]
+# The group that lists the scans for tools of OME-Zarr.
+IMAGES = "o"
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,8 @@ def assemble(
         dataset_facts(source.card), [_identity(record) for record in records_of_use(records)]
     )
     manifest_sha256 = record_sha256([manifest, table_sha256(files)])
+    images = {"labels": [f"../scans/{record['id']}" for record in records]}
+    root.create_group(IMAGES, attributes=images)
     root.attrs.update(root_attributes(manifest, sha256, manifest_sha256))
     consolidate(root)
     return sha256
@@ -92,8 +96,20 @@ def dataset_facts(card: Card) -> dict[str, Any]:
     return {**facts, "write": write} if write else facts
 
 
-def root_attributes(manifest: Record, dataset_hash: str, manifest_hash: str) -> dict[str, Any]:
-    """The attributes of the root group; all but the two hashes follow from the manifest."""
+def flat_facts(card: Card) -> dict[str, Any]:
+    """The same, without a table in it: its keys are those of ``WRITE``."""
+    facts = dataset_facts(card)
+    written = facts.pop("write", {})
+    return facts | {f"{WRITE}{key}": value for key, value in written.items()}
+
+
+def root_attributes(
+    manifest: Record, dataset_hash: str, manifest_hash: str
+) -> dict[str, Any]:
+    """The attributes of the root group; all but the two hashes follow from the manifest.
+
+    Numbers and words only, which any format can hold.
+    """
     card = Card.model_validate(manifest["card"])
     operations = "read, level, register, resample" if manifest["recipe"] else "read, register, resample"
     return {
@@ -103,8 +119,10 @@ def root_attributes(manifest: Record, dataset_hash: str, manifest_hash: str) -> 
         "title": card.title,
         "license": card.license,
         "citation": card.citation,
-        **dataset_facts(card),
-        "assumptions": list(manifest["assumptions"]),
+        **flat_facts(card),
+        # Tools for OME-Zarr look for images under the names in this list, which a word of one letter is to them.
+        "labels": IMAGES,
+        "assumptions": "; ".join(manifest["assumptions"]),
         "history": f"litho-data: {operations}; the steps of every array are in the group provenance",
         "dataset_sha256": dataset_hash,
         "manifest_sha256": manifest_hash,

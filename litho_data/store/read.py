@@ -213,7 +213,8 @@ class Store:
         Raises:
             InputError: a stored chunk that does not decode.
         """
-        values = decoded(self._arrays[name], row, f"{name} of scan {self.ids[row]} in {self.path}")
+        what = f"{name} of scan {self.ids[row]} in {self.path}"
+        values = decoded(self._arrays[name], row, what).astype(VARIABLES[name].dtype, copy=False)
         if name == "scan_to_layout":
             return values
         ny, nx = self.shapes[row]
@@ -278,9 +279,12 @@ class Store:
 
     @cached_property
     def sha256(self) -> str:
-        """Hash of the dataset, independent of chunking: the stored one, else computed from the arrays."""
+        """Hash of the dataset, independent of chunking: the stored one, else computed from the arrays.
+
+        Copies and parts that other tools write carry the attributes of the whole, but no manifest.
+        """
         stored = self.root.attrs.get("dataset_sha256")
-        return str(stored) if stored else self.computed_sha256()
+        return str(stored) if stored and has_child(self.root, "manifest") else self.computed_sha256()
 
     @property
     def dataset_id(self) -> DatasetId:

@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     import zarr
 
 STORE_SCHEMA = "litho-data/store/1"
+WRITE = "write_"
+"""Begins the attributes of the root that hold the card's ``[write]`` table."""
 
 
 @dataclass(frozen=True)
@@ -101,10 +103,8 @@ def dataset_sha256(facts: Mapping[str, Any], scans: Sequence[Mapping[str, Any]])
 def checked_attributes(root: zarr.Group, path: Path) -> dict[str, Any]:
     """Name, pitch, level height, number of levels and write table of a store; InputError if one is wrong."""
     attributes = dict(root.attrs)
-    checked: dict[str, Any] = {
-        "name": str(attributes.get("name", path.stem)),
-        "write": attributes.get("write"),
-    }
+    written = {key.removeprefix(WRITE): value for key, value in attributes.items() if key.startswith(WRITE)}
+    checked: dict[str, Any] = {"name": str(attributes.get("name", path.stem)), "write": written or None}
     for key in ("pitch_um", "level_height_um"):
         value = attributes.get(key)
         if not isinstance(value, int | float) or not math.isfinite(value) or value <= 0:
@@ -130,7 +130,9 @@ def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array]:
             continue
         array = arrays[variable.name]
         wanted = (count, 3, 3) if variable.name == "scan_to_layout" else (count, *field)
-        if array.shape != wanted or array.dtype != np.dtype(variable.dtype):
+        # Other tools write truth as small integers, and say so.
+        as_integers = variable.dtype == "bool" and array.attrs.get("dtype") == "bool"
+        if array.shape != wanted or (array.dtype != np.dtype(variable.dtype) and not as_integers):
             got, wanted_text = f"{array.dtype} {array.shape}", f"{variable.dtype} {wanted}"
             raise InputError(f"array {variable.name} of {path}", got=got, wanted=wanted_text)
     return arrays
