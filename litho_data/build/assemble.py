@@ -103,9 +103,7 @@ def flat_facts(card: Card) -> dict[str, Any]:
     return facts | {f"{WRITE}{key}": value for key, value in written.items()}
 
 
-def root_attributes(
-    manifest: Record, dataset_hash: str, manifest_hash: str
-) -> dict[str, Any]:
+def root_attributes(manifest: Record, dataset_hash: str, manifest_hash: str) -> dict[str, Any]:
     """The attributes of the root group; all but the two hashes follow from the manifest.
 
     Numbers and words only, which any format can hold.
@@ -120,7 +118,7 @@ def root_attributes(
         "license": card.license,
         "citation": card.citation,
         **flat_facts(card),
-        # Tools for OME-Zarr look for images under the names in this list, which a word of one letter is to them.
+        # Tools for OME-Zarr look for images under the names in this list; a word of one letter is one name.
         "labels": IMAGES,
         "assumptions": "; ".join(manifest["assumptions"]),
         "history": f"litho-data: {operations}; the steps of every array are in the group provenance",

@@ -23,7 +23,6 @@ from litho_data.foundation.hashes import file_sha256, record_sha256
 from litho_data.foundation.run_facts import software_record
 from litho_data.store.partial import PartialStore, Piece
 
-
 _LAYOUT_AWARE = "layout-aware"
 
 
@@ -85,7 +84,15 @@ class FieldJob:
     def key(self) -> str:
         """Hash of everything that decides the piece."""
         one = self.field
-        described = [one.id, one.print_id, one.order, one.use, one.full_scale_um, dict(one.columns), dict(one.read)]
+        described = [
+            one.id,
+            one.print_id,
+            one.order,
+            one.use,
+            one.full_scale_um,
+            dict(one.columns),
+            dict(one.read),
+        ]
         plan = [described, self.scan_name, self.layout_name, self.recipe, self.seed]
         plan.append(self.card.model_dump(mode="json"))
         own = (self.field.scan, self.field.layout, *self.standards.files.values())

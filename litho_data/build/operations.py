@@ -133,7 +133,9 @@ def _level(params: Params, _: Files, arrays: Inputs) -> Made:
         )
     notes = [str(one.message) for one in said if issubclass(one.category, LevellingWarning)]
     named = {"levelled_height_um": levelled.height, "removed_um": levelled.removed}
-    return {name: array.astype(np.float32) for name, array in named.items()}, {"notes": notes} if notes else {}
+    return {name: array.astype(np.float32) for name, array in named.items()}, {
+        "notes": notes
+    } if notes else {}
 
 
 @_operation("register", "register")

@@ -63,9 +63,8 @@ _PROCESS = re.compile(r"^\[process\][ \t]*$", re.MULTILINE)
 class Suggestion:
     """The recipe that leaves least, and what each leaves of each scan, nm.
 
-    ``left_nm`` maps recipes to scans to the root mean square of what the layout does not explain in blocks that
-    took no part in its fit; ``card`` is the written card, ``recipe`` its name; ``warned`` maps recipes to what
-    was said of them.
+    ``left_nm`` maps recipes to scans to the root mean square of what the layout does not explain in blocks
+    outside its fit; ``card`` is the written card; ``warned`` maps recipes to what was said of them.
     """
 
     recipe: str
@@ -74,10 +73,12 @@ class Suggestion:
     card: Path
 
 
-def suggest_recipe(card_path: str | Path, out: str | Path, *, data_dir: str | Path | None = None) -> Suggestion:
-    """Compare recipes on three scans of a card; write the best beside it, with a card that names it, and a page.
+def suggest_recipe(
+    card_path: str | Path, out: str | Path, *, data_dir: str | Path | None = None
+) -> Suggestion:
+    """Compare recipes on three scans of a card; write the best, a card that names it, and a page.
 
-    Heights are levelled and explained by a free response to the blurred layout, fitted in half of the blocks of
+    Levelled heights are explained by a free response to the blurred layout, fitted in half of the blocks of
     16 px. What it leaves in the other half decides: the tilt that a recipe leaves and the print that it takes
     out both count. A recipe that moves lines whose pixels did not move is not suggested.
 
@@ -110,7 +111,9 @@ def suggest_recipe(card_path: str | Path, out: str | Path, *, data_dir: str | Pa
             warned |= {name: note} if note else {}
     if not pictures:
         raise InputError("scans to compare recipes on", got=refusal, wanted="one that registers")
-    best = _best({name: float(np.median(list(of.values()))) for name, of in left.items() if name not in warned})
+    best = _best(
+        {name: float(np.median(list(of.values()))) for name, of in left.items() if name not in warned}
+    )
     card = _write_card(Path(card_path), best)
     suggestion = Suggestion(best, left, warned, card)
     _write_page(suggestion, pictures, Path(out))
@@ -151,7 +154,7 @@ def _levelled(
 
 
 def left_by_layout(height_um: np.ndarray, layout: np.ndarray) -> float:
-    """Root mean square of what a free response to the layout leaves in the blocks that it was not fitted to, µm.
+    """Root mean square of what a free response to the layout leaves in blocks outside its fit, µm.
 
     Args:
         height_um: (ny, nx), NaN where not measured.
@@ -189,12 +192,16 @@ def _write_page(found: Suggestion, pictures: Mapping[str, Sequence[np.ndarray]],
 
     from litho_data.foundation.report import Page
 
-    page = Page("Which levelling", "Recipes compared on scans of the card, by what the layout does not explain.")
+    page = Page(
+        "Which levelling", "Recipes compared on scans of the card, by what the layout does not explain."
+    )
     page.verdict(f"Level by \u201c{found.recipe}\u201d: build {found.card.name}.")
     rows: list[dict[str, Any]] = [
         {"recipe": name, **of, "warning": found.warned.get(name, "")} for name, of in found.left_nm.items()
     ]
-    caption = "What the layout leaves of the levelled heights, in blocks outside its fit: root mean square, nm"
+    caption = (
+        "What the layout leaves of the levelled heights, in blocks outside its fit: root mean square, nm"
+    )
     page.table(pd.DataFrame(rows), caption, "recipes.csv", digits=1)
     _show(page, pictures)
     page.write(folder)

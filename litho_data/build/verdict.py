@@ -14,14 +14,14 @@ from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
 
 ALL = "all scans"
-# A print that is this many times as high as its layout says, or as the other prints, has a wrong number behind it.
+# So many times the height that the layout says, or that the other prints have: a number is wrong.
 _TIMES, _IMPOSSIBLE, _ODD_SCAN = 3.0, 100.0, 30.0
 # Scales of the scans that agree with each other but not with 1: the pitch of the card.
 _OFF, _ALIKE, _ODD_SCALE = 0.02, 0.01, 0.04
 _LEAST_VALID = 0.5
 _MOST_TRE_PX = 1.0
 # What levelling left, as a share of the print's own standard deviation.
-_LEFT = 0.1
+_LEFT = 0.3
 
 
 class Weight(IntEnum):
@@ -96,7 +96,8 @@ def findings(
     """
     found = [Finding(scan=name, text=text, weight=Weight.LAYOUT) for name, text in doubts.items()]
     found += [
-        Finding(scan=name, text=f"skipped: {reason}", weight=Weight.SKIPPED) for name, reason in skipped.items()
+        Finding(scan=name, text=f"skipped: {reason}", weight=Weight.SKIPPED)
+        for name, reason in skipped.items()
     ]
     found += _of_the_card(records, prints, card)
     spread_nm = {one.id: 1e3 * float(np.nanstd(one.height)) for one in prints}
@@ -110,18 +111,18 @@ def findings(
             text = f"details lie {off:.1f} px from their place: is it the right layout and pitch?"
             found.append(Finding(scan=name, text=text, weight=Weight.PLACE))
         if (valid := quality.get("valid_fraction", 1.0)) < _LEAST_VALID:
-            text = f"only {valid:.0%} of its layout has a height: is the scan too small, or process.tip too large?"
+            text = f"only {valid:.0%} of its layout has a height: is process.tip too large?"
             found.append(Finding(scan=name, text=text, weight=Weight.PLACE))
         left = quality.get("sigma_levelling_nm", 0.0)
         if left > _LEFT * spread_nm.get(name, np.inf):
-            text = f"a tilt or bow of {left:.0f} nm is left in its heights: compare recipes with build --suggest"
+            text = (
+                f"a tilt or bow of {left:.0f} nm is left in its heights: compare recipes with build --suggest"
+            )
             found.append(Finding(scan=name, text=text, weight=Weight.LEVEL))
     return sorted(found, key=lambda one: (one.weight, one.scan != ALL, one.scan))
 
 
-def _of_the_card(
-    records: Sequence[Mapping[str, Any]], prints: Sequence[Print], card: Card
-) -> list[Finding]:
+def _of_the_card(records: Sequence[Mapping[str, Any]], prints: Sequence[Print], card: Card) -> list[Finding]:
     """Numbers of the card that all scans together contradict."""
     layout, found = card.layout, []
     times = _height_times(prints, card)
@@ -135,12 +136,13 @@ def _of_the_card(
     usual = float(np.median(scales)) if len(scales) else 1.0
     for one in records:
         if (scale := _scale(one)) and abs(scale / usual - 1) > _ODD_SCALE:
-            text = f"its scale is {100 * (scale / usual - 1):+.1f} % off that of the others: is its size the right one?"
+            percent = 100 * (scale / usual - 1)
+            text = f"its scale is {percent:+.1f} % off that of the others: is its size the right one?"
             found.append(Finding(scan=one["id"], text=text, weight=Weight.PITCH))
     if abs(usual - 1) > _OFF and float(np.median(np.abs(scales - usual))) < _ALIKE:
         text = (
-            f"the scans are {100 * (usual - 1):+.1f} % off in scale: layout.pitch_um = {layout.pitch_um:g} fits as "
-            f"{layout.pitch_um / usual:.4g}, or the sizes of the scans are wrong"
+            f"the scans are {100 * (usual - 1):+.1f} % off in scale: layout.pitch_um = {layout.pitch_um:g} "
+            f"fits as {layout.pitch_um / usual:.4g}, or the sizes of the scans are wrong"
         )
         found.append(Finding(scan=ALL, text=text, weight=Weight.PITCH))
     highest = max((float(one.highest_level) for one in prints), default=layout.levels)

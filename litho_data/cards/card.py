@@ -118,8 +118,8 @@ InsidePath = Annotated[str, AfterValidator(_inside)]
 class LayoutFiles(Record):
     """What was sent to the printer.
 
-    ``grey_per_level`` is the step of the grey values of layouts that are saved as pictures, 255 / (levels - 1)
-    for the whole range of 8 bits.
+    ``grey_per_level`` is the step of the grey values of layouts that are saved as pictures, such as
+    255 / (levels - 1) where white is the highest level.
     """
 
     files: FilePatterns
@@ -157,7 +157,8 @@ class ScanFiles(Record):
 class Process(Record):
     """How raw scans become heights on the layout grid: a levelling recipe file, a registration model, a tip.
 
-    Without ``level`` the layout-aware plane is taken out of scans that are not levelled yet. ``tip`` is the radius of the microscope's tip in µm, or ``blind`` to find it in the scans.
+    Without ``level`` the layout-aware plane is taken out of scans that are not levelled yet. ``tip`` is the
+    radius of the microscope's tip in µm, or ``blind`` to find it in the scans.
     """
 
     level: InsidePath | None = None

@@ -31,8 +31,9 @@ json.dump([found and found["print"] for found in (re.fullmatch(pattern, one) for
 class PrintedField:
     """One field to build: its files and what the card says about it.
 
-    ``columns`` holds the optional numbers (µm, dose) and words of the table, ``read`` what it says of the file in
-    place of the card, ``full_scale_um`` the height of the largest integer of an image scan; ``layout`` may be None for a reference scan only (``use`` not dataset).
+    ``columns`` holds the optional numbers (µm, dose) and words of the table, ``read`` what it says of the
+    file in place of the card, ``full_scale_um`` the height of the largest integer of an image scan; ``layout`` may
+    be None for a reference scan only (``use`` not dataset).
     """
 
     id: str
@@ -102,14 +103,17 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
         if scan_id not in scans or (scan_id not in layouts and use == "dataset"):
             wanted = patterns_of(card.scan.files if scan_id not in scans else card.layout.files)
             shown = " or ".join(pattern.replace("{id}", scan_id) for pattern in wanted)
-            aside.append(LeftAside(scan_id, tuple(one for found in files for one in found), True, f"no file {shown}"))
+            aside.append(
+                LeftAside(scan_id, tuple(one for found in files for one in found), True, f"no file {shown}")
+            )
             continue
         print_id = print_ids[scan_id]
         every = tuple(one for found in files for one in found)
         scale = None if scales is None else scales.get(scan_id, scales.get(scans[scan_id][0].name))
         reason = _refusal(scan_id, print_id, use, table, card) or leads_out(every, folder)
         if not reason and (several := [found for found in files if len(found) > 1]):
-            reason = f"several files: {', '.join(one.name for one in several[0])}; the pattern has to tell them apart"
+            names = ", ".join(one.name for one in several[0])
+            reason = f"several files: {names}; the pattern has to tell them apart"
         if not reason and scales is not None and scale is None:
             reason = f"no full scale in {card.scan.full_scale_file}"
         if reason:
@@ -127,7 +131,9 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
                 columns={name: float(row[name]) for name in OPTIONAL_COLUMNS if name in row}
                 | {name: row[name] for name in TEXT_COLUMNS if name in row},
                 read={
-                    name: size_of(row[name]) if name == "size_um" else row[name] for name in READ_COLUMNS if name in row
+                    name: size_of(row[name]) if name == "size_um" else row[name]
+                    for name in READ_COLUMNS
+                    if name in row
                 },
             )
         )

@@ -77,7 +77,9 @@ def _check_row(row: Mapping[str, str], what: str, overfull: bool, needs_order: b
     if "unit" in row and not is_length(row["unit"]):
         raise InputError(f"{what}: unit", got=repr(row["unit"]), wanted="a length, such as nm")
     if "size_um" in row and not size_of(row["size_um"]):
-        raise InputError(f"{what}: size_um", got=repr(row["size_um"]), wanted="one side in µm, or y x x: 54 x 27")
+        raise InputError(
+            f"{what}: size_um", got=repr(row["size_um"]), wanted="one side in µm, or y x x: 54 x 27"
+        )
     for name, known in (
         ("format", ("auto", *formats())),
         ("fast_axis", ("x", "y")),

@@ -110,8 +110,8 @@ def build(
     )
     if result.unpaired:
         typer.echo(f"{result.unpaired[0].id}: {result.unpaired[0].reason}", err=True)
-    if left := [one.id for one in result.skipped]:
-        typer.echo(f"skipped: {', '.join(left)}; --strict refuses to build without them", err=True)
+    if skipped := [one.id for one in result.skipped]:
+        typer.echo(f"skipped: {', '.join(skipped)}; --strict refuses to build without them", err=True)
     typer.echo(f"dataset sha256 {result.dataset.sha256}")
     typer.echo(f"report {report_folder(out) / 'report.html'}")
 

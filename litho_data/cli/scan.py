@@ -61,7 +61,13 @@ def level(
 
     steps = Recipe.from_toml(recipe)
     heights = read_scan(
-        scan, format=format, unit=unit, size_um=size_um, channel=channel, full_scale_um=full_scale_um, missing=marks(missing)
+        scan,
+        format=format,
+        unit=unit,
+        size_um=size_um,
+        channel=channel,
+        full_scale_um=full_scale_um,
+        missing=marks(missing),
     )
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_: typer.echo(f"warning: {message}", err=True)
@@ -102,7 +108,13 @@ def inspect(
                 typer.echo(f"{listed.name}: {key} = {value}")
     try:
         scan = read_scan(
-            file, format=format, unit=unit, size_um=size_um, channel=channel, full_scale_um=full_scale_um, missing=marks(missing)
+            file,
+            format=format,
+            unit=unit,
+            size_um=size_um,
+            channel=channel,
+            full_scale_um=full_scale_um,
+            missing=marks(missing),
         )
     except InputError as error:
         # If no picture was asked for, the list of channels is enough.

@@ -43,9 +43,9 @@ def level_layout_aware(
         height: (ny, nx), any unit.
         layout_level: (ny, nx) in the scan's frame, level per pixel, NaN outside the layout; see
             ``layout_in_scan_frame``.
-        blur_px: sigma of a Gaussian for the lateral spread of printing; by default the one of a few that leaves
-            the least. Pixels within two of them of the edge of the layout are not fitted: there the height
-            depends on what surrounds it.
+        blur_px: sigma of a Gaussian for the lateral spread of printing; by default the one of a few that
+            leaves the least. Pixels within two of them of the edge of the layout are not fitted: there the
+            height depends on what surrounds it.
         x_degree, y_degree, total_degree: as in ``level_polynomial``; by default a plane.
 
     Raises:

@@ -77,8 +77,8 @@ def align_rows(
 def print_taken_for_offsets(z: np.ndarray, removed: np.ndarray) -> str:
     """What to know of an alignment that moved lines although part of their pixels stayed; empty for others.
 
-    An offset of a line moves all of its pixels. Where a line was shifted against its neighbour by far more than
-    the noise, and a good share of its pixels does not differ from the neighbour, a structure moved the others.
+    An offset of a line moves all of its pixels. Where a line was shifted against its neighbour by far more
+    than the noise, and many of its pixels do not differ from the neighbour, a structure moved the others.
 
     Args:
         z: (ny, nx) before; ``removed``: what was taken from it; both with lines as rows.
@@ -91,8 +91,8 @@ def print_taken_for_offsets(z: np.ndarray, removed: np.ndarray) -> str:
     if stayed[worst] < _STAYED:
         return ""
     size = float(np.abs(shifts[stayed >= _STAYED]).max())
-    share = f"{stayed[worst]:.0%} of the pixels of a line"
-    return f"lines were shifted by up to {size:.3g} µm where {share} did not move: part of the print may be removed"
+    shifted = f"lines were shifted by up to {size:.3g} µm where {stayed[worst]:.0%} of the pixels of a line"
+    return f"{shifted} did not move: part of the print may be removed"
 
 
 def _check(

@@ -65,7 +65,7 @@ def array_channel(
 ) -> Channel:
     """The channel of a two-dimensional array: [y, x] unless the names of its dimensions say otherwise.
 
-    ``raw`` reads its values. Where the coordinate along y falls, row 0 is the first all the same: the order of the file is kept.
+    ``raw`` reads its values. Where the coordinate along y falls, the order of the file is kept all the same.
 
     Raises:
         InputError: attributes that change the values in a way that is not known here, with their names; no

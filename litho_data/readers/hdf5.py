@@ -1,4 +1,4 @@
-"""HDF5 files that say whose they are: JPK's image series, Nanosurf's NHF, TopoStats' results; then all others."""
+"""HDF5 files that say whose they are: JPK's series, Nanosurf's NHF, TopoStats' results; then all others."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _TOPOSTATS_IMAGES = ("image", "image_original")
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """JPK, Nanosurf: one channel per signal, direction and frame. TopoStats: the flattened and the raw image, nm.
+    """JPK, Nanosurf: one channel per signal and direction. TopoStats: the flattened and the raw image, nm.
 
     Thumbnails, traces of grains and other tables are passed over.
 
@@ -122,7 +122,7 @@ def _nanosurf_channels(path: Path, file: Any) -> list[Channel]:
 
 
 def _nanosurf_channel(path: Path, item: Any, says: dict[str, Any], name: str) -> Channel:
-    """Counts over the whole range of their type stand for the calibrated range; rows and columns as stored."""
+    """Counts over the range of their type stand for the calibrated range; rows and columns as stored."""
     if "rect_axis_size" in says:
         nx, ny = (int(one) for one in says["rect_axis_size"])
         x_m, y_m = (float(one) for one in says.get("rect_axis_range", (0, 0)))

@@ -1,4 +1,4 @@
-"""Layouts: what was sent to the printer, as integer levels; pictures of them, as they are exported, count too."""
+"""Layouts: what was sent to the printer, as integer levels, from files of levels or pictures of them."""
 
 from __future__ import annotations
 
@@ -51,7 +51,10 @@ def read_layout(
         raise InputError(f"layout {file}: values", got=_range(pixels), wanted="integer levels from 0 to 255")
     step = grey_per_level or sidecar.get("grey_per_level") or _white_step(pixels, levels)
     found = np.rint(pixels / step)
-    if np.abs(pixels - found * step).max() > 0.5 * (step > 1) or not 0 <= found.min() <= found.max() <= _LARGEST_LEVEL:
+    if (
+        np.abs(pixels - found * step).max() > 0.5 * (step > 1)
+        or not 0 <= found.min() <= found.max() <= _LARGEST_LEVEL
+    ):
         wanted = "integer levels from 0 to 255" if step == 1 else f"steps of {step:g} per level"
         raise InputError(f"layout {file}: values", got=_range(pixels), wanted=wanted)
     if marks := sidecar.get("marks"):

@@ -178,7 +178,7 @@ def _size_of_extent(channel: Channel, unit: str) -> tuple[float, float] | None:
     if channel.extent is None or channel.full_scale is not None:
         return None
     sizes = {(channel.extent[0] * factor, channel.extent[1] * factor) for factor in (1.0, um_per(unit))}
-    likely = [size for size in sizes if _SMALLEST_UM <= min(size) and max(size) <= _LARGEST_UM]
+    likely = [size for size in sizes if min(size) >= _SMALLEST_UM and max(size) <= _LARGEST_UM]
     return likely[0] if len(likely) == 1 else None
 
 

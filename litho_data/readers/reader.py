@@ -28,8 +28,11 @@ _LOGGERS = ("tifffile", "igor2", "SurfaceTopography")
 _LONGEST_MESSAGE = 160
 
 # What parsers say of a file that was cut off or changed; all else is a kind that they do not know.
-_CUT = re.compile(r"truncat|too (small|short)|not large enough|end of (file|data|stream)|ended|corrupt|damage|"
-                  r"checksum|crc|incomplete|not enough|reach(es)? beyond", re.IGNORECASE)  # fmt: skip
+_CUT = re.compile(
+    r"truncat|too (small|short)|not (large )?enough|end of (file|data|stream)|ended|corrupt|damage|checksum|"
+    r"crc|incomplete|reach(es)? beyond",
+    re.IGNORECASE,
+)
 _OF_CUT_FILES = (EOFError, MemoryError, OSError, struct.error, zlib.error, BadZipFile)
 DAMAGED = "the file may be damaged"
 

@@ -19,7 +19,7 @@ _ITEM = 4
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """One channel per signal and direction, in its own unit; what was scanned backward is turned to run along x.
+    """One channel per signal and direction; what was scanned backward is turned to run along x.
 
     Pixels of an unfinished scan are NaN in the file.
 

@@ -54,10 +54,11 @@ def without_axes(values: np.ndarray, words: Sequence[str]) -> Map:
     has_x = x is not None and x > 0 and not _goes_on(body[0], x)
     has_y = y is not None and not _goes_on(body[:, 0], y)
     if has_x and has_y:
-        assert x is not None and y is not None
-        extent = (abs(y) * body.shape[0], x * body.shape[1])
-        counts = _counts(row) and _counts(column)
-        return Map(body, None if counts else extent, corner=True, **_units(words, extent, counts))
+        extent = (abs(y or 0.0) * body.shape[0], (x or 0.0) * body.shape[1])
+        if _counts(row) and _counts(column):
+            return Map(body, corner=True)
+        size_um, unit = _units(words, extent)
+        return Map(body, extent, size_um, unit, corner=True)
     if has_y and len(column) >= _FEWEST_ALONE:
         return Map(values[:, 1:], notes=("its first column, evenly spaced, was taken for an axis",))
     if has_x and len(row) >= _FEWEST_ALONE:
@@ -92,15 +93,14 @@ def _counts(line: np.ndarray) -> bool:
 
 
 def _units(
-    words: Sequence[str], extent: tuple[float, float], counts: bool
-) -> dict[str, str | tuple[float, float] | None]:
-    """Units that the words above the numbers give for x, y and z."""
+    words: Sequence[str], extent: tuple[float, float]
+) -> tuple[tuple[float, float] | None, str | None]:
+    """(y, x) in µm, and the unit of z, where the words above the numbers give units for x, y and z."""
     pairs = [(one[0] or one[2], one[1] or one[3]) for text in words for one in _COLUMN.findall(text[:200])]
     units = {axis.lower(): unit for axis, unit in pairs if is_length(unit)}
-    size_um = None
-    if not counts and "x" in units:
-        size_um = extent[0] * um_per(units.get("y", units["x"])), extent[1] * um_per(units["x"])
-    return {"unit": units.get("z"), "size_um": size_um}
+    if "x" not in units:
+        return None, units.get("z")
+    return (extent[0] * um_per(units.get("y", units["x"])), extent[1] * um_per(units["x"])), units.get("z")
 
 
 def map_of_points(points: np.ndarray, words: Sequence[str]) -> Map | None:
@@ -122,6 +122,5 @@ def map_of_points(points: np.ndarray, words: Sequence[str]) -> Map | None:
     values[row if down else len(y) - 1 - row, column] = points[:, 2]
     extent = (step_y * len(y), step_x * len(x))
     note = f"points of a grid, the rows as in the file: y {'grows' if down else 'falls'} downwards"
-    return Map(
-        values, extent, x_is="the first column of points", notes=(note,), **_units(words, extent, False)
-    )
+    size_um, unit = _units(words, extent)
+    return Map(values, extent, size_um, unit, x_is="the first column of points", notes=(note,))

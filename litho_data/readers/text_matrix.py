@@ -1,4 +1,4 @@
-"""Height maps as text: matrices with and without axes, several in a file, points of a grid; read and written."""
+"""Height maps as text: matrices, with axes, several in a file, points of a grid; read and written."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def _recognises(path: Path, head: bytes) -> bool:
 
 
 def _refuse_points(path: Path) -> None:
-    """A table of points is a map only if they fill a grid; ``format = "text-matrix"`` asks for no such thing."""
+    """A table of points is a map only if they fill a grid, unless the caller says that it is a matrix."""
     for block in blocks_of(read_text(path)):
         table = numbers_of(path, block)
         columns = table.values.shape[1]

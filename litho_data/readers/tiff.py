@@ -42,7 +42,9 @@ def read_channels(path: Path) -> list[Channel]:
         InputError: damaged file.
     """
     with open_tiff(path) as file:
-        pages = [(index, page) for index, page in enumerate(file.pages) if not page.is_reduced]
+        pages: list[tuple[int, Any]] = [
+            (k, page) for k, page in enumerate(file.pages) if not _is_reduced(page)
+        ]
         imagej, ome = file.imagej_metadata or {}, file.ome_metadata or ""
         pitches = _ome_pitches_um(ome, len(pages))
         return [
@@ -65,7 +67,7 @@ def maker_of(path: Path) -> str:
     try:
         with open_tiff(path) as file:
             tags = file.pages.first.tags
-            lext = any(_LEXT in str(page.description) for page in file.pages)
+            lext = any(_LEXT in str(getattr(page, "description", "")) for page in file.pages)
             return "lext" if lext else next((kind for code, kind in _SIGNED.items() if code in tags), "")
     except InputError:  # the reader that tries it next reports it
         return ""
@@ -97,6 +99,10 @@ def _channel(
         header={str(key): str(value) for key, value in imagej.items()}
         | ({"ImageDescription": str(page.description)} if page.description else {}),
     )
+
+
+def _is_reduced(page: Any) -> bool:
+    return bool(page.is_reduced)
 
 
 def _may_hold_heights(tag: Any, shape: tuple[int, int]) -> bool:

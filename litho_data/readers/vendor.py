@@ -31,8 +31,8 @@ from litho_data.scan import Axis
 
 _HEAD_BYTES = 512
 IMPORTS = ("SurfaceTopography.IO", "igor2.binarywave")
-# How files start, of the formats that say who wrote them. What has no signature, or a reader of our own, is not
-# here: any bytes of the right length would pass as a map.
+# How files start, of the formats that say who wrote them. What has no signature is not here: any bytes of the
+# right length would pass as a map.
 _STARTS: dict[str, tuple[bytes, ...]] = {
     "al3d": (b"AliconaImaging\0\r\n",),
     "bcr": (b"fileformat = bcr", "fileformat = bcr".encode("utf-16-le"), "fileformat = bcr".encode("utf-16")),
@@ -59,7 +59,8 @@ _ZIP, _IN_ZIP = b"PK\x03\x04", ("x3p", "mitutoyo", "nmm", "plux", "poir", "qep")
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 # Not read from any file in our tests.
 _UNTESTED = {
-    "datx", "lext", "mdt", "mitutoyo", "nmm", "oir", "opdx", "os3d", "plux", "poir", "qep", "vk", "zmg", "zon",
+    "datx", "frt", "lext", "mdt", "metropro", "mitutoyo", "nmm", "oir", "opdx", "os3d", "plux", "poir", "qep",
+    "vk", "zmg", "zon",
 }  # fmt: skip
 # Sensofar's PLU begins with the date of the measurement.
 _PLU = re.compile(rb"\w{3} \w{3} [ \d]\d \d\d:\d\d:\d\d \d{4}\0")
@@ -111,7 +112,7 @@ def _kinds(path: Path, head: bytes) -> tuple[str, ...]:
 
 
 def _is_igor(head: bytes) -> bool:
-    """Whether the header has a version of Igor's waves and, but for the usual one, the sum that it must have."""
+    """Whether the header has a version of Igor's waves and, but for the usual one, the right sum."""
     order = "<" if head[1:2] == b"\0" else ">"
     version = int.from_bytes(head[:2], "little" if order == "<" else "big")
     size = _IGOR_HEADERS.get(version, 0)

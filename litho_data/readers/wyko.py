@@ -1,4 +1,4 @@
-"""Wyko ASCII: a header of tabbed lines, then blocks of numbers, in waves or nanometres, ``Bad`` where missing."""
+"""Wyko ASCII: a header of tabbed lines, then blocks of numbers, in waves or nm, ``Bad`` where missing."""
 
 from __future__ import annotations
 

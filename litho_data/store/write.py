@@ -74,8 +74,8 @@ def write_samples(
 
     Args:
         root: an open group.
-        scans: per scan ``id``, ``print``, ``order``, ``shape`` (ny, nx), ``columns`` (optional numbers and words)
-            and ``arrays`` (names of what was made of it).
+        scans: per scan ``id``, ``print``, ``order``, ``shape`` (ny, nx), ``columns`` (optional numbers and
+            words) and ``arrays`` (names of what was made of it).
         load: the sample arrays of an id.
         pitch_um: pitch of the layout grid, µm.
     """

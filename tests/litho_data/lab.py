@@ -34,7 +34,7 @@ def layout_of(scan_id: str, side_px: int = SIDE_PX) -> np.ndarray:
 
 
 def print_of(scan_id: str, side_px: int = SIDE_PX) -> np.ndarray:
-    """The true heights on the layout's grid with the bare substrate around it, µm: a resist with a response."""
+    """The true heights on the layout's grid with the bare substrate around it, µm."""
     level = np.pad(layout_of(scan_id, side_px).astype(float) + 2.0, 2 * MARGIN_PX)
     exposed = ndimage.gaussian_filter(level, 1.6)
     return LEVEL_HEIGHT_UM * (exposed + 0.015 * exposed**2)
@@ -55,9 +55,7 @@ def scan_of(scan_id: str, side_px: int = SIDE_PX) -> np.ndarray:
     return height + 0.002 * rng.standard_normal(height.shape)
 
 
-def write_lab(
-    folder: Path, side_px: int = SIDE_PX, ids: tuple[str, ...] = IDS, **changed: str
-) -> Path:
+def write_lab(folder: Path, side_px: int = SIDE_PX, ids: tuple[str, ...] = IDS, **changed: str) -> Path:
     """Layouts, scans, table and card; ``changed`` replaces TOML values of the card by their keys."""
     (folder / "layouts").mkdir(parents=True)
     (folder / "scans").mkdir()
@@ -68,7 +66,12 @@ def write_lab(
     rows = {"A1": f"A1;nm;{size};Dimension", "B3": f"B3;m;{size};Cypher"}
     table = ["id;unit;size_um;instrument", *(rows.get(one, f"{one};;;Dimension") for one in ids)]
     (folder / "scans.csv").write_text("\n".join(table))
-    says = {"pitch_um": str(PITCH_UM), "level_height_um": str(LEVEL_HEIGHT_UM), "levels": str(LEVELS), "more": ""} | changed
+    says = {
+        "pitch_um": str(PITCH_UM),
+        "level_height_um": str(LEVEL_HEIGHT_UM),
+        "levels": str(LEVELS),
+        "more": "",
+    } | changed
     (folder / "card.toml").write_text(
         'name = "lab"\n[layout]\nfiles = "layouts/{id}.*"\n'
         + "".join(f"{key} = {says[key]}\n" for key in ("pitch_um", "level_height_um", "levels"))
@@ -92,7 +95,8 @@ def _write(folder: Path, scan_id: str, height_um: np.ndarray) -> None:
         field = GwyDataField(height_um * 1e-6, xreal=side_m, yreal=side_m, **units)
         GwyContainer({"/0/data": field, "/0/data/title": "Height"}).tofile(str(folder / f"{scan_id}.gwy"))
     elif scan_id == "B1":
-        head = f"# Channel: Height\n# Width: {side_m * 1e6:.6f} µm\n# Height: {side_m * 1e6:.6f} µm\n# Value units: m\n"
+        side = f"{side_m * 1e6:.6f} µm"
+        head = f"# Channel: Height\n# Width: {side}\n# Height: {side}\n# Value units: m\n"
         with (folder / "B1.txt").open("w", encoding="utf-8") as stream:
             stream.write(head)
             np.savetxt(stream, height_um * 1e-6, fmt="%.6e")
@@ -109,5 +113,3 @@ def errors_nm(store: object) -> dict[str, float]:
         off = (scan.height_um - truth)[scan.valid]
         found[scan.id] = float(np.abs(off - np.median(off)).mean() * 1e3)
     return found
-
-

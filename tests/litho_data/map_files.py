@@ -1,4 +1,4 @@
-"""Height maps as other programs write them: one known map in many containers, units, axes, marks and channels."""
+"""Height maps as other programs write them: known maps in many containers, units, axes, marks, channels."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.litho_data import afm_files
 class MapFile:
     """A written map: heights in µm with NaN where missing, and what a caller has to add to read it.
 
-    ``says_size`` and ``asks`` are facts of the format: whether the size stands in the file, and whether the file
+    ``says_size`` and ``asks`` are facts of the format: whether the size stands in the file, and whether it
     cannot be read without the arguments. ``atol_um`` is half a step of the numbers that were written.
     """
 
@@ -130,7 +130,7 @@ def text_of_two_channels(path: Path, one: MapFile, rng: np.random.Generator) -> 
 def axes(path: Path, one: MapFile, rng: np.random.Generator) -> None:
     """A matrix below a row and beside a column of coordinates in µm, as spreadsheets have it."""
     rows = one.rows(",")
-    ny, nx = one.height_um.shape
+    nx = one.height_um.shape[1]
     corner = ["0", "", "nan"][rng.integers(3)]
     head = ",".join([corner, *(f"{k * one.pitch_um:.6f}" for k in range(nx))])
     path.write_text(
@@ -212,8 +212,8 @@ def wyko(path: Path, one: MapFile, rng: np.random.Generator) -> None:
     values = one.height_um * 1e3 / (1 if real else 632.8)
     head = [
         f"Wyko ASCII Data File Format 0\t{real}\t1", f"X Size\t{nx}", f"Y Size\t{ny}",
-        "Block Name\tType\tLength\tValue", f"Pixel_size\t7\t4\t{one.pitch_um * 1e-3:.9f}", "Wavelength\t7\t4\t632.8",
-        "RAW_DATA\t3\t48\t",
+        "Block Name\tType\tLength\tValue", f"Pixel_size\t7\t4\t{one.pitch_um * 1e-3:.9f}",
+        "Wavelength\t7\t4\t632.8", "RAW_DATA\t3\t48\t",
     ]  # fmt: skip
     lines = ["\t".join("Bad" if np.isnan(v) else f"{v:.9f}" for v in column[::-1]) for column in values.T]
     path.write_text("\n".join(head + lines) + "\n")
@@ -315,7 +315,8 @@ def sxm(path: Path, one: MapFile, rng: np.random.Generator) -> None:
     way = "up" if rng.random() < 0.5 else "down"
     size_m = f"{nx * one.pitch_um * 1e-6!r} {ny * one.pitch_um * 1e-6!r}"
     sections = {
-        "NANONIS_VERSION": "2", "SCANIT_TYPE": "FLOAT            MSBFIRST", "SCAN_PIXELS": f"       {nx}       {ny}",
+        "NANONIS_VERSION": "2", "SCANIT_TYPE": "FLOAT            MSBFIRST",
+        "SCAN_PIXELS": f"       {nx}       {ny}",
         "SCAN_RANGE": size_m, "SCAN_DIR": way,
         "DATA_INFO": "\tChannel\tName\tUnit\tDirection\tCalibration\tOffset\n"
                      "\t14\tZ\tm\tboth\t-1E-8\t0E+0\n\t0\tCurrent\tA\tboth\t1E-9\t0E+0\n",
@@ -380,7 +381,8 @@ def sdf(path: Path, one: MapFile, rng: np.random.Generator) -> None:
     """ISO 25178-71 as text: heights times Zscale are metres."""
     ny, nx = one.height_um.shape
     head = {
-        "ManufacID": "TEST", "CreateDate": "010120200000", "ModDate": "010120200000", "NumPoints": nx, "NumProfiles": ny,
+        "ManufacID": "TEST", "CreateDate": "010120200000", "ModDate": "010120200000", "NumPoints": nx,
+        "NumProfiles": ny,
         "Xscale": one.pitch_um * 1e-6, "Yscale": one.pitch_um * 1e-6, "Zscale": 1e-6, "Zresolution": 1e-9,
         "Compression": 0, "DataType": 7, "CheckType": 0,
     }  # fmt: skip
@@ -394,8 +396,10 @@ def bcr(path: Path, one: MapFile, rng: np.random.Generator) -> None:
     """BCR: a text header of 2048 bytes, counts of 16 bits, lengths in nm."""
     ny, nx = one.height_um.shape
     one.height_um = np.nan_to_num(one.height_um, nan=0.5)
-    says = {"fileformat": "bcrstm", "headersize": 2048, "xpixels": nx, "ypixels": ny, "xlength": nx * one.pitch_um * 1e3,
-            "ylength": ny * one.pitch_um * 1e3, "bit2nm": 0.1, "zmin": 0}  # fmt: skip
+    says = {
+        "fileformat": "bcrstm", "headersize": 2048, "xpixels": nx, "ypixels": ny, "bit2nm": 0.1, "zmin": 0,
+        "xlength": nx * one.pitch_um * 1e3, "ylength": ny * one.pitch_um * 1e3,
+    }  # fmt: skip
     head = "".join(f"{key} = {value}\n" for key, value in says.items()).encode().ljust(2048, b"%")
     path.write_bytes(head + np.round(one.height_um * 1e4).astype("<i2").tobytes())
     one.mark, one.says_size, one.atol_um = None, True, 1e-8
@@ -423,6 +427,6 @@ def numpy_archive(path: Path, one: MapFile, rng: np.random.Generator) -> None:
 
 
 WRITERS: tuple[Writer, ...] = (
-    text, text, text, text_of_two_channels, axes, axes, frame, points, surfer, esri, wyko, tiff, tiff, hdf5, netcdf,
-    matlab, nhf, sxm, digital_surf, park, sdf, bcr, gsf, numpy_archive,
+    text, text, text, text_of_two_channels, axes, axes, frame, points, surfer, esri, wyko, tiff, tiff, hdf5,
+    netcdf, matlab, nhf, sxm, digital_surf, park, sdf, bcr, gsf, numpy_archive,
 )  # fmt: skip

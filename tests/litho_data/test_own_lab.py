@@ -79,7 +79,11 @@ def align_rows(card: Path) -> None:
     ("changed", "change", "said"),
     [
         ({"pitch_um": "0.14"}, None, r"all scans: the scans are -6\.\d % off.*0\.14 fits as 0\.1(49|5)"),
-        ({"level_height_um": "0.8"}, None, r"all scans: the prints rise by 0\.1\d* µm.*level_height_um = 0\.8"),
+        (
+            {"level_height_um": "0.8"},
+            None,
+            r"all scans: the prints rise by 0\.1\d* µm.*level_height_um = 0\.8",
+        ),
         ({}, other_unit, r"height per level .* times that of the others: is its unit"),
         ({}, other_layout, r"A1: it shows the layout of B1.*B1: skipped: registration failed"),
         ({}, align_rows, r"lines were shifted by up to .*part of the print may be removed"),

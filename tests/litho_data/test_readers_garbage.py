@@ -22,8 +22,8 @@ from tests.litho_data import afm_files
 
 LONGEST_S = 20
 STARTS = (
-    *SIGNATURES, b"DSCOMPRESSED", b":NANONIS_VERSION:\n2\n:SCANIT_END:\n", b"DSAA\n3 3\n", b"DSBB\3\0\3\0", b"DSRB\1\0\0\0",
-    b"Wyko ASCII Data File Format\t0\t1\t1\nX Size\t3\n", b"MATLAB 7.3 MAT-file",
+    *SIGNATURES, b"DSCOMPRESSED", b":NANONIS_VERSION:\n2\n:SCANIT_END:\n", b"DSAA\n3 3\n", b"DSBB\3\0\3\0",
+    b"DSRB\1\0\0\0", b"Wyko ASCII Data File Format\t0\t1\t1\nX Size\t3\n", b"MATLAB 7.3 MAT-file",
 )  # fmt: skip
 
 

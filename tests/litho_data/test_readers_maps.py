@@ -1,4 +1,4 @@
-"""A map is either right or refused: 200 files of other programs, formats × unit × axes × missing × channels."""
+"""A map is right or refused: 200 files of other programs, formats × unit × axes × missing × channels."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FILES = 200
 
 
 def made(path: Path, seed: int) -> MapFile:
-    """The file of a seed; a third of the maps have missing pixels, marked by a number or a word or not at all."""
+    """The file of a seed; some maps have missing pixels, marked by a number or a word or not at all."""
     rng = np.random.default_rng(seed)
     height_um, mark = random_map(rng), None
     if rng.random() < 0.4:
