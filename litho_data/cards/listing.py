@@ -32,8 +32,8 @@ class PrintedField:
     """One field to build: its files and what the card says about it.
 
     ``columns`` holds the optional numbers (µm, dose) and words of the table, ``read`` what it says of the
-    file in place of the card, ``full_scale_um`` the height of the largest integer of an image scan; ``layout`` may
-    be None for a reference scan only (``use`` not dataset).
+    file in place of the card, ``full_scale_um`` the height of the largest integer of an image scan;
+    ``layout`` may be None for a reference scan only (``use`` not dataset).
     """
 
     id: str
