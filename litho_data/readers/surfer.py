@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import struct
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError
-from litho_data.readers.reader import DAMAGED, Channel, Loaded, Reader
+from litho_data.readers.reader import DAMAGED, Channel, Reader, in_memory
 
 _MAGIC = (b"DSAA", b"DSBB", b"DSRB")
 # As float32, and as written with six digits.
@@ -38,14 +37,10 @@ def read_channels(path: Path) -> list[Channel]:
             shape=(values.shape[0], values.shape[1]),
             unit=None,
             size_um=None,
-            load=partial(_given, values),
+            load=in_memory(values),
             extent=(step_y * values.shape[0], step_x * values.shape[1]),
         )
     ]
-
-
-def _given(values: np.ndarray) -> Loaded:
-    return values.copy(), None
 
 
 def _text(raw: bytes) -> tuple[np.ndarray, float, float, float]:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from litho_data.foundation.errors import InputError
-from litho_data.readers.reader import Channel, Loaded, Reader, one_by_one
+from litho_data.readers.reader import Channel, Reader, in_memory, one_by_one
 from litho_data.readers.text_blocks import Block, blocks_of, cells_of, is_row, read_text
 from litho_data.readers.text_grid import Map, map_of_points, without_axes
 from litho_data.readers.text_numbers import Table, numbers_of, refuse_cut_end
@@ -62,7 +62,7 @@ def _channel(path: Path, name: str, block: Block) -> Channel:
         shape=shape,
         unit=block.unit if block.unit is not None else found.unit,
         size_um=block.size_um(shape) or found.size_um,
-        load=partial(_given, values if factor is None else values * factor),
+        load=in_memory(values if factor is None else values * factor),
         header=block.header,
         x_is=found.x_is,
         extent=found.extent,
@@ -80,10 +80,6 @@ def _map_of(block: Block, table: Table) -> Map:
 
 def _may_be_points(shape: tuple[int, ...]) -> bool:
     return shape[1] <= _POINT_COLUMNS and shape[0] >= _POINT_ROWS_PER_COLUMN * shape[1]
-
-
-def _given(values: np.ndarray) -> Loaded:
-    return values.copy(), None
 
 
 def write_text_matrix(path: str | Path, height_um: np.ndarray) -> None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError
-from litho_data.readers.reader import DAMAGED, Channel, Loaded, Reader
+from litho_data.readers.reader import DAMAGED, Channel, Reader, in_memory
 from litho_data.readers.text_blocks import NUMBER, Block, number, read_text
 from litho_data.readers.text_numbers import numbers_of
 
@@ -73,15 +72,11 @@ def _channel(
         shape=shape,
         unit="nm" if name in _HEIGHTS else "not a length",
         size_um=(shape[0] * pitch_um * aspect, shape[1] * pitch_um) if pitch_um > 0 else None,
-        load=partial(_given, values * (scale if name in _HEIGHTS else 1.0)),
+        load=in_memory(values * (scale if name in _HEIGHTS else 1.0)),
         header=dict(says),
         words={word: line for word, line in table.words.items() if word != _BAD},
         x_is="the lines, each a column" if by_columns else "a row of the file",
     )
-
-
-def _given(values: np.ndarray) -> Loaded:
-    return values.copy(), None
 
 
 READER = Reader("wyko", lambda path, head: head.startswith(_MAGIC.encode()), read_channels)

@@ -10,7 +10,29 @@ import pytest
 from litho_data.foundation.errors import InputError
 from litho_data.readers import read_scan
 from litho_data.scan import Scan
-from tests.litho_data.map_files import WRITERS, MapFile, random_map
+from tests.litho_data import afm_files
+from tests.litho_data.map_files import (
+    WRITERS,
+    MapFile,
+    Writer,
+    bcr,
+    digital_surf,
+    gsf,
+    hdf5,
+    matlab,
+    netcdf,
+    nhf,
+    numpy_archive,
+    park,
+    random_map,
+    sdf,
+    surfer,
+    sxm,
+    text,
+    tiff,
+    wyko,
+)
+from tests.litho_data.test_readers_field import INTACT
 
 FILES = 200
 
@@ -65,3 +87,41 @@ def test_the_law_can_fail(tmp_path: Path, seed: int) -> None:
     assert not differs(scan, one)
     one.height_um = one.height_um[::-1] if seed else one.height_um * 1e-3
     assert differs(scan, one)
+
+
+# Rows of the page's table by how they begin: a writer, or real files of the other tests.
+TRIED = {
+    "text": text, "Surfer grids": surfer, "Wyko ASCII": wyko, "SXM": sxm, "TIFF": tiff, "GSF": gsf,
+    "NPY, NPZ": numpy_archive, "GWY": afm_files.write_gwy, "IBW": afm_files.write_ibw,
+    "HDF5 of JPK": nhf, "HDF5 of any": hdf5,
+    "SPM": afm_files.write_spm, "SUR, MNT": digital_surf, "JPK": afm_files.write_jpk, "Park Systems": park,
+    "X3P": afm_files.write_x3p, "SDF": sdf, "BCR": bcr, "STP, TOP": INTACT, "PNG, BMP": "test_readers_layout",
+}  # fmt: skip
+
+
+def test_every_format_of_the_page_has_a_file_of_its_own() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "readers.md").read_text(encoding="utf-8")
+    table = page.split("| tested with |\n")[1].split("\n\n")[0].splitlines()[1:]
+    rows = [row.split("|")[1].strip() for row in table]
+    assert len(rows) == len(TRIED)
+    assert all(any(row.startswith(start) for start in TRIED) for row in rows)
+    real = {"stp", "top", "nid", "mi", "opd", "plu", "al3d", "tmd"}
+    assert real <= {Path(name).suffix[1:] for name in INTACT}
+
+
+@pytest.mark.parametrize(
+    ("writer", "format"),
+    [
+        (text, "text-matrix"), (surfer, "surfer"), (wyko, "wyko"), (sxm, "sxm"), (tiff, "tiff"), (gsf, "gsf"),
+        (nhf, "hdf5"), (hdf5, "hdf5"), (netcdf, "netcdf"), (matlab, "matlab"), (digital_surf, "vendor"),
+        (park, "vendor"), (sdf, "vendor"), (bcr, "vendor"),
+    ],
+)  # fmt: skip
+def test_a_file_lands_in_its_own_reader(tmp_path: Path, writer: Writer, format: str) -> None:
+    rng = np.random.default_rng(3)
+    one = MapFile(random_map(rng), 0.2, "um")
+    writer(tmp_path / "scan", one, rng)
+    scan = read_scan(tmp_path / "scan", **one.arguments)
+    assert scan.format == format
+    assert not differs(scan, one)
+    assert scan.notes == ()
