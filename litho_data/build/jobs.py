@@ -219,7 +219,9 @@ class FieldJob:
         stated |= dict(self.field.read)
         stated["size_um"] = list(stated["size_um"]) if stated["size_um"] else None
         missing = {} if scan.missing is None else {"missing": list(scan.missing)}
-        return {**stated, **missing, "full_scale_um": self.field.full_scale_um}
+        # What the table says of a scan has to agree with its file.
+        defaults = {"defaults": True} if not {"unit", "size_um"} & set(self.field.read) else {}
+        return {**stated, **missing, **defaults, "full_scale_um": self.field.full_scale_um}
 
 
 def scaled_pitch_um(pitch_um: Sequence[float], scales: Mapping[str, float]) -> list[float]:

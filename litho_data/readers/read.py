@@ -33,6 +33,7 @@ def read_scan(
     fast_axis: Axis | None = None,
     full_scale_um: float | None = None,
     missing: Sequence[float | str] | None = None,
+    defaults: bool = False,
 ) -> Scan:
     """Read one height map.
 
@@ -48,6 +49,8 @@ def read_scan(
             height = value / largest value · full_scale_um. Replaces ``unit``.
         missing: numbers (as in the file) and words that mark pixels which were not measured, besides those
             that the file states; an empty list says that there are none.
+        defaults: ``unit`` and ``size_um`` hold for many files, and only where a file states none; otherwise
+            they must not contradict it.
 
     Raises:
         InputError: unreadable, no or several height channels, a missing or contradicting unit or
@@ -58,6 +61,16 @@ def read_scan(
         chosen = _choose(file, _read_channels(reader, file), channel)
         values, mask = chosen.load()
     values = without_missing(file, chosen, values, missing)
+    notes = list(chosen.notes)
+    if defaults and unit is not None and chosen.unit is not None:
+        if um_per(unit) != um_per(chosen.unit):
+            notes.append(f"heights in {chosen.unit}, as the file states, not in {unit}")
+        unit = None
+    if defaults and size_um is not None and chosen.size_um is not None:
+        if not np.allclose(size_um, chosen.size_um, rtol=_SIZE_TOLERANCE, atol=0):
+            side_y, side_x = chosen.size_um
+            notes.append(f"{side_y:g} × {side_x:g} µm, as the file states, not {size_um}")
+        size_um = None
     stated_unit, factor = _settle_unit(file, chosen, values, unit, full_scale_um)
     return Scan(
         height_um=_to_um(values, factor),
@@ -70,7 +83,7 @@ def read_scan(
         header=chosen.header,
         source=str(path),
         format=reader.name,
-        notes=(*chosen.notes, *filter(None, [extreme_note(values)])),
+        notes=(*notes, *filter(None, [extreme_note(values)])),
     )
 
 

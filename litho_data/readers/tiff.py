@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,7 +25,7 @@ _XRESOLUTION, _YRESOLUTION = 282, 283
 _OME_SIZES = ("PhysicalSizeY", "PhysicalSizeX")
 # Makers keep heights beside a picture in tags of their own.
 _SIGNED = {0x8000: "jpk", 50432: "ps"}
-_LEXT = "TiffTagDescData"
+_LEXT, _FIRST_PAGES = "TiffTagDescData", 8
 _FIRST_PRIVATE = 32768
 _GDAL_METADATA, _GDAL_NODATA = 42112, 42113
 _STRAIGHT_LINE = 0
@@ -67,7 +68,8 @@ def maker_of(path: Path) -> str:
     try:
         with open_tiff(path) as file:
             tags = file.pages.first.tags
-            lext = any(_LEXT in str(getattr(page, "description", "")) for page in file.pages)
+            pages = islice(file.pages, _FIRST_PAGES)
+            lext = any(_LEXT in str(getattr(page, "description", "")) for page in pages)
             return "lext" if lext else next((kind for code, kind in _SIGNED.items() if code in tags), "")
     except InputError:  # the reader that tries it next reports it
         return ""
