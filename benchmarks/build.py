@@ -193,7 +193,7 @@ def write_virtual_scans(folder: Path, count: int, size_px: int) -> Path:
     text = (
         'name = "virtual-scans"\n[layout]\nfiles = "layouts/{id}.tif"\npitch_um = 0.1\n'
         "level_height_um = 0.1\nlevels = 13\n"
-        '[scan]\nfiles = "scans/{id}.npy"\nformat = "npy"\nunit = "um"\n'
+        '[scan]\nfiles = "scans/{id}.npy"\nformat = "npy"\nunit = "um"\nlevelled = true\n'
         f"size_um = [{side_um}, {side_um}]\n"
     )
     card = folder / "card.toml"

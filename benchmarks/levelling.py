@@ -154,7 +154,7 @@ def cases(z: np.ndarray) -> dict[str, Callable[[], object]]:
         "rows: median, masked": lambda: align_rows(z, method="median", mask=mask),
         "robust plane": lambda: level_robust(z),
         "mask and relevel": lambda: mask_and_relevel(z),
-        "layout-aware plane": lambda: level_layout_aware(z, layout_level=layout),
+        "layout-aware plane": lambda: level_layout_aware(z, layout_level=layout, blur_px=3.0),
         "mark scars": lambda: mark_scars(z),
         "remove scars": lambda: remove_scars(z, scars=scars),
     }

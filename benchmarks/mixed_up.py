@@ -23,7 +23,7 @@ import tifffile
 from benchmarks.markdown_table import markdown_table
 from benchmarks.record import conclude, options, origin
 from litho_data.build.build import build_dataset
-from litho_data.build.right_layout import doubts
+from litho_data.build.right_layout import doubts, prints_of
 from litho_data.foundation.commands import progress, run_script
 from litho_data.layouts import random_layout
 from litho_data.store import open_store
@@ -93,7 +93,7 @@ def of_store(path: Path) -> dict[str, Any]:
         }
         for name, scan in scans.items()
     ]
-    said = doubts(records, lambda name: vars(scans[name]))
+    said = doubts(prints_of(records, lambda name: vars(scans[name])))
     return {"dataset_sha256": store.sha256, "scans": len(scans), "said": said}
 
 

@@ -28,6 +28,7 @@ class Scan:
         header: everything else that the file says, as strings.
         source: path of the file.
         format: name of the reader that read it.
+        notes: what to know before the heights are trusted.
 
     Raises:
         InputError: not a map of at least 2 x 2 pixels, no finite height at all, a mask of another
@@ -44,6 +45,7 @@ class Scan:
     header: dict[str, str] = field(default_factory=dict)
     source: str = ""
     format: str = ""
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         what = f"scan {self.source or self.name}".strip()

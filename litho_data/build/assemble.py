@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from litho_data.build.jobs import Job
-from litho_data.build.operations import load_recipe
+from litho_data.build.operations import no_recipe
 from litho_data.cards.card import Card
 from litho_data.foundation.hashes import array_sha256, canonical_json, file_sha256, record_sha256
-from litho_data.store.schema import SAMPLE_VARIABLES, STORE_SCHEMA, dataset_sha256
+from litho_data.store.schema import SAMPLE_VARIABLES, STORE_SCHEMA, WRITE, dataset_sha256
 from litho_data.store.write import consolidate, write_samples, write_table
 
 if TYPE_CHECKING:
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     import zarr
 
 Record = Mapping[str, Any]
+# The group that lists the scans for tools of OME-Zarr.
+IMAGES = "o"
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class Source:
     jobs: Sequence[Job]
     data_dir: Path
     files: Mapping[str, Mapping[str, Path]]
-    recipe: Mapping[str, Any] = field(default_factory=lambda: load_recipe(None))
+    recipe: Mapping[str, Any] = field(default_factory=no_recipe)
     seed: int = 0
     standards: Mapping[str, Path] = field(default_factory=dict)
     assumptions: Sequence[str] = ()
@@ -74,6 +76,8 @@ def assemble(
         dataset_facts(source.card), [_identity(record) for record in records_of_use(records)]
     )
     manifest_sha256 = record_sha256([manifest, table_sha256(files)])
+    images = {"labels": [f"../scans/{record['id']}" for record in records]}
+    root.create_group(IMAGES, attributes=images)
     root.attrs.update(root_attributes(manifest, sha256, manifest_sha256))
     consolidate(root)
     return sha256
@@ -92,8 +96,18 @@ def dataset_facts(card: Card) -> dict[str, Any]:
     return {**facts, "write": write} if write else facts
 
 
+def flat_facts(card: Card) -> dict[str, Any]:
+    """The same, without a table in it: its keys are those of ``WRITE``."""
+    facts = dataset_facts(card)
+    written = facts.pop("write", {})
+    return facts | {f"{WRITE}{key}": value for key, value in written.items()}
+
+
 def root_attributes(manifest: Record, dataset_hash: str, manifest_hash: str) -> dict[str, Any]:
-    """The attributes of the root group; all but the two hashes follow from the manifest."""
+    """The attributes of the root group; all but the two hashes follow from the manifest.
+
+    Numbers and words only, which any format can hold.
+    """
     card = Card.model_validate(manifest["card"])
     operations = "read, level, register, resample" if manifest["recipe"] else "read, register, resample"
     return {
@@ -103,8 +117,10 @@ def root_attributes(manifest: Record, dataset_hash: str, manifest_hash: str) -> 
         "title": card.title,
         "license": card.license,
         "citation": card.citation,
-        **dataset_facts(card),
-        "assumptions": list(manifest["assumptions"]),
+        **flat_facts(card),
+        # Tools for OME-Zarr look for images under the names in this list; a word of one letter is one name.
+        "labels": IMAGES,
+        "assumptions": "; ".join(manifest["assumptions"]),
         "history": f"litho-data: {operations}; the steps of every array are in the group provenance",
         "dataset_sha256": dataset_hash,
         "manifest_sha256": manifest_hash,

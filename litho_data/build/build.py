@@ -17,17 +17,18 @@ from litho_data.build.assemble import Source, assemble, records_of_use
 from litho_data.build.calibration import measure_scales, standards_of
 from litho_data.build.day_tip import with_tip_found
 from litho_data.build.jobs import FieldJob, Job, Skipped, field_jobs, finish
-from litho_data.build.operations import UNREGISTERED, load_recipe
+from litho_data.build.operations import UNREGISTERED, load_recipe, no_recipe
 from litho_data.build.report import write_report
 from litho_data.build.result import BuildResult, LeftOut, report_folder
-from litho_data.build.right_layout import doubts, fitting_layout
+from litho_data.build.right_layout import doubts, fitting_layout, prints_of
+from litho_data.build.verdict import Weight, findings, odd_heights, require_heights
 from litho_data.cards.card import Card, with_tip
 from litho_data.cards.listing import Listing, list_fields
 from litho_data.foundation.commands import progress, say
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.run_facts import software_record
 from litho_data.foundation.workers import HERE, Workers, run_jobs
-from litho_data.store.partial import partial_store
+from litho_data.store.partial import PartialStore, partial_store
 from litho_data.store.schema import DatasetId
 
 # A larger difference from the pixel aspect of other scans comes from missing rows or columns.
@@ -71,12 +72,18 @@ def build_dataset(
     listing = list_fields(card_path, data_dir)
     if tip is not None:
         listing = replace(listing, card=with_tip(listing.card, tip))
-    level = listing.card.process.level
-    recipe = load_recipe(None if level is None else listing.card_path.parent / level)
+    recipe = _recipe(listing)
     places = Workers(workers, dask)
     jobs = with_tip_found(field_jobs(listing, recipe, seed), places)
     source = _source(listing, recipe, seed, jobs)
     return make_store(source, Path(out), workers=places, strict=strict)
+
+
+def _recipe(listing: Listing) -> dict[str, Any]:
+    level = listing.card.process.level
+    if level is None and listing.card.scan.levelled:
+        return no_recipe()
+    return load_recipe(None if level is None else listing.card_path.parent / level)
 
 
 def _source(listing: Listing, recipe: Mapping[str, Any], seed: int, jobs: Sequence[Job]) -> Source:
@@ -129,17 +136,19 @@ def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bo
             raise
         try:
             for scan_id, reason in _odd_pixels(records, source.card).items():
-                skipped[scan_id] = reason
-                _report_skipped(scan_id, reason)
-                del records[scan_id]
-                shutil.rmtree(partial.store / "scans" / scan_id)
-            _name_layouts(source.jobs, skipped)
+                _leave_out(scan_id, reason, records, skipped, partial)
+            prints = prints_of(records_of_use(list(records.values())), partial.samples)
+            for scan_id, reason in odd_heights(prints).items():
+                _leave_out(scan_id, reason, records, skipped, partial)
+            prints = [one for one in prints if one.id in records]
+            named = _name_layouts(source.jobs, skipped)
             _require_enough(records, {**skipped, **source.unpaired}, strict, out)
+            require_heights(prints, source.card)
         except InputError:
             partial.discard()
             raise
-        for scan_id, doubt in doubts(records_of_use(list(records.values())), partial.samples).items():
-            print(f"check {scan_id}: {doubt}", file=sys.stderr)
+        doubted = doubts(prints)
+        for scan_id, doubt in doubted.items():
             quality = dict(records[scan_id]["quality"])
             quality["warning"] = "; ".join(filter(None, (quality["warning"], doubt)))
             records[scan_id]["quality"] = quality
@@ -149,12 +158,18 @@ def make_store(source: Source, out: Path, *, workers: Workers = HERE, strict: bo
             "data_dir": _relative(source.data_dir, out.parent),
             "software": software_record(),
         }
+        of_use = records_of_use(kept)
+        found = findings(of_use, prints, {**doubted, **named}, skipped, source.card)
+        for one in found:
+            if one.weight != Weight.SKIPPED:
+                print(f"check {one}", file=sys.stderr)
         sha256 = assemble(root, kept, partial.samples, source, skipped, build)
         result = BuildResult(
             store=out.name,
             dataset=DatasetId(name=source.card.name, sha256=sha256),
-            n_scans=len(records_of_use(kept)),
-            n_references=len(kept) - len(records_of_use(kept)),
+            n_scans=len(of_use),
+            n_references=len(kept) - len(of_use),
+            findings=found,
             skipped=_left_out(skipped),
             unpaired=_left_out(source.unpaired),
             reused=reused,
@@ -175,8 +190,9 @@ def _relative(folder: Path, start: Path) -> str:
         return str(folder)
 
 
-def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> None:
+def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> dict[str, str]:
     """Say of scans that did not register which other layout of the set they show, if there is one."""
+    named = {}
     fields = {job.id: job for job in jobs if isinstance(job, FieldJob)}
     lost = [key for key in skipped if key in fields and UNREGISTERED in skipped[key]]
     layouts = {key: layout for key, job in fields.items() if lost and (layout := job.layout()) is not None}
@@ -190,8 +206,9 @@ def _name_layouts(jobs: Sequence[Job], skipped: dict[str, str]) -> None:
         height_um, pitch_y_x = read.arrays["raw_height_um"], read.facts["pitch_um"]
         pitch_um = fields[key].card.layout.pitch_um
         if fits := fitting_layout(height_um, (pitch_y_x[0], pitch_y_x[1]), others, pitch_um):
-            skipped[key] += f"; it shows the layout of {fits}"
-            print(f"check {key}: it shows the layout of {fits}", file=sys.stderr)
+            named[key] = f"it shows the layout of {fits}"
+            skipped[key] += f"; {named[key]}"
+    return named
 
 
 def _odd_pixels(records: Mapping[str, Mapping[str, Any]], card: Card) -> dict[str, str]:
@@ -211,6 +228,15 @@ def _odd_pixels(records: Mapping[str, Mapping[str, Any]], card: Card) -> dict[st
         return {}
     reason = "pixel sides y/x {:.4g} where most scans have {:.4g}: rows or columns are missing"
     return {key: reason.format(value, most) for key, value in odd.items()}
+
+
+def _leave_out(
+    scan_id: str, reason: str, records: dict[str, Any], skipped: dict[str, str], partial: PartialStore
+) -> None:
+    skipped[scan_id] = reason
+    _report_skipped(scan_id, reason)
+    del records[scan_id]
+    shutil.rmtree(partial.store / "scans" / scan_id)
 
 
 def _report_skipped(scan_id: str, reason: str) -> None:

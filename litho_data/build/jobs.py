@@ -23,6 +23,8 @@ from litho_data.foundation.hashes import file_sha256, record_sha256
 from litho_data.foundation.run_facts import software_record
 from litho_data.store.partial import PartialStore, Piece
 
+_LAYOUT_AWARE = "layout-aware"
+
 
 class Job(Protocol):
     """What a build needs of a unit of work."""
@@ -82,7 +84,15 @@ class FieldJob:
     def key(self) -> str:
         """Hash of everything that decides the piece."""
         one = self.field
-        described = [one.id, one.print_id, one.order, one.use, one.full_scale_um, dict(one.columns)]
+        described = [
+            one.id,
+            one.print_id,
+            one.order,
+            one.use,
+            one.full_scale_um,
+            dict(one.columns),
+            dict(one.read),
+        ]
         plan = [described, self.scan_name, self.layout_name, self.recipe, self.seed]
         plan.append(self.card.model_dump(mode="json"))
         own = (self.field.scan, self.field.layout, *self.standards.files.values())
@@ -109,6 +119,12 @@ class FieldJob:
         described = {"standards": [dict(one) for one in self.standards.described]}
         return OPERATIONS["calibrate"].run(described, self.standards.files, {})
 
+    def register_params(self, pitch_um: Sequence[float], fast_axis: str | None) -> dict[str, Any]:
+        """Parameters of a registration of scans with this (y, x) pitch."""
+        pitches = {"scan_pitch_um": pitch_um, "layout_pitch_um": self.card.layout.pitch_um}
+        lines = {"fast_axis": "y"} if fast_axis == "y" else {}  # otherwise the lines are rows
+        return {**pitches, "model": self.card.process.registration, "seed": self.seed, **lines}
+
     def run(self) -> Piece:
         """The finished scan; InputError if its files do not allow it."""
         steps = list(self._steps())
@@ -117,6 +133,9 @@ class FieldJob:
         quality: dict[str, Any] = {}
         for op in ("register", "uncertainty", "tip", "calibrate"):
             quality |= facts.get(op, {})
+        notes = [note for op in ("read-scan", "level") for note in facts[op].get("notes", ())]
+        said = (quality.get("warning", ""), *notes)
+        quality["warning"] = "; ".join(filter(None, said))
         quality |= noise_figures(arrays["raw_height_um"]) | levelling_figures(arrays["removed_um"])
         if "height_um" in arrays:
             quality["valid_fraction"] = float(arrays["valid"].mean())
@@ -129,6 +148,7 @@ class FieldJob:
             "columns": dict(self.field.columns),
             "steps": [done.step.to_record() for done in steps],
             "quality": quality,
+            "notes": notes,
             "read": facts["read-scan"],
             "pitch_um": scaled_pitch_um(facts["read-scan"]["pitch_um"], facts.get("calibrate", {})),
             "software": software_record(),
@@ -151,19 +171,18 @@ class FieldJob:
             pitch_um = scaled_pitch_um(pitch_um, done.facts)
         pitch = {"scan_pitch_um": pitch_um}
         pitches = {**pitch, "layout_pitch_um": self.card.layout.pitch_um}
-        register_params = {**pitches, "model": self.card.process.registration, "seed": self.seed}
-        if read.facts["fast_axis"] == "y":
-            register_params["fast_axis"] = "y"  # otherwise the lines are rows
+        register_params = self.register_params(pitch_um, read.facts["fast_axis"])
 
-        level_inputs = {**read.arrays, **calibration}
-        if any(step["op"] == "layout-aware" for step in self.recipe["step"]):
-            if not layout:
-                raise InputError("layout-aware levelling", got="a scan without layout", wanted="a layout")
+        level_inputs, recipe = {**read.arrays, **calibration}, dict(self.recipe)
+        if not layout:
+            # A reference has none.
+            recipe["step"] = [step for step in recipe["step"] if step["op"] != _LAYOUT_AWARE]
+        elif any(step["op"] == _LAYOUT_AWARE for step in recipe["step"]):
             raw = {"raw_height_um": read.arrays["raw_height_um"]}
             located = OPERATIONS["locate"].run(register_params, {}, {**layout, **raw})
             level_inputs |= located.arrays
             yield located
-        levelled = OPERATIONS["level"].run({**pitch, "recipe": self.recipe}, {}, level_inputs)
+        levelled = OPERATIONS["level"].run({**pitch, "recipe": recipe}, {}, level_inputs)
         yield levelled
         if self.field.use != "dataset":
             return
@@ -180,7 +199,7 @@ class FieldJob:
         yield resampled
         fit = {name: registered.facts[name] for name in ("blur_um", "model")}
         at = {**height, "height_um": resampled.arrays["height_um"], **layout, **calibration}
-        lines = {"fast_axis": read.facts["fast_axis"] or "x", "levelled": bool(self.recipe["step"])}
+        lines = {"fast_axis": read.facts["fast_axis"] or "x", "levelled": bool(recipe["step"])}
         yield OPERATIONS["uncertainty"].run({**pitches, **fit, **lines}, {}, at)
 
     def _read_layout(self) -> Done | None:
@@ -188,19 +207,21 @@ class FieldJob:
         if self.field.layout is None or self.layout_name is None:
             return None
         file = {self.layout_name: self.field.layout}
-        return OPERATIONS["read-layout"].run({"levels": self.card.layout.levels}, file, {})
+        params: dict[str, Any] = {"levels": self.card.layout.levels}
+        if self.card.layout.grey_per_level is not None:
+            params["grey_per_level"] = self.card.layout.grey_per_level
+        return OPERATIONS["read-layout"].run(params, file, {})
 
     @property
     def _read_params(self) -> dict[str, Any]:
         scan = self.card.scan
-        return {
-            "format": scan.format,
-            "unit": scan.unit,
-            "size_um": list(scan.size_um) if scan.size_um else None,
-            "channel": scan.channel,
-            "fast_axis": scan.fast_axis,
-            "full_scale_um": self.field.full_scale_um,
-        }
+        stated = {name: getattr(scan, name) for name in ("format", "unit", "size_um", "channel", "fast_axis")}
+        stated |= dict(self.field.read)
+        stated["size_um"] = list(stated["size_um"]) if stated["size_um"] else None
+        missing = {} if scan.missing is None else {"missing": list(scan.missing)}
+        # What the table says of a scan has to agree with its file.
+        defaults = {"defaults": True} if not {"unit", "size_um"} & set(self.field.read) else {}
+        return {**stated, **missing, **defaults, "full_scale_um": self.field.full_scale_um}
 
 
 def scaled_pitch_um(pitch_um: Sequence[float], scales: Mapping[str, float]) -> list[float]:

@@ -5,6 +5,7 @@ A build runs them, ``replay`` runs them again from the record; nothing else make
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from litho_data.register import Registration
 
 UNREGISTERED = "registration failed"
+_PLANE = {"step": [{"op": "layout-aware"}]}
 # Beyond it, the message of a failed registration asks whether rows are missing.
 _OBLONG = 0.01
 
@@ -37,17 +39,24 @@ def _operation(name: str, *code: str) -> Callable[[Function], Function]:
 
 
 def load_recipe(path: Path | None) -> dict[str, Any]:
-    """A levelling recipe in canonical form; without a file, the empty one."""
+    """A levelling recipe in canonical form; without a file, the one that cannot ruin a print."""
     from litho_data.level import Recipe
 
-    return (Recipe() if path is None else Recipe.from_toml(path)).canonical()
+    return (Recipe.from_dict(_PLANE) if path is None else Recipe.from_toml(path)).canonical()
+
+
+def no_recipe() -> dict[str, Any]:
+    """The empty recipe, which leaves heights as they are."""
+    from litho_data.level import Recipe
+
+    return Recipe().canonical()
 
 
 @_operation("read-layout", "readers")
 def _read_layout(params: Params, files: Files, _: Inputs) -> Made:
     from litho_data.readers import read_layout
 
-    level = read_layout(files[0])
+    level = read_layout(files[0], levels=params["levels"], grey_per_level=params.get("grey_per_level"))
     if level.max() >= params["levels"]:
         wanted = f"at most {params['levels'] - 1}, since the card says levels = {params['levels']}"
         raise InputError(f"layout {files[0]}: highest level", got=int(level.max()), wanted=wanted)
@@ -63,7 +72,8 @@ def _read_scan(params: Params, files: Files, _: Inputs) -> Made:
     arrays = {"raw_height_um": scan.height_um.astype(np.float32)}
     if scan.mask is not None:
         arrays["vendor_mask"] = scan.mask
-    facts = {
+    facts: Facts = {"notes": list(scan.notes)} if scan.notes else {}
+    facts |= {
         "pitch_um": list(scan.require_pitch()),
         "reader": scan.format,
         "unit": scan.unit,
@@ -101,8 +111,7 @@ def _locate(params: Params, _: Files, arrays: Inputs) -> Made:
 
     raw, layout = arrays["raw_height_um"], arrays["mask_level"]
     found = _registration(raw, layout, params)
-    if not found.quality.passed:
-        raise InputError(f"registration before levelling failed: {found.quality.reason}")
+    _require_found(found, params, " before levelling")
     shape, pitch_um = (raw.shape[0], raw.shape[1]), tuple(params["scan_pitch_um"])
     level = layout_in_scan_frame(
         layout, found.scan_to_layout, shape, pitch_um, params["layout_pitch_um"], found.bend_um
@@ -112,26 +121,27 @@ def _locate(params: Params, _: Files, arrays: Inputs) -> Made:
 
 @_operation("level", "level")
 def _level(params: Params, _: Files, arrays: Inputs) -> Made:
-    from litho_data.level import Recipe
+    from litho_data.level import LevellingWarning, Recipe
 
-    levelled = Recipe.from_dict(params["recipe"]).apply(
-        arrays["raw_height_um"].astype(np.float64) * _z_scale(arrays)[0],
-        pitch_um=tuple(params["scan_pitch_um"]),
-        mask=arrays.get("vendor_mask"),
-        layout_level=arrays.get("layout_in_scan"),
-    )
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always", LevellingWarning)
+        levelled = Recipe.from_dict(params["recipe"]).apply(
+            arrays["raw_height_um"].astype(np.float64) * _z_scale(arrays)[0],
+            pitch_um=tuple(params["scan_pitch_um"]),
+            mask=arrays.get("vendor_mask"),
+            layout_level=arrays.get("layout_in_scan"),
+        )
+    notes = [str(one.message) for one in said if issubclass(one.category, LevellingWarning)]
     named = {"levelled_height_um": levelled.height, "removed_um": levelled.removed}
-    return {name: array.astype(np.float32) for name, array in named.items()}, {}
+    return {name: array.astype(np.float32) for name, array in named.items()}, {
+        "notes": notes
+    } if notes else {}
 
 
 @_operation("register", "register")
 def _register(params: Params, _: Files, arrays: Inputs) -> Made:
     found = _registration(arrays["levelled_height_um"], arrays["mask_level"], params)
-    if not found.quality.passed:
-        pitch_y_um, pitch_x_um = params["scan_pitch_um"]
-        oblong = abs(pitch_y_um / pitch_x_um - 1) > _OBLONG
-        pixels = f"pixels of {pitch_y_um:.4g} × {pitch_x_um:.4g} µm (y × x): are rows missing?"
-        raise InputError(f"{UNREGISTERED}: {found.quality.reason}", hint=pixels if oblong else "")
+    _require_found(found, params)
     arrays_found, figures = {"scan_to_layout": found.scan_to_layout}, asdict(found.quality)
     if found.bend_um is not None:
         arrays_found["bend_um"] = found.bend_um.amount
@@ -139,6 +149,14 @@ def _register(params: Params, _: Files, arrays: Inputs) -> Made:
     if found.defects is not None:
         arrays_found["defect"] = found.defects
     return arrays_found, figures
+
+
+def _require_found(found: Registration, params: Params, when: str = "") -> None:
+    if not found.quality.passed:
+        pitch_y_um, pitch_x_um = params["scan_pitch_um"]
+        oblong = abs(pitch_y_um / pitch_x_um - 1) > _OBLONG
+        pixels = f"pixels of {pitch_y_um:.4g} × {pitch_x_um:.4g} µm (y × x): are rows missing?"
+        raise InputError(f"{UNREGISTERED}{when}: {found.quality.reason}", hint=pixels if oblong else "")
 
 
 def _registration(height_um: np.ndarray, layout_level: np.ndarray, params: Mapping[str, Any]) -> Registration:

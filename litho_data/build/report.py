@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from litho_data.build.gratings import GratingScan, grating_scans
+from litho_data.build.verdict import verdict_of
 from litho_data.foundation.files import atomic_file
 from litho_data.foundation.report import Page
 from litho_data.foundation.report_pictures import colour_bar_png, coloured_png
@@ -96,8 +97,8 @@ def write_report(result: BuildResult, store_path: Path, folder: Path) -> Path:
         words=_TABLE | _BUDGET | _GRATING,
     )
     _summary(page, result, store)
-    _pictures(page, store)
     _left_out(page, result)
+    _pictures(page, store)
     _warnings(page, store.quality)
     _gratings(page, grating_scans(store))
     _quality(page, store.quality)
@@ -109,7 +110,7 @@ def write_report(result: BuildResult, store_path: Path, folder: Path) -> Path:
 
 def _summary(page: Page, result: BuildResult, store: Store) -> None:
     quality = store.quality
-    page.verdict(_verdict(result, quality))
+    page.verdict(verdict_of(result.findings, result.n_scans))
     tiles = [(str(result.n_scans), "scans in the store")]
     if "ncc_after" in quality:
         tiles.append((f"{quality['ncc_after'].median():.3f}", "median correlation of height and layout"))
@@ -126,30 +127,25 @@ def _summary(page: Page, result: BuildResult, store: Store) -> None:
     page.note(*(f"Assumed, because the card does not say: {assumption}." for assumption in assumed))
 
 
-def _verdict(result: BuildResult, quality: pd.DataFrame) -> str:
-    left = len(result.skipped) + len(result.unpaired)
-    stored = f"All {result.n_scans} scans are" if not left else f"{result.n_scans} scans are"
-    parts = {"refused": len(result.skipped), "without a partner": len(result.unpaired)}
-    why = ", ".join(f"{count} {reason}" for reason, count in parts.items() if count)
-    text = f"{stored} in the store" + (f"; {left} ids are not ({why})" if left else "")
-    warned = int(quality["warning"].astype(bool).sum()) if "warning" in quality else 0
-    return text + (f"; {warned} passed with a warning." if warned else ", and none has a warning.")
-
-
 def _left_out(page: Page, result: BuildResult) -> None:
     import pandas as pd
 
+    if result.findings:
+        page.heading("To do")
+        table = pd.DataFrame([(one.scan, one.text) for one in result.findings], columns=["scan", "what"])
+        page.table(table, "What speaks against the dataset, worst first", "findings.csv")
     rows = [(one.id, "skipped", one.reason) for one in result.skipped]
     rows += [(one.id, "unpaired", one.reason) for one in result.unpaired]
     if rows:
         page.heading("Not in the store")
         table = pd.DataFrame(rows, columns=["id", "status", "reason"])
-        page.table(table, "Ids that are not in the store, and why", "left_out.csv")
+        caption = "Ids that are not in the store, and why; `--strict` refuses to build without them"
+        page.table(table, caption, "left_out.csv")
 
 
 def _warnings(page: Page, quality: pd.DataFrame) -> None:
     if "warning" in quality and (warned := quality["warning"].astype(bool)).any():
-        page.heading("Passed with a warning")
+        page.heading("Passed with a note", folded=True)
         alike = quality[warned].groupby("warning", sort=False)["scan"].agg(", ".join).reset_index()
         page.table(alike, "What to know about these scans", "warnings.csv")
 

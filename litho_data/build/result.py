@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, ClassVar
 
+from litho_data.build.verdict import Finding
 from litho_data.foundation.results import Record, Result
 from litho_data.store.schema import DatasetId
 
@@ -17,7 +18,10 @@ class LeftOut(Record):
 
 
 class BuildResult(Result):
-    """What a build made and what it left out; ``reused`` scans were finished by an earlier build."""
+    """What a build made and what it left out; ``reused`` scans were finished by an earlier build.
+
+    ``findings``: what is to be done, worst first.
+    """
 
     SCHEMA: ClassVar[str] = "litho-data/build/1"
     FILE_NAME: ClassVar[str] = "build.json"
@@ -29,6 +33,7 @@ class BuildResult(Result):
     skipped: list[LeftOut]
     unpaired: list[LeftOut]
     reused: int
+    findings: list[Finding]
     seconds: float
     workers: int
     software: dict[str, Any]

@@ -34,7 +34,7 @@ _CLEAR_SIGMA = 4.0
 
 
 @dataclass(frozen=True)
-class _Print:
+class Print:
     """One registered scan: its heights and its blurred layout at a few points, and where it belongs.
 
     ``turned``: whether the card says that it lay turned. ``group`` is what should share a gain: the dose, if
@@ -45,22 +45,27 @@ class _Print:
     topography: np.ndarray
     height: np.ndarray
     response: tuple[float, float]
+    highest_level: int
     layout: str
     dihedral: str
     turned: bool
     group: float | str
 
 
-def doubts(
+def prints_of(
     records: Sequence[Mapping[str, Any]], load: Callable[[str], Mapping[str, np.ndarray]]
-) -> dict[str, str]:
-    """What speaks against a scan being the print of its own layout, by id; nothing for most sets.
+) -> list[Print]:
+    """The registered scans among these, at a few points.
 
     Args:
         records: of the scans of a dataset.
         load: the arrays ``mask_level`` and ``height_um`` of an id.
     """
-    prints = [_print(record, load(record["id"])) for record in records if "dihedral" in record["quality"]]
+    return [_print(record, load(record["id"])) for record in records if "dihedral" in record["quality"]]
+
+
+def doubts(prints: Sequence[Print]) -> dict[str, str]:
+    """What speaks against a scan being the print of its own layout, by id; nothing for most sets."""
     said: dict[str, list[str]] = {one.id: [] for one in prints}
     for name, text in (*_other_layouts(prints), *_orientations(prints), *_gains(prints)):
         said[name].append(text)
@@ -93,18 +98,19 @@ def fitting_layout(
     return ranked[0] if scores[ranked[0]] - rival > _LEAD else ""
 
 
-def _print(record: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> _Print:
+def _print(record: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> Print:
     level = arrays["mask_level"]
     step = max(1, -(-max(level.shape) // _SIDE_PX))
     sparse = (slice(step // 2, None, step),) * 2
     topography, height = predicted_topography(level, _BLUR_PX)[sparse], arrays["height_um"][sparse]
     dose = record["columns"].get("dose")
-    return _Print(
+    return Print(
         id=record["id"],
         # Copies: a view would keep the whole.
         topography=topography[::2, ::2].copy(),
         height=height[::2, ::2].copy(),
         response=_response(topography, height),
+        highest_level=int(level.max()),
         layout=sha256(level.tobytes()).hexdigest(),
         dihedral=str(record["quality"]["dihedral"]),
         turned=bool(record["columns"].get("turned_deg")),
@@ -112,7 +118,7 @@ def _print(record: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> _Prin
     )
 
 
-def _other_layouts(prints: Sequence[_Print]) -> list[tuple[str, str]]:
+def _other_layouts(prints: Sequence[Print]) -> list[tuple[str, str]]:
     """Scans that another layout of the set explains better, at the warp that was found for their own."""
     said = []
     for shape in {one.topography.shape for one in prints}:
@@ -132,7 +138,7 @@ def _other_layouts(prints: Sequence[_Print]) -> list[tuple[str, str]]:
     return said
 
 
-def _correlations(prints: Sequence[_Print], layouts: Sequence[_Print]) -> Iterator[np.ndarray]:
+def _correlations(prints: Sequence[Print], layouts: Sequence[Print]) -> Iterator[np.ndarray]:
     """Per scan its correlation with each layout, within ``_ROUNDING``: sums over pairs as matrix products."""
     of_layouts = np.stack([one.topography.ravel() for one in layouts]).astype(np.float32)
     of_layouts -= of_layouts.mean(axis=1, keepdims=True)
@@ -149,13 +155,13 @@ def _correlations(prints: Sequence[_Print], layouts: Sequence[_Print]) -> Iterat
         yield from (height @ of_layouts.T) / np.sqrt(np.where(energy > 0, energy, np.inf))
 
 
-def _correlation(one: _Print, other: _Print) -> float:
+def _correlation(one: Print, other: Print) -> float:
     """Of the heights of one scan with the layout of another."""
     seen = np.isfinite(one.height)
     return pearson(one.height[seen].astype(np.float64), other.topography[seen])
 
 
-def _orientations(prints: Sequence[_Print]) -> list[tuple[str, str]]:
+def _orientations(prints: Sequence[Print]) -> list[tuple[str, str]]:
     """Scans that lie mirrored or turned on their layout, unlike the others of the set."""
     if not prints:
         return []
@@ -174,7 +180,7 @@ def _orientations(prints: Sequence[_Print]) -> list[tuple[str, str]]:
     return said
 
 
-def _gains(prints: Sequence[_Print]) -> list[tuple[str, str]]:
+def _gains(prints: Sequence[Print]) -> list[tuple[str, str]]:
     """Scans whose height per level fits another group than their own, and groups out of the order of dose."""
     same_layout = Counter(one.layout for one in prints)
     repeated = len(prints) > 0 and min(same_layout.values()) > 1

@@ -14,7 +14,8 @@ from litho_data.foundation.files import read_text
 from litho_data.foundation.quantities import LENGTH_UM
 from litho_data.foundation.results import Record, first_error
 from litho_data.foundation.units import um_per
-from litho_data.readers.registry import formats, reader_of
+from litho_data.readers.registry import formats
+from litho_data.store.schema import Surround
 
 Use = Literal["dataset", "flat", "substrate", "steps", "grating"]
 Registration = Literal["affine", "homography", "ladder"]
@@ -80,8 +81,14 @@ def _known_format(value: str) -> str:
 
 def _file_pattern(value: str) -> str:
     if "{id}" not in value:
-        raise ValueError("wanted a pattern with {id}, for example 'scans/{id}.txt'")
+        raise ValueError("wanted a pattern with {id}, for example 'scans/{id}.txt' or 'scans/{id}.*'")
     return _inside(value)
+
+
+def _file_patterns(value: str | tuple[str, ...]) -> str | tuple[str, ...]:
+    if not value:
+        raise ValueError("wanted at least one pattern")
+    return _file_pattern(value) if isinstance(value, str) else tuple(_file_pattern(one) for one in value)
 
 
 def _inside(value: str) -> str:
@@ -103,50 +110,56 @@ def _id_pattern(value: str) -> str:
 
 
 Length = Annotated[float, Field(strict=True), AfterValidator(_positive)]
-FilePattern = Annotated[str, AfterValidator(_file_pattern)]
+FilePatterns = Annotated[str | tuple[str, ...], AfterValidator(_file_patterns)]
+KnownFormat = Annotated[str, AfterValidator(_known_format)]
+KnownUnit = Annotated[str, AfterValidator(_known_unit)]
 InsidePath = Annotated[str, AfterValidator(_inside)]
 
 
 class LayoutFiles(Record):
-    """What was sent to the printer."""
+    """What was sent to the printer.
 
-    files: FilePattern
+    ``grey_per_level`` is the step of the grey values of layouts that are saved as pictures, such as
+    255 / (levels - 1) where white is the highest level.
+    """
+
+    files: FilePatterns
     pitch_um: Length
     level_height_um: Length
     levels: int = Field(ge=2, le=256)
+    grey_per_level: Length | None = None
 
 
 class ScanFiles(Record):
-    """What the microscope wrote. ``size_um`` is (y, x), for formats that do not carry it."""
+    """What the microscope wrote. ``size_um`` is (y, x), for formats that do not carry it.
 
-    files: FilePattern
-    format: Annotated[str, AfterValidator(_known_format)] = "auto"
-    unit: Annotated[str, AfterValidator(_known_unit)] | None = None
+    ``levelled``: whether the heights are to be taken as they are in the files.
+    ``missing``: numbers and words that mark pixels which were not measured; an empty list says that there are
+    none.
+    """
+
+    files: FilePatterns
+    format: KnownFormat = "auto"
+    unit: KnownUnit | None = None
     size_um: tuple[Length, Length] | None = None
     channel: str | None = None
     fast_axis: Literal["x", "y"] | None = None
     full_scale_file: InsidePath | None = None
+    levelled: bool = False
+    missing: tuple[Annotated[float, Field(strict=True)] | str, ...] | None = None
 
     @model_validator(mode="after")
     def _complete(self) -> Self:
         if self.full_scale_file is not None and self.unit is not None:
             raise ValueError("wanted either unit or full_scale_file, which is in metres")
-        if self.format != "auto" and not reader_of(self.format).self_describing:
-            if self.unit is None and self.full_scale_file is None:
-                raise ValueError(
-                    f"unit is missing: a {self.format} file does not carry it, wanted e.g. unit = 'm'"
-                )
-            if self.size_um is None:
-                raise ValueError(
-                    f"size_um is missing: a {self.format} file does not carry it, wanted [y, x] in µm"
-                )
         return self
 
 
 class Process(Record):
     """How raw scans become heights on the layout grid: a levelling recipe file, a registration model, a tip.
 
-    ``tip`` is the radius of the microscope's tip in µm, or ``blind`` to find it in the scans.
+    Without ``level`` the layout-aware plane is taken out of scans that are not levelled yet. ``tip`` is the
+    radius of the microscope's tip in µm, or ``blind`` to find it in the scans.
     """
 
     level: InsidePath | None = None
@@ -166,8 +179,8 @@ class Standard(Record):
 
     file: InsidePath
     uncertainty_um: float = Field(ge=0, allow_inf_nan=False)
-    format: Annotated[str, AfterValidator(_known_format)] | None = None
-    unit: Annotated[str, AfterValidator(_known_unit)] | None = None
+    format: KnownFormat | None = None
+    unit: KnownUnit | None = None
     size_um: tuple[Length, Length] | None = None
     channel: str | None = None
 
@@ -200,10 +213,14 @@ class Calibration(Record):
 
 
 class Write(Record):
-    """How the printer wrote a field; what is missing is assumed, and labelled as an assumption."""
+    """How the printer wrote a field; what is missing is assumed, and labelled as an assumption.
+
+    ``surround``: what lies around a printed field, the bare substrate or more of the print.
+    """
 
     slow_axis: Literal["x", "y"] | None = None
     field_um: Length | None = None
+    surround: Surround | None = None
 
 
 class KnownGrating(Record):

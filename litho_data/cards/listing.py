@@ -10,13 +10,13 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 from litho_data.cards.card import Card, Use, load_card
 from litho_data.cards.fetch import known_folders
-from litho_data.cards.tables import SAFE_ID, read_full_scales, read_table
+from litho_data.cards.tables import READ_COLUMNS, SAFE_ID, read_full_scales, read_table, size_of
 from litho_data.foundation.errors import InputError
-from litho_data.store.schema import OPTIONAL_COLUMNS
+from litho_data.store.schema import OPTIONAL_COLUMNS, TEXT_COLUMNS
 
 # An expression of a card is matched in a process of its own, for so long at most.
 _LONGEST_S = 10.0
@@ -31,8 +31,9 @@ json.dump([found and found["print"] for found in (re.fullmatch(pattern, one) for
 class PrintedField:
     """One field to build: its files and what the card says about it.
 
-    ``columns`` holds the optional numbers of the table (µm, dose), ``full_scale_um`` the height of the
-    largest integer of an image scan; ``layout`` may be None for a reference scan only (``use`` not dataset).
+    ``columns`` holds the optional numbers (µm, dose) and words of the table, ``read`` what it says of the
+    file in place of the card, ``full_scale_um`` the height of the largest integer of an image scan;
+    ``layout`` may be None for a reference scan only (``use`` not dataset).
     """
 
     id: str
@@ -42,7 +43,8 @@ class PrintedField:
     scan: Path
     layout: Path | None
     full_scale_um: float | None = None
-    columns: Mapping[str, float] = field(default_factory=dict)
+    columns: Mapping[str, float | str] = field(default_factory=dict)
+    read: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -99,16 +101,23 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
         use = cast(Use, row.get("use", "dataset"))
         files = tuple(found[scan_id] for found in (layouts, scans) if scan_id in found)
         if scan_id not in scans or (scan_id not in layouts and use == "dataset"):
-            missing = card.scan.files if scan_id not in scans else card.layout.files
-            aside.append(LeftAside(scan_id, files, True, f"no file {missing.replace('{id}', scan_id)}"))
+            wanted = patterns_of(card.scan.files if scan_id not in scans else card.layout.files)
+            shown = " or ".join(pattern.replace("{id}", scan_id) for pattern in wanted)
+            aside.append(
+                LeftAside(scan_id, tuple(one for found in files for one in found), True, f"no file {shown}")
+            )
             continue
         print_id = print_ids[scan_id]
-        scale = None if scales is None else scales.get(scan_id, scales.get(scans[scan_id].name))
-        reason = _refusal(scan_id, print_id, use, table, card) or leads_out(files, folder)
+        every = tuple(one for found in files for one in found)
+        scale = None if scales is None else scales.get(scan_id, scales.get(scans[scan_id][0].name))
+        reason = _refusal(scan_id, print_id, use, table, card) or leads_out(every, folder)
+        if not reason and (several := [found for found in files if len(found) > 1]):
+            names = ", ".join(one.name for one in several[0])
+            reason = f"several files: {names}; the pattern has to tell them apart"
         if not reason and scales is not None and scale is None:
             reason = f"no full scale in {card.scan.full_scale_file}"
         if reason:
-            aside.append(LeftAside(scan_id, files, False, reason))
+            aside.append(LeftAside(scan_id, every, False, reason))
             continue
         fields.append(
             PrintedField(
@@ -116,10 +125,16 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
                 print_id=print_id or scan_id,
                 order=int(row["order"]) if "order" in row else len(fields),
                 use=use,
-                scan=scans[scan_id],
-                layout=layouts.get(scan_id),
+                scan=scans[scan_id][0],
+                layout=layouts[scan_id][0] if scan_id in layouts else None,
                 full_scale_um=scale,
-                columns={name: float(row[name]) for name in OPTIONAL_COLUMNS if name in row},
+                columns={name: float(row[name]) for name in OPTIONAL_COLUMNS if name in row}
+                | {name: row[name] for name in TEXT_COLUMNS if name in row},
+                read={
+                    name: size_of(row[name]) if name == "size_um" else row[name]
+                    for name in READ_COLUMNS
+                    if name in row
+                },
             )
         )
     if card.grating is None and (unknown := [one.id for one in fields if one.use == "grating"]):
@@ -137,24 +152,36 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
 def _data_folder(card: Card, card_path: Path, data_dir: str | Path | None) -> Path:
     folders = [Path(data_dir)] if data_dir is not None else [card_path.parent, *known_folders(card.name)]
     for folder in folders:
-        if all(_files_by_id(folder, pattern) for pattern in (card.layout.files, card.scan.files)):
+        if all(_files_by_id(folder, files) for files in (card.layout.files, card.scan.files)):
             return folder.resolve()
     raise InputError(
         f"files of card {card_path}",
         got=f"none in {', '.join(str(folder) for folder in folders)}",
-        wanted=f"{card.layout.files} and {card.scan.files}",
+        wanted=" and ".join((*patterns_of(card.layout.files), *patterns_of(card.scan.files))),
         hint=f"try litho-data fetch {card.name}, or set LITHO_DATA_DIR" if card.source else "",
     )
 
 
-def _files_by_id(folder: Path, pattern: str) -> dict[str, Path]:
-    before, *rest = pattern.split("{id}")
-    # The first position captures the id, the others must repeat it.
-    text = re.escape(before) + "(?P<id>[^/]+)" + "(?P=id)".join(re.escape(part) for part in rest)
-    match = re.compile(text)
-    found = glob.glob("*".join(glob.escape(part) for part in (before, *rest)), root_dir=folder)
-    names = {name: match.fullmatch(name.replace("\\", "/")) for name in sorted(found)}
-    return {hit["id"]: folder / name for name, hit in names.items() if hit and (folder / name).is_file()}
+def patterns_of(files: str | Sequence[str]) -> tuple[str, ...]:
+    """The patterns of a card's entry, one or several."""
+    return (files,) if isinstance(files, str) else tuple(files)
+
+
+def _files_by_id(folder: Path, files: str | Sequence[str]) -> dict[str, list[Path]]:
+    """The files of each id, by one pattern or several; ``*`` stands for any part of a name."""
+    found: dict[str, list[Path]] = {}
+    for pattern in patterns_of(files):
+        before, *rest = (
+            "[^/]*".join(re.escape(piece) for piece in part.split("*")) for part in pattern.split("{id}")
+        )
+        # The first position captures the id, the others must repeat it.
+        match = re.compile(before + "(?P<id>[^/]+)" + "(?P=id)".join(rest))
+        parts = pattern.replace("{id}", "*").split("*")
+        for name in sorted(glob.glob("*".join(glob.escape(part) for part in parts), root_dir=folder)):
+            hit, path = match.fullmatch(name.replace("\\", "/")), folder / name
+            if hit and path.is_file() and path not in found.setdefault(hit["id"], []):
+                found[hit["id"]].append(path)
+    return {scan_id: paths for scan_id, paths in found.items() if paths}
 
 
 def _refusal(
@@ -190,6 +217,8 @@ def _table(card: Card, *folders: Path) -> dict[str, dict[str, str]]:
 def _assumptions(card: Card, table: Mapping[str, Mapping[str, str]]) -> tuple[str, ...]:
     """Facts that the card does not state, which are assumed for the effects that need them."""
     assumed = []
+    if card.process.level is None and not card.scan.levelled:
+        assumed.append("the heights are levelled by a plane fitted together with the layout (process.level)")
     if card.write is None or card.write.field_um is None:
         assumed.append("one scan is one write field, centred on it")
     if not any("order" in row for row in table.values()):

@@ -13,25 +13,35 @@ from typing import get_args
 from litho_data.cards.card import Use
 from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.quantities import ORDER
-from litho_data.store.schema import OPTIONAL_COLUMNS
+from litho_data.foundation.units import is_length
+from litho_data.readers.registry import formats
+from litho_data.readers.text_blocks import read_text
+from litho_data.store.schema import OPTIONAL_COLUMNS, TEXT_COLUMNS, Surround
 
 SAFE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._+-]*")
-COLUMNS = ("id", "order", *OPTIONAL_COLUMNS, "use")
+READ_COLUMNS = ("unit", "size_um", "format", "channel", "fast_axis")
+"""What the table may say about single scans, in place of the card's ``[scan]``."""
+COLUMNS = ("id", "order", *OPTIONAL_COLUMNS, *TEXT_COLUMNS, *READ_COLUMNS, "use")
+_NUMBERS = ("order", *OPTIONAL_COLUMNS, "size_um")
 _ALLOWED = {"turned_deg": (0.0, 90.0, 180.0, 270.0), "direction": (1.0, -1.0)}
 
 
 def read_table(path: Path) -> dict[str, dict[str, str]]:
     """Rows of a card's CSV table by id, without empty cells; all other cells have been checked.
 
+    Cells are apart by commas, semicolons or tabs, the text may be UTF-16, and where commas do not separate
+    cells they may be decimal commas: what spreadsheets write in any language.
+
     Raises:
         InputError: unreadable, an unknown column, an id that is no plain name, or a cell of the wrong kind.
     """
     try:
-        with open(path, newline="", encoding="utf-8-sig") as stream:
-            reader = csv.DictReader(stream, strict=True, restkey="(too many cells)")
-            rows = list(reader)
-            columns = list(reader.fieldnames or ())
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        lines = read_text(path).splitlines()
+        separator = max(",;\t", key=(lines or [""])[0].count)
+        reader = csv.DictReader(lines, strict=True, restkey="(too many cells)", delimiter=separator)
+        rows = list(reader)
+        columns = list(reader.fieldnames or ())
+    except (OSError, InputError, csv.Error) as error:
         raise InputError(f"cannot read table {path}", got=error, wanted="a CSV file") from error
     unknown = [name for name in columns if name not in COLUMNS]
     if unknown or "id" not in columns:
@@ -41,6 +51,8 @@ def read_table(path: Path) -> dict[str, dict[str, str]]:
         filled = {
             key: value.strip() for key, value in row.items() if isinstance(value, str) and value.strip()
         }
+        if separator != ",":
+            filled |= {key: filled[key].replace(",", ".") for key in _NUMBERS if key in filled}
         _check_row(filled, f"{path} line {number}", "(too many cells)" in row, "order" in columns)
         if filled["id"] in table:
             raise InputError(f"{path} line {number}: id", got=repr(filled["id"]), wanted="each id once")
@@ -64,8 +76,28 @@ def _check_row(row: Mapping[str, str], what: str, overfull: bool, needs_order: b
         if name in row and float(row[name]) not in _ALLOWED.get(name, (float(row[name]),)):
             wanted = " | ".join(f"{value:g}" for value in _ALLOWED[name])
             raise InputError(f"{what}: {name}", got=repr(row[name]), wanted=wanted)
+    if "unit" in row and not is_length(row["unit"]):
+        raise InputError(f"{what}: unit", got=repr(row["unit"]), wanted="a length, such as nm")
+    if "size_um" in row and not size_of(row["size_um"]):
+        raise InputError(
+            f"{what}: size_um", got=repr(row["size_um"]), wanted="one side in µm, or y x x: 54 x 27"
+        )
+    for name, known in (
+        ("format", ("auto", *formats())),
+        ("fast_axis", ("x", "y")),
+        ("surround", get_args(Surround)),
+    ):
+        require_known(f"{what}: {name}", row.get(name, known[0]), known)
     if float(row.get("pixel_size", 1)) <= 0:
         raise InputError(f"{what}: pixel_size", got=repr(row["pixel_size"]), wanted="above 0: 0.5 is half")
+
+
+def size_of(text: str) -> tuple[float, float] | None:
+    """(y, x) of a cell with one side or with both, apart by ``x``; None if it is none."""
+    sides = [one.strip() for one in re.split("[x×]", text)]
+    if len(sides) > 2 or not all(_is_finite(one) and float(one) > 0 for one in sides):
+        return None
+    return float(sides[0]), float(sides[-1])
 
 
 def _is_finite(text: str) -> bool:

@@ -68,6 +68,9 @@ def build(
     dask: DaskOption = None,
     strict: Strict = False,
     seed: Annotated[int, typer.Option(min=0, help="seed of the robust registration")] = 0,
+    suggest: Annotated[
+        bool, typer.Option("--suggest", help="compare levelling recipes on three scans; build nothing")
+    ] = False,
     tip: Annotated[
         str | None,
         typer.Option(
@@ -78,8 +81,23 @@ def build(
 ) -> None:
     """Read, level, register and store all scans of a card; writes the store and a report beside it.
 
+    With --suggest nothing is built: levelling recipes are compared on three scans, and the best is written
+    beside the card, with a card that names it.
+
     Example: litho-data build prints/card.toml --out prints.zarr --workers 2
     """
+    if suggest:
+        from litho_data.build.suggest import suggest_recipe
+
+        folder = out.parent / f"{out.stem}-levelling"
+        found = suggest_recipe(card, folder, data_dir=data_dir)
+        for name, of in found.left_nm.items():
+            left = ", ".join(f"{scan} {one:.1f} nm" for scan, one in of.items())
+            warned = f" ({found.warned[name]})" if name in found.warned else ""
+            typer.echo(f"{name}: the layout leaves {left}{warned}")
+        typer.echo(f"suggested: {found.recipe}; build {found.card}")
+        typer.echo(f"pictures {folder / 'report.html'}")
+        return
     from litho_data.build.build import build_dataset
     from litho_data.build.result import report_folder
 
@@ -92,6 +110,8 @@ def build(
     )
     if result.unpaired:
         typer.echo(f"{result.unpaired[0].id}: {result.unpaired[0].reason}", err=True)
+    if skipped := [one.id for one in result.skipped]:
+        typer.echo(f"skipped: {', '.join(skipped)}; --strict refuses to build without them", err=True)
     typer.echo(f"dataset sha256 {result.dataset.sha256}")
     typer.echo(f"report {report_folder(out) / 'report.html'}")
 

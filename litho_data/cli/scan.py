@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,6 +10,7 @@ import typer
 
 from litho_data.foundation.errors import InputError
 from litho_data.readers.registry import formats
+from litho_data.readers.text_blocks import NUMBER, number
 
 if TYPE_CHECKING:
     from litho_data.readers.reader import Channel
@@ -23,10 +25,19 @@ Size = Annotated[
     typer.Option("--size-um", metavar="Y X", help="field size in µm (y, x) if the file states none"),
 ]
 ChannelName = Annotated[str | None, typer.Option(help="name of the height channel, if there are several")]
+Missing = Annotated[
+    list[str] | None,
+    typer.Option(help="number or word that marks pixels which were not measured, e.g. -9999; repeatable"),
+]
 FullScale = Annotated[
     float | None,
     typer.Option("--full-scale-um", help="height in µm of the largest value of an integer image"),
 ]
+
+
+def marks(texts: list[str] | None) -> list[float | str] | None:
+    """Numbers and words as ``read_scan`` takes them."""
+    return None if texts is None else [number(one) if NUMBER.fullmatch(one) else one for one in texts]
 
 
 def level(
@@ -38,6 +49,7 @@ def level(
     size_um: Size = None,
     channel: ChannelName = None,
     full_scale_um: FullScale = None,
+    missing: Missing = None,
 ) -> None:
     """Level one scan; writes the levelled heights, the removed surface and a record beside them.
 
@@ -49,9 +61,17 @@ def level(
 
     steps = Recipe.from_toml(recipe)
     heights = read_scan(
-        scan, format=format, unit=unit, size_um=size_um, channel=channel, full_scale_um=full_scale_um
+        scan,
+        format=format,
+        unit=unit,
+        size_um=size_um,
+        channel=channel,
+        full_scale_um=full_scale_um,
+        missing=marks(missing),
     )
-    record = write_levelled(heights, steps, out)
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *_: typer.echo(f"warning: {message}", err=True)
+        record = write_levelled(heights, steps, out)
     typer.echo(f"{out}: {len(steps.step)} steps")
     typer.echo(f"levelled sha256 {record.levelled_sha256}")
     typer.echo(f"removed surface {out.with_name(record.removed)}")
@@ -64,6 +84,7 @@ def inspect(
     size_um: Size = None,
     channel: ChannelName = None,
     full_scale_um: FullScale = None,
+    missing: Missing = None,
     picture: Annotated[Path | None, typer.Option(help="PNG to write")] = None,
     header: Annotated[bool, typer.Option("--header", help="print the full header of the file")] = False,
 ) -> None:
@@ -87,11 +108,17 @@ def inspect(
                 typer.echo(f"{listed.name}: {key} = {value}")
     try:
         scan = read_scan(
-            file, format=format, unit=unit, size_um=size_um, channel=channel, full_scale_um=full_scale_um
+            file,
+            format=format,
+            unit=unit,
+            size_um=size_um,
+            channel=channel,
+            full_scale_um=full_scale_um,
+            missing=marks(missing),
         )
     except InputError as error:
         # If no picture was asked for, the list of channels is enough.
-        if picture is not None or unit or size_um or channel or full_scale_um:
+        if picture is not None or unit or size_um or channel or full_scale_um or missing:
             raise
         typer.echo(f"no picture: {error}")
         return
@@ -102,18 +129,19 @@ def _print_channels(console, file: Path, channels: list[Channel]) -> None:
     from rich.table import Table
 
     table = Table(title=str(file))
-    for column in ("channel", "pixels (y × x)", "unit", "size (µm)", "pitch (µm)", "heights"):
+    for column in ("channel", "pixels (y × x)", "unit", "size (µm)", "pitch (µm)", "along x", "heights"):
         table.add_column(column)
     for channel in channels:
         ny, nx = channel.shape
-        size = channel.size_um
+        size = channel.size_um if not channel.problem else None
         table.add_row(
             channel.name,
             f"{ny} × {nx}",
             channel.unit or "not stated",
             f"{size[0]:.6g} × {size[1]:.6g}" if size else "not stated",
             f"{size[0] / ny:.6g} × {size[1] / nx:.6g}" if size else "not stated",
-            "yes" if channel.is_height else "no",
+            channel.x_is,
+            f"not read: {channel.problem}" if channel.problem else "yes" if channel.is_height else "no",
         )
     console.print(table)
 
@@ -128,6 +156,8 @@ def _print_scan(console, scan: Scan, picture: Path | None) -> None:
     missing = int(np.isnan(scan.height_um).sum())
     typer.echo(f"read as {scan.format}, channel {scan.channel!r}, unit {scan.unit}, pitch {pitch}")
     typer.echo(f"heights {low:.6g} to {high:.6g} µm, {missing} pixels missing")
+    for note in scan.notes:
+        typer.echo(f"note: {note}")
     if scan.mask is not None:
         typer.echo(f"mask covers {scan.mask.mean():.1%} of the pixels")
     if console.is_terminal:

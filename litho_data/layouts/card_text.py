@@ -35,6 +35,7 @@ class CardText:
         plan_of: hash of the dataset that the layouts were planned from, or empty.
         scan_format: of the files of the microscope.
         grating_um: period of the grating that scans of this use show, or None.
+        levelled: whether a build is to take the heights as they are in the files.
     """
 
     name: str
@@ -50,6 +51,7 @@ class CardText:
     plan_of: str = ""
     scan_format: str = "text-matrix"
     grating_um: float | None = None
+    levelled: bool = False
 
     def toml(self) -> str:
         """The card's text."""
@@ -71,7 +73,7 @@ class CardText:
             # The others state both.
             size_y, size_x = (round(side, 9) for side in self.scan_size_um)
             lines += ['unit = "m"', f"size_um = [{size_y}, {size_x}]"]
-        lines += ['fast_axis = "x"']
+        lines += ['fast_axis = "x"', *["levelled = true"] * self.levelled]
         if self.print_pattern or self.table:
             lines += ["", "[ids]"]
             lines += [f"print = '{self.print_pattern}'"] * bool(self.print_pattern)

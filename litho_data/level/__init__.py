@@ -8,6 +8,7 @@ from litho_data.level.layout_aware import layout_in_scan_frame, level_layout_awa
 from litho_data.level.plane import fix_zero, level_plane, level_rotate, level_three_point, zero_max, zero_mean
 from litho_data.level.polynomial import level_polynomial
 from litho_data.level.recipe import Recipe
+from litho_data.level.recipe_steps import LevellingWarning
 from litho_data.level.robust import level_robust
 from litho_data.level.rows import align_rows
 from litho_data.level.scars import mark_scars, remove_scars
@@ -15,6 +16,7 @@ from litho_data.level.selection import Levelled, Masking
 
 __all__ = [
     "Levelled",
+    "LevellingWarning",
     "MaskedLevelling",
     "Masking",
     "Recipe",

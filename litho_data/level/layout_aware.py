@@ -17,13 +17,15 @@ if TYPE_CHECKING:
 # Below it, background and structure cannot be separated in double precision with noise.
 _SINGULAR = 1e-9
 _ROWS_AT_ONCE = 64
+_BLURS_PX = (0.0, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
+_LEAST_INSIDE = 0.25
 
 
 def level_layout_aware(
     height: np.ndarray,
     *,
     layout_level: np.ndarray,
-    blur_px: float = 3.0,
+    blur_px: float | None = None,
     x_degree: int = 1,
     y_degree: int = 1,
     total_degree: int | None = 1,
@@ -41,7 +43,9 @@ def level_layout_aware(
         height: (ny, nx), any unit.
         layout_level: (ny, nx) in the scan's frame, level per pixel, NaN outside the layout; see
             ``layout_in_scan_frame``.
-        blur_px: sigma of a Gaussian for the lateral spread of printing.
+        blur_px: sigma of a Gaussian for the lateral spread of printing; by default the one of a few that
+            leaves the least. Pixels within two of them of the edge of the layout are not fitted: there the
+            height depends on what surrounds it.
         x_degree, y_degree, total_degree: as in ``level_polynomial``; by default a plane.
 
     Raises:
@@ -51,18 +55,29 @@ def level_layout_aware(
     z = as_height(height)
     if layout_level.shape != z.shape:
         raise InputError("layout in the scan's frame: shape", got=layout_level.shape, wanted=z.shape)
-    if blur_px < 0:
+    if blur_px is not None and blur_px < 0:
         raise InputError("blur_px", got=blur_px, wanted="0 or more pixels")
     terms = tuple(term for term in polynomial_terms(x_degree, y_degree, total_degree) if term != (0, 0))
     if not terms:
         raise InputError("layout-aware background", got="degree 0", wanted="degree 1 or more")
-    blurred = _blur(np.asarray(layout_level, dtype=np.float64), blur_px)
+    blurs = _BLURS_PX if blur_px is None else (blur_px,)
+    inside = _inside(np.isfinite(layout_level), 2 * blurs[-1])
     chosen = select(z, mask, masking)
-    fitted = np.isfinite(blurred) if chosen is None else chosen & np.isfinite(blurred)
+    fitted = inside if chosen is None else chosen & inside
     if not fitted.any():
         raise InputError("the layout covers no measured pixel", wanted="a layout in the scan's frame")
-    surface = evaluate(_joint_fit(z, blurred, fitted, terms), z.shape)
+    level = np.asarray(layout_level, dtype=np.float64)
+    fits = [_joint_fit(z, _blur(level, blur), fitted, terms) for blur in blurs]
+    surface = evaluate(min(fits, key=lambda fit: fit[1])[0], z.shape)
     return subtract(z, surface - surface[fitted].mean())
+
+
+def _inside(known: np.ndarray, border_px: float) -> np.ndarray:
+    """The known pixels that are further than a border from unknown ones; all of them if few are left."""
+    if known.all():
+        return known
+    inner = ndimage.distance_transform_edt(known) > border_px
+    return inner if inner.sum() > _LEAST_INSIDE * known.sum() else known
 
 
 def layout_in_scan_frame(
@@ -108,8 +123,10 @@ def _blur(level: np.ndarray, sigma_px: float) -> np.ndarray:
     return np.where(known, spread / np.where(weight > 0, weight, 1.0), np.nan)
 
 
-def _joint_fit(z: np.ndarray, blurred: np.ndarray, fitted: np.ndarray, terms: Terms) -> np.ndarray:
-    """Coefficients of the background, in the Legendre basis of ``evaluate``."""
+def _joint_fit(
+    z: np.ndarray, blurred: np.ndarray, fitted: np.ndarray, terms: Terms
+) -> tuple[np.ndarray, float]:
+    """Coefficients of the background, in the Legendre basis of ``evaluate``; and how little was explained."""
     normal, right = _normal_equations(z, blurred, fitted, terms)
     used = np.diag(normal) > 0
     normal, right = normal[np.ix_(used, used)], right[used]
@@ -125,7 +142,7 @@ def _joint_fit(z: np.ndarray, blurred: np.ndarray, fitted: np.ndarray, terms: Te
     coefficients = np.zeros((max(q for _, q in terms) + 1, max(p for p, _ in terms) + 1))
     for (p, q), value in zip(terms, solution, strict=False):
         coefficients[q, p] = value
-    return coefficients
+    return coefficients, -float(right @ solution)
 
 
 def _normal_equations(

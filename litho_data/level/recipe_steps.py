@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
@@ -17,9 +18,13 @@ from litho_data.level.plane import fix_zero, level_plane, level_rotate, level_th
 from litho_data.level.polynomial import MAX_DEGREE, level_polynomial
 from litho_data.level.robust import Loss, level_robust
 from litho_data.level.row_statistics import MEDIAN_TRIM
-from litho_data.level.rows import MAX_ROW_DEGREE, Direction, RowMethod, align_rows
+from litho_data.level.rows import MAX_ROW_DEGREE, Direction, RowMethod, align_rows, print_taken_for_offsets
 from litho_data.level.scars import ScarSign, mark_scars, remove_scars
 from litho_data.level.selection import Masking
+
+
+class LevellingWarning(UserWarning):
+    """A step may have removed part of the print."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,7 +158,7 @@ class LayoutAware(_PlaneByDefault):
     op: Literal["layout-aware"] = "layout-aware"
     function = staticmethod(level_layout_aware)
     needs = ("layout_level",)
-    blur_px: float = Field(default=3.0, ge=0)
+    blur_px: float | None = Field(default=None, ge=0)
 
 
 class AlignRows(Step):
@@ -167,9 +172,9 @@ class AlignRows(Step):
     trim: float = Field(default=0.05, ge=0, le=MEDIAN_TRIM)
 
     def call(self, state: State) -> Any:
-        """Pass the pitch to the one method that needs it."""
+        """Pass the pitch to the one method that needs it; warn where the print moves with the lines."""
         pitch_um = state.need("pitch_um") if self.method == "facet-tilt" else None
-        return align_rows(
+        levelled = align_rows(
             state.height_um,
             method=self.method,
             direction=self.direction,
@@ -179,6 +184,10 @@ class AlignRows(Step):
             mask=state.mask,
             masking=self.masking,
         )
+        pair = (state.height_um, levelled.removed)
+        if note := print_taken_for_offsets(*(one.T if self.direction == "vertical" else one for one in pair)):
+            warnings.warn(note, LevellingWarning, stacklevel=2)
+        return levelled
 
 
 class _Features(Step):

@@ -30,6 +30,7 @@ RowMethod = Literal[
 ]
 Direction = Literal["horizontal", "vertical"]
 MAX_ROW_DEGREE = 5
+_SIGMA_PER_MAD, _CLEAR_SIGMA, _STAYED = 1.4826, 6.0, 0.15
 
 
 def align_rows(
@@ -71,6 +72,27 @@ def align_rows(
     else:
         removed = _removed(z, chosen, masking, method, degree, trim, pitch_um)
     return subtract(z, removed)
+
+
+def print_taken_for_offsets(z: np.ndarray, removed: np.ndarray) -> str:
+    """What to know of an alignment that moved lines although part of their pixels stayed; empty for others.
+
+    An offset of a line moves all of its pixels. Where a line was shifted against its neighbour by far more
+    than the noise, and many of its pixels do not differ from the neighbour, a structure moved the others.
+
+    Args:
+        z: (ny, nx) before; ``removed``: what was taken from it; both with lines as rows.
+    """
+    steps, shifts = np.diff(z, axis=0), np.diff(removed, axis=0)
+    noise = _SIGMA_PER_MAD * float(np.nanmedian(np.abs(steps - np.nanmedian(steps, axis=1, keepdims=True))))
+    moved = np.abs(shifts) > _CLEAR_SIGMA * max(noise, np.finfo(float).tiny)
+    stayed = (moved & (np.abs(steps) < np.abs(shifts) / 2)).mean(axis=1)
+    worst = int(stayed.argmax())
+    if stayed[worst] < _STAYED:
+        return ""
+    size = float(np.abs(shifts[stayed >= _STAYED]).max())
+    shifted = f"lines were shifted by up to {size:.3g} µm where {stayed[worst]:.0%} of the pixels of a line"
+    return f"{shifted} did not move: part of the print may be removed"
 
 
 def _check(

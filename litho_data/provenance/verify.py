@@ -212,7 +212,7 @@ def _padding(store: Store) -> Iterator[Finding]:
 
 def _coordinates(store: Store) -> Iterator[Finding]:
     shape = array_of(store.root, "mask_level").shape
-    for name, count in (("y_um", shape[1]), ("x_um", shape[2])):
+    for name, count in (("y_um", shape[1]), ("y", shape[1]), ("x_um", shape[2]), ("x", shape[2])):
         if not np.array_equal(values_of(store.root, name), pixel_centres_um(count, store.pitch_um)):
             yield Finding(f"coordinate {name}", "is not at pixel centres")
     for variable in LAYOUT_VARIABLES:

@@ -12,7 +12,15 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.readers.confined import confined
-from litho_data.readers.reader import Channel, Loaded, Reader, extent_um, foreign_parser, with_unique_names
+from litho_data.readers.reader import (
+    Channel,
+    Loaded,
+    Reader,
+    extent_um,
+    foreign_parser,
+    one_by_one,
+    with_unique_names,
+)
 
 _MAGIC = b"GWYP"
 _SCALAR_BYTES = {"b": 1, "c": 1, "i": 4, "q": 8, "d": 8}
@@ -37,18 +45,24 @@ def read_channels(path: Path) -> list[Channel]:
         keys = sorted(
             (key for key in container if _FIELD_KEY.fullmatch(key)), key=lambda key: int(key.split("/")[1])
         )
-        return with_unique_names([_channel(path, container, key) for key in keys])
+        titles = [str(container.get(f"{key}/title", f"channel {key.split('/')[1]}")) for key in keys]
+        return with_unique_names(
+            [
+                one_by_one(path, "GWY", title, partial(_channel, path, container, key, title))
+                for key, title in zip(keys, titles, strict=True)
+            ]
+        )
 
 
-def _channel(path: Path, container: Any, key: str) -> Channel:
+def _channel(path: Path, container: Any, key: str, title: str) -> Channel:
     number = key.split("/")[1]
     field = container[key]
     shape = (int(field["yres"]), int(field["xres"]))
     return Channel(
-        name=str(container.get(f"{key}/title", f"channel {number}")),
+        name=title,
         shape=shape,
         unit=_unit(field, "si_unit_z"),
-        size_um=extent_um(field["yreal"], field["xreal"], _unit(field, "si_unit_xy")),
+        size_um=extent_um(field.get("yreal", 0), field.get("xreal", 0), _unit(field, "si_unit_xy")),
         load=partial(_load, path, key, shape),
         header={str(key): str(value) for key, value in (container.get(f"/{number}/meta") or {}).items()},
     )

@@ -1,4 +1,4 @@
-"""HDF5 files: JPK's image series, TopoStats' results, and through SurfaceTopography all others."""
+"""HDF5 files that say whose they are: JPK's series, Nanosurf's NHF, TopoStats' results; then all others."""
 
 from __future__ import annotations
 
@@ -10,18 +10,35 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.readers import vendor
+from litho_data.readers.arrays import read_hdf5
 from litho_data.readers.confined import confined
-from litho_data.readers.reader import Channel, Loaded, Reader, foreign_parser, with_unique_names
+from litho_data.readers.reader import (
+    Channel,
+    Loaded,
+    Reader,
+    extent_um,
+    foreign_parser,
+    one_by_one,
+    with_unique_names,
+)
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
 _JPK = b"JPK SCAN"
 _UM_PER_M = 1e6
 _UM_PER_NM = 1e-3
+_NANOSURF = "nsf_file_version_major"
+# Names of one fact in the versions 2 and 1 of Nanosurf's files.
+_NAMES, _LOW, _HIGH, _UNIT = (
+    ("signal_name", "name"),
+    ("signal_calibration_min", "base_calibration_min"),
+    ("signal_calibration_max", "base_calibration_max"),
+    ("signal_calibration_unit", "base_calibration_unit"),
+)
 _TOPOSTATS_IMAGES = ("image", "image_original")
 
 
 def read_channels(path: Path) -> list[Channel]:
-    """JPK: one channel per signal, direction and frame. TopoStats: the flattened and the raw image, in nm.
+    """JPK, Nanosurf: one channel per signal and direction. TopoStats: the flattened and the raw image, nm.
 
     Thumbnails, traces of grains and other tables are passed over.
 
@@ -35,8 +52,12 @@ def read_channels(path: Path) -> list[Channel]:
             channels = [channel for name in sorted(file) for channel in _jpk_channels(path, file[name])]
         elif "topostats_file_version" in file:
             channels = [_topostats_channel(path, file, name) for name in _TOPOSTATS_IMAGES if name in file]
-        else:
+        elif _NANOSURF in file.attrs:
+            channels = _nanosurf_channels(path, file)
+        elif "MetaData" in file and "Data" in file:  # Zygo's DATX
             return vendor.read_channels(path)
+        else:
+            return read_hdf5(path, file)
     if not channels:
         raise InputError(f"{path} (HDF5) holds no two-dimensional channel")
     return with_unique_names(channels)
@@ -81,6 +102,62 @@ def _load_jpk(path: Path, name: str, frame: int) -> Loaded:
         values[row.max() - row, column] = counts[:, frame]
         slope, offset = (scaling[f"net-encoder.scaling.{key}"] for key in ("multiplier", "offset"))
     return values * float(slope) + float(offset), None
+
+
+def _nanosurf_channels(path: Path, file: Any) -> list[Channel]:
+    """One channel per signal of every image and direction; other groups hold no images."""
+    import h5py
+
+    channels = []
+    for image in (one for _, one in sorted(file.items()) if isinstance(one, h5py.Group)):
+        for segment in (one for _, one in sorted(image.items()) if isinstance(one, h5py.Group)):
+            says = {key: value for group in (image, segment) for key, value in group.attrs.items()}
+            for item in (one for _, one in sorted(segment.items()) if isinstance(one, h5py.Dataset)):
+                if _first(item.attrs, _NAMES) is not None and item.size > 1:
+                    label = _text(segment.attrs.get("segment_name", segment.attrs.get("name", "")))
+                    name = ", ".join(filter(None, (_text(_first(item.attrs, _NAMES)), label)))
+                    make = partial(_nanosurf_channel, path, item, says, name)
+                    channels.append(one_by_one(path, "NHF", name, make))
+    return channels
+
+
+def _nanosurf_channel(path: Path, item: Any, says: dict[str, Any], name: str) -> Channel:
+    """Counts over the range of their type stand for the calibrated range; rows and columns as stored."""
+    if "rect_axis_size" in says:
+        nx, ny = (int(one) for one in says["rect_axis_size"])
+        x_m, y_m = (float(one) for one in says.get("rect_axis_range", (0, 0)))
+    else:
+        nx, ny = int(says["image_points_per_line"]), int(says["image_number_of_lines"])
+        x_m, y_m = float(says.get("image_size_x", 0)), float(says.get("image_size_y", 0))
+    if item.shape not in ((ny, nx), (ny * nx,)):
+        raise InputError(f"{item.name}: shape", got=item.shape, wanted=f"{ny} lines of {nx} points")
+    low, high, unit = (_first(item.attrs, names) for names in (_LOW, _HIGH, _UNIT))
+    if item.dtype.kind not in "iu" or low is None or high is None or unit is None:
+        raise InputError(
+            f"{item.name}: calibration", got=f"{item.dtype}, {low} to {high} {unit}", wanted="counts"
+        )
+    return Channel(
+        name=name,
+        shape=(ny, nx),
+        unit=_text(unit) or "not a length",
+        size_um=extent_um(y_m, x_m, "m"),
+        load=partial(_load_nanosurf, path, item.name, (ny, nx), (float(low), float(high))),
+        header={key: _text(value) for key, value in {**says, **item.attrs}.items()},
+    )
+
+
+def _first(attributes: Any, names: tuple[str, ...]) -> Any:
+    return next((attributes[name] for name in names if name in attributes), None)
+
+
+def _load_nanosurf(path: Path, name: str, shape: tuple[int, int], range_: tuple[float, float]) -> Loaded:
+    import h5py
+
+    with foreign_parser(path, "NHF"), h5py.File(path) as file:
+        counts, fill = file[name][()].reshape(shape), file[name].fillvalue
+    info = np.iinfo(counts.dtype)
+    values = (counts.astype(np.float64) - info.min) / (float(info.max) - info.min) * (range_[1] - range_[0])
+    return np.where(counts == fill, np.nan, values + range_[0]) if fill else values + range_[0], None
 
 
 def _topostats_channel(path: Path, file: Any, name: str) -> Channel:

@@ -1,52 +1,100 @@
-"""Layouts: what was sent to the printer, as integer levels."""
+"""Layouts: what was sent to the printer, as integer levels, from files of levels or pictures of them."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.hashes import file_sha256
 from litho_data.readers.npy import load_array
-from litho_data.readers.registry import detect_format, require_file
+from litho_data.readers.registry import PICTURE, detect_format, require_file
 from litho_data.readers.tiff import open_tiff, single_sample
 
 _LARGEST_LEVEL = 255
+_WHITE = (255, 65535)
+# Of the files that the design package writes for a printer.
+_EXPORT = "litho-design/export/1"
 
 
-def read_layout(path: str | Path) -> np.ndarray:
+def read_layout(
+    path: str | Path, *, grey_per_level: float | None = None, levels: int | None = None
+) -> np.ndarray:
     """Levels of a layout, uint8 (ny, nx), row 0 on top.
 
     TIFF (any compression of tifffile and imagecodecs), PNG, BMP and NPY; a colour image counts as
-    grey if its colours are identical.
+    grey if its colours are identical. A file exported by the design package is read by the sidecar beside it.
+
+    Args:
+        path: the file.
+        grey_per_level: step of the grey values from level to level, if the file is a picture of the layout.
+        levels: how many there are. A picture whose values go beyond them is then taken for one whose white is
+            the highest level, if all its values are steps of it.
 
     Raises:
-        InputError: no such file, damaged, another format, a true colour image, or values that are
-            not integers from 0 to 255.
+        InputError: no such file, damaged, another format, a true colour image, values that are no levels or
+            no steps of grey, a sidecar of another file.
     """
     file = require_file(path)
-    readers = {"tiff": _tiff_pixels, "npy": load_array, "image": _image_pixels}
     kind = detect_format(file)
+    readers = {"tiff": _tiff_pixels, "npy": load_array, PICTURE: _image_pixels}
     if kind not in readers:
         raise InputError(f"layout {file}: format", got=kind, wanted="TIFF, PNG, BMP or NPY")
+    sidecar = _sidecar(file)
     pixels = single_sample(file, np.asarray(readers[kind](file)))
     if pixels.size == 0:
         raise InputError(f"layout {file}: shape", got=pixels.shape, wanted="at least one pixel")
-    if not _are_levels(pixels):
-        raise InputError(f"layout {file}: values", got=_range(pixels), wanted="integer levels from 0 to 255")
-    return pixels.astype(np.uint8)
-
-
-def _are_levels(pixels: np.ndarray) -> bool:
     if pixels.dtype.kind not in "uif" or not np.isfinite(pixels).all():
-        return False
-    in_range = pixels.min() >= 0 and pixels.max() <= _LARGEST_LEVEL
-    return bool(in_range and np.array_equal(pixels, np.floor(pixels)))
+        raise InputError(f"layout {file}: values", got=_range(pixels), wanted="integer levels from 0 to 255")
+    step = grey_per_level or sidecar.get("grey_per_level") or _white_step(pixels, levels)
+    found = np.rint(pixels / step)
+    if (
+        np.abs(pixels - found * step).max() > 0.5 * (step > 1)
+        or not 0 <= found.min() <= found.max() <= _LARGEST_LEVEL
+    ):
+        wanted = "integer levels from 0 to 255" if step == 1 else f"steps of {step:g} per level"
+        raise InputError(f"layout {file}: values", got=_range(pixels), wanted=wanted)
+    if marks := sidecar.get("marks"):
+        top, bottom, left, right = marks["element_px"]
+        found = found[top:bottom, left:right]
+    return found.astype(np.uint8)
+
+
+def _white_step(pixels: np.ndarray, levels: int | None) -> float:
+    """The step of a picture whose white is the highest level; 1 for levels."""
+    if levels is None or pixels.max() < levels:
+        return 1.0
+    for step in (one for white in _WHITE for one in (white / (levels - 1), float(white // (levels - 1)))):
+        on_steps = np.abs(pixels - np.rint(pixels / step) * step).max() <= 0.5
+        if step > 1 and on_steps and np.rint(pixels.max() / step) <= levels - 1:
+            return step
+    return 1.0
+
+
+def _sidecar(file: Path) -> dict[str, Any]:
+    """What the design package wrote about an exported file; empty for others.
+
+    Raises:
+        InputError: the sidecar is that of another file.
+    """
+    path = file.with_name(f"{file.name}.json")
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    if not isinstance(content, dict) or content.get("schema") != _EXPORT:
+        return {}
+    if content.get("file_sha256") != file_sha256(file):
+        raise InputError(f"layout {file}", got="another file than its sidecar says", wanted=str(path))
+    return content
 
 
 def _tiff_pixels(path: Path) -> np.ndarray:
     with open_tiff(path) as file:
-        if len(file.pages) != 1:
+        if len(file.pages) != 1 and not _sidecar(path):
             raise InputError(f"layout {path}: pages", got=len(file.pages), wanted="one image")
         return file.pages.first.asarray()
 

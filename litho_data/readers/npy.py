@@ -10,7 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from litho_data.foundation.errors import InputError
-from litho_data.readers.reader import MOST_BYTES_PER_PACKED_BYTE, Channel, Loaded, Reader, foreign_parser
+from litho_data.readers.reader import (
+    MOST_BYTES_PER_PACKED_BYTE,
+    Channel,
+    Loaded,
+    Reader,
+    foreign_parser,
+    in_memory,
+)
 
 _ZIP_MAGIC = b"PK\x03\x04"
 _NAME_AT = 30
@@ -29,7 +36,7 @@ def read_channels(path: Path) -> list[Channel]:
     array = load_array(path)
     if array.ndim != 2:
         raise InputError(f"{path}: shape", got=array.shape, wanted="two dimensions (ny, nx)")
-    return [_channel("array", array.shape, array.dtype, lambda: (np.array(array), None))]
+    return [_channel("array", array.shape, array.dtype, in_memory(array))]
 
 
 def read_archive(path: Path) -> list[Channel]:
@@ -94,5 +101,5 @@ def _is_archive(head: bytes) -> bool:
     return head.startswith(_ZIP_MAGIC) and head[_NAME_AT : _NAME_AT + length].endswith(b".npy")
 
 
-ARCHIVE_READER = Reader("npz", lambda path, head: _is_archive(head), read_archive, self_describing=False)
-READER = Reader("npy", lambda path, head: head.startswith(b"\x93NUMPY"), read_channels, self_describing=False)
+ARCHIVE_READER = Reader("npz", lambda path, head: _is_archive(head), read_archive)
+READER = Reader("npy", lambda path, head: head.startswith(b"\x93NUMPY"), read_channels)

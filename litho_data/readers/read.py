@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-import gzip
-import zlib
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import um_per
-from litho_data.readers.reader import MOST_BYTES_PER_PACKED_BYTE, Channel, Loaded, Reader
+from litho_data.readers.missing import extreme_note, without_missing
+from litho_data.readers.packed import unpacked
+from litho_data.readers.reader import DAMAGED, MOST_BYTES_PER_PACKED_BYTE, Channel, Loaded, Reader
 from litho_data.readers.registry import PICTURE, detect_format, reader_of, require_file
 from litho_data.scan import Axis, Scan
 
 # Files state sizes rounded to a few digits.
 _SIZE_TOLERANCE = 1e-4
+# Sides of a scan that coordinates without a unit may have.
+_SMALLEST_UM, _LARGEST_UM = 0.1, 1000.0
 
 
 def read_scan(
@@ -32,6 +32,8 @@ def read_scan(
     channel: str | None = None,
     fast_axis: Axis | None = None,
     full_scale_um: float | None = None,
+    missing: Sequence[float | str] | None = None,
+    defaults: bool = False,
 ) -> Scan:
     """Read one height map.
 
@@ -45,19 +47,34 @@ def read_scan(
         fast_axis: ``"x"`` or ``"y"``, if it is known and the file does not state it.
         full_scale_um: height of the largest integer value, for images that hold integers:
             height = value / largest value · full_scale_um. Replaces ``unit``.
+        missing: numbers (as in the file) and words that mark pixels which were not measured, besides those
+            that the file states; an empty list says that there are none.
+        defaults: ``unit`` and ``size_um`` hold for many files, and only where a file states none; otherwise
+            they must not contradict it.
 
     Raises:
         InputError: unreadable, no or several height channels, a missing or contradicting unit or
-            size, nothing finite in the map.
+            size, what looks like a mark of missing pixels and is not named, nothing finite in the map.
     """
     with unpacked(require_file(path)) as file:
         reader = _settle_format(file, format)
         chosen = _choose(file, _read_channels(reader, file), channel)
         values, mask = chosen.load()
+    values = without_missing(file, chosen, values, missing)
+    notes = list(chosen.notes)
+    if defaults and unit is not None and chosen.unit is not None:
+        if um_per(unit) != um_per(chosen.unit):
+            notes.append(f"heights in {chosen.unit}, as the file states, not in {unit}")
+        unit = None
+    if defaults and size_um is not None and chosen.size_um is not None:
+        if not np.allclose(size_um, chosen.size_um, rtol=_SIZE_TOLERANCE, atol=0):
+            side_y, side_x = chosen.size_um
+            notes.append(f"{side_y:g} × {side_x:g} µm, as the file states, not {size_um}")
+        size_um = None
     stated_unit, factor = _settle_unit(file, chosen, values, unit, full_scale_um)
     return Scan(
-        height_um=_to_um(np.asarray(values, dtype=np.float64), factor),
-        pitch_um=_settle_pitch(file, chosen, size_um),
+        height_um=_to_um(values, factor),
+        pitch_um=_settle_pitch(file, chosen, size_um, stated_unit),
         name=file.stem,
         channel=chosen.name,
         unit=stated_unit,
@@ -66,6 +83,7 @@ def read_scan(
         header=chosen.header,
         source=str(path),
         format=reader.name,
+        notes=(*notes, *filter(None, [extreme_note(values)])),
     )
 
 
@@ -96,9 +114,7 @@ def _read_channels(reader: Reader, file: Path) -> list[Channel]:
     for channel in channels:
         if channel.shape[0] * channel.shape[1] > MOST_BYTES_PER_PACKED_BYTE * size:
             got = f"{size} bytes for {channel.shape[0]} x {channel.shape[1]} pixels"
-            raise InputError(
-                f"{file} ({reader.name})", got=got, wanted="more", hint="the file may be damaged"
-            )
+            raise InputError(f"{file} ({reader.name})", got=got, wanted="more", hint=DAMAGED)
     return channels
 
 
@@ -114,6 +130,8 @@ def _choose(file: Path, channels: list[Channel], name: str | None) -> Channel:
     if name is not None:
         for channel in channels:
             if channel.name == name:
+                if channel.problem:
+                    raise InputError(channel.problem)
                 if not channel.is_height:
                     raise InputError(f"{file}: channel {name!r} is no height", got=f"unit {channel.unit!r}")
                 return channel
@@ -156,9 +174,9 @@ def _to_um(values: np.ndarray, factor: float) -> np.ndarray:
 
 
 def _settle_pitch(
-    file: Path, channel: Channel, size_um: tuple[float, float] | None
+    file: Path, channel: Channel, size_um: tuple[float, float] | None, unit: str
 ) -> tuple[float, float] | None:
-    stated = channel.size_um
+    stated = channel.size_um or _size_of_extent(channel, unit)
     if size_um is not None:
         if len(size_um) != 2 or not all(np.isfinite(size) and size > 0 for size in size_um):
             raise InputError(f"{file}: size_um", got=size_um, wanted="two positive numbers (y, x) in µm")
@@ -168,48 +186,18 @@ def _settle_pitch(
     return None if size is None else (size[0] / channel.shape[0], size[1] / channel.shape[1])
 
 
+def _size_of_extent(channel: Channel, unit: str) -> tuple[float, float] | None:
+    """(y, x) in µm of coordinates without a unit: µm or that of the heights, whichever alone makes sense."""
+    if channel.extent is None or channel.full_scale is not None:
+        return None
+    sizes = {(channel.extent[0] * factor, channel.extent[1] * factor) for factor in (1.0, um_per(unit))}
+    likely = [size for size in sizes if min(size) >= _SMALLEST_UM and max(size) <= _LARGEST_UM]
+    return likely[0] if len(likely) == 1 else None
+
+
 def _settle_fast_axis(file: Path, channel: Channel, fast_axis: Axis | None) -> Axis | None:
     if fast_axis not in (None, "x", "y"):
         raise InputError(f"{file}: fast axis", got=repr(fast_axis), wanted="'x' or 'y'")
     if fast_axis is not None and channel.fast_axis is not None and fast_axis != channel.fast_axis:
         raise InputError(f"{file}: fast axis", got=fast_axis, wanted=f"{channel.fast_axis} as in the file")
     return channel.fast_axis or fast_axis
-
-
-_MAGIC = b"\x1f\x8b"
-_MOST_BYTES = 1 << 30
-_PIECE = 1 << 20
-
-
-@contextmanager
-def unpacked(path: Path) -> Iterator[Path]:
-    """The file itself, or a temporary file with the content of a gzip file; messages name the gzip file.
-
-    Raises:
-        InputError: damaged, or more than 1 GiB inside.
-    """
-    with path.open("rb") as stream:
-        packed = stream.read(len(_MAGIC)) == _MAGIC
-    if not packed:
-        yield path
-        return
-    with TemporaryDirectory() as folder:
-        content = Path(folder) / path.name.removesuffix(".gz")
-        _unpack(path, content)
-        try:
-            yield content
-        except InputError as error:
-            raise InputError(str(error).replace(str(content), str(path))) from error
-
-
-def _unpack(path: Path, content: Path) -> None:
-    try:
-        with gzip.open(path) as source, content.open("wb") as target:
-            while piece := source.read(_PIECE):
-                target.write(piece)
-                if target.tell() > _MOST_BYTES:
-                    raise InputError(f"{path}: content", got="more than 1 GiB", wanted="one scan")
-    except (OSError, EOFError, zlib.error) as error:
-        raise InputError(
-            f"cannot unpack {path}", got=str(error) or type(error).__name__, hint="the file may be damaged"
-        ) from error

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import logging
+import re
+import struct
 import warnings
-from collections.abc import Callable, Iterator
+import zlib
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 
@@ -21,6 +26,15 @@ _MAX_PIXELS = 2**28
 MOST_BYTES_PER_PACKED_BYTE = 1032
 _LOGGERS = ("tifffile", "igor2", "SurfaceTopography")
 _LONGEST_MESSAGE = 160
+
+# What parsers say of a file that was cut off or changed; all else is a kind that they do not know.
+_CUT = re.compile(
+    r"truncat|too (small|short)|not (large )?enough|end of (file|data|stream)|ended|corrupt|damage|checksum|"
+    r"crc|incomplete|reach(es)? beyond",
+    re.IGNORECASE,
+)
+_OF_CUT_FILES = (EOFError, MemoryError, OSError, struct.error, zlib.error, BadZipFile)
+DAMAGED = "the file may be damaged"
 
 Loaded = tuple[np.ndarray, np.ndarray | None]
 
@@ -38,6 +52,11 @@ class Channel:
         full_scale: the largest value of an integer image; None for real numbers.
         fast_axis: None if the file does not state it.
         header: everything that the file states, as strings.
+        problem: why the channel cannot be read; empty if it can.
+        x_is: what of the file runs along x, in words.
+        extent: (y, x) from edge to edge in a unit that the file does not state.
+        words: what stands in place of numbers, and the first line with it; those pixels are NaN.
+        notes: what a reader should know who trusts the map.
     """
 
     name: str
@@ -48,23 +67,30 @@ class Channel:
     full_scale: float | None = None
     fast_axis: Axis | None = None
     header: dict[str, str] = field(default_factory=dict)
+    problem: str = ""
+    x_is: str = "a row of the file"
+    extent: tuple[float, float] | None = None
+    words: Mapping[str, int] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        if min(self.shape) < 2 or self.shape[0] * self.shape[1] > _MAX_PIXELS:
+        if not self.problem and (min(self.shape) < 2 or self.shape[0] * self.shape[1] > _MAX_PIXELS):
             raise InputError(
                 f"channel {self.name!r}: size in pixels",
                 got=f"{self.shape[0]} x {self.shape[1]}",
                 wanted=f"2 x 2 up to {_MAX_PIXELS} pixels",
-                hint="the file may be damaged",
+                hint=DAMAGED,
             )
 
     @property
     def is_height(self) -> bool:
         """Whether the unit is a length, or only the caller can know it."""
-        return self.unit is None or is_length(self.unit)
+        return not self.problem and (self.unit is None or is_length(self.unit))
 
     def describe(self) -> str:
         """Name, size and unit in a few words, for messages."""
+        if self.problem:
+            return f"{self.name!r} (not read: {self.problem})"
         unit = "no unit" if self.unit is None else self.unit
         return f"{self.name!r} ({self.shape[0]} x {self.shape[1]}, {unit})"
 
@@ -77,14 +103,33 @@ class Reader:
         name: as in ``format = "…"`` of a card and ``--format`` of the commands.
         recognises: ``recognises(path, head)``: whether a file has this format; ``head`` is its first 64 KiB.
         read_channels: the channels of a file, in the order of the file; InputError where it is damaged.
-        self_describing: whether such files can state the unit of their heights and their size; where they
-            cannot, a card has to.
     """
 
     name: str
     recognises: Callable[[Path, bytes], bool]
     read_channels: Callable[[Path], list[Channel]]
-    self_describing: bool = True
+
+
+def one_by_one(path: Path, kind: str, name: str, make: Callable[[], Channel]) -> Channel:
+    """The channel, or one that says why it cannot be read, so that it takes no other with it."""
+    try:
+        with foreign_parser(path, kind):
+            return make()
+    except InputError as error:
+        return Channel(name, (0, 0), None, None, partial(_refuse, str(error)), problem=str(error))
+
+
+def _refuse(problem: str) -> Loaded:
+    raise InputError(problem)
+
+
+def in_memory(values: np.ndarray) -> Callable[[], Loaded]:
+    """What loads a map that has been read already."""
+    return partial(_copied, values)
+
+
+def _copied(values: np.ndarray) -> Loaded:
+    return np.array(values), None
 
 
 def extent_um(y: float, x: float, unit: str | None) -> tuple[float, float] | None:
@@ -93,6 +138,11 @@ def extent_um(y: float, x: float, unit: str | None) -> tuple[float, float] | Non
         return None
     size = float(y) * um_per(unit), float(x) * um_per(unit)
     return size if all(np.isfinite(size)) and min(size) > 0 else None
+
+
+def unknown_content(path: Path, head: bytes) -> InputError:
+    """The error for a file that no reader recognises."""
+    return InputError(f"{path}: format", got=f"unknown content {head[:8]!r}", wanted="a known AFM format")
 
 
 def with_unique_names(channels: list[Channel]) -> list[Channel]:
@@ -134,7 +184,9 @@ def foreign_parser(path: Path, kind: str) -> Iterator[None]:
     except InputError:
         raise
     except Exception as error:
-        reason = f"{type(error).__name__}: {error}"[:_LONGEST_MESSAGE]
-        raise InputError(
-            f"cannot read {path} as {kind}", got=reason, hint="the file may be damaged"
-        ) from error
+        reason = f"{type(error).__name__}: {error}"
+        cut = isinstance(error, _OF_CUT_FILES) or _CUT.search(reason)
+        what = (
+            f"cannot read {path} as {kind}" if cut else f"{path} is not read: kind of channel, format {kind}"
+        )
+        raise InputError(what, got=reason[:_LONGEST_MESSAGE], hint=DAMAGED if cut else "") from error

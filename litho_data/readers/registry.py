@@ -5,19 +5,25 @@ from __future__ import annotations
 from pathlib import Path
 
 from litho_data.foundation.errors import InputError, unknown_name
-from litho_data.readers import gsf, gwy, hdf5, npy, text_matrix, tiff, vendor
-from litho_data.readers.reader import Reader
+from litho_data.readers import arrays, gsf, gwy, hdf5, npy, surfer, sxm, text_matrix, tiff, vendor, wyko
+from litho_data.readers.reader import Reader, unknown_content
 
-# In the order in which they are asked.
+# In the order in which they are asked: formats that sign their files first, then the containers and texts
+# that anybody writes.
 _READERS = [
     gsf.READER,
     gwy.READER,
     npy.READER,
     npy.ARCHIVE_READER,
-    tiff.READER,
+    sxm.READER,
+    surfer.READER,
+    wyko.READER,
+    arrays.NETCDF_READER,
+    arrays.MATLAB_READER,
     hdf5.READER,
-    text_matrix.READER,
     vendor.READER,
+    tiff.READER,
+    text_matrix.READER,
 ]
 PICTURE = "image"
 _PICTURE_MAGIC = (b"\x89PNG\r\n\x1a\n", b"BM")
@@ -57,12 +63,19 @@ def reader_of(format: str) -> Reader:
 
 
 def detect_format(path: Path) -> str:
-    """Name of the first format that recognises the file; ``"image"`` for PNG and BMP, pictures at most."""
+    """Name of the first format that recognises the file; ``"image"`` for PNG and BMP, pictures at most.
+
+    Raises:
+        InputError: none does.
+    """
     with path.open("rb") as stream:
         head = stream.read(_HEAD_BYTES)
     if head.startswith(_PICTURE_MAGIC):
         return PICTURE
-    return next(reader.name for reader in _READERS if reader.recognises(path, head))
+    for reader in _READERS:
+        if reader.recognises(path, head):
+            return reader.name
+    raise unknown_content(path, head)
 
 
 def require_file(path: str | Path) -> Path:

@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import is_length, um_per
 from litho_data.readers.confined import confined
-from litho_data.readers.reader import Channel, Loaded, Reader, foreign_parser
+from litho_data.readers.reader import Channel, Loaded, Reader, foreign_parser, one_by_one
 
 if TYPE_CHECKING:
     from tifffile import TiffFile
@@ -22,22 +23,35 @@ if TYPE_CHECKING:
 _MAGIC = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 _XRESOLUTION, _YRESOLUTION = 282, 283
 _OME_SIZES = ("PhysicalSizeY", "PhysicalSizeX")
-_JPK_FILE_FORMAT_VERSION = 0x8000
+# Makers keep heights beside a picture in tags of their own.
+_SIGNED = {0x8000: "jpk", 50432: "ps"}
+_LEXT, _FIRST_PAGES = "TiffTagDescData", 8
+_FIRST_PRIVATE = 32768
+_GDAL_METADATA, _GDAL_NODATA = 42112, 42113
+_STRAIGHT_LINE = 0
+_WITHOUT_MEANING = {"", "none", "gray value", "grey value", "pixel", "pixels", "inch"}
 
 
 def read_channels(path: Path) -> list[Channel]:
     """One channel per page; RGB pages count as one channel if their samples are identical.
 
     The size of a pixel is taken from OME metadata, or from the resolution tags if ImageJ names their
-    unit; otherwise these usually describe paper, not the sample.
+    unit; otherwise these usually describe paper, not the sample. Calibrations of the values by ImageJ and
+    GDAL are applied, GDAL's no-data value is a missing pixel. Reduced copies of a page are passed over.
 
     Raises:
-        InputError: damaged file, or pages that are not two-dimensional images.
+        InputError: damaged file.
     """
     with open_tiff(path) as file:
-        imagej = file.imagej_metadata or {}
-        ome_um = _ome_pitch_um(file.ome_metadata or "")
-        return [_channel(path, index, page, imagej, ome_um) for index, page in enumerate(file.pages)]
+        pages: list[tuple[int, Any]] = [
+            (k, page) for k, page in enumerate(file.pages) if not _is_reduced(page)
+        ]
+        imagej, ome = file.imagej_metadata or {}, file.ome_metadata or ""
+        pitches = _ome_pitches_um(ome, len(pages))
+        return [
+            one_by_one(path, "TIFF", f"page {index}", partial(_channel, path, index, page, imagej, pitch))
+            for (index, page), pitch in zip(pages, pitches, strict=True)
+        ]
 
 
 @contextmanager
@@ -49,36 +63,102 @@ def open_tiff(path: Path) -> Iterator[TiffFile]:
         yield file
 
 
+def maker_of(path: Path) -> str:
+    """SurfaceTopography's name of the format whose maker signs this TIFF; empty if none does."""
+    try:
+        with open_tiff(path) as file:
+            tags = file.pages.first.tags
+            pages = islice(file.pages, _FIRST_PAGES)
+            lext = any(_LEXT in str(getattr(page, "description", "")) for page in pages)
+            return "lext" if lext else next((kind for code, kind in _SIGNED.items() if code in tags), "")
+    except InputError:  # the reader that tries it next reports it
+        return ""
+
+
 def _channel(
     path: Path, index: int, page: Any, imagej: dict[str, Any], ome_um: tuple[float, float] | None
 ) -> Channel:
     samples = page.samplesperpixel
+    what = f"{path} page {index}"
     if page.ndim not in (2, 3) or (page.ndim == 3 and page.shape[-1] != samples):
-        raise InputError(f"{path} page {index}: shape", got=page.shape, wanted="a two-dimensional image")
+        raise InputError(f"{what}: shape", got=page.shape, wanted="a two-dimensional image")
     shape = (int(page.shape[0]), int(page.shape[1]))
     dtype = np.dtype(page.dtype)
     if dtype.kind not in "uif":
-        raise InputError(
-            f"{path} page {index}: type of the values", got=dtype, wanted="integers or real numbers"
-        )
+        raise InputError(f"{what}: type of the values", got=dtype, wanted="integers or real numbers")
+    if page.photometric.name in ("PALETTE", "MINISWHITE") and dtype.kind in "ui":
+        raise InputError(f"{what}: values", got=page.photometric.name.lower(), wanted="larger is higher")
+    if hidden := [tag.code for tag in page.tags if _may_hold_heights(tag, shape)]:
+        raise InputError(f"{what}: heights may stand in private tag {hidden[0]} of an unknown maker")
+    scale, offset, unit, missing = _calibration(what, page, imagej)
     return Channel(
         name=f"page {index}",
         shape=shape,
-        unit=None,
+        unit=unit,
         size_um=(shape[0] * ome_um[0], shape[1] * ome_um[1]) if ome_um else _size_um(page, imagej, shape),
-        load=partial(_load, path, index),
-        full_scale=float(np.iinfo(dtype).max) if dtype.kind in "ui" else None,
+        load=partial(_load, path, index, scale, offset, missing),
+        full_scale=float(np.iinfo(dtype).max) if dtype.kind in "ui" and (scale, offset) == (1, 0) else None,
         header={str(key): str(value) for key, value in imagej.items()}
         | ({"ImageDescription": str(page.description)} if page.description else {}),
     )
 
 
-def _ome_pitch_um(text: str) -> tuple[float, float] | None:
-    """(y, x) of the only image in OME metadata; its lengths are in µm unless it names another unit."""
-    images = re.findall(r"<(?:\w+:)?Pixels\s[^>]*", text)
-    if len(images) != 1:
-        return None
-    says = dict(re.findall(r'(PhysicalSize[XY](?:Unit)?)\s*=\s*"([^"]*)"', images[0]))
+def _is_reduced(page: Any) -> bool:
+    return bool(page.is_reduced)
+
+
+def _may_hold_heights(tag: Any, shape: tuple[int, int]) -> bool:
+    import tifffile
+
+    unknown = tag.code >= _FIRST_PRIVATE and tag.code not in tifffile.TIFF.TAGS
+    return unknown and tag.valuebytecount >= shape[0] * shape[1]
+
+
+def _calibration(
+    what: str, page: Any, imagej: dict[str, Any]
+) -> tuple[float, float, str | None, float | None]:
+    """Scale, offset, unit and no-data value of a page.
+
+    Raises:
+        InputError: a calibration of ImageJ that is no straight line.
+    """
+    scale, offset, unit, missing = 1.0, 0.0, None, None
+    if "c0" in imagej or "c1" in imagej or int(imagej.get("cf", _STRAIGHT_LINE)) != _STRAIGHT_LINE:
+        if int(imagej.get("cf", _STRAIGHT_LINE)) != _STRAIGHT_LINE or "c2" in imagej:
+            stated = ", ".join(f"{key} = {imagej[key]}" for key in ("cf", "c0", "c1", "c2") if key in imagej)
+            raise InputError(f"{what}: calibration by ImageJ", got=stated, wanted="a straight line, cf = 0")
+        scale, offset = float(imagej.get("c1", 1.0)), float(imagej.get("c0", 0.0))
+    if str(imagej.get("vunit", "")).strip().lower() not in _WITHOUT_MEANING:
+        unit = _plain_unit(imagej["vunit"])
+    if _GDAL_METADATA in page.tags:
+        items = re.findall(r'<Item\s[^>]*role="(\w+)"[^>]*>([^<]*)<', str(page.tags[_GDAL_METADATA].value))
+        says = {role.lower(): value.strip() for role, value in items}
+        scale, offset = float(says.get("scale", scale)), float(says.get("offset", offset))
+        unit = says.get("unittype") or unit
+    if _GDAL_NODATA in page.tags:
+        missing = float(str(page.tags[_GDAL_NODATA].value).strip("\0 "))
+    return scale, offset, unit, missing
+
+
+def _plain_unit(unit: Any) -> str:
+    return str(unit).replace("\\u00B5", "µ").strip()
+
+
+def _ome_pitches_um(text: str, pages: int) -> list[tuple[float, float] | None]:
+    """(y, x) of every page from OME metadata; its lengths are in µm unless it names another unit.
+
+    Pages belong to the images in turn, as many to each as its sizes in z, channel and time say.
+    """
+    pitches: list[tuple[float, float] | None] = []
+    for image in re.findall(r"<(?:\w+:)?Pixels\s[^>]*", text):
+        planes = [int(one) for one in re.findall(r'Size[ZCT]\s*=\s*"(\d{1,6})"', image)]
+        pitches += [_ome_pitch_um(image)] * min(int(np.prod(planes, dtype=float)), pages)
+    return pitches if len(pitches) == pages else [None] * pages
+
+
+def _ome_pitch_um(image: str) -> tuple[float, float] | None:
+    """(y, x) that the element of one image states."""
+    says = dict(re.findall(r'(PhysicalSize[XY](?:Unit)?)\s*=\s*"([^"]*)"', image))
     try:
         pitch = [float(says[key]) * um_per(says.get(f"{key}Unit", "µm")) for key in _OME_SIZES]
     except (KeyError, ValueError):  # not stated, no number, or in pixels
@@ -87,7 +167,7 @@ def _ome_pitch_um(text: str) -> tuple[float, float] | None:
 
 
 def _size_um(page: Any, imagej: dict[str, Any], shape: tuple[int, int]) -> tuple[float, float] | None:
-    unit = str(imagej.get("unit", "")).replace("\\u00B5", "µ")
+    unit = _plain_unit(imagej.get("unit", ""))
     if not is_length(unit) or _XRESOLUTION not in page.tags or _YRESOLUTION not in page.tags:
         return None
     pixels_per_unit = [page.tags[code].value for code in (_YRESOLUTION, _XRESOLUTION)]
@@ -97,19 +177,30 @@ def _size_um(page: Any, imagej: dict[str, Any], shape: tuple[int, int]) -> tuple
     return shape[0] * pitch[0], shape[1] * pitch[1]
 
 
-def _load(path: Path, index: int) -> Loaded:
+def _load(path: Path, index: int, scale: float, offset: float, missing: float | None) -> Loaded:
     with open_tiff(path) as file:
-        return single_sample(path, file.pages[index].asarray()), None
+        pixels = single_sample(path, file.pages[index].asarray())
+    if (scale, offset, missing) == (1, 0, None):
+        return pixels, None
+    values = pixels.astype(np.float64)
+    bad = (
+        np.isclose(values, missing, rtol=1e-7, atol=0)
+        if missing is not None
+        else np.zeros(values.shape, bool)
+    )
+    return np.where(bad, np.nan, values * scale + offset), None
 
 
 def single_sample(path: Path, pixels: np.ndarray) -> np.ndarray:
-    """(ny, nx) from (ny, nx) or from (ny, nx, 3 or 4) whose colours are identical.
+    """(ny, nx) from (ny, nx) or from (ny, nx, 1 to 4) whose colours are identical and which hides nothing.
 
     Raises:
-        InputError: the colours differ, so a pixel has no single value.
+        InputError: the colours differ, so a pixel has no single value, or pixels are transparent.
     """
-    if pixels.ndim == 3 and pixels.shape[2] in (1, 3, 4):
-        colours = pixels[..., :3]
+    if pixels.ndim == 3 and 1 <= pixels.shape[2] <= 4:
+        if pixels.shape[2] in (2, 4) and (pixels[..., -1] != pixels[..., -1].max()).any():
+            raise InputError(f"{path} has transparent pixels", wanted="an image without them")
+        colours = pixels[..., : (pixels.shape[2] - 1) | 1]
         if (colours == colours[..., :1]).all():
             return pixels[..., 0]
         raise InputError(
@@ -120,19 +211,11 @@ def single_sample(path: Path, pixels: np.ndarray) -> np.ndarray:
     return pixels
 
 
-def _recognises(path: Path, head: bytes) -> bool:
-    return head.startswith(_MAGIC) and not _is_jpk(path)
-
-
-def _is_jpk(path: Path) -> bool:
-    """Whether a TIFF is a JPK file: its first page then carries JPK's private tags."""
-    try:
-        with open_tiff(path) as file:
-            return _JPK_FILE_FORMAT_VERSION in file.pages.first.tags
-    except InputError:  # the reader that tries it next reports it
-        return False
+def is_tiff(head: bytes) -> bool:
+    """Whether a file begins like a TIFF."""
+    return head.startswith(_MAGIC)
 
 
 READER = Reader(
-    "tiff", _recognises, confined(read_channels, ("tifffile", "imagecodecs")), self_describing=False
+    "tiff", lambda path, head: is_tiff(head), confined(read_channels, ("tifffile", "imagecodecs"))
 )

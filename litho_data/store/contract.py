@@ -10,11 +10,11 @@ import re
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, damaged
+from litho_data.foundation.errors import InputError, damaged, require_known
 from litho_data.foundation.names import require_plain_name
 from litho_data.foundation.quantities import (
     HEIGHT_UM,
@@ -26,7 +26,15 @@ from litho_data.foundation.quantities import (
     Range,
 )
 from litho_data.store.access import array_of, group_of, has_child, values_of
-from litho_data.store.schema import LAYOUT_VARIABLES, OPTIONAL_COLUMNS, SAMPLE_VARIABLES, SIGMA
+from litho_data.store.schema import (
+    LAYOUT_VARIABLES,
+    OPTIONAL_COLUMNS,
+    SAMPLE_VARIABLES,
+    SIGMA,
+    TEXT_COLUMNS,
+    WRITE,
+    Surround,
+)
 
 if TYPE_CHECKING:
     import zarr
@@ -46,25 +54,35 @@ def require_complete(path: Path) -> None:
             f"store {path}",
             got=f"no {name}",
             wanted="every file that it declares",
-            hint="copy or build it again; another program has to write empty chunks too",
+            hint="copy or build it again; a program that copies its groups has to write empty chunks too",
         )
 
 
 def missing_files(path: Path) -> Iterator[str]:
     """Names of files that a store declares and does not have: documents of groups and arrays, and chunks."""
     names = file_names(path)
-    documents = dict(read_documents(path, names))
     with damaged(f"metadata of {path}"):
-        root = json.loads(documents[_DOCUMENT])
+        documents = {name: json.loads(content) for name, content in read_documents(path, names)}
+        root = documents[_DOCUMENT]
         declared = {
             f"{name}/{_DOCUMENT}" for name in (root.get("consolidated_metadata") or {}).get("metadata", {})
         }
         yield from sorted(declared - documents.keys())
-        for name, content in documents.items():
-            document = json.loads(content)
-            if document["node_type"] == "array":
+        groups = [name for name, document in documents.items() if document["node_type"] == "group"]
+        for name, document in documents.items():
+            left_out = groups == [_DOCUMENT] and _may_be_left_out(name, document)
+            if document["node_type"] == "array" and not left_out:
                 folder = name.removesuffix(_DOCUMENT)
                 yield from (folder + chunk for chunk in _chunks(document) if folder + chunk not in names)
+
+
+def _may_be_left_out(name: str, document: Mapping[str, Any]) -> bool:
+    """Whether a copy by xarray, which has no groups, may lack the chunk of this array.
+
+    It writes none of nothing but fill values: order 0 of a single scan, and what no scan of a part states.
+    """
+    column = name.removesuffix(f"/{_DOCUMENT}")
+    return column in (*OPTIONAL_COLUMNS, *TEXT_COLUMNS) or (column == "order" and document["shape"] == [1])
 
 
 def file_names(path: Path) -> set[str]:
@@ -107,13 +125,17 @@ def _chunks(document: Mapping[str, Any]) -> Iterator[str]:
         yield between.join(numbers) or "0"
 
 
+def _by_xarray(attributes: Mapping[str, Any]) -> bool:
+    """Whether xarray wrote this array of truth values: it makes them small integers, and says so."""
+    return attributes.get("dtype") == "bool"
+
+
 def checked_attributes(root: zarr.Group, path: Path) -> dict[str, Any]:
     """Name, pitch, level height, number of levels and write table of a store; InputError if one is wrong."""
     attributes = dict(root.attrs)
-    name, write = str(attributes.get("name", path.name.partition(".")[0])), attributes.get("write")
-    if write is not None and not isinstance(write, dict):
-        raise InputError(f"attribute write of {path}", got=repr(write), wanted="a table or none")
-    checked: dict[str, Any] = {"name": require_plain_name(f"name of {path}", name), "write": write}
+    name = require_plain_name(f"name of {path}", str(attributes.get("name", path.name.partition(".")[0])))
+    write = {key.removeprefix(WRITE): value for key, value in attributes.items() if key.startswith(WRITE)}
+    checked: dict[str, Any] = {"name": name, "write": write or None}
     for key, limits in (("pitch_um", PITCH_UM), ("level_height_um", LEVEL_HEIGHT_UM), ("levels", LEVELS)):
         value = attributes.get(key)
         whole = key == "levels"
@@ -121,8 +143,8 @@ def checked_attributes(root: zarr.Group, path: Path) -> dict[str, Any]:
             wanted = f"a {'whole ' if whole else ''}number from {limits}"
             raise InputError(f"attribute {key} of {path}", got=repr(value), wanted=wanted)
         checked[key] = value if whole else float(value)
-    if write and "field_um" in write:
-        LENGTH_UM.require(f"attribute write.field_um of {path}", write["field_um"])
+    if "field_um" in write:
+        LENGTH_UM.require(f"attribute write_field_um of {path}", write["field_um"])
     return checked
 
 
@@ -138,7 +160,8 @@ def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array]:
             continue
         array = arrays[variable.name]
         wanted = (count, 3, 3) if variable.name == "scan_to_layout" else (count, *field)
-        if array.shape != wanted or array.dtype != np.dtype(variable.dtype):
+        as_integers = variable.dtype == "bool" and _by_xarray(array.attrs)
+        if array.shape != wanted or (array.dtype != np.dtype(variable.dtype) and not as_integers):
             got, wanted_text = f"{array.dtype} {array.shape}", f"{variable.dtype} {wanted}"
             raise InputError(f"array {variable.name} of {path}", got=got, wanted=wanted_text)
     return arrays
@@ -170,6 +193,11 @@ def checked_columns(root: zarr.Group, path: Path) -> dict[str, list[Any]]:
                 f"{name} of {path}", [value for value in stated if value is not None]
             )
             columns[name] = [None if value is None else float(value) for value in stated]
+    for name in TEXT_COLUMNS:
+        if has_child(root, name):
+            columns[name] = [str(value) for value in values_of(root, name)]
+    for word in columns.get("surround", []):
+        require_known(f"surround of {path}", word, ("", *get_args(Surround)))
     for name, values in columns.items():
         if len(values) != len(ids):
             raise InputError(

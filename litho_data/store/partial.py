@@ -98,7 +98,8 @@ class PartialStore:
 
         scan_id = piece.record["id"]
         root = zarr.open_group(self.store, mode="r+")
-        write_scan_group(root, scan_id, piece.arrays, {"use": piece.record["use"]})
+        pitch_um = piece.record.get("pitch_um", piece.record["read"]["pitch_um"])
+        write_scan_group(root, scan_id, piece.arrays, piece.record["use"], pitch_um)
         samples = {v.name: piece.arrays[v.name] for v in LAYOUT_VARIABLES if v.name in piece.arrays}
         with atomic_file(self._pieces / f"{scan_id}.npz") as temporary, open(temporary, "wb") as stream:
             np.savez(stream, allow_pickle=False, **samples)

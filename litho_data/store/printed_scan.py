@@ -35,6 +35,9 @@ class PrintedScan:
         height_sigma_um: float32 (ny, nx), µm, standard uncertainty of ``height_um``, the scan's offset aside;
             NaN where not valid, None if the store has none.
         groups: what the card's pattern of ids says beside the print, such as the field; by name.
+        instrument: that scanned it, if the card's table names it.
+        surround: what lies around the printed field: ``substrate`` (bare), ``continues`` (more of the print)
+            or ``unknown``, if the card does not say.
     """
 
     id: str
@@ -59,6 +62,8 @@ class PrintedScan:
     tip_radius_um: float | None = None
     height_sigma_um: np.ndarray | None = None
     groups: Mapping[str, str] = field(default_factory=dict)
+    instrument: str = ""
+    surround: str = "unknown"
 
     def __repr__(self) -> str:
         ny, nx = self.shape

@@ -39,6 +39,7 @@ from litho_data.store.schema import (
     OPTIONAL_COLUMNS,
     SAMPLE_VARIABLES,
     SIGMA,
+    TEXT_COLUMNS,
     VARIABLES,
     DatasetId,
     dataset_sha256,
@@ -124,6 +125,8 @@ class Store:
             tip_radius_um=self._tip_radius_um(row),
             height_sigma_um=self.sample(SIGMA.name, row) if SIGMA.name in self._arrays else None,
             groups=self._groups(scan_id),
+            instrument=self._word("instrument", row),
+            surround=self._word("surround", row) or str((self.write or {}).get("surround", "unknown")),
         )
 
     def _groups(self, scan_id: str) -> dict[str, str]:
@@ -147,7 +150,8 @@ class Store:
         Raises:
             InputError: a stored chunk that does not decode.
         """
-        values = decoded(self._arrays[name], row, f"{name} of scan {self.ids[row]} in {self.path}")
+        what = f"{name} of scan {self.ids[row]} in {self.path}"
+        values = decoded(self._arrays[name], row, what).astype(VARIABLES[name].dtype, copy=False)
         if name == "scan_to_layout":
             return values
         ny, nx = self.shapes[row]
@@ -239,6 +243,7 @@ class Store:
             value = self._column(name, row)
             if value is not None:
                 identity[name] = value
+        identity |= {name: word for name in TEXT_COLUMNS if (word := self._word(name, row))}
         samples = {v.name: self.sample(v.name, row) for v in SAMPLE_VARIABLES}
         require_possible(samples, self.levels, f"scan {self.ids[row]} of {self.path}")
         hashes = {v.name: v.sample_sha256(samples[v.name]) for v in SAMPLE_VARIABLES}
@@ -264,6 +269,9 @@ class Store:
         with damaged(f"tip_radius_um of {self.path}"):
             value = float(self.quality["tip_radius_um"].iloc[row])
         return None if math.isnan(value) else value
+
+    def _word(self, name: str, row: int) -> str:
+        return self._columns[name][row] if name in self._columns else ""
 
     def _column(self, name: str, row: int) -> float | None:
         return self._columns[name][row] if name in self._columns else None

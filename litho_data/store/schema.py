@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -13,6 +13,8 @@ from litho_data.foundation.quantities import DOSE, ORDER, PLACE_UM, Range
 from litho_data.foundation.results import Record
 
 STORE_SCHEMA = "litho-data/store/1"
+WRITE = "write_"
+"""Begins the attributes of the root that hold the card's ``[write]`` table."""
 
 
 @dataclass(frozen=True)
@@ -84,7 +86,10 @@ OPTIONAL_COLUMNS = {
     "tip": ORDER,
     "pixel_size": Range(1e-3, 1e3),
 }
-"""Numbers per scan from the card's table, and what they may be; NaN where a row has none."""
+"""Numbers per scan from the card's table, and what they may be; coordinates, NaN where a row has none."""
+Surround = Literal["substrate", "continues", "unknown"]
+TEXT_COLUMNS = ("instrument", "surround")
+"""Words per scan from the card's table; coordinates where the card has them, empty where a row has none."""
 
 
 def dataset_sha256(facts: Mapping[str, Any], scans: Sequence[Mapping[str, Any]]) -> str:

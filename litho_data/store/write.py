@@ -1,4 +1,4 @@
-"""Writing a dataset store: whole scans per chunk, groups of scans per shard, every chunk with a checksum."""
+"""Writing a dataset store: one scan per chunk, as other tools copy it too; every chunk with a checksum."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from litho_data.store.schema import (
     SAMPLE_VARIABLES,
     SCAN_VARIABLES,
     SIGMA,
+    TEXT_COLUMNS,
     VARIABLES,
 )
 
@@ -22,12 +23,12 @@ if TYPE_CHECKING:
     import pandas as pd
     import zarr
 
-_SHARD_BYTES = 16 << 20
-_MAX_SCANS_PER_SHARD = 16
 PADDING = {"mask_level": 0, "height_um": np.nan, "valid": False, "height_sigma_um": np.nan}
 """What fills the place beyond a layout that is smaller than the largest."""
 # By default a chunk of nothing but fill values has no file, and would look like one that was lost.
 _EVERY_CHUNK: Any = {"write_empty_chunks": True}
+# What an image of a scan shows.
+_SHOWN = ("levelled_height_um", "raw_height_um")
 _OWN_FRAME = {"y": "scan_y", "x": "scan_x"}
 # Attributes of the CF conventions beyond unit and name.
 _CF: dict[str, dict[str, Any]] = {
@@ -37,14 +38,32 @@ _CF: dict[str, dict[str, Any]] = {
 
 
 def write_scan_group(
-    root: zarr.Group, scan_id: str, arrays: Mapping[str, np.ndarray], attributes: dict
+    root: zarr.Group, scan_id: str, arrays: Mapping[str, np.ndarray], use: str, pitch_um: Sequence[float]
 ) -> None:
-    """Group ``scans/<id>``: what one scan looked like in its own frame."""
+    """Group ``scans/<id>``: what one scan looked like in its own frame, an image of OME-Zarr as well.
+
+    Args:
+        root: an open group.
+        scan_id: name of the scan.
+        arrays: in its own frame, by name; others are passed over.
+        use: as in the card's table.
+        pitch_um: (y, x) of the scan.
+    """
+    shown = next(name for name in _SHOWN if name in arrays)
+    attributes = {"use": use, "ome": _ome(scan_id, shown, pitch_um)}
     group = root.create_group(f"scans/{scan_id}", overwrite=True, attributes=attributes)
     for variable in SCAN_VARIABLES:
         if variable.name in arrays:
             array = arrays[variable.name]
             _create(group, variable.name, array.shape, chunks=array.shape)[...] = array
+
+
+def _ome(name: str, path: str, pitch_um: Sequence[float]) -> dict[str, Any]:
+    """OME-NGFF 0.5: one image of heights with its pixel size; lengths along y and x in micrometres."""
+    axes = [{"name": axis, "type": "space", "unit": "micrometer"} for axis in "yx"]
+    scale = [{"type": "scale", "scale": [float(one) for one in pitch_um]}]
+    dataset = {"path": path, "coordinateTransformations": scale}
+    return {"version": "0.5", "multiscales": [{"name": name, "axes": axes, "datasets": [dataset]}]}
 
 
 def write_samples(
@@ -53,30 +72,28 @@ def write_samples(
     load: Callable[[str], Mapping[str, np.ndarray]],
     pitch_um: float,
 ) -> None:
-    """The arrays over all scans, streamed one shard at a time.
+    """The arrays over all scans, streamed one scan at a time.
 
     Args:
         root: an open group.
-        scans: per scan ``id``, ``print``, ``order``, ``shape`` (ny, nx), ``columns`` (optional numbers) and
-            ``arrays`` (names of what was made of it).
+        scans: per scan ``id``, ``print``, ``order``, ``shape`` (ny, nx), ``columns`` (optional numbers and
+            words) and ``arrays`` (names of what was made of it).
         load: the sample arrays of an id.
         pitch_um: pitch of the layout grid, µm.
     """
     ny, nx = (max(scan["shape"][axis] for scan in scans) for axis in (0, 1))
-    group_size = int(np.clip(_SHARD_BYTES // (ny * nx * 4), 1, _MAX_SCANS_PER_SHARD))
     field_shape = {"y": ny, "x": nx, "row": 3, "column": 3}
     with_sigma = all(SIGMA.name in scan["arrays"] for scan in scans)
     arrays = {}
     for variable in LAYOUT_VARIABLES if with_sigma else SAMPLE_VARIABLES:
         sample = tuple(field_shape[dim] for dim in variable.sample_dims)
-        shape, shards = (len(scans), *sample), (min(group_size, len(scans)), *sample)
-        arrays[variable.name] = _create(root, variable.name, shape, chunks=(1, *sample), shards=shards)
+        arrays[variable.name] = _create(root, variable.name, (len(scans), *sample), chunks=(1, *sample))
     if with_sigma:
         arrays["height_um"].attrs["ancillary_variables"] = f"valid {SIGMA.name}"
-    for start in range(0, len(scans), group_size):
-        rows = scans[start : start + group_size]
-        for name, block in _padded_blocks(list(arrays), rows, load, ny, nx).items():
-            arrays[name][start : start + len(rows)] = block
+    for row, scan in enumerate(scans):
+        loaded = load(scan["id"])
+        for name, array in arrays.items():
+            array[row] = _padded(name, loaded[name], array.shape[1:])
 
     write_strings(root, "scan", [scan["id"] for scan in scans], "scan")
     write_strings(root, "print", [scan["print"] for scan in scans], "scan")
@@ -87,10 +104,14 @@ def write_samples(
             values = [scan["columns"].get(name, np.nan) for scan in scans]
             unit = {"units": "um" if name.endswith("_um") else "degree" if name.endswith("_deg") else "1"}
             write_numbers(root, name, np.array(values), "scan", attributes=unit)
+    for name in TEXT_COLUMNS:
+        if any(name in scan["columns"] for scan in scans):
+            write_strings(root, name, [str(scan["columns"].get(name, "")) for scan in scans], "scan")
     for axis, count in (("y", ny), ("x", nx)):
         described = {"long_name": f"{axis} of the pixel centres, layout frame", "axis": axis.upper()}
         centres = pixel_centres_um(count, pitch_um)
-        write_numbers(root, f"{axis}_um", centres, axis, attributes={"units": "um", **described})
+        for name in (f"{axis}_um", axis):
+            write_numbers(root, name, centres, axis, attributes={"units": "um", **described})
 
 
 def pixel_centres_um(count: int, pitch_um: float) -> np.ndarray:
@@ -186,23 +207,10 @@ def _compressors() -> list[Any]:
     return [BloscCodec(cname="zstd", clevel=5, shuffle="shuffle"), Crc32cCodec()]
 
 
-def _padded_blocks(
-    names: Sequence[str],
-    scans: Sequence[Mapping[str, Any]],
-    load: Callable[[str], Mapping[str, np.ndarray]],
-    ny: int,
-    nx: int,
-) -> dict[str, np.ndarray]:
-    padding = {name: PADDING[name] for name in names if name in PADDING}
-    blocks = {
-        name: np.full((len(scans), ny, nx), fill, dtype=VARIABLES[name].dtype)
-        for name, fill in padding.items()
-    }
-    blocks["scan_to_layout"] = np.empty((len(scans), 3, 3))
-    for row, scan in enumerate(scans):
-        arrays = load(scan["id"])
-        rows, columns = scan["shape"]
-        for name in padding:
-            blocks[name][row, :rows, :columns] = arrays[name]
-        blocks["scan_to_layout"][row] = arrays["scan_to_layout"]
-    return blocks
+def _padded(name: str, sample: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """A sample in the upper left corner of the common shape; ``PADDING`` elsewhere."""
+    if sample.shape == shape:
+        return sample
+    whole = np.full(shape, PADDING[name], dtype=VARIABLES[name].dtype)
+    whole[: sample.shape[0], : sample.shape[1]] = sample
+    return whole

@@ -141,6 +141,8 @@ def jobs_of_card(path: str | Path, *, first: int = 0, printer: Printer | None = 
         )
     folder = Path(path).parent
     table = read_table(folder / card.ids.table) if card.ids.table else {}
+    if not isinstance(card.layout.files, str):
+        raise InputError(f"layouts of card {path}", got="several patterns", wanted="one")
     before, after = card.layout.files.split("{id}", 1)
     files = sorted(folder.glob(f"{before}*{after}"))
     if not files:

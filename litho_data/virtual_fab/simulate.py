@@ -214,6 +214,8 @@ def _write_card(
         slow_axis="y" if full else "",
         write_field_um=write_field_um if full else None,
         grating_um=grating_um if full else None,
+        # Tilt and bow are among the effects that are planted.
+        levelled=True,
     ).write(raw)
 
 

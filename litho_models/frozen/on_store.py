@@ -19,14 +19,15 @@ def predict_file(model: FrozenSimulator, layout: str | Path, out: str | Path) ->
     """Predict the print of a layout of levels and write its height to ``out``; returns it, (ny, nx) µm.
 
     Args:
-        layout: TIFF, PNG, BMP or NPY of integer levels, sampled at the model's pitch.
+        layout: TIFF, PNG, BMP or NPY of integer levels or of their grey values, sampled at the model's pitch.
         out: a ``.gsf`` (opens in Gwyddion) or ``.npy`` file.
 
     Raises:
         InputError: a layout that cannot be read or has levels beyond the calibrated range, or another suffix.
     """
     pitch_um = model.pitch_um
-    height = model.predict(read_layout(layout) * np.float32(model.card["level_height_um"]))
+    levels = read_layout(layout, levels=model.card["levels"])
+    height = model.predict(levels * np.float32(model.card["level_height_um"]))
     write_heights(out, height, pitch_um=(pitch_um, pitch_um), title=f"{Path(layout).name} by {model.name}")
     return height
 

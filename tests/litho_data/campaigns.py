@@ -65,6 +65,7 @@ files = "scans/{{id}}.txt"
 format = "text-matrix"
 unit = {unit}
 size_um = {size_um}
+levelled = true
 [ids]
 print = 'P(?P<print>\\d)\\d'
 {more}

@@ -18,7 +18,7 @@ import tifffile
 
 from litho_data.build.build import build_dataset
 from litho_data.build.jobs import Skipped, field_jobs, finish
-from litho_data.build.operations import load_recipe
+from litho_data.build.operations import no_recipe
 from litho_data.build.result import BuildResult, report_folder
 from litho_data.cards.listing import list_fields
 from litho_data.foundation.errors import InputError
@@ -295,7 +295,7 @@ def test_a_full_disk_loses_neither_the_older_store_nor_the_scans_that_are_done(
 
 def test_a_damaged_or_outdated_piece_is_made_again(campaign: Path, own_campaign: Path) -> None:
     out = own_campaign / "again.zarr"
-    jobs = field_jobs(list_fields(own_campaign / "card.toml"), load_recipe(None))
+    jobs = field_jobs(list_fields(own_campaign / "card.toml"), no_recipe())
     with partial_store(out) as partial:
         partial.open()
         for job in jobs:
@@ -313,7 +313,7 @@ def test_a_damaged_or_outdated_piece_is_made_again(campaign: Path, own_campaign:
 
 def test_a_changed_card_is_another_piece(campaign: Path) -> None:
     listing = list_fields(campaign / "card.toml")
-    job = field_jobs(listing, load_recipe(None))[0]
+    job = field_jobs(listing, no_recipe())[0]
     levels = listing.card.layout.model_copy(update={"levels": 14})
     changed = [
         replace(job, card=listing.card.model_copy(update={"layout": levels})),

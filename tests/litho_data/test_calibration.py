@@ -13,7 +13,7 @@ from litho_data import build_dataset, open_store, verify
 from litho_data.build.calibration import calibrate
 from litho_data.build.day_tip import tip_of
 from litho_data.build.jobs import field_jobs
-from litho_data.build.operations import load_recipe
+from litho_data.build.operations import no_recipe
 from litho_data.cards.listing import list_fields
 from litho_data.cli.app import app
 from litho_data.foundation.errors import InputError
@@ -139,7 +139,7 @@ def test_a_build_applies_the_scales_and_carries_their_uncertainty(calibrated: Pa
 
 
 def test_a_blind_tip_is_found_in_calibrated_lengths(calibrated: Path) -> None:
-    (job, *_) = field_jobs(list_fields(calibrated / "card.toml"), load_recipe(None))
+    (job, *_) = field_jobs(list_fields(calibrated / "card.toml"), no_recipe())
     found, true = tip_of(job), peak_radius(height_of(layout_of(0), 0), (PITCH_UM, PITCH_UM))
     assert found is not None
     assert found.radius_um is not None

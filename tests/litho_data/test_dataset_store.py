@@ -87,7 +87,8 @@ def test_the_whole_store_opens_as_one_tree(campaign: Path) -> None:
 def test_one_chunk_is_one_scan(campaign: Path) -> None:
     array = array_of(open_store(campaign / "prints.zarr").root, "height_um")
     assert array.chunks == (1, 112, 112)
-    assert array.shards == (3, 112, 112)
+    # A shard of several scans keeps other tools from copying a part of them.
+    assert array.shards is None
 
 
 def test_broken_contracts_are_named(own_campaign: Path, tmp_path: Path) -> None:
@@ -123,3 +124,74 @@ def test_a_store_without_quality_and_provenance_can_be_read(own_campaign: Path) 
     assert list(store.quality["scan"]) == store.ids
     assert store.manifest == {}
     assert values_of(store.root, "valid").all()
+
+
+@pytest.mark.parametrize("ids", [["P11", "P12", "P21"], ["P12", "P21"], ["P11"]])
+def test_a_copy_or_a_part_by_xarray_is_a_store_again(campaign: Path, tmp_path: Path, ids: list[str]) -> None:
+    import xarray
+
+    path = campaign / "prints.zarr"
+    whole = open_store(path)
+    part = xarray.open_zarr(path).sel(scan=ids)
+    part.to_zarr(tmp_path / "copy.zarr", mode="w")
+    copy = open_store(tmp_path / "copy.zarr")
+    assert copy.ids == ids
+    assert (copy.sha256 == whole.sha256) == (ids == whole.ids)
+    assert copy.write == whole.write
+    for scan_id in ids:
+        for name in ("mask_level", "height_um", "valid", "scan_to_layout"):
+            one, other = getattr(copy.scan(scan_id), name), getattr(whole.scan(scan_id), name)
+            np.testing.assert_array_equal(one, other)
+            assert one.dtype == other.dtype
+    part.to_netcdf(tmp_path / "copy.nc")
+    with xarray.open_dataset(tmp_path / "copy.nc") as back:
+        np.testing.assert_array_equal(back["height_um"], part["height_um"])
+        # Coordinates of the pixel centres choose by length.
+        assert float(back.sel(x=5.04, y=1.01, method="nearest")["x_um"]) == pytest.approx(5.05)
+
+
+def test_a_copy_by_xarray_may_lack_what_states_nothing_and_no_more(campaign: Path, tmp_path: Path) -> None:
+    import xarray
+
+    copy = tmp_path / "copy.zarr"
+    whole = xarray.open_zarr(campaign / "prints.zarr")
+    unknown = xarray.full_like(whole["order"], np.nan, dtype=float)
+    whole.assign_coords(dose=unknown.rename("dose")).to_zarr(copy)
+    assert not (copy / "dose" / "c").exists()
+    scan = open_store(copy).scan("P11")
+    assert scan.dose is None
+    chunks = sorted(
+        path for path in copy.rglob("*") if "c" in path.relative_to(copy).parts and path.is_file()
+    )
+    assert len(chunks) > 15
+    for chunk in chunks:
+        content = chunk.read_bytes()
+        chunk.unlink()
+        with pytest.raises(InputError, match="every file that it declares"):
+            open_store(copy)
+        chunk.write_bytes(content)
+
+
+def test_a_copy_with_its_groups_has_to_be_whole(campaign: Path, tmp_path: Path) -> None:
+    import xarray
+
+    tree = xarray.open_datatree(campaign / "prints.zarr", engine="zarr")
+    tree.to_zarr(tmp_path / "lacks.zarr")
+    with pytest.raises(InputError, match="write empty chunks"):
+        open_store(tmp_path / "lacks.zarr")
+    tree.to_zarr(tmp_path / "whole.zarr", write_empty_chunks=True)
+    assert open_store(tmp_path / "whole.zarr").sha256 == open_store(campaign / "prints.zarr").sha256
+
+
+def test_the_scans_are_images_of_ome_zarr(campaign: Path) -> None:
+    """What its tools follow: names in ``labels``, then axes, pixel size and path of an image."""
+    root = open_store(campaign / "prints.zarr").root
+    groups = [root[letter] for letter in root.attrs["labels"]]
+    names = [name for group in groups for name in group.attrs["labels"]]
+    assert names == ["../scans/P11", "../scans/P12", "../scans/P21"]
+    ome = root["scans/P12"].attrs["ome"]
+    (image,) = ome["multiscales"]
+    (dataset,) = image["datasets"]
+    assert (ome["version"], [axis["name"] for axis in image["axes"]]) == ("0.5", ["y", "x"])
+    assert dataset["coordinateTransformations"] == [{"type": "scale", "scale": [0.1, 0.1]}]
+    assert root["scans/P12"][dataset["path"]].shape == (128, 128)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import get_args
 
 import numpy as np
@@ -11,6 +12,8 @@ from hypothesis import strategies as st
 
 from litho_data.foundation.errors import InputError
 from litho_data.level import (
+    LevellingWarning,
+    Recipe,
     align_rows,
     fix_zero,
     level_facet,
@@ -348,3 +351,21 @@ def test_rotation_brings_a_plane_to_a_constant_and_keeps_shape() -> None:
 def test_what_cannot_be_levelled_is_refused(operate, message: str) -> None:
     with pytest.raises(InputError, match=message):
         operate(rough((12, 14), 14))
+
+
+@pytest.mark.parametrize("method", ["median", "median-of-differences", "trimmed-mean", "matching"])
+@pytest.mark.parametrize("direction", ["horizontal", "vertical"])
+def test_row_alignment_warns_where_a_block_moves_lines(method: str, direction: str) -> None:
+    """A block over 55 % of each line that it crosses moves the lines, and 45 % of their pixels stay."""
+    rng = np.random.default_rng(0)
+    offsets = 0.05 * rng.standard_normal((128, 1))
+    z = 0.003 * rng.standard_normal((128, 128)) + offsets
+    recipe = Recipe.from_dict({"step": [{"op": "align-rows", "method": method, "direction": direction}]})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # offsets of whole lines, large as they are, are what it is for
+        recipe.apply(z if direction == "horizontal" else z.T)
+    z[30:90, 20:90] += 0.8
+    with pytest.warns(
+        LevellingWarning, match=r"0\.[4-9]\d* µm where \d\d% of the pixels of a line did not move"
+    ):
+        recipe.apply(z if direction == "horizontal" else z.T)

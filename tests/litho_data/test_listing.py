@@ -152,3 +152,51 @@ def test_an_expression_that_never_ends_is_one_line(monkeypatch: pytest.MonkeyPat
     assert listing.prints_of(ids, r"(?P<print>[A-Z])\d") == ["A", None, None, None]
     assert listing.prints_of(ids, r"(?P<print>\w+)\d") == ["A", "B2", "c", "ÄÖ"]
     assert listing.prints_of(ids, None) == ids
+
+
+@pytest.mark.parametrize(
+    ("scans", "layouts"),
+    [("scans/{id}.*", "layouts/{id}.*"), ('["scans/{id}.txt", "scans/{id}.gwy"]', "layouts/{id}.tif")],
+)
+def test_patterns_of_several_formats(tmp_path: Path, scans: str, layouts: str) -> None:
+    files = ["layouts/P11.tif", "layouts/P12.tif", "scans/P11.txt", "scans/P12.gwy", "scans/P13.gwy"]
+    card = folder_with(tmp_path, files)
+    text = card.read_text().replace('"scans/{id}.txt"', scans if scans[0] == "[" else f'"{scans}"')
+    card.write_text(text.replace("layouts/{id}.tif", layouts))
+    listing = list_fields(card)
+    assert [one.scan.name for one in listing.fields] == ["P11.txt", "P12.gwy"]
+    assert listing.left_aside[0].reason == f"no file {layouts.replace('{id}', 'P13')}"
+    (tmp_path / "scans" / "P11.gwy").touch()
+    listing = list_fields(card)
+    assert [one.id for one in listing.fields] == ["P12"]
+    assert "several files: P11." in listing.left_aside[0].reason
+
+
+@pytest.mark.parametrize("code", ["utf-8-sig", "utf-16"])
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_a_table_as_spreadsheets_of_any_language_write_it(tmp_path: Path, separator: str, code: str) -> None:
+    card = folder_with(tmp_path, PAIRS, more='table = "scans.csv"')
+    rows = [
+        "id;dose;unit;size_um;format;channel;fast_axis;instrument;surround",
+        "P11;1,25;nm;27,5;auto;Höhe;y;Gerät 1;substrate",
+        "P12;0,75;;54 x 27,5;;;;;",
+    ]
+    text = "\r\n".join(rows).replace(";", separator)
+    (tmp_path / "scans.csv").write_bytes(text.encode(code))
+    one, other = list_fields(card).fields
+    assert one.columns == {"dose": 1.25, "instrument": "Gerät 1", "surround": "substrate"}
+    says = {"unit": "nm", "size_um": (27.5, 27.5), "format": "auto", "channel": "Höhe", "fast_axis": "y"}
+    assert one.read == says
+    assert (other.columns, other.read) == ({"dose": 0.75}, {"size_um": (54.0, 27.5)})
+
+
+@pytest.mark.parametrize(
+    ("cell", "message"),
+    [("unit\nP11,V", "unit, got 'V'"), ("size_um\nP11,0", "size_um"), ("format\nP11,xls", "format"),
+     ("fast_axis\nP11,z", "fast_axis"), ("surround\nP11,air", "surround")],
+)  # fmt: skip
+def test_what_a_table_says_of_a_file_is_checked(tmp_path: Path, cell: str, message: str) -> None:
+    card = folder_with(tmp_path, PAIRS, more='table = "scans.csv"')
+    (tmp_path / "scans.csv").write_text(f"id,{cell}\n")
+    with pytest.raises(InputError, match=message):
+        list_fields(card)

@@ -206,6 +206,10 @@ def test_what_contradicts_the_file_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="'Phase' is no height"):
         read_scan(path, channel="Phase")
     assert read_scan(path, unit="m", size_um=SIZE_UM).pitch_um == pytest.approx(PITCH_UM)
+    # As defaults for many files they give way to what the file states.
+    scan = read_scan(path, unit="nm", size_um=(9.0, 9.0), defaults=True)
+    assert (scan.unit, scan.pitch_um) == ("m", pytest.approx(PITCH_UM))
+    assert [note.split(",")[0] for note in scan.notes] == ["heights in m", "2.5 × 1.6 µm"]
 
 
 def test_missing_files(tmp_path: Path) -> None:

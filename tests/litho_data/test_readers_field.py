@@ -60,8 +60,8 @@ def test_spellings_of_other_programs(tmp_path: Path, content: str | bytes) -> No
         ("1.5;2.5\n1,5;2.5\n", "line 2, got .*one separator"),
         ("1 2\n1e400 3\n", "line 2, got '1e400', wanted a number below"),
         ("1 2\nx y 3 4\n", "line 2.*first rows are '1 2' | 'x y 3 4'"),
-        ("0 1\n" * 6, "holds a profile.*format 'text-matrix' reads it"),
-        ("0 1 2\n" * 9, "holds a point cloud.*format 'text-matrix' reads it"),
+        ("0 1\n" * 6, "holds a profile.*wanted a height map"),
+        ("0 1 2\n" * 9, "holds a point cloud.*wanted a height map"),
     ],
 )
 def test_text_that_is_no_map_is_refused_with_its_rows(tmp_path: Path, content: str, message: str) -> None:
@@ -71,7 +71,6 @@ def test_text_that_is_no_map_is_refused_with_its_rows(tmp_path: Path, content: s
 
 
 def test_the_hints_are_true(tmp_path: Path) -> None:
-    assert read_text(tmp_path, "0 1 2\n" * 9, format="text-matrix").shape == (9, 3)
     with pytest.raises(InputError, match=r"first row begins 1e-07, 2e-07.*unit 'm'"):
         read_text(tmp_path, ROWS, unit=None)
 

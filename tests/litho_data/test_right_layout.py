@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 
 from litho_data.build import right_layout
 from litho_data.build.build import build_dataset
-from litho_data.build.right_layout import doubts
+from litho_data.build.right_layout import doubts, prints_of
 from litho_data.register.topography import pearson
 from litho_data.store import open_store
 from tests.litho_data.campaigns import MARGIN_PX, height_of, layout_of, write_campaign
@@ -51,7 +51,8 @@ def doses(layouts: int, seed: int) -> dict[str, dict[str, Any]]:
 
 
 def doubts_of(prints: dict[str, dict[str, Any]]) -> dict[str, str]:
-    return doubts([record_of(name, one) for name, one in prints.items()], lambda name: prints[name])
+    records = [record_of(name, one) for name, one in prints.items()]
+    return doubts(prints_of(records, lambda name: prints[name]))
 
 
 def record_of(name: str, one: dict[str, Any]) -> dict[str, Any]:

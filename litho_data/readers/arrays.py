@@ -1,0 +1,244 @@
+"""Arrays that describe themselves: HDF5 of any program, NetCDF 3 and 4, MATLAB; scale, unit, axes applied."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.units import is_length, um_per
+from litho_data.readers.confined import confined
+from litho_data.readers.reader import Channel, Loaded, Reader, foreign_parser, one_by_one
+
+_NUMBERS = "uif"
+_MATLAB_7 = b"MATLAB 7.3 MAT-file"
+_APPLIED = ("scale_factor", "add_offset")
+_MISSING = ("_FillValue", "missing_value")
+_RANGE = ("valid_min", "valid_max", "valid_range")
+# Other attributes with numbers that would change the values, if one knew how.
+_UNKNOWN = re.compile(
+    r"scal(e|ing)|offset|gain|calib|slope|intercept|factor|multipl|conver|_unsigned|lsb", re.I
+)
+_UNEVEN = 1e-3
+_OF_DIMENSIONS = ("DIMENSION_LIST", "REFERENCE_LIST", "CLASS", "NAME", "_Netcdf4Dimid", "_Netcdf4Coordinates")
+_NO_COORDINATE = b"This is a netCDF dimension but not"
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """Positions along one dimension and the unit that the file states, or a stated length alone."""
+
+    values: np.ndarray | None
+    unit: str | None
+    length: float | None = None
+
+    def extent(self, count: int) -> float | None:
+        """From edge to edge; None if it is not known.
+
+        Raises:
+            InputError: uneven steps.
+        """
+        if self.length is not None:
+            return self.length
+        if self.values is None or len(self.values) != count or count < 2:
+            return None
+        steps = np.diff(self.values)
+        if not np.allclose(steps, steps.mean(), rtol=_UNEVEN, atol=0) or not steps.mean():
+            raise InputError("coordinates", got="uneven steps", wanted="even ones")
+        return abs(float(steps.mean())) * count
+
+
+def array_channel(
+    name: str,
+    dtype: np.dtype,
+    stored_shape: tuple[int, ...],
+    raw: Callable[[], np.ndarray],
+    attributes: Mapping[str, Any],
+    dims: tuple[str, str] = ("", ""),
+    coordinates: Mapping[str, Coordinate] | None = None,
+) -> Channel:
+    """The channel of a two-dimensional array: [y, x] unless the names of its dimensions say otherwise.
+
+    ``raw`` reads its values. Where the coordinate along y falls, the order of the file is kept all the same.
+
+    Raises:
+        InputError: attributes that change the values in a way that is not known here, with their names; no
+            real numbers; coordinates at uneven steps.
+    """
+    says = {key: _plain(value) for key, value in attributes.items()}
+    unknown = [f"{key} = {value}" for key, value in says.items() if _changes(key, value)]
+    if unknown:
+        raise InputError(
+            "values", got=", ".join(unknown), wanted="scale_factor and add_offset, or plain values"
+        )
+    if dtype.kind not in _NUMBERS:
+        raise InputError("values", got=dtype, wanted="integers or real numbers")
+    turned = dims[0].lower().startswith("x") and not dims[1].lower().startswith("x")
+    known, (y, x) = coordinates or {}, dims[::-1] if turned else dims
+    shape = stored_shape[::-1] if turned else stored_shape
+    along = [known.get(dim, Coordinate(None, None)) for dim in (y, x)]
+    extents = [one.extent(count) for one, count in zip(along, shape, strict=True)]
+    units = [one.unit for one in along]
+    size_um = extent = None
+    if extents[0] and extents[1]:
+        if all(unit is not None and is_length(unit) for unit in units):
+            size_um = extents[0] * um_per(str(units[0])), extents[1] * um_per(str(units[1]))
+        elif units == [None, None]:
+            extent = (extents[0], extents[1])
+    unit = says.get("units", says.get("unit"))
+    scaled = any(key in says for key in _APPLIED)
+    return Channel(
+        name=name,
+        shape=(int(shape[0]), int(shape[1])),
+        unit=str(unit) if unit not in (None, "", "1") else None,
+        size_um=size_um,
+        load=partial(_values, raw, says, turned),
+        full_scale=float(np.iinfo(dtype).max) if dtype.kind in "ui" and not scaled else None,
+        header={key: str(value) for key, value in says.items()},
+        x_is=f"the {'first' if turned else 'second'} index" + (f", {x}" if x else ""),
+        extent=extent,
+    )
+
+
+def _changes(key: str, value: Any) -> bool:
+    number = isinstance(value, int | float | np.ndarray | list)
+    return key not in (*_APPLIED, *_MISSING, *_RANGE) and number and bool(_UNKNOWN.search(key))
+
+
+def _plain(value: Any) -> Any:
+    """A number, a text, or a list of numbers."""
+    if isinstance(value, bytes):
+        return value.decode("utf-8", errors="replace")
+    if isinstance(value, np.ndarray):
+        return _plain(value.reshape(-1)[0]) if value.size == 1 else value.tolist()
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _values(raw: Callable[[], np.ndarray], says: Mapping[str, Any], turned: bool) -> Loaded:
+    """Missing first, in the numbers of the file; then scale and offset."""
+    low, high = says.get("valid_range", (says.get("valid_min", -np.inf), says.get("valid_max", np.inf)))
+    missing = [float(one) for key in _MISSING if key in says for one in np.atleast_1d(says[key])]
+    values = np.asarray(raw(), dtype=np.float64)
+    bad = (values < low) | (values > high) | np.isin(values, missing)
+    values = values * float(says.get("scale_factor", 1.0)) + float(says.get("add_offset", 0.0))
+    values[bad] = np.nan
+    return np.ascontiguousarray(values.T if turned else values), None
+
+
+def _channels(path: Path, kind: str, made: Iterator[tuple[str, Callable[[], Channel]]]) -> list[Channel]:
+    with foreign_parser(path, kind):
+        channels = [one_by_one(path, kind, name, make) for name, make in made]
+    if not channels:
+        raise InputError(f"{path} ({kind}) holds no two-dimensional array of numbers")
+    return channels
+
+
+def read_hdf5(path: Path, file: Any) -> list[Channel]:
+    """One channel per two-dimensional dataset of an open HDF5 file; MATLAB's are stored column by column."""
+    datasets: list[Any] = []
+    file.visititems(
+        lambda name, item: datasets.append(item) if len(getattr(item, "shape", ())) == 2 else None
+    )
+    matlab = b"MATLAB" in path.open("rb").read(16)
+    maps = [item for item in datasets if min(item.shape) > 1 and item.dtype.kind in _NUMBERS]
+    named = [(item.name.strip("/"), partial(_hdf5_channel, path, item, matlab)) for item in maps]
+    return _channels(path, "HDF5", iter(named))
+
+
+def _hdf5_channel(path: Path, item: Any, matlab: bool) -> Channel:
+    raw = partial(_dataset, path, item.name)
+    scales = [list(item.dims[axis].values()) for axis in (0, 1)]
+    dims = [
+        item.dims[k].label or (at[0].name.rsplit("/", 1)[-1] if at else "") for k, at in enumerate(scales)
+    ]
+    if matlab:
+        dims = ["x", "y"]
+    held = {
+        dim: _coordinate(at[0][()], at[0].attrs)
+        for dim, at in zip(dims, scales, strict=True)
+        if at and not bytes(at[0].attrs.get("NAME", b"")).startswith(_NO_COORDINATE)
+    }
+    attributes = {key: value for key, value in item.attrs.items() if key not in _OF_DIMENSIONS}
+    return array_channel(
+        item.name.strip("/"), item.dtype, item.shape, raw, attributes, (dims[0], dims[1]), held
+    )
+
+
+def _dataset(path: Path, name: str) -> np.ndarray:
+    import h5py
+
+    with foreign_parser(path, "HDF5"), h5py.File(path) as file:
+        return file[name][()]
+
+
+def _coordinate(values: np.ndarray, attributes: Mapping[str, Any]) -> Coordinate:
+    unit = attributes.get("units", attributes.get("unit"))
+    length = attributes.get("length")
+    numbers = np.asarray(values, dtype=np.float64) if np.asarray(values).dtype.kind in _NUMBERS else None
+    return Coordinate(
+        numbers,
+        None if unit is None else str(_plain(unit)),
+        None if length is None else float(_plain(length)),
+    )
+
+
+def read_netcdf(path: Path) -> list[Channel]:
+    """One channel per two-dimensional variable of a NetCDF 3 file; scale, unit and missing by CF's names."""
+    from scipy.io import netcdf_file
+
+    with foreign_parser(path, "NetCDF"), netcdf_file(path, "r", mmap=False) as file:
+        held = {
+            name: _coordinate(np.array(one[:]), one._attributes)
+            for name, one in file.variables.items()
+            if one.dimensions == (name,)
+        }
+        arrays = {name: one for name, one in file.variables.items() if len(one.shape) == 2}
+        return _channels(
+            path,
+            "NetCDF",
+            (
+                (name, partial(_in_memory, name, one[:], one._attributes, one.dimensions, held))
+                for name, one in arrays.items()
+                if min(one.shape) > 1
+            ),
+        )
+
+
+def _in_memory(name: str, values: np.ndarray, *described: Any) -> Channel:
+    native = np.array(values, dtype=values.dtype.newbyteorder("="))
+    return array_channel(name, native.dtype, native.shape, partial(np.array, native), *described)
+
+
+def read_matlab(path: Path) -> list[Channel]:
+    """One channel per matrix of a MATLAB file, its rows along y."""
+    if path.open("rb").read(len(_MATLAB_7)) == _MATLAB_7:
+        import h5py
+
+        with foreign_parser(path, "MATLAB 7.3"), h5py.File(path) as file:
+            return read_hdf5(path, file)
+    from scipy.io import loadmat
+
+    with foreign_parser(path, "MATLAB"):
+        held = {name: one for name, one in loadmat(path).items() if isinstance(one, np.ndarray)}
+    maps = {name: one for name, one in held.items() if one.ndim == 2 and min(one.shape) > 1}
+    named = (
+        (name, partial(_in_memory, name, one, {})) for name, one in maps.items() if one.dtype.kind in "uifc"
+    )
+    return _channels(path, "MATLAB", named)
+
+
+_IMPORTS = ("scipy.io", "h5py")
+NETCDF_READER = Reader(
+    "netcdf", lambda path, head: head.startswith((b"CDF\x01", b"CDF\x02")), confined(read_netcdf, _IMPORTS)
+)
+MATLAB_READER = Reader(
+    "matlab",
+    lambda path, head: head.startswith(b"MATLAB "),
+    confined(read_matlab, _IMPORTS),
+)

@@ -1,0 +1,89 @@
+"""Missing pixels that a file marks by a number or a word: named by the caller, or asked about."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError
+from litho_data.readers.reader import Channel
+
+# What programs write where nothing was measured.
+_USUAL = np.array([
+    -999, 9999, 99999, 999999, 32766, 32767, -32768, 65535, 2147483647, 1.70141e38, 3.4028235e38, 9.96921e36,
+    1e20, 1e30, 1e31, 1e37, 1e38, 1e100, 1.7976931e308, -9999, -99999, -1.70141e38, -3.4028235e38,
+    -2147483648, -1e30, -1e37, -1e38, -1e100, -1.7976931e308,
+])  # fmt: skip
+_USUAL_TOLERANCE = 1e-4
+# A number that no program is known for must stand this many spans of the other values away.
+_FAR = 100
+_FEWEST_VALUES = 8
+# Values are held as float32, and the largest of all written with a few digits.
+_SAME, _SAME_OF_LARGE, _LARGE = 1e-6, 1e-3, 1e30
+# One value in so many pixels, where others are rare.
+_SHARE, _FEWEST, _TIMES = 0.002, 10, 20
+
+
+def without_missing(
+    file: Path, channel: Channel, values: np.ndarray, missing: Sequence[float | str] | None
+) -> np.ndarray:
+    """The values with NaN where they mark a missing pixel.
+
+    Args:
+        file: for messages.
+        channel: what was read.
+        values: (ny, nx) as in the file.
+        missing: the numbers and words that mark missing pixels; None if the caller does not say, an empty
+            list if there are none.
+
+    Raises:
+        InputError: a word that is not among them; without ``missing``, a number that looks like a mark.
+    """
+    marks = {one for one in missing or () if isinstance(one, str)}
+    for word, line in channel.words.items():
+        if word not in marks:
+            shown = f"{word[:24]!r}" if word else "an empty cell"
+            hint = f'if it marks pixels that were not measured: missing = ["{word[:24]}"]'
+            raise InputError(f"{file} line {line}", got=shown, wanted="a number", hint=hint)
+    values = np.array(values, dtype=np.float64)
+    for number in (one for one in missing or () if not isinstance(one, str)):
+        tolerance = _SAME_OF_LARGE if abs(number) > _LARGE else _SAME
+        values[np.isclose(values, number, rtol=tolerance, atol=0)] = np.nan
+    if missing is None and (found := _marks(values)):
+        shown = ", ".join(f"{value:g} in {count} pixels" for value, count in found)
+        keys = ", ".join(f"{value:.8g}" for value, _ in found)
+        hint = f"if it marks pixels that were not measured: missing = [{keys}]; if not: missing = []"
+        raise InputError(f"{file}: heights", got=f"{shown}, far from all others", wanted="heights", hint=hint)
+    return values
+
+
+def _marks(values: np.ndarray) -> list[tuple[float, int]]:
+    """Extreme values that look like marks, the most extreme first, and the number of their pixels."""
+    numbers, counts = np.unique(values[np.isfinite(values)], return_counts=True)
+    found: list[tuple[float, int]] = []
+    while len(numbers) > _FEWEST_VALUES:
+        spans = numbers[-1] - numbers[1], numbers[-2] - numbers[0]
+        gaps = numbers[1] - numbers[0], numbers[-1] - numbers[-2]
+        end = 0 if gaps[0] * max(spans[1], 1e-300) > gaps[1] * max(spans[0], 1e-300) else -1
+        value, count, gap, span = float(numbers[end]), int(counts[end]), float(gaps[end]), float(spans[end])
+        usual = np.isclose(value, _USUAL, rtol=_USUAL_TOLERANCE, atol=0).any()
+        if not (usual and gap > span) and not (count > 1 and gap > _FAR * span):
+            break
+        found.append((value, count))
+        numbers, counts = (numbers[1:], counts[1:]) if end == 0 else (numbers[:-1], counts[:-1])
+    return found
+
+
+def extreme_note(values: np.ndarray) -> str:
+    """What to know of a map with one extreme value in many pixels; empty for others."""
+    numbers, counts = np.unique(values[np.isfinite(values)], return_counts=True)
+    if not len(numbers):
+        return ""
+    least = max(_FEWEST, _SHARE * counts.sum(), _TIMES * counts.sum() / len(numbers))
+    said = [f"{numbers[end]:.6g} in {counts[end]} pixels" for end in (0, -1) if counts[end] >= least]
+    what = (
+        f"its {'lowest' if counts[0] >= least else 'highest'} value stands in many pixels ({'; '.join(said)})"
+    )
+    return f"{what}: cut off by the instrument, or a mark of missing pixels?" if said else ""

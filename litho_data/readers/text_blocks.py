@@ -1,0 +1,205 @@
+"""Text files cut into blocks of numbers, each with the lines of words above it."""
+
+from __future__ import annotations
+
+import codecs
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.units import is_length, um_per
+from litho_data.readers.reader import DAMAGED
+
+# No two neighbouring repetitions of these expressions match the same characters: otherwise a long line of
+# blanks or digits takes hours.
+NUMBER = re.compile(r"[-+]?(\d+([.,]\d*)?|[.,]\d+)([eEdD][-+]?\d+)?|[-+]?nan|[-+]?inf(inity)?", re.IGNORECASE)
+_LEADING_NUMBER = re.compile(r"[-+\d.,eE]+")
+_ASSIGNMENT = re.compile(r"[:=]")
+_KEY = re.compile(r"[\w ()>./-]+")
+_COMMENT = ("#", "%", ";")
+_SEPARATORS = re.compile(r"[\s;]+|,\s*")
+_STRANGE = re.compile(r"[\x00-\x08\x0b\x0e-\x1f]")
+_LOOKED_AT = 400
+_FEWEST_ODD_NULS = 0.8
+# The words of other programs, in the languages of their users.
+_WIDTHS = ("width", "breite", "largeur", "larghezza", "ancho", "anchura", "šířka", "x-length", "x range")
+_HEIGHTS = ("height", "höhe", "hauteur", "altezza", "alto", "altura", "výška", "y-length", "y range")
+_CHANNELS = ("channel", "kanal", "canal", "canale", "kanál", "channel name")
+_UNITS = ("value units", "value unit", "einheiten", "unités", "unità valore", "unidades de valor",
+          "jednotky hodnot", "z-unit", "z unit", "zunit", "z units", "data unit")  # fmt: skip
+_MISSING = (
+    "nodata_value",
+    "nodata value",
+    "nodata",
+    "no data",
+    "missing value",
+    "invalid value",
+    "void pixels",
+)
+_TO_METRES = "height conversion factor (-> m)"
+_SCALES = re.compile(
+    r"bit2nm|scale_?factor|(z|height|value|data)[ _-]?(scale|factor|multiplier|gain|offset)$"
+)
+
+
+@dataclass
+class Block:
+    """Neighbouring lines of numbers: the header above them, and the number of the first one in the file."""
+
+    header: dict[str, str]
+    words: list[str]
+    first_line: int
+    rows: list[str] = field(default_factory=list)
+
+    def first(self, names: tuple[str, ...]) -> str:
+        """What the header says under the first of these keys, in any case; empty if nothing."""
+        lower = {key.lower(): value for key, value in self.header.items()}
+        return next((lower[name] for name in names if name in lower), "")
+
+    @property
+    def name(self) -> str:
+        """Of the channel, if the header gives one."""
+        return self.first(_CHANNELS)
+
+    @property
+    def unit(self) -> str | None:
+        """Of the values; None if the header states none."""
+        return "m" if self.factor is not None else self.first(_UNITS) or None
+
+    @property
+    def factor(self) -> float | None:
+        """From values to metres, where the header gives it.
+
+        Raises:
+            InputError: the header gives another scale, which is not known here.
+        """
+        stated = {key: value for key, value in self.header.items() if NUMBER.match(value)}
+        if _TO_METRES in stated:
+            return number(stated[_TO_METRES])
+        for key, value in stated.items():
+            if _SCALES.search(key.lower()) and number(value) not in (0.0, 1.0):
+                raise InputError(f"a scale in the header, {key} = {value}", wanted="one that is known here")
+        return None
+
+    @property
+    def missing(self) -> list[float]:
+        """The numbers that the header says mark missing pixels."""
+        stated = self.first(_MISSING)
+        return [number(stated)] if NUMBER.match(stated) else []
+
+    def size_um(self, shape: tuple[int, ...]) -> tuple[float, float] | None:
+        """From the two sides, or from the size of a pixel."""
+        if pitch := _length_um(self.first(("pixel size",))):
+            return shape[0] * pitch, shape[1] * pitch
+        sides = [_length_um(self.first(names)) for names in (_HEIGHTS, _WIDTHS)]
+        return (sides[0], sides[1]) if sides[0] and sides[1] else None
+
+
+def read_text(path: Path) -> str:
+    """The text of a file, lines apart by ``\\n``; UTF-8, UTF-16 or an 8-bit code of Western Europe.
+
+    Raises:
+        InputError: UTF-16 with a part of a character, or bytes that are no text; the message names the line.
+    """
+    raw = path.read_bytes()
+    odd = raw[:_LOOKED_AT][1::2]
+    if raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        code = "utf-16"
+    elif odd and odd.count(0) > _FEWEST_ODD_NULS * len(odd):
+        code = "utf-16-le"
+    else:
+        code = "utf-8-sig"
+    try:
+        text = raw.decode(code)
+    except UnicodeDecodeError as error:
+        if code != "utf-8-sig":
+            raise InputError(f"cannot read {path} as UTF-16", got=error.reason, hint=DAMAGED) from error
+        text = raw.decode("latin-1")
+    text = text.replace("\r\n", "\n").replace("\r", "\n")
+    if strange := _STRANGE.search(text):
+        line = text.count("\n", 0, strange.start()) + 1
+        got = f"byte 0x{ord(strange[0]):02x}"
+        raise InputError(f"{path} line {line}", got=got, wanted="a text of numbers")
+    return text
+
+
+def blocks_of(text: str) -> list[Block]:
+    """The blocks of numbers in a text; blank lines and lines of words end a block.
+
+    A line of words counts as one only if less than half of its cells are numbers: otherwise it is a row of
+    the block, with words in place of numbers. Where every other line is blank, all rows are one block.
+    """
+    found = list(_blocks(text))
+    if len(found) > 1 and all(len(one.rows) == 1 and not one.words for one in found[1:]):
+        for one in found[1:]:
+            # Blank lines keep the numbers of the lines right.
+            found[0].rows += [""] * (one.first_line - found[0].first_line - len(found[0].rows)) + one.rows
+        return found[:1]
+    return found
+
+
+def _blocks(text: str) -> Iterator[Block]:
+    block, comments = Block({}, [], 0), 0
+    for number_of_line, line in enumerate(text.split("\n"), start=1):
+        numbers = is_row(line)
+        if block.rows and not numbers:
+            yield block
+            block = Block({}, [], 0)
+        if numbers:
+            block.first_line = block.first_line or number_of_line
+            block.rows.append(line)
+        elif line.strip():
+            comments += 1
+            block.words.append(line.strip())
+            _note(line, block.header, number_of_line)
+    if block.rows:
+        yield block
+
+
+def is_row(line: str) -> bool:
+    """Whether a line is one of numbers: no comment, and at least half of its cells are."""
+    if line.startswith(_COMMENT) or not line.strip():
+        return False
+    cells = cells_of(line[:_LOOKED_AT])
+    if len(line) > _LOOKED_AT and len(cells) > 1:
+        cells = cells[:-1]
+    numbers = [NUMBER.fullmatch(cell) is not None for cell in cells]
+    # `ncols 32` is a word and its value.
+    return 2 * sum(numbers) >= len(cells) and (len(cells) != 2 or NUMBER.match(cells[0]) is not None)
+
+
+def cells_of(line: str) -> list[str]:
+    """The cells of a line, apart by blanks, tabs, commas or semicolons."""
+    return _SEPARATORS.split(line.strip(" \t,;"))
+
+
+def _note(line: str, header: dict[str, str], number_of_line: int) -> None:
+    text = line.strip("#%; \t\n")
+    sign = _ASSIGNMENT.search(text)
+    key = text[: sign.start()].strip() if sign else ""
+    plain = text.split(None, 1)
+    if sign and _KEY.fullmatch(key):
+        header[key] = text[sign.end() :].strip()
+    elif len(plain) == 2 and len(text) < _LOOKED_AT and NUMBER.fullmatch(plain[1]):
+        header[plain[0]] = plain[1]
+    elif text:
+        header[f"comment {number_of_line}"] = text
+
+
+def number(text: str) -> float:
+    """The number at the start of a text, with a decimal comma or Fortran's exponent; NaN if there is none."""
+    found = NUMBER.match(text.strip())
+    return float(re.sub("[dD]", "e", found[0]).replace(",", ".")) if found else float("nan")
+
+
+def _length_um(text: str) -> float | None:
+    lead = _LEADING_NUMBER.match(text := text.strip())
+    unit = text[lead.end() :].strip(" []()") if lead else ""
+    if lead is None or not is_length(unit):
+        return None
+    try:
+        return float(lead[0].replace(",", ".")) * um_per(unit)
+    except ValueError:
+        return None

@@ -1,0 +1,126 @@
+"""Coordinates in a table of numbers: axes in its first row and column, or points that make a whole grid."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.units import is_length, um_per
+
+# Coordinates are written with few digits: a step may be off by this share of the usual one.
+_UNEVEN = 0.02
+_FEWEST_STEPS = 3
+# One axis alone, or uneven ones, need more numbers.
+_FEWEST_ALONE = 6
+_FEWEST_POINTS = 32
+_COLUMN = re.compile(
+    r"\b([xyz])\b[^\[(xyz]{0,20}[\[(]\s*([^\])\s]{1,12})\s*[\])]|\b([xyz])\s+in\s+(\S{1,12})", re.IGNORECASE
+)
+
+
+@dataclass(frozen=True)
+class Map:
+    """Heights with row 0 on top, and what the table said of lengths; ``extent`` has no unit.
+
+    ``corner``: whether the first cell was that of axes."""
+
+    values: np.ndarray
+    extent: tuple[float, float] | None = None
+    size_um: tuple[float, float] | None = None
+    unit: str | None = None
+    x_is: str = "a row of the file"
+    corner: bool = False
+    notes: tuple[str, ...] = ()
+
+
+def without_axes(values: np.ndarray, words: Sequence[str]) -> Map:
+    """The matrix without a first row or column of coordinates or counts.
+
+    Evenly spaced numbers that the neighbouring line does not continue are coordinates: neighbouring lines of
+    a map are alike. Numbers of 0, 1, 2, … (or 1, 2, 3, …) count pixels and say nothing of lengths.
+
+    Raises:
+        InputError: a first row and column that look like coordinates at uneven steps.
+    """
+    body = values[1:, 1:]
+    if min(body.shape) <= _FEWEST_STEPS:
+        return Map(values)
+    row, column = values[0, 1:], values[1:, 0]
+    x, y = _spacing(row), _spacing(column)
+    has_x = x is not None and x > 0 and not _goes_on(body[0], x)
+    has_y = y is not None and not _goes_on(body[:, 0], y)
+    if has_x and has_y:
+        extent = (abs(y or 0.0) * body.shape[0], (x or 0.0) * body.shape[1])
+        if _counts(row) and _counts(column):
+            return Map(body, corner=True)
+        size_um, unit = _units(words, extent)
+        return Map(body, extent, size_um, unit, corner=True)
+    if has_y and len(column) >= _FEWEST_ALONE:
+        return Map(values[:, 1:], notes=("its first column, evenly spaced, was taken for an axis",))
+    if has_x and len(row) >= _FEWEST_ALONE:
+        return Map(values[1:], corner=True, notes=("its first row, evenly spaced, was taken for an axis",))
+    pairs = ((row, body[0]), (column, body[:, 0]))
+    if all(len(line) >= _FEWEST_ALONE and _rises(line) and not _rises(beside) for line, beside in pairs):
+        raise InputError("first row and column that rise like axes", got="uneven steps", wanted="even ones")
+    return Map(values)
+
+
+def _rises(line: np.ndarray) -> bool:
+    steps = np.diff(line)
+    return bool((steps > 0).all() or (steps < 0).all())
+
+
+def _spacing(line: np.ndarray) -> float | None:
+    """The step of evenly spaced numbers; None for others."""
+    steps = np.diff(line)
+    if len(steps) < _FEWEST_STEPS or not np.isfinite(steps).all():
+        return None
+    step = float((line[-1] - line[0]) / len(steps))
+    return step if step and np.allclose(steps, step, rtol=_UNEVEN, atol=0) else None
+
+
+def _goes_on(line: np.ndarray, step: float) -> bool:
+    other = _spacing(line)
+    return other is not None and bool(np.isclose(other, step, rtol=_UNEVEN, atol=0))
+
+
+def _counts(line: np.ndarray) -> bool:
+    return bool(line[0] in (0, 1) and (np.diff(line) == 1).all())
+
+
+def _units(
+    words: Sequence[str], extent: tuple[float, float]
+) -> tuple[tuple[float, float] | None, str | None]:
+    """(y, x) in µm, and the unit of z, where the words above the numbers give units for x, y and z."""
+    pairs = [(one[0] or one[2], one[1] or one[3]) for text in words for one in _COLUMN.findall(text[:200])]
+    units = {axis.lower(): unit for axis, unit in pairs if is_length(unit)}
+    if "x" not in units:
+        return None, units.get("z")
+    return (extent[0] * um_per(units.get("y", units["x"])), extent[1] * um_per(units["x"])), units.get("z")
+
+
+def map_of_points(points: np.ndarray, words: Sequence[str]) -> Map | None:
+    """The map of points (x, y, z) that fill a regular grid; None if they do not.
+
+    The rows are in the order in which the file has them, x grows to the right. Grid points that the file does
+    not have are missing pixels.
+    """
+    x, column = np.unique(points[:, 0], return_inverse=True)
+    y, row = np.unique(points[:, 1], return_inverse=True)
+    step_x, step_y = _spacing(x), _spacing(y)
+    filled = len(points) / max(1, len(x) * len(y))
+    if len(points) < _FEWEST_POINTS or step_x is None or step_y is None or not 0.5 < filled <= 1:
+        return None
+    if len(np.unique(row * len(x) + column)) != len(points):
+        return None
+    down = points[0, 1] <= points[-1, 1]
+    values = np.full((len(y), len(x)), np.nan)
+    values[row if down else len(y) - 1 - row, column] = points[:, 2]
+    extent = (step_y * len(y), step_x * len(x))
+    note = f"points of a grid, the rows as in the file: y {'grows' if down else 'falls'} downwards"
+    size_um, unit = _units(words, extent)
+    return Map(values, extent, size_um, unit, x_is="the first column of points", notes=(note,))

@@ -1,0 +1,159 @@
+"""Rows of text turned into numbers: separators, decimal commas, words in place of numbers, damage."""
+
+from __future__ import annotations
+
+import io
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError
+from litho_data.readers.text_blocks import Block
+
+_EXPONENT = re.compile(r"[eE][+-]?\d+$")
+_FORTRAN_EXPONENT = re.compile(r"(?<=[\d.])[dD](?=[-+]?\d)")
+_AROUND_COMMA = re.compile(r"(?<![ \t])[ \t]*,[ \t]*(?=[^\s,]|\n|$)")
+_OTHER_SEPARATOR = re.compile(r"[^\s;,][;\t ]+[^\s;,]")
+_SHOWN_CHARACTERS, _SHOWN_ROWS = 40, 2
+_TRUNCATED = "the file may be truncated"
+
+
+@dataclass(frozen=True)
+class Table:
+    """Numbers (rows, columns), NaN for words, the first line of each word, and the word in the first cell."""
+
+    values: np.ndarray
+    words: dict[str, int]
+    corner: str | None = None
+
+
+def numbers_of(path: Path, block: Block) -> Table:
+    """The numbers of a block; ``nan`` and words are NaN, an empty cell is the word "".
+
+    A decimal comma is accepted if the cells are not separated by commas, and so is Fortran's ``1.0D-07``.
+
+    Raises:
+        InputError: rows of different lengths, mixed separators, numbers too large, or a last number that was
+            cut off; the message names the line and shows the first rows.
+    """
+    try:
+        return _numbers(path, "\n".join(block.rows), block.first_line)
+    except InputError as error:
+        rows = [row.strip() for row in block.rows if row.strip()][:_SHOWN_ROWS]
+        shown = " | ".join(repr(row[:_SHOWN_CHARACTERS]) for row in rows)
+        raise InputError(str(error), hint=f"the first rows are {shown}") from error
+
+
+def _numbers(path: Path, text: str, first_line: int) -> Table:
+    text, separator = _plain(path, text, first_line)
+    try:
+        values = np.loadtxt(io.StringIO(text), delimiter=separator, dtype=np.float64, comments=None, ndmin=2)
+        table = Table(values, {})
+    except ValueError:
+        table = _cell_by_cell(path, text, separator, first_line)
+    if np.isinf(table.values).any():
+        _refuse_overflow(path, text, separator, first_line)
+    return table
+
+
+def _plain(path: Path, text: str, first_line: int) -> tuple[str, str | None]:
+    """The text with decimal points, and what its cells are apart by; None for blanks.
+
+    Commas separate cells only if nothing else does; otherwise they are decimal commas, and then there is no
+    decimal point in the file.
+
+    Raises:
+        InputError: cells apart by commas and by something else, as in ``1,234.5;2,345.6``.
+    """
+    text = text.replace("\x0c", " ")
+    if "d" in text or "D" in text:
+        text = _FORTRAN_EXPONENT.sub("e", text)
+    separator = ";" if ";" in text else None
+    if "," in text:
+        tight = _AROUND_COMMA.sub(",", text)
+        if not _OTHER_SEPARATOR.search(tight):
+            separator = ","
+        elif "." in tight or tight != text:
+            for line, row in enumerate(tight.split("\n"), start=first_line):
+                if "," in row and _OTHER_SEPARATOR.search(row.strip()):
+                    got = repr(row.strip()[:_SHOWN_CHARACTERS])
+                    wanted = "cells apart by one separator, and no marks of thousands"
+                    raise InputError(f"{path} line {line}", got=got, wanted=wanted)
+        else:
+            text = text.replace(",", ".")
+    if separator is None and "\t" in text and " " not in text.replace("\t ", "\t").replace(" \t", "\t"):
+        separator = "\t"
+    rows = [row.rstrip(" ") for row in text.split("\n")]
+    if separator is not None and all(row.endswith(separator) for row in rows if row):
+        text = "\n".join(row[:-1] for row in rows)
+    return text, separator
+
+
+def _cell_by_cell(path: Path, text: str, separator: str | None, first_line: int) -> Table:
+    rows = [
+        (line, [cell.strip() for cell in (row.split(separator) if separator else row.split())])
+        for line, row in enumerate(text.split("\n"), start=first_line)
+        if row.strip()
+    ]
+    width = max(len(cells) for _, cells in rows[1:]) if len(rows) > 1 else len(rows[0][1])
+    if len(rows) > 2 and len(rows[0][1]) == width - 1:
+        rows[0][1].insert(0, "")  # the corner above a column and beside a row of coordinates
+    width, width_line = len(rows[0][1]), rows[0][0]
+    words: dict[str, int] = {}
+    corner = None if _is_number(rows[0][1][0]) else rows[0][1][0]
+    values = np.full((len(rows), width), np.nan)
+    for number, (line, cells) in enumerate(rows):
+        if len(cells) != width:
+            _refuse_ragged(path, line, len(cells), f"{width} values as in line {width_line}", cells)
+        for column, cell in enumerate(cells):
+            if _is_number(cell):
+                values[number, column] = float(cell)
+            elif number or column:
+                words.setdefault(cell, line)
+    return Table(values, words, corner)
+
+
+def _refuse_ragged(path: Path, line: int, count: int, wanted: str, cells: list[str]) -> NoReturn:
+    for cell in cells:
+        if not _is_number(cell) and cell:
+            raise InputError(f"{path} line {line}", got=repr(cell[:24]), wanted="a number")
+    raise InputError(f"{path} line {line}", got=f"{count} values", wanted=wanted, hint=_TRUNCATED)
+
+
+def refuse_cut_end(path: Path, text: str) -> None:
+    """A copy cut off inside the last number (5.4e-007 -> 5.4) would otherwise read as 5.4 m.
+
+    Raises:
+        InputError: the last number is not spelt like the one before it.
+    """
+    if text.endswith("\n"):
+        return
+    last_row = text[text.rfind("\n") + 1 :].split()
+    if len(last_row) < 2:
+        return
+    before, last = _EXPONENT.search(last_row[-2]), _EXPONENT.search(last_row[-1])
+    if before is not None and (last is None or len(last[0]) < len(before[0])):
+        line = text.count("\n") + 1
+        wanted = f"a number spelt like {last_row[-2]!r}"
+        what = f"{path} line {line} ends inside a number"
+        raise InputError(what, got=repr(last_row[-1]), wanted=wanted, hint=_TRUNCATED)
+
+
+def _refuse_overflow(path: Path, text: str, separator: str | None, first_line: int) -> None:
+    """An infinity that is not written as one is a number too large to hold, such as 1e400."""
+    for line, row in enumerate(text.split("\n"), start=first_line):
+        for cell in row.split(separator):
+            if "inf" not in cell.lower() and _is_number(cell) and np.isinf(float(cell)):
+                raise InputError(f"{path} line {line}", got=repr(cell[:24]), wanted="a number below 1e308")
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    # Python alone takes 1_000 for a number.
+    return "_" not in cell

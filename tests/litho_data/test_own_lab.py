@@ -1,0 +1,142 @@
+"""An own lab's first dataset: right when the page is followed, and every wrong number named first."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from litho_data.build.build import build_dataset
+from litho_data.build.suggest import RECIPES, left_by_layout, suggest_recipe
+from litho_data.cards.card import load_card
+from litho_data.cli.app import app
+from litho_data.foundation.errors import InputError
+from litho_data.level import Recipe
+from litho_data.store import open_store
+from tests.litho_data.lab import IDS, LEVEL_HEIGHT_UM, MIRRORED, errors_nm, write_lab
+
+BOW = f"[process]\nlevel = {'bow.toml'!r}\n"
+# The median of |6 nm jitter of the lines| + noise is 4.8 nm; 8 leaves room for what levelling gets wrong.
+MOST_NM = 8.0
+FEW = ("A1", "A2", "B1", "B2")
+
+
+def lab(folder: Path, ids: tuple[str, ...] = IDS, **changed: str) -> Path:
+    card = write_lab(folder / "lab", 112, ids, **changed)
+    (card.parent / "bow.toml").write_text(RECIPES["plane and bow"])
+    return card
+
+
+def first_box(card: Path) -> str:
+    html = (card.parent / "prints-report" / "report.html").read_text(encoding="utf-8")
+    found = re.search(r'class="verdict"[^>]*>(.*?)</', html, re.DOTALL)
+    assert found
+    return found[1]
+
+
+def test_following_the_page_gives_true_heights(tmp_path: Path) -> None:
+    card = lab(tmp_path)
+    found = suggest_recipe(card, tmp_path / "levelling")
+    assert found.recipe == "plane and bow"
+    # Row alignment takes the print for offsets of lines.
+    assert set(found.warned) >= {"lines, then plane and bow", "plane and bow, then lines"}
+    assert (tmp_path / "levelling" / "report.html").is_file()
+    assert load_card(found.card).process.level == "card.recipe.toml"
+    out = card.parent / "prints.zarr"
+    build = CliRunner().invoke(app, ["build", str(found.card), "--out", str(out), "--workers", "2"])
+    assert build.exit_code == 0
+    store = open_store(out)
+    assert len(store) == 6
+    errors = errors_nm(store)
+    assert max(errors.values()) < MOST_NM, errors
+    assert first_box(card).split("—")[1].strip().startswith(f"{MIRRORED}: a mirror image of its layout")
+    assert f"check {MIRRORED}: a mirror image" in build.stderr
+    scan = store.scan("B3")
+    assert (scan.surround, scan.instrument) == ("substrate", "Cypher")
+
+
+def other_unit(card: Path) -> None:
+    table = card.parent / "scans.csv"
+    table.write_text(table.read_text().replace("A1;nm", "A1;um"))
+
+
+def other_layout(card: Path) -> None:
+    one, other = (card.parent / "layouts" / f"{name}.tif" for name in ("A1", "B1"))
+    kept = one.read_bytes()
+    one.write_bytes(other.read_bytes())
+    other.write_bytes(kept)
+
+
+def align_rows(card: Path) -> None:
+    (card.parent / "bow.toml").write_text('[[step]]\nop = "align-rows"\n')
+
+
+@pytest.mark.parametrize(
+    ("changed", "change", "said"),
+    [
+        ({"pitch_um": "0.14"}, None, r"all scans: the scans are -6\.\d % off.*0\.14 fits as 0\.1(49|5)"),
+        (
+            {"level_height_um": "0.8"},
+            None,
+            r"all scans: the prints rise by 0\.1\d* µm.*level_height_um = 0\.8",
+        ),
+        ({}, other_unit, r"height per level .* times that of the others: is its unit"),
+        ({}, other_layout, r"A1: it shows the layout of B1.*B1: skipped: registration failed"),
+        ({}, align_rows, r"lines were shifted by up to .*part of the print may be removed"),
+    ],
+)
+def test_a_wrong_card_is_named_in_the_first_box_and_in_the_terminal(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    changed: dict[str, str],
+    change: Callable[[Path], None] | None,
+    said: str,
+) -> None:
+    card = lab(tmp_path, FEW, **{"more": BOW} | changed)
+    if change is not None:
+        change(card)
+    build_dataset(card, card.parent / "prints.zarr", workers=2)
+    assert re.search(said, first_box(card))
+    assert re.search(said.split(".*")[0], capsys.readouterr().err.replace("check ", ""))
+
+
+def test_a_level_height_that_no_print_has_is_refused(tmp_path: Path) -> None:
+    card = lab(tmp_path, FEW[:2], level_height_um="80", more=BOW)
+    with pytest.raises(InputError, match=r"level_height_um, got 80 µm, where the prints rise by 0\.\d+ µm"):
+        build_dataset(card, card.parent / "prints.zarr", workers=2)
+    assert not list(card.parent.glob("*.zarr"))
+
+
+@pytest.mark.parametrize("text", ["", "[process]\nregistration = 'affine'\n", BOW])
+def test_a_suggested_card_says_the_rest_as_before(tmp_path: Path, text: str) -> None:
+    from litho_data.build.suggest import _write_card
+
+    card = tmp_path / "card.toml"
+    card.write_text(
+        'name = "p"\n[layout]\nfiles = "l/{id}.tif"\npitch_um = 0.1\nlevel_height_um = 0.1\nlevels = 5\n'
+        f'[scan]\nfiles = "s/{{id}}.gwy"\n{text}'
+    )
+    before, after = load_card(card), load_card(_write_card(card, "plane"))
+    assert after.process.level == "card.recipe.toml"
+    assert Recipe.from_toml(tmp_path / "card.recipe.toml").step[0].op == "layout-aware"
+    same = after.model_copy(update={"process": before.process})
+    assert same == before
+
+
+def test_what_the_layout_leaves_is_noise_tilt_and_lost_print() -> None:
+    rng = np.random.default_rng(0)
+    level = np.repeat(np.repeat(rng.integers(0, 6, (16, 16)), 8, 0), 8, 1).astype(float)
+    from scipy import ndimage
+
+    print_um = LEVEL_HEIGHT_UM * ndimage.gaussian_filter(level, 1.5)
+    noise = 0.004 * rng.standard_normal(level.shape)
+    # What is left of white noise is its own deviation: 7000 pixels know it to 1 %, the fit costs six numbers.
+    assert left_by_layout(print_um + noise, level) == pytest.approx(0.004, rel=0.05)
+    tilt = 0.1 * np.linspace(-1, 1, 128)
+    assert left_by_layout(print_um + noise + tilt, level) > 0.04
+    rows = np.median(print_um, axis=1, keepdims=True)
+    assert left_by_layout(print_um + noise - rows, level) > 0.02

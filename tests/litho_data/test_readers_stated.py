@@ -1,0 +1,188 @@
+"""What a file states is applied, or the file is refused with its name; one bad part spoils nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+
+from litho_data.foundation.errors import InputError
+from litho_data.readers import list_channels, read_scan
+from tests.litho_data import afm_files
+from tests.litho_data.afm_files import HEIGHT_UM, SHAPE, SIZE_UM
+
+ROWS = "\n".join("\t".join(f"{value:.4f}" for value in row) for row in np.tile(HEIGHT_UM, (2, 2))) + "\n"
+
+
+def refused(path: Path, message: str, **arguments: object) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        read_scan(path, **({"unit": "um"} | arguments))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_calibration_that_is_no_line_is_refused_with_its_keys(tmp_path: Path) -> None:
+    path = tmp_path / "scan.tif"
+    tifffile.imwrite(
+        path, np.ones(SHAPE, np.uint16), imagej=True, metadata={"cf": 3, "c0": 1.0, "c1": 2.0, "c2": 3.0}
+    )
+    refused(path, "cf = 3, c0 = 1.0, c1 = 2.0, c2 = 3.0")
+
+
+def test_a_unit_that_is_no_length_makes_no_height(tmp_path: Path) -> None:
+    path = tmp_path / "scan.tif"
+    about = {"c0": 0.0, "c1": 1e-3, "vunit": "V"}
+    tifffile.imwrite(path, np.ones(SHAPE, np.uint16), imagej=True, metadata=about)
+    refused(path, "no height channel.*'page 0'.*V")
+
+
+def test_a_picture_beside_an_unknown_private_tag_is_no_map(tmp_path: Path) -> None:
+    """So do instrument makers keep a preview in the page and the heights elsewhere."""
+    path = tmp_path / "scan.tif"
+    tag = (55555, "B", 4 * HEIGHT_UM.size, HEIGHT_UM.astype("<f4").tobytes(), False)
+    tifffile.imwrite(path, np.ones(SHAPE, np.uint8), extratags=[tag], metadata=None)
+    refused(path, "private tag 55555", unit=None, full_scale_um=1.0)
+
+
+@pytest.mark.parametrize(
+    ("attributes", "message"),
+    [
+        ({"scaling": 2.0}, "scaling = 2.0"),
+        ({"Z_offset": 1.0, "gain": 3.0}, "gain = 3.0"),
+        ({"calibration": [1.0, 2.0]}, r"calibration = \[1.0, 2.0\]"),
+    ],
+)
+def test_numbers_beside_an_array_are_applied_or_named(tmp_path: Path, attributes: dict, message: str) -> None:
+    path = tmp_path / "scan.h5"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("height", data=HEIGHT_UM).attrs.update(attributes)
+        file.create_dataset("other", data=2 * HEIGHT_UM)
+    refused(path, message, channel="height")
+    # The other channel is as good as before.
+    np.testing.assert_array_equal(read_scan(path, channel="other", unit="um").height_um, 2 * HEIGHT_UM)
+    assert [bool(one.problem) for one in list_channels(path)] == [True, False]
+
+
+def test_arrays_show_what_runs_along_x(tmp_path: Path) -> None:
+    path = tmp_path / "scan.h5"
+    with h5py.File(path, "w") as file:
+        file.create_dataset("plain", data=HEIGHT_UM)
+        turned = file.create_dataset("turned", data=HEIGHT_UM.T)
+        turned.dims[0].label, turned.dims[1].label = "x", "y"
+    plain, turned = list_channels(path)
+    assert (plain.x_is, turned.x_is) == ("the second index", "the first index, x")
+    np.testing.assert_array_equal(plain.load()[0], turned.load()[0])
+
+
+def test_a_field_without_its_size_is_a_field_all_the_same(tmp_path: Path) -> None:
+    from gwyfile.objects import GwyContainer, GwyDataField, GwyObject, GwySIUnit
+
+    path = tmp_path / "scan.gwy"
+    field = GwyDataField(
+        HEIGHT_UM * 1e-6, si_unit_xy=GwySIUnit(unitstr="m"), si_unit_z=GwySIUnit(unitstr="m")
+    )
+    for key in ("xreal", "yreal"):
+        GwyObject.__delitem__(field, key)
+    GwyContainer({"/0/data": field, "/1/data": GwyDataField(HEIGHT_UM)}).tofile(str(path))
+    assert read_scan(path, channel="channel 0", size_um=SIZE_UM).height_um == pytest.approx(HEIGHT_UM)
+
+
+@pytest.mark.parametrize(
+    ("text", "asked", "arguments"),
+    [
+        (ROWS.replace("0.0310", "Bad"), "line 4, got 'Bad'.*missing = ", {"missing": ["Bad"]}),
+        (ROWS.replace("0.0310", "--"), "line 4, got '--'.*missing = ", {"missing": ["--"]}),
+        (ROWS.replace("0.0310", ""), "line 4, got an empty cell.*missing = ", {"missing": [""]}),
+        (
+            ROWS.replace("0.0310", "-9999"),
+            r"missing = \[-9999\]; if not: missing = \[\]",
+            {"missing": [-9999]},
+        ),
+        (ROWS.replace("0.0310", "3.4028e+38"), r"missing = \[3.4028e\+38\]", {"missing": [3.4028235e38]}),
+        (
+            ROWS.replace("0.0310", "-77.5"),
+            r"got -77.5 in 4 pixels.*missing = \[-77.5\]",
+            {"missing": [-77.5]},
+        ),
+        (
+            ROWS.replace("0.0310", "-9999").replace("0.0420", "1.70141e38"),
+            r"missing = \[1.70141e\+38, -9999\]",
+            {"missing": [-9999, 1.70141e38]},
+        ),
+    ],
+)
+def test_marks_of_missing_pixels_are_asked_about(
+    tmp_path: Path, text: str, asked: str, arguments: dict
+) -> None:
+    path = tmp_path / "scan.txt"
+    path.write_text(text)
+    refused(path, asked)
+    height_um = read_scan(path, unit="um", **arguments).height_um
+    assert np.isnan(height_um[3, 1])
+    assert np.nanmax(np.abs(height_um)) < 1
+
+
+def test_a_caller_may_say_that_no_pixel_is_missing(tmp_path: Path) -> None:
+    path = tmp_path / "scan.txt"
+    path.write_text(ROWS.replace("0.0310", "-9999"))
+    assert read_scan(path, unit="nm", missing=[]).height_um.min() == -9.999
+
+
+def test_one_extreme_value_in_many_pixels_is_said(tmp_path: Path) -> None:
+    path = tmp_path / "scan.npy"
+    height_um = np.random.default_rng(0).random((40, 50))
+    np.save(path, np.minimum(height_um, 0.97))
+    assert "its highest value stands in many pixels (0.97 in " in read_scan(path, unit="um").notes[0]
+    np.save(path, height_um)
+    assert read_scan(path, unit="um").notes == ()
+
+
+def test_bytes_without_a_known_start_are_unknown_and_not_damaged(tmp_path: Path) -> None:
+    """NanoFocus' NMS begins like an Igor wave of version 2."""
+    path = tmp_path / "scan.nms"
+    path.write_bytes(b"\2\0\0\0\1\0\0\0\0\0\xff\xff" + bytes(4000))
+    refused(path, "unknown content", unit=None)
+
+
+@pytest.mark.parametrize("kind", [1, 5, 12, 20])
+def test_a_digital_surf_file_of_another_kind_is_named(tmp_path: Path, kind: int) -> None:
+    path = tmp_path / "scan.sur"
+    afm_files.write_sur(path, np.ones(SHAPE, int), height_per_count_um=1.0)
+    raw = bytearray(path.read_bytes())
+    raw[18] = kind
+    path.write_bytes(raw)
+    if kind == 1:  # more than one line all the same
+        assert read_scan(path).shape == SHAPE
+    else:
+        refused(path, f"kind of studiable, got {kind}", unit=None)
+
+
+def test_axes_at_uneven_steps_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "scan.csv"
+    values = np.random.default_rng(0).random((9, 12))
+    values[0], values[:, 0] = np.arange(12) ** 2, np.arange(9) ** 2
+    np.savetxt(path, values, delimiter=",")
+    refused(path, "rise like axes, got uneven steps")
+
+
+@pytest.mark.parametrize(
+    ("unit", "step", "pitch_um"),
+    [
+        ("um", 0.2, 0.2),
+        ("m", 2e-7, 0.2),
+        ("nm", 200, 0.2),
+        ("nm", 0.2, 0.2),
+        ("m", 0.2, 0.2),
+        ("nm", 20, None),
+    ],
+)
+def test_coordinates_without_a_unit(tmp_path: Path, unit: str, step: float, pitch_um: float | None) -> None:
+    """They are µm or in the unit of the heights; where both make a scan, the size has to be given."""
+    path = tmp_path / "scan.txt"
+    values = np.random.default_rng(0).random((9, 12))
+    values[0, 1:], values[1:, 0] = np.arange(11) * step, np.arange(8) * step
+    np.savetxt(path, values)
+    found = read_scan(path, unit=unit).pitch_um
+    assert found is None if pitch_um is None else found == pytest.approx((pitch_um, pitch_um))
