@@ -61,6 +61,17 @@ RoughnessOf = Annotated[
 Ensemble = Annotated[
     list[str] | None, typer.Option(help="NAME=MODEL of a further model in the loss; repeatable")
 ]
+Judges = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--judge",
+        help="NAME=MODEL or MODEL that prints the finished layout; repeatable. Those of the zoo for the same "
+        "printer by default",
+    ),
+]
+Robust = Annotated[
+    bool, typer.Option(help="search for the best layout by the worst of the model and its judges")
+]
 Objects = Annotated[
     list[Path] | None,
     typer.Option(
@@ -110,6 +121,8 @@ def hoe(
     spread_of: SpreadOf = None,
     roughness_of: RoughnessOf = None,
     ensemble: Ensemble = None,
+    judge: Judges = None,
+    robust: Robust = False,
     workers: WorkersOption = 1,
     dask: DaskOption = None,
     large: Annotated[
@@ -152,7 +165,9 @@ def hoe(
     else:
         from litho_design.workflows.design import design_hologram
 
-        design = design_hologram(target, model, out, settings=settings, ensemble=ensemble or (), **fit)
+        design = design_hologram(
+            target, model, out, settings=settings, ensemble=ensemble or (), judges=judge, robust=robust, **fit
+        )
         _print_design(design, out)
 
 
@@ -177,6 +192,8 @@ def correct(
     spread_of: SpreadOf = None,
     roughness_of: RoughnessOf = None,
     ensemble: Ensemble = None,
+    judge: Judges = None,
+    robust: Robust = True,
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
@@ -191,7 +208,7 @@ def correct(
     print_of = measured_source(scan, scan_unit, scan_size_um, scan_levelling, aligned=scan_aligned)
     design = correct_relief(
         relief, model, out, settings=settings, after=after, scan=print_of,
-        ensemble=ensemble or (), device=device, extrapolate=extrapolate,
+        ensemble=ensemble or (), judges=judge, robust=robust, device=device, extrapolate=extrapolate,
     )  # fmt: skip
     _print_design(design, out)
 
@@ -206,6 +223,8 @@ def lens(
     spread_of: SpreadOf = None,
     roughness_of: RoughnessOf = None,
     ensemble: Ensemble = None,
+    judge: Judges = None,
+    robust: Robust = False,
     large: Annotated[
         bool, typer.Option("--large", help="ring by ring, for a lens of any size that focuses light")
     ] = False,
@@ -232,14 +251,12 @@ def lens(
 
     design = design_lens(
         model, out, settings=settings, objects=objects or (), held_out_objects=held_out_objects or (),
-        ensemble=ensemble or (), device=device, extrapolate=extrapolate,
+        ensemble=ensemble or (), judges=judge, robust=robust, device=device, extrapolate=extrapolate,
     )  # fmt: skip
     _print_design(design, out)
 
 
-@takes_settings(
-    HologramSettings(), LensSettings(), leave_out=("task", "search.seed", "search.draft", "ensemble.weight")
-)
+@takes_settings(HologramSettings(), LensSettings(), leave_out=("task", "search.seed", "ensemble.weight"))
 def compare(
     models: Annotated[
         str, typer.Option(help="arms, comma-separated: none, NAME=MODEL or MODEL (a folder, or zoo:NAME)")
@@ -378,11 +395,14 @@ def _print_design(design: Design, out: Path) -> None:
         headline,
         stroke_advice,
         thickness_warning,
+        width_sentence,
     )
 
     for warning in filter(None, (distribution_warning(design), thickness_warning(design))):
         print(warning, file=sys.stderr)
     print(stroke_advice(design))
+    if said := width_sentence(design):
+        print(said)
     if design.baselines:
         print(baseline_line(design.baselines))
     page = out / "report.html"

@@ -15,8 +15,8 @@ from litho_design.images.targets import Target, load_target
 from litho_design.judging.score import JudgedScore, ScoreResult
 from litho_design.large.bands import Bands, Ranks
 from litho_design.large.cost import disk_gib, fit_cost, measure_size, sent_gib
-from litho_design.large.lens import design_in_rings, judge_rings
-from litho_design.large.run import design_in_bands
+from litho_design.large.hologram import BandedHologram
+from litho_design.large.lens import RingLens, judge_rings
 from litho_design.large.score import (
     image_figures,
     image_from_disk,
@@ -30,6 +30,7 @@ from litho_design.optics.source import require_one_wave
 from litho_design.optimisation.stitching import Stitching
 from litho_design.printers.printer import Printer
 from litho_design.printers.source import Device, load_printer, load_printers
+from litho_design.reports.design import write_design_report
 from litho_design.reports.score import write_score_report
 from litho_design.tasks.design import (
     HEIGHT_FILE,
@@ -39,6 +40,7 @@ from litho_design.tasks.design import (
     Design,
     read_array,
 )
+from litho_design.tasks.run import run_design
 
 BAND_PX = 512
 
@@ -71,7 +73,8 @@ def design_large_hologram(
     layout = made.layout
     printer = load_printer(model, layout, device=ranks.device(device), extrapolate=extrapolate)
     bands = Bands(layout.size_px, band_px, ranks, layout.cell_px)
-    return design_in_bands(made, printer, load_target(target, layout.size_px), out, bands, announce=announce)
+    task = BandedHologram(made, printer, load_target(target, layout.size_px), bands)
+    return run_design(task, out, write_design_report, announce=announce)
 
 
 def design_large_lens(
@@ -95,7 +98,7 @@ def design_large_lens(
     """
     made = settings or lens_settings()
     printer = load_printer(model, made.layout, device=device, extrapolate=extrapolate)
-    return design_in_rings(made, printer, out, tile_px=tile_px, announce=announce)
+    return run_design(RingLens(made, printer, tile_px), out, write_design_report, announce=announce)
 
 
 def score_from_disk(
