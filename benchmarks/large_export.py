@@ -20,7 +20,7 @@ from benchmarks.record import origin, write_record
 from litho_data.foundation.commands import run_script
 from litho_design.exports.gds import GdsRows, write_gds
 from litho_design.exports.image import TiffRows, write_tiff
-from litho_design.large.rows import LevelRows, RingRows, bands_of
+from litho_design.exports.rows import LevelRows, RingRows, bands_of
 from litho_design.printers.layout import LayoutSettings
 
 _MIB = 2**20

@@ -26,6 +26,7 @@ from litho_design.cli.options import (
     ScanUnit,
     as_toml,
     measured_source,
+    numbers,
     takes_settings,
 )
 from litho_design.holograms.settings import HologramSettings, hologram_settings
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
     from litho_design.tasks.design import Design
 
 S = TypeVar("S", bound=DesignSettings)
-N = TypeVar("N", int, float)
 
 # A variant or a task among the changes replaces these.
 _hologram = partial(hologram_settings, "default")
@@ -158,7 +158,7 @@ def hoe(
         from litho_design.workflows.front import efficiency_front
 
         result = efficiency_front(
-            target, model, out, weights=_numbers("--front", front, float), settings=settings,
+            target, model, out, weights=numbers("--front", front, float), settings=settings,
             ensemble=ensemble or (), workers=workers, dask=dask, **fit,
         )  # fmt: skip
         _print_front(result, out)
@@ -324,7 +324,7 @@ def estimate(
     from litho_design.workflows.large import estimate_large
 
     made = _settings(given, _hologram, "estimate")
-    sizes = _numbers("--measure-px", measure_px, int)
+    sizes = numbers("--measure-px", measure_px, int)
     for line in estimate_large(model, made, sizes, ranks, band_px, device=device, extrapolate=extrapolate):
         print(line)
 
@@ -365,14 +365,6 @@ def _settings(
         window = window.model_copy(update={"roughness": rough})
     measured = made.model_copy(update={"window": window})
     return measured if window is made.window else changed(measured, given.options)
-
-
-def _numbers(option: str, words: str, kind: Callable[[str], N]) -> list[N]:
-    """The numbers behind an option, separated by commas."""
-    try:
-        return [kind(word) for word in words.split(",")]
-    except ValueError:
-        raise InputError(option, got=repr(words), wanted="numbers, separated by commas") from None
 
 
 def _print_front(result: FrontResult, out: Path) -> None:

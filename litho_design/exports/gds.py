@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from litho_design.large.rows import LevelRows
+from litho_design.exports.rows import LevelRows
 
 _UNIT_M = 1e-6
 _PRECISION_M = 1e-9

@@ -11,6 +11,8 @@ from litho_design.optics.materials import Resin, refractive_index
 
 ElementKind = Literal["thin", "thick"]
 
+# Longer is no light, but nanometres.
+LONGEST_UM = 100.0
 # Beyond the element as far as light spreads within the height of a relief.
 _BORDER_UM = 2.0
 
@@ -23,7 +25,9 @@ if TYPE_CHECKING:
 class Optics(Record):
     """Wavelength, refractive index step and distance to the output plane."""
 
-    wavelength_um: float = setting(0.6328, "Wavelength", unit="µm", option="--wavelength-um", gt=0)
+    wavelength_um: float = setting(
+        0.6328, "Wavelength", unit="µm", option="--wavelength-um", gt=0, lt=LONGEST_UM
+    )
     index_step: float = setting(
         0.548, "Refractive index of the resist minus that of its surroundings", option="--index-step", gt=0
     )
