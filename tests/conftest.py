@@ -7,6 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from litho_data.foundation.faces import let_waiting_threads_sleep
+
+# Before any test loads torch.
+let_waiting_threads_sleep()
+
 
 @pytest.fixture(scope="session")
 def measured_prints() -> Path:

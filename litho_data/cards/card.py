@@ -10,6 +10,8 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, BaseModel, Field, ValidationError, model_validator
 
 from litho_data.foundation.errors import InputError, unknown_name
+from litho_data.foundation.files import read_text
+from litho_data.foundation.quantities import LENGTH_UM
 from litho_data.foundation.results import Record, first_error
 from litho_data.foundation.units import um_per
 from litho_data.readers.registry import formats, reader_of
@@ -27,8 +29,8 @@ def load_card(path: str | Path) -> Card:
     """
     file = Path(path)
     try:
-        content = tomllib.loads(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        content = tomllib.loads(read_text(file))
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(
             f"cannot read {file} as a dataset card",
             got=error,
@@ -60,9 +62,8 @@ def with_tip(card: Card, tip: float | str) -> Card:
 
 
 def _positive(value: float) -> float:
-    # pydantic accepts inf as a positive number.
-    if not 0 < value < float("inf"):
-        raise ValueError("wanted a positive number")
+    if not LENGTH_UM.holds(value):
+        raise ValueError(f"wanted a number from {LENGTH_UM}")
     return value
 
 

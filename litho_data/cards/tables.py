@@ -12,6 +12,7 @@ from typing import get_args
 
 from litho_data.cards.card import Use
 from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.quantities import ORDER
 from litho_data.store.schema import OPTIONAL_COLUMNS
 
 SAFE_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._+-]*")
@@ -53,12 +54,13 @@ def _check_row(row: Mapping[str, str], what: str, overfull: bool, needs_order: b
     scan_id = row.get("id", "")
     if not SAFE_ID.fullmatch(scan_id):
         raise InputError(f"{what}: id", got=repr(scan_id), wanted="an id of the data folder, without path")
-    if needs_order and not row.get("order", "").lstrip("-").isdecimal():
+    order = row.get("order", "")
+    if needs_order and not (order.lstrip("-").isdecimal() and ORDER.holds(order)):
         raise InputError(f"{what}: order", got=repr(row.get("order", "")), wanted="a whole number")
     require_known(f"{what}: use", row.get("use", "dataset"), get_args(Use))
     for name in OPTIONAL_COLUMNS:
-        if name in row and not _is_finite(row[name]):
-            raise InputError(f"{what}: {name}", got=repr(row[name]), wanted="a number")
+        if name in row:
+            OPTIONAL_COLUMNS[name].require(f"{what}: {name}", row[name])
         if name in row and float(row[name]) not in _ALLOWED.get(name, (float(row[name]),)):
             wanted = " | ".join(f"{value:g}" for value in _ALLOWED[name])
             raise InputError(f"{what}: {name}", got=repr(row[name]), wanted=wanted)
@@ -81,7 +83,7 @@ def read_full_scales(path: Path) -> dict[str, float]:
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"cannot read {path}", got=error, wanted="a JSON object, m per id") from error
     if not isinstance(content, dict):
         raise InputError(f"content of {path}", got=type(content).__name__, wanted="a JSON object, m per id")

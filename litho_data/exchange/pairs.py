@@ -22,11 +22,10 @@ from litho_data.build.quality import noise_figures
 from litho_data.build.result import BuildResult
 from litho_data.cards.card import Card, check_card
 from litho_data.cards.tables import SAFE_ID, read_full_scales
+from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import atomic_folder
 from litho_data.foundation.hashes import file_sha256, record_sha256
-from litho_data.foundation.outputs import require_replaceable_folder
 from litho_data.foundation.run_facts import software_record
 from litho_data.foundation.workers import Workers
 from litho_data.readers.pairs import GREY_MAX, quadrant_slices
@@ -118,8 +117,9 @@ class PairsJob:
     def key(self) -> str:
         """Hash of everything that decides the piece."""
         operation = OPERATIONS["stitch-pairs"]
-        plan = [self.print_id, self.order, operation.version, operation.code_sha256, self._params]
-        return record_sha256([plan, [file_sha256(path) for path in self.files.values()]])
+        card = self.card.model_dump(mode="json")
+        plan = [self.print_id, self.order, card, operation.version, operation.code_sha256, self._params]
+        return record_sha256([plan, {name: file_sha256(path) for name, path in self.files.items()}])
 
     def run(self) -> Piece:
         """The stitched field as a piece."""
@@ -193,8 +193,7 @@ def export_pairs(store_path: str | Path, out: str | Path) -> list[str]:
     store = open_store(store_path)
     notes: list[str] = []
     scales: dict[str, float] = {}
-    require_replaceable_folder(out, "mask", "afm", SCALES_FILE)
-    with atomic_folder(out) as folder:
+    with whole_folder(out, "mask", "afm", SCALES_FILE) as folder:
         for name in ("mask", "afm"):
             (folder / name).mkdir()
         for scan_id in progress(store.ids, "exporting pairs"):

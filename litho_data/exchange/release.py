@@ -7,11 +7,11 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
+from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import atomic_file, atomic_folder
+from litho_data.foundation.files import atomic_file
 from litho_data.foundation.hashes import file_sha256
-from litho_data.foundation.outputs import require_replaceable_folder
 from litho_data.store.read import Store, open_store
 
 # Zip needs a time for every file; with a fixed one, the same store gives the same archive.
@@ -51,8 +51,7 @@ def export_ro_crate(store_path: str | Path, out: str | Path) -> Path:
     store = open_store(store_path)
     if not store.manifest:
         raise InputError(f"{store_path} carries no manifest", wanted="a store made by litho-data build")
-    require_replaceable_folder(out, "*.zarr.zip", "quality.csv", _CRATE_FILE)
-    with atomic_folder(out) as folder:
+    with whole_folder(out, "*.zarr.zip", "quality.csv", _CRATE_FILE) as folder:
         packed = export_zip(store_path, folder / f"{store.name}.zarr.zip")
         store.quality.to_csv(folder / "quality.csv", index=False)
         content = {

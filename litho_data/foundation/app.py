@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import errno
+import os
 import re
 import sys
 from collections.abc import Sequence
+from io import TextIOWrapper
 from typing import Annotated, Any
 
 import typer
@@ -29,7 +31,16 @@ DaskOption = Annotated[
     ),
 ]
 
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+_LONGEST = 200
+_AGAIN = "what was finished is kept: give the command again"
+_WAYS_OUT = {
+    errno.ENOSPC: f"make room; {_AGAIN}",
+    errno.EDQUOT: f"make room; {_AGAIN}",
+    errno.EROFS: "choose another --out",
+    errno.EACCES: "choose another place, or ask for the right",
+    errno.EMFILE: f"allow more open files (ulimit -n), or fewer workers; {_AGAIN}",
+    errno.ENFILE: f"close other programs; {_AGAIN}",
+}
 
 
 def new_app(help_text: str) -> typer.Typer:
@@ -55,26 +66,49 @@ def new_app(help_text: str) -> typer.Typer:
 
 
 def run_app(app: typer.Typer, name: str) -> None:
-    """Run a typer application; bad input and a full disk become one line on stderr and exit code 2."""
+    """Run a typer application; what a machine or an input does not allow is one line and exit code 2.
+
+    Everything else that is raised is a defect of this project, with a traceback.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            # Not every terminal has a µ.
+            stream.reconfigure(errors="replace")
     try:
         with running_command(command_line(name)):
             code = app(prog_name=name, standalone_mode=False)
-    except InputError as error:
-        said = f"{name}: {error}"
+    except BrokenPipeError:
+        # Who read the output, such as `head`, has had enough; Python would complain when it ends.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(1) from None
     except UsageError as error:
         said = _in_one_line(error, name, given_words())
-    except MemoryError as error:
-        said = f"{name}: {InputError('not enough memory', got=error, wanted='a smaller field')}"
-    except OSError as error:
-        if error.errno not in _NO_ROOM:
+    except Exception as error:
+        refusal = error if isinstance(error, InputError) else _not_allowed(error)
+        if refusal is None:
             raise
-        where = f" {error.filename}" if error.filename else ""
-        hint = "make room and give the command again; a build resumes"
-        said = f"{name}: cannot write{where}, got {error.strerror}; {hint}"
+        said = f"{name}: {refusal}"
     else:
         raise SystemExit(code if isinstance(code, int) else 0)
     print(said, file=sys.stderr)
     raise SystemExit(2)
+
+
+def _not_allowed(error: Exception) -> InputError | None:
+    """What a machine does not allow, in words; None for a defect of this project."""
+    # PyTorch and safetensors have errors of their own for it.
+    text = str(error)
+    if isinstance(error, MemoryError) or "out of memory" in text or "can't allocate memory" in text:
+        got = text.partition("\n")[0][:_LONGEST]
+        return InputError("not enough memory", got=got or None, wanted="a smaller field, or fewer workers")
+    if isinstance(error, OSError):
+        what = f"cannot use {error.filename}" if error.filename else "the system refuses"
+        return InputError(what, got=error, hint=_WAYS_OUT.get(error.errno or 0, _AGAIN))
+    if isinstance(error, RecursionError):
+        return InputError("input", got="parts within parts, too deep", wanted="a flatter file")
+    if isinstance(error, OverflowError):
+        return InputError("a number of the input", got=error, wanted="one of a size that can be")
+    return None
 
 
 def _in_one_line(error: Any, name: str, words: Sequence[str]) -> str:

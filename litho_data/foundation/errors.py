@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 
 _MANY = 12
+# What is found can be of any length.
+_LONGEST = 240
 
 
 class InputError(ValueError):
@@ -18,11 +21,29 @@ class InputError(ValueError):
     def __init__(self, what: str, *, got: object = None, wanted: object = None, hint: str = ""):
         parts = [what]
         if got is not None:
-            parts.append(f"got {said(got) if isinstance(got, Exception) else got}")
+            text = said(got) if isinstance(got, Exception) else str(got)
+            parts.append(f"got {text if len(text) <= _LONGEST else text[:_LONGEST] + '…'}")
         if wanted is not None:
             parts.append(f"wanted {wanted}")
         message = ", ".join(parts)
         super().__init__(" ".join(f"{message}; {hint}".split()) if hint else " ".join(message.split()))
+
+
+@contextmanager
+def damaged(what: str, hint: str = "") -> Iterator[None]:
+    """Read what a program wrote and somebody may have changed since.
+
+    Raises:
+        InputError: whatever is raised for content of another kind: no such key, no number, no JSON, …
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{what} is damaged", got=f"{type(error).__name__}: {said(error)}", hint=hint
+        ) from error
 
 
 def said(error: Exception) -> str:

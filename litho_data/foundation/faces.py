@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import sys
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -10,6 +11,18 @@ from typing import Any
 _DISTRIBUTION = "litholoop"
 # litho_data does without it; it stands for all that the extras `models` and `design` bring.
 _OF_EXTRAS = "torch"
+# Of GNU's OpenMP, and of Intel's.
+_SLEEP = {"OMP_WAIT_POLICY": "PASSIVE", "KMP_BLOCKTIME": "0"}
+
+
+def let_waiting_threads_sleep() -> None:
+    """To be called before torch is loaded, whose threads would spin while they wait for one another.
+
+    Beside one busy process a spinning pair of threads takes ten times as long. What the environment says
+    already stays.
+    """
+    for variable, value in _SLEEP.items():
+        os.environ.setdefault(variable, value)
 
 
 def lazy_face(
@@ -37,6 +50,7 @@ def lazy_face(
         if name == "__version__":
             value: Any = _version()
         elif name in homes:
+            let_waiting_threads_sleep()
             module, _, inner = homes[name].partition(":")
             try:
                 home = __import__(module, fromlist=[inner or name])
@@ -57,6 +71,7 @@ def lazy_face(
 
 def require_extra(command: str, extra: str) -> None:
     """End a command with one line on stderr and exit code 2 where what its extra brings is not installed."""
+    let_waiting_threads_sleep()
     if importlib.util.find_spec(_OF_EXTRAS) is None:
         print(f"{command}: {_missing(extra)}", file=sys.stderr)
         raise SystemExit(2)

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import glob
 import os
 import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import IO
 
 from litho_data.foundation.errors import InputError
 
 
 @contextmanager
 def atomic_file(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary path beside ``path``; it replaces ``path`` only if the block succeeds.
+    """Yield a temporary path beside ``path``, of its suffix; it replaces ``path`` only if the block succeeds.
 
     Raises:
         InputError: ``path`` is a folder, or cannot be written.
@@ -22,59 +26,137 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
     target = Path(path)
     if target.is_dir():
         raise InputError(f"cannot write {target}", got="a folder of that name", wanted="a file")
+    prefix, suffix = f".{target.name}.", f".partial{target.suffix}"
     with writable(target):
         target.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".partial", dir=target.parent)
-    os.close(handle)
+        for left in target.parent.glob(f"{glob.escape(prefix)}*{glob.escape(suffix)}"):
+            _remove_unless_held(left)
+        handle, name = tempfile.mkstemp(prefix=prefix, suffix=suffix, dir=target.parent)
     temporary = Path(name)
-    try:
-        yield temporary
-        temporary.chmod(0o666 & ~_umask())
-        temporary.replace(target)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with os.fdopen(handle) as held:
+        _lock(held)
+        try:
+            yield temporary
+            temporary.chmod(0o666 & ~_umask())
+            temporary.replace(target)
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
 @contextmanager
 def atomic_folder(path: str | Path) -> Iterator[Path]:
-    """Yield an empty temporary folder beside ``path``; it replaces ``path`` only on success.
+    """Yield an empty folder; it replaces ``path`` only on success, and an older folder stays until then.
 
-    An older folder at ``path`` stays until the new one is complete. If a user chose the path, call
-    ``litho_data.foundation.outputs.require_replaceable_folder`` first.
+    If a user chose the path, use ``litho_data.foundation.begun.whole_folder``.
 
     Raises:
-        InputError: ``path`` cannot be written.
+        InputError: ``path`` cannot be written, or another process is writing it.
+    """
+    with unfinished(path) as work:
+        new = work / "new"
+        shutil.rmtree(new, ignore_errors=True)
+        try:
+            with writable(Path(path)):
+                new.mkdir()
+            yield new
+            publish(new, path)
+        finally:
+            shutil.rmtree(work, ignore_errors=True)
+
+
+@contextmanager
+def unfinished(path: str | Path) -> Iterator[Path]:
+    """Yield the folder ``.<name>.partial`` beside ``path``, with what a stopped process left in it.
+
+    Raises:
+        InputError: the place cannot be written, or another process is writing it.
     """
     target = Path(path)
+    work = _work(target)
     with writable(target):
-        target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".partial", dir=target.parent))
-    temporary.chmod(0o777 & ~_umask())
+        work.mkdir(parents=True, exist_ok=True)
+        lock = locked(work / "lock", target)
+    with lock:
+        _put_back(work, target)
+        yield work
+
+
+def publish(new: Path, path: str | Path) -> None:
+    """Rename a finished folder to ``path``; within ``unfinished``, which keeps an older one until then."""
+    target = Path(path)
+    if target.exists():
+        target.replace(_work(target) / "old")
     try:
-        yield temporary
-        replace_folder(temporary, target)
+        new.replace(target)
     finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        _put_back(_work(target), target)
 
 
-def replace_folder(new: Path, target: Path) -> None:
-    """Rename a finished folder to ``target``; an older folder there goes back if that fails.
+def clear_leftovers(folder: Path) -> None:
+    """Remove what a stopped process left of files and folders that it was writing below ``folder``."""
+    for left in sorted(folder.rglob(".*.partial*")):
+        if left.is_dir():
+            _put_back(left, left.parent / left.name[1:].removesuffix(".partial"))
+            shutil.rmtree(left)
+        else:
+            left.unlink(missing_ok=True)
 
-    If the process is killed between the two renames, the older folder stays whole in ``.<name>.….old``.
-    """
-    if not target.exists():
-        new.replace(target)
-        return
-    retired = Path(tempfile.mkdtemp(prefix=f".{target.name}.", suffix=".old", dir=target.parent))
-    old = target.replace(retired / target.name)
-    try:
-        new.replace(target)
-    except OSError:
+
+def _work(target: Path) -> Path:
+    return target.parent / f".{target.name}.partial"
+
+
+def _put_back(work: Path, target: Path) -> None:
+    """An older folder that was put aside for a new one, which did not come."""
+    old = work / "old"
+    if old.exists() and not target.exists():
         old.replace(target)
-        raise
-    finally:
-        if target.exists():
-            shutil.rmtree(retired)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def locked(file: Path, target: Path) -> IO[str]:
+    """The file, open to add to, with an advisory lock that ends with it or with the process.
+
+    Raises:
+        InputError: another process holds it, as the one that writes ``target``.
+    """
+    stream = open(file, "a", encoding="utf-8")  # noqa: SIM115
+    if not _lock(stream):
+        stream.close()
+        raise InputError(f"{target} is being written by another process", hint="wait for it, or stop it")
+    return stream
+
+
+def _lock(stream: IO[str]) -> bool:
+    """Whether the lock could be had; a system without such locks does without."""
+    try:
+        import fcntl
+    except ImportError:
+        return True
+    try:
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def _remove_unless_held(left: Path) -> None:
+    """Remove what a process that was stopped left of a file; another that is writing it holds its own."""
+    with contextlib.suppress(FileNotFoundError), open(left) as stream:
+        if _lock(stream):
+            left.unlink()
+
+
+def read_text(path: Path) -> str:
+    """The text of a file.
+
+    Raises:
+        OSError: none that can be read, also a pipe, which would keep its reader waiting.
+        UnicodeDecodeError: bytes that are no UTF-8.
+    """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise OSError(errno.EINVAL, "a pipe or a device, no file", str(path))
+    return path.read_text(encoding="utf-8")
 
 
 @contextmanager

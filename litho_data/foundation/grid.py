@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.quantities import PITCH_UM
 
 
 @dataclass(frozen=True)
@@ -20,7 +21,7 @@ class PixelGrid:
             lies at ``origin + (i + 0.5) * pitch``.
 
     Raises:
-        InputError: a size below one pixel, or a pitch that is not a positive number.
+        InputError: a size below one pixel, or a pitch that can be none.
     """
 
     shape: tuple[int, int]
@@ -30,8 +31,7 @@ class PixelGrid:
     def __post_init__(self) -> None:
         if min(self.shape) < 1:
             raise InputError("grid shape", got=self.shape, wanted="at least 1 x 1 pixels")
-        if not all(np.isfinite(pitch) and pitch > 0 for pitch in self.pitch_um):
-            raise InputError("grid pitch_um", got=self.pitch_um, wanted="two positive numbers in µm")
+        PITCH_UM.require("grid pitch_um", self.pitch_um)
 
     @classmethod
     def square(cls, shape: tuple[int, int], pitch_um: float) -> PixelGrid:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import read_text
 
 
 def require_replaceable_folder(path: str | Path, *holds: str) -> None:
@@ -53,7 +54,7 @@ def require_same_settings(path: str | Path, record: str, settings: Mapping[str, 
     Raises:
         InputError: another value, which the message names.
     """
-    held = _content(Path(path) / record)
+    held = read_record(Path(path) / record)
     now = json.loads(json.dumps(settings))
     other = first_difference(held, now).removeprefix("settings.") if isinstance(held, dict) else ""
     if other:
@@ -133,7 +134,7 @@ def require_same_subject(record: Path, subject: Mapping[str, object]) -> None:
     Raises:
         InputError: another dataset, model or design.
     """
-    held = _content(record)
+    held = read_record(record)
     for name, asked in subject.items():
         found = held
         for part in name.split("."):
@@ -154,13 +155,14 @@ def _refuse_a_file(folder: Path) -> None:
 
 
 def _is_record(file: Path) -> bool:
-    content = _content(file) if file.suffix == ".json" else None
+    content = read_record(file) if file.suffix == ".json" else None
     schema = content.get("schema") if isinstance(content, dict) else None
     return isinstance(schema, str) and schema.split("/")[1:2] == [file.stem.replace("_", "-")]
 
 
-def _content(file: Path) -> Any:
+def read_record(file: Path) -> Any:
+    """The content of a JSON file; None where there is none."""
     try:
-        return json.loads(file.read_text(encoding="utf-8"))
+        return json.loads(read_text(file))
     except (OSError, ValueError, RecursionError):
         return None

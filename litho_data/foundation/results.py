@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Self
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import atomic_file
+from litho_data.foundation.files import atomic_file, read_text
 
 # An unexpected value may be of any size and nested to any depth.
 _SHORT = reprlib.Repr()
@@ -86,7 +86,7 @@ class Result(Record):
         file = file / cls.FILE_NAME if file.is_dir() else file
         kind = "/".join(cls.SCHEMA.split("/")[:2])
         try:
-            content: Any = json.loads(file.read_text(encoding="utf-8"), parse_constant=_refuse)
+            content: Any = json.loads(read_text(file), parse_constant=_refuse)
         except OSError as error:
             raise InputError(f"cannot read {file}", got=error, wanted=f"a result {kind}") from error
         except (ValueError, RecursionError) as error:

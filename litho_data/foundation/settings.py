@@ -16,6 +16,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, Field, ValidationError
 
 from litho_data.foundation.errors import InputError, unknown_name
+from litho_data.foundation.files import read_text
 
 M = TypeVar("M", bound=BaseModel)
 
@@ -170,7 +171,7 @@ def assigned(words: Iterable[str]) -> dict[str, Any]:
             raise InputError("--set", got=f"{path.strip()} twice", wanted="each setting once")
         try:
             values[path.strip()] = json.loads(text)
-        except ValueError:
+        except (ValueError, RecursionError):
             values[path.strip()] = text
     return values
 
@@ -186,10 +187,10 @@ def read_settings(path: str | Path) -> dict[str, Any]:
     if read is None:
         raise InputError("settings file", got=str(file), wanted="a file .toml or .json")
     try:
-        content = read(file.read_text(encoding="utf-8"))
+        content = read(read_text(file))
     except OSError as error:
         raise InputError(f"settings file {file}", got=error, wanted="a file that can be read") from None
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(f"settings file {file}", got=error, wanted=file.suffix[1:].upper()) from None
     if not isinstance(content, dict):
         raise InputError(f"settings file {file}", got=type(content).__name__, wanted="settings by name")

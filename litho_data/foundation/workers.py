@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import os
 import pickle
+import sys
 import threading
+from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
@@ -32,15 +34,21 @@ R = TypeVar("R")
 # What the numerical libraries read when they are loaded; a Dask worker has these values too.
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 _CONNECT_S = 5.0
+_TRIES = 3
 
 
 class Pool(NamedTuple):
-    """Workers that take jobs: how many there are now, and the errors of a job lost with its worker."""
+    """Workers that take jobs: how many there are now, and the errors of a job lost with its worker.
+
+    ``tries``: how often a job is begun, ``restart``: called before those that were lost are begun again.
+    """
 
     submit: Callable[..., Future[bytes]]
     present: Callable[[], int]
     lost: tuple[type[BaseException], ...]
     fate: str
+    tries: int = 1
+    restart: Callable[[], None] = lambda: None
 
 
 @dataclass(frozen=True)
@@ -82,8 +90,8 @@ def run_jobs(
 ) -> Generator[tuple[J, R], None, None]:
     """Each job with its result, in the order in which they are finished.
 
-    At most two jobs per worker are in progress, so memory does not grow with the number of jobs. Dask runs a
-    job again whose worker died, as often as the scheduler allows (three times by default).
+    At most two jobs per worker are in progress, so memory does not grow with the number of jobs. A job whose
+    worker died is run again, alone, twice at most; Dask does so as often as its scheduler allows.
 
     Args:
         function: importable by name; jobs and results can be pickled.
@@ -102,16 +110,54 @@ def run_jobs(
     software = software_record() if workers.dask else None
     away = Away(function, pickle.dumps(known.make), os.getcwd(), run_facts()["command"], software)
     with nullcontext(workers.pool) if workers.pool else _opened(workers, apart, len(jobs)) as pool:
-        for job, future in _windowed(lambda one: pool.submit(away, sent(one, names)), jobs, pool.present):
+        for number, answer in _tried(
+            lambda one: pool.submit(away, sent(jobs[one], names)),
+            len(jobs),
+            pool,
+            lambda one: name(jobs[one]),
+        ):
+            yield jobs[number], received(answer, known.objects)
+
+
+def _tried(
+    submit: Callable[[int], Future[R]], count: int, pool: Pool, name: Callable[[int], str]
+) -> Iterator[tuple[int, R]]:
+    """The numbers of jobs with their answers; those lost with a worker are tried again, one by one."""
+    tries: Counter[int] = Counter()
+
+    def begin(number: int) -> Future[R]:
+        try:
+            future = submit(number)
+        except pool.lost as error:
+            future = Future()
+            future.set_exception(error)
+        else:
+            tries[number] += 1
+        return future
+
+    batches = [list(range(count))]
+    while batches:
+        lost: list[int] = []
+        for number, future in _windowed(begin, batches.pop(0), pool.present):
             try:
                 answer = future.result()
             except pool.lost as error:
-                raise InputError(
-                    f"the worker of {name(job)}",
-                    got=pool.fate,
-                    hint="run it again, it resumes; should memory have run out, with fewer or larger workers",
-                ) from error
-            yield job, received(answer, known.objects)
+                if tries[number] >= pool.tries:
+                    raise InputError(
+                        f"the worker of {name(number)}",
+                        got=pool.fate,
+                        hint="run it again, it resumes; should memory have run out, with fewer or larger "
+                        "workers",
+                    ) from error
+                lost.append(number)
+            else:
+                yield number, answer
+        if lost:
+            under_way = [number for number in lost if tries[number]]
+            print(f"a worker died: {', '.join(map(name, under_way))} again, alone", file=sys.stderr)
+            pool.restart()
+            waiting = [number for number in lost if not tries[number]]
+            batches = [*([number] for number in under_way), waiting, *batches]
 
 
 @contextmanager
@@ -157,20 +203,30 @@ def _opened(workers: Workers, apart: bool = False, most: int | None = None) -> A
 def _local(count: int, apart: bool) -> Iterator[Pool]:
     from multiprocessing import get_context
 
-    # Spawned, because a forked copy of a process with threads may hang.
-    executor: Executor = (
-        ThreadPoolExecutor(count)
-        if apart
-        else ProcessPoolExecutor(count, get_context("spawn"), initializer=_die_with_parent)
-    )
+    def opened() -> Executor:
+        if apart:
+            return ThreadPoolExecutor(count)
+        # Spawned, because a forked copy of a process with threads may hang.
+        return ProcessPoolExecutor(count, get_context("spawn"), initializer=_die_with_parent)
+
+    def restart() -> None:
+        executors.pop().shutdown(wait=False)
+        executors.append(opened())
+
+    executors = [opened()]
     before = os.environ.copy()
     os.environ.update({**ONE_THREAD, **before})
     try:
         yield Pool(
-            executor.submit, lambda: count, (BrokenProcessPool,), "died, or that of another job under way"
+            lambda *job: executors[0].submit(*job),
+            lambda: count,
+            (BrokenProcessPool,),
+            f"died {_TRIES} times",
+            _TRIES,
+            restart,
         )
     finally:
-        executor.shutdown(wait=apart, cancel_futures=True)
+        executors[0].shutdown(wait=apart, cancel_futures=True)
         for variable in ONE_THREAD.keys() - before.keys():
             del os.environ[variable]
 

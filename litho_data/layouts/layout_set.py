@@ -8,10 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError, require_known
-from litho_data.foundation.files import atomic_folder
-from litho_data.foundation.outputs import require_replaceable_folder, require_same_settings
 from litho_data.layouts.card_text import CARD_NAME, TABLE_NAME, CardText, write_layout, write_table
 from litho_data.layouts.patterns import (
     checkerboard,
@@ -103,12 +102,10 @@ def write_layout_set(
         raise InputError("levels of a layout", got=levels, wanted="2 to 256")
     shape = (size_px, size_px) if isinstance(size_px, int) else size_px
     settings = SetSettings(count, shape, levels, cutoff_per_um, passband, pitch_um, seed, quantiser, field_px)
-    require_replaceable_folder(
-        out, CARD_NAME, TABLE_NAME, "layouts", LayoutStatistics.FILE_NAME, "levels.csv", "report.html"
-    )
     made = {"pattern": pattern, **asdict(settings), "level_height_um": level_height_um}
-    require_same_settings(out, LayoutStatistics.FILE_NAME, {"settings": made})
-    with atomic_folder(out) as folder:
+    record = LayoutStatistics.FILE_NAME
+    holds = (CARD_NAME, TABLE_NAME, "layouts", record, "levels.csv", "report.html")
+    with whole_folder(out, *holds, record=record, facts={"settings": made}) as folder:
         paths: list[Path] = []
         rows: list[tuple[object, ...]] = []
         make, meaning = PATTERNS[pattern]

@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import read_text
 from litho_data.foundation.results import first_error
 from litho_data.level.recipe_steps import AnyStep, State
 from litho_data.level.selection import Levelled, as_height
@@ -38,8 +39,8 @@ class Recipe(BaseModel):
             InputError: no such file, no TOML, an unknown operation or key, a value out of range.
         """
         try:
-            content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            content = tomllib.loads(read_text(Path(path)))
+        except (OSError, ValueError, RecursionError) as error:
             raise InputError(f"cannot read recipe {path}", got=error, wanted="a TOML file") from error
         return cls.from_dict(content, source=str(path))
 

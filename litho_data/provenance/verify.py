@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -15,13 +14,16 @@ from litho_data.build.assemble import root_attributes, table_sha256
 from litho_data.build.operations import OPERATIONS
 from litho_data.build.step import Step
 from litho_data.foundation.commands import progress
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, damaged
 from litho_data.foundation.hashes import file_sha256, record_sha256
 from litho_data.provenance.history import raw_folder, read_steps, require_folder, stored_array
 from litho_data.store.access import array_of, decoded, group_of, has_child, open_root, read_table, values_of
-from litho_data.store.read import Store, open_store
+from litho_data.store.contract import file_names, missing_files, read_documents
+from litho_data.store.read import Store
 from litho_data.store.schema import LAYOUT_VARIABLES, MIXED_UNITS, STORE_SCHEMA, VARIABLES
 from litho_data.store.write import PADDING, pixel_centres_um
+
+F = TypeVar("F")
 
 
 @dataclass(frozen=True)
@@ -62,19 +64,22 @@ def verify(store_path: str | Path, data_dir: str | Path | None = None) -> Verifi
         raise InputError(f"{path} carries no provenance", wanted="a store made by litho-data build")
     if data_dir is not None:
         require_folder(data_dir)
-    findings = list(_documents(path))
+    findings = [*_guarded(_documents(path)), *_guarded(_missing(path))]
     try:
-        store = open_store(path)
+        # Not `open_store`, which refuses what has findings.
+        store = Store(open_root(path), path)
         history = read_steps(store)
         manifest = store.manifest
+        if not manifest:
+            raise InputError(f"manifest of {path}", got="none", wanted="that of its build")
         folder = raw_folder(store, data_dir)
     except InputError as error:
         return Verification((*findings, Finding("store", str(error))), (), 0, 0, 0)
-    arrays = list(progress(_arrays(store, history), "hashing arrays"))
+    arrays = list(progress(_guarded(_arrays(store, history)), "hashing arrays"))
     findings += [finding for finding in arrays if finding]
     for check in (_attributes, _tables, _padding, _coordinates):
         findings += _guarded(check(store))
-    findings += _steps(store, history)
+    findings += _guarded(_steps(store, history))
     notes = list(_other_code(history))
     files = [row for row in manifest["files"] if row["sha256"]]
     if folder is None:
@@ -88,10 +93,15 @@ def verify(store_path: str | Path, data_dir: str | Path | None = None) -> Verifi
     return Verification(tuple(findings), tuple(notes), len(arrays), n_steps, len(files))
 
 
+def _missing(path: Path) -> Iterator[Finding]:
+    for name in missing_files(path):
+        yield Finding(f"file {name}", "is declared and is not there")
+
+
 def _documents(path: Path) -> Iterator[Finding]:
     """Metadata documents that are damaged, or differ from their copy in the root document."""
     documents: dict[str, Any] = {}
-    for name, content in _read_documents(path):
+    for name, content in read_documents(path, file_names(path)):
         try:
             documents[name] = json.loads(content)
         except ValueError as error:
@@ -109,21 +119,11 @@ def _documents(path: Path) -> Iterator[Finding]:
             yield Finding(f"metadata {name}", "differs from its copy in the store's zarr.json")
 
 
-def _read_documents(path: Path) -> Iterator[tuple[str, bytes]]:
-    if path.is_dir():
-        for file in sorted(path.rglob("zarr.json")):
-            yield file.relative_to(path).as_posix(), file.read_bytes()
-        return
-    with zipfile.ZipFile(path) as archive:
-        for name in sorted(archive.namelist()):
-            if name.split("/")[-1] == "zarr.json":
-                yield name, archive.read(name)
-
-
-def _guarded(check: Iterator[Finding]) -> Iterator[Finding]:
+def _guarded(check: Iterator[F]) -> Iterator[F | Finding]:
     """A check whose data cannot be read is a finding, too."""
     try:
-        yield from check
+        with damaged("what a check needs"):
+            yield from check
     except InputError as error:
         yield Finding("store", str(error))
 
@@ -131,7 +131,12 @@ def _guarded(check: Iterator[Finding]) -> Iterator[Finding]:
 def _attributes(store: Store) -> Iterator[Finding]:
     """Attributes of the root, compared with those that follow from the manifest and the arrays."""
     attributes = dict(store.root.attrs)
-    wanted = root_attributes(store.manifest, _dataset_sha256(store), str(attributes.get("manifest_sha256")))
+    sha256 = attributes.get("dataset_sha256")
+    try:
+        sha256 = store.sha256
+    except InputError as error:
+        yield Finding("store", str(error))
+    wanted = root_attributes(store.manifest, str(sha256), str(attributes.get("manifest_sha256")))
     for name in sorted({*wanted, *attributes}):
         if attributes.get(name) != wanted.get(name):
             yield Finding(
@@ -148,14 +153,6 @@ def _tables(store: Store) -> Iterator[Finding]:
     for name in ("quality", "provenance"):
         if table_sha256(read_table(group_of(store.root, name), "scan")) != manifest.get(f"{name}_sha256"):
             yield Finding(f"table {name}", "is not the one whose hash the manifest carries")
-
-
-def _dataset_sha256(store: Store) -> str:
-    """The dataset's hash now; the stored one if an array is damaged, which has its own finding."""
-    try:
-        return store.computed_sha256()
-    except InputError:
-        return store.sha256
 
 
 def _steps(store: Store, history: Mapping[str, list[tuple[str, Step]]]) -> Iterator[Finding]:

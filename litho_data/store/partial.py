@@ -10,16 +10,16 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any
 from zipfile import BadZipFile
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import atomic_file, replace_folder, writable
+from litho_data.foundation.errors import InputError, damaged
+from litho_data.foundation.files import atomic_file, publish, unfinished
 from litho_data.store.access import group_of, open_root, values_of
 from litho_data.store.schema import LAYOUT_VARIABLES, SCAN_VARIABLES, STORE_SCHEMA, VARIABLES
 from litho_data.store.write import write_scan_group
@@ -44,20 +44,16 @@ def partial_store(out: Path) -> Iterator[PartialStore]:
         InputError: ``out`` exists and is not a dataset store, cannot be written, or is being built already.
     """
     _require_replaceable(out)
-    partial = PartialStore(out)
-    with writable(out):
-        partial.folder.mkdir(parents=True, exist_ok=True)
-    with open(partial.folder / "lock", "w") as lock:
-        _lock(lock, out)
-        yield partial
+    with unfinished(out) as folder:
+        yield PartialStore(out, folder)
 
 
 class PartialStore:
     """Pieces on disk and the group that they grow into."""
 
-    def __init__(self, out: Path):
+    def __init__(self, out: Path, folder: Path):
         self.out = out
-        self.folder = out.parent / f".{out.name}.partial"
+        self.folder = folder
         self.store = self.folder / "store"
         self._pieces = self.folder / "pieces"
 
@@ -84,12 +80,13 @@ class PartialStore:
         """
         records = {}
         for path in sorted(self._pieces.glob("*.json")):
-            record = json.loads(path.read_text(encoding="utf-8"))
-            scan_id = record["id"]
-            if scan_id in keys and record["key"] == keys[scan_id]() and self._intact(root, record):
-                records[scan_id] = record
-            else:
-                path.unlink()
+            with suppress(InputError), damaged(str(path)):
+                record = json.loads(path.read_text(encoding="utf-8"))
+                scan_id = record["id"]
+                if scan_id in keys and record["key"] == keys[scan_id]() and self._intact(root, record):
+                    records[scan_id] = record
+                    continue
+            path.unlink()
         for path in (self.store / "scans").glob("*"):
             if path.is_dir() and path.name not in records:
                 shutil.rmtree(path)
@@ -115,7 +112,7 @@ class PartialStore:
 
     def publish(self) -> None:
         """Put the finished store in its place; an older store there is replaced."""
-        replace_folder(self.store, self.out)
+        publish(self.store, self.out)
         self.discard()
 
     def discard(self) -> None:
@@ -146,17 +143,3 @@ def _require_replaceable(out: Path) -> None:
         raise InputError(
             "output", got=f"{out}, which is no dataset store", wanted="a new path, or a store to replace"
         )
-
-
-def _lock(stream: IO[str], out: Path) -> None:
-    """An advisory lock that ends with the process; a system without such locks does without."""
-    try:
-        import fcntl
-    except ImportError:
-        return
-    try:
-        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        raise InputError(
-            f"{out} is being built by another process", hint="wait for it, or stop it"
-        ) from error

@@ -6,14 +6,13 @@ import html
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, unknown_name
+from litho_data.foundation.errors import damaged, unknown_name
 from litho_data.register.bend import Bend
 from litho_data.store.access import (
     decoded,
@@ -24,17 +23,24 @@ from litho_data.store.access import (
     read_table,
     values_of,
 )
+from litho_data.store.contract import (
+    checked_arrays,
+    checked_attributes,
+    checked_columns,
+    require_complete,
+    require_manifest,
+    require_possible,
+    true_shapes,
+)
 from litho_data.store.lock_box import lock_box, lock_box_size
+from litho_data.store.printed_scan import PrintedScan as PrintedScan
 from litho_data.store.schema import (
     OPTIONAL_COLUMNS,
     SAMPLE_VARIABLES,
     SIGMA,
     VARIABLES,
     DatasetId,
-    checked_arrays,
-    checked_attributes,
     dataset_sha256,
-    true_shapes,
 )
 
 if TYPE_CHECKING:
@@ -45,92 +51,19 @@ if TYPE_CHECKING:
 _SHOWN_SCANS = 12
 
 
-@dataclass(frozen=True)
-class PrintedScan:
-    """One printed field: the layout sent to the printer and the height measured on the layout's grid.
-
-    Args:
-        id: name of the scan; ``print_id``: block of fields it was printed with; ``order``: writing order.
-        mask_level: layout levels, uint8 (ny, nx).
-        height_um: float32 (ny, nx), µm, NaN where not measured.
-        valid: bool (ny, nx), measured and inside the scan.
-        pitch_um: pixel pitch of all three arrays, µm; ``level_height_um``: nominal height of a level, µm.
-        levels: number of levels the layout may use.
-        scan_to_layout: 3 x 3 float64, maps (x_um, y_um, 1) of the scan's own frame to the layout frame.
-        write: the card's ``[write]`` table; None if it has none.
-        field_x_um, field_y_um: position of the scan in its write field, µm; ``dose``: relative dose;
-            None if the card does not state it.
-        turned_deg: by how much the scan is turned against the others, ``direction``: 1 trace, -1 retrace,
-            ``tip``: number of the tip, ``pixel_size``: of the scan, relative to the others; None as above.
-        bend_um: of a bent scan; ``scan_to_layout`` then acts on the straightened positions.
-        tip_radius_um: of the microscope's tip, or the most that it can be; None if the store does not say.
-        height_sigma_um: float32 (ny, nx), µm, standard uncertainty of ``height_um``, the scan's offset aside;
-            NaN where not valid, None if the store has none.
-    """
-
-    id: str
-    print_id: str
-    order: int
-    mask_level: np.ndarray
-    height_um: np.ndarray
-    valid: np.ndarray
-    pitch_um: float
-    level_height_um: float
-    levels: int
-    scan_to_layout: np.ndarray
-    write: Mapping[str, Any] | None = None
-    field_x_um: float | None = None
-    field_y_um: float | None = None
-    dose: float | None = None
-    turned_deg: float | None = None
-    direction: float | None = None
-    tip: float | None = None
-    pixel_size: float | None = None
-    bend_um: Bend | None = None
-    tip_radius_um: float | None = None
-    height_sigma_um: np.ndarray | None = None
-
-    def __repr__(self) -> str:
-        ny, nx = self.shape
-        return (
-            f"<PrintedScan {self.id}: {ny} x {nx} px of {self.pitch_um:g} µm, print {self.print_id}, "
-            f"{self.levels} levels of {self.level_height_um:g} µm, {self.valid.mean():.1%} valid>"
-        )
-
-    def _repr_html_(self) -> str:
-        from litho_data.foundation.report_pictures import shown_html
-
-        return shown_html(repr(self), layout_um=self.layout_um, height_um=self.height_um)
-
-    @property
-    def quarter_turns(self) -> int:
-        """How often ``rot90`` turns the layout's grid into the scan's, 0 to 3, by its registration."""
-        along = self.scan_to_layout[:2, 0]
-        return round(math.atan2(along[1], along[0]) / (math.pi / 2)) % 4
-
-    @property
-    def usable(self) -> np.ndarray:
-        """Measured pixels, bool (ny, nx)."""
-        return np.asarray(self.valid, bool) & np.isfinite(self.height_um)
-
-    @property
-    def layout_um(self) -> np.ndarray:
-        """Nominal height, float32 (ny, nx), µm."""
-        return self.mask_level.astype(np.float32) * np.float32(self.level_height_um)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(ny, nx) in pixels."""
-        return self.mask_level.shape[0], self.mask_level.shape[1]
-
-
 def open_store(path: str | Path) -> Store:
-    """Open a dataset store, a folder or a ``.zarr.zip`` file, for reading.
+    """Open a dataset store, a folder or a ``.zarr.zip`` file, for reading; everything is read once.
 
     Raises:
-        InputError: not there, not a Zarr v3 group, or arrays and attributes that break the store's contract.
+        InputError: not there, not a Zarr v3 group, a file that it declares is missing or damaged, or arrays
+            and attributes that break the store's contract.
     """
-    return Store(open_root(path), Path(path))
+    root = open_root(path)
+    require_complete(Path(path))
+    store = Store(root, Path(path))
+    # Both are checked as they are read.
+    _ = store.sha256, store.manifest
+    return store
 
 
 class Store:
@@ -146,13 +79,10 @@ class Store:
         self.levels: int = attributes["levels"]
         self.write: dict[str, Any] | None = attributes["write"]
         self._arrays = checked_arrays(root, path)
-        self.ids: list[str] = [str(value) for value in values_of(root, "scan")]
-        if len(set(self.ids)) != len(self.ids):
-            raise InputError(f"scan ids of {path}", got="duplicates", wanted="unique ids")
-        self._print_ids = [str(value) for value in values_of(root, "print")]
-        self._order = [int(value) for value in values_of(root, "order")]
-        self._columns = {name: values_of(root, name) for name in OPTIONAL_COLUMNS if has_child(root, name)}
-        self.shapes = true_shapes(root, len(self.ids), self._arrays["mask_level"].shape[1:])
+        self._columns = checked_columns(root, path)
+        self.ids: list[str] = self._columns["scan"]
+        self._print_ids: list[str] = self._columns["print"]
+        self.shapes = true_shapes(root, path, len(self.ids), self._arrays["mask_level"].shape[1:])
         self._row = {scan_id: row for row, scan_id in enumerate(self.ids)}
 
     def __len__(self) -> int:
@@ -164,7 +94,7 @@ class Store:
     def _repr_html_(self) -> str:
         import pandas as pd
 
-        scans = pd.DataFrame({"scan": self.ids, "print": self._print_ids, "order": self._order})
+        scans = pd.DataFrame({"scan": self.ids, "print": self._print_ids, "order": self._columns["order"]})
         return f"<p>{html.escape(repr(self))}</p>{scans.to_html(index=False, max_rows=_SHOWN_SCANS)}"
 
     def scan(self, scan_id: str) -> PrintedScan:
@@ -179,7 +109,7 @@ class Store:
         return PrintedScan(
             id=scan_id,
             print_id=self._print_ids[row],
-            order=self._order[row],
+            order=self._columns["order"][row],
             mask_level=self.sample("mask_level", row),
             height_um=self.sample("height_um", row),
             valid=self.sample("valid", row),
@@ -231,22 +161,22 @@ class Store:
         wanted = set(ids)
         rows = [row for row in self.manifest.get("files", []) if row["scan"] in wanted and row["sha256"]]
         # Only what was read as a scan has the facts of a reader.
-        return {row["scan"]: row["sha256"] for row in rows if json.loads(row["read"] or "{}")}
+        return {row["scan"]: row["sha256"] for row in rows if _read_facts(row)}
 
     def references(self) -> dict[str, str]:
         """Scans outside the dataset: id and use, such as flat; ``scan_frame`` has the heights."""
         if not has_child(self.root, "scans"):
             return {}
         groups = groups_in(group_of(self.root, "scans"))
-        uses = {name: str(group.attrs["use"]) for name, group in groups.items()}
+        with damaged(f"metadata of the scans in {self.path}"):
+            uses = {name: str(group.attrs["use"]) for name, group in groups.items()}
         return {name: use for name, use in sorted(uses.items()) if use != "dataset"}
 
     def recorded_pitches_um(self) -> dict[str, tuple[float, float]]:
         """Pitch (y, x) of the scans, references too, as their reader recorded it."""
         pitches = {}
         for row in self.manifest.get("files", []):
-            pitch = json.loads(row["read"] or "{}").get("pitch_um")
-            if pitch:
+            if pitch := _read_facts(row).get("pitch_um"):
                 pitches[row["scan"]] = (float(pitch[0]), float(pitch[1]))
         return pitches
 
@@ -256,7 +186,9 @@ class Store:
         if not has_child(self.root, "manifest"):
             return {}
         group = group_of(self.root, "manifest")
-        return {**dict(group.attrs), "files": read_table(group, "path").to_dict("records")}
+        manifest = {**dict(group.attrs), "files": read_table(group, "path").to_dict("records")}
+        require_manifest(manifest, self.path)
+        return manifest
 
     @cached_property
     def quality(self) -> pd.DataFrame:
@@ -269,9 +201,8 @@ class Store:
 
     @cached_property
     def sha256(self) -> str:
-        """Hash of the dataset, independent of chunking: the stored one, else computed from the arrays."""
-        stored = self.root.attrs.get("dataset_sha256")
-        return str(stored) if stored else self.computed_sha256()
+        """Hash of the dataset as it was read, independent of chunking."""
+        return self.computed_sha256()
 
     @property
     def dataset_id(self) -> DatasetId:
@@ -289,13 +220,15 @@ class Store:
         identity: dict[str, Any] = {
             "id": self.ids[row],
             "print": self._print_ids[row],
-            "order": self._order[row],
+            "order": self._columns["order"][row],
         }
         for name in OPTIONAL_COLUMNS:
             value = self._column(name, row)
             if value is not None:
                 identity[name] = value
-        hashes = {v.name: v.sample_sha256(self.sample(v.name, row)) for v in SAMPLE_VARIABLES}
+        samples = {v.name: self.sample(v.name, row) for v in SAMPLE_VARIABLES}
+        require_possible(samples, self.levels, f"scan {self.ids[row]} of {self.path}")
+        hashes = {v.name: v.sample_sha256(samples[v.name]) for v in SAMPLE_VARIABLES}
         bend_um = self._bend_um(row)
         if bend_um is not None:
             hashes["bend_um"] = VARIABLES["bend_um"].sample_sha256(bend_um.amount)
@@ -306,17 +239,23 @@ class Store:
         scan_id = self.ids[row]
         if not has_child(self.root, f"scans/{scan_id}/bend_um"):
             return None
-        one = self.quality.iloc[row]
-        shape = int(one["scan_ny"]), int(one["scan_nx"])
-        pitch_um = float(one["scan_pitch_y_um"]), float(one["scan_pitch_x_um"])
-        return Bend.of_scan(self.scan_frame(scan_id, "bend_um"), shape, pitch_um)
+        with damaged(f"bend of scan {scan_id} in {self.path}"):
+            one = self.quality.iloc[row]
+            shape = int(one["scan_ny"]), int(one["scan_nx"])
+            pitch_um = float(one["scan_pitch_y_um"]), float(one["scan_pitch_x_um"])
+            return Bend.of_scan(self.scan_frame(scan_id, "bend_um"), shape, pitch_um)
 
     def _tip_radius_um(self, row: int) -> float | None:
         if "tip_radius_um" not in self.quality:
             return None
-        value = float(self.quality["tip_radius_um"].iloc[row])
+        with damaged(f"tip_radius_um of {self.path}"):
+            value = float(self.quality["tip_radius_um"].iloc[row])
         return None if math.isnan(value) else value
 
     def _column(self, name: str, row: int) -> float | None:
-        value = float(self._columns[name][row]) if name in self._columns else math.nan
-        return None if math.isnan(value) else value
+        return self._columns[name][row] if name in self._columns else None
+
+
+def _read_facts(row: Mapping[str, Any]) -> dict[str, Any]:
+    facts: dict[str, Any] = json.loads(row["read"] or "{}")
+    return facts

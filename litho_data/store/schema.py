@@ -1,22 +1,16 @@
-"""The dataset store on one screen: arrays, dimensions, types, units, the hash of a dataset, and the check."""
+"""The dataset store on one screen: arrays, dimensions, types, units, and the hash of a dataset."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import array_sha256, record_sha256
+from litho_data.foundation.quantities import DOSE, ORDER, PLACE_UM, Range
 from litho_data.foundation.results import Record
-from litho_data.store.access import array_of, group_of, has_child, values_of
-
-if TYPE_CHECKING:
-    import zarr
 
 STORE_SCHEMA = "litho-data/store/1"
 
@@ -81,8 +75,16 @@ SCAN_VARIABLES = (
 # No unit for the whole of it; in hashes it counts as 1.
 MIXED_UNITS = {"scan_to_layout": "units of its rows: 1, 1, um; 1, 1, um; um-1, um-1, 1"}
 VARIABLES = {variable.name: variable for variable in (*LAYOUT_VARIABLES, *SCAN_VARIABLES)}
-OPTIONAL_COLUMNS = ("field_x_um", "field_y_um", "dose", "turned_deg", "direction", "tip", "pixel_size")
-"""Numbers per scan from the card's table; coordinates where the card has them, NaN where a row has not."""
+OPTIONAL_COLUMNS = {
+    "field_x_um": PLACE_UM,
+    "field_y_um": PLACE_UM,
+    "dose": DOSE,
+    "turned_deg": Range(0, 360, "degrees"),
+    "direction": Range(-1, 1),
+    "tip": ORDER,
+    "pixel_size": Range(1e-3, 1e3),
+}
+"""Numbers per scan from the card's table, and what they may be; NaN where a row has none."""
 
 
 def dataset_sha256(facts: Mapping[str, Any], scans: Sequence[Mapping[str, Any]]) -> str:
@@ -94,50 +96,3 @@ def dataset_sha256(facts: Mapping[str, Any], scans: Sequence[Mapping[str, Any]])
             and ``arrays``, a dict of variable name to :meth:`Variable.sample_sha256`.
     """
     return record_sha256({"facts": dict(facts), "scans": [dict(scan) for scan in scans]})
-
-
-def checked_attributes(root: zarr.Group, path: Path) -> dict[str, Any]:
-    """Name, pitch, level height, number of levels and write table of a store; InputError if one is wrong."""
-    attributes = dict(root.attrs)
-    checked: dict[str, Any] = {
-        "name": str(attributes.get("name", path.stem)),
-        "write": attributes.get("write"),
-    }
-    for key in ("pitch_um", "level_height_um"):
-        value = attributes.get(key)
-        if not isinstance(value, int | float) or not math.isfinite(value) or value <= 0:
-            raise InputError(f"attribute {key} of {path}", got=repr(value), wanted="a positive number in µm")
-        checked[key] = float(value)
-    levels = attributes.get("levels")
-    if not isinstance(levels, int) or not 2 <= levels <= 256:
-        raise InputError(
-            f"attribute levels of {path}", got=repr(levels), wanted="a whole number from 2 to 256"
-        )
-    return {**checked, "levels": levels}
-
-
-def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array]:
-    """The arrays over all scans by name; InputError where one is missing or of another shape or type."""
-    names = (*(variable.name for variable in SAMPLE_VARIABLES), "scan", "print", "order")
-    arrays = {name: array_of(root, name) for name in names}
-    if has_child(root, SIGMA.name):
-        arrays[SIGMA.name] = array_of(root, SIGMA.name)
-    count, field = arrays["scan"].shape[0], arrays["mask_level"].shape[1:]
-    for variable in LAYOUT_VARIABLES:
-        if variable.name not in arrays:
-            continue
-        array = arrays[variable.name]
-        wanted = (count, 3, 3) if variable.name == "scan_to_layout" else (count, *field)
-        if array.shape != wanted or array.dtype != np.dtype(variable.dtype):
-            got, wanted_text = f"{array.dtype} {array.shape}", f"{variable.dtype} {wanted}"
-            raise InputError(f"array {variable.name} of {path}", got=got, wanted=wanted_text)
-    return arrays
-
-
-def true_shapes(root: zarr.Group, count: int, padded: tuple[int, ...]) -> list[tuple[int, int]]:
-    """(ny, nx) of every scan without its padding."""
-    if not has_child(root, "quality"):
-        return [(padded[0], padded[1])] * count
-    quality = group_of(root, "quality")
-    rows, columns = values_of(quality, "layout_ny"), values_of(quality, "layout_nx")
-    return [(int(ny), int(nx)) for ny, nx in zip(rows, columns, strict=True)]

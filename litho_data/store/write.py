@@ -26,6 +26,8 @@ _SHARD_BYTES = 16 << 20
 _MAX_SCANS_PER_SHARD = 16
 PADDING = {"mask_level": 0, "height_um": np.nan, "valid": False, "height_sigma_um": np.nan}
 """What fills the place beyond a layout that is smaller than the largest."""
+# By default a chunk of nothing but fill values has no file, and would look like one that was lost.
+_EVERY_CHUNK: Any = {"write_empty_chunks": True}
 _OWN_FRAME = {"y": "scan_y", "x": "scan_x"}
 # Attributes of the CF conventions beyond unit and name.
 _CF: dict[str, dict[str, Any]] = {
@@ -118,6 +120,7 @@ def write_strings(group: zarr.Group, name: str, values: Sequence[str], dim: str)
         chunks=size,
         dtype="string",
         compressors=_compressors(),
+        config=_EVERY_CHUNK,
         dimension_names=(dim,),
     )
     array[...] = np.array(values, dtype=object)
@@ -137,6 +140,7 @@ def write_numbers(
         chunks=(max(len(values), 1),),
         dtype=values.dtype,
         compressors=_compressors(),
+        config=_EVERY_CHUNK,
         dimension_names=(dim,),
         attributes=dict(attributes or {}),
     )
@@ -168,6 +172,7 @@ def _create(group: zarr.Group, name: str, shape: tuple[int, ...], **layout: Any)
         dtype=variable.dtype,
         fill_value=np.nan if variable.dtype.startswith("float") else 0,
         compressors=_compressors(),
+        config=_EVERY_CHUNK,
         dimension_names=names,
         attributes=attributes,
         **layout,

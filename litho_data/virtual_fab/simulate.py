@@ -10,11 +10,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError, require_known
-from litho_data.foundation.files import atomic_folder
 from litho_data.foundation.hashes import array_sha256, record_sha256
-from litho_data.foundation.outputs import require_replaceable_folder, require_same_settings
 from litho_data.layouts.card_text import CardText, write_layout, write_table
 from litho_data.level.scan import write_heights
 from litho_data.readers.text_matrix import write_text_matrix
@@ -102,7 +101,6 @@ def simulate(
         _check_jobs(jobs, fab.printer)
     source: Iterator[Job] = iter(jobs) if jobs is not None else random_jobs(plan, fab.printer, seed)
     total = len(jobs) if jobs is not None else plan.total
-    require_replaceable_folder(out, "raw", "truth")
     asked = asdict(plan) if jobs is None else {"jobs": record_sha256([_described(job) for job in jobs])}
     facts: dict[str, Any] = {
         "seed": seed,
@@ -112,8 +110,7 @@ def simulate(
         "knobs": [KnobTruth.of(setting, seed).model_dump() for setting in fab.knobs.settings],
         "settings": {**asked, "metadata": metadata},
     }
-    require_same_settings(out, f"truth/{Truth.FILE_NAME}", facts)
-    with atomic_folder(out) as folder:
+    with whole_folder(out, "raw", "truth", record=f"truth/{Truth.FILE_NAME}", facts=facts) as folder:
         raw, hidden = folder / "raw", folder / "truth"
         for part in (raw / "scans", hidden / "prints", hidden / "surfaces"):
             part.mkdir(parents=True)

@@ -10,11 +10,12 @@ from pathlib import Path
 import torch
 from pydantic import BaseModel, ConfigDict
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_folder
+from litho_models.frozen.files import write_tensors
 from litho_models.simulator import Simulator
 
 
@@ -116,7 +117,7 @@ class CheckpointFolder:
     def save(self, state: TrainingState) -> None:
         """Replace the checkpoint as a whole."""
         with atomic_folder(self.path) as folder:
-            save_file(state.tensors(), folder / "state.safetensors")
+            write_tensors(state.tensors(), folder / "state.safetensors")
             record = {"key": self._key, "history": [entry.model_dump() for entry in state.history]}
             (folder / "state.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 

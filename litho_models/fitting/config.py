@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Literal, Self, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
+from pydantic import BaseModel, ConfigDict, Field
 
 from litho_data.foundation.errors import require_known
 from litho_models.fitting.pixel_weights import Weights
@@ -58,14 +58,6 @@ class TrainingConfig(BaseModel):
     weights: Weights = Field("uniform", description="what pixels count for: alike, or by 1 / σ of the height")
     validation_scans: int = Field(2, ge=0, description="training scans that only choose the checkpoint")
     precision: Literal["bf16-mixed", "32-true"] = "32-true"
-
-    @model_serializer(mode="wrap")
-    def _record(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Uniform weights go unsaid: what was recorded and kept before there were others stays the same."""
-        record: dict[str, Any] = write(self)
-        if record.get("weights") == "uniform":
-            del record["weights"]
-        return record
 
     @classmethod
     def of_recipe(cls, recipe: Recipe, model_name: str, **settings: Any) -> Self:

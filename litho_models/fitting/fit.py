@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,11 +12,11 @@ import numpy as np
 import torch
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.hashes import array_sha256
+from litho_data.foundation.hashes import record_sha256
 from litho_data.store import PrintedScan
+from litho_data.store.printed_scan import scan_sha256
 from litho_models.fitting.checkpoint import CheckpointFolder, RoundRecord
 from litho_models.fitting.config import TrainingConfig
-from litho_models.fitting.pixel_weights import pixel_weights
 from litho_models.fitting.pixels import fit_feature_networks
 from litho_models.fitting.ridge import fit_ridge
 from litho_models.fitting.small_models import fit_small_model
@@ -139,22 +137,12 @@ def run_key(
         "training": config.model_dump(mode="json"),
         "scans": scans_sha256(scans),
     }
-    if config.weights == "sigma":
-        weights = {scan.id: pixel_weights(scan, "sigma") for scan in scans}
-        record["weights"] = {key: array_sha256(own, "1", ("y", "x")) for key, own in weights.items()}
-    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
+    return record_sha256(record)
 
 
-def scans_sha256(scans: Sequence[PrintedScan]) -> dict[str, list[str]]:
-    """Per scan id the hashes of its layout, height and valid pixels."""
-    return {
-        scan.id: [
-            array_sha256(scan.mask_level, "level", ("y", "x")),
-            array_sha256(scan.height_um, "µm", ("y", "x")),
-            array_sha256(scan.valid, "1", ("y", "x")),
-        ]
-        for scan in scans
-    }
+def scans_sha256(scans: Sequence[PrintedScan]) -> dict[str, str]:
+    """The key of each scan by its id."""
+    return {scan.id: scan_sha256(scan) for scan in scans}
 
 
 def common_geometry(scans: Sequence[PrintedScan]) -> dict[str, Any]:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from pydantic import Field, ValidationError
 
-from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.begun import growing_folder
+from litho_data.foundation.errors import require_known
 from litho_data.foundation.files import atomic_file
-from litho_data.foundation.outputs import first_difference, require_own_folder
 from litho_data.foundation.results import Result
 from litho_data.foundation.run_facts import RunInfo, run_info
 from litho_data.foundation.settings import refused
@@ -80,67 +81,55 @@ def train(
     locked = [] if use_lock_box else lock_box
     used = [scan for scan in scans if scan.id not in locked]
     folder = Path(out)
-    named = dataset.dataset_id
-    require_own_folder(folder, TrainingRun.FILE_NAME, CHECKPOINT_FOLDER, MODEL_FOLDER)
-    _require_same_run(folder, {"dataset": named, "model": model, "config": config, "lock_box": locked})
-    fitted = fit_with_record(model, used, config, checkpoint=folder / CHECKPOINT_FOLDER)
-    record = TrainingRun(
-        run=run_info([config.seed], len(used)),
-        dataset=named,
-        model=model,
-        parameters=fitted.model.parameter_count,
-        config=config,
-        training_ids=fitted.training_ids,
-        validation_ids=fitted.validation_ids,
-        lock_box=locked,
-        history=fitted.history,
-        seconds=fitted.seconds,
-        at_bounds=fitted.model.at_bounds,
-    )
-    if int(os.environ.get("RANK", "0")) > 0:
-        return record  # under torchrun the first process writes
-    heights = [predict_scan(fitted.model, scan) for scan in used]
-    save_frozen(
-        fitted.model,
-        folder / MODEL_FOLDER,
-        dataset=record.dataset,
-        training={
-            **config.model_dump(mode="json"),
-            "scan_ids": [scan.id for scan in used],
-            "validation_ids": fitted.validation_ids,
-            "seconds": round(fitted.seconds, 1),
-        },
-        training_level_share=level_share(used),
-        training_step_share=step_share(used),
-        background=learn_background(used, heights),
-        baseline=baseline_of(used, heights, held_out=False),
-        command=record.run.command,
-        split={
-            "kind": "development",
-            "lock_box": locked,
-            "lock_box_sha256": ids_sha256(locked),
-            "lock_box_files_sha256": sorted(dataset.files_sha256(lock_box).values()),
-        },
-        limitations=["Not evaluated yet: see the evaluation of this model for its error."],
-    )
-    _write_history(record, folder)
-    record.write(folder)
-    return record
-
-
-def _require_same_run(folder: Path, facts: dict[str, Any]) -> None:
-    """Refuse a folder with the record of a run that differs in ``facts``, fields of ``TrainingRun``."""
-    if not (folder / TrainingRun.FILE_NAME).exists():
-        return
-    held = TrainingRun.read(folder)
-    then, now = (one.model_dump(mode="json") for one in (held, held.model_copy(update=facts)))
-    if other := first_difference(then, now):
-        raise InputError(
-            f"{folder} holds another run",
-            got=f"{held.model} on {held.dataset.name}, {other}",
-            wanted="a new folder, or the same run again",
-            hint="choose another --out, or delete the folder",
+    facts: dict[str, Any] = {
+        "dataset": dataset.dataset_id.model_dump(),
+        "model": model,
+        "config": config.model_dump(mode="json"),
+        "lock_box": locked,
+    }
+    # Under torchrun the first process writes.
+    first = int(os.environ.get("RANK", "0")) == 0
+    with growing_folder(folder, TrainingRun.FILE_NAME, facts) if first else nullcontext():
+        fitted = fit_with_record(model, used, config, checkpoint=folder / CHECKPOINT_FOLDER)
+        record = TrainingRun(
+            run=run_info([config.seed], len(used)),
+            parameters=fitted.model.parameter_count,
+            training_ids=fitted.training_ids,
+            validation_ids=fitted.validation_ids,
+            history=fitted.history,
+            seconds=fitted.seconds,
+            at_bounds=fitted.model.at_bounds,
+            **facts,
         )
+        if not first:
+            return record
+        heights = [predict_scan(fitted.model, scan) for scan in used]
+        save_frozen(
+            fitted.model,
+            folder / MODEL_FOLDER,
+            dataset=record.dataset,
+            training={
+                **facts["config"],
+                "scan_ids": [scan.id for scan in used],
+                "validation_ids": fitted.validation_ids,
+                "seconds": round(fitted.seconds, 1),
+            },
+            training_level_share=level_share(used),
+            training_step_share=step_share(used),
+            background=learn_background(used, heights),
+            baseline=baseline_of(used, heights, held_out=False),
+            command=record.run.command,
+            split={
+                "kind": "development",
+                "lock_box": locked,
+                "lock_box_sha256": ids_sha256(locked),
+                "lock_box_files_sha256": sorted(dataset.files_sha256(lock_box).values()),
+            },
+            limitations=["Not evaluated yet: see the evaluation of this model for its error."],
+        )
+        _write_history(record, folder)
+        record.write(folder)
+    return record
 
 
 def training_config(recipe: Recipe, model: str, settings: dict[str, Any]) -> TrainingConfig:

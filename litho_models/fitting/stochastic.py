@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, cast
 
@@ -20,6 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from litho_data.foundation.commands import progress
+from litho_data.foundation.errors import InputError
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.store import PrintedScan
 from litho_models.fitting.checkpoint import CheckpointFolder, RoundRecord, TrainingState
@@ -77,22 +79,47 @@ def train_network(
         sums = []
         left = config.steps - first if first == begun else 0
         what = f"training {model.name} to step {config.steps}"
-        for step in progress(range(first, last), what, estimate_of=left):
-            sums.append(_step(fabric, module, optimiser, targets, config, step))
+        with _diverging(model, last):
+            for step in progress(range(first, last), what, estimate_of=left):
+                sums.append(_step(fabric, module, optimiser, targets, config, step))
         absolute, counted = torch.stack(sums).double().cpu().numpy().T
-        state.record(
-            RoundRecord(
-                step=last,
-                training_mae_nm=NM_PER_UM * float(np.mean(absolute / counted)),
-                validation_mae_datum_free_nm=validation_error(model, validation),
-                seconds=time.monotonic() - started,
-            )
+        record = RoundRecord(
+            step=last,
+            training_mae_nm=NM_PER_UM * float(np.mean(absolute / counted)),
+            validation_mae_datum_free_nm=validation_error(model, validation),
+            seconds=time.monotonic() - started,
         )
+        if not np.isfinite([record.training_mae_nm, record.validation_mae_datum_free_nm or 0]).all():
+            raise _diverged(model, last)
+        state.record(record)
         if checkpoints is not None and fabric.is_global_zero:
             checkpoints.save(state)
         fabric.barrier()
     state.restore_best()
     return state.history
+
+
+@contextmanager
+def _diverging(model: Simulator, last: int) -> Iterator[None]:
+    """Steps up to ``last``; InputError where they lead to numbers that are none, whatever fails then."""
+    try:
+        yield
+        error = None
+    except (ArithmeticError, LookupError, RuntimeError, ValueError) as raised:
+        error = raised
+    if not all(bool(value.isfinite().all()) for value in model.state_dict().values()):
+        raise _diverged(model, last) from error
+    if error is not None:
+        raise error
+
+
+def _diverged(model: Simulator, step: int) -> InputError:
+    return InputError(
+        f"training of {model.name}",
+        got=f"weights or errors that are no numbers at step {step}",
+        wanted="steps that converge",
+        hint="try a smaller learning_rate",
+    )
 
 
 class _Targets:

@@ -8,6 +8,8 @@ from typing import Any, ClassVar, Literal, Self
 from pydantic import ConfigDict, Field, JsonValue, field_validator
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.names import PlainName
+from litho_data.foundation.quantities import LevelHeightUm, Levels, PitchUm
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunFacts
 from litho_data.store.schema import DatasetId
@@ -51,15 +53,15 @@ class ModelCard(RunFacts, Result):
     SCHEMA: ClassVar[str] = "litho-models/frozen/1"
     FILE_NAME: ClassVar[str] = CARD_FILE
 
-    name: str
+    name: PlainName
     model: str
     variant: str
     hyper_parameters: dict[str, JsonValue]
     parameters: int
     weights_sha256: str
-    pitch_um: float
-    level_height_um: float
-    levels: int
+    pitch_um: PitchUm
+    level_height_um: LevelHeightUm
+    levels: Levels
     calibrated_range_um: tuple[float, float]
     training_level_share: list[float] = Field(default_factory=list)
     training_step_share: list[float] = Field(default_factory=list)

@@ -58,14 +58,8 @@ def export_model(model: FrozenSimulator, out: str | Path, size_px: int | tuple[i
         program = _program(simulator, layouts)
         facts = {key: model.card[key] for key in _FACTS} | {"sha256": model.sha256}
         with atomic_file(target) as temporary:
-            # The formats are told by the suffix.
-            file = temporary.with_suffix(target.suffix)
-            try:
-                write = _write_pt2 if target.suffix == ".pt2" else _write_onnx
-                printed = write(program, file, layouts[1], facts)
-                file.replace(temporary)
-            finally:
-                file.unlink(missing_ok=True)
+            write = _write_pt2 if target.suffix == ".pt2" else _write_onnx
+            printed = write(program, temporary, layouts[1], facts)
             difference = float((printed - wanted).abs().max())
             if not difference <= LARGEST_DIFFERENCE_UM:
                 got = f"a print that differs by {difference:g} µm"

@@ -13,13 +13,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 from pydantic import ValidationError
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor
 
+from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import atomic_folder
 from litho_data.foundation.hashes import file_sha256
-from litho_data.foundation.outputs import require_replaceable_folder
 from litho_data.foundation.results import first_error
 from litho_data.foundation.run_facts import run_facts
 from litho_models.frozen import zoo
@@ -57,11 +56,10 @@ def save_frozen(
     """
     state = {key: value.detach().cpu().contiguous() for key, value in simulator.state_dict().items()}
     _check_numbers(state, f"weights of {simulator.name}")
-    require_replaceable_folder(folder, WEIGHTS_FILE, CARD_FILE, README_FILE)
     config = simulator.config
-    with atomic_folder(folder) as temporary:
+    with whole_folder(folder, WEIGHTS_FILE, CARD_FILE, README_FILE) as temporary:
         # No metadata in the file: safetensors writes its entries in no fixed order, which moved the hash.
-        save_file(state, temporary / WEIGHTS_FILE)
+        write_tensors(state, temporary / WEIGHTS_FILE)
         try:
             card = ModelCard(
                 name=name or simulator.name,
@@ -85,6 +83,11 @@ def save_frozen(
         card.write(temporary)
         (temporary / README_FILE).write_text(model_readme(card), encoding="utf-8")
     return Path(folder)
+
+
+def write_tensors(tensors: dict[str, Tensor], file: Path) -> None:
+    """A file of safetensors; an OSError, which theirs is not, where it cannot be written."""
+    file.write_bytes(save(tensors))
 
 
 def load_frozen(

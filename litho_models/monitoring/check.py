@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.outputs import require_own_folder
 from litho_data.foundation.run_facts import run_info
-from litho_data.store import open_store
+from litho_data.store import Store, open_store
 from litho_models.frozen.files import load_frozen
+from litho_models.frozen.simulator import FrozenSimulator
 from litho_models.monitoring import wording
 from litho_models.monitoring.inputs import gather
 from litho_models.monitoring.judging import DEFAULT_RATE, judge
@@ -53,8 +54,23 @@ def check(
         raise InputError("tolerance", got=tolerance, wanted="between 0 and 1: 0.05 is 5 %")
     dataset = open_store(store)
     frozen = load_frozen(model, device=device)
-    subject = {"dataset.name": dataset.name, "model.name": frozen.name}
-    require_own_folder(out, Check.FILE_NAME, subject=subject)
+    subject = {"dataset": {"name": dataset.name}, "model": {"name": frozen.name}}
+    with growing_folder(out, Check.FILE_NAME, subject) as begun:
+        result = _checked(frozen, dataset, reference, new, residuals, false_alarms, tolerance)
+        write_check_report(result, begun.folder)
+        result.write(begun.folder)
+    return result
+
+
+def _checked(
+    frozen: FrozenSimulator,
+    dataset: Store,
+    reference: str | Path | None,
+    new: Sequence[str],
+    residuals: Sequence[str | Path],
+    false_alarms: float,
+    tolerance: float | None,
+) -> Check:
     found = gather(frozen, dataset, reference, new, residuals)
     figures, limits = list(FIGURES), []
     if wording.too_optimistic(found.reference, frozen.card["parameters"]):
@@ -72,7 +88,7 @@ def check(
         figures=figures,
         between=found.between,
     )
-    result = Check(
+    return Check(
         run=run_info([], len(found.new), found.dropped),
         dataset=dataset.dataset_id,
         model=CheckedModel(name=frozen.name, sha256=frozen.sha256, dataset=frozen.card["dataset"]),
@@ -85,6 +101,3 @@ def check(
         new_scans=found.new,
         notes=[*limits, *wording.notes(found.reference, found.new, judged)],
     )
-    result.write(out)
-    write_check_report(result, out)
-    return result

@@ -175,7 +175,7 @@ def test_a_full_disk_is_one_line_and_exit_code_2(app, scan_file: Path, monkeypat
         run_app(app, "litho-data")
     assert stopped.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "cannot write somewhere, got No space left on device" in line
+    assert "cannot use somewhere, got no space left on device; make room" in line
 
 
 def test_a_step_that_fails_writes_nothing(tmp_path: Path) -> None:

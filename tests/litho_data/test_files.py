@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from litho_data.foundation.files import atomic_file, atomic_folder
+from litho_data.foundation.files import atomic_file, atomic_folder, unfinished
 
 
 @pytest.fixture
@@ -52,7 +52,7 @@ def test_a_rename_that_fails_puts_the_older_folder_back(older: Path, monkeypatch
     replace = Path.replace
 
     def refuse_the_new(self: Path, target: Path) -> Path:
-        if self.name.endswith(".partial"):
+        if self.name == "new":
             raise OSError("no space left on device")
         return replace(self, target)
 
@@ -78,19 +78,20 @@ def test_a_process_killed_while_it_writes_leaves_the_older_folder(older: Path) -
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs SIGKILL")
-def test_a_process_killed_between_the_renames_leaves_both_folders_whole(older: Path) -> None:
+def test_an_older_folder_that_a_killed_process_had_put_aside_comes_back(older: Path) -> None:
     code = (
         "from pathlib import Path\nfrom litho_data.foundation.files import atomic_folder\n"
         "replace = Path.replace\n"
         "def stop(self, target):\n"
-        f"    if self.name.endswith('.partial'):\n        {KILL}\n"
+        f"    if self.name == 'new':\n        {KILL}\n"
         "    return replace(self, target)\n"
         "Path.replace = stop\n"
         f"with atomic_folder({str(older)!r}) as folder:\n    (folder / 'c.txt').write_text('new')"
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode != 0
-    beside = [path for path in older.parent.iterdir() if path.suffix == ".old"]
-    assert [contents(path / "result") for path in beside] == [OLDER]
+    assert not older.exists()
+    with unfinished(older):
+        assert contents(older) == OLDER
 
 
 def test_an_error_on_the_way_leaves_the_older_file(tmp_path: Path) -> None:

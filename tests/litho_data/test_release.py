@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from litho_data.exchange.pairs import export_pairs
 from litho_data.exchange.release import export_ro_crate, export_zip
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256
@@ -56,13 +57,24 @@ def test_the_crate_describes_its_files(campaign: Path, tmp_path: Path) -> None:
     assert {"name", "description", "datePublished"} <= set(root)
 
 
-def test_a_member_that_points_out_of_the_file_stays_in_it(campaign: Path, tmp_path: Path) -> None:
-    (tmp_path / "in").mkdir()
-    packed = export_zip(campaign / "prints.zarr", tmp_path / "in" / "prints.zarr.zip")
+@pytest.mark.parametrize(
+    "name", ["../evil.txt", "../evil.zarr/zarr.json", "/evil.txt", "a/../../b", "..\\\\c"]
+)
+def test_an_archive_with_a_path_that_leads_out_is_refused(name: str, campaign: Path, tmp_path: Path) -> None:
+    packed = export_zip(campaign / "prints.zarr", tmp_path / "prints.zarr.zip")
     with zipfile.ZipFile(packed, "a") as archive:
-        for name in ("../evil.txt", "../evil.zarr/zarr.json", f"{tmp_path}/evil.txt"):
-            archive.writestr(name, "{}")
-    store = open_store(packed)
-    assert store.computed_sha256() == open_store(campaign / "prints.zarr").sha256
-    verify(packed, data_dir=campaign)
-    assert [path.name for path in tmp_path.rglob("*")] == ["in", "prints.zarr.zip"]
+        archive.writestr(name, "{}")
+    with pytest.raises(InputError, match="names that stay inside"):
+        open_store(packed)
+    assert any("stay inside" in str(finding) for finding in verify(packed, data_dir=campaign).findings)
+
+
+def test_a_name_that_leads_out_is_refused_before_anything_is_written(
+    own_campaign: Path, tmp_path: Path
+) -> None:
+    document = own_campaign / "prints.zarr" / "zarr.json"
+    document.write_text(document.read_text().replace('"name": "test-prints"', '"name": "../../escaped"'))
+    for export in (export_ro_crate, export_pairs):
+        with pytest.raises(InputError, match=r"escaped.*plain name"):
+            export(own_campaign / "prints.zarr", tmp_path / "a" / "b" / "crate")
+    assert not (tmp_path / "a").exists()

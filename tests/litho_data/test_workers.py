@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import socket
 import subprocess
 import sys
@@ -26,7 +27,7 @@ from litho_data.foundation.sending import Known, sent
 from litho_data.foundation.workers import Workers, _windowed, run_jobs
 from litho_data.store import open_store
 from litho_data.store.partial import PartialStore
-from tests.jobs import die, large, refuse, told
+from tests.jobs import die_at_first, large, refuse, told
 from tests.litho_data.campaigns import write_campaign
 
 NOBODY = "tcp://127.0.0.1:9"
@@ -92,10 +93,27 @@ def test_what_is_bad_there_is_said_here(processes: int) -> None:
         list(run_jobs(refuse, range(3), Workers(processes), apart=True))
 
 
-def test_a_job_that_kills_its_worker_is_named_in_one_line() -> None:
-    with pytest.raises(InputError, match=r"^the worker of scan 7, got died, .*; run it again") as said:
-        list(run_jobs(die, [7, 7], Workers(2), name=lambda number: f"scan {number}"))
+def test_a_job_that_always_kills_its_worker_is_named_and_no_other(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    jobs = [(number, 3 if number == 7 else 0, tmp_path) for number in range(12)]
+    done = run_jobs(die_at_first, jobs, Workers(2), name=lambda job: f"scan {job[0]}")
+    with pytest.raises(InputError, match=r"^the worker of scan 7, got died 3 times; run it again") as said:
+        list(done)
     assert "\n" not in str(said.value)
+    assert capsys.readouterr().err.count("\n") == 2
+
+
+def test_a_worker_that_dies_while_jobs_wait_costs_a_line_and_no_job(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Killed twice, in two jobs: the one start does them all, each once."""
+    jobs = [(number, 1 if number in (3, 20) else 0, tmp_path) for number in range(40)]
+    done = list(run_jobs(die_at_first, jobs, Workers(2), name=lambda job: f"scan {job[0]}"))
+    assert sorted(answer for _, answer in done) == list(range(40))
+    said = capsys.readouterr().err
+    assert said.count("a worker died") == said.count("\n") <= 2
+    assert {"3", "20"} <= set(re.findall(r"scan (\d+)", said))
 
 
 def test_an_address_without_scheduler_is_one_line_in_a_few_seconds(monkeypatch: pytest.MonkeyPatch) -> None:

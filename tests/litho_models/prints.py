@@ -81,5 +81,5 @@ def write_store(path: Path, scans: Sequence[PrintedScan], **attributes: float) -
             **attributes,
         },
     )
-    data.to_zarr(path, mode="w", zarr_format=3)
+    data.to_zarr(path, mode="w", zarr_format=3, write_empty_chunks=True)
     return path

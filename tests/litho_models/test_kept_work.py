@@ -8,6 +8,7 @@ import shutil
 import pytest
 from typer.testing import CliRunner
 
+from litho_data.foundation.begun import BEGUN
 from litho_data.foundation.errors import InputError
 from litho_data.store.lock_box import locked_ids
 from litho_models.cli.app import app
@@ -95,7 +96,7 @@ def test_a_folder_keeps_the_run_that_it_holds(before, now, differs, trained, sto
     else:
         train(store, before, folder)
     weights = ModelCard.read(folder / "model").weights_sha256
-    with pytest.raises(InputError, match=rf"holds another run.*{differs}.*--out"):
+    with pytest.raises(InputError, match=rf"holds a result with other settings.*{differs}.*--out"):
         train(store, **{"model": before, "out": folder, **now})
     assert ModelCard.read(folder / "model").weights_sha256 == weights
     assert TrainingRun.read(folder).model == before
@@ -103,9 +104,11 @@ def test_a_folder_keeps_the_run_that_it_holds(before, now, differs, trained, sto
 
 def test_a_killed_run_keeps_its_folder_from_models_that_leave_no_checkpoint(trained, store, tmp_path):
     shutil.copytree(trained[1] / "checkpoint", tmp_path / "checkpoint")
-    with pytest.raises(InputError, match="another model, configuration or dataset"):
+    config = {"model": "pbl", "config": trained[0].config.model_dump(mode="json")}
+    (tmp_path / BEGUN).write_text(json.dumps({"record": "run.json", **config}))
+    with pytest.raises(InputError, match="model = 'pbl' where now 'affine'"):
         train(store, "affine", tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["checkpoint"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [BEGUN, "checkpoint"]
 
 
 def cut_short(file):
@@ -171,7 +174,7 @@ def test_a_damaged_fit_is_told_where_the_noise_reads_it_too(scored, store, tmp_p
 def test_a_result_lists_the_settings_that_a_fit_used(scored):
     settings = json.loads((scored[1] / "benchmark.json").read_text())["training"]
     affine = {"recipe": "fast", "variant": "paper", "seed": 0, "nuisance": "offset", "free_gain": False}
-    assert settings["affine"] == {**affine, "optimiser": "gauss-newton"}
+    assert settings["affine"] == {**affine, "weights": "uniform", "optimiser": "gauss-newton"}
     assert {**settings["pbl"], **QUICK} == TrainingConfig(**QUICK).model_dump(mode="json")
 
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -20,6 +23,36 @@ def threads(monkeypatch):
     before = torch.get_num_threads()
     yield torch.set_num_threads
     torch.set_num_threads(before)
+
+
+_LOADED = """
+import importlib.abc, os, sys
+class Watch(importlib.abc.MetaPathFinder):
+    def find_spec(self, name, path, target=None):
+        if name == "torch":
+            print(os.environ.get("OMP_WAIT_POLICY"), os.environ.get("KMP_BLOCKTIME"))
+            raise SystemExit(0)
+sys.meta_path.insert(0, Watch())
+"""
+
+
+@pytest.mark.parametrize("given", [None, "ACTIVE"])
+@pytest.mark.parametrize(
+    "use",
+    [
+        "import litho_models; litho_models.load_frozen",
+        "import litho_design; litho_design.design_hologram",
+        "sys.argv = ['litho-models', 'zoo', 'list']; from litho_models.cli import main; main()",
+        "sys.argv = ['litho-design', 'first', '--out', '/tmp']; from litho_design.cli import main; main()",
+    ],
+)
+def test_threads_sleep_while_they_wait_unless_told_otherwise(use, given):
+    """Spinning they take ten times as long beside one busy process; read when torch is loaded."""
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    environment |= {} if given is None else {"OMP_WAIT_POLICY": given}
+    words = [sys.executable, "-c", _LOADED + use]
+    done = subprocess.run(words, env=environment, capture_output=True, text=True)
+    assert done.stdout.split() == [given or "PASSIVE", "0"], done.stderr
 
 
 def test_the_limits_of_all_other_threads_stay_as_they_are(threads):

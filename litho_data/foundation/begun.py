@@ -1,0 +1,124 @@
+"""One notion of begun, for every command that writes a folder: it states, begins, continues and finishes.
+
+A command states what its result will be: the name of its record, which is written last, and the fields of the
+record that decide it. A folder is then one of these:
+
+=========  =======================================  =========================================================
+free       not there, or empty                      it is begun
+begun      ``begun.json``, written before all else  continued, if of the same record and fields
+finished   the record                               made again or continued, if of the same record and fields
+other      anything else                            refused, and nothing is changed
+=========  =======================================  =========================================================
+
+The law: a command that was stopped after any of its writes and is given again ends with the same result.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.files import atomic_folder, clear_leftovers, locked, writable
+from litho_data.foundation.outputs import (
+    first_addition,
+    first_difference,
+    read_record,
+    require_own_folder,
+    require_replaceable_folder,
+)
+
+BEGUN = "begun.json"
+
+
+@dataclass(frozen=True)
+class Begun:
+    """A folder that a result grows in; ``finished``: the same result was there, and whole."""
+
+    folder: Path
+    finished: bool
+
+
+@contextmanager
+def growing_folder(out: str | Path, record: str, facts: Mapping[str, Any] | None = None) -> Iterator[Begun]:
+    """A folder whose files appear as they are finished, so that a stopped run goes on from them.
+
+    What else lies in a folder of its own is left alone. One process at a time writes it.
+
+    Args:
+        out: the folder; made if need be.
+        record: the file that a finished result holds, such as ``run.json``. The block writes it last.
+        facts: fields of the record that decide the result; a folder with others is refused.
+
+    Raises:
+        InputError: a file, a folder with something else in it, one of other facts, one that another process
+            is writing, or one that cannot be written: all before the block begins.
+    """
+    folder, mark = Path(out), Path(out) / BEGUN
+    _require_own(folder, record, facts or {})
+    finished = (folder / record).exists() and not mark.exists()
+    made = not folder.exists()
+    with writable(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        stream = locked(mark, folder)
+    with stream:
+        with writable(folder):
+            clear_leftovers(folder)
+            stream.truncate(0)
+            json.dump({"record": record, **(facts or {})}, stream, indent=1)
+            stream.flush()
+        try:
+            yield Begun(folder, finished)
+        except BaseException:
+            if [one.name for one in folder.iterdir()] == [BEGUN]:
+                mark.unlink()
+                if made:
+                    folder.rmdir()
+            raise
+        mark.unlink(missing_ok=True)
+
+
+@contextmanager
+def whole_folder(
+    out: str | Path, *holds: str, record: str = "", facts: Mapping[str, Any] | None = None
+) -> Iterator[Path]:
+    """A folder that replaces ``out`` as a whole; what a stopped run left of it is no part of the next one.
+
+    Args:
+        out: what will be replaced.
+        holds: names, or patterns of names, of everything that such a result holds.
+        record, facts: as for ``growing_folder``; without a record any older result is replaced.
+
+    Raises:
+        InputError: as for ``growing_folder``, and a folder with anything beside an older result in it.
+    """
+    require_replaceable_folder(out, *holds)
+    if record:
+        _require_same(Path(out), read_record(Path(out) / record), facts or {})
+    with atomic_folder(out) as folder:
+        yield folder
+
+
+def _require_own(folder: Path, record: str, facts: Mapping[str, Any]) -> None:
+    begun = read_record(folder / BEGUN)
+    own = isinstance(begun, dict) and begun.get("record") == record
+    # A process that was stopped before it had said what it begins has begun nothing.
+    nothing = begun is None and [one.name for one in folder.glob("*")] == [BEGUN]
+    require_own_folder(folder, record, *[BEGUN] * (own or nothing))
+    _require_same(folder, read_record(folder / (BEGUN if own else record)), facts)
+
+
+def _require_same(folder: Path, held: Any, facts: Mapping[str, Any]) -> None:
+    """Refuse a folder whose result, begun or finished, was made of other facts."""
+    now = json.loads(json.dumps(facts))
+    if isinstance(held, dict) and (other := first_difference(held, now) or first_addition(held, now)):
+        raise InputError(
+            "output",
+            got=f"{folder}, which holds a result with other settings, {other.removeprefix('settings.')}",
+            wanted="the same settings, or a folder of its own",
+            hint="choose another --out, or delete the folder",
+        )

@@ -1,0 +1,47 @@
+"""The gate for names: what comes out of a received file and may become part of a path is a plain name."""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated
+
+from pydantic import AfterValidator
+
+from litho_data.foundation.errors import InputError
+
+# A file system takes 255 bytes, of which suffixes need some.
+_LONGEST_BYTES = 200
+_NO_NAME = re.compile(r'[\x00-\x1f\x7f/\\:*?"<>|]')
+
+
+def is_plain_name(name: object) -> bool:
+    """Whether the text can be one file's name on any system, and never a path, hidden or an option."""
+    return (
+        isinstance(name, str)
+        and 0 < len(name.encode("utf-8", "replace")) <= _LONGEST_BYTES
+        and not _NO_NAME.search(name)
+        and name[0] not in ".-~ "
+        and name[-1] not in ". "
+        # Surrogates of undecodable bytes are no text.
+        and name.isprintable()
+    )
+
+
+def require_plain_name(what: str, name: str) -> str:
+    """The name itself.
+
+    Raises:
+        InputError: it could lead somewhere else as a part of a path.
+    """
+    if not is_plain_name(name):
+        raise InputError(what, got=repr(name)[:80], wanted="a plain name, without path")
+    return name
+
+
+def _plain(name: str) -> str:
+    if not is_plain_name(name):
+        raise ValueError("wanted a plain name, without path")
+    return name
+
+
+PlainName = Annotated[str, AfterValidator(_plain)]

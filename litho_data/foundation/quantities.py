@@ -1,0 +1,59 @@
+"""What physical numbers can be, stated once: a type for records, and a check for everything else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from litho_data.foundation.errors import InputError
+
+
+@dataclass(frozen=True)
+class Range:
+    """Lowest and highest value of a quantity; everything in between is finite."""
+
+    low: float
+    high: float
+    unit: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.low:g} to {self.high:g} {self.unit}".rstrip()
+
+    def holds(self, values: object) -> bool:
+        """Whether a number, or every number of an array, is one and within."""
+        if isinstance(values, bool):
+            return False
+        try:
+            numbers = np.asarray(values, dtype=np.float64)
+        except (TypeError, ValueError, OverflowError):
+            return False
+        return bool(np.all((numbers >= self.low) & (numbers <= self.high)))
+
+    def require(self, what: str, values: object) -> None:
+        """Refuse a number that is none, or is out of range.
+
+        Raises:
+            InputError: with the first such number.
+        """
+        wrong = [one for one in np.ravel(np.asarray(values, dtype=object)) if not self.holds(one)]
+        if wrong:
+            raise InputError(what, got=repr(wrong[0])[:40], wanted=f"a number from {self}")
+
+
+# From a tenth of a nanometre, and up to a field of a centimetre in one pixel.
+PITCH_UM = Range(1e-4, 1e4, "µm")
+LEVEL_HEIGHT_UM = Range(1e-5, 1e3, "µm")
+HEIGHT_UM = Range(-1e5, 1e5, "µm")
+LENGTH_UM = Range(1e-6, 1e7, "µm")
+PLACE_UM = Range(-1e7, 1e7, "µm")
+DOSE = Range(1e-3, 1e3)
+ORDER = Range(-1e9, 1e9)
+LEVELS = Range(2, 256)
+
+PitchUm = Annotated[float, Field(ge=PITCH_UM.low, le=PITCH_UM.high)]
+LevelHeightUm = Annotated[float, Field(ge=LEVEL_HEIGHT_UM.low, le=LEVEL_HEIGHT_UM.high)]
+LengthUm = Annotated[float, Field(ge=LENGTH_UM.low, le=LENGTH_UM.high)]
+Levels = Annotated[int, Field(ge=int(LEVELS.low), le=int(LEVELS.high))]

@@ -1,0 +1,233 @@
+"""A store is complete or refused: every file that it declares is there, and every number can be one."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+import os
+import re
+import zipfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError, damaged
+from litho_data.foundation.names import require_plain_name
+from litho_data.foundation.quantities import (
+    HEIGHT_UM,
+    LENGTH_UM,
+    LEVEL_HEIGHT_UM,
+    LEVELS,
+    ORDER,
+    PITCH_UM,
+    Range,
+)
+from litho_data.store.access import array_of, group_of, has_child, values_of
+from litho_data.store.schema import LAYOUT_VARIABLES, OPTIONAL_COLUMNS, SAMPLE_VARIABLES, SIGMA
+
+if TYPE_CHECKING:
+    import zarr
+
+_DOCUMENT = "zarr.json"
+_LEADS_OUT = re.compile(r"(^|/)\.\.(/|$)|[\\:\x00]")
+
+
+def require_complete(path: Path) -> None:
+    """Refuse a store that has lost a file: zarr would read zeros or NaN in its place.
+
+    Raises:
+        InputError: with the first file that is missing.
+    """
+    for name in missing_files(path):
+        raise InputError(
+            f"store {path}",
+            got=f"no {name}",
+            wanted="every file that it declares",
+            hint="copy or build it again; another program has to write empty chunks too",
+        )
+
+
+def missing_files(path: Path) -> Iterator[str]:
+    """Names of files that a store declares and does not have: documents of groups and arrays, and chunks."""
+    names = file_names(path)
+    documents = dict(read_documents(path, names))
+    with damaged(f"metadata of {path}"):
+        root = json.loads(documents[_DOCUMENT])
+        declared = {
+            f"{name}/{_DOCUMENT}" for name in (root.get("consolidated_metadata") or {}).get("metadata", {})
+        }
+        yield from sorted(declared - documents.keys())
+        for name, content in documents.items():
+            document = json.loads(content)
+            if document["node_type"] == "array":
+                folder = name.removesuffix(_DOCUMENT)
+                yield from (folder + chunk for chunk in _chunks(document) if folder + chunk not in names)
+
+
+def file_names(path: Path) -> set[str]:
+    """Names of all files of a store, a folder or a zip file, with forward slashes.
+
+    Raises:
+        InputError: a zip file with a name that leads out of it.
+    """
+    if path.is_dir():
+        found = (Path(folder) / name for folder, _, names in os.walk(path) for name in names)
+        # A link that leads nowhere is no file.
+        return {file.relative_to(path).as_posix() for file in found if file.is_file()}
+    with zipfile.ZipFile(path) as archive:
+        names = archive.namelist()
+    for name in names:
+        if name.startswith("/") or _LEADS_OUT.search(name):
+            raise InputError(f"store {path}", got=f"a file {name!r}", wanted="names that stay inside")
+    return set(names)
+
+
+def read_documents(path: Path, names: set[str]) -> Iterator[tuple[str, bytes]]:
+    """The metadata documents among the files of a store, by name."""
+    wanted = sorted(name for name in names if name.split("/")[-1] == _DOCUMENT)
+    if path.is_dir():
+        yield from ((name, (path / name).read_bytes()) for name in wanted)
+        return
+    with zipfile.ZipFile(path) as archive:
+        yield from ((name, archive.read(name)) for name in wanted)
+
+
+def _chunks(document: Mapping[str, Any]) -> Iterator[str]:
+    """Names of the files of an array, below its folder."""
+    sizes = document["chunk_grid"]["configuration"]["chunk_shape"]
+    encoding = document["chunk_key_encoding"]
+    with_c = encoding["name"] == "default"
+    between = encoding.get("configuration", {}).get("separator", "/" if with_c else ".")
+    counts = [math.ceil(length / size) for length, size in zip(document["shape"], sizes, strict=True)]
+    for place in itertools.product(*map(range, counts)):
+        numbers = [*(["c"] if with_c else []), *map(str, place)]
+        yield between.join(numbers) or "0"
+
+
+def checked_attributes(root: zarr.Group, path: Path) -> dict[str, Any]:
+    """Name, pitch, level height, number of levels and write table of a store; InputError if one is wrong."""
+    attributes = dict(root.attrs)
+    name, write = str(attributes.get("name", path.name.partition(".")[0])), attributes.get("write")
+    if write is not None and not isinstance(write, dict):
+        raise InputError(f"attribute write of {path}", got=repr(write), wanted="a table or none")
+    checked: dict[str, Any] = {"name": require_plain_name(f"name of {path}", name), "write": write}
+    for key, limits in (("pitch_um", PITCH_UM), ("level_height_um", LEVEL_HEIGHT_UM), ("levels", LEVELS)):
+        value = attributes.get(key)
+        whole = key == "levels"
+        if not isinstance(value, int if whole else int | float) or not limits.holds(value):
+            wanted = f"a {'whole ' if whole else ''}number from {limits}"
+            raise InputError(f"attribute {key} of {path}", got=repr(value), wanted=wanted)
+        checked[key] = value if whole else float(value)
+    if write and "field_um" in write:
+        LENGTH_UM.require(f"attribute write.field_um of {path}", write["field_um"])
+    return checked
+
+
+def checked_arrays(root: zarr.Group, path: Path) -> dict[str, zarr.Array]:
+    """The arrays over all scans by name; InputError where one is missing or of another shape or type."""
+    names = (*(variable.name for variable in SAMPLE_VARIABLES), "scan", "print", "order")
+    arrays = {name: array_of(root, name) for name in names}
+    if has_child(root, SIGMA.name):
+        arrays[SIGMA.name] = array_of(root, SIGMA.name)
+    count, field = arrays["scan"].shape[0], arrays["mask_level"].shape[1:]
+    for variable in LAYOUT_VARIABLES:
+        if variable.name not in arrays:
+            continue
+        array = arrays[variable.name]
+        wanted = (count, 3, 3) if variable.name == "scan_to_layout" else (count, *field)
+        if array.shape != wanted or array.dtype != np.dtype(variable.dtype):
+            got, wanted_text = f"{array.dtype} {array.shape}", f"{variable.dtype} {wanted}"
+            raise InputError(f"array {variable.name} of {path}", got=got, wanted=wanted_text)
+    return arrays
+
+
+def checked_columns(root: zarr.Group, path: Path) -> dict[str, list[Any]]:
+    """``scan`` (the ids), ``print``, ``order`` and the optional columns, None where a number is not stated.
+
+    Raises:
+        InputError: no scan, an id twice or with a path in it, columns of other lengths, or a number that
+            can be none.
+    """
+    columns: dict[str, list[Any]] = {
+        name: [require_plain_name(f"{name} of {path}", str(value)) for value in values_of(root, name)]
+        for name in ("scan", "print")
+    }
+    ids = columns["scan"]
+    if not ids:
+        raise InputError(f"scans of {path}", got="none", wanted="at least one")
+    if len(set(ids)) != len(ids):
+        raise InputError(f"scan ids of {path}", got="duplicates", wanted="unique ids")
+    order = values_of(root, "order")
+    ORDER.require(f"order of {path}", order)
+    columns["order"] = [int(value) for value in order]
+    for name in OPTIONAL_COLUMNS:
+        if has_child(root, name):
+            stated = [None if value != value else value for value in values_of(root, name).tolist()]
+            OPTIONAL_COLUMNS[name].require(
+                f"{name} of {path}", [value for value in stated if value is not None]
+            )
+            columns[name] = [None if value is None else float(value) for value in stated]
+    for name, values in columns.items():
+        if len(values) != len(ids):
+            raise InputError(
+                f"{name} of {path}", got=f"{len(values)} values", wanted=f"{len(ids)}, one per scan"
+            )
+    return columns
+
+
+def true_shapes(root: zarr.Group, path: Path, count: int, padded: tuple[int, ...]) -> list[tuple[int, int]]:
+    """(ny, nx) of every scan without its padding; InputError where one is no part of the padded field."""
+    if not has_child(root, "quality"):
+        return [(padded[0], padded[1])] * count
+    quality = group_of(root, "quality")
+    sides = [values_of(quality, name) for name in ("layout_ny", "layout_nx")]
+    for side, most in zip(sides, padded, strict=True):
+        if len(side) != count or not Range(1, most).holds(side):
+            got = ", ".join(map(str, side.tolist()[:3]))
+            raise InputError(
+                f"sizes of the layouts of {path}", got=got, wanted=f"{count} from 1 to {most} px"
+            )
+    return [(int(ny), int(nx)) for ny, nx in zip(*sides, strict=True)]
+
+
+def require_possible(samples: Mapping[str, np.ndarray], levels: int, what: str) -> None:
+    """Refuse the arrays of a scan that show no print: levels that are none, or nothing measured.
+
+    Raises:
+        InputError: a level above the highest, a transform or a height that can be none, or no measured pixel.
+    """
+    highest = int(samples["mask_level"].max())
+    if highest >= levels:
+        raise InputError(f"level in the layout of {what}", got=highest, wanted=f"0 to {levels - 1}")
+    measured = samples["height_um"][samples["valid"]]
+    measured = measured[np.isfinite(measured)]
+    if not measured.size:
+        raise InputError(f"measured pixels of {what}", got="none", wanted="at least one")
+    HEIGHT_UM.require(f"height_um of {what}", np.array([measured.min(), measured.max()]))
+    transform = samples["scan_to_layout"]
+    if not np.isfinite(transform).all() or abs(np.linalg.det(transform)) == 0:
+        raise InputError(
+            f"scan_to_layout of {what}", got=transform.tolist(), wanted="a transform that can be undone"
+        )
+
+
+def require_manifest(manifest: Mapping[str, Any], path: Path) -> None:
+    """Refuse a manifest without what its readers take from it.
+
+    Raises:
+        InputError: with the first thing that is missing or of another kind.
+    """
+    with damaged(f"manifest of {path}"):
+        card, build = dict(manifest["card"]), dict(manifest["build"])
+        dict(build["software"]["versions"])
+        texts = [card["name"], build["data_dir"], build["started"]]
+        for row in manifest["files"]:
+            texts += [row[name] for name in ("path", "scan", "status", "sha256", "read")]
+            pitch = dict(json.loads(row["read"] or "{}")).get("pitch_um")
+            if pitch is not None:
+                PITCH_UM.require("pitch_um", [pitch[0], pitch[1]])
+        if not all(isinstance(text, str) for text in texts):
+            raise TypeError("a number in the place of a text")

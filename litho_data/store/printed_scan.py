@@ -1,0 +1,107 @@
+"""One printed field as everything in this project sees it, and the key of the whole of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any
+
+import numpy as np
+
+from litho_data.foundation.hashes import array_sha256, record_sha256
+from litho_data.register.bend import Bend
+
+
+@dataclass(frozen=True)
+class PrintedScan:
+    """One printed field: the layout sent to the printer and the height measured on the layout's grid.
+
+    Args:
+        id: name of the scan; ``print_id``: block of fields it was printed with; ``order``: writing order.
+        mask_level: layout levels, uint8 (ny, nx).
+        height_um: float32 (ny, nx), µm, NaN where not measured.
+        valid: bool (ny, nx), measured and inside the scan.
+        pitch_um: pixel pitch of all three arrays, µm; ``level_height_um``: nominal height of a level, µm.
+        levels: number of levels the layout may use.
+        scan_to_layout: 3 x 3 float64, maps (x_um, y_um, 1) of the scan's own frame to the layout frame.
+        write: the card's ``[write]`` table; None if it has none.
+        field_x_um, field_y_um: position of the scan in its write field, µm; ``dose``: relative dose;
+            None if the card does not state it.
+        turned_deg: by how much the scan is turned against the others, ``direction``: 1 trace, -1 retrace,
+            ``tip``: number of the tip, ``pixel_size``: of the scan, relative to the others; None as above.
+        bend_um: of a bent scan; ``scan_to_layout`` then acts on the straightened positions.
+        tip_radius_um: of the microscope's tip, or the most that it can be; None if the store does not say.
+        height_sigma_um: float32 (ny, nx), µm, standard uncertainty of ``height_um``, the scan's offset aside;
+            NaN where not valid, None if the store has none.
+    """
+
+    id: str
+    print_id: str
+    order: int
+    mask_level: np.ndarray
+    height_um: np.ndarray
+    valid: np.ndarray
+    pitch_um: float
+    level_height_um: float
+    levels: int
+    scan_to_layout: np.ndarray
+    write: Mapping[str, Any] | None = None
+    field_x_um: float | None = None
+    field_y_um: float | None = None
+    dose: float | None = None
+    turned_deg: float | None = None
+    direction: float | None = None
+    tip: float | None = None
+    pixel_size: float | None = None
+    bend_um: Bend | None = None
+    tip_radius_um: float | None = None
+    height_sigma_um: np.ndarray | None = None
+
+    def __repr__(self) -> str:
+        ny, nx = self.shape
+        return (
+            f"<PrintedScan {self.id}: {ny} x {nx} px of {self.pitch_um:g} µm, print {self.print_id}, "
+            f"{self.levels} levels of {self.level_height_um:g} µm, {self.valid.mean():.1%} valid>"
+        )
+
+    def _repr_html_(self) -> str:
+        from litho_data.foundation.report_pictures import shown_html
+
+        return shown_html(repr(self), layout_um=self.layout_um, height_um=self.height_um)
+
+    @property
+    def quarter_turns(self) -> int:
+        """How often ``rot90`` turns the layout's grid into the scan's, 0 to 3, by its registration."""
+        along = self.scan_to_layout[:2, 0]
+        return round(math.atan2(along[1], along[0]) / (math.pi / 2)) % 4
+
+    @property
+    def usable(self) -> np.ndarray:
+        """Measured pixels, bool (ny, nx)."""
+        return np.asarray(self.valid, bool) & np.isfinite(self.height_um)
+
+    @property
+    def layout_um(self) -> np.ndarray:
+        """Nominal height, float32 (ny, nx), µm."""
+        return self.mask_level.astype(np.float32) * np.float32(self.level_height_um)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(ny, nx) in pixels."""
+        return self.mask_level.shape[0], self.mask_level.shape[1]
+
+
+def scan_sha256(scan: PrintedScan) -> str:
+    """The one key of a scan, for caches, resumed work and ids of datasets: the hash of every field of it."""
+    return record_sha256(_hashed(scan))
+
+
+def _hashed(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return array_sha256(value, "", ())
+    if is_dataclass(value):
+        return {one.name: _hashed(getattr(value, one.name)) for one in fields(value)}
+    if isinstance(value, Mapping):
+        return {name: _hashed(inner) for name, inner in value.items()}
+    return value

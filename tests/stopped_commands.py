@@ -1,0 +1,174 @@
+"""Commands that are stopped after their writes: ``python -m tests.stopped_commands NAME FOLDER [every]``.
+
+A process of its own, with one thread: a stopped command is a fork of it. Every command is a function of the
+folder that it works in; what it needs is made there beforehand. Prints how many stops ended like the whole:
+six of them as a test, with ``every`` all.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from litho_data.build.build import build_dataset
+from litho_data.exchange.pairs import export_pairs, import_pairs
+from litho_data.exchange.release import export_ro_crate
+from litho_data.layouts import write_layout_set
+from litho_data.provenance.verify import verify
+from litho_data.store import open_store
+from litho_data.virtual_fab import simulate
+from litho_models.fitting.runs import train
+from litho_models.frozen.exporting import export_model
+from litho_models.frozen.files import load_frozen
+from litho_models.frozen.freezing import freeze as freeze_model
+from tests.litho_data.campaigns import write_campaign
+from tests.stops import stopped_after, writes_of
+
+# What differs between two runs of one command.
+_VOLATILE = {
+    "seconds",
+    "started",
+    "command",
+    "commit",
+    "dirty",
+    "reused",
+    "peak_memory_gib",
+    "cost",
+    "weights_sha256",
+}
+QUICK = {"variant": "paper", "steps": 2, "rounds": 2, "batch": 1, "crop_px": 32, "nuisance": "offset"}
+
+
+def _store(folder: Path) -> Path:
+    card = write_campaign(folder / "fab", count=4, shape=(112, 124))
+    build_dataset(card, folder / "prints.zarr")
+    return folder / "prints.zarr"
+
+
+def simulate_prints(folder: Path) -> None:
+    simulate(folder / "out", count=1, size_px=40)
+
+
+def layouts(folder: Path) -> None:
+    write_layout_set(folder / "out", count=2, size_px=64)
+
+
+def build(folder: Path) -> None:
+    build_dataset(folder / "fab" / "card.toml", folder / "out")
+
+
+def build_pairs(folder: Path) -> None:
+    import_pairs(folder / "pairs", folder / "out")
+
+
+def _pairs(folder: Path) -> None:
+    export_pairs(_store(folder), folder / "pairs")
+
+
+def crate(folder: Path) -> None:
+    export_ro_crate(folder / "prints.zarr", folder / "out")
+
+
+def pairs(folder: Path) -> None:
+    export_pairs(folder / "prints.zarr", folder / "out")
+
+
+def train_network(folder: Path) -> None:
+    train(folder / "prints.zarr", "pbl", folder / "out", settings=QUICK)
+
+
+def train_small(folder: Path) -> None:
+    train(folder / "prints.zarr", "affine", folder / "out")
+
+
+def freeze(folder: Path) -> None:
+    freeze_model("zoo:physics", folder / "out")
+
+
+def program(folder: Path) -> None:
+    export_model(load_frozen("zoo:physics"), folder / "out" / "physics.pt2", 64)
+
+
+def nothing(folder: Path) -> None:
+    pass
+
+
+# Per command: what it needs, and itself.
+COMMANDS: dict[str, tuple[Callable[[Path], Any], Callable[[Path], None]]] = {
+    "simulate": (nothing, simulate_prints),
+    "masks": (nothing, layouts),
+    "build": (_store, build),
+    "import-pairs": (_pairs, build_pairs),
+    "export-ro-crate": (_store, crate),
+    "export-pairs": (_store, pairs),
+    "train-network": (_store, train_network),
+    "train-small": (_store, train_small),
+    "freeze": (nothing, freeze),
+    "export-model": (nothing, program),
+}
+
+
+def content(folder: Path) -> dict[str, Any]:
+    """All that a command left, hidden files too, without what differs between two runs."""
+    if (folder / "out" / "zarr.json").exists():
+        assert not verify(folder / "out").findings
+        found: dict[str, Any] = {"dataset": open_store(folder / "out").sha256}
+    else:
+        found = {}
+    for path in sorted(folder.rglob("*")):
+        name = path.relative_to(folder).as_posix()
+        if path.is_dir() or name.startswith(("fab/", "prints.zarr/", "prints.zarr-report", "pairs/")):
+            continue
+        found[name] = None
+        if path.suffix == ".json" and "zarr.json" not in name:
+            found[name] = _steady(json.loads(path.read_text(encoding="utf-8")))
+        elif path.suffix in (".npy", ".safetensors", ".tif", ".txt", ".zip"):
+            found[name] = path.read_bytes()
+    return found
+
+
+def _steady(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _steady(inner) for name, inner in value.items() if name not in _VOLATILE}
+    return [_steady(inner) for inner in value] if isinstance(value, list) else value
+
+
+def chosen(count: int, most: int) -> list[int]:
+    """Stops that are spread over all writes, and the last ones, where results are put in place."""
+    spread = range(0, count, max(1, -(-count // most)))
+    return sorted({*spread, *range(max(0, count - 3), count)})
+
+
+def stop_everywhere(name: str, place: Path, most: int) -> int:
+    """Stop a command after its writes and give it again; returns how often that was done."""
+    need, command = COMMANDS[name]
+    prepared = place / "prepared"
+    prepared.mkdir(parents=True)
+    need(prepared)
+    # In this process too, so that its forks need not import anything.
+    command(Path(shutil.copytree(prepared, place / "first")))
+    whole = Path(shutil.copytree(prepared, place / "whole"))
+    count = writes_of(lambda: command(whole), whole)
+    wanted = content(whole)
+    assert wanted, "the command left nothing"
+    stops = chosen(count, most)
+    for stop in stops:
+        folder = Path(shutil.copytree(prepared, place / "stopped"))
+        assert stopped_after(stop, lambda folder=folder: command(folder), folder)  # type: ignore[misc]
+        assert not stopped_after(10**9, lambda folder=folder: command(folder), folder)  # type: ignore[misc]
+        found = content(folder)
+        differing = [one for one in wanted.keys() | found.keys() if wanted.get(one, 0) != found.get(one, 0)]
+        assert not differing, f"{name} stopped after write {stop} of {count}: {sorted(differing)[:5]}"
+        shutil.rmtree(folder)
+    print(f"{name}: {len(stops)} of {count} stops, all equal")
+    return len(stops)
+
+
+if __name__ == "__main__":
+    assert os.environ.get("OMP_NUM_THREADS") == "1", "forks need one thread"
+    stop_everywhere(sys.argv[1], Path(sys.argv[2]), 10**9 if "every" in sys.argv else 3)

@@ -1,0 +1,76 @@
+"""Stop a process after each of its writes, and compare what a second start makes of what is left.
+
+A write is what changes a file system by Python's hands: a file opened to write, a folder made, a rename, a
+removal. A stopped process ends at once, as if killed: no clean-up runs.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+_CHANGES = {"os.rename", "os.mkdir", "os.remove", "os.rmdir", "os.truncate", "os.link", "os.symlink"}
+_STOPPED = 77
+
+
+def writes_of(work: Callable[[], object], below: Path) -> int:
+    """How many writes below a folder the work makes, in a process of its own."""
+    reader, writer = os.pipe()
+    child = os.fork()
+    if child == 0:
+        count = _watch(below, stop_before=None)
+        _end(work, lambda: os.write(writer, str(count[0]).encode()))
+    os.close(writer)
+    with os.fdopen(reader) as stream:
+        said = stream.read()
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    assert code == 0, f"the work itself ended with {code}"
+    return int(said)
+
+
+def stopped_after(count: int, work: Callable[[], object], below: Path) -> bool:
+    """Whether the work, in a process of its own, was stopped after ``count`` writes below a folder."""
+    child = os.fork()
+    if child == 0:
+        _watch(below, stop_before=count)
+        _end(work, lambda: None)
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    assert code in (0, _STOPPED), f"the work ended with {code}"
+    return code == _STOPPED
+
+
+def _end(work: Callable[[], object], last: Callable[[], object]) -> None:
+    code = 1
+    try:
+        work()
+        last()
+        code = 0
+    except BaseException as error:
+        print(f"{type(error).__name__}: {error}", file=sys.stderr, flush=True)
+    finally:
+        os._exit(code)
+
+
+def _watch(below: Path, stop_before: int | None) -> list[int]:
+    """Count writes from now on; before the one with this number the process ends."""
+    count, root = [0], str(below.resolve())
+
+    def seen(event: str, arguments: tuple[Any, ...]) -> None:
+        if event == "open":
+            path, _, flags = arguments
+            writes = isinstance(flags, int) and flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT)
+        elif event in _CHANGES:
+            path, writes = arguments[0], True
+        else:
+            return
+        if not writes or not isinstance(path, str | Path) or not os.path.abspath(path).startswith(root):
+            return
+        if count[0] == stop_before:
+            os._exit(_STOPPED)
+        count[0] += 1
+
+    sys.addaudithook(seen)
+    return count
