@@ -54,7 +54,7 @@ def _exported(kind: str, size_px: int, file: Path) -> dict[str, Any]:
     before, started = _resident_kib("VmRSS"), time.process_time()
     back: LevelRows
     if kind == "tiff":
-        write_tiff(file, levels, layout)
+        write_tiff(file, levels, layout.pitch_um, layout.level_height_um)
         back = TiffRows(file)
     else:
         write_gds(file, levels, layout.pitch_um, "cumulative")

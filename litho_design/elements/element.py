@@ -17,7 +17,7 @@ from litho_data.foundation.settings import changed
 from litho_design.elements.transforms import printed_anyhow
 from litho_design.optics import Optics
 from litho_design.optics.materials import Resin, refractive_index
-from litho_design.optics.thin_element import LONGEST_UM, ElementKind, through_relief
+from litho_design.optics.thin_element import LONGEST_UM, SHORTEST_UM, ElementKind, through_relief
 from litho_design.optimisation.parameters import DirectLevels
 from litho_design.optimisation.phases import focusing_levels, printed_phase
 from litho_design.printers.layout import LayoutSettings
@@ -117,11 +117,10 @@ class Element(nn.Module):
 
     def optics(self, wavelength_um: float) -> Optics:
         """Wavelength, index step and kind of the element there."""
-        if not 0 < wavelength_um < LONGEST_UM:
-            hint = "are nm, or metres, meant?"
-            raise InputError(
-                "wavelength", got=f"{wavelength_um:g} µm", wanted=f"0 to {LONGEST_UM:g}", hint=hint
-            )
+        if not SHORTEST_UM < wavelength_um < LONGEST_UM:
+            wanted = f"{SHORTEST_UM:g} to {LONGEST_UM:g} µm"
+            hint = "are nm or metres meant? as_torchoptics(unit_um=1e6) counts in metres"
+            raise InputError("wavelength", got=f"{wavelength_um:g} µm", wanted=wanted, hint=hint)
         index, around = self._index(wavelength_um), self.surroundings
         if not index > around:
             raise InputError("resin", got=f"an index of {index:g}", wanted=f"more than around it, {around:g}")

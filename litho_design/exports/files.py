@@ -116,11 +116,12 @@ def export(
             )
         guard_um, heights = source.design.printer.guard_um, source.design.stroke.printed_height_um
         written, found = with_marks(levels, source.layout, guard_um, heights)
-    greys, bits = None, _GREY_BITS.get(format)
-    if bits is not None:
-        make = linear_greys if dose_curve is None else measured_greys(dose_curve)
-        greys = make(source.layout, bits)
-    linear = greys is not None and dose_curve is None and bits is not None
+    greys, white_um = None, None
+    if format in _GREY_BITS:
+        bits = _GREY_BITS[format]
+        greys = (linear_greys if dose_curve is None else measured_greys(dose_curve))(source.layout, bits)
+        if dose_curve is None:
+            white_um = (2**bits - 1) / greys[1] * source.layout.level_height_um
     name = f"layout{_SUFFIX[format]}"
     require_replaceable_folder(out, "layout*")
     place = Path(out)
@@ -136,7 +137,7 @@ def export(
             **of_layout(source.layout, (written.shape[0], written.shape[1])),
             **job,
             "greys": greys,
-            "white_height_um": (2**bits - 1) / greys[1] * source.layout.level_height_um if linear else None,
+            "white_height_um": white_um,
             "gds_layers": gds_layers if format == "gds" else None,
             "gwl": (gwl or Gwl()) if format == "gwl" else None,
             "marks": found,

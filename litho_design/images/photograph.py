@@ -31,6 +31,8 @@ _VIGNETTING_SD = 0.1
 _NEEDED = 0.93
 # Half the range of tilts that a camera is believed to have, over half the window.
 _TILT_SD = 0.1
+# Along each side of the window.
+_TILES = 6
 # Orientations are told apart on images of about this side, px; correlations this close are a tie.
 _SMALL_PX = 192
 _TIE = 0.03
@@ -142,7 +144,7 @@ class Photograph:
         about[:2, 2] = moved_px - scale * middle
         warp = self.window_to_photo @ about
         flat = counts / (1 - vignetting * _radius_squared(counts.shape))
-        way: Any = {"flags": cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
+        way: Any = {"flags": cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
         found = cv2.warpPerspective(flat.astype(np.float32), warp, (side, side), **way)
         found = np.where(_inside(warp, flat.shape, side), found, self.expected)
         # What is finer than any light of the element is noise; of the rest a pixel took its mean.
@@ -425,8 +427,7 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
     warp = _camera(pose, photo.shape, side, scale)
     if not further or not correlation > 0:
         return _Fit(warp, correlation)
-    # The residual has the variance 2 (1 - r) of the normalised image.
-    spread = np.linalg.pinv(found.jac.T @ found.jac) * 2 * max(1 - correlation, 1e-6)
+    spread = _covariance(found.jac, found.fun, side)
     scale_sd = float(np.sqrt(spread[3, 3]) * unit[3]) if pitch_sd else 0.0
     light = _light(seen(photo, pose), wanted, alike)
     return _Fit(
@@ -436,6 +437,21 @@ def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: boo
         scale_sd=scale_sd,
         **light,
     )
+
+
+def _covariance(slopes: np.ndarray, residual: np.ndarray, side: int) -> np.ndarray:
+    """Covariance of what least squares found, where neighbours are alike: by the scatter between tiles.
+
+    A print unlike the expected one is displaced here one way and there another (White 1980; a tile is one
+    observation).
+    """
+    tile = np.minimum(np.arange(side) * _TILES // side, _TILES - 1)
+    number = np.append((tile[:, None] * _TILES + tile).ravel(), np.full(len(residual) - side**2, _TILES**2))
+    pull = np.zeros((_TILES**2 + 1, slopes.shape[1]))
+    np.add.at(pull, number, slopes * residual[:, None])
+    inverse = np.linalg.pinv(slopes.T @ slopes)
+    found: np.ndarray = inverse @ (pull.T @ pull) @ inverse
+    return found
 
 
 def _light(seen: np.ndarray, expected: np.ndarray, alike: float) -> dict[str, float]:

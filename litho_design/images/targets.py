@@ -178,7 +178,7 @@ def read_grey(path: str | Path, what: str) -> tuple[np.ndarray, list[str]]:
         raise InputError(what, got=str(path), wanted="an image that OpenCV can read (PNG, TIFF, JPEG, BMP)")
     notes = ["colour to grey (ITU-R BT.601 luma)"] if stored.ndim == 3 else []
     if stored.ndim == 3 and stored.shape[2] == 4:
-        opaque = stored[..., 3] / float(np.iinfo(stored.dtype).max)
+        opaque = stored[..., 3] / float(2 ** (8 * stored.dtype.itemsize) - 1)
         if (opaque < 1).any():
             grey = np.rint(cv2.cvtColor(stored[..., :3], cv2.COLOR_BGR2GRAY) * opaque).astype(stored.dtype)
             notes.append("alpha channel composed on black")

@@ -38,6 +38,7 @@ ONLY: dict[str, Any] = {
     "optics.element": "thin",
     "optics.source_sine": 0.0,
     "optics.bandwidth_um": 0.0,
+    "optics.beam_um": 0.0,
     "window.samples": 0,
     "fabrication.max_step_levels": 0,
     "fabrication.min_feature_um": 0.0,
@@ -139,9 +140,9 @@ class BandedHologram(HologramTask):
             )
         return done
 
-    def wait(self) -> None:
-        """Until all processes are here."""
-        self.bands.ranks.wait()
+    def together(self, value: bool) -> bool:
+        """Whether this holds for any of the processes, when all are here."""
+        return bool(self.bands.ranks.total(torch.tensor([float(value)])) > 0)
 
 
 class BandedBench(nn.Module):

@@ -249,8 +249,12 @@ def _check(settings: LensSettings) -> None:
             got=f"symmetry {settings.layout.symmetry!r}, aperture {settings.view.aperture!r}",
             wanted="a ring layout behind a circular aperture",
         )
-    if radial and (settings.optics.incidence_x or settings.optics.incidence_y):
-        raise InputError("search path 'radial'", got="oblique incidence", wanted="light along the axis")
+    optics = settings.optics
+    if radial and (optics.incidence_x or optics.incidence_y or optics.beam_um):
+        got, wanted = "oblique incidence or a beam", "even light along the axis"
+        raise InputError("search path 'radial'", got=got, wanted=wanted, hint="--set view.path=plane")
+    if optics.propagation == "far-field":
+        raise InputError("propagation of a lens", got="far-field", wanted="a focal plane of its own")
     window = settings.window
     if radial and window.samples and (window.roughness.sigma_um or window.stitch.sigma_um):
         got, hint = "a rough surface or displaced write fields", "--set view.path=plane"

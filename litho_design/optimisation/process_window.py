@@ -24,14 +24,9 @@ _NARROWEST_BLUR_PX = 0.2
 _UNSEEN_STREAM, _SURFACE_STREAM, _STITCH_STREAM = 1, 2, 3
 _SMOOTH, _IN_PLACE = Roughness(), Stitching()
 _SPREADS = (
-    "gain_sd",
-    "offset_sd_um",
-    "blur_sd_um",
-    "defocus_sd_um",
-    "wavelength_sd_um",
-    "roughness.sigma_um",
-)
-_SPREADS += ("stitch.sigma_um",)
+    "gain_sd", "offset_sd_um", "blur_sd_um", "defocus_sd_um", "wavelength_sd_um", "roughness.sigma_um",
+    "stitch.sigma_um",
+)  # fmt: skip
 
 
 class ProcessWindow(Record):

@@ -10,18 +10,16 @@ import torch
 from pydantic import Field, model_validator
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import atomic_file, writable
+from litho_data.foundation.files import atomic_file
 from litho_data.foundation.hashes import file_sha256
-from litho_data.foundation.outputs import first_addition, first_difference, require_own_folder
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunFacts, run_facts
 from litho_design.images.targets import TargetRecord
 from litho_design.optics import Optics
 from litho_design.optics.stroke import Stroke
 from litho_design.optimisation.budget import peak_memory_gib
-from litho_design.optimisation.checkpoint import CHECKPOINTS
 from litho_design.optimisation.disagreement import EnsembleRecord
-from litho_design.optimisation.settings import DesignSettings, without
+from litho_design.optimisation.settings import without
 from litho_design.printers.layout import LayoutSettings, Printability
 from litho_design.printers.printer import PrinterRecord, TilingCheck
 from litho_design.printers.training import OutOfDistribution
@@ -112,35 +110,6 @@ class Design(Findings, Result):
     def layout_sha256(self) -> str:
         """Hash of the file of levels."""
         return self.files[RINGS_FILE if self.in_rings else LEVELS_FILE]
-
-
-def finished_design(folder: Path, fingerprint: str, settings: DesignSettings) -> Design | None:
-    """The design that a folder holds already; None where there is none, and the folder is there then.
-
-    Raises:
-        InputError: a folder with something else, or a design of other settings, another target or model.
-    """
-    require_own_folder(folder, Design.FILE_NAME, CHECKPOINTS)
-    if not (folder / Design.FILE_NAME).exists():
-        with writable(folder):
-            folder.mkdir(parents=True, exist_ok=True)
-        return None
-    design = Design.read(folder)
-    if design.fingerprint != fingerprint:
-        asked = settings.model_dump(mode="json")
-        if setting := first_difference(design.settings, asked):
-            other = f"a design with other settings, {setting}"
-        elif setting := first_addition(design.settings, asked):
-            other = f"a design of a version without the setting {setting}"
-        else:
-            other = "a design with another target or model, or other bands"
-        raise InputError(
-            f"folder {folder}",
-            got=other,
-            wanted="the same settings, target and model",
-            hint="choose another --out",
-        )
-    return design
 
 
 def write_arrays(folder: Path, arrays: dict[str, np.ndarray]) -> dict[str, str]:

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
+from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import record_sha256
 from litho_design.optics.stroke import measure_stroke
@@ -19,7 +20,7 @@ from litho_design.optimisation.budget import Budget, measure_budget
 from litho_design.optimisation.checkpoint import SearchState, remove_checkpoint
 from litho_design.optimisation.polish import polish_levels
 from litho_design.optimisation.search import search_layout
-from litho_design.tasks.design import Design, RunRecord, finished_design
+from litho_design.tasks.design import Design, RunRecord
 from litho_design.tasks.task import Task
 from litho_design.tasks.width import SEARCHED, best_layout
 
@@ -49,18 +50,36 @@ def run_design(task: Task, out: str | Path, report: Report, *, announce: bool = 
             raise InputError(f"model {printer.name}", got="a virtual fab", wanted="a frozen model", hint=hint)
     before = [printer.weights_sha256() for printer in task.printers]
     judged_by = [judge.weights_sha256() for judge in task.judges]
-    target = task.target_record.model_dump(mode="json") if task.target_record else None
-    fingerprint = record_sha256(
-        [task.name, settings.model_dump(mode="json"), before + judged_by, target, task.inputs_sha256()]
-    )
-    finished = finished_design(folder, fingerprint, settings)
-    if finished is not None:
-        return finished
+    facts = {
+        "settings": settings.model_dump(mode="json"),
+        "target": task.target_record.model_dump(mode="json") if task.target_record else None,
+        "fingerprint": record_sha256([task.name, before + judged_by, task.inputs_sha256()]),
+    }
+    # Of the processes that share a design the first one keeps the folder.
+    with growing_folder(folder, Design.FILE_NAME, facts) if task.leads else nullcontext() as begun:
+        if not task.together(begun is not None and begun.finished):
+            _make(task, folder, facts, before, report if task.reported else None, announce and task.leads)
+            task.together(True)
+            remove_checkpoint(folder, task.part)
+    return Design.read(folder)
+
+
+def _make(
+    task: Task,
+    folder: Path,
+    facts: Mapping[str, Any],
+    weights_sha256: Sequence[str],
+    report: Report | None,
+    announce: bool,
+) -> None:
+    """Search, choose, print, score and write."""
+    settings = task.settings
+    layout, wave_um = settings.layout, settings.optics.wave_height_um
     heights = task.printer.level_heights_um()
     with ExitStack() as precisions:
         for printer in task.printers:
             precisions.enter_context(printer.at_precision(settings.search.precision))
-        found, state, budget, seconds = _search(task, folder, fingerprint, announce and task.leads)
+        found, state, budget, seconds = _search(task, folder, record_sha256(facts), announce)
     level, width, loss = task.cells(found.levels), None, found.loss
     if task.polished:
         level, width = best_layout(task, level)
@@ -70,7 +89,7 @@ def run_design(task: Task, out: str | Path, report: Report, *, announce: bool = 
         with torch.no_grad():
             loss = float(task.objective(level[None, None].float())[0])
     height = task.printed_um(level)
-    for printer, then in zip(task.printers, before, strict=True):
+    for printer, then in zip(task.printers, weights_sha256, strict=True):
         if printer.weights_sha256() != then:
             raise InputError(
                 f"model {printer.name}",
@@ -78,35 +97,30 @@ def run_design(task: Task, out: str | Path, report: Report, *, announce: bool = 
                 wanted="a model that printing does not change",
             )
     files = task.save(folder, level, height)
-    if task.leads:
-        layout, wave_um = settings.layout, settings.optics.wave_height_um
-        design = Design(
-            task=task.name,
-            variant=settings.variant,
-            fingerprint=fingerprint,
-            run=RunRecord.of(height.device, seconds, budget.seconds_per_iteration),
-            settings=settings.model_dump(mode="json"),
-            layout=layout,
-            optics=settings.optics,
-            target=task.target_record,
-            printer=task.printer.record(),
-            stroke=measure_stroke(heights, wave_um, level_height_um=layout.level_height_um),
-            notes=task.notes,
-            iterations=state.iteration,
-            start_loss=found.start_loss,
-            sample_loss=state.history[-1]["sample_loss"],
-            argmax_loss=state.best_loss,
-            polished_loss=loss,
-            files=files,
-            width=width,
-            **dict(task.findings(level, height)),
-        )
-        if task.reported:
-            report(folder, design, task, state.history)
-        design.write(folder)
-    task.wait()
-    remove_checkpoint(folder, task.part)
-    return Design.read(folder)
+    if not task.leads:
+        return
+    design = Design(
+        **facts,
+        task=task.name,
+        variant=settings.variant,
+        run=RunRecord.of(height.device, seconds, budget.seconds_per_iteration),
+        layout=layout,
+        optics=settings.optics,
+        printer=task.printer.record(),
+        stroke=measure_stroke(heights, wave_um, level_height_um=layout.level_height_um),
+        notes=task.notes,
+        iterations=state.iteration,
+        start_loss=found.start_loss,
+        sample_loss=state.history[-1]["sample_loss"],
+        argmax_loss=state.best_loss,
+        polished_loss=loss,
+        files=files,
+        width=width,
+        **dict(task.findings(level, height)),
+    )
+    if report is not None:
+        report(folder, design, task, state.history)
+    design.write(folder)
 
 
 class _Found(NamedTuple):

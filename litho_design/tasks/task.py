@@ -191,8 +191,9 @@ class Task:
         """Finished iterations of an interrupted run in ``folder``."""
         return finished_iterations(folder, self.part)
 
-    def wait(self) -> None:
-        """Until all processes that share the search are here."""
+    def together(self, value: bool) -> bool:
+        """Whether this holds for any of the processes that share the search, when all are here."""
+        return value
 
     def save(self, folder: Path, level: Tensor, height_um: Tensor) -> dict[str, str]:
         """Write levels, print and what is seen; SHA-256 by file name."""

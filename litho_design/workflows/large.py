@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.outputs import require_own_folder
 from litho_design.holograms.settings import HologramSettings, hologram_settings
 from litho_design.images.targets import Target, load_target
 from litho_design.judging.score import JudgedScore, ScoreResult
@@ -121,7 +121,6 @@ def score_from_disk(
         InputError: as ``score``; a design that is no hologram of a thin element, or a judge without a
             finite reach.
     """
-    require_own_folder(out, ScoreResult.FILE_NAME)
     folder, record = Path(design), Design.read(design)
     layout, optics = record.layout, record.optics
     if record.task != "hoe" or optics.element != "thin":
@@ -135,28 +134,31 @@ def score_from_disk(
     if not printers:
         raise InputError("score", got="nothing to judge with", wanted="a judge")
     bands = Bands(layout.size_px, band_px)
-    Path(out).mkdir(parents=True, exist_ok=True)
-    scores, pictures = [], {"in design": preview(seen, bands)}
-    for printer in printers.values():
-        judge = printer.record()
-        with tempfile.TemporaryDirectory(prefix=".large-", dir=out) as name:
-            room = Path(name)
-            height, image = (
-                np.memmap(room / file, np.float32, "w+", shape=level.shape) for file in ("height", "image")
-            )
-            print_from_disk(level, printer, bands, height)
-            printed: np.ndarray = height
-            if stitch is not None:
-                printed = in_fields_from_disk(height, layout.pitch_um, stitch, bands, on_disk(room)).numpy()
-            zero_order = image_from_disk(printed, layout.pitch_um, optics, bands, image, on_disk(room))
-            off_um = _difference(printed, expected, bands)
-            figures = image_figures(image, target, bands) | {"zero_order_share": zero_order}
-            pictures[f"printed by {judge.name}"] = preview(image, bands)
-        scores.append(JudgedScore.of_print(record, judge, off_um, figures, stitching=stitch))
-    result = ScoreResult.of(folder, record, scores)
-    brightest = {title: picture / picture.max() for title, picture in pictures.items()}
-    write_score_report(Path(out), result, brightest, layout.size_um, {}, layout.size_um)
-    result.write(out)
+    with growing_folder(out, ScoreResult.FILE_NAME):
+        scores, pictures = [], {"in design": preview(seen, bands)}
+        for printer in printers.values():
+            judge = printer.record()
+            with tempfile.TemporaryDirectory(prefix=".large-", dir=out) as name:
+                room = Path(name)
+                height, image = (
+                    np.memmap(room / file, np.float32, "w+", shape=level.shape)
+                    for file in ("height", "image")
+                )
+                print_from_disk(level, printer, bands, height)
+                printed: np.ndarray = height
+                if stitch is not None:
+                    printed = in_fields_from_disk(
+                        height, layout.pitch_um, stitch, bands, on_disk(room)
+                    ).numpy()
+                zero_order = image_from_disk(printed, layout.pitch_um, optics, bands, image, on_disk(room))
+                off_um = _difference(printed, expected, bands)
+                figures = image_figures(image, target, bands) | {"zero_order_share": zero_order}
+                pictures[f"printed by {judge.name}"] = preview(image, bands)
+            scores.append(JudgedScore.of_print(record, judge, off_um, figures, stitching=stitch))
+        result = ScoreResult.of(folder, record, scores)
+        brightest = {title: picture / picture.max() for title, picture in pictures.items()}
+        write_score_report(Path(out), result, brightest, layout.size_um, {}, layout.size_um)
+        result.write(out)
     return result
 
 
@@ -174,16 +176,16 @@ def score_rings(
     Raises:
         InputError: as ``score``, or a judge without a finite reach.
     """
-    require_own_folder(out, ScoreResult.FILE_NAME)
     folder, record = Path(design), Design.read(design)
     printers = load_printers(judges, record.layout, device=device, extrapolate=extrapolate)
     if not printers:
         raise InputError("score", got="nothing to judge with", wanted="a judge")
-    scores, pictures, side_um = judge_rings(folder, record, list(printers.values()), tile_px)
-    result = ScoreResult.of(folder, record, scores)
-    shown = {title: np.sqrt(psf / psf.max()) for title, psf in pictures.items()}
-    write_score_report(Path(out), result, shown, side_um, {}, side_um)
-    result.write(out)
+    with growing_folder(out, ScoreResult.FILE_NAME):
+        scores, pictures, side_um = judge_rings(folder, record, list(printers.values()), tile_px)
+        result = ScoreResult.of(folder, record, scores)
+        shown = {title: np.sqrt(psf / psf.max()) for title, psf in pictures.items()}
+        write_score_report(Path(out), result, shown, side_um, {}, side_um)
+        result.write(out)
     return result
 
 

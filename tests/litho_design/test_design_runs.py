@@ -108,7 +108,14 @@ def test_a_resumed_search_knows_what_the_interrupted_ones_took(tmp_path, monkeyp
     assert run().earlier_seconds == 21
 
 
-def test_a_damaged_checkpoint_is_refused(tmp_path, small_settings, make_printer, target):
+def test_a_damaged_checkpoint_is_refused(tmp_path, small_settings, make_printer, target, monkeypatch):
+    def stopped(*given, **named):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("litho_design.tasks.run.polish_levels", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            design_hologram(target, make_printer(small_settings.layout), tmp_path, settings=small_settings)
     (tmp_path / "checkpoint.pt").write_text("half a file")
     with pytest.raises(InputError, match=r"checkpoint\.pt.*damaged.*delete it"):
         design_hologram(target, make_printer(small_settings.layout), tmp_path, settings=small_settings)
@@ -134,6 +141,35 @@ def test_a_checkpoint_cut_short_is_damaged_and_one_that_cannot_be_read_is_not(tm
     # Nothing is said of a file to delete.
     with pytest.raises(IsADirectoryError):
         search()
+
+
+@pytest.mark.parametrize("where", ["score", "write_design_report"])
+def test_a_run_stopped_after_its_arrays_goes_on_without_a_checkpoint(
+    tmp_path, small_settings, make_printer, target, monkeypatch, where
+):
+    """Fewer iterations than between two checkpoints, stopped between the arrays and the record."""
+    search = small_settings.search.model_copy(update={"iterations": 4, "checkpoint_every": 50})
+    settings = small_settings.model_copy(update={"search": search})
+
+    def stopped(*given, **named):
+        raise KeyboardInterrupt
+
+    def design(folder):
+        return design_hologram(
+            target, make_printer(settings.layout), folder, settings=settings, announce=False
+        )
+
+    with monkeypatch.context() as patch:
+        if where == "score":
+            patch.setattr(HologramTask, "score", stopped)
+        else:
+            patch.setattr("litho_design.workflows.design.write_design_report", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            design(tmp_path / "cut")
+    assert (tmp_path / "cut" / "layout_level.npy").exists()
+    assert not (tmp_path / "cut" / "design.json").exists()
+    assert design(tmp_path / "cut").files == design(tmp_path / "whole").files
+    assert not (tmp_path / "cut" / "begun.json").exists()
 
 
 def test_a_model_that_changes_while_it_prints_leaves_no_design(
