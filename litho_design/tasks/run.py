@@ -20,9 +20,10 @@ from litho_design.optimisation.budget import Budget, measure_budget
 from litho_design.optimisation.checkpoint import SearchState, remove_checkpoint
 from litho_design.optimisation.polish import polish_levels
 from litho_design.optimisation.search import search_layout
+from litho_design.tasks.candidates import best_layout
 from litho_design.tasks.design import Design, RunRecord
 from litho_design.tasks.task import Task
-from litho_design.tasks.width import SEARCHED, best_layout
+from litho_design.tasks.width import SEARCHED
 
 # Writes the report into the folder of a design, from the record and the history of the search.
 Report = Callable[[Path, Design, Task, list[dict[str, float]]], object]

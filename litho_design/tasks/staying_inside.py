@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from torch import Tensor
 
 from litho_design.optimisation.fabrication import outside
@@ -12,17 +10,17 @@ from litho_design.optimisation.search import search_layout
 from litho_design.optimisation.settings import SearchSettings
 from litho_design.printers.training import OutOfDistribution, out_of_distribution
 
-if TYPE_CHECKING:
-    from litho_design.tasks.task import Task
-
 # Brings a hologram from 0.67 to 0.2 of the level distance in twenty iterations.
 _INSIDE_WEIGHT, _ITERATIONS = 0.5, 20
 
 
-def cost_of_staying_inside(task: Task, level: Tensor) -> OutOfDistribution | None:
+def cost_of_staying_inside(task: Any, level: Tensor) -> OutOfDistribution | None:
     """Distance of levels (size, size) from the training layouts; where large, the scores of closer ones.
 
     They are those of a short search from the layout with a penalty on what the training layouts have not.
+
+    Args:
+        task: the ``Task``, which calls this.
     """
     layout, card = task.settings.layout, task.printer.card
     gauge = out_of_distribution(level.cpu().numpy(), layout, card)
