@@ -33,7 +33,7 @@ from litho_design.holograms.loss import hologram_loss
 from litho_design.holograms.settings import HologramSettings, hologram_settings
 from litho_design.holograms.task import HologramTask
 from litho_design.images.targets import load_target
-from litho_design.optimisation.search import make_parametrisation
+from litho_design.optimisation.parameters import make_parametrisation
 from litho_design.printers.source import load_printer
 from litho_models.layers.precision import Precision
 

@@ -20,7 +20,7 @@ from benchmarks.record import origin, write_record
 from litho_data.foundation.commands import run_script
 from litho_design.exports.gds import GdsRows, write_gds
 from litho_design.exports.image import TiffRows, write_tiff
-from litho_design.large.rows import LevelRows, RingRows, bands_of
+from litho_design.exports.rows import LevelRows, RingRows, bands_of
 from litho_design.printers.layout import LayoutSettings
 
 _MIB = 2**20
@@ -54,7 +54,7 @@ def _exported(kind: str, size_px: int, file: Path) -> dict[str, Any]:
     before, started = _resident_kib("VmRSS"), time.process_time()
     back: LevelRows
     if kind == "tiff":
-        write_tiff(file, levels, layout)
+        write_tiff(file, levels, layout.pitch_um, layout.level_height_um)
         back = TiffRows(file)
     else:
         write_gds(file, levels, layout.pitch_um, "cumulative")

@@ -34,6 +34,8 @@ NAME = "photographs.json"
 TARGETS = {"text": (256, 25.0), "ring": (192, 15.0)}
 DARK, WHITE, RANGE = 8000.0, 40000.0, 65535
 LIMIT_DB = 0.3
+# Of the scales drawn below, a tenth to either side.
+SCALE_SD = 0.06
 # By number, of every eighteen photographs.
 FAULTS = {5: {"noise": 0.15}, 11: {"gamma": 1 / 2.2}, 17: {"exposure": 3.5}}
 _FINER = 4
@@ -115,7 +117,14 @@ def photographed(loaded: LoadedDesign, count: int, folder: Path) -> list[dict[st
         dark = DARK if number % 2 else None
         row = {"number": number, "orientation": orientation, "noise": camera.noise, "fault": fault}
         said = _scored(
-            loaded, PhotoSource(file, camera.pitch_um, dark, orientation=_BACK.get(orientation, orientation))
+            loaded,
+            PhotoSource(
+                file,
+                camera.pitch_um,
+                dark,
+                orientation=_BACK.get(orientation, orientation),
+                pitch_sd=SCALE_SD,
+            ),
         )
         truth = si_psnr_db(torch.from_numpy(light).double(), loaded.target.double())
         if isinstance(said, str):
@@ -123,7 +132,7 @@ def photographed(loaded: LoadedDesign, count: int, folder: Path) -> list[dict[st
         else:
             row["error_db"], row["sd_db"] = said[0] - truth, said[1]
         if orientation != "identity" and sum("silent" in one for one in rows) < _UNSAID:
-            unsaid = _scored(loaded, PhotoSource(file, camera.pitch_um, dark))
+            unsaid = _scored(loaded, PhotoSource(file, camera.pitch_um, dark, pitch_sd=SCALE_SD))
             row["silent"] = not isinstance(unsaid, str) and not unsaid[2]
         rows.append(row)
     return rows

@@ -28,7 +28,8 @@ from litho_design.exports.stl import write_stl
 from litho_design.holograms.settings import HologramSettings
 from litho_design.holograms.task import HologramTask
 from litho_design.images.targets import load_target
-from litho_design.optimisation.search import make_parametrisation, search_layout
+from litho_design.optimisation.parameters import make_parametrisation
+from litho_design.optimisation.search import search_layout
 from litho_design.printers.printer import Printer
 
 PAGE = Path(__file__).parents[1] / "docs" / "optics.md"

@@ -37,14 +37,14 @@ def run_trial(out: Path, task: Task, arm: str) -> None:
     Weights do not change the time: an untrained model stands for an arm that is not trained yet. What a
     design costs beside its iterations is the same optics for every arm, and is timed with the arm ``none``.
     """
-    from litho_design.optimisation.search import make_parametrisation
+    from litho_design.optimisation.parameters import make_parametrisation
 
     torch.set_num_threads(1)
     source = task.models[arm]
     if arm != "none" and not (Path(source) / ModelCard.FILE_NAME).exists():
         source = str(_untrained(arm, out / "cost" / "models" / arm))
     design, settings = _task(task, source)
-    parameters = make_parametrisation(settings.layout, settings.search)
+    parameters = make_parametrisation(settings.layout, settings.search, design.cells)
     parameters.start_random(0)
     with design.printer.at_precision(settings.search.precision):
         iteration_s = min(_cpu_s(lambda: _iterate(design, parameters)) for _ in range(_TRIALS))
@@ -74,7 +74,7 @@ def _beside_s(design: Any, parameters: Any, height: torch.Tensor) -> float:
     from litho_design.lenses.bench import LensBench
     from litho_design.lenses.focus_window import focus_window
 
-    seconds = _cpu_s(lambda: design.start(parameters, design.printer.level_heights_um()))
+    seconds = _cpu_s(design.free_parameters)
     seconds += _cpu_s(lambda: design.reference_efficiency(height)) + _cpu_s(design.baselines)
     seconds += design.settings.window.yield_draws * _cpu_s(lambda: design.window_scores(height, 1))
     if isinstance(design.bench, LensBench):

@@ -144,7 +144,7 @@ def checked_attributes(root: zarr.Group, path: Path) -> dict[str, Any]:
             raise InputError(f"attribute {key} of {path}", got=repr(value), wanted=wanted)
         checked[key] = value if whole else float(value)
     if "field_um" in write:
-        LENGTH_UM.require(f"attribute write_field_um of {path}", write["field_um"])
+        LENGTH_UM.require(f"write_field_um of {path}", write["field_um"])
     return checked
 
 

@@ -9,6 +9,7 @@ import typer
 
 from litho_data.foundation.app import new_app, run_app
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.settings import changed
 from litho_design.cli.design import compare, correct, estimate, first, hoe, lens, settings
 from litho_design.cli.options import (
     BandPx,
@@ -21,6 +22,7 @@ from litho_design.cli.options import (
     ScanSizeUm,
     ScanUnit,
     measured_source,
+    numbers,
 )
 
 if TYPE_CHECKING:
@@ -52,11 +54,22 @@ def score(
     scan_scale_sd: Annotated[
         float, typer.Option(help="relative standard uncertainty of the microscope's height scale")
     ] = 0.02,
+    scan_tip_um: Annotated[
+        float | None,
+        typer.Option(help="radius of the tip, µm; 0 for none. By default what the scan tells"),
+    ] = None,
     camera: Annotated[
         Path | None,
         typer.Option(help="photograph of the printed hologram's image, or through the printed lens"),
     ] = None,
     camera_pitch_um: Annotated[float | None, typer.Option(help="its pixel in the image plane, µm")] = None,
+    camera_pitch_sd: Annotated[
+        float, typer.Option(help="relative uncertainty of that, where the magnification is not sure")
+    ] = 0.0,
+    camera_flat: Annotated[
+        Path | None,
+        typer.Option(help="photograph of an even light by the same camera, against vignetting"),
+    ] = None,
     camera_dark_level: Annotated[float | None, typer.Option(help="its dark level, counts")] = None,
     camera_object: Annotated[
         str | None,
@@ -140,19 +153,26 @@ def score(
         raise InputError("--camera-object", got="no --camera", wanted="the photograph of it")
     if task_file is not None:
         register_tasks_of(task_file)
-    measured = measured_source(
-        scan, scan_unit, scan_size_um, scan_levelling, scale_sd=scan_scale_sd, aligned=scan_aligned
-    )
+    photo = None
+    if camera is not None:
+        photo = PhotoSource(
+            camera,
+            camera_pitch_um or 0.0,
+            dark_level=camera_dark_level,
+            imaged=camera_object,
+            orientation=camera_orientation,
+            power_counts=camera_power,
+            pitch_sd=camera_pitch_sd,
+            flat=camera_flat,
+        )
+    further = {"scale_sd": scan_scale_sd, "aligned": scan_aligned, "tip_um": scan_tip_um}
+    measured = measured_source(scan, scan_unit, scan_size_um, scan_levelling, **further)
     result = score_design(
         design,
         out,
         judges=judge or (),
         scan=measured,
-        camera=None
-        if camera is None
-        else PhotoSource(
-            camera, camera_pitch_um or 0.0, camera_dark_level, camera_object, camera_orientation, camera_power
-        ),
+        camera=photo,
         element=element,
         stitch=stitch,
         device=device,
@@ -175,17 +195,29 @@ def _print_scores(result: ScoreResult, out: Path) -> None:
 
 @app.command()
 def export(
-    design: Annotated[Path, typer.Argument(help="folder of a design")],
+    design: Annotated[Path, typer.Argument(help="folder of a design, or NAME.npy: levels, or heights in µm")],
     out: Out,
     format: Annotated[
-        Literal["png16", "bmp", "tiff", "stl", "gds"], typer.Option(help="file for the printer")
+        Literal["png16", "bmp", "tiff", "stl", "gds", "dxf", "gwl"], typer.Option(help="file for the printer")
     ] = "png16",
+    pitch_um: Annotated[float, typer.Option(help="pixel of NAME.npy, µm")] = 0.1,
+    level_height_um: Annotated[float, typer.Option(help="level of NAME.npy, µm")] = 0.1,
     pedestal_um: Annotated[float, typer.Option(help="base under level 0, µm")] = 1.0,
     slicing_um: Annotated[float, typer.Option(help="slicing distance for the job, µm")] = 0.1,
     hatching_um: Annotated[float, typer.Option(help="hatching distance for the job, µm")] = 0.1,
     gds_layers: Annotated[
         Literal["cumulative", "exclusive"], typer.Option(help="layer k is level >= k, or level == k")
     ] = "cumulative",
+    gwl_mode: Annotated[Literal["galvo", "piezo"], typer.Option(help="who moves the focus")] = "galvo",
+    gwl_field_um: Annotated[float, typer.Option(help="write field of the galvo, µm")] = 100.0,
+    gwl_speed: Annotated[float, typer.Option(help="scan speed, µm/s")] = 40000.0,
+    gwl_power: Annotated[
+        str, typer.Option(help="laser power, %: one number, or that of the pedestal and of every level")
+    ] = "50",
+    dose_curve: Annotated[
+        Path | None,
+        typer.Option(help="CSV of grey,height_um as printed; without it grey is linear"),
+    ] = None,
     marks: Annotated[
         bool, typer.Option("--marks", help="also print an F (orientation) and a flat witness beside it")
     ] = False,
@@ -195,16 +227,25 @@ def export(
     Example: litho-design export hologram --format stl --out files
     """
     from litho_design.exports.files import export as export_design
+    from litho_design.exports.gwl import Gwl
     from litho_design.exports.sidecar import sidecar_path
 
+    powers = tuple(numbers("--gwl-power", gwl_power, float))
     file = export_design(
         design,
         format,
         out,
+        pitch_um=pitch_um,
+        level_height_um=level_height_um,
         pedestal_um=pedestal_um,
         slicing_um=slicing_um,
         hatching_um=hatching_um,
         gds_layers=gds_layers,
+        gwl=changed(
+            Gwl(),
+            {"mode": gwl_mode, "field_um": gwl_field_um, "speed_um_s": gwl_speed, "power_percent": powers},
+        ),
+        dose_curve=dose_curve,
         marks=marks,
     )
     print(file)

@@ -26,6 +26,7 @@ from litho_design.cli.options import (
     ScanUnit,
     as_toml,
     measured_source,
+    numbers,
     takes_settings,
 )
 from litho_design.holograms.settings import HologramSettings, hologram_settings
@@ -38,7 +39,6 @@ if TYPE_CHECKING:
     from litho_design.tasks.design import Design
 
 S = TypeVar("S", bound=DesignSettings)
-N = TypeVar("N", int, float)
 
 # A variant or a task among the changes replaces these.
 _hologram = partial(hologram_settings, "default")
@@ -60,6 +60,17 @@ RoughnessOf = Annotated[
 ]
 Ensemble = Annotated[
     list[str] | None, typer.Option(help="NAME=MODEL of a further model in the loss; repeatable")
+]
+Judges = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--judge",
+        help="NAME=MODEL or MODEL that prints the finished layout; repeatable. Those of the zoo for the same "
+        "printer by default",
+    ),
+]
+Robust = Annotated[
+    bool, typer.Option(help="search for the best layout by the worst of the model and its judges")
 ]
 Objects = Annotated[
     list[Path] | None,
@@ -110,6 +121,8 @@ def hoe(
     spread_of: SpreadOf = None,
     roughness_of: RoughnessOf = None,
     ensemble: Ensemble = None,
+    judge: Judges = None,
+    robust: Robust = False,
     workers: WorkersOption = 1,
     dask: DaskOption = None,
     large: Annotated[
@@ -145,14 +158,16 @@ def hoe(
         from litho_design.workflows.front import efficiency_front
 
         result = efficiency_front(
-            target, model, out, weights=_numbers("--front", front, float), settings=settings,
+            target, model, out, weights=numbers("--front", front, float), settings=settings,
             ensemble=ensemble or (), workers=workers, dask=dask, **fit,
         )  # fmt: skip
         _print_front(result, out)
     else:
         from litho_design.workflows.design import design_hologram
 
-        design = design_hologram(target, model, out, settings=settings, ensemble=ensemble or (), **fit)
+        design = design_hologram(
+            target, model, out, settings=settings, ensemble=ensemble or (), judges=judge, robust=robust, **fit
+        )
         _print_design(design, out)
 
 
@@ -177,6 +192,8 @@ def correct(
     spread_of: SpreadOf = None,
     roughness_of: RoughnessOf = None,
     ensemble: Ensemble = None,
+    judge: Judges = None,
+    robust: Robust = True,
     device: Device = "cpu",
     extrapolate: Extrapolate = False,
 ) -> None:
@@ -191,7 +208,7 @@ def correct(
     print_of = measured_source(scan, scan_unit, scan_size_um, scan_levelling, aligned=scan_aligned)
     design = correct_relief(
         relief, model, out, settings=settings, after=after, scan=print_of,
-        ensemble=ensemble or (), device=device, extrapolate=extrapolate,
+        ensemble=ensemble or (), judges=judge, robust=robust, device=device, extrapolate=extrapolate,
     )  # fmt: skip
     _print_design(design, out)
 
@@ -206,6 +223,8 @@ def lens(
     spread_of: SpreadOf = None,
     roughness_of: RoughnessOf = None,
     ensemble: Ensemble = None,
+    judge: Judges = None,
+    robust: Robust = False,
     large: Annotated[
         bool, typer.Option("--large", help="ring by ring, for a lens of any size that focuses light")
     ] = False,
@@ -232,14 +251,12 @@ def lens(
 
     design = design_lens(
         model, out, settings=settings, objects=objects or (), held_out_objects=held_out_objects or (),
-        ensemble=ensemble or (), device=device, extrapolate=extrapolate,
+        ensemble=ensemble or (), judges=judge, robust=robust, device=device, extrapolate=extrapolate,
     )  # fmt: skip
     _print_design(design, out)
 
 
-@takes_settings(
-    HologramSettings(), LensSettings(), leave_out=("task", "search.seed", "search.draft", "ensemble.weight")
-)
+@takes_settings(HologramSettings(), LensSettings(), leave_out=("task", "search.seed", "ensemble.weight"))
 def compare(
     models: Annotated[
         str, typer.Option(help="arms, comma-separated: none, NAME=MODEL or MODEL (a folder, or zoo:NAME)")
@@ -307,7 +324,7 @@ def estimate(
     from litho_design.workflows.large import estimate_large
 
     made = _settings(given, _hologram, "estimate")
-    sizes = _numbers("--measure-px", measure_px, int)
+    sizes = numbers("--measure-px", measure_px, int)
     for line in estimate_large(model, made, sizes, ranks, band_px, device=device, extrapolate=extrapolate):
         print(line)
 
@@ -350,14 +367,6 @@ def _settings(
     return measured if window is made.window else changed(measured, given.options)
 
 
-def _numbers(option: str, words: str, kind: Callable[[str], N]) -> list[N]:
-    """The numbers behind an option, separated by commas."""
-    try:
-        return [kind(word) for word in words.split(",")]
-    except ValueError:
-        raise InputError(option, got=repr(words), wanted="numbers, separated by commas") from None
-
-
 def _print_front(result: FrontResult, out: Path) -> None:
     from litho_design.reports.advice import baseline_line
 
@@ -378,11 +387,14 @@ def _print_design(design: Design, out: Path) -> None:
         headline,
         stroke_advice,
         thickness_warning,
+        width_sentence,
     )
 
     for warning in filter(None, (distribution_warning(design), thickness_warning(design))):
         print(warning, file=sys.stderr)
     print(stroke_advice(design))
+    if said := width_sentence(design):
+        print(said)
     if design.baselines:
         print(baseline_line(design.baselines))
     page = out / "report.html"

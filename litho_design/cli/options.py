@@ -8,7 +8,7 @@ import json
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args, get_origin
 
 import typer
 from pydantic import BaseModel
@@ -18,6 +18,8 @@ from litho_data.foundation.settings import Leaf, assigned, flattened, leaves, re
 
 if TYPE_CHECKING:
     from litho_design.judging.measured import MeasuredSource
+
+N = TypeVar("N", int, float)
 
 Out = Annotated[Path, typer.Option(help="folder of the result; one that holds anything else is refused")]
 Device = Annotated[str, typer.Option(help="cpu, cuda, cuda:0 …")]
@@ -62,6 +64,14 @@ def measured_source(
     from litho_design.judging.measured import MeasuredSource
 
     return MeasuredSource(scan, unit, None if size_um is None else (size_um, size_um), levelling, **further)
+
+
+def numbers(option: str, words: str, kind: Callable[[str], N]) -> list[N]:
+    """The numbers behind an option, separated by commas."""
+    try:
+        return [kind(word) for word in words.split(",")]
+    except ValueError:
+        raise InputError(option, got=repr(words), wanted="numbers, separated by commas") from None
 
 
 _Config = Annotated[

@@ -14,9 +14,10 @@ from torch import Tensor, nn
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.settings import changed
+from litho_design.elements.transforms import printed_anyhow
 from litho_design.optics import Optics
 from litho_design.optics.materials import Resin, refractive_index
-from litho_design.optics.thin_element import ElementKind, through_relief
+from litho_design.optics.thin_element import LONGEST_UM, SHORTEST_UM, ElementKind, through_relief
 from litho_design.optimisation.parameters import DirectLevels
 from litho_design.optimisation.phases import focusing_levels, printed_phase
 from litho_design.printers.layout import LayoutSettings
@@ -87,24 +88,28 @@ class Element(nn.Module):
             height_um: a known print (size, size) instead of that of the levels, such as a measured one.
         """
         height = self.height_um() if height_um is None else height_um
+        self._check_map("field", field)
         if self.kind == "thin":
             return field * self.transmission(wavelength_um, height)
+        self._check_map("height", height)
         kept = (-0.5 * self.absorption_per_um * height).exp()
         return through_relief(field * kept, height, self.layout.pitch_um, self.optics(wavelength_um))
 
     def transmission(self, wavelength_um: float, height_um: Tensor | None = None) -> Tensor:
         """Complex factor (size, size) of the thin element: exp(2 pi j (n - n0) h / wavelength - a h / 2)."""
         height = self.height_um() if height_um is None else height_um
+        self._check_map("height", height)
         phase = height * (2 * math.pi / self.optics(wavelength_um).wave_height_um)
         return torch.polar((-0.5 * self.absorption_per_um * height).exp(), phase)
 
     def height_um(self) -> Tensor:
         """Printed height (size, size), µm, with a gradient to the free levels."""
-        level = self.free.sample(1.0, self.whole, 0)
-        size, tile = self.layout.size_px, self.tile_px
-        if tile is None or size <= tile:
-            return self.printer(level)[0, 0]
-        return self.printer.print_in_tiles(level, tile)[0, 0]
+        return printed_anyhow(self._print, self.free.sample(1.0, self.whole, 0))[0, 0]
+
+    def _print(self, level: Tensor) -> Tensor:
+        tile = self.tile_px
+        large = tile is not None and self.layout.size_px > tile
+        return self.printer.print_in_tiles(level, tile) if large and tile else self.printer(level)
 
     def levels(self) -> np.ndarray:
         """The layout to be printed, uint8 (size, size)."""
@@ -112,6 +117,10 @@ class Element(nn.Module):
 
     def optics(self, wavelength_um: float) -> Optics:
         """Wavelength, index step and kind of the element there."""
+        if not SHORTEST_UM < wavelength_um < LONGEST_UM:
+            wanted = f"{SHORTEST_UM:g} to {LONGEST_UM:g} µm"
+            hint = "are nm or metres meant? as_torchoptics(unit_um=1e6) counts in metres"
+            raise InputError("wavelength", got=f"{wavelength_um:g} µm", wanted=wanted, hint=hint)
         index, around = self._index(wavelength_um), self.surroundings
         if not index > around:
             raise InputError("resin", got=f"an index of {index:g}", wanted=f"more than around it, {around:g}")
@@ -119,11 +128,13 @@ class Element(nn.Module):
 
     def start_from_levels(self, levels: np.ndarray) -> None:
         """Start from a layout (size, size), whole or real levels."""
-        pixels = torch.as_tensor(levels, dtype=torch.float32, device=self.free.height.device)
+        pixels = torch.as_tensor(levels, dtype=self.free.height.dtype, device=self.free.height.device)
+        self._check_map("levels", pixels)
         self.free.start_from(self.free.cells.average(pixels))
 
     def start_from_phase(self, phase: Tensor, wavelength_um: float) -> None:
         """Start from the levels that print a wanted phase (size, size), radian, up to a constant."""
+        self._check_map("phase", phase)
         printed = printed_phase(self.printer.level_heights_um(), self.optics(wavelength_um))
         wave = self.free.cells.average(torch.polar(torch.ones_like(phase), phase).to(self.free.height.device))
         self.free.start_from(focusing_levels(wave.angle().float(), printed.to(wave.device)).float())
@@ -147,6 +158,12 @@ class Element(nn.Module):
         if self.kind != "thin":
             raise InputError("element for torchoptics", got="a thick element", wanted="a thin one")
         return PrintedElement(self, z=z, offset=offset, unit_um=unit_um)
+
+    def _check_map(self, what: str, values: Tensor) -> None:
+        size = self.layout.size_px
+        if tuple(values.shape[-2:]) != (size, size):
+            got = f"shape {tuple(values.shape)}"
+            raise InputError(f"{what} of an element", got=got, wanted=f"(..., {size}, {size}), its pixels")
 
     def _check(self) -> None:
         if self.printer.only_judges:

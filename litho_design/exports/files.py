@@ -1,54 +1,92 @@
-"""Export of a design in one of the formats, and the exact import of what was exported."""
+"""Export of a layout in one of the formats, and the exact import of what was exported."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.files import writable
+from litho_data.foundation.hashes import array_sha256, file_sha256
 from litho_data.foundation.outputs import require_replaceable_folder
+from litho_design.elements.element import Element
+from litho_design.exports.dxf import read_dxf_levels, write_dxf
 from litho_design.exports.gds import GdsLayers, GdsRows, write_gds
-from litho_design.exports.image import TiffRows, read_image_levels, write_bmp, write_png16, write_tiff
+from litho_design.exports.gwl import Gwl, read_gwl_levels, write_gwl
+from litho_design.exports.image import (
+    TiffRows,
+    linear_greys,
+    measured_greys,
+    read_image_levels,
+    write_image,
+    write_tiff,
+)
 from litho_design.exports.marks import Marks, with_marks
-from litho_design.exports.sidecar import Format, Sidecar, make_sidecar, read_sidecar, sidecar_path
+from litho_design.exports.rows import LevelRows, bands_of, layout_rows
+from litho_design.exports.sidecar import Format, Sidecar, of_design, of_layout, read_sidecar, sidecar_path
 from litho_design.exports.stl import read_stl_levels, write_stl
 from litho_design.judging.loaded import LoadedDesign
-from litho_design.large.rows import LevelRows, bands_of, layout_rows
+from litho_design.printers.layout import LayoutSettings
 from litho_design.tasks.design import Design
 
-_SUFFIX: dict[str, str] = {"png16": ".png", "bmp": ".bmp", "tiff": ".tif", "stl": ".stl", "gds": ".gds"}
+_SUFFIX: dict[str, str] = {
+    "png16": ".png", "bmp": ".bmp", "tiff": ".tif", "stl": ".stl", "gds": ".gds", "dxf": ".dxf",
+    "gwl": ".gwl",
+}  # fmt: skip
+_GREY_BITS = {"png16": 16, "bmp": 8, "dxf": 8}
 _IN_PIECES = ("tiff", "gds")
 # What the other formats need of memory for it is some 3 GiB (images) and more (solids).
 _MOST_PX_WHOLE = 16384**2
 _BAND_PX = 128
 
 
+@dataclass(frozen=True)
+class _Source:
+    """A layout to export: levels (ny, nx), their geometry and hash, and the design that they are of."""
+
+    levels: LevelRows
+    layout: LayoutSettings
+    sha256: str
+    folder: Path | None = None
+    design: Design | None = None
+
+
 def export(
-    design: str | Path | LoadedDesign,
+    design: str | Path | LoadedDesign | Element | np.ndarray,
     format: Format,
     out: str | Path,
     *,
+    pitch_um: float = 0.1,
+    level_height_um: float = 0.1,
     pedestal_um: float = 1.0,
     slicing_um: float = 0.1,
     hatching_um: float = 0.1,
     gds_layers: GdsLayers = "cumulative",
+    gwl: Gwl | None = None,
+    dose_curve: str | Path | None = None,
     marks: bool = False,
 ) -> Path:
-    """Write the layout of a design for the printer, and ``<file>.json`` beside it.
+    """Write a layout for the printer, and ``<file>.json`` beside it.
 
     The file is read back before the export counts as done. ``tiff`` and ``gds`` are written and read a band
     of rows at a time, so that memory does not grow with the height of an element.
 
     Args:
-        design: its folder, or what ``load_design`` gives.
-        format: png16, bmp, tiff, stl or gds.
+        design: folder of a design, or what ``load_design`` gives; an ``Element``; or an array (ny, nx) or its
+            file NAME.npy: whole numbers are levels, others heights in µm, rounded to the nearest level.
+        format: png16, bmp, tiff, stl, gds, dxf or gwl.
         out: folder of the export; exports of the same layout in other formats stay in it.
-        pedestal_um: base under level 0; part of the solid in STL, a note to the operator in other formats.
-        slicing_um, hatching_um: settings of the print job, recorded in the sidecar.
+        pitch_um, level_height_um: pixel and level of an array; a design and an element have their own.
+        pedestal_um: base under level 0; printed by STL and GWL, a note to the operator in other formats.
+        slicing_um, hatching_um: settings of the print job: the sidecar has them, GWL uses them.
+        gwl: mode, write field, speed and power of GWL; ``Gwl()`` by default.
+        dose_curve: CSV of ``grey,height_um``, what the printer makes of a grey value, for the grey formats
+            bmp, png16 and dxf; without it grey is linear in height.
         marks: also a mark of orientation and a flat witness beside the element (see ``with_marks``).
 
     Returns:
@@ -62,35 +100,54 @@ def export(
     job = {"pedestal_um": pedestal_um, "slicing_um": slicing_um, "hatching_um": hatching_um}
     for setting, value in job.items():
         # Only a closed solid needs a base.
-        may_be_zero = setting == "pedestal_um" and format != "stl"
+        may_be_zero = setting == "pedestal_um" and format not in ("stl", "gwl")
         if not 0 <= value < math.inf or (value == 0 and not may_be_zero):
             raise InputError(setting, got=f"{value:g} µm", wanted="a positive length")
-    folder = design.folder if isinstance(design, LoadedDesign) else Path(design)
-    record = Design.read(folder)
-    levels = written = layout_rows(folder)
+    source = _source(design, pitch_um, level_height_um)
+    levels = written = source.levels
     if format not in _IN_PIECES and levels.shape[0] * levels.shape[1] > _MOST_PX_WHOLE:
         got = f"{format} of {levels.shape[0]} x {levels.shape[1]} px"
         raise InputError("format of a large element", got=got, wanted="tiff or gds, written in pieces")
     found: Marks | None = None
     if marks:
-        guard_um, heights = record.printer.guard_um, record.stroke.printed_height_um
-        written, found = with_marks(levels, record.layout, guard_um, heights)
+        if source.design is None:
+            raise InputError(
+                "marks", got="levels without a design", wanted="a design, whose printer has a reach"
+            )
+        guard_um, heights = source.design.printer.guard_um, source.design.stroke.printed_height_um
+        written, found = with_marks(levels, source.layout, guard_um, heights)
+    greys, white_um = None, None
+    if format in _GREY_BITS:
+        bits = _GREY_BITS[format]
+        greys = (linear_greys if dose_curve is None else measured_greys(dose_curve))(source.layout, bits)
+        if dose_curve is None:
+            white_um = (2**bits - 1) / greys[1] * source.layout.level_height_um
     name = f"layout{_SUFFIX[format]}"
     require_replaceable_folder(out, "layout*")
     place = Path(out)
-    _require_same_layout(place, name, record.layout_sha256)
+    _require_same_layout(place, name, source.sha256)
     with writable(place):
         place.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory(prefix="layout.", suffix=".partial", dir=place) as temporary:
         file = Path(temporary) / name
-        step = _write(file, format, written, record, pedestal_um, gds_layers, found)
-        sidecar = make_sidecar(
-            folder, record, file, format, pedestal_um=pedestal_um, slicing_um=slicing_um,
-            hatching_um=hatching_um, grey_per_level=step, gds_layers=gds_layers if format == "gds" else None,
-            shape_px=(written.shape[0], written.shape[1]), marks=found,
-        )  # fmt: skip
-        sidecar.write(temporary).rename(sidecar_path(file))
-        back = _rows(file, read_sidecar(file))
+        sidecar: dict[str, Any] = {
+            "file": name,
+            "format": format,
+            "layout_sha256": source.sha256,
+            **of_layout(source.layout, (written.shape[0], written.shape[1])),
+            **job,
+            "greys": greys,
+            "white_height_um": white_um,
+            "gds_layers": gds_layers if format == "gds" else None,
+            "gwl": (gwl or Gwl()) if format == "gwl" else None,
+            "marks": found,
+        }
+        if source.design is not None and source.folder is not None:
+            sidecar |= of_design(source.folder, source.design)
+        _write(file, Sidecar(file_sha256="", **sidecar), written)
+        record = Sidecar(file_sha256=file_sha256(file), **sidecar)
+        record.write(temporary).rename(sidecar_path(file))
+        back = _rows(file, record)
         if not all(np.array_equal(back[rows], written[rows]) for rows in bands_of(written, _BAND_PX)):
             raise AssertionError(f"{format} export does not read back as it was written")
         # The sidecar last: without it, or with an older one, the file is refused.
@@ -114,22 +171,36 @@ def import_levels(file: str | Path) -> tuple[np.ndarray, Sidecar]:
     return levels, sidecar
 
 
-def _rows(path: Path, sidecar: Sidecar) -> LevelRows:
-    """The map of a file, marks included."""
-    if sidecar.format == "stl":
-        cell_px = _cell_px(sidecar)
-        shape = (sidecar.shape_px[0] // cell_px, sidecar.shape_px[1] // cell_px)
-        cells = read_stl_levels(
-            path, shape, cell_px * sidecar.pitch_um, sidecar.level_height_um, sidecar.pedestal_um
-        )
-        return cells.repeat(cell_px, 0).repeat(cell_px, 1)
-    if sidecar.format == "gds":
-        assert sidecar.gds_layers is not None
-        return GdsRows(path, sidecar.shape_px, sidecar.pitch_um, sidecar.gds_layers)
-    if sidecar.format == "tiff":
-        return TiffRows(path)
-    assert sidecar.grey_per_level is not None
-    return read_image_levels(path, sidecar.grey_per_level)
+def _source(given: Any, pitch_um: float, level_height_um: float) -> _Source:
+    if isinstance(given, Element):
+        levels = given.levels()
+        return _Source(levels, given.layout, array_sha256(levels, "level", ("y", "x")))
+    if isinstance(given, LoadedDesign):
+        given = given.folder
+    if isinstance(given, str | Path) and Path(given).suffix == ".npy":
+        try:
+            given = np.load(given, allow_pickle=False)
+        except (OSError, ValueError, EOFError) as error:
+            raise InputError(f"array {given}", got=str(error), wanted="levels or heights in µm") from None
+    if isinstance(given, str | Path):
+        record = Design.read(given)
+        return _Source(layout_rows(given), record.layout, record.layout_sha256, Path(given), record)
+    if not isinstance(given, np.ndarray):
+        wanted = "a design's folder, an Element, or an array of levels or heights in µm"
+        raise InputError("layout to export", got=type(given).__name__, wanted=wanted)
+    if given.ndim != 2 or not given.size or given.dtype.kind not in "buif" or not np.isfinite(given).all():
+        got = f"{given.dtype} of shape {given.shape}"
+        raise InputError("array to export", got=got, wanted="finite levels or heights in µm (ny, nx)")
+    levels = np.rint(given / level_height_um) if given.dtype.kind == "f" else given
+    if levels.min() < 0 or levels.max() > 255:
+        got = f"levels from {levels.min():g} to {levels.max():g}"
+        raise InputError("array to export", got=got, wanted="0 to 255", hint="another --level-height-um")
+    levels = np.ascontiguousarray(levels, np.uint8)
+    layout = LayoutSettings(
+        size_px=max(4, *levels.shape), pitch_um=pitch_um, cell_um=pitch_um,
+        levels=max(2, int(levels.max()) + 1), level_height_um=level_height_um,
+    )  # fmt: skip
+    return _Source(levels, layout, array_sha256(levels, "level", ("y", "x")))
 
 
 def _require_same_layout(place: Path, name: str, layout_sha256: str) -> None:
@@ -140,30 +211,44 @@ def _require_same_layout(place: Path, name: str, layout_sha256: str) -> None:
             )
 
 
-def _write(
-    file: Path,
-    kind: Format,
-    levels: LevelRows,
-    design: Design,
-    pedestal_um: float,
-    gds_layers: GdsLayers,
-    marks: Marks | None,
-) -> int | None:
-    layout = design.layout
-    if kind == "stl":
-        cell_px = 1 if layout.symmetry == "radial" else layout.cell_px
-        cells = levels[::cell_px][:, ::cell_px]
-        write_stl(file, cells, cell_px * layout.pitch_um, layout.level_height_um, pedestal_um)
-        return None
-    if kind == "gds":
-        parts = None if marks is None else marks.parts()
-        write_gds(file, levels, layout.pitch_um, gds_layers, parts)
-        return None
-    if kind == "tiff":
-        return write_tiff(file, levels, layout)
-    return {"png16": write_png16, "bmp": write_bmp}[kind](file, levels[:], layout)
+def _write(file: Path, job: Sidecar, levels: LevelRows) -> None:
+    pitch_um, step_um = job.pitch_um, job.level_height_um
+    if job.format == "stl":
+        cells = levels[:: job.cell_px][:, :: job.cell_px]
+        write_stl(file, cells, job.cell_px * pitch_um, step_um, job.pedestal_um)
+    elif job.format == "gds":
+        assert job.gds_layers is not None
+        write_gds(file, levels, pitch_um, job.gds_layers, None if job.marks is None else job.marks.parts())
+    elif job.format == "tiff":
+        write_tiff(file, levels, pitch_um, step_um)
+    elif job.format == "gwl":
+        assert job.gwl is not None
+        write_gwl(file, levels, pitch_um, step_um, job.pedestal_um, job.slicing_um, job.hatching_um, job.gwl)
+    else:
+        assert job.greys is not None
+        if job.format == "dxf":
+            write_dxf(file, levels, pitch_um, job.greys)
+        else:
+            write_image(file, levels[:], job.greys, step_um)
 
 
-def _cell_px(sidecar: Sidecar) -> int:
-    layout = sidecar.settings["layout"]
-    return 1 if layout["symmetry"] == "radial" else round(layout["cell_um"] / layout["pitch_um"])
+def _rows(path: Path, sidecar: Sidecar) -> LevelRows:
+    """The map of a file, marks included."""
+    shape, pitch_um, step_um = sidecar.shape_px, sidecar.pitch_um, sidecar.level_height_um
+    if sidecar.format == "stl":
+        px = sidecar.cell_px
+        cells = read_stl_levels(
+            path, (shape[0] // px, shape[1] // px), px * pitch_um, step_um, sidecar.pedestal_um
+        )
+        return cells.repeat(px, 0).repeat(px, 1)
+    if sidecar.format == "gds":
+        assert sidecar.gds_layers is not None
+        return GdsRows(path, shape, pitch_um, sidecar.gds_layers)
+    if sidecar.format == "tiff":
+        return TiffRows(path)
+    if sidecar.format == "gwl":
+        return read_gwl_levels(path, shape, pitch_um, step_um, sidecar.pedestal_um, sidecar.slicing_um)
+    assert sidecar.greys is not None
+    if sidecar.format == "dxf":
+        return read_dxf_levels(path, shape, pitch_um, sidecar.greys)
+    return read_image_levels(path, sidecar.greys)

@@ -1,19 +1,17 @@
-"""Layouts as GDSII, one layer per level in cells that repeat, written and read a band of rows at a time.
-
-Records and numbers as in the GDSII Stream Format Manual, release 6.0 (Calma, 1987).
-"""
+"""Layouts as GDSII, one layer per level in cells that repeat, written and read a band of rows at a time."""
 
 from __future__ import annotations
 
 import hashlib
 import struct
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
+from datetime import datetime
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import Any, Literal
 
 import numpy as np
 
-from litho_design.large.rows import LevelRows
+from litho_design.exports.rows import LevelRows
 
 _UNIT_M = 1e-6
 _PRECISION_M = 1e-9
@@ -26,11 +24,7 @@ _CHUNK = 1 << 10
 GdsLayers = Literal["cumulative", "exclusive"]
 Box = tuple[int, int, int, int]
 
-_HEADER, _LIBRARY, _LIBRARY_NAME, _UNITS, _END_LIBRARY = 0x0002, 0x0102, 0x0206, 0x0305, 0x0400
-_CELL, _CELL_NAME, _END_CELL = 0x0502, 0x0606, 0x0700
-_REFERENCE, _REFERENCE_NAME, _PLACE, _END = 0x0A00, 0x1206, 0x1003, 0x1100
-# The same for equal layouts, whose files are equal then.
-_DATE = struct.pack(">12h", *(1970, 1, 1, 0, 0, 0) * 2)
+_CELL_NAME, _REFERENCE_NAME, _PLACE, _END_LIBRARY = 0x0606, 0x1206, 0x1003, 0x0400
 
 # One rectangle: the records BOUNDARY, LAYER, DATATYPE 0, XY of five corners, ENDEL, one after the other.
 _RECTANGLE = np.dtype(
@@ -43,7 +37,7 @@ _RECTANGLE = np.dtype(
         ("end", ">u4"),
     ]
 )
-_START, _TYPE, _XY, _ENDED = 0x0004080000060D02, b"\0\x06\x0e\x02\0\0", 0x002C1003, 0x00041100
+_START = 0x0004080000060D02
 
 
 def write_gds(
@@ -63,55 +57,50 @@ def write_gds(
     Args:
         parts: rows from, to, columns from, to, of each part by name; the whole map is ELEMENT by default.
     """
-    known: dict[bytes, str] = {}
+    import gdstk
+
+    known: dict[bytes, gdstk.Cell] = {}
     height, width = levels.shape
-    step = pitch_um * _UNIT_M / _PRECISION_M
-    drawn, placed = 0, []
-    with open(path, "wb") as stream:
-        stream.write(_record(_HEADER, struct.pack(">h", 600)) + _record(_LIBRARY, _DATE))
-        units = _real(_PRECISION_M / _UNIT_M) + _real(_PRECISION_M)
-        stream.write(_text(_LIBRARY_NAME, "library") + _record(_UNITS, units))
-        for name, (top, bottom, left, right) in (parts or {"ELEMENT": (0, height, 0, width)}).items():
-            rows_of_part = []
-            for row in range(top, bottom, _BLOCK_PX):
-                band = levels[row : min(row + _BLOCK_PX, bottom)][:, left:right]
-                blocks = []
-                for column in range(0, right - left, _BLOCK_PX):
-                    block = np.ascontiguousarray(band[:, column : column + _BLOCK_PX])
-                    found = hashlib.blake2b(
-                        repr(block.shape).encode() + block.tobytes(), digest_size=16
-                    ).digest()
-                    if found not in known:
-                        known[found] = f"BLOCK_{len(known)}"
-                        shapes = _shapes(block, step, layers)
-                        drawn += len(shapes)
-                        _write_cell(stream, known[found], [shapes.tobytes()])
-                    blocks.append(_reference(known[found], column * step, 0.0))
-                cell = f"{name}_{row}"
-                _write_cell(stream, cell, blocks)
-                rows_of_part.append(_reference(cell, 0.0, (bottom - row - len(band)) * step))
-            _write_cell(stream, name, rows_of_part)
-            placed.append(_reference(name, left * step, (height - bottom) * step))
-        _write_cell(stream, "LAYOUT", placed)
-        stream.write(_record(_END_LIBRARY))
+    drawn, layout = 0, gdstk.Cell("LAYOUT")
+    # The same time for equal layouts, whose files are equal then.
+    writer = gdstk.GdsWriter(path, unit=_UNIT_M, precision=_PRECISION_M, timestamp=datetime(1970, 1, 1))
+    for name, (top, bottom, left, right) in (parts or {"ELEMENT": (0, height, 0, width)}).items():
+        part = gdstk.Cell(name)
+        for row in range(top, bottom, _BLOCK_PX):
+            band = levels[row : min(row + _BLOCK_PX, bottom)][:, left:right]
+            cell = gdstk.Cell(f"{name}_{row}")
+            for column in range(0, right - left, _BLOCK_PX):
+                block = np.ascontiguousarray(band[:, column : column + _BLOCK_PX])
+                key = hashlib.blake2b(repr(block.shape).encode() + block.tobytes(), digest_size=16).digest()
+                if key not in known:
+                    shapes = _shapes(block, pitch_um, layers)
+                    drawn += len(shapes)
+                    writer.write(gdstk.Cell(f"BLOCK_{len(known)}").add(*shapes))
+                    # Later blocks refer to it by its name: its shapes need not stay.
+                    known[key] = gdstk.Cell(f"BLOCK_{len(known)}")
+                cell.add(gdstk.Reference(known[key], (column * pitch_um, 0)))
+            writer.write(cell)
+            part.add(gdstk.Reference(cell, (0, (bottom - row - len(band)) * pitch_um)))
+        writer.write(part)
+        layout.add(gdstk.Reference(part, (left * pitch_um, (height - bottom) * pitch_um)))
+    writer.write(layout)
+    writer.close()
     return drawn
 
 
-def _shapes(levels: np.ndarray, step: float, layers: GdsLayers) -> np.ndarray:
-    """The rectangles of one block, its lower left corner at 0; ``step``: a pixel in units of the file."""
+def _shapes(levels: np.ndarray, pitch_um: float, layers: GdsLayers) -> list[Any]:
+    """The rectangles of one block, its lower left corner at 0."""
+    from gdstk import rectangle
+
     highest = int(levels.max())
     wanted = np.arange(1, highest + 1) if layers == "cumulative" else np.arange(highest + 1)
     masks = levels >= wanted[:, None, None] if layers == "cumulative" else levels == wanted[:, None, None]
-    layer, top, bottom, left, right = rectangles(masks).T
-    shapes = np.zeros(len(layer), _RECTANGLE)
-    shapes["start"], shapes["type"], shapes["xy"], shapes["end"] = _START, _TYPE, _XY, _ENDED
-    shapes["layer"] = wanted[layer]
-    x, y = (
-        np.stack([left, right, right, left, left]),
-        len(levels) - np.stack([bottom, bottom, top, top, bottom]),
-    )
-    shapes["corners"] = np.rint(np.stack([x, y], -1) * step).swapaxes(0, 1)
-    return shapes
+    mask, top, bottom, left, right = rectangles(masks).T
+    corners = pitch_um * np.stack([left, len(levels) - bottom, right, len(levels) - top], axis=1)
+    return [
+        rectangle((x0, y0), (x1, y1), layer)
+        for layer, (x0, y0, x1, y1) in zip(wanted[mask].tolist(), corners.tolist(), strict=True)
+    ]
 
 
 def rectangles(masks: np.ndarray) -> np.ndarray:
@@ -198,31 +187,3 @@ class GdsRows:
             if other.size or len(part) < _CHUNK:
                 return count + (int(other[0]) if other.size else len(part))
             count += len(part)
-
-
-def _write_cell(stream: BinaryIO, name: str, contents: Iterable[bytes]) -> None:
-    stream.write(_record(_CELL, _DATE) + _text(_CELL_NAME, name))
-    for content in contents:
-        stream.write(content)
-    stream.write(_record(_END_CELL))
-
-
-def _reference(name: str, x: float, y: float) -> bytes:
-    place = _record(_PLACE, struct.pack(">ii", round(x), round(y)))
-    return _record(_REFERENCE) + _text(_REFERENCE_NAME, name) + place + _record(_END)
-
-
-def _text(kind: int, text: str) -> bytes:
-    return _record(kind, text.encode() + b"\0" * (len(text) % 2))
-
-
-def _record(kind: int, body: bytes = b"") -> bytes:
-    return struct.pack(">HH", len(body) + 4, kind) + body
-
-
-def _real(value: float) -> bytes:
-    """A positive number below 1 as an eight-byte real: an exponent of 16 above 64, and 56 bits."""
-    exponent = 64
-    while value < 1 / 16:
-        value, exponent = 16 * value, exponent - 1
-    return struct.pack(">Q", exponent << 56 | round(value * 2**56))

@@ -1,16 +1,16 @@
-"""Layouts as grey images: grey is linear in height, one whole number of grey values per level."""
+"""Layouts as grey images: grey linear in height, or as a dose curve says."""
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from litho_data.foundation.errors import InputError
-from litho_design.large.rows import LevelRows, bands_of
+from litho_design.exports.rows import LevelRows, bands_of
 from litho_design.printers.layout import LayoutSettings
 
 _UM_PER_CM = 1e4
@@ -19,32 +19,73 @@ _STRIP_PX = 64
 _CLASSIC_BYTES = 2**32 - 2**24
 
 
-def grey_step(layout: LayoutSettings, bits: int) -> int:
-    """Grey values per level, the most that ``bits`` allow."""
-    return (2**bits - 1) // (layout.levels - 1)
+def linear_greys(layout: LayoutSettings, bits: int) -> list[int]:
+    """Grey of each level: linear in height, as many values per level as ``bits`` allow.
+
+    Raises:
+        InputError: more levels than grey values.
+    """
+    step = (2**bits - 1) // (layout.levels - 1)
+    if step < 1:
+        raise InputError("grey export", got="more levels than grey values", wanted="png16 or tiff")
+    return [level * step for level in range(layout.levels)]
 
 
-def write_png16(path: Path, levels: np.ndarray, layout: LayoutSettings) -> int:
-    """A 16-bit grey PNG; returns the grey values per level."""
-    return _write_encoded(path, ".png", levels, grey_step(layout, 16), np.uint16)
+def measured_greys(file: str | Path) -> Callable[[LayoutSettings, int], list[int]]:
+    """Greys whose heights a printer was measured to make are those of the levels, up to a constant height.
+
+    Args:
+        file: CSV with the columns ``grey`` and ``height_um``, both rising, such as of a dose matrix.
+
+    Raises:
+        InputError: no such table; of the greys that it gives, a level beyond its heights, or two of one grey.
+    """
+    try:
+        table = np.genfromtxt(file, delimiter=",", names=True, dtype=float)
+        grey, height_um = table["grey"], table["height_um"]
+        rising = (
+            grey.ndim == 1 and len(grey) > 1 and (np.diff(grey) > 0).all() and (np.diff(height_um) > 0).all()
+        )
+    except (OSError, ValueError, IndexError):
+        rising = False
+    if not rising:
+        wanted = "a CSV with the rising columns grey and height_um"
+        raise InputError("dose curve", got=str(file), wanted=wanted)
+
+    def greys(layout: LayoutSettings, bits: int) -> list[int]:
+        heights = height_um[0] + np.arange(layout.levels) * layout.level_height_um
+        found = np.rint(np.interp(heights, height_um, grey)).astype(int)
+        if heights[-1] > height_um[-1] + 1e-9 or len(set(found.tolist())) < layout.levels:
+            got = f"{np.ptp(height_um):.3g} µm for levels up to {heights[-1] - heights[0]:.3g} µm"
+            raise InputError("dose curve", got=got, wanted="a grey of its own for every level")
+        if found[0] < 0 or found[-1] >= 2**bits:
+            raise InputError("dose curve", got=f"grey {found[-1]}", wanted=f"0 to {2**bits - 1}")
+        return [int(one) for one in found]
+
+    return greys
 
 
-def write_bmp(path: Path, levels: np.ndarray, layout: LayoutSettings) -> int:
-    """An 8-bit grey BMP, and beside it a CSV of grey against height; returns the grey values per level."""
-    step = _write_encoded(path, ".bmp", levels, grey_step(layout, 8), np.uint8)
-    rows = [f"{level * step},{level * layout.level_height_um:.9g}" for level in range(layout.levels)]
-    path.with_suffix(".csv").write_text("grey,height_um\n" + "\n".join(rows) + "\n", encoding="utf-8")
-    return step
+def write_image(path: Path, levels: np.ndarray, greys: Sequence[int], level_height_um: float) -> None:
+    """A 16-bit grey PNG, or an 8-bit BMP and beside it a CSV of grey against height."""
+    import cv2
+
+    kind = np.uint8 if path.suffix == ".bmp" else np.uint16
+    encoded = cv2.imencode(path.suffix, np.array(greys, kind)[levels])[1]
+    path.write_bytes(encoded.tobytes())
+    if path.suffix == ".bmp":
+        rows = [f"{grey},{level * level_height_um:.9g}" for level, grey in enumerate(greys)]
+        text = "grey,height_um\n" + "\n".join(rows) + "\n"
+        path.with_suffix(".csv").write_text(text, encoding="utf-8")
 
 
-def write_tiff(path: Path, levels: LevelRows, layout: LayoutSettings) -> int:
+def write_tiff(path: Path, levels: LevelRows, pitch_um: float, level_height_um: float) -> None:
     """A TIFF of two pages, 16-bit levels and float32 nominal heights in µm, with its resolution.
 
     Written strip by strip; where a TIFF cannot hold them they are a BigTIFF, compressed by deflate.
     """
     import tifffile
 
-    per_cm, shape = _UM_PER_CM / layout.pitch_um, (levels.shape[0], levels.shape[1])
+    per_cm, shape = _UM_PER_CM / pitch_um, (levels.shape[0], levels.shape[1])
     big = shape[0] * shape[1] * (2 + 4) > _CLASSIC_BYTES
 
     def strips(scale: float, kind: np.dtype[Any]) -> Iterator[bytes]:
@@ -53,13 +94,12 @@ def write_tiff(path: Path, levels: LevelRows, layout: LayoutSettings) -> int:
             yield zlib.compress(found, 1) if big else found
 
     with tifffile.TiffWriter(path, bigtiff=big, byteorder="<") as writer:
-        for scale, kind in ((1.0, np.dtype("<u2")), (layout.level_height_um, np.dtype("<f4"))):
+        for scale, kind in ((1.0, np.dtype("<u2")), (level_height_um, np.dtype("<f4"))):
             writer.write(
                 strips(scale, kind), shape=shape, dtype=kind, rowsperstrip=_STRIP_PX,
                 compression="zlib" if big else None, resolution=(per_cm, per_cm),
                 resolutionunit="CENTIMETER", photometric="minisblack",
             )  # fmt: skip
-    return 1
 
 
 class TiffRows:
@@ -77,7 +117,7 @@ class TiffRows:
         return found
 
 
-def read_image_levels(path: Path, grey_per_level: int) -> np.ndarray:
+def read_image_levels(path: Path, greys: Sequence[int]) -> np.ndarray:
     """Levels uint8 (ny, nx) from an exported PNG or BMP.
 
     Raises:
@@ -86,27 +126,7 @@ def read_image_levels(path: Path, grey_per_level: int) -> np.ndarray:
     import cv2
 
     grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
-    if grey is None or (grey % grey_per_level).any():
-        raise InputError(
-            f"image {path}", got="grey values between levels", wanted=f"multiples of {grey_per_level}"
-        )
-    return (grey // grey_per_level).astype(np.uint8)
-
-
-def read_published_bmp(path: Path) -> np.ndarray:
-    """Levels uint8 of the one published hologram mask, whose grey value is level + 10."""
-    import cv2
-
-    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if grey is None or grey.min() < 10:
-        raise InputError(f"published mask {path}", wanted="an 8-bit image of grey level + 10")
-    return (grey - 10).astype(np.uint8)
-
-
-def _write_encoded(path: Path, suffix: str, levels: np.ndarray, step: int, dtype: type) -> int:
-    import cv2
-
-    if step < 1:
-        raise InputError(f"{suffix} export", got="more levels than grey values", wanted="png16 or tiff")
-    path.write_bytes(cv2.imencode(suffix, (levels.astype(np.uint32) * step).astype(dtype))[1].tobytes())
-    return step
+    level = np.searchsorted(greys, grey if grey is not None else [[-1]]).clip(max=len(greys) - 1)
+    if grey is None or (np.array(greys)[level] != grey).any():
+        raise InputError(f"image {path}", got="grey values between levels", wanted=f"one of {list(greys)}")
+    return level.astype(np.uint8)

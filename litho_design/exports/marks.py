@@ -8,7 +8,7 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Record
-from litho_design.large.rows import LevelRows, SideBySide
+from litho_design.exports.rows import LevelRows, SideBySide
 from litho_design.printers.layout import LayoutSettings
 
 Box = tuple[int, int, int, int]

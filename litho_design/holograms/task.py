@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from litho_design.holograms.settings import HologramSettings
 from litho_design.images.similarity import SSIM_WINDOW_PX, si_psnr_db
 from litho_design.images.targets import Target, load_target, stroke_width_px
 from litho_design.optics import Optics
-from litho_design.optimisation.starts import Scene
+from litho_design.optimisation.phases import gerchberg_saxton, nearest_levels
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 from litho_design.tasks.task import Task, register_task
@@ -43,10 +42,13 @@ class HologramTask(Task):
     name = "hoe"
     starts = ("random", "gs", "wgs")
     headline = ("si_psnr_db", "ssim", "ssim_camera", "eff_signal", "speckle_contrast")
+    errors = ("rmse_paper", "zero_order_share", "clipped_share", "speckle_contrast")
     score_type = WindowedHologramScore
     settings_type = HologramSettings
     settings: HologramSettings
     bench: HologramBench
+    # Sum over the pixels of the whole element, of which target and cells may be a part.
+    total: Callable[[Tensor], Tensor] = staticmethod(torch.sum)
 
     def __init__(
         self,
@@ -79,7 +81,7 @@ class HologramTask(Task):
 
     def loss(self, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
         """See ``hologram_loss``."""
-        return hologram_loss(seen, self.target, self.settings.loss, self.counted)
+        return hologram_loss(seen, self.target, self.settings.loss, self.counted, self.total)
 
     def window_figures(self, seen: Tensor) -> dict[str, float]:
         """Loss, SI-PSNR and signal efficiency."""
@@ -90,10 +92,15 @@ class HologramTask(Task):
         }
         return figures | self._inside_window(seen)
 
-    def scene(self, level_phase: Tensor) -> Scene:
-        """With the image that a start approaches."""
-        scene = super().scene(level_phase)
-        return replace(scene, target=self.target, counted=self.counted, propagator=self.bench.propagator)
+    def start_levels(self, level_phase: Tensor) -> Tensor:
+        """Levels that print the phases of ``gerchberg_saxton``, weighted for ``wgs``."""
+        search = self.settings.search
+        phase, _ = gerchberg_saxton(
+            self.bench.propagator, self.target, self.cells, iterations=search.start_iterations,
+            weighted=search.start == "wgs", seed=search.seed, level_phase=level_phase, counted=self.counted,
+            total=self.total,
+        )  # fmt: skip
+        return nearest_levels(phase, level_phase)
 
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> HologramScore:
         """Score of the image behind a print (size, size), µm."""

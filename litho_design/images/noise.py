@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import TypeVar
 
 import numpy as np
+from scipy.optimize import nnls
 
 from litho_data.foundation.results import Record
 
@@ -24,6 +25,24 @@ def white_noise(values: np.ndarray) -> float:
     power = np.abs(np.fft.fft2(values * window)) ** 2 / np.square(window).sum()
     high = (np.abs(np.fft.fftfreq(ny)) > _NOISE_BAND)[:, None] & (np.abs(np.fft.fftfreq(nx)) > _NOISE_BAND)
     return float(np.sqrt(power[high].mean()))
+
+
+def noise_of_light(counts: np.ndarray) -> tuple[float, float]:
+    """Noise of a photograph (ny, nx): sd in the dark, and as a share of the light, such as of speckle.
+
+    The variance of its highest frequencies is a sum of both squares, as far as it follows that of the light.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    ny, nx = counts.shape
+    window = np.hanning(ny)[:, None] * np.hanning(nx)
+    high = (np.abs(np.fft.fftfreq(ny)) > _NOISE_BAND)[:, None] & (np.abs(np.fft.fftfreq(nx)) > _NOISE_BAND)
+    noise = np.fft.ifft2(np.fft.fft2(counts * window) * high).real / np.sqrt(high.mean())
+    light = gaussian_filter(counts.astype(float).clip(0), 2.0)
+    columns = np.square(np.stack([window, window * light], axis=-1)).reshape(-1, 2)
+    scale = columns.max(0)
+    (dark, share), _ = nnls(columns / scale, np.square(noise).ravel())
+    return float(np.sqrt(dark / scale[0])), float(np.sqrt(share / scale[1]))
 
 
 def uncertainties(score: Callable[[T], Record], measured: Record, variants: Iterable[T]) -> dict[str, float]:

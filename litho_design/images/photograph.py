@@ -9,23 +9,30 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.hashes import file_sha256
 from litho_data.foundation.results import Record
 from litho_data.register.geometry import ORIENTATIONS, orient, orientation_matrix
-from litho_design.images.noise import DRAWS, white_noise
-from litho_design.images.targets import ImagedObject
+from litho_design.images.noise import DRAWS, noise_of_light
+from litho_design.images.targets import ImagedObject, read_grey
 
 _HOT_SIGMAS = 6.0
 _SMALLEST_CORRELATION = 0.45
-_LARGEST_STRETCH = 1.2
 # Of pixels at the end of their range: more of them change the likeness of an image.
 _LARGEST_SATURATED = 0.01
-# What undoes the encoding of pictures for a screen.
-_SCREEN_GAMMA = 2.2
+# Prints close to the expected one look as if the exponent of counts over light were 0.9 to 1.1.
+_LARGEST_GAMMA_OFF, _OPEN_GAMMA_OFF = 0.12, 0.1
+_SMALLEST_COVERAGE = 0.9
+# Loss of light in the corners that an objective may have.
+_VIGNETTING_SD = 0.1
 # A tilt is accepted if it leaves no more than this share of what is unexplained without it.
-_TILTED = 0.8
+_NEEDED = 0.93
+# Half the range of tilts that a camera is believed to have, over half the window.
+_TILT_SD = 0.1
+# Along each side of the window.
+_TILES = 6
 # Orientations are told apart on images of about this side, px; correlations this close are a tie.
 _SMALL_PX = 192
 _TIE = 0.03
@@ -35,32 +42,48 @@ class CameraRecord(Record):
     """Source of a photograph and how it was processed; ``imaged`` is the object in front of a lens.
 
     ``orientation`` is the operation that brings the photograph onto the image, ``ambiguous`` lists others
-    that fit as well. The last four are None in older results.
+    that fit as well. ``noise_counts`` is the noise (sd) in the dark, ``noise_share`` what it grows by, as a
+    share of the light; ``vignetting_sd`` what the camera may lose in its corners; ``blur_um`` the blur (sd)
+    beyond the expected image, and ``gamma`` the exponent of counts over light, as found.
     """
 
     name: str
     sha256: str
     pitch_um: float
+    pitch_sd: float
     dark_level: float
     replaced_pixels: int
     saturated_share: float
     correlation: float
     photo_to_window: list[list[float]]
     imaged: ImagedObject | None = None
-    orientation: str | None = None
-    ambiguous: list[str] | None = None
-    noise_counts: float | None = None
-    dark_level_sd: float | None = None
-    position_sd_um: float | None = None
+    orientation: str
+    ambiguous: list[str]
+    noise_counts: float
+    noise_share: float
+    dark_level_sd: float
+    position_sd_um: float
+    scale_sd: float
+    vignetting_sd: float
+    blur_um: float
+    gamma: float
+    coverage: float
+    notes: list[str]
 
     def remarks(self) -> list[str]:
-        """What to know about the orientation, one phrase each."""
-        found = []
-        if self.orientation not in (None, "identity"):
+        """What to know about the photograph, one phrase each."""
+        found = list(self.notes)
+        if self.orientation != "identity":
             found.append(f"the photograph was brought onto the image by {self.orientation}, as asked")
         if self.ambiguous:
             others = ", ".join(self.ambiguous)
             found.append(f"ambiguous: it fits as well after {others}, so a mirrored print would go unnoticed")
+        if self.coverage < 1:
+            found.append(f"{100 * (1 - self.coverage):.1f} % of the image lies beyond it, and is as expected")
+        if self.vignetting_sd:
+            found.append("without --camera-flat a vignetting may be in the score, and is in its uncertainty")
+        if abs(math.log(self.gamma)) > _OPEN_GAMMA_OFF:
+            found.append(f"counts look like the light to the power {self.gamma:.2f}: is the file raw?")
         return found
 
 
@@ -69,12 +92,13 @@ class Photograph:
     """A photograph and where the image lies on it.
 
     Attributes:
-        counts: cleaned, without the dark level (ny, nx).
+        counts: cleaned, upright, without the dark level (ny, nx).
         window_to_photo: projective map (3, 3) from window pixels to its pixels.
         side_px: side of the window.
         pitch_um: pixel of the window.
         finest_per_um: the highest spatial frequency that the light can have.
         record: source and processing.
+        expected: counts (m, m) that stand for what lies beyond the photograph.
     """
 
     counts: np.ndarray
@@ -83,10 +107,11 @@ class Photograph:
     pitch_um: float
     finest_per_um: float
     record: CameraRecord
+    expected: np.ndarray
 
     def image(self) -> np.ndarray:
         """Counts per pixel of the photograph, on the pixels of the window (m, m); noise goes below 0."""
-        return self._warped(self.counts, np.zeros(2))
+        return self._warped(self.counts, np.zeros(2), 0.0, 0.0)
 
     def power_share(self, image: np.ndarray, power_counts: float) -> np.ndarray:
         """``image`` as the share of the light that falls on the element, of its summed counts."""
@@ -95,28 +120,37 @@ class Photograph:
         return image * abs(np.linalg.det(warp) / (warp[2] @ middle) ** 3) / power_counts
 
     def as_it_might_be(self) -> Iterator[np.ndarray]:
-        """Images that it would also allow: other noise, dark level and position, in opposite pairs."""
+        """Images that it would also allow: other noise, dark level, place, size and vignetting, in pairs."""
         generator = np.random.default_rng(0)
-        record = self.record
+        record, light = self.record, self.counts.clip(0)
+        sd = np.sqrt(record.noise_counts**2 + (record.noise_share * light) ** 2)
         for _ in range(DRAWS):
-            noise = (record.noise_counts or 0) * generator.standard_normal(self.counts.shape)
-            noise = noise - (record.dark_level_sd or 0) * generator.standard_normal()
-            moved = (record.position_sd_um or 0) / self.pitch_um * generator.standard_normal(2)
+            noise = sd * generator.standard_normal(light.shape)
+            noise -= record.dark_level_sd * generator.standard_normal()
+            moved = record.position_sd_um / self.pitch_um * generator.standard_normal(2)
+            scale, edge = generator.standard_normal(2) * (record.scale_sd, record.vignetting_sd)
             for sign in (1, -1):
-                yield self._warped((self.counts + sign * noise).astype(np.float32), sign * moved)
+                counts = (self.counts + sign * noise).astype(np.float32)
+                yield self._warped(counts, sign * moved, sign * scale, sign * edge)
 
-    def _warped(self, counts: np.ndarray, moved_px: np.ndarray) -> np.ndarray:
+    def _warped(
+        self, counts: np.ndarray, moved_px: np.ndarray, scale: float, vignetting: float
+    ) -> np.ndarray:
         import cv2
         from scipy.fft import dctn, idctn
 
-        warp, side = self.window_to_photo.copy(), self.side_px
-        warp[:, 2] += warp[:, :2] @ moved_px
-        found: Any = cv2.warpPerspective(
-            counts, warp, (side, side), flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
-        )
-        # What is finer than any light of the element is noise.
-        passed = np.arange(side) / (2 * side * self.pitch_um) <= self.finest_per_um
-        kept: np.ndarray = idctn(dctn(found, norm="ortho") * np.outer(passed, passed), norm="ortho")
+        side, middle = self.side_px, (self.side_px - 1) / 2
+        about = np.diag([1 + scale, 1 + scale, 1])
+        about[:2, 2] = moved_px - scale * middle
+        warp = self.window_to_photo @ about
+        flat = counts / (1 - vignetting * _radius_squared(counts.shape))
+        way: Any = {"flags": cv2.INTER_LANCZOS4 | cv2.WARP_INVERSE_MAP, "borderMode": cv2.BORDER_REPLICATE}
+        found = cv2.warpPerspective(flat.astype(np.float32), warp, (side, side), **way)
+        found = np.where(_inside(warp, flat.shape, side), found, self.expected)
+        # What is finer than any light of the element is noise; of the rest a pixel took its mean.
+        frequency = np.arange(side) / (2 * side * self.pitch_um)
+        sharp = (frequency <= self.finest_per_um) / np.sinc(frequency * self.record.pitch_um).clip(min=0.5)
+        kept: np.ndarray = idctn(dctn(found, norm="ortho") * np.outer(sharp, sharp), norm="ortho")
         return kept
 
 
@@ -129,98 +163,138 @@ def photographed_image(
     finest_per_um: float,
     dark_level: float | None = None,
     orientation: str = "identity",
+    pitch_sd: float = 0.0,
+    flat_file: str | Path | None = None,
 ) -> Photograph:
     """A photograph, registered on the image that the design expects.
 
-    Dark level subtracted (where none is given, the 1st percentile of means over 5 px), single hot or dead
-    pixels replaced by their neighbours' median, then brought onto the expected image as a camera sees it
-    that is moved, turned and tilted: the shift by cross-correlation, the rest by maximising the correlation
-    coefficient (Evangelidis and Psarakis 2008). All eight orientations are tried, and a photograph that fits
-    another one better than ``orientation`` is refused.
+    Dark level subtracted, single hot or dead pixels replaced by their neighbours' median, then brought onto
+    the expected image as a camera sees it that is moved and turned, and tilted if that is needed: by least
+    squares, with gain and background free. The scale is that of the pitch, unless the pitch has an
+    uncertainty: a print that is too large is not the camera's fault. All eight orientations are tried, and a
+    photograph that fits another one better than ``orientation`` is refused.
 
     Args:
         wanted: expected image (m, m), any scale; ``wanted_pitch_um`` its pixel, µm.
         photo_file: grey image of any bit depth, counts proportional to the light.
-        pitch_um: camera pixel in the plane of the image, µm.
+        pitch_um: camera pixel in the plane of the image, µm; ``pitch_sd`` its relative standard uncertainty.
         finest_per_um: highest spatial frequency of the light, 2 NA / wavelength; what is finer is left out.
+        dark_level: counts without light; without it, what makes the darkest pixels as bright as expected.
         orientation: what brings the photograph upright, such as ``flip-x`` or ``rotate-180``.
+        flat_file: photograph of an even light by the same camera, whose brightness is divided out.
 
     Raises:
         InputError: not an image, a pitch that is not positive, an unknown orientation, or a photograph that
             is overexposed, not linear, unlike the expected image, or mirrored or turned.
     """
-    import cv2
-
-    if not pitch_um > 0:
-        raise InputError("camera pitch", got=f"{pitch_um} µm", wanted="a positive number")
+    if not pitch_um > 0 or not pitch_sd >= 0:
+        raise InputError("camera pitch", got=f"{pitch_um} µm ± {pitch_sd}", wanted="a positive number")
     require_known("camera orientation", orientation, ORIENTATIONS)
-    if not Path(photo_file).is_file():
-        raise InputError("photograph", got=f"{photo_file}, which does not exist", wanted="an image file")
-    raw = cv2.imread(str(photo_file), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
-    if raw is None:
-        raise InputError("photograph", got=str(photo_file), wanted="an image file")
+    raw, notes = read_grey(photo_file, "photograph")
     photo = raw.astype(np.float32)
-    darkest = np.percentile(cv2.blur(photo, (5, 5)), [1, 10])
-    dark = float(darkest[0]) if dark_level is None else dark_level
-    top = float(2 ** (8 * raw.dtype.itemsize) - 1) if raw.dtype.kind == "u" else float(raw.max())
-    # Below the dark level noise is cut off at zero.
-    saturated, cut_off = float((raw >= top).mean()), float((raw == 0).mean()) if dark > 0 else 0.0
-    if max(saturated, cut_off) > _LARGEST_SATURATED:
+    saturated = _saturated(raw)
+    cut_off = float((raw <= raw.min()).mean()) if dark_level is None or dark_level > 0 else 0.0
+    if max(saturated, cut_off if raw.min() == 0 else 0.0) > _LARGEST_SATURATED:
         raise InputError(
             f"photograph {photo_file}",
             got=f"{100 * max(saturated, cut_off):.1f} % of its pixels at an end of their range",
             wanted=f"at most {100 * _LARGEST_SATURATED:g} %",
             hint="a shorter exposure" if saturated > cut_off else "a black level above the noise",
         )
-    cleaned, replaced = _replace_outliers(photo - np.float32(dark))
-    wanted = wanted.astype(np.float32)
-    ambiguous = _check_orientation(cleaned, wanted, pitch_um / wanted_pitch_um, orientation, photo_file)
+    cleaned, replaced = _replace_outliers(photo)
+    if flat_file is not None:
+        cleaned = _flattened(cleaned, flat_file, dark_level)
+    wanted, scale = wanted.astype(np.float32) / wanted.max(), pitch_um / wanted_pitch_um
+    ambiguous = _check_orientation(cleaned, wanted, scale, pitch_sd, orientation, photo_file)
     upright = np.ascontiguousarray(orient(cleaned, orientation))
-    fit = _register(upright, wanted, pitch_um / wanted_pitch_um, tilted=True)
+    fit = _fit(upright, wanted, scale, pitch_sd, further=True)
     if fit.correlation < _SMALLEST_CORRELATION:
         raise _unlike(photo_file, fit.correlation)
+    coverage = float(_inside(fit.window_to_photo, upright.shape, len(wanted)).mean())
+    if coverage < _SMALLEST_COVERAGE:
+        got = f"{100 * coverage:.0f} % of the image"
+        wanted_share = f"at least {100 * _SMALLEST_COVERAGE:.0f} %"
+        raise InputError(f"photograph {photo_file}", got=got, wanted=wanted_share)
+    # A print unlike the expected one has bright and dark elsewhere, and that looks like a gamma, too.
+    open_gamma = _LARGEST_GAMMA_OFF + 2 * (1 - fit.correlation)
+    if abs(math.log(fit.gamma)) > max(open_gamma, 3 * fit.gamma_sd):
+        raise InputError(
+            f"photograph {photo_file}",
+            got=f"counts that grow as the light to the power {fit.gamma:.2f} ± {fit.gamma_sd:.2f}",
+            wanted="counts proportional to the light",
+            hint="take the camera's raw file, or undo its gamma",
+        )
+    dark, dark_sd = (dark_level, 0.0) if dark_level is not None else _dark_level(upright, wanted, fit)
+    counts = upright - np.float32(dark)
+    noise_counts, noise_share = noise_of_light(counts)
     back = np.linalg.inv(orientation_matrix(orientation, cleaned.shape))
-    warp = back @ fit.window_to_photo
     record = CameraRecord(
         name=Path(photo_file).name,
         sha256=file_sha256(photo_file),
         pitch_um=pitch_um,
+        pitch_sd=pitch_sd,
         dark_level=dark,
         replaced_pixels=replaced,
         saturated_share=saturated,
         correlation=fit.correlation,
-        photo_to_window=warp.tolist(),
+        photo_to_window=(back @ fit.window_to_photo).tolist(),
         orientation=orientation,
         ambiguous=ambiguous,
-        noise_counts=white_noise(cleaned),
-        dark_level_sd=float(np.diff(darkest)[0]) / 2 if dark_level is None else 0.0,
+        noise_counts=noise_counts,
+        noise_share=noise_share,
+        dark_level_sd=dark_sd,
         position_sd_um=fit.position_sd_px * wanted_pitch_um,
+        scale_sd=fit.scale_sd,
+        vignetting_sd=_VIGNETTING_SD if flat_file is None else 0.0,
+        blur_um=fit.blur_px * wanted_pitch_um,
+        gamma=fit.gamma,
+        coverage=coverage,
+        notes=notes,
     )
-    found = Photograph(cleaned, warp, wanted.shape[0], wanted_pitch_um, finest_per_um, record)
-    _check_linear(found.image(), wanted, photo_file)
-    return found
+    side = len(wanted)
+    return Photograph(
+        counts, fit.window_to_photo, side, wanted_pitch_um, finest_per_um, record, fit.gain * wanted
+    )
 
 
-def _check_linear(image: np.ndarray, wanted: np.ndarray, photo_file: str | Path) -> None:
-    """Refuse counts that fit the expected image better once the encoding for a screen is undone."""
+def _saturated(raw: np.ndarray) -> float:
+    """Share of pixels at the top of the range: of the file, or of 12 or 14 bits in it where they pile up."""
+    top = int(raw.max())
+    ends = [2**bits - 1 for bits in (8, 10, 12, 14, 16)]
+    at_top = float((raw == top).mean())
+    # A maximum that many pixels share, and few come close to, is an end of the range whatever its number.
+    beside = float(((raw < top) & (raw >= top - max(1, top // 500))).mean())
+    return at_top if top in ends or at_top > max(4 * beside, _LARGEST_SATURATED) else 0.0
+
+
+def _flattened(photo: np.ndarray, flat_file: str | Path, dark_level: float | None) -> np.ndarray:
+    """A photograph over the brightness of an even light, 1 in its mean; its dark level stays."""
+    from scipy.ndimage import gaussian_filter
+
+    flat = read_grey(flat_file, "photograph of an even light")[0].astype(np.float32)
+    if flat.shape != photo.shape or dark_level is None or not np.median(flat) > dark_level:
+        wanted = f"{photo.shape} px, and --camera-dark-level"
+        raise InputError("photograph of an even light", got=f"{flat.shape} px", wanted=wanted)
+    light = gaussian_filter(flat - dark_level, 2.0)
+    even: np.ndarray = (photo - dark_level) * (light.mean() / light.clip(min=0.05 * light.max()))
+    return (even + dark_level).astype(np.float32)
+
+
+def _dark_level(photo: np.ndarray, wanted: np.ndarray, fit: _Fit) -> tuple[float, float]:
+    """What makes the darkest pixels of the photograph as bright as those expected, and its sd."""
     import cv2
 
-    light = image.clip(0)
-    smooth = [cv2.GaussianBlur(one, (0, 0), 2.0).ravel() for one in (wanted, light, light**_SCREEN_GAMMA)]
-    correlations: Any = np.corrcoef(smooth)
-    _, as_it_is, decoded = correlations[0]
-    if decoded > as_it_is:
-        raise InputError(
-            f"photograph {photo_file}",
-            got=f"counts that fit the expected image better to the power {_SCREEN_GAMMA} (correlation "
-            f"{decoded:.2f}) than as they are ({as_it_is:.2f})",
-            wanted="counts proportional to the light",
-            hint="take the camera's raw file, or undo its gamma",
-        )
+    way: Any = {"flags": cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP}
+    seen = cv2.warpPerspective(cv2.blur(photo, (3, 3)), fit.window_to_photo, wanted.shape, **way)
+    blurred = cv2.GaussianBlur(wanted, (0, 0), max(fit.blur_px, 0.5))
+    shares = [1, 3, 10]
+    found, expected = (np.percentile(one, shares) for one in (seen, blurred))
+    levels = found - fit.gain * expected
+    return float(levels[1]), float(np.ptp(levels)) / 2 + 0.3 * fit.gain * float(expected[1])
 
 
 def _check_orientation(
-    photo: np.ndarray, wanted: np.ndarray, scale: float, asked: str, photo_file: str | Path
+    photo: np.ndarray, wanted: np.ndarray, scale: float, pitch_sd: float, asked: str, photo_file: str | Path
 ) -> list[str]:
     """Other orientations that fit as well as the one asked for.
 
@@ -237,7 +311,7 @@ def _check_orientation(
     counts: Any = cv2.blur(photo, (finer, finer)) if finer > 1 else photo
     small_scale = scale * side / wanted.shape[0]
     found = {
-        name: _register(np.ascontiguousarray(orient(counts, name)), small, small_scale).correlation
+        name: _fit(np.ascontiguousarray(orient(counts, name)), small, small_scale, pitch_sd).correlation
         for name in ORIENTATIONS
     }
     best = max(found, key=lambda name: found[name])
@@ -259,7 +333,7 @@ def _unlike(photo_file: str | Path, correlation: float) -> InputError:
         f"photograph {photo_file}",
         got=f"correlation {correlation:.2f} with the expected image in any orientation",
         wanted=f"at least {_SMALLEST_CORRELATION}",
-        hint="check the camera pitch",
+        hint="check the camera pitch; --camera-pitch-sd where it is not sure",
     )
 
 
@@ -267,60 +341,162 @@ def _replace_outliers(photo: np.ndarray) -> tuple[np.ndarray, int]:
     """Pixels far from the median of their 3 x 3 neighbourhood, in units of the image's own spread."""
     import cv2
 
-    median = cv2.medianBlur(photo, 3)
-    difference = photo - median
-    spread = 1.4826 * float(np.median(np.abs(difference))) + 1e-6 * float(photo.max())
-    outliers = np.abs(difference) > np.maximum(_HOT_SIGMAS * spread, 0.5 * median + 0.05 * photo.max())
-    return np.where(outliers, median, photo), int(outliers.sum())
+    lit = photo - np.percentile(photo, 1)
+    median = cv2.medianBlur(lit.astype(np.float32), 3)
+    difference = lit - median
+    spread = 1.4826 * float(np.median(np.abs(difference))) + 1e-6 * float(lit.max())
+    # A hot pixel does not decide what is bright.
+    bright = float(median.max())
+    outliers = np.abs(difference) > np.maximum(_HOT_SIGMAS * spread, 0.5 * median + 0.05 * bright)
+    return np.where(outliers, photo - difference, photo).astype(np.float32), int(outliers.sum())
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """Projective map (3, 3) from window to photograph pixels, its correlation, the shift's uncertainty."""
+    """Map (3, 3) from window to photograph pixels, what the camera does, and standard deviations."""
 
     window_to_photo: np.ndarray
     correlation: float
-    position_sd_px: float
+    gain: float = 1.0
+    position_sd_px: float = math.inf
+    scale_sd: float = 0.0
+    gamma: float = 1.0
+    gamma_sd: float = 0.0
+    blur_px: float = 0.0
 
 
-def _register(photo: Any, wanted: Any, scale: float, *, tilted: bool = False) -> _Fit:
+def _fit(photo: Any, wanted: Any, scale: float, pitch_sd: float, *, further: bool = False) -> _Fit:
+    """The camera whose photograph of the expected image is closest; ``further``: what else it does."""
     import cv2
 
-    side = wanted.shape[0]
-    blur_px = 2 * max(1.0, scale)
-    reference: Any = cv2.GaussianBlur(wanted / wanted.max(), (0, 0), blur_px)
-    centre = (np.array(photo.shape[::-1]) - 1) / 2
-    # Window pixel (i, j) looks at photograph pixel (i - middle) / scale + centre.
-    start = np.array([[1 / scale, 0, 0], [0, 1 / scale, 0]])
-    start[:, 2] = centre - start[:, :2] @ np.full(2, (side - 1) / 2)
-    moving: Any = cv2.warpAffine(photo, start, (side, side), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP)
-    moving = cv2.GaussianBlur(moving / max(float(moving.max()), 1e-12), (0, 0), blur_px)
-    warp: Any = np.eye(3, dtype=np.float32)
-    warp[:2, 2] = _shift_px(reference, moving)
-    criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 200, 1e-7)
-    correlation = 0.0
+    side, blur_px = wanted.shape[0], 2 * max(1.0, scale)
+    fixed = cv2.GaussianBlur(wanted, (0, 0), blur_px)
+    smooth = cv2.GaussianBlur(photo, (0, 0), blur_px / scale)
+    pose = np.zeros(6)
+
+    def seen(image: Any, pose: np.ndarray) -> np.ndarray:
+        warp = _camera(pose, photo.shape, side, scale)
+        found: np.ndarray = cv2.warpPerspective(
+            image, warp, (side, side), flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REPLICATE,
+        )  # fmt: skip
+        return found.astype(np.float64)
+
+    pose[:2] = _shift_px(fixed, seen(smooth, pose))
+    free = [0, 1, 2] + ([3] if pitch_sd else [])
+    # Sines of angles, logarithm of the scale and tilts move the edge by as much as a shift of half a window.
+    unit = np.array([1, 1, *[2 / side] * 4])
+    # Residuals of neighbours are the same one: this many pixels count as one.
+    alike = 4 * math.pi * blur_px**2
+
+    def solved(columns: list[int], image: Any, model: Any, start: np.ndarray) -> Any:
+        target = (model - model.mean()) / model.std()
+
+        def residual(step: np.ndarray) -> np.ndarray:
+            at = start.copy()
+            at[columns] += step * unit[columns]
+            one = seen(image, at)
+            off = (one - one.mean()) / max(float(one.std()), 1e-12) - target
+            # What is known beforehand of scale and tilts.
+            prior = [at[3] / pitch_sd] if 3 in columns and pitch_sd else []
+            prior += [at[i] / _TILT_SD for i in (4, 5) if i in columns]
+            return np.append(off.ravel() / math.sqrt(alike), prior)
+
+        def slopes(step: np.ndarray) -> np.ndarray:
+            # Half a pixel: cv2 knows places to a 32nd of one.
+            ways = 0.5 * np.eye(len(columns))
+            return np.stack([residual(step + way) - residual(step - way) for way in ways], axis=1)
+
+        found = least_squares(residual, np.zeros(len(columns)), jac=slopes, method="lm", max_nfev=60)
+        at = start.copy()
+        at[columns] += found.x * unit[columns]
+        return at, found
+
     # From coarse to fine: the fine structure of an image has maxima beside the right one.
-    for rows, further in ((2, 3.0 * blur_px), (2, 0.0), *([(3, 0.0)] if tilted else [])):
-        fixed, moved = reference, moving.astype(np.float32)
-        if further:
-            fixed, moved = (cv2.GaussianBlur(image, (0, 0), further) for image in (fixed, moved))
-        motion = cv2.MOTION_AFFINE if rows == 2 else cv2.MOTION_HOMOGRAPHY
-        try:
-            reached, found = cv2.findTransformECC(fixed, moved, warp[:rows].copy(), motion, criteria)
-        except cv2.error:
-            reached, found = 0.0, warp[:rows]
-        # Two numbers more fit what differs in the image, too, if no tilt asks for them.
-        if rows == 2 or 1 - reached**2 < _TILTED * (1 - correlation**2):
-            correlation, warp[:rows] = reached, found
-    # A fit that strongly shrinks, shears or tilts the image has matched noise.
-    middle = warp @ np.array([(side - 1) / 2, (side - 1) / 2, 1])
-    linear = (warp[:2, :2] - np.outer(middle[:2] / middle[2], warp[2, :2])) / middle[2]
-    tilt = np.abs(warp[2, :2]).sum() * side / 2 / middle[2]
-    stretch = np.linalg.svd(linear, compute_uv=False)
-    if max(stretch.max(), 1 / stretch.min(), 1 + tilt) > _LARGEST_STRETCH:
-        correlation = 0.0
-    whole = np.vstack([start, [0, 0, 1]]) @ warp
-    return _Fit(whole, float(correlation), _position_sd_px(reference, correlation, blur_px))
+    for more in (4 * blur_px, 0.0):
+        images = smooth, fixed
+        if more:
+            images = cv2.GaussianBlur(smooth, (0, 0), more / scale), cv2.GaussianBlur(fixed, (0, 0), more)
+        pose, found = solved(free, *images, pose)
+    correlation = float(np.corrcoef(seen(smooth, pose).ravel(), fixed.ravel())[0, 1])
+    if further:
+        tilted, of_tilt = solved([*free, 4, 5], smooth, fixed, pose)
+        closer = float(np.corrcoef(seen(smooth, tilted).ravel(), fixed.ravel())[0, 1])
+        if 1 - closer**2 < _NEEDED * (1 - correlation**2):
+            pose, found, correlation = tilted, of_tilt, closer
+    warp = _camera(pose, photo.shape, side, scale)
+    if not further or not correlation > 0:
+        return _Fit(warp, correlation)
+    spread = _covariance(found.jac, found.fun, side)
+    scale_sd = float(np.sqrt(spread[3, 3]) * unit[3]) if pitch_sd else 0.0
+    light = _light(seen(photo, pose), wanted, alike)
+    return _Fit(
+        warp,
+        correlation,
+        position_sd_px=float(np.sqrt(np.diag(spread)[:2].mean())),
+        scale_sd=scale_sd,
+        **light,
+    )
+
+
+def _covariance(slopes: np.ndarray, residual: np.ndarray, side: int) -> np.ndarray:
+    """Covariance of what least squares found, where neighbours are alike: by the scatter between tiles.
+
+    A print unlike the expected one is displaced here one way and there another (White 1980; a tile is one
+    observation).
+    """
+    tile = np.minimum(np.arange(side) * _TILES // side, _TILES - 1)
+    number = np.append((tile[:, None] * _TILES + tile).ravel(), np.full(len(residual) - side**2, _TILES**2))
+    pull = np.zeros((_TILES**2 + 1, slopes.shape[1]))
+    np.add.at(pull, number, slopes * residual[:, None])
+    inverse = np.linalg.pinv(slopes.T @ slopes)
+    found: np.ndarray = inverse @ (pull.T @ pull) @ inverse
+    return found
+
+
+def _light(seen: np.ndarray, expected: np.ndarray, alike: float) -> dict[str, float]:
+    """Counts as background + gain * (blurred expected light)^gamma, by least squares."""
+    import cv2
+
+    found = {}
+    for blur_px in np.arange(0.25, 4.1, 0.25).tolist():
+        light = cv2.GaussianBlur(expected, (0, 0), blur_px).clip(1e-6).ravel()
+        gamma = 1.0
+        for _ in range(2):
+            bent = light**gamma
+            matrix = np.stack([np.ones_like(light), bent, bent * np.log(light)], axis=1)
+            inverse = np.linalg.inv(matrix.T @ matrix)
+            part = inverse @ (matrix.T @ seen.ravel())
+            left = float(np.square(seen.ravel() - matrix @ part).mean())
+            gamma = float(np.clip(gamma + part[2] / part[1], 0.3, 3.0))
+        plain = np.polyfit(light, seen.ravel(), 1)
+        sd = math.sqrt(inverse[2, 2] * left * alike) / abs(part[1])
+        found[left] = {"gain": float(plain[0]), "gamma": gamma, "gamma_sd": sd, "blur_px": blur_px}
+    return found[min(found)]
+
+
+def _camera(pose: np.ndarray, shape: tuple[int, ...], side: int, scale: float) -> np.ndarray:
+    """Map (3, 3) from window to photograph pixels of a camera: shift (px), turn, log scale, two tilts."""
+    turn, size, half = pose[2], math.exp(-pose[3]) / scale, (side - 1) / 2
+    centre = (np.array(shape[1::-1]) - 1) / 2
+    cos, sin = size * math.cos(turn), size * math.sin(turn)
+    linear = np.array([[cos, -sin, centre[0]], [sin, cos, centre[1]], [0, 0, 1]])
+    tilted = np.array([[1, 0, 0], [0, 1, 0], [pose[4] / half, pose[5] / half, 1]])
+    start = np.array([[1, 0, pose[0] - half], [0, 1, pose[1] - half], [0, 0, 1]])
+    return linear @ tilted @ start
+
+
+def _inside(warp: np.ndarray, shape: tuple[int, ...], side: int) -> np.ndarray:
+    """Which pixels of the window (side, side) lie on the photograph."""
+    y, x = np.mgrid[:side, :side].astype(float)
+    at_x, at_y, w = np.tensordot(warp, np.stack([x, y, np.ones_like(x)]), 1)
+    return (np.abs(2 * at_x / w - shape[1] + 1) < shape[1]) & (np.abs(2 * at_y / w - shape[0] + 1) < shape[0])
+
+
+def _radius_squared(shape: tuple[int, ...]) -> np.ndarray:
+    """Squared distance from the middle of a photograph, 1 in its corners."""
+    y, x = (np.linspace(-1, 1, size) for size in shape)
+    return (y[:, None] ** 2 + x**2) / 2
 
 
 def _shift_px(reference: np.ndarray, moving: np.ndarray) -> np.ndarray:
@@ -330,15 +506,3 @@ def _shift_px(reference: np.ndarray, moving: np.ndarray) -> np.ndarray:
     correlation = np.fft.irfft2(spectra[0] * spectra[1].conj())
     y, x = np.unravel_index(int(correlation.argmax()), correlation.shape)
     return np.array([x - 2 * n * (x > n), y - 2 * n * (y > n)])
-
-
-def _position_sd_px(reference: np.ndarray, correlation: float, blur_px: float) -> float:
-    """Standard deviation of a least-squares shift, from what the correlation leaves unexplained.
-
-    The residual has the variance (1 - r^2) / r^2 of the image and is correlated over 4 pi blur^2 pixels.
-    """
-    if not correlation > 0:
-        return math.inf
-    residual = reference.var() * (1 / correlation**2 - 1)
-    slopes = min(float(np.square(slope).sum()) for slope in np.gradient(reference))
-    return math.sqrt(residual * 4 * math.pi * blur_px**2 / slopes)

@@ -162,6 +162,29 @@ def _spots(y: np.ndarray, x: np.ndarray) -> np.ndarray:
     return picture
 
 
+def read_grey(path: str | Path, what: str) -> tuple[np.ndarray, list[str]]:
+    """A picture in grey (ny, nx), in the numbers of its file, and the conversions, one phrase each.
+
+    Raises:
+        InputError: no file, or not a readable image.
+    """
+    import cv2
+
+    if not Path(path).is_file():
+        raise InputError(what, got=f"{path}, which does not exist", wanted="an image file")
+    stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    if stored is None or grey is None:
+        raise InputError(what, got=str(path), wanted="an image that OpenCV can read (PNG, TIFF, JPEG, BMP)")
+    notes = ["colour to grey (ITU-R BT.601 luma)"] if stored.ndim == 3 else []
+    if stored.ndim == 3 and stored.shape[2] == 4:
+        opaque = stored[..., 3] / float(2 ** (8 * stored.dtype.itemsize) - 1)
+        if (opaque < 1).any():
+            grey = np.rint(cv2.cvtColor(stored[..., :3], cv2.COLOR_BGR2GRAY) * opaque).astype(stored.dtype)
+            notes.append("alpha channel composed on black")
+    return grey, notes
+
+
 def read_image(path: Path, size_px: int, what: str) -> tuple[np.ndarray, list[str]]:
     """A picture in grey on a black square, divided by its brightest value.
 
@@ -178,18 +201,12 @@ def read_image(path: Path, size_px: int, what: str) -> tuple[np.ndarray, list[st
     """
     import cv2
 
-    picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) if path.is_file() else None
-    if picture is None:
-        raise InputError(what, got=str(path), wanted="an image that OpenCV can read (PNG, TIFF, JPEG, BMP)")
-    grey: np.ndarray = picture.astype(np.float32)
+    found, notes = read_grey(path, what)
+    grey: np.ndarray = found.astype(np.float32)
     if not np.isfinite(grey).all():
         raise InputError(what, got=f"{path} with values that are not numbers", wanted="finite brightness")
     if grey.max() <= 0:
         raise InputError(what, got=f"{path} without any light", wanted="an image with bright pixels")
-    notes = []
-    stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    if stored is not None and stored.ndim == 3:
-        notes.append("colour to grey (ITU-R BT.601 luma)")
     height, width = grey.shape
     if height != width:
         side = max(height, width)

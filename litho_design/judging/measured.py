@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -24,6 +24,11 @@ Levelling = Literal["none", "plane", "bow"]
 _SMALLEST_COVERAGE = 0.8
 # Levelled prints of the measured layouts correlate at 0.9 and above with a model's expectation.
 _SMALLEST_NCC = 0.6
+_SMALLEST_FOR_TIP = 64
+# Dust is higher than what a print is off by chance, and wider than a step.
+_DUST_BLUR_PX, _DUST_SIGMAS, _LOWEST_DUST_UM = 1.5, 7.0, 0.1
+# Of what a tip changes, this share stays open.
+_TIP_SD = 0.3
 
 
 @dataclass(frozen=True)
@@ -35,6 +40,8 @@ class MeasuredSource:
         scale_sd: relative standard uncertainty of its heights; a calibrated microscope's is about 0.02.
         aligned: it lies on the pixels of the element already, upright: nothing is registered. For elements
             that look alike in several places or orientations, such as a lens cap or a blaze.
+        tip_um: radius of the microscope's tip, whose widening is taken off; 0 for none. Without it, what the
+            scan itself tells of it.
     """
 
     path: Path
@@ -43,43 +50,54 @@ class MeasuredSource:
     levelling: Levelling = "bow"
     scale_sd: float = 0.02
     aligned: bool = False
+    tip_um: float | None = None
 
 
 class MeasuredRecord(Record):
-    """The scan, its agreement with the expected print, and what was done to it; None in older results.
+    """The scan, its agreement with the expected print, and what was done to it.
 
     ``orientation`` is the operation that brings the scan onto the layout. ``tilt_um_per_um`` (x, y) and
     ``bow_um``, the range of the curved part over the element, were removed; ``noise_um`` is what is left
-    at frequencies that no print has.
+    at frequencies that no print has. In ``defect_share`` of the element dust or scars stand for the print.
     """
 
     name: str
     sha256: str
     coverage: float
     registration_ncc: float
-    aligned: bool = False
+    aligned: bool
     height_offset_um: float
-    orientation: str | None = None
-    warning: str | None = None
-    levelling: Levelling | None = None
-    tilt_um_per_um: tuple[float, float] | None = None
-    bow_um: float | None = None
-    noise_um: float | None = None
-    position_sd_um: float | None = None
-    scale_sd: float | None = None
+    orientation: str
+    warning: str
+    levelling: Levelling
+    tilt_um_per_um: tuple[float, float]
+    bow_um: float
+    noise_um: float
+    position_sd_um: float
+    scale_sd: float
+    defect_share: float
+    tip_um: float
+    tip_change_um: float
 
     def remarks(self) -> list[str]:
         """What was removed, and whether the scan lies as the layout does, one phrase each."""
         found = [] if not self.warning else [self.warning]
         found += ["the scan was taken as it lies"] if self.aligned else []
-        if self.orientation not in (None, "identity"):
+        if self.orientation != "identity":
             found.append(f"the scan was brought onto the layout by {self.orientation}")
         if self.levelling == "none":
             found.append("nothing was levelled")
-        elif self.tilt_um_per_um is not None and self.bow_um is not None:
+        else:
             x, y = self.tilt_um_per_um
             found.append(
                 f"removed a tilt of {x:+.4f}, {y:+.4f} µm/µm and a bow of {1000 * self.bow_um:.0f} nm"
+            )
+        if self.defect_share:
+            found.append(f"dust or scars on {100 * self.defect_share:.2g} % of it were left out")
+        if self.tip_um:
+            change = f"{1000 * self.tip_change_um:.0f} nm rms"
+            found.append(
+                f"a tip of {1000 * self.tip_um:.0f} nm was taken off, which changes heights by {change}"
             )
         return found
 
@@ -111,6 +129,7 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
     layout = loaded.record.layout
     scan = read_scan(source.path, unit=source.unit, size_um=source.size_um)
     place = _as_it_lies if source.aligned else _registered
+    scan, tip_um, tip_change_um = _without_tip(scan, source.tip_um)
     placed = place(scan, loaded.level.cpu().numpy(), layout.pitch_um)
     height, valid, coverage = placed.height_um, placed.valid, float(placed.valid.mean())
     if coverage < _SMALLEST_COVERAGE:
@@ -121,6 +140,9 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
             hint="a hologram needs its whole area; stitch the scans first",
         )
     expected = loaded.expected_um.cpu().numpy()
+    background = fitted_background(height, expected, valid, layout.pitch_um, source.levelling)
+    defects = _defects(np.where(valid, height - background.map_um - expected, 0.0)) & valid
+    valid = valid & ~defects
     background = fitted_background(height, expected, valid, layout.pitch_um, source.levelling)
     levelled = height - background.map_um
     ncc = float(np.corrcoef(levelled[valid], expected[valid])[0, 1])
@@ -148,8 +170,44 @@ def measured_print(loaded: LoadedDesign, source: MeasuredSource) -> tuple[Tensor
         noise_um=white_noise(complete - expected),
         position_sd_um=placed.position_sd_um,
         scale_sd=source.scale_sd,
+        defect_share=float(defects.mean()),
+        tip_um=tip_um,
+        tip_change_um=tip_change_um,
     )
     return torch.from_numpy(complete).to(loaded.device), record
+
+
+def _without_tip(scan: Scan, tip_um: float | None) -> tuple[Scan, float, float]:
+    """A scan without what its tip widened, the radius of that, and the rms change of heights, µm."""
+    from litho_data.tip import estimate_tip, paraboloid_erosion
+
+    radius_um = tip_um
+    if radius_um is None and min(scan.height_um.shape) >= _SMALLEST_FOR_TIP:
+        found = estimate_tip([scan])
+        radius_um = found.radius_um if found.kind == "estimate" else None
+    if not radius_um:
+        return scan, 0.0, 0.0
+    if not radius_um > 0:
+        raise InputError("radius of the tip", got=f"{radius_um} µm", wanted="a positive length, or 0")
+    surface = paraboloid_erosion(scan.height_um, scan.require_pitch(), radius_um).surface
+    change_um = float(np.nanstd(surface - scan.height_um))
+    return replace(scan, height_um=surface), radius_um, change_um
+
+
+def _defects(off_um: np.ndarray) -> np.ndarray:
+    """Dust and scars, by what a print (ny, nx) is off from its expectation, µm, without tilt and bow."""
+    from scipy.ndimage import binary_dilation, gaussian_filter
+
+    from litho_data.level.scars import mark_scars
+
+    # Steps that lie a pixel aside are high on one side and low on the other; a blur takes them out.
+    smooth = gaussian_filter(off_um, _DUST_BLUR_PX)
+    middle = np.median(smooth)
+    spread = 1.4826 * float(np.median(np.abs(smooth - middle)))
+    dust = np.abs(smooth - middle) > max(_DUST_SIGMAS * spread, _LOWEST_DUST_UM)
+    strict: Any = {"high": 4.0, "low": 2.5, "max_width_px": 2}
+    scars = mark_scars(off_um, **strict) | mark_scars(off_um.T, **strict).T
+    return binary_dilation(dust | scars, iterations=2)
 
 
 class _Placed(NamedTuple):
@@ -224,14 +282,21 @@ def fitted_background(
 
 
 def as_it_might_be(height_um: Tensor, record: MeasuredRecord, pitch_um: float) -> Iterator[Tensor]:
-    """Prints (ny, nx), µm, that the scan would also allow: other noise, position and scale of heights."""
+    """Prints (ny, nx), µm, that the scan would also allow: other noise, place, scale of heights, tip."""
     from scipy.ndimage import shift
+
+    from litho_data.tip import paraboloid_erosion
 
     generator = np.random.default_rng(0)
     measured = height_um.double().cpu().numpy()
-    position_px = (record.position_sd_um or 0.0) / pitch_um
+    position_px = record.position_sd_um / pitch_um
+    under_tip = np.zeros_like(measured)
+    if record.tip_um:
+        pitches = (pitch_um, pitch_um)
+        under_tip = paraboloid_erosion(measured, pitches, record.tip_um).surface - measured
     for _ in range(DRAWS):
         moved = shift(measured, position_px * generator.standard_normal(2), order=3, mode="nearest")
-        scale = 1 + (record.scale_sd or 0.0) * generator.standard_normal()
-        noisy = scale * moved + (record.noise_um or 0.0) * generator.standard_normal(measured.shape)
+        scale = 1 + record.scale_sd * generator.standard_normal()
+        noisy = scale * moved + record.noise_um * generator.standard_normal(measured.shape)
+        noisy += _TIP_SD * generator.standard_normal() * under_tip
         yield torch.from_numpy(noisy.astype(np.float32)).to(height_um)

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from pydantic import Field
+from scipy.ndimage import gaussian_filter
 from torch import Tensor
 
 from litho_data.foundation.errors import InputError, unknown_name
@@ -23,8 +24,10 @@ from litho_design.lenses.objects import object_name, object_stack, read_object
 from litho_design.lenses.task import LensTask
 from litho_design.optics.imaging import Blur
 
-# Three standard deviations are the 0.3 dB that a score is to be trusted to.
-_LARGEST_SD_DB = 0.1
+# A score that is less sure decides nothing between designs.
+_LARGEST_SD_DB = 0.5
+# Of what a blur of the camera changes, this share stays open.
+_BLUR_SD = 0.3
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,8 @@ class PhotoSource:
         orientation: the operation that brings it upright, where the camera turned or mirrored it.
         power_counts: summed counts, without dark level, of all light that falls on the element, at the same
             exposure; without it a photograph knows no efficiency.
+        pitch_sd: relative standard uncertainty of the pitch, where the magnification is not sure.
+        flat: photograph of an even light by the same camera; with it a vignetting is none.
     """
 
     path: Path
@@ -44,6 +49,8 @@ class PhotoSource:
     imaged: str | None = None
     orientation: str = "identity"
     power_counts: float | None = None
+    pitch_sd: float = 0.0
+    flat: Path | None = None
 
 
 class PhotoScore(Record):
@@ -114,6 +121,13 @@ def score_hologram_photo(loaded: LoadedDesign, source: PhotoSource) -> PhotoVerd
 
     image = photo.image()
     freed, uncertainty = freed_of_noise(figures, figures(image), photo.as_it_might_be())
+    # A blur beyond the expected image is the camera's or the print's: part of what it changes stays open.
+    sharp, soft = (
+        photo_score(one, target, resolved, has_power=False).model_dump(exclude_none=True)
+        for one in (wanted, gaussian_filter(wanted, photo.record.blur_um / loaded.record.layout.pitch_um))
+    )
+    for name, value in sharp.items():
+        uncertainty[name] = math.hypot(uncertainty[name], _BLUR_SD * (soft[name] - value))
     if uncertainty["si_psnr_db"] > _LARGEST_SD_DB:
         raise InputError(
             f"photograph {source.path}",
@@ -132,6 +146,7 @@ def _registered(loaded: LoadedDesign, wanted: np.ndarray, pitch_um: float, sourc
     return photographed_image(
         wanted, pitch_um, source.path, source.pitch_um,
         finest_per_um=finest_per_um, dark_level=source.dark_level, orientation=source.orientation,
+        pitch_sd=source.pitch_sd, flat_file=source.flat,
     )  # fmt: skip
 
 
@@ -158,8 +173,8 @@ def score_lens_photo(
 
     The photograph is cleaned and registered by ``photographed_image`` on the image that the design
     expects of the object, on the sensor pixels of the design, and deconvolved by Richardson-Lucy with
-    its number of iterations. The registration takes any scale for one of the camera: the image of the
-    object must have the size of the design's, or its PSFs do not fit.
+    its number of iterations. The image of the object must have the size of the design's, or its PSFs do
+    not fit.
 
     Args:
         loaded: a lens's design.

@@ -11,11 +11,11 @@ import torch
 
 from litho_data.foundation.results import Record
 from litho_design.holograms.settings import HologramSettings
+from litho_design.images.targets import load_target
 from litho_design.large.bands import Bands
 from litho_design.large.hologram import BandedHologram
 from litho_design.optics.sampling import fast_length
 from litho_design.optimisation.budget import measure_budget, peak_memory_gib
-from litho_design.optimisation.parameters import DirectLevels
 from litho_design.printers.printer import Printer
 
 _GIB = 2**30
@@ -109,13 +109,14 @@ def measure_size(
     bands = Bands(size_px, band_px, cell_px=layout.cell_px)
     square = np.zeros((size_px, size_px), np.float32)
     square[size_px // 4 : size_px // 2, size_px // 4 : size_px // 2] = 1
-    hologram = BandedHologram(settings.model_copy(update={"layout": layout}), printer, square, bands)
-    parameters = DirectLevels(layout).to(printer.device)
-    parameters.start_random(0)
+    search = settings.search.model_copy(update={"start": "random"})
+    given = settings.model_copy(update={"layout": layout, "search": search})
+    hologram = BandedHologram(given, printer, load_target(square, size_px), bands)
+    parameters = hologram.free_parameters()
     budget = measure_budget(parameters, hologram.objective, settings.search, clock)
     wave = torch.ones(size_px, size_px, dtype=torch.complex64, device=printer.device)
     started = clock()
-    hologram.propagator.adjoint(hologram.propagator(wave))
+    hologram.bench.propagator.adjoint(hologram.bench.propagator(wave))
     transforms = clock() - started
     return MeasuredSize(
         size_px=size_px,

@@ -1,118 +1,194 @@
-"""A hologram in bands: what ``HologramTask`` is for an element in one piece, for the rows of this process."""
+"""A hologram in bands: the task of an element in one piece, for the rows of this process."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.grid import PixelGrid
-from litho_design.holograms.loss import hologram_loss
+from litho_data.foundation.hashes import file_sha256
+from litho_data.foundation.results import Record
 from litho_design.holograms.settings import HologramSettings
-from litho_design.large.bands import Allocate, Bands, in_memory
+from litho_design.holograms.task import HologramTask
+from litho_design.images.targets import Target
+from litho_design.large.bands import Bands, in_memory
 from litho_design.large.printing import check_printer, print_bands
 from litho_design.large.propagator import BandedPropagator
-from litho_design.optics import centred_grid, element_field, intensity_share
+from litho_design.large.score import image_figures, part_of_grid
+from litho_design.optics import Optics, centred_grid, element_field, intensity_share
 from litho_design.optimisation.parameters import CellMap
-from litho_design.optimisation.starts import Scene
+from litho_design.printers.layout import printability
 from litho_design.printers.printer import Printer
+from litho_design.printers.training import out_of_distribution
+from litho_design.tasks.design import HEIGHT_FILE, IMAGE_FILE, LEVELS_FILE, TARGET_FILE, Findings
+from litho_design.tasks.task import Task
+
+_LEFT_OUT = (
+    "a large element: without polish, process window, baselines, thick element and report; the figures that "
+    "need the whole image at once are left out"
+)
+# What a large element does not have: only these values.
+ONLY: dict[str, Any] = {
+    "search.parametrisation": "direct",
+    "search.start_jitter_levels": 0.0,
+    "optics.element": "thin",
+    "optics.source_sine": 0.0,
+    "optics.bandwidth_um": 0.0,
+    "optics.beam_um": 0.0,
+    "window.samples": 0,
+    "fabrication.max_step_levels": 0,
+    "fabrication.min_feature_um": 0.0,
+    "fabrication.inside_weight": 0.0,
+    "layout.cell_filter_um": 0.0,
+}
 
 
-class BandedHologram:
+class BandedHologram(HologramTask):
     """The loss of the rows that this process holds, and of those of all others with them.
 
+    All processes run it with the same arguments, and share the file system of the folder. The layout is the
+    same for any number of them.
+
     Args:
-        settings: of the hologram; see ``check_settings`` for what is left out.
+        settings: of the hologram.
         printer: frozen model with a finite reach, or nominal heights.
         target: wanted image (size, size) in [0, 1].
         bands: of the element.
-        allocate: room for the spectrum; memory of the printer's device by default.
 
     Raises:
         InputError: settings or a printer that a large element cannot have.
     """
 
-    def __init__(
-        self,
-        settings: HologramSettings,
-        printer: Printer,
-        target: np.ndarray,
-        bands: Bands,
-        allocate: Allocate | None = None,
-    ):
-        check_settings(settings)
-        check_printer(printer, bands)
-        self.settings, self.printer, self.bands = settings, printer, bands
-        layout, rows = settings.layout, bands.rows()
-        self.target = torch.from_numpy(np.ascontiguousarray(target[rows.start : rows.stop])).to(
-            printer.device
-        )
-        self.grid = part_of_grid(centred_grid((layout.size_px,) * 2, layout.pitch_um), rows)
-        room = allocate or in_memory(printer.device)
-        self.propagator = BandedPropagator(layout.pitch_um, settings.optics, bands, room)
+    polished = reported = False
 
-    def image(self, height_um: Tensor) -> Tensor:
-        """Share of the incident power on the own pixels (rows, size) behind the own heights, µm."""
-        pixels = self.settings.layout.size_px**2
-        field = element_field(height_um, self.grid, self.settings.optics, pixels=pixels)
-        return intensity_share(self.propagator(field), self.grid)
+    def __init__(self, settings: HologramSettings, printer: Printer, target: Target, bands: Bands):
+        only(settings, ONLY | {"loss.signal_window_um": 0.0, "layout.symmetry": "none"})
+        check_printer(printer, bands)
+        ranks, rows = bands.ranks, bands.rows()
+        self.bands, self.total, self.leads = bands, ranks.total, ranks.rank == 0
+        self.part = f"-{ranks.rank + 1}-of-{ranks.count}" if ranks.count > 1 else ""
+        Task.__init__(self, settings, printer)
+        self.target_record, self.counted = target.record, None
+        own = np.ascontiguousarray(target.pixels[rows.start : rows.stop])
+        self.target = torch.from_numpy(own).to(printer.device)
+        self.notes = [_LEFT_OUT, f"{bands.count} bands of {bands.band_px} rows, {ranks.count} process(es)"]
+
+    def inputs_sha256(self) -> str:
+        """Bands decide the rounding of a sum, and so the layout."""
+        return f"bands of {self.bands.band_px}"
+
+    def make_cells(self) -> CellMap:
+        """Of the own rows."""
+        return CellMap(self.settings.layout, self.bands.rows())
+
+    def make_bench(self, optics: Optics) -> Any:
+        """Light onto the own rows of the image plane."""
+        return BandedBench(self.settings.layout.pitch_um, optics, self.bands, self.printer.device)
+
+    def search_print(self, level: Tensor, printer: int) -> Tensor:
+        """Height of the own rows, µm."""
+        return print_bands(level[0, 0], self.printers[printer], self.bands)
 
     def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
         """Loss of the whole element, of the own levels (1, 1, rows, size), and its parts."""
-        seen = self.image(print_bands(level[0, 0], self.printer, self.bands))
-        ranks = self.bands.ranks
-        loss, parts = hologram_loss(seen, self.target, self.settings.loss, total=ranks.total)
-        return ranks.shared_loss(loss), parts
+        loss, parts = super().objective(level)
+        return self.bands.ranks.shared_loss(loss), parts
 
-    def scene(self, level_phase: Tensor) -> Scene:
-        """What a start can use."""
-        settings = self.settings
-        return Scene(
-            cells=CellMap(settings.layout, self.bands.rows()),
-            pitch_um=settings.layout.pitch_um,
-            optics=settings.optics,
-            level_phase=level_phase.to(self.printer.device),
-            iterations=settings.search.start_iterations,
-            seed=settings.search.seed,
-            target=self.target,
-            propagator=self.propagator,
-            total=self.bands.ranks.total,
+    @torch.no_grad()
+    def printed_um(self, level: Tensor, printer: int = 0) -> Tensor:
+        """Height of the own rows, µm."""
+        return print_bands(level.float(), self.printers[printer], self.bands)
+
+    @torch.no_grad()
+    def save(self, folder: Path, level: Tensor, height_um: Tensor) -> dict[str, str]:
+        """Write the arrays that all processes share; the first of them gets the hashes."""
+        seen = self.bench(height_um)
+        arrays = {LEVELS_FILE: level.byte(), HEIGHT_FILE: height_um, IMAGE_FILE: seen}
+        self.saved = folder
+        return _write_rows(folder, arrays | {TARGET_FILE: self.target}, self.bands)
+
+    def findings(self, level: Tensor, height_um: Tensor) -> Findings:
+        """Figures of the whole, which is on disk."""
+        levels, seen, aim = (
+            np.load(self.saved / name, mmap_mode="r") for name in (LEVELS_FILE, IMAGE_FILE, TARGET_FILE)
+        )
+        layout = self.settings.layout
+        return Findings(
+            printability=printability(levels, layout),
+            out_of_distribution=out_of_distribution(levels, layout, self.printer.card),
+            predicted=image_figures(seen, aim, Bands(layout.size_px, self.bands.band_px)),
         )
 
+    def finished_iterations(self, folder: Path) -> int:
+        """Those that all processes have done.
 
-def part_of_grid(grid: PixelGrid, rows: range) -> PixelGrid:
-    """Some rows of a grid."""
-    top = grid.origin_um[0] + rows.start * grid.pitch_um[0]
-    return replace(grid, shape=(len(rows), grid.shape[1]), origin_um=(top, grid.origin_um[1]))
+        Raises:
+            InputError: some have done others, or there were other processes.
+        """
+        done, ranks = super().finished_iterations(folder), self.bands.ranks
+        others = list(folder.glob("checkpoint*.pt"))
+        if float(ranks.total(torch.tensor([float(done)]))) != done * ranks.count or (others and not done):
+            raise InputError(
+                f"checkpoints in {folder}",
+                got="those of another number of processes, or of different iterations",
+                wanted=f"one of the same iteration from each of {ranks.count}",
+                hint="start as many processes as before, or delete them to start again",
+            )
+        return done
+
+    def together(self, value: bool) -> bool:
+        """Whether this holds for any of the processes, when all are here."""
+        return bool(self.bands.ranks.total(torch.tensor([float(value)])) > 0)
 
 
-def check_settings(settings: HologramSettings) -> None:
-    """Refuse what a large element does not have.
+class BandedBench(nn.Module):
+    """Light of one plane wave through the own rows of an element onto those of the image plane."""
+
+    def __init__(self, pitch_um: float, optics: Optics, bands: Bands, device: torch.device):
+        super().__init__()
+        self.optics, self.pixels = optics, bands.size_px**2
+        self.grid = self.window = centred_grid((bands.size_px,) * 2, pitch_um)
+        self.propagator = BandedPropagator(pitch_um, optics, bands, in_memory(device))
+        self.rows = part_of_grid(self.grid, bands.rows())
+
+    def forward(self, height_um: Tensor) -> Tensor:
+        """Share of the incident power on the own pixels (rows, size) behind the own heights, µm."""
+        field = element_field(height_um, self.rows, self.optics, pixels=self.pixels)
+        return intensity_share(self.propagator(field), self.rows)
+
+
+def only(settings: Record, values: dict[str, Any]) -> None:
+    """Refuse settings, by path, that a large element does not have.
 
     Raises:
-        InputError: a distribution over levels, a thick element, a process window or fabrication penalties in
-            the loss, a signal window, noise on the start.
+        InputError: another value.
     """
-    search, fabrication = settings.search, settings.fabrication
-    unknown = {
-        "search.parametrisation": (search.parametrisation, "direct"),
-        "search.start_jitter_levels": (search.start_jitter_levels, 0.0),
-        "search.draft": (search.draft, ""),
-        "optics.element": (settings.optics.element, "thin"),
-        "optics.source_sine": (settings.optics.source_sine, 0.0),
-        "optics.bandwidth_um": (settings.optics.bandwidth_um, 0.0),
-        "window.samples": (settings.window.samples, 0),
-        "loss.signal_window_um": (settings.loss.signal_window_um, 0.0),
-        "fabrication.max_step_levels": (fabrication.max_step_levels, 0),
-        "fabrication.min_feature_um": (fabrication.min_feature_um, 0.0),
-        "fabrication.inside_weight": (fabrication.inside_weight, 0.0),
-        "layout.symmetry": (settings.layout.symmetry, "none"),
-        "layout.cell_filter_um": (settings.layout.cell_filter_um, 0.0),
-    }
-    for name, (given, wanted) in unknown.items():
+    for path, wanted in values.items():
+        given: Any = settings
+        for name in path.split("."):
+            given = getattr(given, name)
         if given != wanted:
             hint = "without --large the element is designed in one piece"
-            raise InputError(f"{name} of a large element", got=repr(given), wanted=repr(wanted), hint=hint)
+            raise InputError(f"{path} of a large element", got=repr(given), wanted=repr(wanted), hint=hint)
+
+
+def _write_rows(folder: Path, arrays: dict[str, Tensor], bands: Bands) -> dict[str, str]:
+    """Write arrays whose own rows (rows, size) each process has, by file name; their SHA-256 in the first."""
+    size, rows, hashes = bands.size_px, bands.rows(), {}
+    for name, values in arrays.items():
+        own = values.cpu().numpy()
+        if bands.ranks.rank == 0:
+            np.lib.format.open_memmap(folder / name, "w+", own.dtype, (size, size)).flush()
+        bands.ranks.wait()
+        whole = np.load(folder / name, mmap_mode="r+")
+        whole[rows.start : rows.stop] = own
+        whole.flush()
+        del whole
+        bands.ranks.wait()
+        if bands.ranks.rank == 0:
+            hashes[name] = file_sha256(folder / name)
+    return hashes

@@ -7,15 +7,16 @@ resolved target, uniformity) are left out.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from litho_data.foundation.grid import PixelGrid
 from litho_design.images.similarity import SSIM_WINDOW_PX, ssim_map
 from litho_design.large.bands import Allocate, Bands
-from litho_design.large.hologram import part_of_grid
 from litho_design.large.printing import check_printer, print_band
 from litho_design.large.propagator import BandedPropagator
 from litho_design.optics import Optics, element_field, intensity_share
@@ -94,6 +95,12 @@ def image_from_disk(
     propagator.carry(wave, keep)
     # A thin element has the same amplitude everywhere, so that its power is known.
     return float(mean.abs().square()) * pitch_um**2 / size**2
+
+
+def part_of_grid(grid: PixelGrid, rows: range) -> PixelGrid:
+    """Some rows of a grid."""
+    top = grid.origin_um[0] + rows.start * grid.pitch_um[0]
+    return replace(grid, shape=(len(rows), grid.shape[1]), origin_um=(top, grid.origin_um[1]))
 
 
 def image_figures(image: np.ndarray, target: np.ndarray, bands: Bands) -> dict[str, float]:

@@ -30,6 +30,7 @@ class LensOptics(nn.Module):
         require_one_wave(optics, "a lens")
         self.layout, self.optics, self.view = layout, optics, view
         self.window = centred_grid((view.window_px, view.window_px), layout.pitch_um)
+        self.grid = centred_grid((layout.size_px, layout.size_px), layout.pitch_um)
 
     @property
     def numerical_aperture(self) -> float:
@@ -67,7 +68,6 @@ class LensBench(LensOptics):
 
     def __init__(self, layout: LayoutSettings, optics: Optics, view: LensView):
         super().__init__(layout, optics, view)
-        self.grid = centred_grid((layout.size_px, layout.size_px), layout.pitch_um)
         self.propagator = make_propagator(self.grid, self.window, optics)
         radius = np.hypot(self.grid.y_um[:, None], self.grid.x_um[None, :])
         inside = radius < layout.size_um / 2 if view.aperture == "circle" else np.ones_like(radius)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -31,8 +30,7 @@ from litho_design.lenses.score import (
 )
 from litho_design.lenses.settings import SMOOTH_BELOW, LensSettings
 from litho_design.optics import Optics
-from litho_design.optimisation.parameters import CellMap
-from litho_design.optimisation.starts import Scene
+from litho_design.optimisation.phases import focusing_levels, fresnel_lens_phase
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 from litho_design.tasks.task import Task, register_task
@@ -71,6 +69,14 @@ class LensTask(Task):
     """
 
     starts = ("random", "fresnel")
+    errors = (
+        "fwhm_um",
+        "mae_direct",
+        "mae_design",
+        "mae_calibrated",
+        "mae_calibrated_sd",
+        "ssim_calibrated_sd",
+    )
     settings_type = LensSettings
     settings: LensSettings
     bench: LensBench
@@ -135,10 +141,11 @@ class LensTask(Task):
             return None
         return bench.propagator.ring_area_um2.float().to(self.printer.device)
 
-    def scene(self, level_phase: Tensor) -> Scene:
-        """On the CPU, where sums over rings are reproducible."""
-        scene = super().scene(level_phase)
-        return replace(scene, cells=CellMap(self.settings.layout), level_phase=level_phase.cpu())
+    def start_levels(self, level_phase: Tensor) -> Tensor:
+        """Levels whose print is nearest to a perfect lens; on the CPU, where sums over rings repeat."""
+        phase = fresnel_lens_phase(self.cells.cpu(), self.settings.layout.pitch_um, self.settings.optics)
+        self.cells.to(self.printer.device)
+        return focusing_levels(phase, level_phase.cpu())
 
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> LensScore | ImagingLensScore:
         """Score of a print whose design expected ``expected_um``, or the same."""
@@ -242,8 +249,12 @@ def _check(settings: LensSettings) -> None:
             got=f"symmetry {settings.layout.symmetry!r}, aperture {settings.view.aperture!r}",
             wanted="a ring layout behind a circular aperture",
         )
-    if radial and (settings.optics.incidence_x or settings.optics.incidence_y):
-        raise InputError("search path 'radial'", got="oblique incidence", wanted="light along the axis")
+    optics = settings.optics
+    if radial and (optics.incidence_x or optics.incidence_y or optics.beam_um):
+        got, wanted = "oblique incidence or a beam", "even light along the axis"
+        raise InputError("search path 'radial'", got=got, wanted=wanted, hint="--set view.path=plane")
+    if optics.propagation == "far-field":
+        raise InputError("propagation of a lens", got="far-field", wanted="a focal plane of its own")
     window = settings.window
     if radial and window.samples and (window.roughness.sigma_um or window.stitch.sigma_um):
         got, hint = "a rough surface or displaced write fields", "--set view.path=plane"

@@ -6,11 +6,12 @@ import torch
 
 from litho_data.foundation.grid import PixelGrid
 from litho_design.optics.angular_spectrum import ASMPropagator
+from litho_design.optics.far_field import FarFieldPropagator
 from litho_design.optics.rayleigh_sommerfeld import RSPropagator
 from litho_design.optics.sampling import sampling_limit_um
 from litho_design.optics.thin_element import Optics
 
-Propagator = RSPropagator | ASMPropagator
+Propagator = RSPropagator | ASMPropagator | FarFieldPropagator
 
 
 def make_propagator(
@@ -19,13 +20,16 @@ def make_propagator(
     """Carry waves from ``source`` to ``target`` in ``optics``.
 
     ``auto`` takes the Rayleigh-Sommerfeld sum wherever its sampled kernel is not aliased, and the angular
-    spectrum below that distance, where its own period is long enough without further padding.
+    spectrum below that distance, where its own period is long enough without further padding. ``far-field``
+    takes the distance as the focal length of an ideal lens.
 
     Raises:
         InputError: a distance below the sampling limit where ``rayleigh-sommerfeld`` is asked for, or unequal
             pitches for the angular spectrum.
     """
-    kind = ASMPropagator if takes_spectrum(source, target, optics) else RSPropagator
+    kind: type[Propagator] = ASMPropagator if takes_spectrum(source, target, optics) else RSPropagator
+    if optics.propagation == "far-field":
+        kind = FarFieldPropagator
     return kind(source, target, optics.distance_um, optics.wavelength_um, dtype=dtype)
 
 

@@ -78,9 +78,10 @@ def require_one_wave(optics: Optics, what: str) -> None:
     Raises:
         InputError: such a source.
     """
-    if optics.bandwidth_um or optics.source_sine:
+    if optics.bandwidth_um or optics.source_sine or optics.source_distance_um:
         raise InputError(
             f"source of {what}",
-            got=f"bandwidth {optics.bandwidth_um:g} µm, sine {optics.source_sine:g}",
-            wanted="a point of one colour: 0, 0",
+            got=f"bandwidth {optics.bandwidth_um:g} µm, sine {optics.source_sine:g}, distance "
+            f"{optics.source_distance_um:g} µm",
+            wanted="a far point of one colour: 0, 0, 0",
         )

@@ -12,6 +12,8 @@ from litho_design.optics.materials import Resin, refractive_index
 
 ElementKind = Literal["thin", "thick"]
 
+# Shorter or longer is no light, but a number of metres or nanometres.
+SHORTEST_UM, LONGEST_UM = 0.05, 100.0
 # Beyond the element as far as light spreads within the height of a relief.
 _BORDER_UM = 2.0
 
@@ -25,7 +27,7 @@ class Optics(Record):
     """Wavelength, refractive index step and distance to the output plane."""
 
     wavelength_um: float = setting(
-        0.6328, "Wavelength", unit="µm", option="--wavelength-um", gt=0, le=LENGTH_UM.high
+        0.6328, "Wavelength", unit="µm", option="--wavelength-um", gt=SHORTEST_UM, lt=LONGEST_UM
     )
     index_step: float = setting(
         0.548,
@@ -58,9 +60,24 @@ class Optics(Record):
         ge=0,
         le=LENGTH_UM.high,
     )
-    propagation: Literal["auto", "rayleigh-sommerfeld", "angular-spectrum"] = setting(
+    beam_um: float = setting(
+        0.0,
+        "Radius of a Gaussian beam on the element, at 1/e² of its intensity; 0 for even light",
+        unit="µm",
+        ge=0,
+        le=LENGTH_UM.high,
+    )
+    source_distance_um: float = setting(
+        0.0,
+        "Distance of the point before the element that its light comes from; 0 for far away",
+        unit="µm",
+        ge=0,
+        le=LENGTH_UM.high,
+    )
+    propagation: Literal["auto", "rayleigh-sommerfeld", "angular-spectrum", "far-field"] = setting(
         "auto",
-        "Propagator: the Rayleigh-Sommerfeld sum, the angular spectrum, or whichever is valid",
+        "Propagator: the Rayleigh-Sommerfeld sum, the angular spectrum, or whichever is valid; or the far "
+        "field, in the focal plane of a lens",
         option="--propagation",
     )
     element: ElementKind = setting(
@@ -95,8 +112,9 @@ def element_field(
     """The wave just behind a phase element lit by a plane wave of unit power.
 
     u = exp(j 2 pi (index_step height + incidence . position) / wavelength) on the aperture and 0
-    elsewhere, scaled so that sum |u|^2 dy dx = 1: intensities summed over any window times its pixel area
-    are shares of the incident power. A thick element is what ``wave_through_relief`` makes of it, in air.
+    elsewhere, times a Gaussian beam and the wave of a near point where the optics have them, scaled so that
+    sum |u|^2 dy dx = 1: intensities summed over any window times its pixel area are shares of the incident
+    power. A thick element is what ``wave_through_relief`` makes of it, in air.
 
     Args:
         height_um: real (..., ny, nx), µm.
@@ -110,10 +128,16 @@ def element_field(
     import torch  # the command line reads `Optics` without it
 
     phase = height_um * (2 * math.pi / optics.wave_height_um)
-    if optics.incidence_x or optics.incidence_y:
-        x, y = (torch.from_numpy(axis).to(phase) for axis in (grid.x_um, grid.y_um))
+    if optics.incidence_x or optics.incidence_y or optics.source_distance_um or optics.beam_um:
+        x, y = (torch.from_numpy(axis).double().to(phase.device) for axis in (grid.x_um, grid.y_um))
+        squared = x[None, :] ** 2 + y[:, None] ** 2
         path_um = optics.incidence_x * x[None, :] + optics.incidence_y * y[:, None]
-        phase = phase + path_um * (2 * math.pi / optics.wavelength_um)
+        if optics.source_distance_um:
+            path_um = path_um + (squared + optics.source_distance_um**2).sqrt() - optics.source_distance_um
+        phase = phase + (path_um * (2 * math.pi / optics.wavelength_um)).to(phase)
+        if optics.beam_um:
+            beam = torch.exp(-squared / optics.beam_um**2)
+            aperture = beam if aperture is None else aperture * beam
     area = math.prod(grid.pitch_um)
     if aperture is None:
         amplitude = torch.full_like(phase, 1 / math.sqrt((pixels or math.prod(grid.shape)) * area))

@@ -16,8 +16,6 @@ from torch import Tensor
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
 
-# What an interrupted run leaves, of all its parts.
-CHECKPOINTS = "checkpoint*.pt"
 # What torch raises for a damaged file depends on the place of the damage.
 _DAMAGED = (
     RuntimeError,

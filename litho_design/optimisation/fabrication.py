@@ -38,9 +38,6 @@ class Fabrication(Record):
         0.0, "Weight of levels and steps that the model's training layouts hardly have",
         option="--inside-weight", ge=0,
     )  # fmt: skip
-    trial_iterations: int = setting(
-        20, "Iterations of the search that says what staying inside costs, where a layout is unusual", ge=0
-    )
 
 
 def fabrication_penalty(

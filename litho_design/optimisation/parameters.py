@@ -6,7 +6,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from litho_data.foundation.errors import InputError
 from litho_design.optimisation.process_window import blurred
+from litho_design.optimisation.settings import SearchSettings
 from litho_design.printers.layout import LayoutSettings
 
 # A learning rate of 1 moves by one level of 13, and by as much of the height where there are more or fewer.
@@ -71,9 +73,9 @@ class GumbelLevels(nn.Module):
     # Of a learning rate: logits have no range.
     rate_unit = 1.0
 
-    def __init__(self, layout: LayoutSettings):
+    def __init__(self, layout: LayoutSettings, cells: CellMap | None = None):
         super().__init__()
-        self.cells = CellMap(layout)
+        self.cells = cells or CellMap(layout)
         self.levels = layout.levels
         self.logits = nn.Parameter(torch.zeros(layout.levels, *self.cells.cells))
 
@@ -113,9 +115,9 @@ class DirectLevels(nn.Module):
     Rounding passes the gradient straight through when ``hard``.
     """
 
-    def __init__(self, layout: LayoutSettings, rows: range | None = None, *, cells: CellMap | None = None):
+    def __init__(self, layout: LayoutSettings, cells: CellMap | None = None):
         super().__init__()
-        self.cells = cells or CellMap(layout, rows)
+        self.cells = cells or CellMap(layout)
         self.levels = layout.levels
         self.rate_unit = (layout.levels - 1) / _RATE_STEPS
         self.height = nn.Parameter(torch.zeros(self.cells.cells))
@@ -157,6 +159,23 @@ class DirectLevels(nn.Module):
 
 
 Parametrisation = GumbelLevels | DirectLevels
+
+
+def make_parametrisation(
+    layout: LayoutSettings, search: SearchSettings, cells: CellMap | None = None
+) -> Parametrisation:
+    """The free parameters named by ``search.parametrisation``; ``cells`` of a part of the layout.
+
+    Raises:
+        InputError: a filter over the cells of a distribution over levels.
+    """
+    if search.parametrisation == "direct":
+        return DirectLevels(layout, cells)
+    if layout.cell_filter_um:
+        raise InputError(
+            "cell filter", got="the parametrisation gumbel", wanted="direct: distributions have no neighbours"
+        )
+    return GumbelLevels(layout, cells)
 
 
 def _jittered(levels: Tensor, jitter_levels: float, seed: int, level_count: int) -> Tensor:

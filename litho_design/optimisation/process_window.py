@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -23,8 +23,10 @@ if TYPE_CHECKING:
 _NARROWEST_BLUR_PX = 0.2
 _UNSEEN_STREAM, _SURFACE_STREAM, _STITCH_STREAM = 1, 2, 3
 _SMOOTH, _IN_PLACE = Roughness(), Stitching()
-# Figures that are better when lower.
-_ERRORS = ("loss", "mae_", "rms_", "rmse_", "p95_", "speckle_", "fwhm_")
+_SPREADS = (
+    "gain_sd", "offset_sd_um", "blur_sd_um", "defocus_sd_um", "wavelength_sd_um", "roughness.sigma_um",
+    "stitch.sigma_um",
+)  # fmt: skip
 
 
 class ProcessWindow(Record):
@@ -74,9 +76,8 @@ class ProcessWindow(Record):
 
 def spreads(window: ProcessWindow) -> list[str]:
     """Every spread of a window with its value and unit, for reports."""
-    found = [leaf for leaf in leaves(window) if leaf.help.startswith("Spread of the ")]
     told = []
-    for leaf in found:
+    for leaf in (leaf for leaf in leaves(window) if leaf.path in _SPREADS):
         values = leaf.value if isinstance(leaf.value, tuple) else (leaf.value,)
         if values:
             told.append(f"{leaf.help.removeprefix('Spread of the ')} {_range(values)} {leaf.unit}".strip())
@@ -197,25 +198,32 @@ class Yield(Record):
 
 
 def measure_yield(
-    drawn: Sequence[Mapping[str, float]], modelled: Mapping[str, float], window: ProcessWindow
+    drawn: Sequence[Mapping[str, float]],
+    modelled: Mapping[str, float],
+    window: ProcessWindow,
+    errors: Collection[str] = (),
 ) -> Yield:
-    """How many drawn prints pass: all figures that they share with the print as modelled stay close to it."""
+    """How many drawn prints pass: all figures that they share with the print as modelled stay close to it.
+
+    Args:
+        errors: figures that are better when lower.
+    """
     figures = [name for name in drawn[0] if name in modelled]
-    passed = sum(all(_passes(name, one[name], modelled[name], window) for name in figures) for one in drawn)
+
+    def passes(name: str, value: float) -> bool:
+        if name in errors:
+            return value <= modelled[name] / window.pass_share
+        if name.endswith("_db"):
+            return value >= modelled[name] - window.pass_drop_db
+        return value >= modelled[name] * window.pass_share
+
+    passed = sum(all(passes(name, one[name]) for name in figures) for one in drawn)
     count, z = len(drawn), 1.96
     share = passed / count
     middle = (share + z**2 / (2 * count)) / (1 + z**2 / count)
     half = z / (1 + z**2 / count) * math.sqrt(share * (1 - share) / count + z**2 / (4 * count**2))
     interval = (max(0.0, middle - half), min(1.0, middle + half))
     return Yield(draws=count, passed=passed, share=share, ci95=interval, figures=figures)
-
-
-def _passes(name: str, value: float, modelled: float, window: ProcessWindow) -> bool:
-    if name.startswith(_ERRORS):
-        return value <= modelled / window.pass_share
-    if name.endswith("_db"):
-        return value >= modelled - window.pass_drop_db
-    return value >= modelled * window.pass_share
 
 
 def risk(losses: Tensor, window: ProcessWindow) -> Tensor:

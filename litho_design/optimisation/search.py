@@ -17,25 +17,11 @@ from litho_design.optimisation.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
-from litho_design.optimisation.parameters import DirectLevels, GumbelLevels, Parametrisation
+from litho_design.optimisation.parameters import Parametrisation
 from litho_design.optimisation.rate import RateSchedule
 from litho_design.optimisation.settings import SearchSettings
-from litho_design.printers.layout import LayoutSettings
 
 Objective = Callable[[Tensor], tuple[Tensor, dict[str, float]]]
-
-
-def make_parametrisation(layout: LayoutSettings, search: SearchSettings) -> Parametrisation:
-    """The free parameters named by ``search.parametrisation``.
-
-    Raises:
-        InputError: a filter over the cells of a distribution over levels.
-    """
-    if layout.cell_filter_um and search.parametrisation == "gumbel":
-        raise InputError(
-            "cell filter", got="the parametrisation gumbel", wanted="direct: distributions have no neighbours"
-        )
-    return GumbelLevels(layout) if search.parametrisation == "gumbel" else DirectLevels(layout)
 
 
 def search_layout(

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Literal, get_args
+
+from pydantic import model_validator
 
 from litho_data.foundation.errors import require_known
 from litho_data.foundation.results import Record
@@ -38,12 +40,6 @@ class SearchSettings(Record):
     start_jitter_levels: float = setting(
         0.0, "Noise added to a start that is not random", unit="levels", ge=0
     )
-    draft: str = setting(
-        "",
-        "Cheaper model for a first stage of the search: a folder, zoo:NAME or none; without it there is none",
-        option="--draft",
-    )
-    draft_iterations: int = setting(80, "Iterations of that stage", ge=1)
     iterations: int = setting(300, "Iterations of the search", option="--iterations", ge=1)
     optimiser: Literal["adam", "adamw"] = setting("adam", "Optimiser")
     learning_rate: float = setting(
@@ -100,15 +96,25 @@ PAPER_SEARCH = SearchSettings(
 
 
 class EnsemblePenalty(Record):
-    """With further models in the search, the loss is their mean loss + weight * disagreement in waves."""
+    """With further models in the search, the loss is their mean or worst + weight * disagreement in waves."""
 
+    risk: Literal["mean", "worst"] = setting("mean", "Loss over the models: their mean, or the worst of them")
     weight: float = setting(
         1.0, "Weight of the models' disagreement, per wave of height", option="--ensemble-weight", ge=0
     )
 
 
+# Settings of older designs that changed no figure of theirs.
+_GONE = (("search", "draft"), ("search", "draft_iterations"), ("fabrication", "trial_iterations"))
+
+
 class DesignSettings(Record):
     """What the settings of every design hold."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_what_is_gone(cls, content: Any) -> Any:
+        return without(content, _GONE)
 
     variant: Variant = setting(
         "default",
@@ -130,6 +136,16 @@ def design_settings(changes: Mapping[str, Any] | None = None) -> DesignSettings:
         InputError: a change of a setting that does not exist, or to a value that it does not accept.
     """
     return changed(DesignSettings(), dict(changes or {}))
+
+
+def without(content: Any, paths: Iterable[tuple[str, ...]]) -> Any:
+    """Nested values, as read from a file, without those at some paths."""
+    for first, *rest in paths if isinstance(content, dict) else ():
+        if rest and first in content:
+            content = content | {first: without(content[first], [tuple(rest)])}
+        elif not rest:
+            content = {name: value for name, value in content.items() if name != first}
+    return content
 
 
 def check_variant(variant: str) -> None:

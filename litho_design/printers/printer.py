@@ -78,6 +78,7 @@ class Printer(nn.Module):
         self.name = name or ("none" if simulator is None else str(simulator.name))
         borders_px = (0, 0, 0) if simulator is None else _borders_px(simulator, layout.pitch_um)
         self.guard_px, self.halo_px, self.strip_halo_px = borders_px
+        self._level_heights_um: list[float] = []
         if simulator is not None:
             simulator.eval().requires_grad_(False)
 
@@ -203,12 +204,15 @@ class Printer(nn.Module):
     @torch.no_grad()
     def level_heights_um(self) -> list[float]:
         """Printed height of a wide uniform field of each level, µm: the level table of the advisor."""
+        if self._level_heights_um:
+            return self._level_heights_um
         size = 2 * self.guard_px + 16
         middle = slice(size // 2 - 4, size // 2 + 4)
         heights = []
         for level in range(self.layout.levels):
             nominal = torch.full((1, 1, size, size), level * self.layout.level_height_um, device=self.device)
             heights.append(float(self._printed(nominal)[..., middle, middle].mean()))
+        self._level_heights_um = heights
         return heights
 
     def _inside(self, height_um: Tensor, border_px: int) -> Tensor:

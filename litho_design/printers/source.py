@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +76,33 @@ def load_printers(
             )
         printers[printer.name] = printer
     return printers
+
+
+def models_at_hand(
+    printers: Sequence[Printer], layout: LayoutSettings, *, device: Device = "cpu"
+) -> list[Printer]:
+    """Models of the zoo that were trained on the prints of the first of some models, and are none of them.
+
+    A model that was not calibrated for the layout is left out.
+    """
+    from litho_models import load_frozen, zoo
+
+    dataset, known = _dataset(printers[0].card), {str(one.card.get("weights_sha256")) for one in printers}
+    found = []
+    for name in zoo.list() if dataset else ():
+        simulator = load_frozen(zoo.folder(name), device=device)
+        if _dataset(simulator.card) != dataset or str(simulator.card.get("weights_sha256")) in known:
+            continue
+        try:
+            _check_calibration(simulator.card, layout, extrapolate=False)
+        except InputError:
+            continue
+        found.append(Printer(simulator, layout, source=f"{zoo.PREFIX}{name}").to(device))
+    return found
+
+
+def _dataset(card: Mapping[str, Any]) -> str:
+    return str((card.get("dataset") or {}).get("sha256", ""))
 
 
 def _load_simulator(source: str, device: Device, extrapolate: bool) -> Any:

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 import torch
 from pydantic import Field
+from scipy.optimize import minimize
 from torch import Tensor, nn
 
 from litho_data.foundation.results import Record
 from litho_design.images.targets import TargetRecord
 from litho_design.optics import Optics, centred_grid
-from litho_design.optimisation.parameters import DirectLevels, Parametrisation
-from litho_design.optimisation.starts import start_search
+from litho_design.optimisation.parameters import DirectLevels
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 from litho_design.reliefs.settings import ReliefSettings
@@ -24,7 +24,9 @@ from litho_design.tasks.task import Task, register_task
 
 UNPRINTABLE_FILE = "unprintable_um.npy"
 _FREE_ITERATIONS = 100
-_AFFINE_FACTORS = (0.6, 0.7, 0.8, 0.9, 1.0, 1.1)
+# Gains of an affine layout, over the inverse of the printer's; where between the ends of the levels it lies.
+_AFFINE_GAINS, _AFFINE_ZEROS = (0.5, 0.65, 0.8, 0.95, 1.1, 1.3), (0.0, 0.5, 1.0)
+_AFFINE_STEPS = 20
 
 
 class ReliefScore(Record):
@@ -60,7 +62,7 @@ class ReliefTask(Task):
 
     name = "relief"
     starts = ("inverse", "random")
-    headline = ("rms_nm", "mae_nm", "p95_nm")
+    headline = errors = ("rms_nm", "mae_nm", "p95_nm")
     score_type = ReliefScore
     settings_type = ReliefSettings
     settings: ReliefSettings
@@ -112,31 +114,56 @@ class ReliefTask(Task):
         """Errors without the offset: where the zero is free, no print passes or fails by it."""
         return {name: value for name, value in self.figures(seen).items() if name != "offset_nm"}
 
-    def start(self, parameters: Parametrisation, level_heights_um: list[float]) -> None:
-        """The level that prints the wanted height where it is uniform, or random levels."""
-        start_search(
-            parameters, self.settings.search, lambda: self._levels_printing(level_heights_um, self.asked)
-        )
+    def start_levels(self, level_phase: Tensor) -> Tensor:
+        """Levels that print the height where it is uniform, at the best zero, or the best affine ones."""
+        heights = self.printer.level_heights_um()
+        starts = [self._levels_printing(heights, self.asked, zero) for zero in _AFFINE_ZEROS]
+        return min((*starts, self.cells.average(self._best_affine)), key=self._worst_loss)
+
+    def untouched(self) -> dict[str, Tensor]:
+        """The layout of the wanted heights as they are, and the best affine one."""
+        return {"uncorrected": self._nominal.long(), "best affine": self._best_affine.long()}
 
     def baselines(self) -> dict[str, dict[str, float]]:
-        """Errors of the nominal layout, of the best affine correction, and of levels of any height."""
-        nominal = [
-            level * self.settings.layout.level_height_um for level in range(self.settings.layout.levels)
-        ]
-        printed = self.printer.level_heights_um()
-        gain = (printed[-1] - printed[0]) / (nominal[-1] - nominal[0])
-        # A layout of uniform gain, from the one of wide fields to the one of the finest detail.
-        affine = [
-            self._score_of_levels(
-                self._levels_printing([factor * gain * one for one in nominal], self.target)
-            )
-            for factor in _AFFINE_FACTORS
-        ]
-        return {
-            "uncorrected": self._score_of_levels(self._levels_printing(nominal, self.target)),
-            "best affine": min(affine, key=lambda one: one["rms_nm"]),
-            "free levels": self.figures(self._free_print),
-        }
+        """Errors of the two layouts of ``untouched``, and of levels of any height."""
+        with torch.no_grad():
+            found = {name: self.figures(self.printed_um(one)) for name, one in self.untouched().items()}
+        return found | {"free levels": self.figures(self._free_print)}
+
+    @property
+    def _nominal(self) -> Tensor:
+        """Levels (size, size) of the wanted heights; a relief that reaches below 0 is lifted to it."""
+        return self._affine(
+            1.0, float(self.target.amin().clamp(min=0)) / self.settings.layout.level_height_um
+        )
+
+    @cached_property
+    def _best_affine(self) -> Tensor:
+        """Levels (size, size) of gain * height + zero whose worst error over the printers is the lowest."""
+        layout, heights = self.settings.layout, self.printer.level_heights_um()
+        top, span = layout.levels - 1, float(np.ptp(self.inputs["relief_um"])) / layout.level_height_um
+        unit = top * layout.level_height_um / (heights[-1] - heights[0])
+
+        def error(given: Sequence[float]) -> float:
+            return self._worst_loss(self.cells.average(self._affine(*given)))
+
+        coarse = [(g * unit, zero * (top - g * unit * span)) for g in _AFFINE_GAINS for zero in _AFFINE_ZEROS]
+        gain, zero = min(coarse, key=error)
+        corners = [(gain, zero), (1.05 * gain, zero), (gain, zero + 1)]
+        options = {"maxfev": _AFFINE_STEPS, "initial_simplex": corners}
+        return self._affine(*minimize(error, (gain, zero), method="Nelder-Mead", options=options).x)
+
+    def _affine(self, gain: float, zero: float) -> Tensor:
+        """Whole levels (size, size): gain * height above the lowest point + zero, within the levels."""
+        layout = self.settings.layout
+        level = gain * (self.target - self.target.amin()) / layout.level_height_um + zero
+        return self.cells(self.cells.average(level).round().clamp(0, layout.levels - 1))
+
+    @torch.no_grad()
+    def _worst_loss(self, levels: Tensor) -> float:
+        """Largest loss of real levels (*cells), rounded, over the printers of the search."""
+        whole = self.cells(levels.round())[None, None].float()
+        return max(float(self.loss(printer(whole)[0, 0])) for printer in self.printers)
 
     def thick_score(self, height_um: Tensor) -> None:
         """A height is a height, whatever the light."""
@@ -167,19 +194,18 @@ class ReliefTask(Task):
         assert best is not None
         return best
 
-    def _levels_printing(self, level_heights_um: Sequence[float], relief_um: Tensor) -> Tensor:
+    def _levels_printing(
+        self, level_heights_um: Sequence[float], relief_um: Tensor, zero: float = 0.5
+    ) -> Tensor:
         """Real levels (*cells) that have a relief's heights where level k is ``level_heights_um[k]`` high.
 
-        Zero is free: the middle of the relief lies in the middle of the levels.
+        Zero is free: the relief lies at this place between the lowest and the highest of the levels.
         """
         heights, target = np.asarray(level_heights_um), relief_um.cpu().numpy()
-        middle = (heights[0] + heights[-1] - target.min() - target.max()) / 2
-        levels = np.interp(target + middle, heights, np.arange(len(heights)))
+        room_um = (heights[-1] - heights[0]) - np.ptp(target)
+        lifted = target - target.min() + heights[0] + zero * room_um
+        levels = np.interp(lifted, heights, np.arange(len(heights)))
         return self.cells.average(torch.from_numpy(levels).float().to(self.printer.device))
-
-    @torch.no_grad()
-    def _score_of_levels(self, levels: Tensor) -> dict[str, float]:
-        return self.figures(self.printer(self.cells(levels.round())[None, None])[0, 0])
 
     def display(self, seen: np.ndarray) -> np.ndarray:
         """Heights over the range of the target."""

@@ -31,18 +31,11 @@ _EFFICIENCIES = ("eff_signal", "focusing_efficiency")
 _THICK_SHARE = 0.1
 # Below this share of the training pixels, a model has hardly seen the lowest and the highest level.
 _SEEN_SHARE = 0.02
-# Figures that are errors or widths, by how their names begin; of all others more is better.
-_LESS_IS_BETTER = ("mae", "rms", "p95", "fwhm", "speckle", "zero_order", "loss")
 
 
 def named(figure: str) -> str:
     """The name of a score's figure for people."""
     return WORDS.get(figure, (spelt_out(figure), ""))[0]
-
-
-def less_is_better(figure: str) -> bool:
-    """Whether a smaller value of a score's figure is the better one."""
-    return figure.startswith(_LESS_IS_BETTER)
 
 
 def distribution_warning(design: Design) -> str:
@@ -85,6 +78,31 @@ def _cost_of_staying_inside(design: Design) -> str:
         f". A short search that stays closer ({100 * gauge.inside_distance:.0f} % of the pixels) ends "
         f"with {', '.join(told)}, as the model prints both (--inside-weight searches so from the start)"
     )
+
+
+def width_sentence(design: Design) -> str:
+    """What the models of the printer at hand say of the layout; empty where there is only its own."""
+    width = design.width
+    if width is None or len(width.level_heights_um) == 1:
+        return ""
+    name, _, unit = named(width.figure).partition(" (")
+    unit = f" {unit.rstrip(')')}" if unit else ""
+    models = list(width.level_heights_um)
+    stated, median, worst = width.stated_median_worst
+    by = models[int(width.values().argmax() if width.less else width.values().argmin())]
+    text = (
+        f"{len(models)} models of this printer print it ({', '.join(models)}; {width.searched_with} of them "
+        f"in the search): {name} {stated:.3g}{unit} as stated by {models[0]}, {median:.3g} in the median, "
+        f"{worst:.3g} at worst, by {by}"
+    )
+    if width.gain is not None and width.disagreement > width.gain:
+        level, low_um, high_um = width.open_level
+        text += (
+            f". They disagree by {width.disagreement:.3g}{unit}, more than the {width.gain:.3g} that the "
+            f"design gains over doing nothing. They differ most about level {level} ({low_um:.3f} to "
+            f"{high_um:.3f} µm): a print with wide fields of it would decide (litho-models next-print)"
+        )
+    return text + "."
 
 
 def thickness_warning(design: Design) -> str:

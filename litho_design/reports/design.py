@@ -13,7 +13,7 @@ from litho_design.holograms.task import HologramTask
 from litho_design.lenses.task import LensTask
 from litho_design.optimisation.process_window import measure_yield
 from litho_design.reliefs.task import UNPRINTABLE_FILE, ReliefTask
-from litho_design.reports.advice import WORDS, baseline_line, headline, named, stroke_advice
+from litho_design.reports.advice import WORDS, baseline_line, headline, named, stroke_advice, width_sentence
 from litho_design.reports.lens import add_lens_curves, add_lens_window, decibels
 from litho_design.reports.parts import (
     BRIGHTEST,
@@ -57,7 +57,7 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
     page.verdict(
         f"As {design.printer.name} prints it: {headline(design.predicted)}. This is what the model that the "
         "layout was designed with expects, not a measurement: before printing, score it with another model "
-        "(litho-design score, litho-design compare)."
+        "(litho-design score, litho-design compare). " + width_sentence(design)
     )
     if design.baselines:
         line = baseline_line(design.baselines)
@@ -67,6 +67,15 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
         "Rows are y (down), columns x; lengths in µm." + (_PSF if isinstance(task, LensTask) else ""),
     )
     add_notes(page, design)
+    if design.width is not None:
+        rows = [
+            {"layout": name, "printed by": model, **figures}
+            for name, by_model in design.width.figures.items()
+            for model, figures in by_model.items()
+        ]
+        page.table(
+            rows, "The layout and those of doing nothing, by every model at hand", "width.csv", digits=4
+        )
     page.tiles([*_tiles(design, task), (f"{design.stroke.stroke_waves:.2f} waves", "printed stroke")])
     page.heading("All scores", folded=True)
     labels = meanings(task.score_type)
@@ -90,7 +99,9 @@ def write_design_report(folder: Path, design: Design, task: Task, history: list[
     shown = [name for name in draws[0] if name in design.predicted]
     chosen = [name for name in task.headline if name in shown][:2] or shown[:2]
     figures = {name: (design.predicted[name], labels.get(name, named(name))) for name in chosen}
-    add_yield(page, draws, window, figures, measure_yield(draws, design.predicted, window))
+    add_yield(
+        page, draws, window, figures, measure_yield(draws, design.predicted, window, task.errors), task.errors
+    )
     if isinstance(task, LensTask):
         add_lens_window(page, task.bench, print_um)
     page.heading("Printed height of the levels", folded=True)

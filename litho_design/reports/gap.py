@@ -13,10 +13,10 @@ from litho_data.foundation.report import Page, capitalised
 from litho_data.foundation.report_pictures import model_colour, new_figure
 from litho_design.holograms.bench import HologramScore
 from litho_design.judging.gap import GapResult, PairedDifference, design_folder, headline
-from litho_design.judging.loaded import LoadedDesign
+from litho_design.judging.loaded import LoadedDesign, task_named
 from litho_design.lenses.score import ImagingLensScore
 from litho_design.printers.printer import Printer
-from litho_design.reports.advice import WORDS, baseline_line, less_is_better, named
+from litho_design.reports.advice import WORDS, baseline_line, named
 from litho_design.reports.parts import image_grid, meanings
 from litho_design.tasks.design import Design
 
@@ -62,13 +62,13 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
         "(columns). On the diagonal a model judges its own design: that is its expectation, not an "
         "independent result."
     )
-    page.table(_matrix(result, shown[0]), _caption(shown[0]), f"matrix_{shown[0]}.csv", digits=3)
+    page.table(_matrix(result, shown[0]), _caption(result.task, shown[0]), f"matrix_{shown[0]}.csv", digits=3)
     if own.baselines:
         line = baseline_line(own.baselines)
         page.paragraph(f"{capitalised(line)}. No printer is involved in these.")
     page.heading("Further figures", folded=True)
     for figure in shown[1:]:
-        page.table(_matrix(result, figure), _caption(figure), f"matrix_{figure}.csv", digits=3)
+        page.table(_matrix(result, figure), _caption(result.task, figure), f"matrix_{figure}.csv", digits=3)
     page.heading("Layouts, prints and what they cost", folded=True)
     page.links(
         [
@@ -108,7 +108,7 @@ def write_gap_report(folder: Path, result: GapResult, printers: Mapping[str, Pri
 def _verdict(result: GapResult, figure: str) -> str:
     """The best arm under each judge that is none of the arms, or else under every judge."""
     judges = [name for name in result.judges if name not in result.arms] or list(result.judges)
-    sign = -1 if less_is_better(figure) else 1
+    sign = -1 if figure in task_named(result.task).errors else 1
     unit = " dB" if figure.endswith("_db") else ""
     told = []
     for judge in judges:
@@ -138,8 +138,8 @@ def _chance(pair: PairedDifference, seeds: int) -> str:
     return f"{sure} (95 % interval of the difference over {seeds} seeds {low:.3g} … {high:.3g})"
 
 
-def _caption(figure: str) -> str:
-    better = "less" if less_is_better(figure) else "more"
+def _caption(task: str, figure: str) -> str:
+    better = "less" if figure in task_named(task).errors else "more"
     return f"{capitalised(_label(figure))}: mean over seeds [95 % interval]; {better} is better."
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +13,6 @@ from litho_data.foundation.results import Record
 from litho_design.optimisation.process_window import ProcessWindow, Yield, spreads
 from litho_design.reports.advice import (
     distribution_warning,
-    less_is_better,
     named,
     thickness_warning,
 )
@@ -60,6 +59,7 @@ def add_yield(
     window: ProcessWindow,
     figures: dict[str, tuple[float, str]],
     passed: Yield,
+    errors: Collection[str],
 ) -> None:
     """Yield curves of a design.
 
@@ -68,6 +68,7 @@ def add_yield(
         window: the spreads that were drawn from.
         figures: name to value of the print as modelled, and label.
         passed: how many draws pass.
+        errors: figures that are better when lower.
     """
     page.heading("Process window", folded=True)
     designed = "in the loss" if window.samples else "not in the loss"
@@ -77,19 +78,19 @@ def add_yield(
         f"deviations: {'; '.join(spreads(window))}."
     )
     low, high = (round(100 * edge) for edge in passed.ci95)
-    error = any(map(less_is_better, passed.figures))
-    errors = f", an error grows to {100 / window.pass_share:.0f} % at most" if error else ""
+    grown = f", an error grows to {100 / window.pass_share:.0f} % at most"
+    grown = grown if set(errors) & set(passed.figures) else ""
     page.paragraph(
         f"{passed.passed} of {passed.draws} prints pass ({low} to {high} %, 95 % interval): no figure in dB "
         f"is more than {window.pass_drop_db:g} dB below the print as modelled, every other one keeps "
-        f"{100 * window.pass_share:g} % of it{errors}. Judged by {', '.join(map(named, passed.figures))}."
+        f"{100 * window.pass_share:g} % of it{grown}. Judged by {', '.join(map(named, passed.figures))}."
     )
     figure = new_figure(8, 3)
     (axes,) = figure.subplots(1, len(figures), sharey=True, squeeze=False)
     for axis, (name, (modelled, label)) in zip(axes, figures.items(), strict=True):
         values = np.sort([draw[name] for draw in draws])
         worse = np.arange(len(values)) / len(values)
-        if less_is_better(name):
+        if name in errors:
             axis.step(values, worse + 1 / len(values), where="post")
         else:
             axis.step(values, 1 - worse, where="pre")

@@ -3,28 +3,27 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import atomic_file, writable
+from litho_data.foundation.files import atomic_file
 from litho_data.foundation.hashes import file_sha256
-from litho_data.foundation.outputs import first_addition, first_difference, require_own_folder
-from litho_data.foundation.results import Result
+from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunFacts, run_facts
 from litho_design.images.targets import TargetRecord
 from litho_design.optics import Optics
-from litho_design.optics.stroke import Stroke, measure_stroke
+from litho_design.optics.stroke import Stroke
 from litho_design.optimisation.budget import peak_memory_gib
-from litho_design.optimisation.checkpoint import CHECKPOINTS, SearchState
-from litho_design.optimisation.robust import EnsembleRecord
-from litho_design.optimisation.settings import DesignSettings
+from litho_design.optimisation.disagreement import EnsembleRecord
+from litho_design.optimisation.settings import without
 from litho_design.printers.layout import LayoutSettings, Printability
-from litho_design.printers.printer import Printer, PrinterRecord, TilingCheck
+from litho_design.printers.printer import PrinterRecord, TilingCheck
 from litho_design.printers.training import OutOfDistribution
+from litho_design.tasks.width import Width
 
 LEVELS_FILE = "layout_level.npy"
 HEIGHT_FILE = "predicted_height_um.npy"
@@ -38,7 +37,7 @@ DESIGNS = "designs"
 
 
 class RunRecord(RunFacts):
-    """Command, software, device, duration with interrupted runs; older result files may have no commit."""
+    """Command, software, device, duration with interrupted runs."""
 
     device: str
     threads: int
@@ -59,13 +58,25 @@ class RunRecord(RunFacts):
         )
 
 
-class Design(Result):
+class Findings(Record):
+    """What a task finds out about its levels and their print; ``thick``: the print as a thick element."""
+
+    tiling: TilingCheck | None = None
+    ensemble: EnsembleRecord | None = None
+    printability: Printability
+    out_of_distribution: OutOfDistribution | None = None
+    reference_efficiency: float | None = None
+    predicted: dict[str, float]
+    baselines: dict[str, dict[str, float]] | None = None
+    thick: dict[str, float] | None = None
+
+
+class Design(Findings, Result):
     """design.json."""
 
     SCHEMA: ClassVar[str] = "litho-design/design/1"
     FILE_NAME: ClassVar[str] = "design.json"
 
-    schema_: Literal["litho-design/design/1"] = Field(default="litho-design/design/1", alias="schema")
     task: str
     variant: str
     fingerprint: str
@@ -75,48 +86,20 @@ class Design(Result):
     optics: Optics
     target: TargetRecord | None = None
     printer: PrinterRecord
-    printer_unchanged: bool
-    tiling: TilingCheck | None = None
-    ensemble: EnsembleRecord | None = None
     stroke: Stroke
-    printability: Printability
-    out_of_distribution: OutOfDistribution | None = None
     notes: list[str] = Field(default_factory=list)
     iterations: int
     start_loss: float
     sample_loss: float
     argmax_loss: float
     polished_loss: float
-    reference_efficiency: float | None = None
-    predicted: dict[str, float]
-    # Both are absent in older designs; the second is the same print as a thick element.
-    baselines: dict[str, dict[str, float]] | None = None
-    thick: dict[str, float] | None = None
+    width: Width | None = None
     files: dict[str, str]
 
+    @model_validator(mode="before")
     @classmethod
-    def searched(
-        cls,
-        settings: DesignSettings,
-        printer: Printer,
-        level_heights_um: list[float],
-        state: SearchState,
-        **found: Any,
-    ) -> Design:
-        """The record of a layout that was searched; ``found``: the fields that these do not decide."""
-        layout, wave_um = settings.layout, settings.optics.wave_height_um
-        return cls(
-            variant=settings.variant,
-            settings=settings.model_dump(mode="json"),
-            layout=layout,
-            optics=settings.optics,
-            printer=printer.record(),
-            stroke=measure_stroke(level_heights_um, wave_um, level_height_um=layout.level_height_um),
-            iterations=state.iteration,
-            sample_loss=state.history[-1]["sample_loss"],
-            argmax_loss=state.best_loss,
-            **found,
-        )
+    def _without_what_is_gone(cls, content: Any) -> Any:
+        return without(content, [("printer_unchanged",)])
 
     @property
     def in_rings(self) -> bool:
@@ -127,35 +110,6 @@ class Design(Result):
     def layout_sha256(self) -> str:
         """Hash of the file of levels."""
         return self.files[RINGS_FILE if self.in_rings else LEVELS_FILE]
-
-
-def finished_design(folder: Path, fingerprint: str, settings: DesignSettings) -> Design | None:
-    """The design that a folder holds already; None where there is none, and the folder is there then.
-
-    Raises:
-        InputError: a folder with something else, or a design of other settings, another target or model.
-    """
-    require_own_folder(folder, Design.FILE_NAME, CHECKPOINTS)
-    if not (folder / Design.FILE_NAME).exists():
-        with writable(folder):
-            folder.mkdir(parents=True, exist_ok=True)
-        return None
-    design = Design.read(folder)
-    if design.fingerprint != fingerprint:
-        asked = settings.model_dump(mode="json")
-        if setting := first_difference(design.settings, asked):
-            other = f"a design with other settings, {setting}"
-        elif setting := first_addition(design.settings, asked):
-            other = f"a design of a version without the setting {setting}"
-        else:
-            other = "a design with another target or model, or other bands"
-        raise InputError(
-            f"folder {folder}",
-            got=other,
-            wanted="the same settings, target and model",
-            hint="choose another --out",
-        )
-    return design
 
 
 def write_arrays(folder: Path, arrays: dict[str, np.ndarray]) -> dict[str, str]:

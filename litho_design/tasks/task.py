@@ -20,16 +20,25 @@ from litho_data.foundation.errors import InputError, unknown_name
 from litho_data.foundation.results import Record
 from litho_design.images.targets import TargetRecord
 from litho_design.optics import Optics
+from litho_design.optimisation.checkpoint import finished_iterations
+from litho_design.optimisation.disagreement import disagreement_um, measure_disagreement
 from litho_design.optimisation.fabrication import fabrication_penalty
-from litho_design.optimisation.parameters import CellMap, Parametrisation
+from litho_design.optimisation.parameters import CellMap, Parametrisation, make_parametrisation
 from litho_design.optimisation.phases import printed_phase
-from litho_design.optimisation.process_window import Draw, check_draws, draws
-from litho_design.optimisation.robust import penalised, windowed_loss
+from litho_design.optimisation.process_window import Draw, check_draws, draws, risk
 from litho_design.optimisation.settings import DesignSettings
-from litho_design.optimisation.starts import Scene, check_start, start_levels, start_search
+from litho_design.printers.layout import printability
 from litho_design.printers.printer import Printer
 from litho_design.tasks.bench import ViewsBench
-from litho_design.tasks.design import IMAGE_FILE
+from litho_design.tasks.design import (
+    HEIGHT_FILE,
+    IMAGE_FILE,
+    LEVELS_FILE,
+    Findings,
+    write_arrays,
+    write_level_image,
+)
+from litho_design.tasks.staying_inside import cost_of_staying_inside
 
 
 class Figures(Record):
@@ -49,6 +58,9 @@ class Task:
         name: in results; one for every task.
         starts: starts of the search that make sense.
         headline: figures that reports and commands show first; all of them where empty.
+        errors: figures that are better when lower.
+        polished, reported: whether the search ends with single-level changes, and the run with a page.
+        part, leads: its checkpoint, and whether it writes the record, where several processes share it.
         score_type: record of the scores, whose field descriptions are the meanings in reports.
         settings: as given, as are ``printer``, ``printers`` and ``inputs``; ``notes``: for the record.
         bench: from a height map to what is seen, in the optics of the settings.
@@ -66,8 +78,11 @@ class Task:
     name: ClassVar[str]
     starts: ClassVar[tuple[str, ...]] = ("random",)
     headline: ClassVar[tuple[str, ...]] = ()
+    errors: ClassVar[tuple[str, ...]] = ()
     score_type: ClassVar[type[Record]] = Figures
     settings_type: ClassVar[type[DesignSettings]] = DesignSettings
+    polished = reported = leads = True
+    part = ""
 
     def __init__(
         self,
@@ -77,12 +92,17 @@ class Task:
         inputs: Mapping[str, np.ndarray] | None = None,
         ensemble: Sequence[Printer] = (),
     ):
-        check_start(settings.search.start, self.starts, self.name)
+        start = settings.search.start
+        if start not in self.starts:
+            wanted = f"{', '.join(map(repr, self.starts))} for {self.name}"
+            raise InputError("start", got=repr(start), wanted=wanted)
         self.settings, self.printer, self.printers = settings, printer, [printer, *ensemble]
         self.inputs = dict(inputs or {})
         self.target_record: TargetRecord | None = None
         self.notes: list[str] = []
-        self.cells = CellMap(settings.layout).to(printer.device)
+        # Models of the printer that take no part in the search.
+        self.judges: Sequence[Printer] = ()
+        self.cells = self.make_cells().to(printer.device)
         self.bench: Any = self.make_bench(settings.optics)
         for optics in self.views(settings.optics):
             check_draws(settings.window, optics, self.bench.grid, self.bench.window)
@@ -107,9 +127,30 @@ class Task:
 
     # What holograms and lenses do in their own way.
 
+    def make_cells(self) -> CellMap:
+        """From one value per free cell to the pixels that are searched."""
+        return CellMap(self.settings.layout)
+
     def make_bench(self, optics: Optics) -> Any:
         """From a height map (size, size), µm, to what is seen."""
         return ViewsBench(self.settings.layout, self.views(optics)).to(self.printer.device)
+
+    def start_levels(self, level_phase: Tensor) -> Tensor:
+        """Levels (*cells) where the search starts unless at random.
+
+        Args:
+            level_phase: phase that each level prints, radian (levels,).
+        """
+        raise NotImplementedError
+
+    def untouched(self) -> dict[str, Tensor]:
+        """Layouts (size, size) of doing nothing about the printer, by name: the start at nominal heights."""
+        if set(self.starts) == {"random"}:
+            return {}
+        layout = self.settings.layout
+        nominal = [level * layout.level_height_um for level in range(layout.levels)]
+        phase = printed_phase(nominal, self.settings.optics).to(self.printer.device)
+        return {"nominal heights": self.cells(self.start_levels(phase).to(self.printer.device))}
 
     def search_bench(self, optics: Optics) -> Any:
         """The bench of the search, from ``search_print`` to what the loss sees."""
@@ -123,17 +164,10 @@ class Task:
         """Area that each height of ``search_print`` covers; None for pixels."""
         return None
 
-    def scene(self, level_phase: Tensor) -> Scene:
-        """What a start can use."""
-        settings, search = self.settings, self.settings.search
-        return Scene(
-            cells=self.cells,
-            pitch_um=settings.layout.pitch_um,
-            optics=settings.optics,
-            level_phase=level_phase.to(self.printer.device),
-            iterations=search.start_iterations,
-            seed=search.seed,
-        )
+    @torch.no_grad()
+    def printed_um(self, level: Tensor, printer: int = 0) -> Tensor:
+        """Height, µm, that a design keeps of its levels on the pixels."""
+        return self.printers[printer](level[None, None].float())[0, 0]
 
     def score(self, height_um: Tensor, expected_um: Tensor | None = None) -> Record:
         """Score of a print (size, size), µm, whose design expected another one, or the same."""
@@ -152,6 +186,36 @@ class Task:
     def window_figures(self, seen: Tensor) -> Mapping[str, float]:
         """Figures of one draw of the process window."""
         return self.figures(seen)
+
+    def finished_iterations(self, folder: Path) -> int:
+        """Finished iterations of an interrupted run in ``folder``."""
+        return finished_iterations(folder, self.part)
+
+    def together(self, value: bool) -> bool:
+        """Whether this holds for any of the processes that share the search, when all are here."""
+        return value
+
+    def save(self, folder: Path, level: Tensor, height_um: Tensor) -> dict[str, str]:
+        """Write levels, print and what is seen; SHA-256 by file name."""
+        levels = level.cpu().numpy().astype(np.uint8)
+        arrays = {LEVELS_FILE: levels, HEIGHT_FILE: height_um.cpu().numpy(), **self.arrays(height_um)}
+        return write_arrays(folder, arrays) | write_level_image(folder, levels)
+
+    def findings(self, level: Tensor, height_um: Tensor) -> Findings:
+        """What the record of a design says of its levels and their print."""
+        settings, layout = self.settings, self.settings.layout
+        whole, levels = level[None, None].float(), level.cpu().numpy().astype(np.uint8)
+        thick = self.thick_score(height_um)
+        return Findings(
+            tiling=self.printer.tiling_check(whole),
+            ensemble=measure_disagreement(self.printers, whole, settings.optics.wave_height_um),
+            printability=printability(levels, layout),
+            out_of_distribution=cost_of_staying_inside(self, level),
+            reference_efficiency=self.reference_efficiency(height_um),
+            predicted=self.score(height_um).model_dump(),
+            baselines=self.baselines(),
+            thick=None if thick is None else thick.model_dump(),
+        )
 
     def arrays(self, height_um: Tensor) -> dict[str, np.ndarray]:
         """Arrays saved beside levels and heights: what is seen, and the inputs, by file name."""
@@ -197,26 +261,43 @@ class Task:
             (None, self.search_bench(optics))
         ]
 
+    def free_parameters(self) -> Parametrisation:
+        """Free parameters of the search, at its start."""
+        search, optics = self.settings.search, self.settings.optics
+        parameters = make_parametrisation(self.settings.layout, search, self.cells).to(self.printer.device)
+        if search.start == "random":
+            parameters.start_random(search.seed)
+        else:
+            phase = printed_phase(self.printer.level_heights_um(), optics).to(self.printer.device)
+            levels = self.start_levels(phase).float()
+            parameters.start_from(levels, jitter_levels=search.start_jitter_levels, seed=search.seed)
+        return parameters
+
     def objective(self, level: Tensor) -> tuple[Tensor, dict[str, float]]:
         """Loss of levels on the pixels (1, 1, size, size), and its parts.
 
-        With process-window samples: the risk of the loss over them; with an ensemble: its mean over
-        the models, and their disagreement; then the penalties on what the printer can make.
+        Of several models their mean, or the worst of them, and their disagreement; over samples of the
+        process window its risk; then the penalties on what the printer can make.
         """
-        settings = self.settings
-        prints = [self.search_print(level, number) for number in range(len(self.printers))]
-        loss, parts = windowed_loss(
-            prints, self.scenes, self._loss_of_print, settings.window, settings.layout.pitch_um
-        )
-        wave_um = settings.optics.wave_height_um
-        loss = penalised(loss, prints, settings.ensemble.weight, wave_um, self.search_area())
+        settings, prints = self.settings, [self.search_print(level, n) for n in range(len(self.printers))]
+        losses: list[Tensor] = []
+        parts: dict[str, float] = {}
+        for draw, bench in self.scenes:
+            drawn = [one if draw is None else draw.apply(one, settings.layout.pitch_um) for one in prints]
+            found = [self.loss_and_parts(bench(height)) for height in drawn]
+            parts = parts or found[0][1]
+            of_models = torch.stack([loss for loss, _ in found])
+            losses.append(of_models.max() if settings.ensemble.risk == "worst" else of_models.mean())
+        loss = losses[0]
+        if len(losses) > 1:
+            together = torch.stack(losses)
+            loss = risk(together, settings.window)
+            parts = {"mean": float(together.detach().mean()), "worst": float(together.detach().max())}
+        if len(prints) > 1 and settings.ensemble.weight:
+            apart_um = disagreement_um(torch.stack(prints), self.search_area())
+            loss = loss + settings.ensemble.weight * apart_um / settings.optics.wave_height_um
         extra = fabrication_penalty(level, settings.fabrication, settings.layout, self.printer.card)
         return loss if extra is None else loss + extra, parts
-
-    def start(self, parameters: Parametrisation, level_heights_um: list[float]) -> None:
-        """Set the start of the search, from the phases of the levels as printed."""
-        search, phase = self.settings.search, printed_phase(level_heights_um, self.settings.optics)
-        start_search(parameters, search, lambda: start_levels(search.start, self.scene(phase)))
 
     @torch.no_grad()
     def window_scores(self, height_um: Tensor, count: int) -> list[dict[str, float]]:
@@ -238,8 +319,9 @@ class Task:
             digest.update(_source(type(self)).encode())
         return digest.hexdigest()
 
-    def _loss_of_print(self, height_um: Tensor, bench: Any) -> tuple[Tensor, dict[str, float]]:
-        found = self.loss(bench(height_um))
+    def loss_and_parts(self, seen: Tensor) -> tuple[Tensor, dict[str, float]]:
+        """What ``loss`` gives, its named parts beside it."""
+        found = self.loss(seen)
         return found if isinstance(found, tuple) else (found, {})
 
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.outputs import require_own_folder
 from litho_data.foundation.run_facts import run_facts
 from litho_data.foundation.sending import Known
 from litho_data.foundation.workers import Workers, run_jobs
@@ -36,7 +36,7 @@ from litho_design.printers.printer import Printer
 from litho_design.printers.source import Device, load_printers
 from litho_design.reports.design import write_design_report
 from litho_design.reports.gap import write_gap_report
-from litho_design.tasks.design import DESIGNS, Design
+from litho_design.tasks.design import Design
 from litho_design.tasks.run import run_design
 from litho_design.tasks.task import Task, registered_task
 
@@ -98,7 +98,6 @@ def compare(
     others = load_printers(judges, settings.layout, **fit)
     _check(designers, others, every_seed)
     folder = Path(out)
-    require_own_folder(folder, GapResult.FILE_NAME, DESIGNS)
     # Printers are checked before a target is drawn or a picture is read.
     make: Callable[[Any, Printer], Task]
     if task is not None:
@@ -120,27 +119,28 @@ def compare(
         search = settings.search.model_copy(update={"seed": seed})
         own = settings.model_copy(update={"search": search})
         jobs.append((make, own, printer, design_folder(folder, arm, seed), announce))
-    done = run_jobs(_design, jobs, Workers(workers, dask, known), name=lambda job: str(job[3]))
-    designs = [design for _, design in progress(done, "designs", len(jobs))]
-    entries = [
-        entry
-        for arm, seed in itertools.product(designers, every_seed)
-        for entry in _judged(design_folder(folder, arm, seed), arm, seed, everyone)
-    ]
-    result = GapResult(
-        task=designs[0].task,
-        **run_facts(),
-        settings=settings,
-        target=designs[0].target.name if designs[0].target else "",
-        seeds=every_seed,
-        arms={name: printer.record() for name, printer in designers.items()},
-        judges={name: printer.record() for name, printer in everyone.items()},
-        entries=entries,
-        summary=summarise(entries),
-        paired=paired_differences(entries, headline(designs[0].task) or tuple(designs[0].predicted)),
-    )
-    report(folder, result, everyone)
-    result.write(folder)
+    with growing_folder(folder, GapResult.FILE_NAME):
+        done = run_jobs(_design, jobs, Workers(workers, dask, known), name=lambda job: str(job[3]))
+        designs = [design for _, design in progress(done, "designs", len(jobs))]
+        entries = [
+            entry
+            for arm, seed in itertools.product(designers, every_seed)
+            for entry in _judged(design_folder(folder, arm, seed), arm, seed, everyone)
+        ]
+        result = GapResult(
+            task=designs[0].task,
+            **run_facts(),
+            settings=settings,
+            target=designs[0].target.name if designs[0].target else "",
+            seeds=every_seed,
+            arms={name: printer.record() for name, printer in designers.items()},
+            judges={name: printer.record() for name, printer in everyone.items()},
+            entries=entries,
+            summary=summarise(entries),
+            paired=paired_differences(entries, headline(designs[0].task) or tuple(designs[0].predicted)),
+        )
+        report(folder, result, everyone)
+        result.write(folder)
     return result
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from litho_design.lenses.task import lens_task
 from litho_design.optimisation.settings import DesignSettings
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
-from litho_design.printers.source import Device, load_printer, load_printers
+from litho_design.printers.source import Device, load_printer, load_printers, models_at_hand
 from litho_design.reliefs.settings import ReliefSettings, relief_settings
 from litho_design.reliefs.targets import load_relief, print_off_um
 from litho_design.reliefs.task import ReliefTask
@@ -39,6 +39,8 @@ def design_hologram(
     *,
     settings: HologramSettings | None = None,
     ensemble: Iterable[str | Printer] = (),
+    judges: Iterable[str | Printer] | None = None,
+    robust: bool = False,
     device: Device = "cpu",
     extrapolate: bool = False,
     announce: bool = True,
@@ -52,6 +54,9 @@ def design_hologram(
         settings: geometry, optics, search and loss; ``hologram_settings()`` by default.
         ensemble: further models, MODEL or NAME=MODEL: the loss is the mean over all models, plus a
             penalty on their disagreement.
+        judges: models that print the finished layout, the width of the design; those of the zoo that were
+            trained on the same prints by default.
+        robust: search with the judges for the layout whose worst loss is the lowest, instead of printing it.
         device: where models are loaded.
         extrapolate: accept heights beyond a model's calibration; recorded in the result.
         announce: print the expected time and memory to stderr before starting.
@@ -65,10 +70,11 @@ def design_hologram(
     """
     made = _of_kind(settings or hologram_settings(), HologramSettings)
 
-    def task(printer: Printer, others: list[Printer]) -> Task:
-        return HologramTask(made, printer, load_target(target, made.layout.size_px), others)
+    def task(printer: Printer, others: list[Printer], worst: bool) -> Task:
+        wanted = load_target(target, made.layout.size_px)
+        return HologramTask(_over_worst(made, worst), printer, wanted, others)
 
-    return _designed(task, made.layout, out, announce, model, ensemble, device, extrapolate)
+    return _designed(task, made.layout, out, announce, model, ensemble, judges, robust, device, extrapolate)
 
 
 def design_lens(
@@ -79,6 +85,8 @@ def design_lens(
     objects: Sequence[str | Path] = (),
     held_out_objects: Sequence[str | Path] = (),
     ensemble: Iterable[str | Printer] = (),
+    judges: Iterable[str | Printer] | None = None,
+    robust: bool = False,
     device: Device = "cpu",
     extrapolate: bool = False,
     announce: bool = True,
@@ -91,7 +99,7 @@ def design_lens(
         settings: geometry, optics, task and search; ``lens_settings()`` by default.
         objects: pictures, or folders of them, that a computational lens images instead of the drawings.
         held_out_objects: pictures or folders that are only scored (see ``with_objects``).
-        ensemble, device, extrapolate, announce: as for ``design_hologram``.
+        ensemble, judges, robust, device, extrapolate, announce: as for ``design_hologram``.
 
     Returns:
         The record written to ``out/design.json``.
@@ -102,11 +110,11 @@ def design_lens(
     """
     made = _of_kind(settings or lens_settings(), LensSettings)
 
-    def task(printer: Printer, others: list[Printer]) -> Task:
-        imaging, pictures = with_objects(made, objects, held_out_objects)
+    def task(printer: Printer, others: list[Printer], worst: bool) -> Task:
+        imaging, pictures = with_objects(_over_worst(made, worst), objects, held_out_objects)
         return lens_task(imaging, printer, others, pictures)
 
-    return _designed(task, made.layout, out, announce, model, ensemble, device, extrapolate)
+    return _designed(task, made.layout, out, announce, model, ensemble, judges, robust, device, extrapolate)
 
 
 def correct(
@@ -118,6 +126,8 @@ def correct(
     after: str | Path | None = None,
     scan: MeasuredSource | None = None,
     ensemble: Iterable[str | Printer] = (),
+    judges: Iterable[str | Printer] | None = None,
+    robust: bool = True,
     device: Device = "cpu",
     extrapolate: bool = False,
     announce: bool = True,
@@ -131,7 +141,7 @@ def correct(
         settings: layout, height, search and process window; ``relief_settings()`` by default.
         after: folder of a first correction whose print was measured; ``scan``: that measurement. What the
             print was off from its expectation is expected again.
-        ensemble, device, extrapolate, announce: as for ``design_hologram``.
+        ensemble, judges, robust, device, extrapolate, announce: as for ``design_hologram``.
 
     Returns:
         The record written to ``out/design.json``; what no layout prints is in ``unprintable_um.npy``.
@@ -142,12 +152,12 @@ def correct(
     """
     made = _of_kind(settings or relief_settings(), ReliefSettings)
 
-    def task(printer: Printer, others: list[Printer]) -> Task:
+    def task(printer: Printer, others: list[Printer], worst: bool) -> Task:
         heights, record = load_relief(relief, made.layout, made.height_um)
         inputs = {"relief_um": heights} | _print_off(made, after, scan)
-        return ReliefTask(made, printer, inputs=inputs, ensemble=others, record=record)
+        return ReliefTask(_over_worst(made, worst), printer, inputs=inputs, ensemble=others, record=record)
 
-    return _designed(task, made.layout, out, announce, model, ensemble, device, extrapolate)
+    return _designed(task, made.layout, out, announce, model, ensemble, judges, robust, device, extrapolate)
 
 
 def _print_off(
@@ -177,6 +187,8 @@ def design(
     settings: DesignSettings | None = None,
     inputs: Mapping[str, np.ndarray] | None = None,
     ensemble: Iterable[str | Printer] = (),
+    judges: Iterable[str | Printer] | None = None,
+    robust: bool = False,
     device: Device = "cpu",
     extrapolate: bool = False,
     announce: bool = True,
@@ -189,7 +201,7 @@ def design(
         out: folder of the design; an interrupted run in it resumes.
         settings: geometry, optics, search, process window; ``design_settings()`` by default.
         inputs: arrays that the task needs, by name.
-        ensemble, device, extrapolate, announce: as for ``design_hologram``.
+        ensemble, judges, robust, device, extrapolate, announce: as for ``design_hologram``.
 
     Returns:
         The record written to ``out/design.json``.
@@ -203,26 +215,44 @@ def design(
     registered_task(task.name)
     made = settings or DesignSettings()
 
-    def of_task(printer: Printer, others: list[Printer]) -> Task:
-        return task(made, printer, inputs=inputs, ensemble=others)
+    def of_task(printer: Printer, others: list[Printer], worst: bool) -> Task:
+        return task(_over_worst(made, worst), printer, inputs=inputs, ensemble=others)
 
-    return _designed(of_task, made.layout, out, announce, model, ensemble, device, extrapolate)
+    return _designed(
+        of_task, made.layout, out, announce, model, ensemble, judges, robust, device, extrapolate
+    )
 
 
 def _designed(
-    make: Callable[[Printer, list[Printer]], Task],
+    make: Callable[[Printer, list[Printer], bool], Task],
     layout: LayoutSettings,
     out: str | Path,
     announce: bool,
     model: str | Path | Printer,
     ensemble: Iterable[str | Printer],
+    judges: Iterable[str | Printer] | None,
+    robust: bool,
     device: Device,
     extrapolate: bool,
 ) -> Design:
     """The design of a task, made when its printers are there: they are refused before a target is read."""
-    printer = load_printer(model, layout, device=device, extrapolate=extrapolate)
-    others = load_printers(ensemble, layout, device=device, extrapolate=extrapolate)
-    return run_design(make(printer, list(others.values())), out, write_design_report, announce=announce)
+    fit: Any = {"device": device, "extrapolate": extrapolate}
+    printer = load_printer(model, layout, **fit)
+    others = list(load_printers(ensemble, layout, **fit).values())
+    rivals = (
+        models_at_hand([printer, *others], layout, device=device)
+        if judges is None
+        else list(load_printers(judges, layout, **fit).values())
+    )
+    in_search = [one for one in rivals if robust and not one.only_judges]
+    task = make(printer, others + in_search, bool(in_search))
+    task.judges = [one for one in rivals if one not in in_search]
+    return run_design(task, out, write_design_report, announce=announce)
+
+
+def _over_worst(settings: S, worst: bool) -> S:
+    ensemble = settings.ensemble.model_copy(update={"risk": "worst"})
+    return settings.model_copy(update={"ensemble": ensemble}) if worst else settings
 
 
 def _of_kind(settings: S, kind: type[S]) -> S:

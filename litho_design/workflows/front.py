@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.outputs import require_own_folder
 from litho_data.foundation.run_facts import run_facts
 from litho_data.foundation.sending import Known
 from litho_data.foundation.workers import Workers, run_jobs
@@ -60,7 +60,6 @@ def efficiency_front(
             "weights of the front", got=", ".join(f"{one:g}" for one in weights), wanted="two or more, from 0"
         )
     folder, made = Path(out), settings or hologram_settings()
-    require_own_folder(folder, FrontResult.FILE_NAME, DESIGNS)
     load = partial(_printers, model, list(ensemble), made.layout, device, extrapolate)
     printers = load()
     name = "si_psnr_window_db" if made.loss.signal_window_um else "si_psnr_db"
@@ -71,26 +70,29 @@ def efficiency_front(
         own = made.model_copy(update={"loss": loss})
         jobs.append((weight, target, [*printers.values()], folder / place, own, announce))
     where = Workers(workers, dask, Known(load, printers))
-    done = run_jobs(_design, jobs, where, name=lambda job: f"weight {job[0]:g}")
-    designs = {weight: design for (weight, *_), design in progress(done, "designs", len(jobs))}
-    found = [
-        (weight, str(place), designs[weight].predicted[name], designs[weight].predicted["eff_signal"])
-        for weight, place in places.items()
-    ]
-    points = [
-        FrontPoint(
-            efficiency_weight=weight,
-            folder=place,
-            si_psnr_db=psnr,
-            eff_signal=share,
-            on_front=not any(p >= psnr and s >= share and (p, s) != (psnr, share) for _, _, p, s in found),
-        )
-        for weight, place, psnr, share in found
-    ]
-    baselines = designs[max(weights)].baselines
-    result = FrontResult(**run_facts(), figure=name, points=points, baselines=baselines)
-    write_front_report(folder, result, printers[""].name)
-    result.write(folder)
+    with growing_folder(folder, FrontResult.FILE_NAME):
+        done = run_jobs(_design, jobs, where, name=lambda job: f"weight {job[0]:g}")
+        designs = {weight: design for (weight, *_), design in progress(done, "designs", len(jobs))}
+        found = [
+            (weight, str(place), designs[weight].predicted[name], designs[weight].predicted["eff_signal"])
+            for weight, place in places.items()
+        ]
+        points = [
+            FrontPoint(
+                efficiency_weight=weight,
+                folder=place,
+                si_psnr_db=psnr,
+                eff_signal=share,
+                on_front=not any(
+                    p >= psnr and s >= share and (p, s) != (psnr, share) for _, _, p, s in found
+                ),
+            )
+            for weight, place, psnr, share in found
+        ]
+        baselines = designs[max(weights)].baselines
+        result = FrontResult(**run_facts(), figure=name, points=points, baselines=baselines)
+        write_front_report(folder, result, printers[""].name)
+        result.write(folder)
     return result
 
 

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 
+from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.outputs import require_own_folder
 from litho_design.holograms.settings import HologramSettings, hologram_settings
 from litho_design.images.targets import Target, load_target
 from litho_design.judging.score import JudgedScore, ScoreResult
 from litho_design.large.bands import Bands, Ranks
 from litho_design.large.cost import disk_gib, fit_cost, measure_size, sent_gib
-from litho_design.large.lens import design_in_rings, judge_rings
-from litho_design.large.run import design_in_bands
+from litho_design.large.hologram import BandedHologram
+from litho_design.large.lens import RingLens, judge_rings
 from litho_design.large.score import (
     image_figures,
     image_from_disk,
@@ -30,6 +30,7 @@ from litho_design.optics.source import require_one_wave
 from litho_design.optimisation.stitching import Stitching
 from litho_design.printers.printer import Printer
 from litho_design.printers.source import Device, load_printer, load_printers
+from litho_design.reports.design import write_design_report
 from litho_design.reports.score import write_score_report
 from litho_design.tasks.design import (
     HEIGHT_FILE,
@@ -39,6 +40,7 @@ from litho_design.tasks.design import (
     Design,
     read_array,
 )
+from litho_design.tasks.run import run_design
 
 BAND_PX = 512
 
@@ -71,7 +73,8 @@ def design_large_hologram(
     layout = made.layout
     printer = load_printer(model, layout, device=ranks.device(device), extrapolate=extrapolate)
     bands = Bands(layout.size_px, band_px, ranks, layout.cell_px)
-    return design_in_bands(made, printer, load_target(target, layout.size_px), out, bands, announce=announce)
+    task = BandedHologram(made, printer, load_target(target, layout.size_px), bands)
+    return run_design(task, out, write_design_report, announce=announce)
 
 
 def design_large_lens(
@@ -95,7 +98,7 @@ def design_large_lens(
     """
     made = settings or lens_settings()
     printer = load_printer(model, made.layout, device=device, extrapolate=extrapolate)
-    return design_in_rings(made, printer, out, tile_px=tile_px, announce=announce)
+    return run_design(RingLens(made, printer, tile_px), out, write_design_report, announce=announce)
 
 
 def score_from_disk(
@@ -118,7 +121,6 @@ def score_from_disk(
         InputError: as ``score``; a design that is no hologram of a thin element, or a judge without a
             finite reach.
     """
-    require_own_folder(out, ScoreResult.FILE_NAME)
     folder, record = Path(design), Design.read(design)
     layout, optics = record.layout, record.optics
     if record.task != "hoe" or optics.element != "thin":
@@ -132,28 +134,31 @@ def score_from_disk(
     if not printers:
         raise InputError("score", got="nothing to judge with", wanted="a judge")
     bands = Bands(layout.size_px, band_px)
-    Path(out).mkdir(parents=True, exist_ok=True)
-    scores, pictures = [], {"in design": preview(seen, bands)}
-    for printer in printers.values():
-        judge = printer.record()
-        with tempfile.TemporaryDirectory(prefix=".large-", dir=out) as name:
-            room = Path(name)
-            height, image = (
-                np.memmap(room / file, np.float32, "w+", shape=level.shape) for file in ("height", "image")
-            )
-            print_from_disk(level, printer, bands, height)
-            printed: np.ndarray = height
-            if stitch is not None:
-                printed = in_fields_from_disk(height, layout.pitch_um, stitch, bands, on_disk(room)).numpy()
-            zero_order = image_from_disk(printed, layout.pitch_um, optics, bands, image, on_disk(room))
-            off_um = _difference(printed, expected, bands)
-            figures = image_figures(image, target, bands) | {"zero_order_share": zero_order}
-            pictures[f"printed by {judge.name}"] = preview(image, bands)
-        scores.append(JudgedScore.of_print(record, judge, off_um, figures, stitching=stitch))
-    result = ScoreResult.of(folder, record, scores)
-    brightest = {title: picture / picture.max() for title, picture in pictures.items()}
-    write_score_report(Path(out), result, brightest, layout.size_um, {}, layout.size_um)
-    result.write(out)
+    with growing_folder(out, ScoreResult.FILE_NAME):
+        scores, pictures = [], {"in design": preview(seen, bands)}
+        for printer in printers.values():
+            judge = printer.record()
+            with tempfile.TemporaryDirectory(prefix=".large-", dir=out) as name:
+                room = Path(name)
+                height, image = (
+                    np.memmap(room / file, np.float32, "w+", shape=level.shape)
+                    for file in ("height", "image")
+                )
+                print_from_disk(level, printer, bands, height)
+                printed: np.ndarray = height
+                if stitch is not None:
+                    printed = in_fields_from_disk(
+                        height, layout.pitch_um, stitch, bands, on_disk(room)
+                    ).numpy()
+                zero_order = image_from_disk(printed, layout.pitch_um, optics, bands, image, on_disk(room))
+                off_um = _difference(printed, expected, bands)
+                figures = image_figures(image, target, bands) | {"zero_order_share": zero_order}
+                pictures[f"printed by {judge.name}"] = preview(image, bands)
+            scores.append(JudgedScore.of_print(record, judge, off_um, figures, stitching=stitch))
+        result = ScoreResult.of(folder, record, scores)
+        brightest = {title: picture / picture.max() for title, picture in pictures.items()}
+        write_score_report(Path(out), result, brightest, layout.size_um, {}, layout.size_um)
+        result.write(out)
     return result
 
 
@@ -171,16 +176,16 @@ def score_rings(
     Raises:
         InputError: as ``score``, or a judge without a finite reach.
     """
-    require_own_folder(out, ScoreResult.FILE_NAME)
     folder, record = Path(design), Design.read(design)
     printers = load_printers(judges, record.layout, device=device, extrapolate=extrapolate)
     if not printers:
         raise InputError("score", got="nothing to judge with", wanted="a judge")
-    scores, pictures, side_um = judge_rings(folder, record, list(printers.values()), tile_px)
-    result = ScoreResult.of(folder, record, scores)
-    shown = {title: np.sqrt(psf / psf.max()) for title, psf in pictures.items()}
-    write_score_report(Path(out), result, shown, side_um, {}, side_um)
-    result.write(out)
+    with growing_folder(out, ScoreResult.FILE_NAME):
+        scores, pictures, side_um = judge_rings(folder, record, list(printers.values()), tile_px)
+        result = ScoreResult.of(folder, record, scores)
+        shown = {title: np.sqrt(psf / psf.max()) for title, psf in pictures.items()}
+        write_score_report(Path(out), result, shown, side_um, {}, side_um)
+        result.write(out)
     return result
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import Path
 
+from litho_data.foundation.begun import growing_folder
 from litho_data.foundation.errors import InputError
-from litho_data.foundation.outputs import require_own_folder
 from litho_design.judging.loaded import LoadedDesign
 from litho_design.judging.score import MeasuredSource, PhotoSource, ScoreResult, judge_design
 from litho_design.optics.thin_element import ElementKind
@@ -57,7 +57,6 @@ def score(
             given = "a scan, a photograph, another element or write fields"
             raise InputError("score of a lens in rings", got=given, wanted="models as judges")
         return score_rings(design, out, judges=judges, device=device, extrapolate=extrapolate)
-    require_own_folder(out, ScoreResult.FILE_NAME)
     loaded = (
         design if isinstance(design, LoadedDesign) else LoadedDesign(design, device=device, element=element)
     )
@@ -65,10 +64,11 @@ def score(
     printers = load_printers(judges, record.layout, device=loaded.device, extrapolate=extrapolate)
     if not printers and scan is None and camera is None:
         raise InputError("score", got="nothing to judge with", wanted="a judge, a scan or a photograph")
-    judgement = judge_design(loaded, list(printers.values()), scan, camera, stitch)
-    result = ScoreResult.of(loaded.folder, record, judgement.scores)
-    wanted = {} if loaded.target is None else {"wanted": loaded.target.cpu().numpy()}
-    shown = wanted | {title: loaded.display(image) for title, image in judgement.pictures.items()}
-    write_score_report(Path(out), result, shown, loaded.window_um, judgement.photos, loaded.frame_um)
-    result.write(out)
+    with growing_folder(out, ScoreResult.FILE_NAME):
+        judgement = judge_design(loaded, list(printers.values()), scan, camera, stitch)
+        result = ScoreResult.of(loaded.folder, record, judgement.scores)
+        wanted = {} if loaded.target is None else {"wanted": loaded.target.cpu().numpy()}
+        shown = wanted | {title: loaded.display(image) for title, image in judgement.pictures.items()}
+        write_score_report(Path(out), result, shown, loaded.window_um, judgement.photos, loaded.frame_um)
+        result.write(out)
     return result

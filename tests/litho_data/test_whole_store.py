@@ -128,7 +128,7 @@ IMPOSSIBLE: dict[str, tuple[Change, str]] = {
     "a name that is a path": (lambda s: put_attribute(s, "name", "../../escaped"), "name of .*plain name"),
     "a pitch beyond all": (lambda s: put_attribute(s, "pitch_um", 1e300), "attribute pitch_um"),
     "a pitch of 4,000 digits": (lambda s: put_attribute(s, "pitch_um", 10**4000), "attribute pitch_um"),
-    "a write field of no size": (lambda s: put_attribute(s, "write_field_um", -3.0), "attribute write_field_um"),
+    "a write field of no size": (lambda s: put_attribute(s, "write_field_um", -3.0), "write_field_um of"),
     "a card that is none": (lambda s: put_attribute(s / "manifest", "card", "none"), "manifest"),
     "a build without software": (lambda s: put_attribute(s / "manifest", "build", {}), "manifest"),
     "facts of a reader that are no JSON": (lambda s: put(s, "manifest/read", "{"), "manifest"),

@@ -13,8 +13,9 @@ from litho_design.holograms.settings import HologramSettings, hologram_settings
 from litho_design.images.targets import load_target
 from litho_design.large.bands import Bands, Ranks
 from litho_design.large.hologram import BandedHologram
-from litho_design.large.run import design_in_bands
 from litho_design.printers.printer import Printer
+from litho_design.reports.design import write_design_report
+from litho_design.tasks.run import run_design
 from tests.litho_design.conftest import BlurPrinter
 
 SIZE, BAND, ITERATIONS = 160, 32, 20
@@ -38,7 +39,7 @@ def work(folder: Path, ranks: Ranks) -> None:
     bands = Bands(SIZE, BAND, ranks, cell_px=4)
     rows = bands.rows()
     target = load_target("ring", SIZE)
-    hologram = BandedHologram(settings(), printer(), target.pixels, bands)
+    hologram = BandedHologram(settings(), printer(), target, bands)
     draw = torch.Generator().manual_seed(0)
     level = 12 * torch.rand(SIZE, SIZE, generator=draw)[rows.start : rows.stop]
     field = torch.randn(SIZE, SIZE, dtype=torch.complex64, generator=draw)[rows.start : rows.stop]
@@ -47,12 +48,18 @@ def work(folder: Path, ranks: Ranks) -> None:
     loss.backward()
     np.savez(
         folder / f"{ranks.rank}.npz",
-        field=hologram.propagator(field).numpy(),
-        back=hologram.propagator.adjoint(field).numpy(),
+        field=hologram.bench.propagator(field).numpy(),
+        back=hologram.bench.propagator.adjoint(field).numpy(),
         gradient=level.grad.numpy(),
         loss=float(loss.detach()),
     )
-    design_in_bands(settings(), printer(), target, folder / "design", bands, announce=False)
+    design(folder / "design", bands)
+
+
+def design(folder: Path, bands: Bands) -> None:
+    """The hologram of this process's bands."""
+    task = BandedHologram(settings(), printer(), load_target("ring", SIZE), bands)
+    run_design(task, folder, write_design_report, announce=False)
 
 
 def start(rank: int, count: int, port: int, folder: Path) -> None:

@@ -20,9 +20,9 @@ from litho_design.images.targets import load_target
 from litho_design.optics import Optics, RSPropagator, centred_grid, element_field, intensity_share
 from litho_design.optimisation import search as search_module
 from litho_design.optimisation.budget import Budget
-from litho_design.optimisation.parameters import CellMap
+from litho_design.optimisation.parameters import CellMap, make_parametrisation
 from litho_design.optimisation.polish import polish_levels
-from litho_design.optimisation.search import make_parametrisation, search_layout
+from litho_design.optimisation.search import search_layout
 from litho_design.optimisation.settings import SearchSettings
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
@@ -40,7 +40,6 @@ def test_a_design_beats_its_start_and_leaves_the_model_alone(tmp_path, small_set
     printer = make_printer(small_settings.layout)
     before = printer.weights_sha256()
     design = design_hologram(target, printer, tmp_path, settings=small_settings, announce=False)
-    assert design.printer_unchanged
     assert printer.weights_sha256() == before == design.printer.sha256
     assert all(p.grad is None and not p.requires_grad for p in printer.parameters())
     assert design.polished_loss <= design.argmax_loss < 0.5 * design.start_loss
@@ -54,30 +53,6 @@ def test_a_design_beats_its_start_and_leaves_the_model_alone(tmp_path, small_set
     # The same layout through the same model: the stored expectation must come out again.
     assert own.figures == pytest.approx(design.predicted, rel=1e-5)
     assert own.rms_height_difference_um == pytest.approx(0, abs=1e-7)
-
-
-def test_a_draft_is_a_search_through_another_model_where_the_search_starts(
-    tmp_path, small_settings, make_printer, target
-):
-    search = small_settings.search.model_copy(update={"draft": "none", "draft_iterations": 20})
-    settings = small_settings.model_copy(update={"search": search})
-    printer = make_printer(settings.layout)
-    made = design_hologram(target, printer, tmp_path / "draft", settings=settings, announce=False)
-    # The start is the layout that such a search ends with, printed by the model of the design.
-    alone = search.model_copy(update={"draft": "", "iterations": 20, "polish_rounds": 0})
-    nominal = Printer(None, settings.layout, source="none")
-    design_hologram(
-        target, nominal, tmp_path / "alone",
-        settings=settings.model_copy(update={"search": alone}), announce=False,
-    )  # fmt: skip
-    levels = torch.from_numpy(read_array(tmp_path / "alone", "layout_level.npy"))[None, None].float()
-    with torch.no_grad():
-        loss, _ = HologramTask(settings, printer, target).objective(levels)
-    assert made.start_loss == pytest.approx(float(loss), rel=1e-5)
-    assert made.polished_loss < made.start_loss
-    undrafted = settings.model_copy(update={"search": small_settings.search})
-    with pytest.raises(InputError, match="draft"):
-        design_hologram(target, printer, tmp_path / "draft", settings=undrafted, announce=False)
 
 
 @pytest.mark.parametrize("parametrisation", ["direct", "gumbel"])
@@ -133,7 +108,14 @@ def test_a_resumed_search_knows_what_the_interrupted_ones_took(tmp_path, monkeyp
     assert run().earlier_seconds == 21
 
 
-def test_a_damaged_checkpoint_is_refused(tmp_path, small_settings, make_printer, target):
+def test_a_damaged_checkpoint_is_refused(tmp_path, small_settings, make_printer, target, monkeypatch):
+    def stopped(*given, **named):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("litho_design.tasks.run.polish_levels", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            design_hologram(target, make_printer(small_settings.layout), tmp_path, settings=small_settings)
     (tmp_path / "checkpoint.pt").write_text("half a file")
     with pytest.raises(InputError, match=r"checkpoint\.pt.*damaged.*delete it"):
         design_hologram(target, make_printer(small_settings.layout), tmp_path, settings=small_settings)
@@ -159,6 +141,35 @@ def test_a_checkpoint_cut_short_is_damaged_and_one_that_cannot_be_read_is_not(tm
     # Nothing is said of a file to delete.
     with pytest.raises(IsADirectoryError):
         search()
+
+
+@pytest.mark.parametrize("where", ["score", "write_design_report"])
+def test_a_run_stopped_after_its_arrays_goes_on_without_a_checkpoint(
+    tmp_path, small_settings, make_printer, target, monkeypatch, where
+):
+    """Fewer iterations than between two checkpoints, stopped between the arrays and the record."""
+    search = small_settings.search.model_copy(update={"iterations": 4, "checkpoint_every": 50})
+    settings = small_settings.model_copy(update={"search": search})
+
+    def stopped(*given, **named):
+        raise KeyboardInterrupt
+
+    def design(folder):
+        return design_hologram(
+            target, make_printer(settings.layout), folder, settings=settings, announce=False
+        )
+
+    with monkeypatch.context() as patch:
+        if where == "score":
+            patch.setattr(HologramTask, "score", stopped)
+        else:
+            patch.setattr("litho_design.workflows.design.write_design_report", stopped)
+        with pytest.raises(KeyboardInterrupt):
+            design(tmp_path / "cut")
+    assert (tmp_path / "cut" / "layout_level.npy").exists()
+    assert not (tmp_path / "cut" / "design.json").exists()
+    assert design(tmp_path / "cut").files == design(tmp_path / "whole").files
+    assert not (tmp_path / "cut" / "begun.json").exists()
 
 
 def test_a_model_that_changes_while_it_prints_leaves_no_design(

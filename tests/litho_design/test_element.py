@@ -128,6 +128,65 @@ def test_torchoptics_takes_it_as_its_own(element):
     assert element.free.height.grad.abs().sum() > 0
 
 
+def test_a_field_in_metres_is_refused_where_micrometres_are_meant(element):
+    torchoptics = pytest.importorskip("torchoptics")
+    field = torchoptics.Field(torch.ones(40, 40), 532e-9, spacing=0.1e-6)
+    with pytest.raises(InputError, match=r"5\.32e-07 µm.*unit_um=1e6"):
+        element.as_torchoptics().modulation_profile(field.wavelength)
+
+
+@pytest.mark.parametrize("model", ["blur", "zoo:physics", "zoo:pbl"])
+def test_gradients_of_torch_func_are_those_of_autograd(model, make_printer):
+    """Of one and of several layouts at once, through models with gradients of their own too."""
+    layout = LayoutSettings(size_px=24, cell_um=0.4)
+    element = Element(make_printer(layout) if model == "blur" else model, layout, seed=1)
+    wave = torch.ones(24, 24, dtype=torch.complex64)
+
+    def loss(levels):
+        behind = torch.func.functional_call(element, {"free.height": levels}, (wave, 0.6328))
+        return (behind.real - 0.3).square().mean()
+
+    first, other = element.free.height.detach().clone(), element.free.height.detach().flip(0)
+    wanted = [torch.autograd.grad(loss(one.requires_grad_()), one)[0] for one in (first, other)]
+    first, other = first.detach(), other.detach()
+    # The same operations in another order: float32.
+    assert torch.allclose(torch.func.grad(loss)(first), wanted[0], rtol=1e-4, atol=1e-8)
+    both = torch.func.vmap(torch.func.grad(loss))(torch.stack([first, other]))
+    assert torch.allclose(both, torch.stack(wanted), rtol=1e-4, atol=1e-8)
+
+
+def test_batches_and_double_precision(element):
+    wave = torch.randn(3, 2, 40, 40, dtype=torch.complex128)
+    single = element(wave, 0.6328)
+    assert single.shape == wave.shape
+    exact = element.double()(wave, 0.6328)
+    assert exact.dtype == torch.complex128
+    # A phase of some waves in float32 is known to 1e-6.
+    assert (exact - single).abs().max() < 1e-5 * wave.abs().max()
+    element.float()
+
+
+def test_wrong_shapes_and_units_are_answered_in_one_line(element):
+    wave = torch.ones(40, 40, dtype=torch.complex64)
+    for call in (
+        lambda: element(wave[:39], 0.6),
+        lambda: element(wave, 0.6, torch.zeros(39, 40)),
+        lambda: element(wave, 600.0),
+        lambda: element.start_from_levels(np.zeros((20, 20))),
+        lambda: element.start_from_phase(torch.zeros(20, 20), 0.6),
+    ):
+        with pytest.raises(InputError) as refused:
+            call()
+        assert len(str(refused.value).splitlines()) == 1
+
+
+@pytest.mark.long
+def test_a_compiled_element_gives_the_same_wave(element):
+    wave = torch.ones(40, 40, dtype=torch.complex64)
+    compiled = torch.compile(element, backend="aot_eager")
+    assert torch.allclose(compiled(wave, 0.6328), element(wave, 0.6328), rtol=1e-5)
+
+
 def test_what_cannot_be_an_element_is_refused(element, make_printer, monkeypatch):
     printer = make_printer(LAYOUT)
     with pytest.raises(InputError, match="wanted air"):

@@ -11,8 +11,8 @@ from litho_design.images.targets import load_target
 from litho_design.lenses.bench import RadialLensBench
 from litho_design.lenses.settings import LensView, lens_settings
 from litho_design.optics import Optics
+from litho_design.optimisation.disagreement import disagreement_um, measure_disagreement
 from litho_design.optimisation.parameters import CellMap
-from litho_design.optimisation.robust import disagreement_um, penalised
 from litho_design.printers.layout import LayoutSettings
 from litho_design.printers.printer import Printer
 from litho_design.tasks.design import LEVELS_FILE, Design
@@ -24,9 +24,6 @@ def test_disagreement_is_the_rms_spread_without_the_datum():
     # Two models at +-0.1 of a pattern of unit rms, one of them 5 µm higher: the spread is 0.1 everywhere.
     apart = torch.stack([0.1 * pattern, -0.1 * pattern + 5])
     assert float(disagreement_um(apart)) == pytest.approx(0.1, rel=1e-5)
-    loss = torch.tensor(2.0)
-    assert float(penalised(loss, list(apart), 3.0, 0.5)) == pytest.approx(2 + 3 * 0.1 / 0.5, rel=1e-5)
-    assert penalised(loss, [pattern], 3.0, 0.5) is loss
 
 
 def test_rings_count_by_their_area():
@@ -67,18 +64,25 @@ def test_the_penalty_brings_the_models_together(tmp_path, small_settings, make_p
         design = design_hologram(
             target, main, tmp_path / f"{weight:g}", settings=settings, ensemble=[other], announce=False
         )
-        assert design.printer_unchanged
         assert [member.name for member in design.ensemble.members] == ["wide"]
         assert Design.read(tmp_path / f"{weight:g}") == design
         apart[weight] = design.ensemble.disagreement_waves
     assert apart[20.0] < 0.8 * apart[0.0]
-    # The mean over the members, not the first one's loss alone.
+    # The mean over the members, or the worst of them, and their disagreement in waves.
     main, other = models()
     level = torch.from_numpy(np.load(tmp_path / "0" / LEVELS_FILE)).float()[None, None]
     alone = [float(HologramTask(small_settings, p, target).objective(level)[0]) for p in (main, other)]
-    free = small_settings.ensemble.model_copy(update={"weight": 0.0})
-    both = HologramTask(small_settings.model_copy(update={"ensemble": free}), main, target, [other])
-    assert float(both.objective(level)[0]) == pytest.approx(sum(alone) / 2, rel=1e-5)
+    waves = measure_disagreement(
+        [main, other], level, small_settings.optics.wave_height_um
+    ).disagreement_waves
+    for risk, weight, wanted in (
+        ("mean", 0.0, sum(alone) / 2),
+        ("worst", 0.0, max(alone)),
+        ("mean", 3.0, sum(alone) / 2 + 3 * waves),
+    ):
+        ensemble = small_settings.ensemble.model_copy(update={"weight": weight, "risk": risk})
+        both = HologramTask(small_settings.model_copy(update={"ensemble": ensemble}), main, target, [other])
+        assert float(both.objective(level)[0]) == pytest.approx(wanted, rel=1e-5)
 
 
 def test_a_lens_takes_an_ensemble_too(tmp_path, make_printer):

@@ -14,11 +14,13 @@ from PIL import Image
 
 from benchmarks import stl_files as benchmark
 from litho_data.foundation.errors import InputError
+from litho_design.elements.element import Element
 from litho_design.exports import marks
 from litho_design.exports.files import export as export_design
 from litho_design.exports.files import import_levels
 from litho_design.exports.gds import GdsRows, rectangles, write_gds
-from litho_design.exports.image import TiffRows, read_published_bmp, write_bmp, write_png16, write_tiff
+from litho_design.exports.gwl import Gwl
+from litho_design.exports.image import TiffRows, linear_greys, write_image, write_tiff
 from litho_design.exports.sidecar import sidecar_path
 from litho_design.exports.stl import read_stl_levels, read_stl_triangles, write_stl
 from litho_design.images.targets import load_target
@@ -28,7 +30,8 @@ from litho_design.tasks.design import Design
 from litho_design.workflows.design import design_hologram
 from tests.quoted import require_quoted
 
-FORMATS = ["png16", "bmp", "tiff", "stl", "gds"]
+POWERS = tuple(range(50, 63))
+FORMATS = ["png16", "bmp", "tiff", "stl", "gds", "dxf", "gwl"]
 # An "F" has no symmetry: any flip or rotation shows.
 LETTER = np.array([[1, 1, 1, 1], [1, 0, 0, 0], [1, 1, 1, 0], [1, 0, 0, 0], [1, 0, 0, 0]], np.uint8)
 
@@ -65,15 +68,15 @@ def test_round_trip_is_exact_and_has_its_size(tmp_path, design, kind):
 
 @pytest.mark.parametrize(("suffix", "step"), [(".png", 65535 // 12), (".bmp", 255 // 12)])
 def test_images_are_upright_for_another_reader(tmp_path, suffix, step):
-    write = write_png16 if suffix == ".png" else write_bmp
-    write(tmp_path / f"f{suffix}", LETTER * 7, LayoutSettings())
+    greys = linear_greys(LayoutSettings(), 16 if suffix == ".png" else 8)
+    write_image(tmp_path / f"f{suffix}", LETTER * 7, greys, 0.1)
     grey = cv2.imread(str(tmp_path / f"f{suffix}"), cv2.IMREAD_UNCHANGED)
     assert np.array_equal(grey, LETTER.astype(int) * 7 * step)
 
 
 def test_tiff_is_upright_and_has_its_size_for_another_reader(tmp_path):
     levels = np.kron(LETTER * 7, np.ones((200, 200), np.uint8))
-    write_tiff(tmp_path / "f.tif", levels, LayoutSettings(pitch_um=0.13))
+    write_tiff(tmp_path / "f.tif", levels, 0.13, 0.1)
     with tifffile.TiffFile(tmp_path / "f.tif") as file:
         pages = [page.asarray() for page in file.pages]
         per_cm = [file.pages[0].tags[name].value for name in ("XResolution", "YResolution")]
@@ -309,7 +312,7 @@ def test_a_bigtiff_is_written_in_strips_that_another_reader_knows(tmp_path, desi
     """Pillow and libtiff in place of tifffile, which wrote it."""
     monkeypatch.setattr("litho_design.exports.image._CLASSIC_BYTES", 0)
     levels = np.kron(LETTER * 7, np.ones((50, 50), np.uint8))
-    write_tiff(tmp_path / "f.tif", levels, LayoutSettings(pitch_um=0.13))
+    write_tiff(tmp_path / "f.tif", levels, 0.13, 0.1)
     assert (tmp_path / "f.tif").read_bytes()[:4] == b"II" + struct.pack("<H", 43)
     with Image.open(tmp_path / "f.tif") as pages:
         assert np.array_equal(np.asarray(pages), levels)
@@ -342,7 +345,7 @@ def test_memory_of_an_export_does_not_grow_with_its_rows(tmp_path, kind, monkeyp
         levels, file = _Tall(height), tmp_path / f"{height}.{kind}"
         tracemalloc.start()
         if kind == "tiff":
-            write_tiff(file, levels, LayoutSettings())
+            write_tiff(file, levels, 0.1, 0.1)
             back = TiffRows(file)
         else:
             write_gds(file, levels, 0.1, "cumulative")
@@ -431,12 +434,125 @@ def test_rectangles_cover_once():
     assert len(rectangles(masks[:1])) == 4
 
 
-def test_published_bmp_is_read_with_its_offset(tmp_path):
-    cv2.imwrite(str(tmp_path / "mask.bmp"), LETTER * 7 + 10)
-    assert np.array_equal(read_published_bmp(tmp_path / "mask.bmp"), LETTER * 7)
-    cv2.imwrite(str(tmp_path / "other.bmp"), LETTER)
-    with pytest.raises(InputError, match="published mask"):
-        read_published_bmp(tmp_path / "other.bmp")
+@pytest.mark.parametrize(
+    ("job", "hatching_um"),
+    [
+        (Gwl(), 0.1),
+        (Gwl(mode="piezo"), 0.05),
+        (Gwl(field_um=0.7), 0.1),
+        (Gwl(power_percent=range(50, 63)), 0.1),
+    ],
+)
+def test_gwl_writes_the_volume_of_the_layout_voxel_by_voxel(tmp_path, design, job, hatching_um):
+    """Another parser follows the stage and paints every line into voxels of a pixel and a slice."""
+    file = export_design(design, "gwl", tmp_path / "out", pedestal_um=0.3, hatching_um=hatching_um, gwl=job)
+    levels = np.load(design / "layout_level.npy")
+    painted = np.zeros((15, 64, 64))
+    stage, points, power, powers, mode = {"X": 0.0, "Y": 0.0}, [], None, {}, None
+    for line in file.read_text().splitlines():
+        if line.startswith("MoveStage"):
+            stage[line[9]] += float(line.split()[1])
+        elif line.startswith(("GalvoScanMode", "PiezoScanMode")):
+            mode = line[:5].lower()
+        elif line.startswith("LaserPower"):
+            power = float(line.split()[1])
+        elif line == "Write":
+            (x0, y, z), (x1, y1, z1) = points
+            assert (y, z) == (y1, z1)
+            assert mode == "piezo" or max(abs(x0), abs(x1), abs(y)) <= job.field_um / 2
+            begin, end = (round((x + stage["X"]) / 0.1) for x in (x0, x1))
+            number = int(z / 0.1)
+            painted[number, 63 - int((y + stage["Y"]) / 0.1), begin:end] += hatching_um / 0.1
+            powers.setdefault(number, set()).add(power)
+            points = []
+        elif line[0] in "-0123456789":
+            points.append(tuple(map(float, line.split())))
+    assert mode == job.mode
+    wanted = np.arange(15)[:, None, None] < 3 + levels
+    assert painted == pytest.approx(wanted.astype(float))
+    if len(job.power_percent) > 1:
+        assert powers == {n: {50.0 + max(0, n - 2)} for n in powers}
+
+
+def test_gwl_refuses_what_it_cannot_write_exactly(tmp_path, design):
+    for said, more in (
+        ("slices of a level", {"slicing_um": 0.15}),
+        ("slices of the pedestal", {"pedestal_um": 0.25}),
+        ("hatching distances", {"hatching_um": 0.07}),
+        ("laser power", {"gwl": Gwl(power_percent=(50.0, 40.0))}),
+        ("pedestal_um", {"pedestal_um": 0.0}),
+    ):
+        with pytest.raises(InputError, match=said):
+            export_design(design, "gwl", tmp_path / "out", **more)
+    with pytest.raises(InputError, match="piezo mode"):
+        export_design(np.ones((4, 4000), np.uint8), "gwl", tmp_path / "out", gwl=Gwl(mode="piezo"))
+
+
+def test_dxf_has_a_closed_polyline_on_the_layer_of_its_grey(tmp_path):
+    """Group codes read in pairs by code of the test: corners, layers, unit; areas add up."""
+    file = export_design(LETTER * 7, "dxf", tmp_path, pitch_um=0.13)
+    words = file.read_text().split()
+    pairs = list(zip(words[::2], words[1::2], strict=True))
+    assert ("1", "AC1009") in pairs
+    assert pairs[pairs.index(("9", "$INSUNITS")) + 1] == ("70", "13")
+    area, corners = 0.0, []
+    for code, word in pairs:
+        if (code, word) == ("0", "POLYLINE"):
+            corners = []
+        elif code in ("10", "20"):
+            corners.append(float(word))
+        elif code == "8":
+            assert word == "252"
+        elif (code, word) == ("0", "SEQEND"):
+            x, y = np.array(corners[2:]).reshape(-1, 2).T
+            area += abs(x @ np.roll(y, 1) - y @ np.roll(x, 1)) / 2
+            assert len(x) == 4
+    assert pairs.count(("70", "1")) == pairs.count(("0", "POLYLINE")) > 0
+    assert area == pytest.approx(LETTER.sum() * 0.13**2, abs=1e-6)
+    # The F stands upright: its bar is the highest.
+    assert max(float(word) for code, word in pairs if code == "20") == pytest.approx(5 * 0.13)
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_bare_levels_heights_and_elements_are_exported(tmp_path, kind):
+    levels = np.kron(LETTER * 7, np.ones((2, 3), np.uint8))
+    heights = levels * 0.2 + np.random.default_rng(0).uniform(-0.09, 0.09, levels.shape)
+    np.save(tmp_path / "h.npy", heights)
+    for name, given in (("levels", levels), ("heights", heights), ("file", tmp_path / "h.npy")):
+        file = export_design(given, kind, tmp_path / name, pitch_um=0.2, level_height_um=0.2, slicing_um=0.1)
+        back, sidecar = import_levels(file)
+        assert np.array_equal(back, levels)
+        assert sidecar.size_um == pytest.approx((2.0, 2.4))
+        assert sidecar.maximum_height_um == pytest.approx(1.4)
+        assert sidecar.design_sha256 is None
+    element = Element("none", {"size_px": 16})
+    assert np.array_equal(import_levels(export_design(element, kind, tmp_path / "e"))[0], element.levels())
+    for bad in (np.full((4, 4), -1), np.full((4, 4), np.nan), np.zeros(4), np.full((4, 4), 999)):
+        with pytest.raises(InputError, match="array to export"):
+            export_design(bad, kind, tmp_path / "bad")
+    with pytest.raises(InputError, match="layout to export"):
+        export_design(object(), kind, tmp_path / "bad")
+
+
+def test_a_dose_curve_gives_each_level_the_grey_that_prints_it(tmp_path):
+    """A quadratic curve: height = (grey / 100)^2 / 4 + 0.5 µm."""
+    grey = np.arange(0, 256, 5)
+    rows = [f"{g},{(g / 100) ** 2 / 4 + 0.5:.9g}" for g in grey]
+    (tmp_path / "curve.csv").write_text("grey,height_um\n" + "\n".join(rows))
+    file = export_design(LETTER * 12, "bmp", tmp_path / "out", dose_curve=tmp_path / "curve.csv")
+    # 1.2 µm above the height of grey 0: 100 sqrt(4.8) = 219.1.
+    assert cv2.imread(str(file), cv2.IMREAD_UNCHANGED).max() == 219
+    levels, sidecar = import_levels(file)
+    assert np.array_equal(levels, LETTER * 12)
+    assert sidecar.greys[4] == round(100 * (4 * 0.4) ** 0.5)
+    assert sidecar.white_height_um is None
+    linear = import_levels(export_design(LETTER * 12, "png16", tmp_path / "png"))[1]
+    assert linear.white_height_um == pytest.approx(65535 / (65535 // 12) * 0.1)
+    (tmp_path / "curve.csv").write_text("grey,height_um\n0,0\n255,1.0\n")
+    with pytest.raises(InputError, match=r"dose curve, got 1 µm for levels up to 1\.2 µm"):
+        export_design(LETTER * 12, "bmp", tmp_path / "no", dose_curve=tmp_path / "curve.csv")
+    with pytest.raises(InputError, match="rising columns"):
+        export_design(LETTER * 12, "bmp", tmp_path / "no", dose_curve=tmp_path / "none.csv")
 
 
 def test_printability_of_known_stripes():

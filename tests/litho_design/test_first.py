@@ -73,5 +73,5 @@ def test_a_folder_of_another_design_says_what_differs(tmp_path):
     assert again.settings == made.model_dump(mode="json")
     with pytest.raises(InputError, match=r"search\.start = 'random' where now 'gs' is asked"):
         design_hologram("ring", "none", tmp_path, settings=hologram_settings(changes=TINY), announce=False)
-    with pytest.raises(InputError, match="another target or model"):
+    with pytest.raises(InputError, match=r"target\.name = 'ring' where now 'chart'"):
         design_hologram("chart", "none", tmp_path, settings=made, announce=False)

@@ -25,9 +25,8 @@ from litho_design.judging.loaded import load_design
 from litho_design.large.bands import Bands, Ranks
 from litho_design.large.cost import MeasuredSize, fit_cost, sent_gib
 from litho_design.large.hologram import BandedHologram
-from litho_design.large.lens import RingLens, design_in_rings
+from litho_design.large.lens import RingLens
 from litho_design.large.propagator import BandedPropagator
-from litho_design.large.run import design_in_bands
 from litho_design.lenses.settings import lens_settings
 from litho_design.lenses.task import lens_task
 from litho_design.optics import Optics, centred_grid, make_propagator
@@ -37,7 +36,7 @@ from litho_design.optimisation.search import search_layout
 from litho_design.optimisation.stitching import Stitching, in_fields
 from litho_design.printers.printer import Printer
 from litho_design.tasks.design import LEVELS_FILE, RING_HEIGHT_FILE, RINGS_FILE, Design
-from litho_design.workflows.large import score_from_disk
+from litho_design.workflows.large import design_large_lens, score_from_disk
 from litho_design.workflows.score import score
 from litho_models.models.pbl import PblConfig
 from tests.litho_design import large_rank
@@ -82,7 +81,7 @@ def test_loss_and_gradient_in_bands_are_those_of_the_whole():
     found = []
     for task in (
         HologramTask(settings, printer, target),
-        BandedHologram(settings, printer, target.pixels, Bands(SIZE, BAND, cell_px=4)),
+        BandedHologram(settings, printer, target, Bands(SIZE, BAND, cell_px=4)),
     ):
         loss, _ = task.objective(level)
         found.append((loss.detach(), torch.autograd.grad(loss, level)[0]))
@@ -125,7 +124,6 @@ def test_ranks_give_the_layout_of_one_process(alone, tmp_path):
 
 
 def test_an_interrupted_run_ends_the_same_and_other_checkpoints_are_refused(alone, tmp_path, monkeypatch):
-    settings, printer, target = large_rank.settings(), large_rank.printer(), load_target("ring", SIZE)
     bands = Bands(SIZE, BAND, cell_px=4)
 
     def stopped(parameters, objective, *given, **named):
@@ -138,16 +136,16 @@ def test_an_interrupted_run_ends_the_same_and_other_checkpoints_are_refused(alon
 
         return search_layout(parameters, interrupted, *given, **named)
 
-    monkeypatch.setattr("litho_design.large.run.search_layout", stopped)
+    monkeypatch.setattr("litho_design.tasks.run.search_layout", stopped)
     with pytest.raises(KeyboardInterrupt):
-        design_in_bands(settings, printer, target, tmp_path, bands, announce=False)
+        large_rank.design(tmp_path, bands)
     monkeypatch.undo()
     (kept,) = tmp_path.glob("checkpoint*.pt")
     kept.rename(tmp_path / "checkpoint-1-of-2.pt")
     with pytest.raises(InputError, match="another number of processes"):
-        design_in_bands(settings, printer, target, tmp_path, bands, announce=False)
+        large_rank.design(tmp_path, bands)
     (tmp_path / "checkpoint-1-of-2.pt").rename(kept)
-    design_in_bands(settings, printer, target, tmp_path, bands, announce=False)
+    large_rank.design(tmp_path, bands)
     layouts = [np.load(folder / LEVELS_FILE) for folder in (alone / "design", tmp_path)]
     np.testing.assert_array_equal(*layouts)
 
@@ -193,13 +191,13 @@ def test_what_a_large_element_cannot_have_is_refused():
     with pytest.raises(InputError, match="at most one per band"):
         Bands(SIZE, 64, Ranks(0, 4))
     with pytest.raises(InputError, match="rows of a band"):
-        BandedHologram(settings, printer, target.pixels, Bands(SIZE, 12, cell_px=4))
+        BandedHologram(settings, printer, target, Bands(SIZE, 12, cell_px=4))
     thick = settings.model_copy(update={"optics": settings.optics.model_copy(update={"element": "thick"})})
     with pytest.raises(InputError, match=r"optics\.element of a large element"):
-        BandedHologram(thick, printer, target.pixels, Bands(SIZE, BAND, cell_px=4))
+        BandedHologram(thick, printer, target, Bands(SIZE, BAND, cell_px=4))
     printer.simulator.reach_um = None
     with pytest.raises(InputError, match="depends on the whole image"):
-        BandedHologram(settings, printer, target.pixels, Bands(SIZE, BAND, cell_px=4))
+        BandedHologram(settings, printer, target, Bands(SIZE, BAND, cell_px=4))
 
 
 def test_the_estimate_follows_its_laws(tmp_path, capsys, monkeypatch):
@@ -290,7 +288,7 @@ def test_a_lens_in_rings_is_the_lens_of_the_plane(tmp_path):
     plane, rings = lens_task(settings, printer), RingLens(settings, printer, 48)
     free = 12 * torch.rand(plane.cells.cells, generator=torch.Generator().manual_seed(0))
     radius = rings.cells(free[: rings.cells.cells[0]])[None, None]
-    printed = rings.printed_um(radius)
+    printed = rings.search_print(radius, 0)
     # Beyond the aperture the plane has corners, which the print reaches for 8 px: 1e-5 µm is rounding.
     assert (printed - plane.printed_rings(plane.cells(free)[None, None]))[:-8].abs().max() < 1e-5
     found, whole = (
@@ -300,11 +298,11 @@ def test_a_lens_in_rings_is_the_lens_of_the_plane(tmp_path):
     # A circle of square pixels against true rings: a pixel of the edge in 128, twice, in power.
     assert found[1].focusing_efficiency == pytest.approx(whole[1].focusing_efficiency, rel=1 / 64)
     assert found[1].fwhm_um == pytest.approx(whole[1].fwhm_um, rel=1 / 64)
-    design = design_in_rings(settings, printer, tmp_path, tile_px=48, announce=False)
+    design = design_large_lens(printer, tmp_path, settings=settings, tile_px=48, announce=False)
     assert design.argmax_loss < design.start_loss
     level, height = (np.load(tmp_path / name) for name in (RINGS_FILE, RING_HEIGHT_FILE))
     assert level.shape == height.shape == (128,)
-    again = rings.score(rings.printed_um(torch.from_numpy(level).float()[None, None])).model_dump()
+    again = rings.score(rings.printed_um(torch.from_numpy(level))).model_dump()
     assert design.predicted == pytest.approx(again, rel=1e-6)
     assert 0.2 < design.predicted["strehl"] <= 1
     # Its plane: what the map of a plane makes of the same rings, the last one in the corners.
@@ -322,8 +320,8 @@ def test_a_lens_in_rings_is_the_lens_of_the_plane(tmp_path):
     rms = np.sqrt((off**2 * area).sum() / area.sum())
     assert nominal.rms_height_difference_um == pytest.approx(rms, rel=1e-4)
     changed = settings.model_copy(update={"search": settings.search.model_copy(update={"iterations": 7})})
-    with pytest.raises(InputError, match=r"got a design with other settings, search\.iterations"):
-        design_in_rings(changed, printer, tmp_path, tile_px=48, announce=False)
+    with pytest.raises(InputError, match=r"other settings, search\.iterations"):
+        design_large_lens(printer, tmp_path, settings=changed, tile_px=48, announce=False)
     with pytest.raises(InputError, match="got a scan, a photograph, another element or write fields"):
         score(tmp_path, tmp_path / "fields", judges=[printer], stitch=Stitching(sigma_um=0.1))
     (tmp_path / RINGS_FILE).write_bytes(b"")

@@ -103,7 +103,7 @@ def test_a_photograph_is_deconvolved_with_the_designed_and_the_measured_psf(tmp_
     printed = loaded.expected_um * (1 - 0.5 * radius.square())
     np.savetxt(tmp_path / "scan.txt", (printed.double().numpy() + 0.2) * 1e-6)
     psf, to_window = photographed(tmp_path / "photo.png", loaded, printed, wanted)
-    photo = PhotoSource(tmp_path / "photo.png", CAMERA_UM, DARK, str(picture))
+    photo = PhotoSource(tmp_path / "photo.png", 1.03 * CAMERA_UM, DARK, str(picture))
     scan = MeasuredSource(tmp_path / "scan.txt", "m", (20.0, 20.0))
     measured, score = score_design(lens, tmp_path / "score", judges=[], scan=scan, camera=photo).scores
     assert (measured.kind, score.kind) == ("scan", "camera")
@@ -148,7 +148,7 @@ def test_an_object_of_the_design_is_known_by_name(tmp_path, lens):
     loaded = LoadedDesign(lens)
     wanted = object_stack(["text"], OBJECT_PX)[0]
     photographed(tmp_path / "photo.png", loaded, loaded.expected_um, wanted)
-    photo = PhotoSource(tmp_path / "photo.png", CAMERA_UM, imaged="text")
+    photo = PhotoSource(tmp_path / "photo.png", 1.03 * CAMERA_UM, imaged="text")
     verdict = score_lens_photo(loaded, photo)
     score, record = verdict.figures, verdict.record
     assert record.imaged == "text"
@@ -169,7 +169,7 @@ def test_a_name_that_two_objects_have_is_refused(lens):
     imaging = settings.imaging.model_copy(update={"objects": (one,), "test_objects": (other, "ring")})
     loaded.task.settings = settings.model_copy(update={"imaging": imaging})
     with pytest.raises(InputError, match="two objects"):
-        score_lens_photo(loaded, PhotoSource("photo.png", CAMERA_UM, imaged="a.png"))
+        score_lens_photo(loaded, PhotoSource("photo.png", 1.03 * CAMERA_UM, imaged="a.png"))
 
 
 @pytest.mark.parametrize(

@@ -124,7 +124,7 @@ def test_a_photograph_is_cleaned_registered_and_scored(tmp_path, printed_design)
     cv2.imwrite(str(tmp_path / "photo.png"), counts.astype(np.uint16))
     source = PhotoSource(tmp_path / "photo.png", 0.2)
     score = score_design(printed_design, tmp_path / "score", judges=[], camera=source).scores[0]
-    assert score.judge.dark_level == pytest.approx(300, abs=30)
+    assert abs(score.judge.dark_level - 300) < 2 * score.judge.dark_level_sd < 150
     assert score.judge.replaced_pixels == 3
     assert score.judge.correlation > 0.97
     # photograph = matrix^-1 window / 2: the linear part found must undo what was done.
@@ -179,7 +179,8 @@ def test_a_photograph_is_within_a_third_of_a_decibel_of_its_light_or_refused(tmp
     def scored(dark=photographs.DARK, **camera):
         counts = Camera(**camera).counts(light, 0.1, seed=0)
         cv2.imwrite(str(tmp_path / "p.png"), counts)
-        return score_hologram_photo(loaded, PhotoSource(tmp_path / "p.png", 0.15, dark))
+        pitch_sd = 0.05 if "scale" in camera else 0.0
+        return score_hologram_photo(loaded, PhotoSource(tmp_path / "p.png", 0.15, dark, pitch_sd=pitch_sd))
 
     for camera in (
         {"tilt": (0.08, -0.08), "turn_deg": 6.0},

@@ -8,9 +8,8 @@ import pytest
 import torch
 
 from litho_data.foundation.errors import InputError
-from litho_design.optimisation.parameters import CellMap, DirectLevels, GumbelLevels
+from litho_design.optimisation.parameters import CellMap, DirectLevels, GumbelLevels, make_parametrisation
 from litho_design.optimisation.phases import nearest_levels
-from litho_design.optimisation.search import make_parametrisation
 from litho_design.optimisation.settings import SearchSettings
 from litho_design.printers.layout import LayoutSettings
 

@@ -15,9 +15,9 @@ from litho_design.lenses.bench import reconstruct, record, sensor_psf
 from litho_design.lenses.objects import object_stack
 from litho_design.lenses.settings import ImagingSettings, lens_settings
 from litho_design.lenses.task import lens_task, strip_rings
-from litho_design.optimisation.parameters import CellMap, GumbelLevels
+from litho_design.optimisation.parameters import CellMap, GumbelLevels, make_parametrisation
 from litho_design.optimisation.rate import RateSchedule
-from litho_design.optimisation.search import make_parametrisation, search_layout
+from litho_design.optimisation.search import search_layout
 from litho_design.optimisation.settings import SearchSettings
 from litho_design.printers.layout import LayoutSettings
 from litho_design.workflows.design import design_lens

@@ -20,6 +20,7 @@ from litho_design.optimisation.process_window import measure_yield
 from litho_design.reliefs.settings import relief_settings
 from litho_design.reliefs.targets import load_relief
 from litho_design.reliefs.task import ReliefTask
+from litho_design.reports.advice import width_sentence
 from tests.quoted import require_quoted
 
 TINY = {
@@ -36,9 +37,10 @@ def test_a_relief_that_a_layout_prints_is_printed(tmp_path, make_printer):
     cells = torch.from_numpy(np.random.default_rng(0).integers(2, 11, (24, 24))).float()
     with torch.no_grad():
         printed = printer(cells.repeat_interleave(2, 0).repeat_interleave(2, 1)[None, None])[0, 0].numpy()
-    # The zero of a relief is free.
     made = correct(printed - 0.4, printer, tmp_path, settings=settings, announce=False)
-    assert made.predicted["offset_nm"] == pytest.approx(400, abs=62)
+    # The zero of a relief is free by whole levels, of 62 nm in print.
+    levels_off = (made.predicted["offset_nm"] - 400) / 62
+    assert levels_off == pytest.approx(round(levels_off), abs=0.1)
     # Each cell that is a level off costs 62 nm x its share: a tenth of the cells would give 6 nm as blurred.
     assert made.predicted["rms_nm"] < 6
     assert made.baselines["free levels"]["rms_nm"] < 6
@@ -48,6 +50,53 @@ def test_a_relief_that_a_layout_prints_is_printed(tmp_path, make_printer):
     loaded = load_design(tmp_path)
     assert loaded.score(loaded.expected_um).rms_nm == pytest.approx(made.predicted["rms_nm"], rel=1e-4)
     assert np.abs(np.load(tmp_path / "unprintable_um.npy")).mean() < 0.006
+
+
+def test_nominal_is_nominal_and_the_best_affine_is_the_best_over_gain_and_zero(make_printer):
+    """A printer of gain 1/2 and no blur, with a floor of 0.1 µm: all figures follow by hand."""
+    settings = relief_settings({"layout.size_px": 48, "layout.levels": 13})
+    printer = make_printer(settings.layout, sigma_um=1e-3, gain=0.5, offset_um=0.1)
+    wanted = np.repeat(0.1 * (np.arange(48) // 12), 48).reshape(48, 48).astype(np.float32)
+    found = ReliefTask(settings, printer, inputs={"relief_um": wanted}).untouched()
+    # Levels 0 to 3 as they are, not lifted to the middle of the levels.
+    assert torch.equal(found["uncorrected"], torch.from_numpy(np.rint(wanted / 0.1)).long())
+    # Twice the steps, from any level, print the relief to the last bit of a float.
+    task = ReliefTask(settings, printer, inputs={"relief_um": wanted})
+    baselines = {name: task.figures(task.printed_um(level)) for name, level in found.items()}
+    assert baselines["best affine"]["rms_nm"] < 1e-3
+    assert baselines["uncorrected"]["rms_nm"] == pytest.approx(0.5e3 * wanted.std(), rel=1e-4)
+    # A relief that stands on 0.3 µm keeps its foot, one that reaches below 0 is lifted to it.
+    for shift_um, foot in ((0.3, 3), (-0.2, 0)):
+        task = ReliefTask(settings, printer, inputs={"relief_um": wanted + np.float32(shift_um)})
+        assert int(task.untouched()["uncorrected"].min()) == foot
+
+
+def test_doing_nothing_is_returned_where_the_models_at_hand_prefer_it(tmp_path, make_printer):
+    """A model that believes in a gain of 0.4 corrects by 2.5; two judges print at nominal height."""
+    settings = relief_settings({"layout.size_px": 48, "search.iterations": 10, "height_um": 0.4})
+    layout = settings.layout
+    model = make_printer(layout, sigma_um=0.05, gain=0.4, offset_um=0.0, name="low")
+    judges = [
+        make_printer(layout, sigma_um=0.05, gain=gain, offset_um=0.0, name=f"j{gain}") for gain in (1.0, 1.1)
+    ]
+    fit = {"settings": settings, "announce": False}
+    alone = correct("staircase", model, tmp_path / "alone", judges=(), **fit)
+    assert alone.width.returned == "searched"
+    judged = correct("staircase", model, tmp_path / "judged", judges=judges, robust=False, **fit)
+    width = judged.width
+    assert width.returned == "uncorrected"
+    assert list(width.level_heights_um) == ["low", "j1.0", "j1.1"]
+    # The steps lie between levels: a third of a step is rounded off; judges err by no more and a tenth.
+    assert width.values("searched").max() > 3 * np.delete(width.values(), 0).max()
+    assert "models at hand print the layout “uncorrected” better" in judged.notes[-1]
+    said = width_sentence(judged)
+    assert "3 models of this printer" in said
+    assert "level 12 (0.480 to 1.320 µm)" in said
+    # Searched for the worst of all, the layout is a compromise that beats both.
+    robust = correct("staircase", model, tmp_path / "robust", judges=judges, **fit)
+    assert robust.width.searched_with == 3
+    assert robust.settings["ensemble"]["risk"] == "worst"
+    assert robust.width.values().max() <= min(width.values().max(), width.values("best affine").max()) + 1e-3
 
 
 def test_the_zero_of_a_print_decides_no_yield(make_printer):
@@ -63,7 +112,7 @@ def test_the_zero_of_a_print_decides_no_yield(make_printer):
             settings.model_copy(update={"window": window}), printer, inputs={"relief_um": wanted}
         )
         drawn = task.window_scores(printed, 20)
-        return drawn, measure_yield(drawn, task.score(printed).model_dump(), window)
+        return drawn, measure_yield(drawn, task.score(printed).model_dump(), window, task.errors)
 
     drawn, found = passed(settings.window)
     assert found.share == 1
@@ -101,12 +150,12 @@ def test_a_second_round_takes_off_what_the_first_print_was_off(tmp_path, make_pr
         return 1e3 * (printed_um(folder) - wanted).std()
 
     # What a level costs stays, 62 nm for a tenth of the cells; the slope of 50 nm rms goes.
-    assert rms_nm(first) > 30
+    assert rms_nm(first) > 20
     assert rms_nm(again) < rms_nm(first) / 3
     # Figures are those of the print as the model has it, against what is wanted.
     expected = np.load(again / "predicted_height_um.npy")
     assert made.predicted["rms_nm"] == pytest.approx(1e3 * (expected - wanted).std(), rel=1e-4)
-    assert made.predicted["rms_nm"] > 30
+    assert made.predicted["rms_nm"] > 20
     assert made.baselines["uncorrected"] == load_design(first).record.baselines["uncorrected"]
     # So small an element cannot be registered, and one of another size does not lie on its pixels.
     with pytest.raises(InputError, match="--scan-aligned"):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from litho_design.optimisation.search import make_parametrisation, search_layout
+from litho_design.optimisation.parameters import make_parametrisation
+from litho_design.optimisation.search import search_layout
 from litho_design.optimisation.settings import SearchSettings
 from litho_design.printers.layout import LayoutSettings
 

@@ -22,7 +22,6 @@ from litho_design.holograms.task import HologramTask
 from litho_design.lenses.settings import LensSettings, lens_settings
 from litho_design.lenses.task import LensTask
 from litho_design.optimisation.settings import StartName
-from litho_design.optimisation.starts import _STARTS
 from litho_design.reliefs.settings import ReliefSettings
 from litho_design.reliefs.task import ReliefTask
 
@@ -206,8 +205,6 @@ def test_bad_settings_are_one_line_and_exit_code_2(tmp_path, monkeypatch, refuse
 def test_every_start_that_can_be_named_can_be_made():
     named = {start for task in (HologramTask, LensTask, ReliefTask) for start in task.starts}
     assert named == set(get_args(StartName))
-    # A relief makes its own.
-    assert named - set(_STARTS) == {"random", "inverse"}
 
 
 def test_help_needs_no_torch():

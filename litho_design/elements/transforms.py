@@ -1,0 +1,74 @@
+"""A print inside ``torch.func`` and ``torch.compile``, which cannot look into the models' own gradients."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+Print = Callable[[Tensor], Tensor]
+
+
+def printed_anyhow(run: Print, level: Tensor) -> Tensor:
+    """``run(level)``, as one step without an inside where a transform cannot look into it."""
+    if "torch._dynamo" in sys.modules:
+        run = torch.compiler.disable(run)
+    if not torch._C._functorch.is_functorch_wrapped_tensor(level):
+        return run(level)
+    try:
+        return run(level)
+    except RuntimeError:
+        # A gradient of the model's own, or a look at its values: no transform of torch.func takes them.
+        printed: Tensor = _Printed.apply(level, run)
+        return printed
+
+
+# The mark of ``torch.compiler.disable``, whose import takes two seconds.
+printed_anyhow._torchdynamo_disable = True  # type: ignore[attr-defined]
+
+
+class _Printed(torch.autograd.Function):
+    @staticmethod
+    def forward(level: Tensor, run: Print) -> Tensor:
+        return run(level)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        ctx.save_for_backward(inputs[0])
+        ctx.run = inputs[1]
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        return _Slope.apply(ctx.saved_tensors[0], gradient, ctx.run), None
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], level: Tensor, run: Print) -> tuple[Tensor, int]:
+        return torch.stack([_Printed.apply(one, run) for one in level.unbind(in_dims[0])]), 0
+
+
+class _Slope(torch.autograd.Function):
+    @staticmethod
+    def forward(level: Tensor, gradient: Tensor, run: Print) -> Tensor:
+        with torch.enable_grad():
+            again = level.detach().requires_grad_()
+            (found,) = torch.autograd.grad(run(again), again, gradient)
+        return found
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        """Second derivatives through a model are not known."""
+
+    @staticmethod
+    def vmap(
+        info: Any, in_dims: tuple[Any, ...], level: Tensor, gradient: Tensor, run: Print
+    ) -> tuple[Tensor, int]:
+        levels, slopes = (_parts(one, at, info) for one, at in zip((level, gradient), in_dims, strict=False))
+        parts = zip(levels, slopes, strict=True)
+        return torch.stack([_Slope.apply(one, slope, run) for one, slope in parts]), 0
+
+
+def _parts(values: Tensor, at: int | None, info: Any) -> tuple[Tensor, ...]:
+    return (values,) * info.batch_size if at is None else values.unbind(at)

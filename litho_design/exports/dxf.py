@@ -1,0 +1,67 @@
+"""Layouts as DXF (R12, ASCII): closed polylines, the layer named after the grey value of its level."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from litho_design.exports.gds import rectangles
+from litho_design.exports.rows import LevelRows, bands_of
+
+_BAND_PX = 128
+
+
+def write_dxf(path: Path, levels: LevelRows, pitch_um: float, greys: Sequence[int]) -> int:
+    """Write disjoint rectangles of every level whose grey is not 0, in µm, y up; returns how many."""
+    count = 0
+    with open(path, "w", encoding="ascii") as stream:
+        # $INSUNITS 13: micrometres.
+        stream.write("0\nSECTION\n2\nHEADER\n9\n$ACADVER\n1\nAC1009\n9\n$INSUNITS\n70\n13\n0\nENDSEC\n")
+        stream.write("0\nSECTION\n2\nENTITIES\n")
+        for rows in bands_of(levels, _BAND_PX):
+            band = levels[rows]
+            drawn = [level for level in np.unique(band).tolist() if greys[level]]
+            masks = band == np.array(drawn, band.dtype)[:, None, None]
+            for mask, top, bottom, left, right in rectangles(masks).tolist():
+                low, high = (levels.shape[0] - rows.start - edge for edge in (bottom, top))
+                corners = ((left, low), (right, low), (right, high), (left, high))
+                layer = greys[drawn[mask]]
+                stream.write(f"0\nPOLYLINE\n8\n{layer}\n66\n1\n70\n1\n10\n0\n20\n0\n30\n0\n")
+                for x, y in corners:
+                    stream.write(
+                        f"0\nVERTEX\n8\n{layer}\n10\n{x * pitch_um:.4f}\n20\n{y * pitch_um:.4f}\n30\n0\n"
+                    )
+                stream.write("0\nSEQEND\n")
+                count += 1
+        stream.write("0\nENDSEC\n0\nEOF\n")
+    return count
+
+
+def read_dxf_levels(path: Path, shape: tuple[int, int], pitch_um: float, greys: Sequence[int]) -> np.ndarray:
+    """Levels uint8 (ny, nx), row 0 on top, from the polylines of ``write_dxf``."""
+    level_of = {grey: level for level, grey in enumerate(greys)}
+    found = np.full(shape, level_of.get(0, 0), np.uint8)
+    layer, x, corners = 0, 0.0, []
+    for code, value in _pairs(path):
+        if code == "8":
+            layer = int(value)
+        elif code == "10":
+            x = float(value)
+        elif code == "20":
+            corners.append((x / pitch_um, shape[0] - float(value) / pitch_um))
+        elif value == "POLYLINE":
+            corners = []
+        elif value == "SEQEND":
+            (left, top), (right, bottom) = (
+                np.rint(edge(corners[1:], axis=0)).astype(int) for edge in (np.min, np.max)
+            )
+            found[top:bottom, left:right] = level_of[layer]
+    return found
+
+
+def _pairs(path: Path) -> Iterator[tuple[str, str]]:
+    with open(path, encoding="ascii") as stream:
+        for code in stream:
+            yield code.strip(), next(stream).strip()

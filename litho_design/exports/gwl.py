@@ -1,0 +1,164 @@
+"""Layouts as GWL for Nanoscribe printers: one line of resist per run of a row and slice, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from litho_data.foundation.errors import InputError
+from litho_data.foundation.results import Record
+from litho_data.foundation.settings import setting
+from litho_design.exports.rows import LevelRows
+
+# What the piezo of a Photonic Professional reaches along x and y.
+_PIEZO_UM = 300.0
+
+
+class Gwl(Record):
+    """How a Nanoscribe prints the slices."""
+
+    mode: Literal["galvo", "piezo"] = setting("galvo", "Who moves the focus: galvo or piezo")
+    field_um: float = setting(100.0, "Side of a write field of the galvo", unit="µm", gt=0)
+    speed_um_s: float = setting(40000.0, "Scan speed", unit="µm/s", gt=0)
+    power_percent: tuple[float, ...] = setting(
+        (50.0,),
+        "Laser power, %: one number, or that of the pedestal and of every level above it",
+    )
+
+
+def write_gwl(
+    path: Path,
+    levels: LevelRows,
+    pitch_um: float,
+    level_height_um: float,
+    pedestal_um: float,
+    slicing_um: float,
+    hatching_um: float,
+    job: Gwl,
+) -> int:
+    """Write the slices from the pedestal up, field by field; returns the number of lines.
+
+    A slice of height z lies in the middle of its thickness, a row in the middle of its hatching distance, and
+    a line of resist runs along x from edge to edge of the pixels that are higher. x and y are those of the
+    element, y up, in galvo mode from the middle of the field, to which the stage moves.
+
+    Raises:
+        InputError: level height or pedestal that are no whole number of slices, a pitch that is no whole
+            number of hatching distances, powers for another number of levels, or an element beyond the piezo.
+    """
+    height, width = levels.shape
+    thick, base, rows_per_px = (
+        _whole(name, whole / part)
+        for name, whole, part in (
+            ("slices of a level", level_height_um, slicing_um),
+            ("slices of the pedestal", pedestal_um, slicing_um),
+            ("hatching distances of a pixel", pitch_um, hatching_um),
+        )
+    )
+    if job.mode == "piezo" and max(height, width) * pitch_um > _PIEZO_UM:
+        size = f"an element of {max(height, width) * pitch_um:g} µm"
+        raise InputError("piezo mode", got=size, wanted=f"at most {_PIEZO_UM:g} µm", hint="--gwl-mode galvo")
+    field_px = max(1, round(job.field_um / pitch_um)) if job.mode == "galvo" else max(height, width)
+    lines, at_um = 0, np.zeros(2)
+    with open(path, "w", encoding="ascii") as stream:
+        stream.write(_head(job))
+        for top, left in np.ndindex(-(-height // field_px), -(-width // field_px)):
+            bottom, right = min((top + 1) * field_px, height), min((left + 1) * field_px, width)
+            part = levels[top * field_px : bottom][:, left * field_px : right]
+            corner_um = np.array([left * field_px, height - bottom]) * pitch_um
+            if job.mode == "galvo":
+                middle_um = corner_um + np.array(part.shape[::-1]) / 2 * pitch_um
+                for axis, move_um in zip("XY", (middle_um - at_um).tolist(), strict=True):
+                    stream.write(f"MoveStage{axis} {move_um:.4f}\n")
+                at_um, corner_um = middle_um, corner_um - middle_um
+            highest = int(part.max())
+            powers = _powers(job, highest)
+            for number in range(base + thick * highest):
+                level = 0 if number < base else (number - base) // thick + 1
+                stream.write(f"LaserPower {powers[level]:g}\n")
+                z_um = (number + 0.5) * slicing_um
+                for row, begin, end in _runs(part >= level):
+                    x = (corner_um[0] + begin * pitch_um, corner_um[0] + end * pitch_um)
+                    for hatch in range(rows_per_px):
+                        y = corner_um[1] + (len(part) - row - 1) * pitch_um + (hatch + 0.5) * hatching_um
+                        stream.write(f"{x[0]:.4f} {y:.4f} {z_um:.4f}\n{x[1]:.4f} {y:.4f} {z_um:.4f}\nWrite\n")
+                        lines += 1
+    return lines
+
+
+def read_gwl_levels(
+    path: Path,
+    shape: tuple[int, int],
+    pitch_um: float,
+    level_height_um: float,
+    pedestal_um: float,
+    slicing_um: float,
+) -> np.ndarray:
+    """Levels uint8 (ny, nx), row 0 on top, from the number of slices that lie above one another.
+
+    Raises:
+        InputError: columns of resist that are no whole number of levels.
+    """
+    steps = np.zeros((shape[0], shape[1] + 1), np.int32)
+    stage = {"MoveStageX": 0.0, "MoveStageY": 0.0}
+    points: list[list[float]] = []
+    hatched: dict[int, int] = {}
+    with open(path, encoding="ascii") as stream:
+        for words in (line.split() for line in stream):
+            if words[0] in stage:
+                stage[words[0]] += float(words[1])
+            elif words[0] == "Write":
+                (x0, y, _), (x1, _, _) = points
+                row = shape[0] - 1 - int((y + stage["MoveStageY"]) / pitch_um)
+                begin, end = (round((x + stage["MoveStageX"]) / pitch_um) for x in (x0, x1))
+                steps[row, begin] += 1
+                steps[row, end] -= 1
+                hatched[round(1e4 * (y + stage["MoveStageY"]))] = row
+                points = []
+            elif words[0][0] in "-0123456789":
+                points.append([float(word) for word in words])
+    rows_per_px = len(hatched) / shape[0]
+    slices = steps.cumsum(1)[:, :-1] / rows_per_px - pedestal_um / slicing_um
+    found = slices * slicing_um / level_height_um
+    if np.abs(found - np.rint(found)).max() > 1e-6:
+        raise InputError(f"GWL {path}", got="columns between two levels", wanted="whole levels")
+    return np.rint(found).astype(np.uint8)
+
+
+def _head(job: Gwl) -> str:
+    mode = {"galvo": "GalvoScanMode", "piezo": "PiezoScanMode\nConnectPointsOn"}[job.mode]
+    return (
+        "% litholoop layout, micrometres; y up, z from the substrate\n"
+        f"InvertZAxis 1\n{mode}\nContinuousMode\nPowerScaling 1\nScanSpeed {job.speed_um_s:g}\n"
+        "XOffset 0\nYOffset 0\nZOffset 0\nFindInterfaceAt 0\n"
+    )
+
+
+def _runs(mask: np.ndarray) -> Iterator[tuple[int, int, int]]:
+    """Row, begin and end of the runs of a mask (ny, nx), the lowest row first."""
+    edges = np.diff(np.pad(mask.astype(np.int8), ((0, 0), (1, 1))), axis=1)[::-1]
+    row, begin = np.nonzero(edges > 0)
+    end = np.nonzero(edges < 0)[1]
+    return zip((len(mask) - 1 - row).tolist(), begin.tolist(), end.tolist(), strict=True)
+
+
+def _powers(job: Gwl, highest: int) -> tuple[float, ...]:
+    powers = job.power_percent
+    if len(powers) == 1:
+        return powers * (highest + 1)
+    if len(powers) <= highest:
+        raise InputError(
+            "laser power",
+            got=f"{len(powers)} numbers",
+            wanted=f"one, or one for the pedestal and {highest} levels",
+        )
+    return powers
+
+
+def _whole(what: str, count: float) -> int:
+    if abs(count - round(count)) > 1e-6 or round(count) < 1:
+        raise InputError(what, got=f"{count:.4g}", wanted="a whole number, at least one")
+    return round(count)

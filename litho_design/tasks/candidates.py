@@ -1,0 +1,43 @@
+"""The layout that a design returns: the searched one, or one of doing nothing that the models prefer."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from litho_design.tasks.task import Task
+from litho_design.tasks.width import SEARCHED, Width
+
+
+@torch.no_grad()
+def best_layout(task: Task, searched: Tensor) -> tuple[Tensor, Width | None]:
+    """The candidate that the models at hand agree on most: that of the smallest largest loss.
+
+    Args:
+        searched: levels of the search on the pixels (size, size).
+
+    Returns:
+        Its levels, and the width of the design; None where there is one model and nothing to compare with.
+    """
+    candidates = {SEARCHED: searched, **task.untouched()}
+    models = {printer.name: printer for printer in (*task.printers, *task.judges)}
+    if len(models) == 1 and len(candidates) == 1:
+        return searched, None
+    figures: dict[str, dict[str, dict[str, float]]] = {}
+    for name, level in candidates.items():
+        seen = {model: task.bench(one(level[None, None].float())[0, 0]) for model, one in models.items()}
+        figures[name] = {
+            model: {"loss": float(task.loss_and_parts(one)[0]), **task.window_figures(one)}
+            for model, one in seen.items()
+        }
+    returned = min(figures, key=lambda name: max(one["loss"] for one in figures[name].values()))
+    known = next(iter(figures[SEARCHED].values()))
+    figure = next((name for name in (*task.headline, *known) if name in known), "loss")
+    return candidates[returned], Width(
+        searched_with=len(task.printers),
+        figures=figures,
+        returned=returned,
+        figure=figure,
+        less=figure in (*task.errors, "loss"),
+        level_heights_um={model: list(one.level_heights_um()) for model, one in models.items()},
+    )

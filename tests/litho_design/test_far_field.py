@@ -1,0 +1,91 @@
+"""The far field and light that is no even plane wave, against closed forms."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from litho_data.foundation.errors import InputError
+from litho_design import design_hologram, hologram_settings
+from litho_design.optics import (
+    Optics,
+    blaze_efficiency,
+    centred_grid,
+    element_field,
+    intensity_share,
+    make_propagator,
+)
+from litho_design.optics.far_field import FarFieldPropagator
+
+FAR = Optics(distance_um=100.0, propagation="far-field")
+
+
+def test_orders_of_a_blaze_have_the_power_of_the_formula():
+    """Periods of whole pixels and a window of whole diffraction orders: every order is one pixel."""
+    size, period, levels = 96, 8, 8
+    grid = centred_grid((size, size), 0.2)
+    height = (torch.arange(size) % period * (FAR.wave_height_um / levels)).repeat(size, 1)
+    # One pixel of the image is one step of the discrete transform: lambda f / (N pitch).
+    step_um = FAR.wavelength_um * FAR.distance_um / (size * 0.2)
+    odd = centred_grid((size - 1, size - 1), step_um)
+    wave = make_propagator(grid, odd, FAR)(element_field(height, grid, FAR))
+    power = intensity_share(wave, odd)
+    first = power[size // 2 - 1, size // 2 - 1 + size // period]
+    assert float(first) == pytest.approx(blaze_efficiency(levels, 1.0), rel=1e-4)
+    # Other orders of eight steps of one wave lie 8 orders away: the rest of the light is beyond the window.
+    assert float(power.sum() - first) < 1e-5
+
+
+def test_the_adjoint_and_the_largest_angle():
+    grid, window = centred_grid((20, 24), 0.3), centred_grid((16, 30), 1.7)
+    far = FarFieldPropagator(grid, window, 90.0, 0.6, dtype=torch.complex128)
+    draw = torch.Generator().manual_seed(0)
+    one = torch.randn(20, 24, dtype=torch.complex128, generator=draw)
+    other = torch.randn(16, 30, dtype=torch.complex128, generator=draw)
+    assert torch.allclose(
+        (far(one).conj() * other).sum(), (one.conj() * far.adjoint(other)).sum(), rtol=1e-12
+    )
+    with pytest.raises(InputError, match="focal length of the far field"):
+        FarFieldPropagator(grid, centred_grid((16, 30), 8.0), 90.0, 0.6)
+
+
+def test_a_gaussian_beam_and_a_near_point():
+    """A beam of radius w has a spot of radius lambda f / (pi w); light of a point d away focuses nowhere."""
+    size, beam_um = 128, 4.0
+    grid = centred_grid((size, size), 0.2)
+    optics = FAR.model_copy(update={"beam_um": beam_um})
+    field = element_field(torch.zeros(size, size), grid, optics)
+    assert float(intensity_share(field, grid).sum()) == pytest.approx(1, rel=1e-5)
+    window = centred_grid((101, 101), 0.2)
+    seen = intensity_share(make_propagator(grid, window, optics)(field), window)
+    spot_um = optics.wavelength_um * optics.distance_um / (math.pi * beam_um)
+    along = seen[50] / seen[50, 50]
+    wanted = torch.exp(-2 * torch.from_numpy(window.x_um) ** 2 / spot_um**2)
+    # What lies beyond 12.8 µm of a beam of 4: exp(-(12.8 / 4)^2) = 4e-5 in amplitude.
+    assert (along - wanted).abs().max() < 1e-3
+    near = element_field(torch.zeros(size, size), grid, Optics(source_distance_um=50.0))
+    x = torch.from_numpy(grid.x_um)
+    phase = 2 * math.pi / 0.6328 * (torch.hypot(x, torch.tensor(float(grid.y_um[64]))) ** 2 / 100.0)
+    turned = near[64] * torch.polar(torch.ones_like(phase), -phase)
+    # Paraxial: r^4 / (8 d^3) = 0.03 µm at 12.8 µm, 0.27 rad.
+    assert turned.angle().sub(turned[64].angle()).abs().max() < 0.4
+
+
+def test_a_fan_out_in_the_far_field_stands_beside_its_baselines(tmp_path):
+    changes = {
+        "layout.size_px": 64,
+        "layout.cell_um": 0.2,
+        "optics.distance_um": 12.0,
+        "optics.propagation": "far-field",
+        "search.iterations": 30,
+        "search.polish_rounds": 3,
+        "window.yield_draws": 2,
+        "window.defocus_sd_um": 0.0,
+    }
+    settings = hologram_settings(changes=changes)
+    made = design_hologram("spots", "none", tmp_path, settings=settings, announce=False)
+    assert made.predicted["eff_signal"] > 0.5 * made.baselines["continuous phase"]["eff_signal"]
+    assert made.predicted["si_psnr_db"] > made.baselines["black image"]["si_psnr_db"]
+    assert {"weighted GS", "continuous phase"} <= made.baselines.keys()
