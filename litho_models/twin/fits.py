@@ -17,7 +17,6 @@ from litho_models.effects import get_effect
 from litho_models.fitting.least_squares import (
     Linearised,
     Rules,
-    eliminated,
     eliminated_sum,
     fit_least_squares,
     orthonormal,
@@ -105,14 +104,6 @@ class State:
     def mse_nm2(self) -> float:
         return float(self.freed_nm2.mean())
 
-    def covariance(self) -> np.ndarray:
-        """Covariance (p, p) of the numbers, by what each scan asks for at the optimum."""
-        parts = [eliminated(part, RULES.term_weight) for part in self.linear]
-        normal = np.sum([p[0] for p in parts], axis=0)
-        inverse = np.linalg.pinv(normal, rcond=1e-10, hermitian=True)
-        scores = np.stack([p[1] for p in parts])
-        return inverse @ (scores.T @ scores) @ inverse * len(parts) / max(len(parts) - 1, 1)
-
 
 class TwinProblem:
     """A twin on windows of scans; derivatives are one-sided differences."""
@@ -138,11 +129,10 @@ class TwinProblem:
         base = placed.base_height(chain, window)
         prediction = finished(chain, base, window)
         value = window.at_sample(prediction)
-        labels = set(twin.labels(window).values())
         rows = np.zeros((len(steps), len(window.sample)))
         for i, (other, step) in enumerate(zip(moved, steps, strict=True)):
             slot = twin.slots[i - own] if i >= own else None
-            if slot is not None and slot.label is not None and slot.label not in labels:
+            if slot is not None and not twin.is_of(slot, window):
                 continue
             there = other.chain(window)
             # What acts on the height leaves the height of the base, most of the work, as it is.
@@ -188,7 +178,7 @@ def fit_state(twin: Twin, study: Study) -> State:
 def without_terms(
     columns: np.ndarray, window: PreparedScan, prediction_um: np.ndarray, terms: Terms = ALL_FREE
 ) -> np.ndarray:
-    """Columns (n, m) at the sampled pixels, freed of what a single scan may add to a prediction (y, x), µm."""
+    """Columns (n, m) at the sampled pixels, without what a single scan may add to a prediction (y, x), µm."""
     basis = orthonormal(window.terms_at_sample(prediction_um, terms).T)
     return columns - basis @ (basis.T @ columns)
 
@@ -196,7 +186,10 @@ def without_terms(
 def _without(
     common: Twin, linear: Sequence[Linearised], windows: Sequence[PreparedScan]
 ) -> tuple[np.ndarray, float]:
-    """Fit on some of the windows with the derivatives of the common fit, and its weighted sum of squares."""
+    """Numbers fitted to some of the windows with the derivatives of the common fit; weighted squares, µm².
+
+    The common fit, which has seen all windows, is where it starts: nothing may be left there.
+    """
     normal, right, total = eliminated_sum(linear, RULES.term_weight)
     vector = common.vector
     if not len(vector):
@@ -212,4 +205,4 @@ def _without(
         vector, gained, total = trial, total - squares, squares
         if gained <= _FOLD_GAIN * squares:
             break
-    return vector, total
+    return common.at(vector).known_from(windows).vector, total

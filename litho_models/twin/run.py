@@ -327,7 +327,7 @@ def _survives(loop: _Loop, others: Mapping[str, nn.Module]) -> dict[str, list[st
 def _nested(
     scans: Sequence[PrintedScan], base: nn.Module, study: Study, held_out: HeldOut
 ) -> tuple[list[ErrorRow], dict[str, int]]:
-    """Everything chosen anew without each fold, or print, and judged there; how often each effect was chosen."""
+    """All chosen anew without each fold, or print, and judged there; how often each effect was chosen."""
     ids = [scan.id for scan in scans]
     parts = (
         [[ids[i] for i in np.flatnonzero(study.fold_of == fold)] for fold in study.folds]
