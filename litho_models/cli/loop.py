@@ -9,6 +9,7 @@ import typer
 
 import litho_models
 from litho_data.foundation.app import DaskOption, WorkersOption
+from litho_data.foundation.errors import InputError
 
 
 def close_loop(
@@ -23,7 +24,12 @@ def close_loop(
         Path, typer.Option("--out", help="folder for result, report, tables and the corrected model")
     ],
     base: Annotated[
-        str, typer.Option("--base", help="model to correct: its name, or a frozen model (a folder, zoo:NAME)")
+        str,
+        typer.Option(
+            "--base",
+            help="model to correct: its name, a frozen model (a folder, zoo:NAME), or auto: small models "
+            "compete, causes are sought together, strengths by group, and laws where no name holds",
+        ),
     ] = "physics",
     prior: Annotated[
         str | None,
@@ -80,6 +86,16 @@ def close_loop(
 
     Example: litho-models close-loop prints.zarr --base physics --out loop
     """
+    if base == "auto":
+        others = {
+            "further stores": stores[1:], "--prior": prior, "--inject": inject, "--steps": steps,
+            "--cache": cache, "--loss": loss != "squares", "--weights": weights != "uniform",
+            "--background": background != "none",
+        }  # fmt: skip
+        if given := [name for name, value in others.items() if value]:
+            raise InputError(f"--base auto with {given[0]}", wanted="a named base, or none of it")
+        _close_together(stores[0], out, folds, nested, open_lock_box, seed, workers, dask)
+        return
     from litho_models.loop import LoopConfig, parse_priors
     from litho_models.loop.report.wording import error_lines, verdict_text
 
@@ -116,4 +132,35 @@ def close_loop(
     for one in result.decisions or []:
         left = ", ".join(one.left) or "none"
         typer.echo(f"  new prints on {one.question}: {one.verdict}: {left}; {one.evidence}")
+    typer.echo(f"report: {out / 'report.html'}")
+
+
+def _close_together(
+    store: Path,
+    out: Path,
+    folds: int,
+    nested: Literal["folds", "prints"] | None,
+    open_lock_box: bool,
+    seed: int,
+    workers: int,
+    dask: str | None,
+) -> None:
+    """Causes and laws sought together, with strengths by group."""
+    from litho_models.twin.report import effect_text, verdict_text
+    from litho_models.twin.run import close_store
+
+    result = close_store(
+        store,
+        out,
+        folds=folds,
+        nested=nested,
+        open_lock_box=open_lock_box,
+        seed=seed,
+        workers=workers,
+        dask=dask,
+        report=lambda message: typer.echo(message, err=True),
+    )
+    typer.echo(verdict_text(result))
+    for one in result.effects:
+        typer.echo(f"  {effect_text(one)}")
     typer.echo(f"report: {out / 'report.html'}")

@@ -51,8 +51,8 @@ _OFFERS: tuple[tuple[Shared, int, bool], ...] = (
 )
 # Scans' worth of evidence for no difference between groups: the spread within groups over that between them.
 _SHRINKING = (0.3, 1.0, 3.0)
-# A part stays if the held-out squared error falls in the mean by more than so many standard errors.
-_LEAST_Z = 1.5
+# A part stays if the held-out squared error falls by more than so many standard errors, and by such a share.
+_LEAST_Z, _LEAST_SHARE = 0.5, 0.01
 _SAMPLED_PX = 16384
 # Displacements are found by their derivative; the second time around it is taken at the displaced print.
 _ROUNDS = 2
@@ -201,7 +201,7 @@ class _Learner:
                     best, best_left = offer, now
             gain = left - best_left
             error = gain.std(ddof=1) / np.sqrt(len(gain)) if len(gain) > 1 else np.inf
-            if best is None or gain.mean() <= _LEAST_Z * error:
+            if best is None or gain.mean() <= max(_LEAST_Z * error, _LEAST_SHARE * left.mean()):
                 return chosen
             chosen.append(best)
             left = best_left

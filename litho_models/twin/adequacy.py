@@ -7,8 +7,6 @@ the place, blurred, displaced, squared.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
@@ -24,25 +22,8 @@ _BLURS_UM = (0.2, 0.6, 1.6)
 _SHRINKING = 0.02
 
 
-@dataclass(frozen=True)
-class Adequacy:
-    """What the change by one cause leaves.
-
-    Attributes:
-        gain_nm2: what the cause takes from the squared error, the rest of the model in place.
-        reshaped_nm2: what its change in other shapes would take beside it, on held-out scans.
-        left_nm2: what all features of layout and place still explain beside the whole model.
-        without_nm2: the same without the cause.
-    """
-
-    gain_nm2: float
-    reshaped_nm2: float
-    left_nm2: float
-    without_nm2: float
-
-
-def reshaped_gain(without: State, state: State, study: Study) -> tuple[float, float]:
-    """Gain (nm²) of a cause's change in other shapes, and of the change itself scaled, on held-out scans.
+def reshaped_gain(without: State, state: State, study: Study) -> float:
+    """Gain (nm²) on held-out scans of a cause's change in other shapes, beside the change itself.
 
     Args:
         without, state: the model without and with the cause.
@@ -61,8 +42,7 @@ def reshaped_gain(without: State, state: State, study: Study) -> tuple[float, fl
     count = products.grams.shape[1]
     left = products.held_out([], study.fold_of)
     taken = left - products.held_out([Block(tuple(range(1, count)), ALL, _SHRINKING)], study.fold_of)
-    scaled = left - products.held_out([Block((1,))], study.fold_of)
-    return float(taken.mean()) * NM_PER_UM**2, float(scaled.mean()) * NM_PER_UM**2
+    return float(taken.mean()) * NM_PER_UM**2
 
 
 def _of_folds(twin: Twin, vectors: np.ndarray):

@@ -31,7 +31,9 @@ from litho_models.twin.model import Placed, Twin, finished
 FREE_TERMS: Terms = frozenset({"offset", "bow", "warp"})
 # What a comparison of errors leaves to the single scans.
 ALL_FREE: Terms = FREE_TERMS | {"gain"}
-RULES = Rules("squares", steps=8, relative_gain=1e-3)
+RULES = Rules("squares")
+# The way to the neighbourhood of the optimum is walked on every third scan.
+_START_EVERY = 3
 # A fit without a fold starts at the common one and takes its derivatives.
 _FOLD_STEPS, _FOLD_GAIN, _FOLD_DAMPING = 6, 1e-4, 1e-6
 
@@ -155,7 +157,7 @@ class TwinProblem:
 def fit_state(twin: Twin, study: Study) -> State:
     """Fit a twin to all windows of a study, then without each fold in turn, from where it stands."""
     windows = study.windows
-    fitted = fit_least_squares(TwinProblem(twin, windows), twin.vector, RULES)
+    fitted = fit_least_squares(TwinProblem(twin, windows), _best_start(twin, windows), RULES)
     common = twin.at(fitted.vector)
     free = common.free()
     linear = [replace(part, jacobian=part.jacobian * free[:, None]) for part in fitted.linear]
@@ -173,6 +175,20 @@ def fit_state(twin: Twin, study: Study) -> State:
             left = without_terms(held_out[i][:, None], windows[i], prediction)
             freed[i] = NM_PER_UM**2 * float(np.mean(left**2))
     return State(common, np.stack(per_fold), linear, held_out, np.array(training), freed)
+
+
+def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
+    """Where the twin stands, or with the base's numbers before any fit: the better one after a fit to some scans.
+
+    The best base without an effect is no good place to look for one beside it: what the base took of the effect
+    keeps it there, on the wrong side of a hill.
+    """
+    unfitted = twin.with_base_unfitted()
+    if not twin.slots or np.array_equal(unfitted, twin.vector):
+        return twin.vector
+    some = TwinProblem(twin, windows[::_START_EVERY] if len(windows) > 2 * _START_EVERY else windows)
+    fits = [fit_least_squares(some, start, RULES) for start in (twin.vector, unfitted)]
+    return min(fits, key=lambda fit: eliminated_sum(fit.linear, RULES.term_weight)[2]).vector
 
 
 def without_terms(

@@ -114,6 +114,14 @@ class Twin:
         vector = np.concatenate([bare.vector, self.vector[self.own :]])
         return Twin(base, self.by, self.choices, self.slots, vector, self.full_height_um, self.pitch_um)
 
+    def with_base_unfitted(self) -> np.ndarray:
+        """The numbers with the base's as they are before any fit."""
+        if not (self.own and isinstance(self.base, Simulator)):
+            return self.vector
+        fresh = type(self.base)(self.base.config)
+        own = np.concatenate([p.detach().numpy().reshape(-1) for p in _parameters(fresh)])
+        return np.concatenate([own.astype(np.float64), self.vector[self.own :]])
+
     def values(self, label_in: Mapping[str, str]) -> Values:
         """Parameter values of all effects for the scans with these labels, by grouping.
 

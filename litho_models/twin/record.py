@@ -27,7 +27,7 @@ CandidateVerdict = Literal[
     "below-noise",
     "too-few-scans",
 ]
-Stage = Literal["base", "causes", "laws", "all"]
+Stage = Literal["base", "causes", "all"]
 MeasuredBy = Literal["print alone", "published", "shared"]
 
 
@@ -35,7 +35,7 @@ class ErrorRow(Record):
     """Error of one model on scans held out from it.
 
     Attributes:
-        model: how much of what was found is in it.
+        model: the base, with its causes, with causes and laws (``all``, the corrected model).
         measurement: what is added to the print: nothing, the smooth background that training scans share (the
             published protocol), or the whole measurement model.
         policy: terms of each scan, ``k`` of them, fitted on pixels that are not scored.

@@ -21,8 +21,7 @@ _BEFORE, _AFTER = "#9aa5b1", "#2f7fd0"
 _STAGES = {
     "base": "base",
     "causes": "with the causes",
-    "laws": "with causes and laws",
-    "all": "with all that was found",
+    "all": "corrected",
 }
 _SHOWN_SCANS = 3
 _WORDS = {
@@ -140,7 +139,7 @@ def _by(one: FoundEffect) -> str:
 
 
 def _headline(result: CloseLoop) -> list[ErrorRow]:
-    rows = [result.error(stage) for stage in ("base", "causes", "laws", "all")]  # type: ignore[arg-type]
+    rows = [result.error(stage) for stage in ("base", "causes", "all")]  # type: ignore[arg-type]
     return [row for row in rows if row is not None]
 
 

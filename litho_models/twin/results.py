@@ -102,9 +102,8 @@ def record(
     """
     study, scans = closed.study, closed.study.scans
     effects = [
-        *(_found(closed, one, "causes", left_out_nm, survives) for one in closed.causes),
-        *(_found(closed, one, "laws", left_out_nm, survives) for one in closed.lawful.causes),
-        *(_found(closed, one, "all", left_out_nm, survives) for one in closed.described.causes),
+        _found(closed, one, left_out_nm, survives)
+        for one in (*closed.causes, *closed.lawful.causes, *closed.described.causes)
     ]
     before, after = (
         next(
@@ -177,14 +176,13 @@ def _values(twin: Twin) -> dict[str, float]:
 def _found(
     closed: Closed,
     cause: Cause,
-    stage: Stage,
     left_out_nm: Mapping[str, float],
     survives: Mapping[str, list[str]],
 ) -> FoundEffect:
     effect = get_effect(cause.name)
     verdicts: dict[str, EffectVerdict] = {"law": "lawful", "description": "described"}
     verdict = verdicts.get(effect.knowledge, "confusable" if cause.alike else "explained")
-    reshaped = next((c.reshaped_nm2 for c in closed.checked if c.cause.name == cause.name), None)
+    reshaped = next((c.reshaped_share for c in closed.checked if c.cause.name == cause.name), None)
     roles = {effect.role, *(get_effect(name).role for name in cause.alike)}
     return FoundEffect(
         name=cause.name,
@@ -194,7 +192,9 @@ def _found(
         stage=effect.stage,
         verdict=verdict,
         by=cause.by,
-        strengths=_strengths(closed.final, closed, cause.name),
+        strengths=_strengths(
+            closed.final if cause.name in closed.final.twin.by else closed.described.state, closed, cause.name
+        ),
         confusable_with=list(cause.alike),
         separating_experiment=separating([cause.name, *cause.alike]),
         gain_nm2=cause.judgement.gain_nm2,
@@ -203,7 +203,7 @@ def _found(
         p_confirm=cause.judgement.p,
         family_p=cause.family_p,
         group_p=cause.group_p,
-        reshaped_share=None if reshaped is None else reshaped / max(cause.judgement.gain_nm2, 1e-9),
+        reshaped_share=reshaped,
         left_out_nm=left_out_nm.get(cause.name),
         survives_on=survives.get(cause.name, []),
     )

@@ -13,20 +13,19 @@ from torch import nn
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_folder
 from litho_data.foundation.outputs import require_replaceable_folder
-from litho_data.foundation.workers import Workers, kept_open
+from litho_data.foundation.workers import Workers, kept_open, run_jobs
 from litho_data.store import PrintedScan, Store, open_store
-from litho_models.effects import get_effect
 from litho_models.fitting.runs import level_share, step_share
 from litho_models.frozen.files import save_frozen
 from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.models import build_model
 from litho_models.scan_terms.background import learn_background
 from litho_models.scan_terms.groups import ALL
-from litho_models.scan_terms.measurement import MeasurementModel, learn_measurement
+from litho_models.scan_terms.measurement import MeasurementModel
 from litho_models.scoring.records import Prediction
 from litho_models.simulator import Simulator
 from litho_models.splits.folds import GROUPED_FOLDS, Split, grouped_folds, leave_one_print_out
-from litho_models.twin.closing import Closed, close
+from litho_models.twin.closing import Closed, close, fit_with_measurement, held_out_maps
 from litho_models.twin.fits import State, Study, fit_state
 from litho_models.twin.judging import judge
 from litho_models.twin.model import Twin
@@ -85,7 +84,7 @@ def close_store(
         study = Study((), dealt(development, folds, seed), seed, places, report)
         name, chosen, others = _bases(base, development, study)
         loop = _Loop(development, chosen, study)
-        errors = loop.errors("scans")
+        errors = loop.errors()
         left_out = loop.left_out_nm()
         survives = _survives(loop, others)
         often: dict[str, int] = {}
@@ -94,7 +93,7 @@ def close_store(
             errors += rows
         if open_lock_box and locked:
             errors += loop.errors_of(locked, "locked")
-    measurement = loop.learned_on_all(loop.closed.final)
+    _, measurement = fit_with_measurement(loop.closed.final.twin, loop.closed.original, seed)
     result = record(
         loop.closed,
         errors,
@@ -133,119 +132,90 @@ class _Loop:
 
     def __post_init__(self) -> None:
         self.closed = close(self.scans, self.settings.fold_of, self.base, self.settings)
-        self.study = replace(self.settings, scans=self.closed.original)
-        self._measured: dict[int, list[MeasurementModel]] = {}
-        self._maps: dict[int, list[list[np.ndarray]]] = {}
+        self._fitted: dict[int, list[tuple[Twin, MeasurementModel]]] = {}
 
     @property
     def stages(self) -> dict[Stage, State]:
         """The models in order, each once."""
         found: dict[Stage, State] = {"base": self.closed.base}
-        steps: tuple[tuple[Stage, State], ...] = (
-            ("causes", self.closed.named.state),
-            ("laws", self.closed.lawful.state),
-            ("all", self.closed.final),
-        )
-        for name, state in steps:
-            if name == "all" or not any(state is one for one in (*found.values(), self.closed.final)):
-                found[name] = state
-        return found
+        if self.closed.causes and self.closed.lawful.causes:
+            found["causes"] = self.closed.named.state
+        return {**found, "all": self.closed.final}
 
-    def errors(self, held_out: str) -> list[ErrorRow]:
+    def errors(self) -> list[ErrorRow]:
         """Errors of all models on the development scans, each predicted without its fold."""
-        rows = []
+        plain = self.closed.plain
+        numbers = len(plain.twin.vector)
+        maps = held_out_maps(plain, self.closed.study, self.closed.original)
+        rows = self._rows("base", "print alone", maps, (numbers, 0))
+        rows += self._rows("base", "published", self._published(plain, maps), (numbers, 5))
         for name, state in self.stages.items():
-            self.settings.report(f"scoring the model with {name}" if name != "base" else "scoring the base")
-            plain = self.held_out(state)
-            count = len(state.twin.vector)
-            if name in ("base", "all"):
-                rows += self._rows(name, "print alone", plain, (count, 0), held_out)
-                rows += self._rows(name, "published", self._published(state), (count, 5), held_out)
-            measured = self.measured(state)
-            numbers = max(model.numbers for model in self.models(state))
-            rows += self._rows(name, "shared", measured, (count, numbers), held_out)
+            self.settings.report("scoring the base" if name == "base" else f"scoring {name}")
+            shared = max(learned.numbers for _, learned in self.fitted(state))
+            rows += self._rows(name, "shared", self.measured(state), (len(state.twin.vector), shared))
         return rows
 
     def _rows(
-        self,
-        model: Stage,
-        measurement: Any,
-        maps: Sequence[np.ndarray],
-        numbers: tuple[int, int],
-        held_out: Any,
+        self, model: Stage, measurement: Any, maps: Sequence[np.ndarray], numbers: tuple[int, int]
     ) -> list[ErrorRow]:
         return error_rows(
-            self.scans, maps, model=model, measurement=measurement, held_out=held_out, numbers=numbers,
+            self.scans, maps, model=model, measurement=measurement, held_out="scans", numbers=numbers,
             seed=self.settings.seed,
         )  # fmt: skip
 
-    def of_folds(self, state: State) -> list[list[np.ndarray]]:
-        """By fold, what the fit without it predicts of every scan, (y, x) µm."""
-        if id(state) not in self._maps:
-            placed = [state.twin.at(vector).placed() for vector in state.per_fold]
-            self._maps[id(state)] = [
-                [one.height(scan, fold) for scan in self.closed.original] for fold, one in enumerate(placed)
-            ]
-        return self._maps[id(state)]
-
-    def held_out(self, state: State) -> list[np.ndarray]:
-        maps = self.of_folds(state)
-        return [maps[fold][at] for at, fold in enumerate(self.study.fold_of)]
-
-    def models(self, state: State) -> list[MeasurementModel]:
-        """The measurement learned without each fold."""
-        if id(state) not in self._measured:
-            maps = self.of_folds(state)
-            found = []
-            for fold in self.study.folds:
-                own = np.flatnonzero(self.study.fold_of != fold)
-                found.append(
-                    learn_measurement(
-                        [self.scans[i] for i in own], [maps[fold][i] for i in own], seed=self.study.seed
-                    )
+    def fitted(self, state: State) -> list[tuple[Twin, MeasurementModel]]:
+        """Printer and measurement fitted without each fold."""
+        if id(state) not in self._fitted:
+            jobs = [
+                (
+                    int(fold),
+                    state.twin.at(state.per_fold[fold]),
+                    [self.closed.original[i] for i in np.flatnonzero(self.settings.fold_of != fold)],
+                    self.settings.seed,
                 )
-            self._measured[id(state)] = found
-        return self._measured[id(state)]
+                for fold in self.closed.study.folds
+            ]
+            done = run_jobs(_fit_fold, jobs, self.settings.workers, name=lambda job: f"fold {job[0]}")
+            by_fold = {job[0]: fitted for job, fitted in done}
+            self._fitted[id(state)] = [by_fold[job[0]] for job in jobs]
+        return self._fitted[id(state)]
 
-    def measured(self, state: State, learned: Sequence[MeasurementModel] | None = None) -> list[np.ndarray]:
+    def measured(self, state: State) -> list[np.ndarray]:
         """The maps that the scans should show, print and measurement learned without their fold."""
-        learned = learned or self.models(state)
-        return [
-            learned[fold].expected_um(scan, own)
-            for scan, own, fold in zip(self.scans, self.held_out(state), self.study.fold_of, strict=True)
-        ]
-
-    def _published(self, state: State) -> list[np.ndarray]:
-        """The maps with the smooth background of the training scans: today's published protocol."""
-        maps, found = self.of_folds(state), list(self.held_out(state))
-        for fold in self.study.folds:
-            own = np.flatnonzero(self.study.fold_of != fold)
-            learned = learn_background([self.scans[i] for i in own], [maps[fold][i] for i in own])
-            for i in np.flatnonzero(self.study.fold_of == fold):
-                found[i] = Prediction.beside(learned, found[i]).map_um
+        found = []
+        for scan, prepared, fold in zip(self.scans, self.closed.original, self.settings.fold_of, strict=True):
+            twin, learned = self.fitted(state)[fold]
+            found.append(learned.expected_um(scan, twin.placed().height(prepared, int(fold))))
         return found
 
-    def learned_on_all(self, state: State) -> MeasurementModel:
-        """The measurement learned on all development scans."""
-        placed = state.twin.placed()
-        maps = [placed.height(one) for one in self.closed.original]
-        return learn_measurement(self.scans, maps, seed=self.study.seed)
+    def _published(self, state: State, maps: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """The maps with the smooth background of the training scans: the published protocol."""
+        found, fold_of = list(maps), self.settings.fold_of
+        for fold in self.closed.study.folds:
+            placed = state.twin.at(state.per_fold[fold]).placed()
+            own = np.flatnonzero(fold_of != fold)
+            learned = learn_background(
+                [self.scans[i] for i in own],
+                [placed.height(self.closed.original[i], int(fold)) for i in own],
+            )
+            for i in np.flatnonzero(fold_of == fold):
+                found[i] = Prediction.beside(learned, maps[i]).map_um
+        return found
 
     def left_out_nm(self) -> dict[str, float]:
-        """By how much the error grows (k = 1) where each effect is left out and the rest fitted again."""
-        final = self.closed.final
-        if not final.twin.names:
+        """By how much the error grows (k = 1) where each cause or law is left out and the rest fitted again."""
+        model = self.closed.final
+        if not model.twin.names:
             return {}
-        full = self._mae(self.measured(final))
+        full = self._mae(model)
         found = {}
-        for name in final.twin.names:
+        for name in model.twin.names:
             self.settings.report(f"leaving out {name}")
-            without = fit_state(final.twin.without(name), self.closed.study)
-            found[name] = self._mae(self.measured(without, self.models(final))) - full
+            found[name] = self._mae(fit_state(model.twin.without(name), self.closed.study)) - full
         return found
 
-    def _mae(self, maps: Sequence[np.ndarray]) -> float:
-        rows = self._rows("all", "shared", maps, (0, 0), "scans")
+    def _mae(self, state: State) -> float:
+        rows = self._rows("all", "shared", self.measured(state), (0, 0))
         return next(row.mae_nm for row in rows if row.policy == "offset")
 
     def errors_of(self, scans: Sequence[PrintedScan], held_out: Any) -> list[ErrorRow]:
@@ -253,14 +223,15 @@ class _Loop:
         prepared, rows = prepare_scans(scans), []
         stages: tuple[tuple[Stage, State], ...] = (("base", self.closed.base), ("all", self.closed.final))
         for name, state in stages:
-            placed, learned = state.twin.placed(), self.learned_on_all(state)
+            twin, learned = fit_with_measurement(state.twin, self.closed.original, self.settings.seed)
+            placed = twin.placed()
             maps = [
                 learned.expected_um(scan, placed.height(one))
                 for scan, one in zip(scans, prepared, strict=True)
             ]
             rows += error_rows(
                 scans, maps, model=name, measurement="shared", held_out=held_out,
-                numbers=(len(state.twin.vector), learned.numbers), seed=self.study.seed,
+                numbers=(len(twin.vector), learned.numbers), seed=self.settings.seed,
             )  # fmt: skip
         return rows
 
@@ -275,6 +246,11 @@ class _Loop:
                 pair.append(left - np.nanmedian(left))
             found.append((scan.id, pair[0], pair[1]))
         return found
+
+
+def _fit_fold(job: tuple[int, Twin, Sequence[PreparedScan], int]) -> tuple[Twin, MeasurementModel]:
+    _, twin, scans, seed = job
+    return fit_with_measurement(twin, scans, seed)
 
 
 def _bases(
@@ -308,7 +284,7 @@ def _built(name: str, scans: Sequence[PrintedScan]) -> Simulator:
 
 
 def _survives(loop: _Loop, others: Mapping[str, nn.Module]) -> dict[str, list[str]]:
-    """For each effect, the other bases on which it is confirmed too, all effects in place."""
+    """For each cause and law, the other bases on which it is confirmed too, all others in place."""
     final, study = loop.closed.final, loop.closed.study
     found: dict[str, list[str]] = {name: [] for name in final.twin.names}
     if not final.twin.names:
@@ -406,4 +382,3 @@ def _save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) -
             {"name": "mae_datum_free", "value": error.mae_nm, "split": "grouped", "policy": "offset"},
         ],
     )
-    assert all(get_effect(name) for name in values)
