@@ -163,7 +163,7 @@ def _law(name: str, formula: str, unit: str, column: Column) -> Effect:
         return height + values["strength"] * column(height, context)
 
     return Effect(
-        name=name,
+        name=_named(name),
         title=f"height changed by {formula}",
         stage="development",
         role="undetermined",
@@ -235,7 +235,7 @@ def _description(name: str, title: str, names: list[str], unit: str, apply: Call
     )
 
 
-LAWS = {law.name: law for law in (_law(_named(name), *facts) for name, *facts in _columns())}
+LAWS = {law.name: law for law in (_law(*facts) for facts in _columns())}
 DESCRIPTIONS = {
     one.name: one
     for one in (

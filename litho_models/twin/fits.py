@@ -13,6 +13,7 @@ import numpy as np
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.foundation.workers import HERE, Workers
+from litho_data.store import PrintedScan
 from litho_models.effects import get_effect
 from litho_models.fitting.least_squares import (
     Linearised,
@@ -22,7 +23,7 @@ from litho_models.fitting.least_squares import (
     orthonormal,
     solve_damped,
 )
-from litho_models.loop.prepared import PreparedScan
+from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.scan_terms import Terms
 from litho_models.scan_terms.groups import Labels, groupings
 from litho_models.twin.model import Placed, Twin, finished
@@ -107,6 +108,18 @@ class State:
         return float(self.freed_nm2.mean())
 
 
+def prepared_among(scans: Sequence[PrintedScan], known: Sequence[PreparedScan]) -> list[PreparedScan]:
+    """Scans prepared with places in the writing order of those that a model is known from."""
+    orders, places = zip(*sorted((one.stored.order, one.context.order) for one in known), strict=True)
+
+    def placed(scan: PreparedScan) -> PreparedScan:
+        order = float(np.interp(scan.stored.order, orders, places))
+        part = None if scan.quadrant is None else placed(scan.quadrant)
+        return replace(scan, context=replace(scan.context, order=order), quadrant=part)
+
+    return [placed(scan) for scan in prepare_scans(scans)]
+
+
 class TwinProblem:
     """A twin on windows of scans; derivatives are one-sided differences."""
 
@@ -178,10 +191,10 @@ def fit_state(twin: Twin, study: Study) -> State:
 
 
 def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
-    """Where the twin stands, or with the base's numbers before any fit: the better one after a fit to some scans.
+    """Where the twin stands, or with the base's numbers before any fit: the better after a fit to some scans.
 
-    The best base without an effect is no good place to look for one beside it: what the base took of the effect
-    keeps it there, on the wrong side of a hill.
+    The best base without an effect is no good place to look for one beside it: what the base took of the
+    effect keeps it there, on the wrong side of a hill.
     """
     unfitted = twin.with_base_unfitted()
     if not twin.slots or np.array_equal(unfitted, twin.vector):

@@ -139,7 +139,7 @@ def _by(one: FoundEffect) -> str:
 
 
 def _headline(result: CloseLoop) -> list[ErrorRow]:
-    rows = [result.error(stage) for stage in ("base", "causes", "all")]  # type: ignore[arg-type]
+    rows = [result.error(stage) for stage in ("base", "causes", "all")]
     return [row for row in rows if row is not None]
 
 

@@ -26,7 +26,7 @@ from litho_models.scoring.records import Prediction
 from litho_models.simulator import Simulator
 from litho_models.splits.folds import GROUPED_FOLDS, Split, grouped_folds, leave_one_print_out
 from litho_models.twin.closing import Closed, close, fit_with_measurement, held_out_maps
-from litho_models.twin.fits import State, Study, fit_state
+from litho_models.twin.fits import State, Study, fit_state, prepared_among
 from litho_models.twin.judging import judge
 from litho_models.twin.model import Twin
 from litho_models.twin.record import CloseLoop, ErrorRow, Stage
@@ -203,7 +203,7 @@ class _Loop:
         return found
 
     def left_out_nm(self) -> dict[str, float]:
-        """By how much the error grows (k = 1) where each cause or law is left out and the rest fitted again."""
+        """By how much the error grows (k = 1) without each cause or law, the rest fitted again."""
         model = self.closed.final
         if not model.twin.names:
             return {}
@@ -220,7 +220,7 @@ class _Loop:
 
     def errors_of(self, scans: Sequence[PrintedScan], held_out: Any) -> list[ErrorRow]:
         """Errors of scans that took no part, by the fits to all that did."""
-        prepared, rows = prepare_scans(scans), []
+        prepared, rows = prepared_among(scans, self.closed.original), []
         stages: tuple[tuple[Stage, State], ...] = (("base", self.closed.base), ("all", self.closed.final))
         for name, state in stages:
             twin, learned = fit_with_measurement(state.twin, self.closed.original, self.settings.seed)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 
 from litho_models.effects import get_effect
@@ -26,7 +25,7 @@ def share(planted_name: str, fitted_name: str, beside: tuple[str, ...] = (), see
     state = fit_state(without.twin.with_effect(fitted_name, ALL, {"": values_of(fitted_name)}), study)
     gain = without.mse_nm2 - state.mse_nm2
     assert gain > 0
-    return float(np.ravel(reshaped_gain(without, state, study))[0]) / gain
+    return reshaped_gain(without, state, study) / gain
 
 
 # Each with one that does much the same by another formula.

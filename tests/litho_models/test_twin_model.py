@@ -10,7 +10,7 @@ from scipy.ndimage import gaussian_filter
 
 from litho_models.effects import get_effect
 from litho_models.scan_terms.groups import ALL
-from litho_models.twin.fits import TwinProblem, fit_state, without_terms
+from litho_models.twin.fits import TwinProblem, fit_state, prepared_among, without_terms
 from litho_models.twin.model import Slot, Twin, Values
 from litho_models.twin.results import clustered_covariance
 from tests.litho_models.twin_scans import BLUR_UM, PITCH_UM, bare_state, base_model, planted, study_of
@@ -194,3 +194,19 @@ def test_a_base_that_is_not_fitted_has_no_numbers(study) -> None:
     state = fit_state(twin, study)
     assert state.per_fold.shape == (5, 0)
     assert state.mse_nm2 > 16
+
+
+def test_scans_from_elsewhere_have_their_places_in_the_order_of_those_known(study) -> None:
+    """A drift goes on as it began: scans are not spread over the order anew."""
+    stored = [study.scans[3].stored, replace(study.scans[6].stored, order=7)]
+    found = prepared_among(stored, study.scans)
+    assert [one.context.order for one in found] == [
+        study.scans[3].context.order,
+        study.scans[7].context.order,
+    ]
+    late = prepared_among([replace(stored[0], order=99)], study.scans)[0]
+    assert late.context.order == 0.5
+    between = prepared_among(stored[1:], study.scans[::2])[0]
+    assert between.context.order == pytest.approx(
+        (study.scans[6].context.order + study.scans[8].context.order) / 2
+    )
