@@ -13,10 +13,10 @@ SPOTS = ("given", "round", "elliptical")
 WIDTHS = {"round": ("spot",), "elliptical": ("spot_y", "spot_x")}
 
 
-def model_of(spot: str, **widths_um: float) -> Simulator:
+def model_of(kind: str, **widths_um: float) -> Simulator:
     """Physics with a short diffusion and these widths (``spot``, ``spot_y``, ``spot_x``), float64."""
     model = build_model(
-        "physics", pitch_um=PITCH_UM, level_height_um=0.1, levels=13, spot=spot, sigma_diffusion_init_um=0.3
+        "physics", pitch_um=PITCH_UM, level_height_um=0.1, levels=13, spot=kind, sigma_diffusion_init_um=0.3
     ).double()
     for name, width in widths_um.items():
         key = f"raw_{name}_um"

@@ -15,6 +15,7 @@ import tifffile
 import litho_data
 from litho_data.foundation.errors import InputError
 from litho_data.store import open_store
+from litho_models.effects import get_effect
 from litho_models.frozen.files import load_frozen
 from litho_models.scan_terms.groups import ALL
 from litho_models.twin import closing, run
@@ -28,6 +29,8 @@ from tests.litho_models.twin_scans import bare_state, blank_scan, planted, study
 
 COUNT = 12
 BASE = "affine-mtf"
+CAUSES = ("write-order-memory", "slope-thinning", "galvo-lag")
+SOME_LAWS, TABLE = ("height-power-2", "slope-x-power-1"), "level-table"
 TABLES = {"errors.csv": "errors", "candidates.csv": "candidates", "explained.csv": "explained"}
 
 
@@ -50,10 +53,15 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def closed(store: Path) -> tuple[CloseLoop, Path, list[str]]:
-    """Result, its folder, and what was said; the locked scans are opened."""
+    """Result, its folder, and what was said, with a handful of candidates; the locked scans are opened."""
     said: list[str] = []
     out = store.parent / "loop"
-    return close_store(store, out, base=BASE, open_lock_box=True, report=said.append), out, said
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(closing, "screened_effects", lambda tip_radius_um: [get_effect(one) for one in CAUSES])
+        patch.setattr(closing, "LAWS", {one.name: one for one in map(get_effect, SOME_LAWS)})
+        patch.setattr(closing, "DESCRIPTIONS", {TABLE: get_effect(TABLE)})
+        result = close_store(store, out, base=BASE, open_lock_box=True, report=said.append)
+    return result, out, said
 
 
 def test_the_record_reads_back_as_it_was_written(closed) -> None:
