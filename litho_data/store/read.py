@@ -134,9 +134,14 @@ class Store:
 
         A pattern that repeats is not asked: one in a store from elsewhere might never come to an end.
         """
-        pattern = self.manifest.get("card", {}).get("ids", {}).get("print") or ""
-        repeats = set("*+{?") & set(pattern.replace("(?", "("))
-        match = None if repeats else re.fullmatch(pattern, scan_id)
+        ids = (self.manifest.get("card") or {}).get("ids") or {}
+        pattern = str(ids.get("print") or "")
+        if set("*+{?") & set(pattern.replace("(?", "(")):
+            return {}
+        try:
+            match = re.fullmatch(pattern, scan_id)
+        except re.error:
+            return {}
         found = match.groupdict() if match else {}
         return {name: value for name, value in found.items() if name != "print" and value is not None}
 

@@ -7,11 +7,11 @@ many strengths: they follow whatever their covariate carries, and explain nothin
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Iterator
 
 import torch
 from torch import Tensor
+from torch.nn import functional
 
 from litho_models.effects.effect import Effect, FieldContext, Parameter, Values
 from litho_models.effects.filters import add_blur, add_filtered, gradient, trailing_response
@@ -20,19 +20,94 @@ from litho_models.effects.filters import add_blur, add_filtered, gradient, trail
 Column = Callable[[Tensor, FieldContext], Tensor]
 
 _ROUNDED_SLOPE = 1e-3
-_NEAR_UM, _REACHES_UM, _TAILS_UM = 0.3, (0.6, 1.5, 4.0), (0.6, 2.0, 6.0)
+_REACHES_UM, _TAILS_UM = (0.6, 1.5, 4.0), (0.6, 2.0, 6.0)
 _STENCIL_UM = (-0.6, -0.3, 0.0, 0.3, 0.6)
+_COPIES_UM = tuple((dy, dx) for dy in _STENCIL_UM for dx in _STENCIL_UM if dy or dx)
 _SIDES = {"left": (-1, -1), "right": (-1, 1), "above": (-2, -1), "below": (-2, 1)}
+_DIAGONAL = 0.5**0.5
+# (y, x) of the directions along which a slope is taken.
+_DIRECTIONS = {
+    "x": (0.0, 1.0),
+    "y": (1.0, 0.0),
+    "diagonal": (_DIAGONAL, _DIAGONAL),
+    "antidiagonal": (_DIAGONAL, -_DIAGONAL),
+}
 
 
-def _slope(height: Tensor, context: FieldContext, along: tuple[float, float]) -> Tensor:
-    """Slope along a direction (y, x), smoothed by a pixel's own difference."""
-    y, x = gradient(height, context.pitch_um)
-    return along[0] * y + along[1] * x
+def _height(height: Tensor, context: FieldContext) -> Tensor:
+    return height
 
 
-def _size(slope: Tensor, power: float) -> Tensor:
-    return (slope**2 + _ROUNDED_SLOPE**2) ** (power / 2) - _ROUNDED_SLOPE**power
+def _order(height: Tensor, context: FieldContext) -> Tensor:
+    return torch.full_like(height, context.order)
+
+
+def _place(word: str) -> Column:
+    """x, y, or r² of the pixel in its scan."""
+
+    def column(height: Tensor, context: FieldContext) -> Tensor:
+        y, x = context.scan_position()
+        return {"x": x + 0 * y, "y": y + 0 * x, "r²": x**2 + y**2}[word].to(height)
+
+    return column
+
+
+def _times(first: Column, second: Column) -> Column:
+    return lambda height, context: first(height, context) * second(height, context)
+
+
+def _minus(first: Column, second: Column) -> Column:
+    return lambda height, context: first(height, context) - second(height, context)
+
+
+def _twice(column: Column) -> Column:
+    return lambda height, context: column(column(height, context), context)
+
+
+def _slope(direction: str, sign: float = 1.0) -> Column:
+    """Slope along a direction by central differences."""
+    along_y, along_x = _DIRECTIONS[direction]
+
+    def column(height: Tensor, context: FieldContext) -> Tensor:
+        y, x = gradient(height, context.pitch_um)
+        return sign * (along_y * y + along_x * x)
+
+    return column
+
+
+def _size(power: float, *slopes: Column) -> Column:
+    """A power of the size of a slope, or of the steepness, rounded off near zero so that it is smooth."""
+
+    def column(height: Tensor, context: FieldContext) -> Tensor:
+        squared = torch.stack([slope(height, context) for slope in slopes]).square().sum(dim=0)
+        return (squared + _ROUNDED_SLOPE**2) ** (power / 2) - _ROUNDED_SLOPE**power
+
+    return column
+
+
+def _uphill(slope: Column) -> Column:
+    return lambda height, context: torch.relu(slope(height, context))
+
+
+def _mean(reach_um: float, of: Column = _height) -> Column:
+    """Mean nearby, weighted by a Gaussian."""
+    return lambda height, context: _blurred(of(height, context), context, reach_um)
+
+
+def _beside(side: str, length_um: float) -> Column:
+    """Mean height on one side, weighted by an exponential of that length."""
+    axis, sign = _SIDES[side]
+
+    def column(height: Tensor, context: FieldContext) -> Tensor:
+        length = torch.as_tensor(length_um, dtype=height.dtype, device=height.device)
+
+        def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
+            along = fx if axis == -1 else fy
+            return trailing_response(-sign * along, length, context.pitch_um) - 1
+
+        return add_filtered(height, transfer_minus_one, context.pitch_um, 6 * length_um)
+
+    return column
 
 
 def _blurred(height: Tensor, context: FieldContext, sigma_um: float) -> Tensor:
@@ -40,106 +115,55 @@ def _blurred(height: Tensor, context: FieldContext, sigma_um: float) -> Tensor:
     return add_blur(height, variance, context.pitch_um, 4 * sigma_um)
 
 
-def _side(height: Tensor, context: FieldContext, side: str, length_um: float) -> Tensor:
-    """Mean height on one side, weighted by an exponential of that length, less the height here."""
-    axis, sign = _SIDES[side]
-    length = torch.as_tensor(length_um, dtype=height.dtype, device=height.device)
-
-    def transfer_minus_one(fy: Tensor, fx: Tensor) -> Tensor:
-        along = fx if axis == -1 else fy
-        return trailing_response(-sign * along, length, context.pitch_um) - 1
-
-    return add_filtered(height, transfer_minus_one, context.pitch_um, 6 * length_um) - height
-
-
-def _columns() -> dict[str, tuple[str, str, Column]]:
-    """By name: formula, unit of the column, column."""
-    found: dict[str, tuple[str, str, Column]] = {}
-    half = 0.5**0.5
-    directions = {
-        "x": (0.0, 1.0), "y": (1.0, 0.0), "diagonal": (half, half), "antidiagonal": (half, -half),
-    }  # fmt: skip
-    for axis, along in directions.items():
+def _columns() -> Iterator[tuple[str, str, str, Column]]:
+    """Name, formula, unit of the column, column."""
+    steepness = _slope("x"), _slope("y")
+    for axis in _DIRECTIONS:
+        slope = _slope(axis)
         for power in (1.0, 1.5, 2.0, 3.0):
-            found[_named(f"slope-{axis}-power-{power:g}")] = (
-                f"|∂h/∂{axis}|^{power:g}", "1",
-                lambda h, c, a=along, p=power: _size(_slope(h, c, a), p),
-            )  # fmt: skip
-    for axis, along in directions.items():
-        for sign, word in ((1.0, "rising"), (-1.0, "falling")):
-            found[f"{word}-slope-{axis}"] = (
-                f"max({'' if sign > 0 else '-'}∂h/∂{axis}, 0)", "1",
-                lambda h, c, a=along, s=sign: torch.relu(s * _slope(h, c, a)),
-            )  # fmt: skip
+            yield f"slope-{axis}-power-{power:g}", f"|∂h/∂{axis}|^{power:g}", "1", _size(power, slope)
+        yield f"rising-slope-{axis}", f"max(∂h/∂{axis}, 0)", "1", _uphill(slope)
+        yield f"falling-slope-{axis}", f"max(-∂h/∂{axis}, 0)", "1", _uphill(_slope(axis, -1.0))
     for axis in ("x", "y"):
-        along = directions[axis]
-        found[f"height-times-slope-{axis}"] = (
-            f"h ∂h/∂{axis}", "µm", lambda h, c, a=along: h * _slope(h, c, a),
-        )  # fmt: skip
-        found[f"height-times-slope-size-{axis}"] = (
-            f"h |∂h/∂{axis}|", "µm", lambda h, c, a=along: h * _size(_slope(h, c, a), 1.0),
-        )  # fmt: skip
-        found[f"curvature-{axis}"] = (
-            f"∂²h/∂{axis}²", "1/µm", lambda h, c, a=along: _slope(_slope(h, c, a), c, a),
-        )  # fmt: skip
-    found["steepness-power-1"] = (
-        "|∇h|", "1", lambda h, c: (sum(s**2 for s in gradient(h, c.pitch_um)) + _ROUNDED_SLOPE**2) ** 0.5,
-    )  # fmt: skip
-    found["steepness-power-2"] = ("|∇h|²", "1", lambda h, c: sum(s**2 for s in gradient(h, c.pitch_um)))
-    for power in (2, 3):
-        found[f"height-power-{power}"] = (f"h^{power}", f"µm^{power}", lambda h, c, p=power: h**p)
+        slope, size = _slope(axis), _size(1, _slope(axis))
+        yield f"height-times-slope-{axis}", f"h ∂h/∂{axis}", "µm", _times(_height, slope)
+        yield f"height-times-slope-size-{axis}", f"h |∂h/∂{axis}|", "µm", _times(_height, size)
+        yield f"curvature-{axis}", f"∂²h/∂{axis}²", "1/µm", _twice(slope)
+        yield f"slope-size-{axis}-times-order", f"|∂h/∂{axis}| t", "1", _times(size, _order)
+        for word in ("x", "y", "r²"):
+            name = f"slope-size-{axis}-times-{word.replace('²', '2')}"
+            yield name, f"|∂h/∂{axis}| {word}", "1", _times(size, _place(word))
+    yield "steepness-power-1", "|∇h|", "1", _size(1, *steepness)
+    yield "steepness-power-2", "|∇h|²", "1", _size(2, *steepness)
+    square = _times(_height, _height)
+    yield "height-power-2", "h²", "µm²", square
+    yield "height-power-3", "h³", "µm³", _times(square, _height)
+    yield "height-squared-times-order", "h² t", "µm²", _times(square, _order)
+    for word in ("x", "y", "r²"):
+        name = f"height-times-{word.replace('²', '2')}"
+        yield name, f"h {word}", "µm", _times(_height, _place(word))
     for reach in _REACHES_UM:
-        mean = partial(_blurred, sigma_um=reach)
-        found[_named(f"surroundings-{reach:g}-um")] = (
-            f"h̄({reach:g} µm)",
-            "µm",
-            lambda h, c, m=mean: m(h, c) - h,
-        )
-        found[_named(f"height-times-surroundings-{reach:g}-um")] = (
-            f"h h̄({reach:g} µm)", "µm²", lambda h, c, m=mean: h * m(h, c),
-        )  # fmt: skip
-        found[_named(f"above-surroundings-{reach:g}-um")] = (
-            f"(h - h̄({reach:g} µm))²", "µm²", lambda h, c, m=mean: (h - m(h, c)) ** 2,
-        )  # fmt: skip
-        found[_named(f"steps-within-{reach:g}-um")] = (
-            f"mean of |∇h| within {reach:g} µm", "1",
-            lambda h, c, r=reach: _blurred(found["steepness-power-1"][2](h, c), c, r),
-        )  # fmt: skip
+        mean, within = f"h̄({reach:g} µm)", f"{reach:g}-um"
+        above = _minus(_height, _mean(reach))
+        yield f"surroundings-{within}", f"{mean} - h", "µm", _minus(_mean(reach), _height)
+        yield f"height-times-surroundings-{within}", f"h {mean}", "µm²", _times(_height, _mean(reach))
+        yield f"above-surroundings-{within}", f"(h - {mean})²", "µm²", _times(above, above)
+        steps = _mean(reach, _size(1, *steepness))
+        yield f"steps-within-{within}", f"mean of |∇h| within {reach:g} µm", "1", steps
     for side in _SIDES:
         for length in _TAILS_UM:
-            found[_named(f"{side}-{length:g}-um")] = (
-                f"h {side}, over {length:g} µm, less h", "µm",
-                lambda h, c, s=side, n=length: _side(h, c, s, n),
-            )  # fmt: skip
-    for word, place in (
-        ("x", lambda c: c.scan_position()[1]),
-        ("y", lambda c: c.scan_position()[0]),
-        ("r2", lambda c: sum(one**2 for one in c.scan_position())),
-    ):
-        found[f"height-times-{word}"] = (f"h {word}", "µm", lambda h, c, p=place: h * p(c))
-        for axis in ("x", "y"):
-            found[f"slope-size-{axis}-times-{word}"] = (
-                f"|∂h/∂{axis}| {word}", "1",
-                lambda h, c, p=place, a=directions[axis]: _size(_slope(h, c, a), 1.0) * p(c),
-            )  # fmt: skip
-    found["height-squared-times-order"] = ("h² t", "µm²", lambda h, c: h**2 * c.order)
-    found["slope-size-x-times-order"] = (
-        "|∂h/∂x| t", "1", lambda h, c: _size(_slope(h, c, directions["x"]), 1.0) * c.order,
-    )  # fmt: skip
-    found["slope-size-y-times-order"] = (
-        "|∂h/∂y| t", "1", lambda h, c: _size(_slope(h, c, directions["y"]), 1.0) * c.order,
-    )  # fmt: skip
-    return found
+            column = _minus(_beside(side, length), _height)
+            yield f"{side}-{length:g}-um", f"h {side} over {length:g} µm - h", "µm", column
 
 
 def _law(name: str, formula: str, unit: str, column: Column) -> Effect:
-    unit_of_strength = {"1": "µm", "µm": "1", "µm²": "1/µm", "µm^2": "1/µm", "µm^3": "1/µm²", "1/µm": "µm²"}
+    unit_of_strength = {"1": "µm", "µm": "1", "µm²": "1/µm", "µm³": "1/µm²", "1/µm": "µm²"}
 
     def apply(height: Tensor, values: Values, context: FieldContext) -> Tensor:
         return height + values["strength"] * column(height, context)
 
     return Effect(
-        name=name,
+        name=_named(name),
         title=f"height changed by {formula}",
         stage="development",
         role="undetermined",
@@ -147,7 +171,8 @@ def _law(name: str, formula: str, unit: str, column: Column) -> Effect:
         parameters={"strength": Parameter(unit_of_strength[unit], -2.0, 2.0, 0.05)},
         apply=apply,
         trials=({"strength": 0.05},),
-        source="found in the residual; h, x, y, t: height, place from -1 to 1, order from -0.5 to 0.5",
+        source="found in the residual; h in µm, h̄ its Gaussian mean, x and y from -1 to 1 over the scan, "
+        "r² = x² + y², the order t from -0.5 to 0.5",
         separating="print and scan the same layouts turned by 90 degrees",
         knowledge="law",
     )
@@ -158,19 +183,24 @@ def _level_table(height: Tensor, values: Values, context: FieldContext) -> Tenso
     share = _blurred(context.layout_um, context, 0.15) / context.full_height_um * 8
     total = height
     for knot in range(9):
-        total = total + values[f"at_{knot}_um"] * torch.relu(1 - (share - knot).abs())
+        total = total + values[_of_knot(knot)] * torch.relu(1 - (share - knot).abs())
     return total
 
 
 def _linear_response(height: Tensor, values: Values, context: FieldContext) -> Tensor:
-    """A weight for each displaced copy of the height."""
-    total, pitch = height, context.pitch_um
-    for dy in _STENCIL_UM:
-        for dx in _STENCIL_UM:
-            if dy or dx:
-                moved = torch.roll(height, (round(dy / pitch), round(dx / pitch)), (-2, -1))
-                total = total + values[_of_copy(dy, dx)] * (moved - height)
+    """A weight for what the height differs by at each displaced place; the field goes on beyond its edge."""
+    total, pitch, (ny, nx) = height, context.pitch_um, height.shape[-2:]
+    edge = round(max(_STENCIL_UM) / pitch)
+    padded = functional.pad(height, (edge,) * 4, mode="replicate")
+    for dy, dx in _COPIES_UM:
+        top, left = edge + round(dy / pitch), edge + round(dx / pitch)
+        moved = padded[..., top : top + ny, left : left + nx]
+        total = total + values[_of_copy(dy, dx)] * (moved - height)
     return total
+
+
+def _of_knot(knot: int) -> str:
+    return f"level_{knot}_of_8"
 
 
 def _of_copy(dy_um: float, dx_um: float) -> str:
@@ -205,18 +235,17 @@ def _description(name: str, title: str, names: list[str], unit: str, apply: Call
     )
 
 
-LAWS = {name: _law(name, *facts) for name, facts in _columns().items()}
+LAWS = {law.name: law for law in (_law(*facts) for facts in _columns())}
 DESCRIPTIONS = {
     one.name: one
     for one in (
         _description(
-            "level-table", "a height of its own for each level", [f"at_{k}_um" for k in range(9)], "µm",
+            "level-table", "a height of its own for each level", [_of_knot(k) for k in range(9)], "µm",
             _level_table,
         ),
         _description(
             "linear-response", "a response to the height nearby",
-            [_of_copy(dy, dx) for dy in _STENCIL_UM for dx in _STENCIL_UM if dy or dx], "1",
-            _linear_response,
+            [_of_copy(*one) for one in _COPIES_UM], "1", _linear_response,
         ),
         _description(
             "place-map", "a gain that follows the place in the scan",

@@ -90,7 +90,7 @@ def register_effect(effect: Effect, *, after: str | None = None) -> Effect:
     Raises:
         InputError: a name that is taken, or no effect called ``after``.
     """
-    if effect.name in CATALOGUE:
+    if effect.name in {**CATALOGUE, **LAWS, **DESCRIPTIONS}:
         raise InputError("effect", got=f"{effect.name}, which exists", wanted="a new name")
     alike = [name for name, other in CATALOGUE.items() if other.stage == effect.stage]
     behind = get_effect(after).name if after else alike[-1]

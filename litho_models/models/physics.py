@@ -121,13 +121,13 @@ class Physics(Simulator):
     def _spot_um(self, values: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
         """Standard deviation of the spot along y and along x, µm."""
         keys = self._spot_keys or ("",)
-        given = torch.tensor(self.config.sigma_optical_um, device=self.bias_um.device)
+        given = self.bias_um.new_tensor(self.config.sigma_optical_um)
         widths = [values.get(key.removeprefix("raw_"), given) for key in keys]
         return widths[0], widths[-1]
 
     @property
     def values(self) -> dict[str, Tensor]:
-        """The physical values: alpha, eta, kappa_min, sigma_diffusion_um, bias_um; fitted widths and gain if any."""
+        """The physical values: alpha, eta, kappa_min, sigma_diffusion_um, bias_um; fitted widths, gain."""
         ranged = {own.name: own.value(getattr(self, key)) for key, own in self.ranges.items()}
         return {**ranged, "bias_um": self.bias_um}
 

@@ -1,7 +1,7 @@
 """One ridge for all that is fitted linearly to scans: columns with one strength for all, or one by group.
 
-Of each scan only the inner products of its residual and its columns are needed. From them follow the strengths
-on any scans, and the squared error on any others.
+Of each scan only the inner products of its residual and its columns are needed. From them follow the
+strengths on any scans, and the squared error on any others.
 """
 
 from __future__ import annotations
@@ -45,7 +45,10 @@ class Products:
     groups: Mapping[str, Labels]
 
     def strengths(self, blocks: Sequence[Block], scans: np.ndarray) -> list[dict[str, np.ndarray]]:
-        """Of each block, by label, the strengths that fit these scans best; labels not among them are absent."""
+        """Of each block, by label, the strengths (columns,) that fit these scans best; ``scans``: numbers.
+
+        Labels that none of these scans has are absent.
+        """
         expanded = _Expanded(self, blocks, scans)
         solved = expanded.solve([0])[:, 0]
         return [
@@ -58,7 +61,10 @@ class Products:
     def squares(
         self, blocks: Sequence[Block], strengths: Sequence[Mapping[str, np.ndarray]], scans: np.ndarray
     ) -> np.ndarray:
-        """Mean squared residual of each of these scans with the strengths of its groups in place."""
+        """Mean squared residual (scans,) of these scans with the strengths of their groups in place.
+
+        Where a scan's label has no strengths it is left as it is.
+        """
         left = np.empty(len(scans))
         for number, scan in enumerate(scans):
             vector = np.zeros(self.grams.shape[1])
@@ -80,7 +86,11 @@ class Products:
         return left
 
     def freed_of(self, blocks: Sequence[Block]) -> Products:
-        """The same, residual and columns freed of what these blocks do on all scans; their columns are zero."""
+        """The same, residual and columns freed of what these blocks fit of them on all scans.
+
+        The columns of the blocks are then zero. Strengths for all scans are those of the whole fit from here
+        on; strengths by group are so as far as the groups have the same share of what was taken out.
+        """
         every = np.arange(len(self.grams))
         expanded = _Expanded(self, blocks, every)
         used = {column for block in blocks for column in block.columns}
@@ -131,12 +141,12 @@ class _Expanded:
 
     def solve(self, targets: Sequence[int]) -> np.ndarray:
         """Strengths (rows, targets) that come closest to these columns, or to the residual."""
-        size = int(self.starts[-1])
+        size, wanted = int(self.starts[-1]), np.array(targets, np.intp)
         matrix, right = np.diag(self._shrunk), np.zeros((size, len(targets)))
         for members, rows, columns in self.alike:
             gram = self._products.grams[members].sum(axis=0)
             matrix[np.ix_(rows, rows)] += gram[np.ix_(columns, columns)]
-            right[rows] += gram[np.ix_(columns, targets)]
+            right[rows] += gram[np.ix_(columns, wanted)]
         scale = np.sqrt(np.maximum(np.diag(matrix), 1e-300))[:, None]
         normal = matrix / (scale * scale.T) + _ALIKE * np.eye(size)
         return np.linalg.solve(normal, right / scale) / scale

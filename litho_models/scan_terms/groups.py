@@ -16,29 +16,32 @@ _ORDER, _CHARACTER = "order", "character"
 
 
 def label_of(scan: PrintedScan, by: str) -> str:
-    """The label of a scan in a grouping, by the grouping's name."""
-    kind, _, value = by.partition(" ")
+    """The label of a scan in a grouping, by the grouping's name; empty where the scan has none."""
     if by == ALL:
         return ""
-    if kind == _ORDER:
-        return "before" if scan.order < int(value) else "from there on"
-    if kind == _CHARACTER:
-        return scan.id[int(value) - 1 : int(value)]
+    if by in scan.groups:
+        return scan.groups[by]
     if by == "print":
         return scan.print_id
     if by in _STATED:
         stated = getattr(scan, by)
         return "" if stated is None else f"{stated:g}"
-    return scan.groups.get(by, "")
+    # A group of the card may have any word for a name, but no blank in it.
+    kind, _, value = by.partition(" ")
+    if value and kind == _ORDER:
+        return "before" if scan.order < int(value) else "from there on"
+    if value and kind == _CHARACTER:
+        return scan.id[int(value) - 1 : int(value)]
+    return ""
 
 
 def groupings(scans: Sequence[PrintedScan], *, by_order: bool = True) -> dict[str, Labels]:
     """Label of each scan by grouping; ``all`` is always there and comes first.
 
     Groups come from the card (print, field, tip, direction and turn of a scan), from the ids, where each
-    character that varies may stand for a group, and, with ``by_order``, from the order: before and after every
-    place at which something may have changed. A grouping counts if it has two labels or more, at least half of
-    them of two scans or more; of two that divide the scans alike the first counts.
+    character that varies may stand for a group, and, with ``by_order``, from the order: before and after
+    every place at which something may have changed. A grouping counts if it has two labels or more, at
+    least half of them of two scans or more; of two that divide the scans alike the first counts.
     """
     stated = list(dict.fromkeys(name for scan in scans for name in scan.groups))
     names = [ALL, *stated, "print", *_STATED]
@@ -69,7 +72,7 @@ def _is_known(labels: Labels, found: Mapping[str, Labels]) -> bool:
 
 
 def _places(scans: Sequence[PrintedScan], prints: Labels | None) -> list[int]:
-    """Orders at which a change may have come: between prints, or between any scans with some on both sides."""
+    """Orders at which a change may have come: where a print begins, or anywhere with two scans a side."""
     orders = sorted({scan.order for scan in scans})
     if prints is not None:
         first = {

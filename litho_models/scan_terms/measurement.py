@@ -8,6 +8,7 @@ printer: no design sees it.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import Literal
@@ -27,7 +28,7 @@ from litho_models.splits.folds import grouped_folds
 Shared = Literal["background", "shift-x", "shift-y", "gain"]
 Levelling = Literal["none", "plane", "twist", "bow"]
 
-# Surfaces that a file may have been freed of, structure included: which of x, y, x², xy, y², by number from 1.
+# Surfaces that a file may have been freed of, structure included: which of x, y, x², xy, y², from 1.
 LEVELLED: dict[Levelling, tuple[int, ...]] = {
     "none": (),
     "plane": (1, 2),
@@ -59,13 +60,19 @@ _INNER_FOLDS = 5
 _SAME_SIZE = 0.01
 
 
+# What may be shared: its degree, its columns by group. A scan with its predicted print (ny, nx), µm.
+_Offer = tuple[Shared, int, Block]
+_Pair = tuple[PrintedScan, np.ndarray]
+
+
 class SharedPart(Record):
     """One thing that scans have in common.
 
     Attributes:
         what: ``background`` and the displacements are sums of Legendre polynomials of x and y, -1 to 1 over
             the field, of ``degree`` in all; the gain is one number, relative.
-        by: grouping; ``coefficients``: by label, µm, or 1 for the gain. A label that is not there adds nothing.
+        by: grouping; ``coefficients``: by label, µm, or 1 for the gain. One without any adds nothing.
+        shrinking: scans' worth of evidence for no such thing that the fit went by.
     """
 
     what: Shared
@@ -149,38 +156,42 @@ def learn_measurement(
     """Choose and fit what these scans share beside the predicted prints (ny, nx), µm.
 
     Parts are added one at a time as long as they lower the error on scans that they were not fitted to, dealt
-    into folds among these scans, and only if they do so beyond the scatter over scans.
+    into folds among these scans, and only if they do so beyond the scatter over scans. Where fields differ in
+    size, those of the most frequent one are learned from.
     """
-    parts: list[SharedPart] = []
-    levelling = _best_levelling(scans, predictions_um)
+    field_um = Counter(map(_field_um, scans)).most_common(1)[0][0]
+    model = MeasurementModel(levelling="none", parts=[], field_um=field_um, scans=0)
+    pairs = [pair for pair in zip(scans, predictions_um, strict=True) if model.fits(pair[0])]
+    model = model.model_copy(update={"levelling": _best_levelling(pairs, model), "scans": len(pairs)})
+    chosen: list[_Offer] = []
     for _ in range(_ROUNDS):
-        model = MeasurementModel(
-            levelling=levelling, parts=parts, field_um=_field_um(scans[0]), scans=len(scans)
-        )
-        learner = _Learner(scans, predictions_um, model)
-        chosen = learner.choose(seed) if not parts else [learner.block_of(part) for part in parts]
-        parts = learner.moved(parts, chosen)
-    return model.model_copy(update={"parts": parts})
+        learner = _Learner(pairs, model)
+        chosen = chosen or learner.choose(seed)
+        model = model.model_copy(update={"parts": learner.fitted(chosen)})
+        if not chosen:
+            break
+    return model
 
 
 class _Learner:
     """Inner products of what could be shared, at a model of the measurement so far."""
 
-    def __init__(
-        self, scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray], model: MeasurementModel
-    ):
+    def __init__(self, pairs: Sequence[_Pair], model: MeasurementModel):
+        scans = [scan for scan, _ in pairs]
         self._groups = groupings(scans, by_order=False)
         self._ids = [scan.id for scan in scans]
         grams = []
-        for scan, prediction in zip(scans, predictions_um, strict=True):
-            rows = self._rows(scan, prediction, model)
+        for scan, prediction in pairs:
+            rows = _rows(scan, prediction, model)
             grams.append(rows @ rows.T / rows.shape[1])
         self._products = Products(np.stack(grams), self._groups)
 
-    def choose(self, seed: int) -> list[tuple[Shared, int, Block]]:
+    def choose(self, seed: int) -> list[_Offer]:
         """What to add, beginning with nothing."""
+        if len(self._ids) < 2:
+            return []
         fold_of = _deal(self._ids, seed)
-        chosen: list[tuple[Shared, int, Block]] = []
+        chosen: list[_Offer] = []
         left = self._products.held_out([], fold_of)
         while True:
             best, best_left = None, left
@@ -195,58 +206,54 @@ class _Learner:
             chosen.append(best)
             left = best_left
 
-    def block_of(self, part: SharedPart) -> tuple[Shared, int, Block]:
-        """A part as it was chosen before."""
-        return part.what, part.degree, self._block(part.what, part.degree, part.by, part.shrinking)
-
-    def moved(
-        self, before: Sequence[SharedPart], chosen: Sequence[tuple[Shared, int, Block]]
-    ) -> list[SharedPart]:
-        """The parts with their strengths fitted, added to those that are in the residual already."""
+    def fitted(self, chosen: Sequence[_Offer]) -> list[SharedPart]:
+        """The parts with their strengths."""
         every = np.arange(len(self._ids))
         fitted = self._products.strengths([block for *_, block in chosen], every)
-        known = [part.coefficients for part in before] or [{}] * len(chosen)
         return [
             SharedPart(
                 what=what,
                 by=block.by,
                 degree=degree,
                 shrinking=block.shrinking,
-                coefficients={
-                    label: (own + np.array(old.get(label, np.zeros(len(own))))).tolist()
-                    for label, own in strengths.items()
-                },
+                coefficients={label: own.tolist() for label, own in strengths.items()},
             )
-            for (what, degree, block), strengths, old in zip(chosen, fitted, known, strict=True)
+            for (what, degree, block), strengths in zip(chosen, fitted, strict=True)
         ]
 
-    def _offers(self, chosen: Sequence[tuple[Shared, int, Block]]) -> list[tuple[Shared, int, Block]]:
+    def _offers(self, chosen: Sequence[_Offer]) -> list[_Offer]:
         taken = {(what, block.by) for what, _, block in chosen}
         found = []
         for what, degree, grouped in _OFFERS:
             for by in [name for name in self._groups if (name != ALL) == grouped]:
                 if (what, by) not in taken:
                     shrinking = _SHRINKING if grouped else _SHRINKING[:1]
-                    found += [(what, degree, self._block(what, degree, by, one)) for one in shrinking]
+                    found += [(what, degree, Block(_columns_of(what, degree), by, one)) for one in shrinking]
         return found
 
-    def _block(self, what: Shared, degree: int, by: str, shrinking: float) -> Block:
-        return Block(_columns_of(what, degree), by, shrinking)
 
-    def _rows(self, scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel) -> FloatMap:
-        """Residual and columns (1 + m, n) at thinned pixels, each without its mean: the datum is free."""
-        at = _thinned(scan.usable)
-        seen = _displaced(scan, prediction_um, model.parts)
-        slope_y, slope_x = (slope.reshape(-1)[at] for slope in np.gradient(seen, scan.pitch_um))
-        shapes = _polynomials(scan.shape, _HIGHEST).reshape(_count(_HIGHEST), -1)[:, at]
-        residual = (scan.height_um - model.expected_um(scan, prediction_um)).reshape(-1)[at]
-        own = shapes[: _count(_LATERAL)]
-        moved = np.concatenate([own * slope_x, own * slope_y, seen.reshape(-1)[at][None]])
-        # A background is added after the levelling, so that it is not levelled itself.
-        surface = shapes[[0, *LEVELLED[model.levelling]]]
-        moved -= np.linalg.solve(surface @ surface.T, surface @ moved.T).T @ surface
-        rows = np.concatenate([residual[None], shapes[1:], moved])
-        return rows - rows.mean(axis=1, keepdims=True)
+def _rows(scan: PrintedScan, prediction_um: np.ndarray, model: MeasurementModel) -> FloatMap:
+    """What is to be explained and the columns (1 + m, n) at thinned pixels, without their means.
+
+    What the parts of the model explain is put back, to first order: their strengths are then fitted anew as
+    a whole, so that they are shrunk once, however often.
+    """
+    at = _thinned(scan.usable)
+    seen = _displaced(scan, prediction_um, model.parts)
+    slope_y, slope_x = (slope.reshape(-1)[at] for slope in np.gradient(seen, scan.pitch_um))
+    shapes = _polynomials(scan.shape, _HIGHEST).reshape(_count(_HIGHEST), -1)[:, at]
+    residual = (scan.height_um - model.expected_um(scan, prediction_um)).reshape(-1)[at]
+    own = shapes[: _count(_LATERAL)]
+    moved = np.concatenate([own * slope_x, own * slope_y, seen.reshape(-1)[at][None]])
+    # A background is added after the levelling, so that it is not levelled itself.
+    surface = shapes[[0, *LEVELLED[model.levelling]]]
+    moved -= np.linalg.solve(surface @ surface.T, surface @ moved.T).T @ surface
+    rows = np.concatenate([residual[None], shapes[1:], moved])
+    for part in model.parts:
+        known = part.coefficients.get(label_of(scan, part.by))
+        if known:
+            rows[0] += known @ rows[list(_columns_of(part.what, part.degree))]
+    return rows - rows.mean(axis=1, keepdims=True)
 
 
 def _columns_of(what: Shared, degree: int) -> tuple[int, ...]:
@@ -258,36 +265,35 @@ def _columns_of(what: Shared, degree: int) -> tuple[int, ...]:
     return tuple(range(starts[what], starts[what] + count))
 
 
-def _best_levelling(scans: Sequence[PrintedScan], predictions_um: Sequence[np.ndarray]) -> Levelling:
+def _best_levelling(pairs: Sequence[_Pair], model: MeasurementModel) -> Levelling:
     """The levelling of predictions that comes closest to the scans, a shared bow and tilt taken out."""
     errors: dict[Levelling, float] = {}
     for name in LEVELLED:
-        model = MeasurementModel(levelling=name, parts=[], field_um=_field_um(scans[0]), scans=len(scans))
+        levelled = model.model_copy(update={"levelling": name})
         rests = []
-        for scan, prediction in zip(scans, predictions_um, strict=True):
+        for scan, prediction in pairs:
             at = _thinned(scan.usable)
-            rest = (scan.height_um - model.expected_um(scan, prediction)).reshape(-1)[at]
+            rest = (scan.height_um - levelled.expected_um(scan, prediction)).reshape(-1)[at]
             shapes = _polynomials(scan.shape, 2).reshape(_count(2), -1)[:, at]
             rests.append(np.linalg.lstsq(shapes @ shapes.T, shapes @ rest, rcond=None)[0])
         # Legendre polynomials are all but orthogonal over a field: their spread is the squared error.
-        weights = np.array([np.mean(shape**2) for shape in _polynomials(scans[0].shape, 2)])
+        weights = np.mean(_polynomials(pairs[0][0].shape, 2) ** 2, axis=(1, 2))
         errors[name] = float((np.var(rests, axis=0) * weights)[1:].sum())
     return min(errors, key=lambda name: errors[name])
 
 
 def _displaced(scan: PrintedScan, prediction_um: np.ndarray, parts: Sequence[SharedPart]) -> FloatMap:
-    shifts_px = {"shift-x": 0.0, "shift-y": 0.0}
-    for part in parts:
-        own = part.coefficients.get(label_of(scan, part.by))
-        if own and part.what in shifts_px:
-            shapes = _polynomials(scan.shape, part.degree)
-            shifts_px[part.what] = shifts_px[part.what] + np.tensordot(own, shapes, axes=1) / scan.pitch_um
+    """A predicted print looked up where the displacements of these parts say, (ny, nx) µm."""
     prediction = np.asarray(prediction_um, np.float64)
-    if all(np.ndim(shift) == 0 for shift in shifts_px.values()):
+    known = [(part, part.coefficients.get(label_of(scan, part.by))) for part in parts]
+    moves = [(part, own) for part, own in known if own and part.what in ("shift-x", "shift-y")]
+    if not moves:
         return prediction
     y, x = np.meshgrid(*(np.arange(n, dtype=np.float64) for n in scan.shape), indexing="ij")
-    places = [y + shifts_px["shift-y"], x + shifts_px["shift-x"]]
-    return map_coordinates(prediction, places, order=3, mode="nearest")
+    places = {"shift-y": y, "shift-x": x}
+    for part, own in moves:
+        places[part.what] += np.tensordot(own, _polynomials(scan.shape, part.degree), axes=1) / scan.pitch_um
+    return map_coordinates(prediction, [*places.values()], order=3, mode="nearest")
 
 
 def _levelled(field: np.ndarray, usable: np.ndarray, levelling: Levelling) -> FloatMap:
@@ -297,7 +303,8 @@ def _levelled(field: np.ndarray, usable: np.ndarray, levelling: Levelling) -> Fl
     shapes = _polynomials(field.shape, 2)[[0, *LEVELLED[levelling]]]
     basis = shapes[:, usable]
     fitted = np.linalg.solve(basis @ basis.T, basis @ field[usable])
-    return field - np.tensordot(fitted[1:], shapes[1:], axes=1)
+    surface = np.tensordot(fitted[1:], shapes[1:], axes=1)
+    return field - surface + surface[usable].mean()
 
 
 @lru_cache(maxsize=8)

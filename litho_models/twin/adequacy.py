@@ -1,8 +1,8 @@
 """Whether a name holds: does its formula leave what another formula of the same change would take?
 
-A cause that is missing beside a named one leaves a residual that has nothing to do with the named change. A name
-that only resembles the cause leaves one that is the named change in another shape: scaled with the height or
-the place, blurred, displaced, squared.
+A cause that is missing beside a named one leaves a residual that has nothing to do with the named change. A
+name that only resembles the cause leaves one that is the named change in another shape: scaled with the
+height or the place, blurred, displaced, squared.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from litho_models.loop.prepared import PreparedScan
 from litho_models.scan_terms.grouped import Block, Products
 from litho_models.scan_terms.groups import ALL
 from litho_models.twin.fits import State, Study, without_terms
-from litho_models.twin.model import Twin
+from litho_models.twin.model import Placed, Twin
 
 _BLURS_UM = (0.2, 0.6, 1.6)
 # Evidence for no reshaping, in scans: as many numbers would else fit the noise of a few scans.
@@ -45,11 +45,12 @@ def reshaped_gain(without: State, state: State, study: Study) -> float:
     return float(taken.mean()) * NM_PER_UM**2
 
 
-def _of_folds(twin: Twin, vectors: np.ndarray):
+def _of_folds(twin: Twin, vectors: np.ndarray) -> list[Placed]:
     return [twin.at(vector).placed() for vector in vectors]
 
 
 def _shapes(change: np.ndarray, prediction: np.ndarray, window: PreparedScan) -> list[np.ndarray]:
+    """A change of the prediction (y, x), µm, and the same in other shapes."""
     pitch = window.context.pitch_um
     blurred = [gaussian_filter(change, sigma / pitch) for sigma in _BLURS_UM]
     layout = np.asarray(window.stored.layout_um, np.float64)

@@ -21,13 +21,14 @@ from litho_models.loop.explainable import Learner, Rest
 from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.scan_terms.measurement import MeasurementModel, learn_measurement
 from litho_models.twin.adequacy import reshaped_gain
-from litho_models.twin.fits import RULES, State, Study, TwinProblem, fit_state
+from litho_models.twin.fits import RULES, State, Study, TwinProblem, fit_state, prepared_among
 from litho_models.twin.judging import judge
 from litho_models.twin.model import Twin
 from litho_models.twin.search import Cause, Found, search, untestable
 
-# Of a cause's gain: what its change in other shapes may take beside it. On trials of the virtual fab the formulas
-# of true causes leave less than 1 % (layer-stacking 10 %), of causes that only resemble one 20 % and more.
+# Of a cause's gain: what its change in other shapes may take beside it. On trials of the virtual fab the
+# formulas of true causes leave less than 1 % (layer-stacking 10 %), of causes that only resemble one 20 % and
+# more.
 FORM_SHARE = 0.15
 # Of what is left to be explained: less is the little that any columns take of causes that are still missing.
 LEFT_SHARE = 0.3
@@ -106,7 +107,7 @@ class Closed:
 
     @property
     def final(self) -> State:
-        """The corrected model: causes and laws. A description says where the rest lies and corrects nothing."""
+        """The corrected model: causes and laws. A description says where the rest lies, no more."""
         return self.lawful.state
 
     @property
@@ -219,7 +220,7 @@ def held_out_maps(state: State, study: Study, scans: Sequence[PreparedScan]) -> 
 def freed_scans(scans: Sequence[PrintedScan], state: State, study: Study) -> list[PrintedScan]:
     """The scans without what those of a group share beside their prints.
 
-    What all scans share stays in: a cause may have it. Each scan is freed by what was learned without its fold.
+    What all scans share stays in: a cause may have it. A scan is freed by what was learned without its fold.
     """
     maps = held_out_maps(state, study, study.scans)
     freed = list(scans)
@@ -255,7 +256,7 @@ def fit_with_measurement(
         for scan, own in zip(stored, maps, strict=True)
     ]
     if len(twin.vector):
-        windows = [scan.window for scan in prepare_scans(freed)]
+        windows = [scan.window for scan in prepared_among(freed, scans)]
         twin = twin.at(fit_least_squares(TwinProblem(twin, windows), twin.vector, RULES).vector)
         placed = twin.placed()
         learned = learn_measurement(stored, [placed.height(scan) for scan in scans], seed=seed)

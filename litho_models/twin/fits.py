@@ -13,17 +13,17 @@ import numpy as np
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.foundation.workers import HERE, Workers
+from litho_data.store import PrintedScan
 from litho_models.effects import get_effect
 from litho_models.fitting.least_squares import (
     Linearised,
     Rules,
-    eliminated,
     eliminated_sum,
     fit_least_squares,
     orthonormal,
     solve_damped,
 )
-from litho_models.loop.prepared import PreparedScan
+from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.scan_terms import Terms
 from litho_models.scan_terms.groups import Labels, groupings
 from litho_models.twin.model import Placed, Twin, finished
@@ -107,13 +107,17 @@ class State:
     def mse_nm2(self) -> float:
         return float(self.freed_nm2.mean())
 
-    def covariance(self) -> np.ndarray:
-        """Covariance (p, p) of the numbers, by what each scan asks for at the optimum."""
-        parts = [eliminated(part, RULES.term_weight) for part in self.linear]
-        normal = np.sum([p[0] for p in parts], axis=0)
-        inverse = np.linalg.pinv(normal, rcond=1e-10, hermitian=True)
-        scores = np.stack([p[1] for p in parts])
-        return inverse @ (scores.T @ scores) @ inverse * len(parts) / max(len(parts) - 1, 1)
+
+def prepared_among(scans: Sequence[PrintedScan], known: Sequence[PreparedScan]) -> list[PreparedScan]:
+    """Scans prepared with places in the writing order of those that a model is known from."""
+    orders, places = zip(*sorted((one.stored.order, one.context.order) for one in known), strict=True)
+
+    def placed(scan: PreparedScan) -> PreparedScan:
+        order = float(np.interp(scan.stored.order, orders, places))
+        part = None if scan.quadrant is None else placed(scan.quadrant)
+        return replace(scan, context=replace(scan.context, order=order), quadrant=part)
+
+    return [placed(scan) for scan in prepare_scans(scans)]
 
 
 class TwinProblem:
@@ -140,11 +144,10 @@ class TwinProblem:
         base = placed.base_height(chain, window)
         prediction = finished(chain, base, window)
         value = window.at_sample(prediction)
-        labels = set(twin.labels(window).values())
         rows = np.zeros((len(steps), len(window.sample)))
         for i, (other, step) in enumerate(zip(moved, steps, strict=True)):
             slot = twin.slots[i - own] if i >= own else None
-            if slot is not None and slot.label is not None and slot.label not in labels:
+            if slot is not None and not twin.is_of(slot, window):
                 continue
             there = other.chain(window)
             # What acts on the height leaves the height of the base, most of the work, as it is.
@@ -188,10 +191,10 @@ def fit_state(twin: Twin, study: Study) -> State:
 
 
 def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
-    """Where the twin stands, or with the base's numbers before any fit: the better one after a fit to some scans.
+    """Where the twin stands, or with the base's numbers before any fit: the better after a fit to some scans.
 
-    The best base without an effect is no good place to look for one beside it: what the base took of the effect
-    keeps it there, on the wrong side of a hill.
+    The best base without an effect is no good place to look for one beside it: what the base took of the
+    effect keeps it there, on the wrong side of a hill.
     """
     unfitted = twin.with_base_unfitted()
     if not twin.slots or np.array_equal(unfitted, twin.vector):
@@ -204,7 +207,7 @@ def _best_start(twin: Twin, windows: Sequence[PreparedScan]) -> np.ndarray:
 def without_terms(
     columns: np.ndarray, window: PreparedScan, prediction_um: np.ndarray, terms: Terms = ALL_FREE
 ) -> np.ndarray:
-    """Columns (n, m) at the sampled pixels, freed of what a single scan may add to a prediction (y, x), µm."""
+    """Columns (n, m) at the sampled pixels, without what a single scan may add to a prediction (y, x), µm."""
     basis = orthonormal(window.terms_at_sample(prediction_um, terms).T)
     return columns - basis @ (basis.T @ columns)
 
@@ -212,7 +215,10 @@ def without_terms(
 def _without(
     common: Twin, linear: Sequence[Linearised], windows: Sequence[PreparedScan]
 ) -> tuple[np.ndarray, float]:
-    """Fit on some of the windows with the derivatives of the common fit, and its weighted sum of squares."""
+    """Numbers fitted to some of the windows with the derivatives of the common fit; weighted squares, µm².
+
+    The common fit, which has seen all windows, is where it starts: nothing may be left there.
+    """
     normal, right, total = eliminated_sum(linear, RULES.term_weight)
     vector = common.vector
     if not len(vector):
@@ -228,4 +234,4 @@ def _without(
         vector, gained, total = trial, total - squares, squares
         if gained <= _FOLD_GAIN * squares:
             break
-    return vector, total
+    return common.at(vector).known_from(windows).vector, total

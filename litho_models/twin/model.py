@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -73,7 +73,7 @@ class Twin:
 
     def at(self, vector: np.ndarray) -> Twin:
         """The same with other numbers."""
-        return Twin(self.base, self.by, self.choices, self.slots, vector, self.full_height_um, self.pitch_um)
+        return replace(self, vector=vector)
 
     def with_effect(self, name: str, by: str, values: Mapping[str, Mapping[str, float]]) -> Twin:
         """One effect more, with starting values by label (``""`` for all scans)."""
@@ -89,27 +89,23 @@ class Twin:
                 numbers.append(first[parameter] if label is None else values[label][parameter])
         chosen = {key: first[key] for key, facts in effect.parameters.items() if facts.kind == "choice"}
         order = in_forward_order([*self.by, name])
-        return Twin(
-            self.base,
-            {one: {**self.by, name: by}[one] for one in order},
-            {**self.choices, name: chosen},
-            (*self.slots, *slots),
-            np.concatenate([self.vector, numbers]),
-            self.full_height_um,
-            self.pitch_um,
+        return replace(
+            self,
+            by={one: {**self.by, name: by}[one] for one in order},
+            choices={**self.choices, name: chosen},
+            slots=(*self.slots, *slots),
+            vector=np.concatenate([self.vector, numbers]),
         )
 
     def without(self, name: str) -> Twin:
         """The same without one of its effects."""
         kept = [i for i, slot in enumerate(self.slots) if slot.effect != name]
-        return Twin(
-            self.base,
-            {one: by for one, by in self.by.items() if one != name},
-            {one: own for one, own in self.choices.items() if one != name},
-            tuple(self.slots[i] for i in kept),
-            np.concatenate([self.vector[: self.own], self.vector[self.own :][kept]]),
-            self.full_height_um,
-            self.pitch_um,
+        return replace(
+            self,
+            by={one: by for one, by in self.by.items() if one != name},
+            choices={one: own for one, own in self.choices.items() if one != name},
+            slots=tuple(self.slots[i] for i in kept),
+            vector=np.concatenate([self.vector[: self.own], self.vector[self.own :][kept]]),
         )
 
     def over(self, base: nn.Module, scan: PreparedScan) -> Twin:
@@ -142,14 +138,36 @@ class Twin:
 
     def labels(self, scan: PreparedScan) -> dict[str, str]:
         """The scan's label in every grouping in use."""
-        return {by: label_of(scan.stored, by) for by in set(self.by.values()) if by != ALL}
+        return {by: label_of(scan.stored, by) for by in dict.fromkeys(self.by.values()) if by != ALL}
+
+    def is_of(self, slot: Slot, scan: PreparedScan) -> bool:
+        """Whether a number is one of the scan's own group, or of all scans."""
+        return slot.label is None or slot.label == label_of(scan.stored, self.by[slot.effect])
+
+    def known_from(self, scans: Sequence[PreparedScan]) -> Twin:
+        """The same with nothing but these scans behind it.
+
+        A strength of a group that none of them is in becomes the mean of the other groups' strengths.
+        """
+        seen = [any(self.is_of(slot, scan) for scan in scans) for slot in self.slots]
+        vector = self.vector.copy()
+        for at, slot in enumerate(self.slots):
+            if not seen[at]:
+                alike = [
+                    self.vector[self.own + other]
+                    for other, one in enumerate(self.slots)
+                    if seen[other] and (one.effect, one.parameter) == (slot.effect, slot.parameter)
+                ]
+                null = get_effect(slot.effect).parameters[slot.parameter].null
+                vector[self.own + at] = np.mean(alike) if alike else null
+        return self.at(vector)
 
     def placed(self) -> Placed:
-        """The model at its numbers, ready to predict."""
+        """The model at its numbers, ready to predict; the twin keeps a base of its own."""
         return Placed(self)
 
     def steps(self) -> np.ndarray:
-        """Steps of difference quotients, pointing away from the nearer bound of an effect."""
+        """Steps (p,) of difference quotients, upwards unless an effect has no room there."""
         steps = _BASE_STEP * np.maximum(np.abs(self.vector), 0.2)
         for at, slot in enumerate(self.slots, self.own):
             facts = get_effect(slot.effect).parameters[slot.parameter]

@@ -112,7 +112,7 @@ class Candidate(Record):
 
 
 class Explained(Record):
-    """What features of layout and place still explain out of fold at one stage, nm²; ``matters`` beyond chance."""
+    """What features of layout and place still explain out of fold, nm²; ``matters``: beyond chance."""
 
     stage: str
     squared_error_nm2: float

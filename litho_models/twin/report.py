@@ -38,7 +38,7 @@ def write_report(result: CloseLoop, maps: Maps, folder: Path) -> Path:
     """Write ``report.html`` and its tables; ``maps``: residual (y, x), nm, by scan, before and after."""
     page = Page(
         f"What {result.base_model} lacks on {result.dataset.name}",
-        "From the residual on scans that the model was not fitted to, to causes and laws, to a corrected model.",
+        "From the residual on held-out scans to causes and laws, to a corrected model.",
         run=result.run,
         facts={"dataset": result.dataset.sha256, "seeds": ", ".join(map(str, result.run.seeds))},
         words=_WORDS,
@@ -139,7 +139,7 @@ def _by(one: FoundEffect) -> str:
 
 
 def _headline(result: CloseLoop) -> list[ErrorRow]:
-    rows = [result.error(stage) for stage in ("base", "causes", "all")]  # type: ignore[arg-type]
+    rows = [result.error(stage) for stage in ("base", "causes", "all")]
     return [row for row in rows if row is not None]
 
 

@@ -97,7 +97,7 @@ def record(
     """The record of one run.
 
     Args:
-        closed: what was found; ``errors``: of ``error_rows``; ``measurement``: learned on all development scans.
+        closed: what was found; ``errors``: of ``error_rows``; ``measurement``: learned on all scans.
         left_out_nm, survives: of each effect, see ``FoundEffect``; ``chosen``: by nested selections.
     """
     study, scans = closed.study, closed.study.scans
@@ -152,9 +152,10 @@ def _verdict(closed: Closed, effects: Sequence[FoundEffect]) -> Verdict:
         return "traced"
     if effects:
         return "described"
-    if [*closed.rests.values()][-1].matters or closed.named.refused:
-        return "unexplained"
-    return "too-few-scans" if len(closed.study.scans) < FEWEST_SCANS else "nothing-missing"
+    if len(closed.study.scans) < FEWEST_SCANS:
+        return "too-few-scans"
+    left = [*closed.rests.values()][-1].matters or closed.named.refused
+    return "unexplained" if left else "nothing-missing"
 
 
 def _values(twin: Twin) -> dict[str, float]:
@@ -209,7 +210,7 @@ def _found(
 
 
 def _strengths(state: State, closed: Closed, name: str) -> dict[str, list[Strength]]:
-    """Numbers of an effect with intervals from what each print asks for (each scan, where prints are single)."""
+    """Numbers of an effect with intervals from what each print (or scan) asks for."""
     from scipy.stats import t
 
     twin, effect = state.twin, get_effect(name)
@@ -237,7 +238,7 @@ def _strengths(state: State, closed: Closed, name: str) -> dict[str, list[Streng
 
 
 def clustered_covariance(state: State, units: Sequence[str]) -> np.ndarray:
-    """Covariance (p, p) of the fitted numbers, by what each unit (a scan, a print) asks for at the optimum."""
+    """Covariance (p, p) of the fitted numbers, by what each unit asks for at the optimum."""
     if not len(state.twin.vector):
         return np.empty((0, 0))
     parts = [eliminated(part, RULES.term_weight) for part in state.linear]

@@ -26,7 +26,7 @@ from litho_models.scoring.records import Prediction
 from litho_models.simulator import Simulator
 from litho_models.splits.folds import GROUPED_FOLDS, Split, grouped_folds, leave_one_print_out
 from litho_models.twin.closing import Closed, close, fit_with_measurement, held_out_maps
-from litho_models.twin.fits import State, Study, fit_state
+from litho_models.twin.fits import State, Study, fit_state, prepared_among
 from litho_models.twin.judging import judge
 from litho_models.twin.model import Twin
 from litho_models.twin.record import CloseLoop, ErrorRow, Stage
@@ -208,7 +208,7 @@ class _Loop:
         return found
 
     def left_out_nm(self) -> dict[str, float]:
-        """By how much the error grows (k = 1) where each cause or law is left out and the rest fitted again."""
+        """By how much the error grows (k = 1) without each cause or law, the rest fitted again."""
         model = self.closed.final
         if not model.twin.names:
             return {}
@@ -225,7 +225,7 @@ class _Loop:
 
     def errors_of(self, scans: Sequence[PrintedScan], held_out: Any) -> list[ErrorRow]:
         """Errors of scans that took no part, by the fits to all that did."""
-        prepared, rows = prepare_scans(scans), []
+        prepared, rows = prepared_among(scans, self.closed.original), []
         stages: tuple[tuple[Stage, State], ...] = (("base", self.closed.base), ("all", self.closed.final))
         for name, state in stages:
             twin, learned = fit_with_measurement(state.twin, self.closed.original, self.settings.seed)
@@ -308,7 +308,7 @@ def _survives(loop: _Loop, others: Mapping[str, nn.Module]) -> dict[str, list[st
 def _nested(
     scans: Sequence[PrintedScan], base: nn.Module, study: Study, held_out: HeldOut
 ) -> tuple[list[ErrorRow], dict[str, int]]:
-    """Everything chosen anew without each fold, or print, and judged there; how often each effect was chosen."""
+    """All chosen anew without each fold, or print, and judged there; how often each effect was chosen."""
     ids = [scan.id for scan in scans]
     parts = (
         [[ids[i] for i in np.flatnonzero(study.fold_of == fold)] for fold in study.folds]

@@ -25,7 +25,7 @@ from litho_models.twin.model import finished
 SMALLEST_RETAINED = 1e-5
 # A strength on the wrong side of its null counts as noise if it is smaller than this share of the largest.
 _NOISE_SHARE = 0.3
-PERMUTATIONS = 499
+PERMUTATIONS = 199
 
 
 @dataclass(frozen=True)
@@ -47,16 +47,24 @@ class Trial:
                     values[name] = value
         return values
 
-    def allowed(self, multiples: np.ndarray) -> bool:
-        """No amplitude on the wrong side of a null that bounds it, unless noise may have put it there."""
+    def sizes(self, multiples: np.ndarray) -> dict[str, float]:
+        """Of each amplitude its distance from its null, in those of ordinary values."""
         values = self.values(multiples)
         named = {n for trial in self.sets for n in trial} & set(self.effect.amplitudes)
         facts = {name: self.effect.parameters[name] for name in named}
-        sizes = {n: abs(values[n] - f.null) / abs(f.typical - f.null) for n, f in facts.items()}
+        return {n: abs(values[n] - f.null) / abs(f.typical - f.null) for n, f in facts.items()}
+
+    def allowed(self, multiples: np.ndarray, largest: float = 0.0) -> bool:
+        """No amplitude on the wrong side of a null that bounds it, unless noise may have put it there.
+
+        Noise is what is small beside the largest amplitude, or beside ``largest``, that of any group.
+        """
+        values, sizes = self.values(multiples), self.sizes(multiples)
+        facts = {name: self.effect.parameters[name] for name in sizes}
         wrong = [
             n for n, f in facts.items() if (values[n] < f.null <= f.lower) or (values[n] > f.null >= f.upper)
         ]
-        return not any(sizes[n] > _NOISE_SHARE * max(sizes.values()) for n in wrong)
+        return not any(sizes[n] > _NOISE_SHARE * max(largest, *sizes.values()) for n in wrong)
 
     def reach(self, multiples: np.ndarray) -> float:
         """Share of the step that stays within the ranges: a straight line from the null overshoots."""
@@ -152,7 +160,6 @@ class Screening:
         count = 1 + self._own + sum(len(trial.sets) for trial in self.trials)
         grams = np.empty((len(study.scans), count, count))
         raw = np.zeros(count)
-        self.pixels = np.array([len(window.sample) for window in study.windows])
         placed = twin.placed()
         for at, window in enumerate(study.windows):
             chain = placed.chain(window)
@@ -209,14 +216,14 @@ class Screening:
         return float(inner[0, 1] / max(np.sqrt(inner[0, 0] * inner[1, 1]), 1e-300))
 
     def permutation_p(self, one: Candidate) -> float:
-        """Share of exchanges of the labels between scans that gain as much as the true ones."""
-        labels = np.array(self.study.groups[one.by])
+        """Share of exchanges of the scans after which a strength by any grouping gains as much as this."""
+        groupings = [np.array(labels) for by, labels in self.study.groups.items() if by != ALL]
         rng = np.random.default_rng(self.study.seed)
         beaten = 0
         for _ in range(PERMUTATIONS):
-            drawn = tuple(labels[rng.permutation(len(labels))])
-            gains, _ = self._gains(one.trial, one.columns, drawn)
-            beaten += gains.mean() >= one.gain_nm2 * (1 - 1e-12)
+            order = rng.permutation(len(self.freed))
+            gains = (self._gains(one.trial, one.columns, tuple(own[order]))[0] for own in groupings)
+            beaten += any(own.mean() >= one.gain_nm2 * (1 - 1e-12) for own in gains)
         return (1 + beaten) / (1 + PERMUTATIONS)
 
     def family_p(self, one: Candidate) -> float:
@@ -231,13 +238,14 @@ class Screening:
 
     def _candidate(self, trial: Trial, columns: tuple[int, ...], by: str) -> Candidate:
         gains, multiples = self._gains(trial, columns, self.study.groups[by])
+        largest = max(max(trial.sizes(own).values()) for own in multiples.values())
         return Candidate(
             trial=trial,
             by=by,
             gains_nm2=gains,
             multiples=multiples,
             columns=columns,
-            allowed=all(trial.allowed(own) for own in multiples.values()),
+            allowed=all(trial.allowed(own, largest) for own in multiples.values()),
             retained=float(self._retained[list(columns)].max()),
             beside_base=float(self._beside_base[list(columns)].max()),
         )

@@ -1,8 +1,8 @@
-"""The joint search: causes are added while they gain on held-out scans, and each defends its place in the end.
+"""The joint search: causes are added while they gain on held-out scans, and each defends its place.
 
-All candidates are screened at once, with strengths for all scans and by group. Those that promise about as much
-as the best are fitted in full beside each other before one is taken, because a derivative at the null only
-guesses what a large effect does.
+All candidates are screened at once, with strengths for all scans and by group. Those that promise about as
+much as the best are fitted in full beside each other before one is taken, because a derivative at the null
+only guesses what a large effect does.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from litho_models.twin.judging import FAMILY_P, Judgement, judge, told_apart
 from litho_models.twin.screening import SMALLEST_RETAINED, Candidate, Screening
 
 MOST_EFFECTS = 8
-# Of the smallest gain that counts: the derivative at the null predicts the gain of a fit within a factor of three.
+# Of the smallest gain that counts: a derivative at the null predicts the gain of a fit to a factor of three.
 WORTH_FITTING = 0.3
 # Rivals are fitted beside the best if they promise this share of its gain, and change much the same.
 RIVAL_SHARE, RIVAL_COSINE = 0.3, 0.5
@@ -37,7 +37,7 @@ class Cause:
         name, by: the effect, and the grouping of its strength.
         alike: other effects that these scans cannot tell from it.
         judgement: of its gain on held-out scans, the rest of the model in place.
-        family_p: of its screening, over all candidates; ``group_p``: of its grouping against exchanged labels.
+        family_p: of its screening, over all candidates; ``group_p``: of its grouping, by exchanged labels.
     """
 
     name: str
@@ -139,7 +139,7 @@ def _add_one(found: Found, study: Study, candidates: Sequence[Effect]) -> bool:
 
 
 def _standing(screening: Screening, found: Found) -> list[Candidate]:
-    """The candidates that stand out, each with the grouping that its scans ask for; the largest gain first."""
+    """The candidates that stand out, each with the grouping that its scans ask for, by gain."""
     by_name: dict[str, list[Candidate]] = {}
     for one in screening.candidates:
         by_name.setdefault(one.name, []).append(one)
@@ -163,16 +163,17 @@ def _standing(screening: Screening, found: Found) -> list[Candidate]:
 def _grouped(
     own: Sequence[Candidate], common: Candidate, screening: Screening, mse_nm2: float
 ) -> Candidate | None:
-    """The grouping of an effect's strength that gains beyond chance over one strength for all; None if none."""
+    """The grouping of an effect's strength that gains beyond chance over one strength for all, or None."""
     groups = [one for one in own if one.by != ALL]
-    better = [one for one in groups if one.allowed and one.gain_nm2 - common.gain_nm2 > 0.01 * mse_nm2]
+    least = max(common.gain_nm2, 0.0) + 0.01 * mse_nm2
+    better = [one for one in groups if one.allowed and one.gain_nm2 > least]
     if not better:
         return None
     best = max(better, key=lambda one: one.gain_nm2)
     # Of groupings that do nearly as well the one with the fewest numbers.
     close = [one for one in better if one.gain_nm2 >= 0.95 * best.gain_nm2]
     best = min(close, key=lambda one: (one.numbers, -one.gain_nm2))
-    return best if screening.permutation_p(best) * len(groups) <= FAMILY_P else None
+    return best if screening.permutation_p(best) <= FAMILY_P else None
 
 
 def _fitted(state: State, entering: Sequence[Candidate], study: Study) -> dict[str, State]:

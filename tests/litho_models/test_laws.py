@@ -1,0 +1,228 @@
+"""Laws and descriptions against their formulas, written once more in numpy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter
+
+from litho_data.foundation.errors import InputError
+from litho_models.effects import CATALOGUE, FieldContext, get_effect, in_forward_order, screened_effects
+from litho_models.effects.laws import DESCRIPTIONS, LAWS
+from litho_models.effects.registry import register_effect
+
+PITCH_UM, SHAPE = 0.1, (170, 168)
+NAMELESS = {**LAWS, **DESCRIPTIONS}
+BY_NAME = pytest.mark.parametrize("name", NAMELESS)
+# Slopes are rounded off below this, and a size by no more than this.
+ROUNDED = 1e-3
+
+
+def height_of(shape: tuple[int, int] = SHAPE, seed: int = 0) -> np.ndarray:
+    """A smooth random height with a flat corner, (y, x) µm."""
+    smooth = gaussian_filter(np.random.default_rng(seed).normal(size=shape), 4.0)
+    height = 0.5 + 0.25 * smooth / smooth.std()
+    height[:20, :20] = 0.5
+    return height
+
+
+HEIGHT = height_of()
+
+
+def context_of(height: np.ndarray, pitch_um: float = PITCH_UM) -> FieldContext:
+    layout = torch.from_numpy(np.round(np.clip(height, 0, 1.2), 1))[None, None]
+    return FieldContext(layout, pitch_um, 1.2, order=0.3)
+
+
+def changed(
+    name: str, values: dict[str, float], height: np.ndarray, pitch_um: float = PITCH_UM
+) -> np.ndarray:
+    """What the effect adds to the height, (y, x) µm."""
+    field = torch.from_numpy(height)[None, None]
+    effect = NAMELESS.get(name) or get_effect(name)
+    return (effect(field, values, context_of(height, pitch_um)) - field)[0, 0].numpy()
+
+
+# The formulas anew: slopes by central differences, means by a Gaussian, sides by a running mean.
+
+
+def slope(h: np.ndarray, along: str) -> np.ndarray:
+    padded = np.pad(h, 1, mode="edge")
+    x = (padded[1:-1, 2:] - padded[1:-1, :-2]) / (2 * PITCH_UM)
+    y = (padded[2:, 1:-1] - padded[:-2, 1:-1]) / (2 * PITCH_UM)
+    return {"x": x, "y": y, "diagonal": (x + y) / 2**0.5, "antidiagonal": (y - x) / 2**0.5}[along]
+
+
+def mean_within(h: np.ndarray, reach_um: float) -> np.ndarray:
+    return gaussian_filter(h, reach_um / PITCH_UM, mode="nearest", truncate=4)
+
+
+def beside(h: np.ndarray, side: str, length_um: float) -> np.ndarray:
+    """y_i = y_(i-1) + (h_i - y_(i-1)) / (1 + l / dx), coming from that side."""
+    turned = {"left": h, "right": h[:, ::-1], "above": h.T, "below": h.T[:, ::-1]}[side]
+    found = turned.copy()
+    for i in range(1, turned.shape[1]):
+        found[:, i] = found[:, i - 1] + (turned[:, i] - found[:, i - 1]) / (1 + length_um / PITCH_UM)
+    return {"left": found, "right": found[:, ::-1], "above": found.T, "below": found[:, ::-1].T}[side]
+
+
+Y, X = (np.linspace(-1, 1, n) for n in SHAPE)
+PLACES = {"x": X[None, :] + 0 * Y[:, None], "y": Y[:, None] + 0 * X[None, :]}
+PLACES["r2"] = PLACES["x"] ** 2 + PLACES["y"] ** 2
+ORDER = 0.3
+SIDES = ("left", "right", "above", "below")
+
+
+def formulas() -> dict[str, Callable[[np.ndarray], np.ndarray]]:
+    found: dict[str, Callable[[np.ndarray], np.ndarray]] = {}
+    for axis in ("x", "y", "diagonal", "antidiagonal"):
+        for power in (1, 1.5, 2, 3):
+            name = f"slope-{axis}-power-{power}".replace(".", "-")
+            found[name] = lambda h, a=axis, p=power: np.abs(slope(h, a)) ** p
+        found[f"rising-slope-{axis}"] = lambda h, a=axis: np.maximum(slope(h, a), 0)
+        found[f"falling-slope-{axis}"] = lambda h, a=axis: np.maximum(-slope(h, a), 0)
+    for axis in ("x", "y"):
+        found[f"height-times-slope-{axis}"] = lambda h, a=axis: h * slope(h, a)
+        found[f"height-times-slope-size-{axis}"] = lambda h, a=axis: h * np.abs(slope(h, a))
+        found[f"curvature-{axis}"] = lambda h, a=axis: slope(slope(h, a), a)
+        found[f"slope-size-{axis}-times-order"] = lambda h, a=axis: np.abs(slope(h, a)) * ORDER
+        for place, own in PLACES.items():
+            found[f"slope-size-{axis}-times-{place}"] = lambda h, a=axis, p=own: np.abs(slope(h, a)) * p
+    for power in (1, 2):
+        found[f"steepness-power-{power}"] = lambda h, p=power: np.hypot(slope(h, "x"), slope(h, "y")) ** p
+    for power in (2, 3):
+        found[f"height-power-{power}"] = lambda h, p=power: h**p
+    for place, own in PLACES.items():
+        found[f"height-times-{place}"] = lambda h, p=own: h * p
+    found["height-squared-times-order"] = lambda h: h**2 * ORDER
+    for reach in (0.6, 1.5, 4.0):
+        end = f"{reach:g}-um".replace(".", "-")
+        found[f"surroundings-{end}"] = lambda h, r=reach: mean_within(h, r) - h
+        found[f"height-times-surroundings-{end}"] = lambda h, r=reach: h * mean_within(h, r)
+        found[f"above-surroundings-{end}"] = lambda h, r=reach: (h - mean_within(h, r)) ** 2
+        found[f"steps-within-{end}"] = lambda h, r=reach: mean_within(
+            np.hypot(slope(h, "x"), slope(h, "y")), r
+        )
+    for side in SIDES:
+        for length in (0.6, 2.0, 6.0):
+            name = f"{side}-{length:g}-um".replace(".", "-")
+            found[name] = lambda h, s=side, n=length: beside(h, s, n) - h
+    return found
+
+
+FORMULAS = formulas()
+
+
+def test_every_law_has_a_formula_here() -> None:
+    assert set(FORMULAS) == set(LAWS)
+    assert len({law.title for law in LAWS.values()}) == len(LAWS)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_a_law_adds_its_strength_times_its_formula(name: str) -> None:
+    wanted = FORMULAS[name](HEIGHT)
+    assert wanted.std() > 1e-3
+    # Besides the rounding, which a place may double: a Gaussian ends after 4 sigma, a tail after 6 lengths,
+    # or a field, with what comes around from the other side.
+    allowed = 2 * ROUNDED
+    if name.split("-")[0] in SIDES and "surroundings" not in name:
+        steps = float(".".join(name.split("-")[1:-1])) / PITCH_UM
+        allowed += np.ptp(HEIGHT) * (steps / (1 + steps)) ** min(6 * steps, min(SHAPE) - 1)
+    found = changed(name, {"strength": 0.05}, HEIGHT)
+    np.testing.assert_allclose(found, 0.05 * wanted, atol=0.05 * allowed, rtol=1e-9)
+
+
+@BY_NAME
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_off_it_changes_not_a_bit(name: str, dtype: torch.dtype) -> None:
+    height = torch.from_numpy(HEIGHT[:40, :44].copy()).to(dtype)[None, None]
+    context = FieldContext(height.round(decimals=1), PITCH_UM, 1.2)
+    assert torch.equal(NAMELESS[name](height, {}, context), height)
+
+
+@BY_NAME
+def test_a_flat_print_has_a_finite_derivative(name: str) -> None:
+    height = torch.full((1, 1, 24, 20), 0.4, requires_grad=True)
+    context = FieldContext(torch.full((1, 1, 24, 20), 0.4), PITCH_UM, 1.2, order=0.2)
+    values = dict.fromkeys(NAMELESS[name].amplitudes, 0.1)
+    NAMELESS[name](height, values, context).sum().backward()
+    assert height.grad is not None
+    assert torch.isfinite(height.grad).all()
+
+
+POWERS_OF_UM = {"1": 0, "µm": 1, "µm²": 2, "1/µm": -1, "1/µm²": -2}
+
+
+@pytest.mark.parametrize("name", [name for name in LAWS if not name.endswith("-um")])
+def test_the_unit_of_a_strength_makes_its_change_a_height(name: str) -> None:
+    """In units half as large all lengths are twice as many, the change of the height too."""
+    unit = LAWS[name].parameters["strength"].unit
+    height = HEIGHT[:60, :64].copy()
+    one = changed(name, {"strength": 0.05}, height)
+    other = changed(name, {"strength": 0.05 * 2 ** POWERS_OF_UM[unit]}, 2 * height, 2 * PITCH_UM)
+    np.testing.assert_allclose(other, 2 * one, atol=4 * 0.05 * ROUNDED)
+    assert np.abs(one).max() > 2e-3
+
+
+def test_a_table_of_one_height_is_a_datum_and_each_level_has_its_own() -> None:
+    names = DESCRIPTIONS["level-table"].amplitudes
+    np.testing.assert_allclose(changed("level-table", dict.fromkeys(names, 0.02), HEIGHT), 0.02, atol=1e-12)
+    flat = np.full((30, 30), 0.6)
+    for knot, name in enumerate(names):
+        # 0.6 of 1.2 µm is the fourth of eight steps.
+        np.testing.assert_allclose(changed("level-table", {name: 0.02}, flat), 0.02 * (knot == 4), atol=1e-9)
+
+
+def test_a_response_looks_at_its_place_and_goes_on_beyond_the_edge() -> None:
+    for name in DESCRIPTIONS["linear-response"].amplitudes:
+        dy, dx = (round(float(part) / 1000 / PITCH_UM) for part in name.split("_")[1:3])
+        padded = np.pad(HEIGHT, 6, mode="edge")
+        there = padded[6 + dy : 6 + dy + SHAPE[0], 6 + dx : 6 + dx + SHAPE[1]]
+        np.testing.assert_allclose(
+            changed("linear-response", {name: 0.3}, HEIGHT), 0.3 * (there - HEIGHT), atol=1e-12
+        )
+
+
+def test_a_map_of_the_place_is_a_gain() -> None:
+    for name in DESCRIPTIONS["place-map"].amplitudes:
+        i, j = (int(part[1:]) for part in name.split("_"))
+        wanted = 0.1 * HEIGHT * PLACES["y"] ** i * PLACES["x"] ** j
+        np.testing.assert_allclose(changed("place-map", {name: 0.1}, HEIGHT), wanted, atol=1e-12)
+
+
+@BY_NAME
+def test_it_acts_on_the_print_before_the_microscope_sees_it(name: str) -> None:
+    given = ["tip-dilation", name, "vertical-shrinkage", "dose-exponent"]
+    assert in_forward_order(given) == ["dose-exponent", "vertical-shrinkage", name, "tip-dilation"]
+
+
+def test_what_has_no_name_is_found_by_it_and_is_no_cause() -> None:
+    assert all(get_effect(name) is one for name, one in NAMELESS.items())
+    assert {one.knowledge for one in LAWS.values()} == {"law"}
+    assert {one.knowledge for one in DESCRIPTIONS.values()} == {"description"}
+    assert {one.knowledge for one in CATALOGUE.values()} == {"cause"}
+    assert not NAMELESS.keys() & {one.name for one in screened_effects()}
+    with pytest.raises(InputError, match="which exists"):
+        register_effect(LAWS["curvature-x"])
+
+
+@pytest.mark.parametrize("power", [1.0, 1.5, 2.0, 3.0])
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_slope_thinning_is_a_power_of_the_slope(power: float, axis: str) -> None:
+    found = changed("slope-thinning", {f"along_{axis}_um": 0.2, "exponent": power}, HEIGHT)
+    np.testing.assert_allclose(found, -0.2 * np.abs(slope(HEIGHT, axis)) ** power, atol=0.2 * 1.1 * ROUNDED)
+
+
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_a_shortened_line_loses_its_delta_at_both_ends(axis: str) -> None:
+    """The area of a line of 0.8 µm falls by twice delta times its height; across it nothing happens."""
+    line = np.zeros((30, 60))
+    line[:, 15:45] = 0.8
+    line = line if axis == "x" else line.T
+    lost = changed("line-shortening", {f"along_{axis}_um": 0.15}, line).sum(axis=1 if axis == "x" else 0)
+    np.testing.assert_allclose(lost * PITCH_UM, -2 * 0.15 * 0.8, rtol=1e-12)
+    other = "y" if axis == "x" else "x"
+    assert np.array_equal(changed("line-shortening", {f"along_{other}_um": 0.15}, line), 0 * line)

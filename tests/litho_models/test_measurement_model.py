@@ -1,0 +1,239 @@
+"""What scans share beside their prints: planted, found, and nothing invented."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.polynomial import legendre
+
+from litho_data.store import PrintedScan
+from litho_models.scan_terms.measurement import LEVELLED, MeasurementModel, SharedPart, learn_measurement
+from tests.litho_models.twin_scans import PITCH_UM, blank_scans, with_heights
+
+COUNT, SIZE_PX, NOISE_UM = 8, 48, 0.004
+SIDE = np.linspace(-1, 1, SIZE_PX)
+X, Y = SIDE[None, :] + 0 * SIDE[:, None], SIDE[:, None] + 0 * SIDE[None, :]
+FIELD_UM = (SIZE_PX * PITCH_UM, SIZE_PX * PITCH_UM)
+SCANS = blank_scans(COUNT, SIZE_PX)
+
+
+def relief(
+    number: int, shift_x_um: np.ndarray | float = 0.0, shift_y_um: np.ndarray | float = 0.0
+) -> np.ndarray:
+    """A print (ny, nx), µm, as a sum of waves: known at every place, so also displaced."""
+    rng = np.random.default_rng([11, number])
+    x = (np.arange(SIZE_PX) * PITCH_UM)[None, :] + shift_x_um
+    y = (np.arange(SIZE_PX) * PITCH_UM)[:, None] + shift_y_um
+    total = np.full((SIZE_PX, SIZE_PX), 0.6)
+    for _ in range(12):
+        fy, fx, phase = rng.uniform(-0.6, 0.6), rng.uniform(-0.6, 0.6), rng.uniform(0, 2 * np.pi)
+        total = total + 0.08 * np.cos(2 * np.pi * (fy * y + fx * x) + phase)
+    return total
+
+
+PRINTS = [relief(number) for number in range(COUNT)]
+
+
+def measured(
+    seen: Callable[[int], np.ndarray], *, noise_um: float = NOISE_UM, seed: int = 0
+) -> list[PrintedScan]:
+    """Scans that show ``seen(number)`` (ny, nx), µm, with a datum of their own and white noise."""
+    rng = np.random.default_rng(seed)
+    noise = rng.normal(0, noise_um, (COUNT, SIZE_PX, SIZE_PX)) + rng.normal(0, 0.05, (COUNT, 1, 1))
+    return with_heights(SCANS, [seen(number) + noise[number] for number in range(COUNT)])
+
+
+def in_field(number: int, field: str) -> bool:
+    return SCANS[number].groups["field"] == field
+
+
+def part_of(model: MeasurementModel, what: str, by: str) -> SharedPart:
+    return next(part for part in model.parts if (part.what, part.by) == (what, by))
+
+
+def left_nm(
+    scans: Sequence[PrintedScan], model: MeasurementModel, prints: Sequence[np.ndarray] = PRINTS
+) -> float:
+    """What the model leaves of scans, rms without each datum, nm."""
+    left = [scan.height_um - model.expected_um(scan, own) for scan, own in zip(scans, prints, strict=True)]
+    # At the edge a displaced print would have to be looked up beyond it.
+    return 1e3 * float(np.sqrt(np.mean([one[2:-2, 2:-2].var() for one in left])))
+
+
+def levelled(field_um: np.ndarray, levelling: str) -> np.ndarray:
+    """Without the plane (or twist, or bow) that fits best; the mean stays."""
+    powers = {1: X, 2: Y, 3: X**2, 4: X * Y, 5: Y**2}
+    shapes = np.stack([np.ones_like(X), *(powers[k] for k in LEVELLED[levelling])]).reshape(  # type: ignore[index]
+        1 + len(LEVELLED[levelling]),
+        -1,  # type: ignore[index]
+    )
+    fitted = np.linalg.lstsq(shapes.T, field_um.reshape(-1), rcond=None)[0] @ shapes
+    return field_um - fitted.reshape(field_um.shape) + fitted.mean()
+
+
+@pytest.mark.parametrize("levelling", list(LEVELLED))
+def test_predictions_are_levelled_as_the_files_were(levelling: str) -> None:
+    scans = measured(lambda number: levelled(PRINTS[number], levelling))
+    learned = learn_measurement(scans, PRINTS)
+    assert learned.levelling == levelling
+    # White noise is all that is left; a surface that was learned from it adds less than a percent.
+    assert left_nm(scans, learned) == pytest.approx(1e3 * NOISE_UM, rel=0.02)
+
+
+def test_a_levelled_prediction_has_none_of_the_surface_and_keeps_its_mean() -> None:
+    for name in LEVELLED:
+        found = made(levelling=name).expected_um(SCANS[0], PRINTS[0])
+        np.testing.assert_allclose(found, levelled(PRINTS[0], name), atol=1e-12)
+
+
+def background(number: int) -> np.ndarray:
+    """A bow along x and a twist in field 2, nothing in field 1, µm."""
+    return (0.03 * legendre.legval(X, [0, 0, 1]) + 0.02 * X * Y) * in_field(number, "2")
+
+
+@pytest.fixture(scope="module")
+def with_background() -> list[PrintedScan]:
+    return measured(lambda number: PRINTS[number] + background(number))
+
+
+@pytest.fixture(scope="module")
+def learned(with_background: list[PrintedScan]) -> MeasurementModel:
+    return learn_measurement(with_background, PRINTS)
+
+
+def test_a_background_by_field_is_found_to_within_its_noise(
+    with_background: list[PrintedScan], learned: MeasurementModel
+) -> None:
+    # Of what k scans of a field ask for no more than shrinking / (k + shrinking) is lost, however often it is
+    # fitted; half of it may come from what all scans have, the rest from the field.
+    shrinking = part_of(learned, "background", "field").shrinking
+    lost = shrinking / (COUNT / 2 + shrinking) * background(1).std()
+    # A part of p numbers has p pixels' worth of noise in each field.
+    noise = NOISE_UM * np.sqrt(2 * 35 / (COUNT * SIZE_PX**2))
+    for number in range(COUNT):
+        assert (learned.background_um(SCANS[number]) - background(number)).std() < lost + 2 * noise
+    assert left_nm(with_background, learned) < 1e3 * NOISE_UM * 1.1
+
+
+def test_what_one_group_has_leaves_every_other_scan_untouched(learned: MeasurementModel) -> None:
+    elsewhere = replace(SCANS[0], groups={"field": "3"})
+    common = learned.model_copy(update={"parts": [part for part in learned.parts if part.by != "field"]})
+    assert np.array_equal(learned.expected_um(elsewhere, PRINTS[0]), common.expected_um(elsewhere, PRINTS[0]))
+    assert np.array_equal(made(BY_FIELD).expected_um(elsewhere, PRINTS[0]), PRINTS[0])
+    inside = made(BY_FIELD).expected_um(SCANS[1], PRINTS[1])
+    np.testing.assert_allclose(inside, PRINTS[1] + 0.03 * X + 0.02 * Y, atol=1e-12)
+
+
+@pytest.mark.parametrize("axis", ["x", "y"])
+def test_a_displacement_in_one_field_is_found(axis: str) -> None:
+    """Under a pixel, S-shaped along x: the scan shows at x what lies at x + shift."""
+    size_um = 0.08
+    shift = size_um * legendre.legval(X, [0, 0, 0, 1])
+
+    def seen(number: int) -> np.ndarray:
+        own = shift * in_field(number, "2")
+        return relief(number, own) if axis == "x" else relief(number, 0.0, own)
+
+    scans = measured(seen)
+    learned = learn_measurement(scans, PRINTS)
+    part = part_of(learned, f"shift-{axis}", "field")
+    # 1, x, y, P2(x), x y, P2(y), P3(x): the last is what was planted.
+    kept = COUNT / 2 / (COUNT / 2 + part.shrinking)
+    # Slopes differ from place to place, so that the shapes are not quite apart: a twentieth.
+    assert part.coefficients["2"][6] == pytest.approx(size_um * kept, rel=0.05 + 1 - kept)
+    assert np.abs(part.coefficients["1"]).max() < 0.05 * size_um
+    assert left_nm(scans, learned) < 1e3 * NOISE_UM * 1.15 < 0.6 * left_nm(scans, made())
+
+
+def test_a_gain_by_print_is_found() -> None:
+    gains = {"1": 0.05, "2": -0.05, "3": 0.03, "4": -0.03}
+    scans = measured(lambda number: PRINTS[number] * (1 + gains[SCANS[number].print_id]))
+    part = part_of(learn_measurement(scans, PRINTS), "gain", "print")
+    kept = 2 / (2 + part.shrinking)
+    # Shrunk by the mean size of all reliefs, which are not of one size: within a fifth.
+    for label, gain in gains.items():
+        assert part.coefficients[label][0] == pytest.approx(gain * kept, abs=0.2 * 0.05)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_next_to_nothing_is_learned_from_noise(seed: int) -> None:
+    scans = measured(lambda number: PRINTS[number], seed=seed)
+    learned = learn_measurement(scans, PRINTS, seed=seed)
+    added = [learned.expected_um(scan, own) - own for scan, own in zip(scans, PRINTS, strict=True)]
+    # p numbers fit p pixels' worth of white noise; the largest part has 35 in each of 2 fields.
+    limit_um = NOISE_UM * np.sqrt(2 * 35 / (COUNT * SIZE_PX**2))
+    assert np.sqrt(np.mean([one.var() for one in added])) < 2 * limit_um
+
+
+def test_scans_that_did_not_take_part_are_freed_too(with_background: list[PrintedScan]) -> None:
+    """What a field does is learned on three prints and predicts the fourth."""
+    scans, prints = with_background[6:], PRINTS[6:]
+    learned = learn_measurement(with_background[:6], PRINTS[:6])
+    assert left_nm(scans, learned, prints) < 0.6 * left_nm(scans, made(), prints)
+
+
+def made(*parts: SharedPart, **facts: object) -> MeasurementModel:
+    return MeasurementModel.model_validate(
+        {"levelling": "none", "parts": list(parts), "field_um": FIELD_UM, "scans": COUNT, **facts}
+    )
+
+
+def shared(what: str, by: str, degree: int, coefficients: dict[str, list[float]]) -> SharedPart:
+    return SharedPart.model_validate(
+        {"what": what, "by": by, "degree": degree, "shrinking": 0.3, "coefficients": coefficients}
+    )
+
+
+BY_FIELD = shared("background", "field", 1, {"1": [0.01, 0.0], "2": [0.03, 0.02]})
+
+
+def test_between_groups_is_what_groups_differ_in() -> None:
+    common = shared("background", "all", 1, {"": [0.5, 0.5]})
+    gain = shared("gain", "print", 0, {"1": [0.1], "2": [-0.1]})
+    model = made(common, BY_FIELD, gain, levelling="twist").between_groups()
+    assert model.levelling == "none"
+    assert [part.by for part in model.parts] == ["field"]
+    np.testing.assert_allclose(model.background_um(SCANS[0]), -0.01 * X - 0.01 * Y, atol=1e-12)
+    np.testing.assert_allclose(model.background_um(SCANS[1]), 0.01 * X + 0.01 * Y, atol=1e-12)
+
+
+def test_a_field_of_another_size_has_its_levelling_alone() -> None:
+    model = made(BY_FIELD, levelling="plane", field_um=(2 * FIELD_UM[0], FIELD_UM[1]))
+    assert not model.fits(SCANS[0])
+    np.testing.assert_allclose(
+        model.expected_um(SCANS[0], PRINTS[0]), levelled(PRINTS[0], "plane"), atol=1e-12
+    )
+
+
+def test_fields_of_the_most_frequent_size_are_learned_from(
+    with_background: list[PrintedScan], learned: MeasurementModel
+) -> None:
+    small = blank_scans(1, 24)[0]
+    assert learn_measurement([small, *with_background], [small.layout_um, *PRINTS]) == learned
+    assert learned.scans == COUNT
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_one_or_two_scans_are_no_error(count: int) -> None:
+    scans = measured(lambda number: PRINTS[number])[:count]
+    learned = learn_measurement(scans, PRINTS[:count])
+    assert left_nm(scans, learned, PRINTS[:count]) < 1e3 * NOISE_UM * 1.2
+
+
+def test_unmeasured_pixels_take_no_part(with_background: list[PrintedScan]) -> None:
+    hidden = []
+    for scan in with_background[:4]:
+        height, valid = scan.height_um.copy(), scan.valid.copy()
+        height[:6], valid[:6] = np.nan, False
+        hidden.append(replace(scan, height_um=height, valid=valid))
+    garbage = [replace(s, height_um=np.where(s.valid, s.height_um, 1e6).astype(np.float32)) for s in hidden]
+    assert learn_measurement(hidden, PRINTS[:4]) == learn_measurement(garbage, PRINTS[:4])
+
+
+def test_the_record_says_how_many_numbers_it_has_and_reads_back() -> None:
+    model = made(BY_FIELD, shared("gain", "print", 0, {"1": [0.1], "2": [-0.1]}))
+    assert model.numbers == 6
+    assert MeasurementModel.model_validate_json(model.model_dump_json()) == model

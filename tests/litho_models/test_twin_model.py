@@ -1,0 +1,212 @@
+"""The twin: its numbers by group, its derivatives, and fits in which no scan predicts itself."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from litho_models.effects import get_effect
+from litho_models.scan_terms.groups import ALL
+from litho_models.twin.fits import TwinProblem, fit_state, prepared_among, without_terms
+from litho_models.twin.model import Slot, Twin, Values
+from litho_models.twin.results import clustered_covariance
+from tests.litho_models.twin_scans import BLUR_UM, PITCH_UM, bare_state, base_model, planted, study_of
+
+THINNING = "slope-thinning"
+
+
+def thinning(along_x_um: float, exponent: float = 1.0) -> dict[str, float]:
+    return get_effect(THINNING).with_values({"along_x_um": along_x_um, "exponent": exponent})
+
+
+BY_FIELD: Values = {"1": thinning(0.1), "2": thinning(0.2)}
+
+
+@pytest.fixture(scope="module")
+def study():
+    return study_of(planted([(THINNING, "field", BY_FIELD)]))
+
+
+@pytest.fixture(scope="module")
+def twin(study) -> Twin:
+    return Twin.bare(base_model(), study.scans[0]).with_effect(THINNING, "field", BY_FIELD)
+
+
+def test_the_bare_twin_is_the_base(study) -> None:
+    scan = study.scans[0]
+    bare = Twin.bare(base_model(), scan)
+    np.testing.assert_allclose(bare.vector, [0.9, 0.03], rtol=1e-6)
+    assert bare.names == ()
+    blurred = gaussian_filter(scan.stored.layout_um, BLUR_UM / PITCH_UM, mode="nearest", truncate=4)
+    np.testing.assert_allclose(bare.placed().height(scan), 0.9 * blurred + 0.03, atol=1e-5)
+
+
+def test_amplitudes_differ_by_group_and_shapes_do_not(twin: Twin) -> None:
+    assert twin.slots == (
+        Slot(THINNING, "along_x_um", "1"),
+        Slot(THINNING, "along_x_um", "2"),
+        Slot(THINNING, "along_y_um", "1"),
+        Slot(THINNING, "along_y_um", "2"),
+        Slot(THINNING, "exponent", None),
+    )
+    assert twin.own == 2
+    assert twin.values({"field": "2"}) == {THINNING: thinning(0.2)}
+
+
+def test_a_group_that_was_never_fitted_has_the_mean_of_the_others(twin: Twin, study) -> None:
+    assert twin.values({"field": "9"})[THINNING]["along_x_um"] == pytest.approx(0.15)
+    stored = replace(study.scans[0].stored, groups={"field": "9"})
+    elsewhere = replace(study.scans[0], stored=stored)
+    one = Twin.bare(base_model(), elsewhere).with_effect(THINNING, ALL, {"": thinning(0.15)})
+    np.testing.assert_allclose(twin.placed().height(elsewhere), one.placed().height(elsewhere), atol=1e-6)
+
+
+def test_a_group_behind_which_there_is_no_scan_has_the_mean_of_the_others(twin: Twin, study) -> None:
+    first = [scan for scan in study.scans if scan.stored.groups["field"] == "1"]
+    known = twin.known_from(first)
+    assert known.values({"field": "2"}) == known.values({"field": "1"}) == {THINNING: thinning(0.1)}
+    assert np.array_equal(twin.known_from(study.scans).vector, twin.vector)
+    assert twin.known_from([]).values({"field": "1"})[THINNING]["along_x_um"] == 0.0
+
+
+def test_directions_are_chosen_and_never_fitted(study) -> None:
+    lag = {"length_um": 0.2, "direction": -1.0}
+    twin = Twin.bare(base_model(), study.scans[0]).with_effect("galvo-lag", ALL, {"": lag})
+    assert twin.slots == (Slot("galvo-lag", "length_um", None),)
+    assert twin.values({}) == {"galvo-lag": lag}
+
+
+def test_effects_act_in_their_order_however_they_came_and_leave_no_trace(twin: Twin) -> None:
+    blur = get_effect("resampling-blur").with_values({})
+    prox = get_effect("long-range-proximity").with_values({})
+    more = twin.with_effect("resampling-blur", ALL, {"": blur}).with_effect(
+        "long-range-proximity", ALL, {"": prox}
+    )
+    assert more.names == ("long-range-proximity", THINNING, "resampling-blur")
+    back = more.without("resampling-blur").without("long-range-proximity")
+    assert (back.by, back.choices, back.slots) == (twin.by, twin.choices, twin.slots)
+    assert np.array_equal(back.vector, twin.vector)
+    with_first = more.without(THINNING)
+    assert with_first.own == 2
+    assert THINNING not in {slot.effect for slot in with_first.slots}
+
+
+def test_effects_off_change_no_prediction(study) -> None:
+    scan = study.scans[0]
+    bare = Twin.bare(base_model(), scan)
+    twin = bare.with_effect(THINNING, "field", {"1": thinning(0.0), "2": thinning(0.0)})
+    assert np.array_equal(twin.placed().height(scan), bare.placed().height(scan))
+
+
+def test_moving_the_twin_does_not_move_its_base(twin: Twin, study) -> None:
+    before = [p.detach().clone() for p in twin.base.parameters()]
+    twin.at(twin.vector + 0.1).placed().height(study.scans[0])
+    assert all((a == b).all() for a, b in zip(before, twin.base.parameters(), strict=True))
+
+
+def test_derivatives_are_difference_quotients_of_the_whole_prediction(twin: Twin, study) -> None:
+    """Also where a number is of another group, or acts on the height so that the base is not run again."""
+    twin = twin.with_effect("long-range-proximity", ALL, {"": _typical("long-range-proximity")})
+    steps = twin.steps()
+    linear = TwinProblem(twin, study.windows).linearise(twin.vector)
+    for window, part in zip(study.windows, linear, strict=True):
+        here = window.at_sample(twin.placed().height(window))
+        np.testing.assert_allclose(part.residual, window.height - here, atol=1e-12)
+        for at, step in enumerate(steps):
+            moved = twin.vector.copy()
+            moved[at] += step
+            there = window.at_sample(twin.at(moved).placed().height(window))
+            # Heights are float32: two of them, over the step.
+            np.testing.assert_allclose(part.jacobian[at], (there - here) / step, atol=4e-7 / abs(step))
+
+
+def _typical(name: str) -> dict[str, float]:
+    return {key: facts.typical for key, facts in get_effect(name).parameters.items()}
+
+
+def test_a_step_turns_back_at_the_end_of_a_range(twin: Twin) -> None:
+    facts = get_effect(THINNING).parameters
+    vector = twin.vector.copy()
+    vector[2], vector[3] = facts["along_x_um"].upper, facts["along_x_um"].lower
+    ends = twin.at(vector)
+    assert ends.steps()[2] < 0 < ends.steps()[3]
+    lowest, highest = ends.room()
+    assert highest[2] == lowest[3] == 0
+    assert list(ends.free()[2:4]) == [False, False]
+    assert ends.free()[:2].all()
+    # Both groups and the axis that is off stand on a bound of the same name.
+    assert set(ends.at_bounds()) == {f"{THINNING}: along_x_um", f"{THINNING}: along_y_um"}
+
+
+def test_strengths_by_group_are_recovered_to_within_their_noise(study) -> None:
+    start = {label: thinning(0.12, 1.2) for label in "12"}
+    state = fit_state(bare_state(study).twin.with_effect(THINNING, "field", start), study)
+    sd = np.sqrt(np.diag(clustered_covariance(state, [scan.id for scan in study.scans])))
+    wanted = [0.9, 0.03, 0.1, 0.2, 0.0, 0.0, 1.0]
+    for at in (2, 3, 6):
+        assert state.twin.vector[at] == pytest.approx(wanted[at], abs=5 * sd[at] + 0.01 * wanted[at])
+    # White noise of 4 nm, seven terms and an affine shift a scan taken out.
+    assert np.sqrt(state.mse_nm2) == pytest.approx(4.0, rel=0.05)
+
+
+def test_free_errors_are_those_of_the_fit_that_has_not_seen_the_scan(study) -> None:
+    state = bare_state(study)
+    for at, scan in enumerate(study.scans):
+        fold = study.fold_of[at]
+        prediction = state.twin.at(state.per_fold[fold]).placed().height(scan)
+        left = scan.height - scan.at_sample(prediction)
+        np.testing.assert_allclose(state.held_out_um[at], left, atol=1e-12)
+        freed = without_terms(left[:, None], scan, prediction)
+        assert state.freed_nm2[at] == pytest.approx(1e6 * np.mean(freed**2))
+
+
+@pytest.mark.parametrize("by", [ALL, "field", "print"])
+def test_a_scan_says_nothing_about_its_own_prediction(by: str) -> None:
+    """Prints are whole folds here: a strength of a print has then nothing behind it but the other prints."""
+    law = "height-power-2"
+    scans = planted()
+    changed = [
+        replace(s, height_um=s.height_um + np.float32(0.3) * s.layout_um**2) if s.print_id == "2" else s
+        for s in scans
+    ]
+    fold_of = np.array([int(scan.print_id) - 1 for scan in scans])
+    found = []
+    for own in (scans, changed):
+        study = replace(study_of(own), fold_of=fold_of)
+        labels = set(study.groups[by])
+        values = {label: {"strength": 0.0} for label in labels}
+        state = fit_state(Twin.bare(base_model(), study.scans[0]).with_effect(law, by, values), study)
+        placed = state.twin.at(state.per_fold[1]).placed()
+        found.append(np.stack([placed.height(scan) for scan in study.scans[2:4]]))
+    # A fit without a fold begins at the common one, and stops where a step gains 1e-4 of what is left.
+    assert np.abs(found[1] - found[0]).max() < 1e-3 * 0.3
+
+
+def test_a_base_that_is_not_fitted_has_no_numbers(study) -> None:
+    base = base_model()
+    for parameter in base.parameters():
+        parameter.requires_grad_(False)
+    twin = Twin.bare(base, study.scans[0])
+    assert len(twin.vector) == twin.own == 0
+    state = fit_state(twin, study)
+    assert state.per_fold.shape == (5, 0)
+    assert state.mse_nm2 > 16
+
+
+def test_scans_from_elsewhere_have_their_places_in_the_order_of_those_known(study) -> None:
+    """A drift goes on as it began: scans are not spread over the order anew."""
+    stored = [study.scans[3].stored, replace(study.scans[6].stored, order=7)]
+    found = prepared_among(stored, study.scans)
+    assert [one.context.order for one in found] == [
+        study.scans[3].context.order,
+        study.scans[7].context.order,
+    ]
+    late = prepared_among([replace(stored[0], order=99)], study.scans)[0]
+    assert late.context.order == 0.5
+    between = prepared_among(stored[1:], study.scans[::2])[0]
+    assert between.context.order == pytest.approx(
+        (study.scans[6].context.order + study.scans[8].context.order) / 2
+    )

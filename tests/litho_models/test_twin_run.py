@@ -1,0 +1,303 @@
+"""The loop on a small store of the virtual fab, from scans to record, report and corrected model."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+import tifffile
+
+import litho_data
+from litho_data.foundation.errors import InputError
+from litho_data.store import open_store
+from litho_models.effects import get_effect
+from litho_models.frozen.files import load_frozen
+from litho_models.scan_terms.groups import ALL
+from litho_models.twin import closing, run
+from litho_models.twin.closing import freed_scans
+from litho_models.twin.record import CloseLoop, Explained
+from litho_models.twin.report import effect_text, measurement_text, verdict_text
+from litho_models.twin.results import REPORTED, _verdict, clustered_covariance, error_rows
+from litho_models.twin.run import close_store, dealt
+from tests.litho_models.prints import make_scans, write_store
+from tests.litho_models.twin_scans import bare_state, blank_scan, planted, study_of, with_heights
+
+COUNT = 12
+BASE = "affine-mtf"
+CAUSES = ("write-order-memory", "slope-thinning", "galvo-lag")
+SOME_LAWS, TABLE = ("height-power-2", "slope-x-power-1"), "level-table"
+TABLES = {"errors.csv": "errors", "candidates.csv": "candidates", "explained.csv": "explained"}
+
+
+@pytest.fixture(scope="module")
+def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Surfaces of the fab on the layout's grid: fields this small cannot be registered."""
+    folder = tmp_path_factory.mktemp("fab")
+    knobs = ("write-order-memory=0.25",)
+    litho_data.simulate(folder / "prints", count=COUNT, size_px=64, seed=3, knobs=knobs, microscope="aligned")
+    rng = np.random.default_rng(0)
+    scans = []
+    for number in range(COUNT):
+        name = f"P{number // 4 + 1}F{number % 4 + 1}"
+        surface = np.load(folder / "prints" / "truth" / "surfaces" / f"{name}.npy")
+        level = tifffile.imread(folder / "prints" / "raw" / "layouts" / f"{name}.tif")
+        printed = replace(blank_scan(number, 64), id=name, print_id=name[1], mask_level=level)
+        scans.append(replace(printed, height_um=(surface + 0.03 * rng.normal()).astype(np.float32)))
+    return write_store(folder / "prints.zarr", scans)
+
+
+@pytest.fixture(scope="module")
+def closed(store: Path) -> tuple[CloseLoop, Path, list[str]]:
+    """Result, its folder, and what was said, with a handful of candidates; the locked scans are opened."""
+    said: list[str] = []
+    out = store.parent / "loop"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(closing, "screened_effects", lambda tip_radius_um: [get_effect(one) for one in CAUSES])
+        patch.setattr(closing, "LAWS", {one.name: one for one in map(get_effect, SOME_LAWS)})
+        patch.setattr(closing, "DESCRIPTIONS", {TABLE: get_effect(TABLE)})
+        result = close_store(store, out, base=BASE, open_lock_box=True, report=said.append)
+    return result, out, said
+
+
+def test_the_record_reads_back_as_it_was_written(closed) -> None:
+    result, out, _ = closed
+    assert CloseLoop.read(out) == result
+    assert json.loads((out / CloseLoop.FILE_NAME).read_text())["schema"] == "litho-models/close-loop/4"
+
+
+@pytest.mark.parametrize(
+    "change", [{"schema": "litho-models/close-loop/3"}, {"more": 1}, {"verdict": "perhaps"}]
+)
+def test_another_record_is_refused(closed, tmp_path: Path, change: dict[str, object]) -> None:
+    content = json.loads((closed[1] / CloseLoop.FILE_NAME).read_text()) | change
+    (tmp_path / CloseLoop.FILE_NAME).write_text(json.dumps(content))
+    with pytest.raises(InputError):
+        CloseLoop.read(tmp_path)
+
+
+def test_errors_are_means_over_the_scans_that_took_part(closed, store: Path) -> None:
+    result, _, _ = closed
+    opened = open_store(store)
+    locked, rest = set(opened.locked_ids), set(opened.ids) - set(opened.locked_ids)
+    assert locked
+    for row in result.errors:
+        assert row.mae_nm == pytest.approx(np.mean([*row.by_scan_nm.values()]))
+        assert row.rmse_nm >= row.mae_nm
+        assert set(row.by_scan_nm) == (locked if row.held_out == "locked" else rest)
+    assert {row.policy for row in result.errors} == set(REPORTED)
+    before, after = result.error("base"), result.error("all")
+    assert before is not None
+    assert after is not None
+    gains = [before.by_scan_nm[one] - after.by_scan_nm[one] for one in before.by_scan_nm]
+    assert result.gain_nm == pytest.approx(np.mean(gains))
+    assert result.error("all", held_out="locked") is not None
+    assert result.error("causes", "none", "published") is None
+
+
+def test_every_candidate_has_a_verdict_once(closed) -> None:
+    result, _, _ = closed
+    names = [one.name for one in (*result.effects, *result.candidates)]
+    assert len(names) == len(set(names))
+    assert all(one.reason for one in result.candidates)
+
+
+def test_every_column_of_a_table_is_the_field_that_it_names(closed) -> None:
+    result, out, _ = closed
+    for file, field in TABLES.items():
+        table = pd.read_csv(out / file)
+        rows = [one.model_dump() for one in getattr(result, field)]
+        assert len(table) == len(rows)
+        _same_columns(table, rows)
+    if result.effects:
+        rows = [one.model_dump() for one in result.effects]
+        for row in rows:
+            row["confusable_with"] = ", ".join(row["confusable_with"])
+        _same_columns(pd.read_csv(out / "effects.csv"), rows)
+        strengths = [
+            own.model_dump(include={"value", "unit"})
+            | {"effect": one.name, "parameter": name, "group": own.label}
+            | dict(zip(("from", "to"), own.ci95 or (None, None), strict=True))
+            for one in result.effects
+            for name, of_name in one.strengths.items()
+            for own in of_name
+        ]
+        _same_columns(pd.read_csv(out / "strengths.csv"), strengths)
+
+
+def _same_columns(table: pd.DataFrame, rows: list[dict[str, object]]) -> None:
+    for column in table:
+        for found, row in zip(table[column], rows, strict=True):
+            wanted = row[str(column)]
+            if isinstance(wanted, float):
+                assert found == pytest.approx(wanted, rel=1e-12), column
+            elif wanted is None or wanted == "":
+                assert pd.isna(found), column
+            else:
+                assert str(found) == str(wanted), column
+
+
+def test_the_page_holds_the_answer_and_nothing_from_elsewhere(closed) -> None:
+    result, out, said = closed
+    page = (out / "report.html").read_text(encoding="utf-8")
+    before = result.error("base")
+    assert before is not None
+    assert f"{before.mae_nm:.2f}" in page
+    assert "http://" not in page.replace("http://www.w3.org", "")
+    assert said[0].startswith("fitting the base model on 10 scans")
+
+
+def test_the_corrected_model_predicts_what_the_record_says(closed, store: Path) -> None:
+    result, out, _ = closed
+    model = load_frozen(out / "model")
+    scan = open_store(store).scan(next(iter(open_store(store).locked_ids)))
+    import torch
+
+    height = model(torch.from_numpy(scan.layout_um)[None, None], pitch_um=scan.pitch_um)[0, 0].numpy()
+    left = 1e3 * (scan.height_um - height)[scan.usable]
+    # Levelling, background and each scan's datum are the microscope's: the print alone is less near.
+    own = result.error("all", held_out="locked")
+    assert own is not None
+    assert np.abs(left - np.median(left)).mean() < 3 * own.by_scan_nm[scan.id]
+
+
+def test_texts_follow_the_verdict(closed) -> None:
+    result, _, _ = closed
+    words = {
+        "described": "no cause and no short law holds",
+        "nothing-missing": "Nothing is missing",
+        "unexplained": "Something is missing",
+        "too-few-scans": f"at least {result.fewest_scans} scans",
+    }
+    for verdict, text in words.items():
+        assert text in verdict_text(result.model_copy(update={"verdict": verdict, "effects": []}))
+    assert result.measurement.levelling != "none" or "not levelled" in measurement_text(result)
+    for one in result.effects:
+        assert one.name in effect_text(one)
+
+
+# Laws of the parts, without the fab.
+
+
+def test_a_verdict_needs_a_name_or_a_law_and_enough_scans() -> None:
+    def verdict(*knowledge: str, matters: bool = False, refused: bool = False, count: int = 10) -> str:
+        found = SimpleNamespace(
+            study=SimpleNamespace(scans=[None] * count),
+            rests={"base": SimpleNamespace(matters=True), "all": SimpleNamespace(matters=matters)},
+            named=SimpleNamespace(refused={"one": "reason"} if refused else {}),
+        )
+        return _verdict(found, [SimpleNamespace(knowledge=one) for one in knowledge])  # type: ignore[arg-type]
+
+    assert verdict("cause") == verdict("law") == verdict("description", "law") == "traced"
+    assert verdict("description") == "described"
+    assert verdict() == "nothing-missing"
+    assert verdict(matters=True) == verdict(refused=True) == "unexplained"
+    # Nothing can be confirmed, so that a refusal says nothing.
+    assert verdict(count=7, refused=True) == "too-few-scans"
+
+
+def test_error_rows_count_the_terms_of_each_scan() -> None:
+    scans = make_scans(2, 64, noise_um=0.0)
+    maps = [scan.height_um + np.float32(0.01) for scan in scans]
+    rows = {
+        row.policy: row
+        for row in error_rows(
+            scans, maps, model="base", measurement="shared", held_out="scans", numbers=(3, 4)
+        )
+    }
+    assert rows["none"].mae_nm == pytest.approx(10, rel=1e-4)
+    assert rows["offset"].mae_nm < 1e-3
+    assert [rows[policy].k for policy in REPORTED] == [0, 1, 7]
+    assert (rows["none"].printer_numbers, rows["none"].measurement_numbers) == (3, 4)
+
+
+def test_intervals_cover_the_scatter_of_fits_to_other_noise() -> None:
+    """The sandwich by scans against the spread over draws of the noise."""
+    fitted, sds = [], []
+    for seed in range(12):
+        study = study_of(planted(seed=seed))
+        state = bare_state(study)
+        fitted.append(state.twin.vector[0])
+        sds.append(np.sqrt(clustered_covariance(state, [scan.id for scan in study.scans])[0, 0]))
+    # A spread of 12 draws is known to a fifth, twice that is allowed for.
+    assert np.std(fitted, ddof=1) == pytest.approx(np.mean(sds), rel=0.45)
+
+
+def test_a_scan_is_freed_by_what_the_others_say() -> None:
+    """Its own heights move nothing of what is taken from it."""
+    scans = planted(count=8)
+    bows = [0.03 * _bow(s.shape) * (s.groups["field"] == "2") for s in scans]
+    bowed = with_heights(scans, [s.height_um + bow for s, bow in zip(scans, bows, strict=True)])
+    study = study_of(bowed)
+    state = bare_state(study)
+    freed = freed_scans(bowed, state, study)
+    taken = [one.height_um - other.height_um for one, other in zip(bowed, freed, strict=True)]
+    # Half of the difference between the fields is in each, shrunk.
+    for scan, own in zip(bowed, taken, strict=True):
+        sign = 1 if scan.groups["field"] == "2" else -1
+        assert np.corrcoef(own.ravel(), sign * _bow(scan.shape).ravel())[0, 1] > 0.9
+    other = [replace(bowed[0], height_um=bowed[0].height_um + _bow(bowed[0].shape)), *bowed[1:]]
+    again = freed_scans(other, state, study)
+    np.testing.assert_allclose(other[0].height_um - again[0].height_um, taken[0], atol=1e-6)
+    assert np.abs(other[1].height_um - again[1].height_um - taken[1]).max() > 1e-4
+
+
+def _bow(shape: tuple[int, int]) -> np.ndarray:
+    x = np.linspace(-1, 1, shape[1], dtype=np.float32)[None, :]
+    return (x * x - (x * x).mean()) * np.ones((shape[0], 1), np.float32)
+
+
+def test_folds_hold_every_scan_out_once() -> None:
+    scans = make_scans(7, 48)
+    fold_of = dealt(scans, 5, 0)
+    assert set(fold_of) == set(range(5))
+    assert len(set(dealt(scans[:3], 5, 0))) == 3
+    assert np.array_equal(fold_of, dealt(scans, 5, 0))
+
+
+def test_a_base_is_asked_for_by_name_or_the_best_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    scans = planted(count=4)
+    study = replace(study_of(scans), scans=())
+    name, _, others = run._bases("affine", scans, study)
+    assert (name, others) == ("affine", {})
+    monkeypatch.setattr(run, "BASES", ("identity", "affine"))
+    name, _, others = run._bases(run.AUTO, scans, study)
+    assert (name, list(others)) == ("affine", ["identity"])
+    with pytest.raises(InputError):
+        run._bases("nonsense", scans, study)
+
+
+def test_one_scan_is_too_few(tmp_path: Path) -> None:
+    store = write_store(tmp_path / "one.zarr", make_scans(1, 64))
+    with pytest.raises(InputError, match="at least 2"):
+        close_store(store, tmp_path / "out", base=BASE)
+    assert not (tmp_path / "out").exists()
+
+
+def test_three_scans_are_said_to_be_too_few_and_nothing_is_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(closing, "LAWS", {})
+    monkeypatch.setattr(closing, "DESCRIPTIONS", {})
+    monkeypatch.setattr(closing, "screened_effects", lambda tip_radius_um: [])
+    store = write_store(tmp_path / "few.zarr", make_scans(3, 64))
+    result = close_store(store, tmp_path / "out", base="affine")
+    assert result.verdict == "too-few-scans"
+    assert {row.held_out for row in result.errors} == {"scans"}
+    assert result.groups.get(ALL) is None
+
+
+def test_a_folder_of_something_else_is_left_alone(store: Path, tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(InputError):
+        close_store(store, tmp_path, base=BASE)
+    assert (tmp_path / "notes.txt").read_text() == "mine"
+
+
+def test_explained_is_what_a_stage_leaves() -> None:
+    row = Explained(stage="base", squared_error_nm2=20.0, explained_nm2=5.0, matters=True)
+    assert Explained.model_validate(row.model_dump()) == row

@@ -1,0 +1,136 @@
+"""Screening promises what a fit then gains, with one strength or one by group."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from litho_models.effects import get_effect
+from litho_models.effects.effect import Parameter, of_development
+from litho_models.scan_terms.groups import ALL
+from litho_models.twin.fits import State, Study, fit_state
+from litho_models.twin.screening import PERMUTATIONS, Candidate, Screening, Trial, trials_of
+from tests.litho_models.twin_scans import bare_state, planted, study_of
+
+LAW = "slope-x-power-1"
+EFFECTS = [get_effect(name) for name in (LAW, "height-power-2", "rising-slope-y", "place-map")]
+
+
+def screened(by: str, *strengths: float) -> tuple[Study, State, dict[tuple[str, str], Candidate], Screening]:
+    labels = [""] if by == ALL else [str(k + 1) for k in range(len(strengths))]
+    values = {label: {"strength": one} for label, one in zip(labels, strengths, strict=True)}
+    study = study_of(planted([(LAW, by, values)]))
+    state = bare_state(study)
+    screening = Screening(state, study, EFFECTS)
+    return study, state, {(one.name, one.by): one for one in screening.candidates}, screening
+
+
+@pytest.fixture(scope="module")
+def in_half():
+    return screened("field", 0.0, 0.04)
+
+
+@pytest.fixture(scope="module")
+def in_all():
+    return screened(ALL, 0.04)
+
+
+@pytest.mark.parametrize("by", [ALL, "field"])
+def test_a_linear_candidate_promises_what_its_fit_gains(in_half, by: str) -> None:
+    study, state, found, _ = in_half
+    one = found[LAW, by]
+    fitted = fit_state(state.twin.with_effect(LAW, by, one.start()), study)
+    gains = state.freed_nm2 - fitted.freed_nm2
+    # By group the base's share is taken out as all scans together have it: the promise is a rough one.
+    np.testing.assert_allclose(one.gain_nm2, gains.mean(), rtol=0.05 if by == ALL else 0.3)
+    assert np.corrcoef(one.gains_nm2, gains)[0, 1] > 0.95
+
+
+def test_a_strength_in_half_of_the_scans_is_found_with_its_grouping(in_half) -> None:
+    study, _, found, screening = in_half
+    one = found[LAW, "field"]
+    assert set(study.groups) >= {ALL, "field", "print"}
+    assert max((own for own in found.values() if own.name == LAW), key=lambda own: own.gain_nm2).by == "field"
+    assert one.gain_nm2 > 1.5 * found[LAW, ALL].gain_nm2
+    strengths = {label: values["strength"] for label, values in one.start().items()}
+    assert strengths["2"] == pytest.approx(0.04, rel=0.05)
+    assert abs(strengths["1"]) < 0.1 * 0.04
+    # Of 252 ways to choose five scans of ten, two divide them as the fields do.
+    chance = 2 / 252
+    error = 3 * np.sqrt(chance / PERMUTATIONS) + 1 / PERMUTATIONS
+    assert screening.permutation_p(one) == pytest.approx(chance, abs=error)
+
+
+def test_a_strength_in_all_scans_gains_nothing_by_group(in_all) -> None:
+    _, _, found, screening = in_all
+    one = found[LAW, ALL]
+    assert one.start()[""]["strength"] == pytest.approx(0.04, rel=0.05)
+    # All signs alike: the observed one, of 2^10.
+    assert screening.family_p(one) <= 4 / 2**10
+    for (name, by), other in found.items():
+        if name == LAW and by != ALL:
+            assert other.gain_nm2 < 1.02 * one.gain_nm2
+            assert screening.permutation_p(other) > 0.02
+
+
+def test_a_candidate_is_wholly_like_itself_and_its_opposite(in_all) -> None:
+    _, _, found, screening = in_all
+    one, other = found[LAW, ALL], found["height-power-2", ALL]
+    assert screening.cosine(one, one) == pytest.approx(1)
+    assert screening.cosine(one, other) == pytest.approx(screening.cosine(other, one))
+    assert abs(screening.cosine(one, other)) < 0.5
+
+
+def test_what_the_base_does_is_no_candidate(in_all) -> None:
+    """A gain that all scans share is a number of the base, and what is left of it a gain of each scan."""
+    study, state, _, _ = in_all
+    found = Screening(state, study, [get_effect("vertical-shrinkage")]).candidates[0]
+    assert found.retained < 1e-5
+
+
+def _effect():
+    return of_development(
+        name="made",
+        title="made",
+        parameters={
+            "a": Parameter("1", 0.0, 1.0, 0.1),
+            "b": Parameter("1", -1.0, 2.0, 1.1, null=1.0),
+            "length_um": Parameter("µm", 0.1, 5.0, 1.0, kind="shape"),
+        },
+        apply=lambda height, values, context: height,
+        trials=(
+            {"a": 0.1, "length_um": 0.5},
+            {"b": 1.2, "length_um": 0.5},
+            {"a": 0.4, "length_um": 0.5},
+            {"a": 0.1},
+        ),
+        source="",
+    )
+
+
+def test_trials_of_one_shape_and_size_are_fitted_together() -> None:
+    sets = [trial.sets for trial in trials_of([_effect()])]
+    a, b, larger, bare = _effect().trials
+    assert sets == [(a, b), (larger,), (bare,)]
+
+
+def test_multiples_count_from_the_null_and_stay_in_range() -> None:
+    trial = Trial(_effect(), _effect().trials[:2])
+    assert trial.values(np.array([2.0, 3.0])) == pytest.approx({"a": 0.2, "b": 1.6, "length_um": 0.5})
+    assert trial.reach(np.array([2.0, 3.0])) == 1
+    # a would be 2, twice what it can be.
+    assert trial.reach(np.array([20.0, 1.0])) == pytest.approx(0.5)
+    # b would be 3 where 2 is the most.
+    assert trial.reach(np.array([1.0, 10.0])) == pytest.approx(0.5)
+
+
+def test_a_sign_that_cannot_be_is_not_allowed_unless_it_is_small_beside_the_rest() -> None:
+    trial = Trial(_effect(), _effect().trials[:2])
+    assert trial.allowed(np.array([1.0, 1.0]))
+    assert not trial.allowed(np.array([-1.0, 0.0]))
+    assert not trial.allowed(np.array([-1.0, 1.0]))
+    # Beside a group in which it is ten times as large, it is noise.
+    assert trial.allowed(np.array([-1.0, 0.0]), 10.0)
+    assert trial.allowed(np.array([-0.1, 1.0]))
+    # b may go either way.
+    assert trial.allowed(np.array([1.0, -1.0]))

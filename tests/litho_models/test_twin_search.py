@@ -1,0 +1,161 @@
+"""The joint search names what was planted, with the grouping that it was planted with, and nothing else."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from litho_models.effects import CATALOGUE, get_effect
+from litho_models.scan_terms.groups import ALL
+from litho_models.twin.fits import Study, fit_state
+from litho_models.twin.judging import CONFIRM_P, FEWEST_SCANS, judge, told_apart
+from litho_models.twin.model import Values
+from litho_models.twin.search import Found, same_change, search, separating, untestable
+from tests.litho_models.twin_scans import bare_state, planted, study_of
+
+CANDIDATES = [
+    get_effect(name)
+    for name in ("slope-thinning", "long-range-proximity", "write-order-memory", "trench-residue")
+]
+THINNING, MEMORY = "slope-thinning", "write-order-memory"
+
+
+def thinning(along_x_um: float) -> dict[str, float]:
+    return get_effect(THINNING).with_values({"along_x_um": along_x_um, "exponent": 1.0})
+
+
+def memory(strength: float) -> dict[str, float]:
+    return {"strength": strength, "length_um": 3.0, "direction": 1.0}
+
+
+def found_in(*effects: tuple[str, str, Values], **facts: int) -> Found:
+    study = study_of(planted(effects, **facts))
+    return search(bare_state(study), study, CANDIDATES)
+
+
+def added(found: Found) -> dict[str, str]:
+    return {cause.name: cause.by for cause in found.causes}
+
+
+def test_a_cause_in_half_of_the_scans_is_found_with_its_grouping() -> None:
+    found = found_in((THINNING, "field", {"1": thinning(0.0), "2": thinning(0.2)}))
+    assert added(found) == {THINNING: "field"}
+    cause = found.causes[0]
+    # Half of the scans have nothing to gain: better in few of them is no refusal where labels say which.
+    assert cause.group_p is not None
+    assert cause.group_p < 0.05
+    assert cause.judgement.improved[0] >= 5
+    values = found.state.twin.values({"field": "2"})[THINNING]
+    assert values["along_x_um"] == pytest.approx(0.2, rel=0.1)
+    assert found.state.twin.values({"field": "1"})[THINNING]["along_x_um"] < 0.02
+    assert np.sqrt(found.state.mse_nm2) == pytest.approx(4.0, rel=0.06)
+
+
+def test_a_cause_in_all_scans_is_found_with_one_strength() -> None:
+    found = found_in((THINNING, ALL, {"": thinning(0.15)}))
+    assert added(found) == {THINNING: ALL}
+    assert found.causes[0].group_p is None
+    assert found.causes[0].family_p <= 0.05
+    assert found.causes[0].judgement.improved == (10, 10)
+
+
+def test_two_causes_are_found_together_each_with_its_grouping() -> None:
+    found = found_in(
+        (MEMORY, ALL, {"": memory(0.1)}), (THINNING, "field", {"1": thinning(0.05), "2": thinning(0.2)})
+    )
+    assert added(found) == {MEMORY: ALL, THINNING: "field"}
+    assert np.sqrt(found.state.mse_nm2) == pytest.approx(4.0, rel=0.06)
+    for name in (MEMORY, THINNING):
+        assert found.last[name].name == found.first[name].name == name
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nothing_is_found_in_noise(seed: int) -> None:
+    found = found_in(seed=seed)
+    assert found.names == []
+    assert found.state.twin.names == ()
+    assert set(found.family_p) == {effect.name for effect in CANDIDATES}
+
+
+def test_too_few_scans_confirm_nothing_and_the_reason_says_so() -> None:
+    found = found_in((THINNING, ALL, {"": thinning(0.2)}), count=FEWEST_SCANS - 2)
+    assert found.names == []
+    assert found.refused[THINNING].startswith(f"{FEWEST_SCANS - 2} scans, at least {FEWEST_SCANS}")
+
+
+def test_no_more_effects_than_asked_for() -> None:
+    study = study_of(planted([(THINNING, ALL, {"": thinning(0.15)})]))
+    assert search(bare_state(study), study, CANDIDATES, most=0).names == []
+
+
+def test_a_change_is_the_same_as_itself_scaled_and_no_other() -> None:
+    study = study_of(planted([(THINNING, ALL, {"": thinning(0.15)}), (MEMORY, ALL, {"": memory(0.1)})]))
+    bare = bare_state(study)
+    one = fit_state(bare.twin.with_effect(THINNING, ALL, {"": thinning(0.1)}), study)
+    other = fit_state(bare.twin.with_effect(MEMORY, ALL, {"": memory(0.05)}), study)
+    half = replace(
+        one, held_out_um=[(a + b) / 2 for a, b in zip(bare.held_out_um, one.held_out_um, strict=True)]
+    )
+    assert same_change(bare, one, half)
+    assert same_change(bare, other, one) is same_change(bare, one, other) is False
+
+
+# The judge, in numbers.
+
+STUDY = Study((), np.empty(0))
+
+
+def test_a_gain_in_all_scans_is_confirmed_and_one_in_half_only_by_group() -> None:
+    before = np.full(10, 100.0)
+    assert judge(before, np.full(10, 90.0), STUDY).passed()
+    half = judge(before, before - 20.0 * (np.arange(10) % 2), STUDY)
+    # The five that gain must have their sign: one arrangement in 2^5.
+    assert half.p == pytest.approx(2**-5)
+    assert not half.passed()
+    assert half.passed(grouped=True)
+    assert half.improved == (5, 10)
+
+
+def test_the_reason_says_what_is_missing() -> None:
+    before = np.full(10, 100.0)
+    signs = np.where(np.arange(10) % 2, 1.0, -1.0)
+    assert judge(before[:7], before[:7] - 50, STUDY).reason().startswith("7 scans, at least 8")
+    assert judge(before, before - 10 * signs, STUDY).reason().startswith("better in only 5 of 10")
+    assert judge(before, before - 0.1, STUDY).reason() == "gain of 0.10 % is too small to matter"
+    assert judge(before, before - 10, STUDY).reason() == ""
+
+
+def test_a_gain_matters_by_its_share_or_by_its_size() -> None:
+    before = np.full(8, 400.0)
+    assert judge(before, before - 4.1, STUDY).matters
+    assert not judge(before, before - 3.9, STUDY).matters
+    # From 100 to 99.4 nm is 1.2 % of the squares; from 20 to 19.6 nm is 0.4 nm and 4 %.
+    assert judge(np.full(8, 100.0**2), np.full(8, 99.4**2), STUDY).matters
+
+
+def test_a_rival_is_told_apart_by_a_quarter_of_the_gain_in_all_scans() -> None:
+    before, best = np.full(10, 100.0), np.full(10, 60.0)
+    assert told_apart(before, best, np.full(10, 71.0), STUDY)
+    assert not told_apart(before, best, np.full(10, 69.0), STUDY)
+    mixed = best + np.where(np.arange(10) % 3, 20.0, -20.0)
+    assert judge(mixed, best, STUDY).p > CONFIRM_P
+    assert not told_apart(before, best, mixed, STUDY)
+
+
+def test_what_scans_cannot_test_is_said_before_any_fit() -> None:
+    scans = planted()
+    flat = [replace(scan, mask_level=np.full_like(scan.mask_level, 3)) for scan in scans]
+    assert set(untestable(study_of(flat))) == {name for name, one in CATALOGUE.items() if not one.per_scan}
+    unordered = [replace(scan, order=0) for scan in scans]
+    needing = {name for name, one in CATALOGUE.items() if "order" in one.needs and not one.per_scan}
+    assert set(untestable(study_of(unordered))) == needing
+    assert needing
+    assert untestable(study_of(scans)) == {}
+
+
+def test_the_experiment_that_parts_a_set_is_named_once() -> None:
+    text = get_effect(THINNING).separating
+    assert separating([THINNING, THINNING]) == text
+    assert separating([THINNING, MEMORY]) == f"{text}; {get_effect(MEMORY).separating}"

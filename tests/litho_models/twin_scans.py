@@ -1,0 +1,95 @@
+"""Small scans whose print and microscope are known, for the tests of the measurement model and the twin."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from litho_data.store import PrintedScan
+from litho_models.loop.prepared import PreparedScan, prepare_scans
+from litho_models.models import build_model
+from litho_models.simulator import Simulator
+from litho_models.twin.fits import State, Study, fit_state
+from litho_models.twin.model import Twin, Values
+
+PITCH_UM, LEVELS, LEVEL_HEIGHT_UM = 0.1, 13, 0.1
+FIELDS, BLUR_UM = 2, 0.25
+
+
+def blank_scan(number: int, size_px: int = 48, **facts: object) -> PrintedScan:
+    """Scan ``number``: two fields to a print, a random layout, no height yet."""
+    rng = np.random.default_rng([3, number])
+    smooth = gaussian_filter(rng.normal(size=(size_px, size_px)), 4.0, mode="wrap")
+    ranks = np.argsort(np.argsort(smooth.ravel())).reshape(smooth.shape) / smooth.size
+    level = np.floor(ranks * LEVELS).clip(0, LEVELS - 1).astype(np.uint8)
+    printed, field = str(number // FIELDS + 1), str(number % FIELDS + 1)
+    scan = PrintedScan(
+        id=f"P{printed}F{field}",
+        print_id=printed,
+        order=number,
+        mask_level=level,
+        height_um=np.zeros(level.shape, np.float32),
+        valid=np.ones(level.shape, bool),
+        pitch_um=PITCH_UM,
+        level_height_um=LEVEL_HEIGHT_UM,
+        levels=LEVELS,
+        scan_to_layout=np.eye(3),
+        groups={"field": field},
+    )
+    return replace(scan, **facts)  # type: ignore[arg-type]
+
+
+def blank_scans(count: int, size_px: int = 48) -> list[PrintedScan]:
+    return [blank_scan(number, size_px) for number in range(count)]
+
+
+def with_heights(scans: Sequence[PrintedScan], heights_um: Sequence[np.ndarray]) -> list[PrintedScan]:
+    """The scans with these measured heights (ny, nx), µm."""
+    pairs = zip(scans, heights_um, strict=True)
+    return [replace(scan, height_um=own.astype(np.float32)) for scan, own in pairs]
+
+
+def base_model() -> Simulator:
+    """A blur and two numbers, a gain and an offset, away from where they start."""
+    facts = {"pitch_um": PITCH_UM, "level_height_um": LEVEL_HEIGHT_UM, "levels": LEVELS}
+    model = build_model("affine-mtf", sigmas_um=(BLUR_UM,), **facts)
+    for name, value in (("weights", 0.9), ("offset_um", 0.03)):
+        getattr(model, name).data.fill_(value)
+    return model
+
+
+def planted(
+    effects: Sequence[tuple[str, str, Values]] = (),
+    *,
+    count: int = 10,
+    size_px: int = 48,
+    noise_um: float = 0.004,
+    seed: int = 0,
+) -> list[PrintedScan]:
+    """Scans of the base with effects (name, grouping, values by label), a datum each, and white noise."""
+    rng = np.random.default_rng(seed)
+    scans = blank_scans(count, size_px)
+    prepared = prepare_scans(scans)
+    twin = Twin.bare(base_model(), prepared[0])
+    for name, by, values in effects:
+        twin = twin.with_effect(name, by, values)
+    placed = twin.placed()
+    heights = [
+        placed.height(scan) + 0.02 * rng.normal() + rng.normal(0, noise_um, scan.stored.shape)
+        for scan in prepared
+    ]
+    return with_heights(scans, heights)
+
+
+def study_of(scans: Sequence[PrintedScan], folds: int = 5, seed: int = 0) -> Study:
+    """The scans prepared, dealt into folds in turn."""
+    prepared: list[PreparedScan] = prepare_scans(scans)
+    return Study(prepared, np.arange(len(scans)) * 3 % folds, seed)
+
+
+def bare_state(study: Study) -> State:
+    """The base alone, fitted."""
+    return fit_state(Twin.bare(base_model(), study.scans[0]), study)
