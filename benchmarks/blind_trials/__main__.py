@@ -1,14 +1,12 @@
 """Blind trials of the closed loop on the virtual fab.
 
-    python -m benchmarks.blind_trials --out runs/blind-trials --workers 2
-    python -m benchmarks.blind_trials --out runs/blind-trials --dask tcp://host:8786
-    python -m benchmarks.blind_trials --out runs/development --seed 1 --only 0,1,2
-    python -m benchmarks.blind_trials --out runs/development --seed 1 --plan
-    python -m benchmarks.blind_trials --out runs/earlier --count 24 --seed 20266
+    python -m benchmarks.blind_trials --out runs/singles
+    python -m benchmarks.blind_trials --out runs/mixtures --board mixtures --measured runs/measured.zarr
+    python -m benchmarks.blind_trials --out runs/development --board mixtures --seed 1 --only 0,1,2
 
 Draws what the fab hides, gives the loop scans and layouts only, and judges its answers by the rules in
-docs/blind_trials.md. An interrupted run resumes. Writes scoreboard.json, scoreboard.csv and report.html;
---publish also puts them into the documentation.
+docs/blind_trials.md. An interrupted run resumes. Writes scoreboard.json and scoreboard.csv;
+--publish also puts the figures into the documentation.
 """
 
 from __future__ import annotations
@@ -16,30 +14,32 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import get_args
 
 from benchmarks.blind_trials.campaign import (
     finished,
     make_draws,
     open_campaign,
-    plan_lines,
     run_campaign,
     run_one,
 )
-from benchmarks.blind_trials.report import CSV_NAME, write_report
-from benchmarks.blind_trials.scoreboard import figures_of, make_scoreboard, publish
+from benchmarks.blind_trials.records import Board
+from benchmarks.blind_trials.scoreboard import figures_of, make_scoreboard, publish, trial_table
 from litho_data.foundation.commands import run_script
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.workers import Workers
 
-# Of the last board, drawn from once the loop was finished; development uses other seeds.
-REPORTED_SEED = 20270
+# Announced before any of their trials is run; development uses other seeds.
+ANNOUNCED: dict[Board, int] = {"singles": 20270, "mixtures": 20271}
+# The printers of single causes are Physics models; mixtures have others too, so there the bases compete.
+BASE: dict[Board, str] = {"singles": "physics", "mixtures": "auto"}
 DOCS = Path(__file__).parents[2] / "docs"
 PAGE, RESULTS = DOCS / "blind_trials.md", DOCS / "results" / "blind-trials"
 
 
-def results_of(seed: int) -> Path:
-    """Where the published results of a board lie; the first published one has no folder of its own."""
-    return RESULTS if seed == 20266 else RESULTS / str(seed)
+def results_of(board: Board, seed: int) -> Path:
+    """Where the published results of a board lie."""
+    return RESULTS / f"{board}-{seed}"
 
 
 def main() -> None:
@@ -47,7 +47,9 @@ def main() -> None:
     arguments = _arguments()
     try:
         if arguments.run_one is not None:
-            run_one(arguments.out, arguments.run_one, arguments.keep_data)
+            run_one(
+                arguments.out, arguments.run_one, measured=arguments.measured, keep_data=arguments.keep_data
+            )
             return
         _campaign(arguments)
     except InputError as error:
@@ -56,36 +58,42 @@ def main() -> None:
 
 
 def _campaign(arguments: argparse.Namespace) -> None:
-    out, seed = arguments.out, arguments.seed
-    draws = make_draws(count=arguments.count, seed=seed, n_scans=arguments.scans, size_px=arguments.size_px)
+    out, board, measured = arguments.out, arguments.board, arguments.measured
+    seed = ANNOUNCED[board] if arguments.seed is None else arguments.seed
+    base = arguments.base or BASE[board]
+    size = {"n_scans": arguments.scans, "size_px": arguments.size_px}
+    draws = make_draws(board=board, seed=seed, base=base, **size)
     numbers = arguments.only or [draw.number for draw in draws.trials]
-    if arguments.plan:
-        for line in plan_lines(draws, numbers):
-            print(line, flush=True)
-        return
+    if measured is None and any(draw.kind == "measured" and draw.number in numbers for draw in draws.trials):
+        raise InputError(
+            "store of measured prints",
+            got="none",
+            wanted="--measured STORE",
+            hint="or leave them out by --only",
+        )
     open_campaign(out, draws)
+    options = ["--keep-data"] * arguments.keep_data
+    options += ["--measured", str(measured.resolve())] if measured else []
     run_campaign(
         out,
         draws,
         numbers=numbers,
         workers=Workers(arguments.workers, arguments.dask),
         timeout_s=arguments.timeout_s,
-        keep_data=arguments.keep_data,
+        options=options,
     )
-    plan = [] if arguments.count is None else ["--count", str(arguments.count)]
-    settings = [*plan, "--seed", str(seed), "--scans", str(draws.n_scans), "--size-px", str(draws.size_px)]
-    command = " ".join(["python -m benchmarks.blind_trials", *settings])
-    scoreboard = make_scoreboard(draws, finished(out, draws), command)
+    settings = (
+        f"--board {board} --seed {seed} --scans {draws.n_scans} --size-px {draws.size_px} --base {base}"
+    )
+    scoreboard = make_scoreboard(draws, finished(out, draws), f"python -m benchmarks.blind_trials {settings}")
     scoreboard.write(out)
-    page = write_report(scoreboard, out)
+    trial_table(scoreboard).to_csv(out / "scoreboard.csv", index=False)
     if arguments.publish:
         publish(PAGE, scoreboard)
-        results_of(seed).mkdir(parents=True, exist_ok=True)
-        scoreboard.write(results_of(seed))
-        (results_of(seed) / CSV_NAME).write_bytes((out / CSV_NAME).read_bytes())
+        scoreboard.write(results_of(board, seed))
     for what, value, wanted in figures_of(scoreboard):
-        print(f"{value:>16}  {what}" + (f" (wanted: {wanted})" if wanted else ""))
-    print(f"report: {page}")
+        print(f"{value:>24}  {what}" + (f" (wanted: {wanted})" if wanted else ""))
+    print(f"all trials: {out / 'scoreboard.csv'}")
 
 
 def _arguments() -> argparse.Namespace:
@@ -94,25 +102,21 @@ def _arguments() -> argparse.Namespace:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--out", type=Path, required=True, help="folder of the campaign")
-    parser.add_argument(
-        "--count", type=int, help="so many trials by the plan of boards up to 20266, instead of a board of 48"
-    )
-    parser.add_argument(
-        "--plan",
-        action="store_true",
-        help="only size what would be planted; runs no loop",
-    )
-    parser.add_argument("--seed", type=int, default=REPORTED_SEED, help=f"draws (default {REPORTED_SEED})")
-    parser.add_argument("--scans", type=int, default=12, help="scans per trial (default 12)")
-    parser.add_argument("--size-px", type=int, default=256, help="side of a layout, pixels (default 256)")
-    parser.add_argument("--workers", type=int, default=1, help="trials side by side, one thread each")
-    parser.add_argument("--dask", help="address of a Dask scheduler: its workers in the place of --workers")
-    parser.add_argument("--only", type=_numbers, help="numbers of the trials to run, such as 0,3,7")
-    parser.add_argument("--timeout-s", type=float, default=3600.0, help="longest time of a trial, seconds")
-    parser.add_argument("--keep-data", action="store_true", help="keep raw files and stores")
-    parser.add_argument("--publish", action="store_true", help="write the scoreboard into docs/")
-    parser.add_argument("--run-one", type=int, help=argparse.SUPPRESS)
+    add = parser.add_argument
+    add("--out", type=Path, required=True, help="folder of the board's trials")
+    add("--board", choices=get_args(Board), default="singles", help="one cause a trial, or two to four")
+    add("--seed", type=int, help="draws (default: the announced one of the board)")
+    add("--base", help="base of the loop (default: physics for singles, auto for mixtures)")
+    add("--measured", type=Path, help="store of measured prints, into which four mixtures are injected")
+    add("--scans", type=int, default=12, help="scans per trial (default 12)")
+    add("--size-px", type=int, default=256, help="side of a layout, pixels (default 256)")
+    add("--workers", type=int, default=1, help="trials side by side, one thread each")
+    add("--dask", help="address of a Dask scheduler: its workers in the place of --workers")
+    add("--only", type=_numbers, help="numbers of the trials to run, such as 0,3,7")
+    add("--timeout-s", type=float, default=3600.0, help="longest time of a trial, seconds")
+    add("--keep-data", action="store_true", help="keep raw files and stores")
+    add("--publish", action="store_true", help="write the figures into docs/")
+    add("--run-one", type=int, help=argparse.SUPPRESS)
     return parser.parse_args()
 
 

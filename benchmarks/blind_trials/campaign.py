@@ -6,13 +6,12 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from benchmarks.blind_trials.draws import draw_board, draw_earlier
-from benchmarks.blind_trials.planting import plant, trial_jobs
-from benchmarks.blind_trials.records import COUNTS_FROM_RMS_NM, Draw, Draws, Trial
+from benchmarks.blind_trials.draws import draw_board
+from benchmarks.blind_trials.records import Board, Draw, Draws, Trial
 from benchmarks.blind_trials.trial import failed, run_trial, trial_folder
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.workers import ONE_THREAD, Workers, run_jobs
@@ -21,15 +20,15 @@ from litho_data.virtual_fab.jobs import Plan
 _ROOT = Path(__file__).parents[2]
 
 
-def make_draws(*, count: int | None, seed: int, n_scans: int, size_px: int) -> Draws:
-    """The draws of a board; with a ``count`` those of the plan of boards up to seed 20266.
+def make_draws(*, board: Board, seed: int, n_scans: int, size_px: int, base: str) -> Draws:
+    """The draws of a board.
 
     Raises:
         InputError: settings that cannot be drawn, or fields that cannot be printed.
     """
     Plan(n_scans, (size_px, size_px))  # refuses fields that cannot be printed, before any trial fails by it
-    trials = draw_board(seed) if count is None else draw_earlier(count, seed)
-    return Draws(seed=seed, n_scans=n_scans, size_px=size_px, trials=trials)
+    trials = draw_board(board, seed)
+    return Draws(board=board, seed=seed, n_scans=n_scans, size_px=size_px, base=base, trials=trials)
 
 
 def open_campaign(out: Path, draws: Draws) -> None:
@@ -56,11 +55,18 @@ def finished(out: Path, draws: Draws) -> list[Trial]:
 
 
 def run_campaign(
-    out: Path, draws: Draws, *, numbers: Sequence[int], workers: Workers, timeout_s: float, keep_data: bool
+    out: Path,
+    draws: Draws,
+    *,
+    numbers: Sequence[int],
+    workers: Workers,
+    timeout_s: float,
+    options: Sequence[str] = (),
 ) -> None:
     """Run the trials of these numbers that are not finished; a line per trial as it ends.
 
-    A trial whose process dies or takes longer than ``timeout_s`` is recorded as failed.
+    A trial whose process dies or takes longer than ``timeout_s`` is recorded as failed. ``options``: for the
+    process of each trial, see `run_one`.
 
     Raises:
         InputError: a number that was not drawn, or workers that cannot be had.
@@ -72,52 +78,36 @@ def run_campaign(
     todo = [draw for draw in draws.trials if draw.number in set(numbers) - done]
     if len(todo) < len(set(numbers)):
         print(f"{len(set(numbers)) - len(todo)} trials are finished already", flush=True)
-    jobs = [_Job(out, draw, timeout_s, keep_data) for draw in todo]
+    jobs = [_Job(out, draw, timeout_s, options) for draw in todo]
     results = run_jobs(_run_apart, jobs, workers, name=lambda job: f"trial {job.draw.number}", apart=True)
     for place, (_, (trial, seconds)) in enumerate(results, 1):
         print(f"[{place}/{len(todo)}] {_line(trial)} ({seconds:.0f} s)", flush=True)
 
 
-def plan_lines(draws: Draws, numbers: Sequence[int]) -> Iterator[str]:
-    """What would be planted, a line per trial, and how much of it counts in each class; no loop is run."""
-    chosen = [draw for draw in draws.trials if draw.number in set(numbers)]
-    counted: dict[str, list[bool]] = {}
-    for draw in chosen:
-        planted = plant(draw, trial_jobs(draw, draws.n_scans, draws.size_px))
-        counts = [one.rms_nm > COUNTS_FROM_RMS_NM for one in planted]
-        counted.setdefault(draw.kind, []).extend(counts or [False])
-        what = [f"{one.name} {one.strength:.4g} {one.unit}: {one.rms_nm:.1f} nm" for one in planted]
-        yield f"trial {draw.number}: {draw.kind}: {', '.join(what)}"
-    yield "counted: " + ", ".join(f"{kind} {sum(c)} of {len(c)}" for kind, c in sorted(counted.items()))
-
-
-def run_one(out: Path, number: int, keep_data: bool) -> None:
+def run_one(out: Path, number: int, *, measured: Path | None, keep_data: bool) -> None:
     """Run one trial of an open campaign in this process."""
     draws = Draws.read(out)
     draw = next(draw for draw in draws.trials if draw.number == number)
-    run_trial(
-        draw,
-        out,
-        n_scans=draws.n_scans,
-        size_px=draws.size_px,
-        keep_data=keep_data,
-        report=lambda message: print(message, flush=True),
-    )
+    run_trial(draw, draws, out, measured=measured, keep_data=keep_data, report=_print)
+
+
+def _print(message: str) -> None:
+    print(message, flush=True)
 
 
 class _Job(NamedTuple):
     out: Path
     draw: Draw
     timeout_s: float
-    keep_data: bool
+    options: Sequence[str]
 
 
 def _run_apart(job: _Job) -> tuple[Trial, float]:
     """Run a trial in a process of its own; what it prints goes to a log beside its result."""
-    out, draw, timeout_s, keep_data = job
+    out, draw, timeout_s, options = job
     folder, clock = trial_folder(out, draw.number), time.monotonic()
     command = [sys.executable, "-m", "benchmarks.blind_trials", "--out", str(out.resolve())]
-    command += ["--run-one", str(draw.number), *(["--keep-data"] if keep_data else [])]
+    command += ["--run-one", str(draw.number), *options]
     log = out / "logs" / f"{draw.number:02d}.txt"
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("w", encoding="utf-8") as stream:
@@ -135,12 +125,14 @@ def _run_apart(job: _Job) -> tuple[Trial, float]:
         except subprocess.TimeoutExpired:
             reason = f"not finished after {timeout_s:g} s"
     if not (folder / Trial.FILE_NAME).exists():
-        failed(draw, [], reason).write(folder)
+        failed(draw, reason).write(folder)
     return Trial.read(folder), time.monotonic() - clock
 
 
 def _line(trial: Trial) -> str:
-    planted = " + ".join(f"{one.name} {one.rms_nm:.1f} nm" for one in trial.planted) or trial.draw.kind
-    outcomes = ", ".join(outcome.judgement for outcome in trial.outcomes)
-    reason = f": {trial.failure}" if trial.failure else ""
-    return f"trial {trial.draw.number}: {planted}: {outcomes}{reason}"
+    causes = [f"{one.name}: {one.verdict}" for one in trial.outcomes]
+    false = [f"false: {name}" for name in trial.false_names]
+    ratio = trial.errors and trial.errors.ratio
+    errors = [f"{ratio:.2f} × the true models"] if ratio else []
+    reason = [trial.failure] if trial.failure else []
+    return f"trial {trial.draw.number}: {', '.join([*causes, *false, *errors, *reason])}"

@@ -1,27 +1,46 @@
 """What is planted: drawn from one seed over what the virtual fab can do, before anything is run.
 
-Two plans: the board of 48 trials since seed 20267, and the one that boards up to seed 20266 were drawn by,
-kept so that they can be made again. Nothing here reads the loop's catalogue of effects.
+Two boards: ``singles``, one cause a trial, and ``mixtures``, two to four at once. Nothing here reads the
+loop's catalogue of effects.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from itertools import islice
+from itertools import chain, islice
 
 import numpy as np
 
 from benchmarks.blind_trials.other_forms import FORMS
-from benchmarks.blind_trials.records import Draw, Kind, KnobDraw
+from benchmarks.blind_trials.records import Board, CauseDraw, Draw, Kind
 from litho_data.foundation.errors import InputError
 from litho_data.virtual_fab.knobs import KNOBS, OFF_CATALOGUE
 
-# The board: at least 20 causes in form and 16 of another form are to count, so one more of each is drawn.
-BOARD: dict[Kind, int] = {"in-form": 21, "alias": 2, "other-form": 17, "empty": 8}
+SINGLES: dict[Kind, int] = {"in-form": 21, "alias": 2, "other-form": 17, "empty": 8}
 # Sought on four scans, a size is up to 13 % off on all of them: what is drawn is to count nevertheless.
-BOARD_RMS_NM = (10.0, 25.0)
+SINGLES_RMS_NM = (10.0, 25.0)
+MIXTURES: dict[Kind, int] = {"mixture": 30, "measured": 4, "empty": 8}
+MIXTURES_RMS_NM = (8.0, 25.0)
+# Of the mixtures: with a linear slope loss by batch, with an S-shaped axis in half of the scans, with another
+# cause whose strength differs by batch or field, and with a printer beyond the Physics model.
+LINEAR, S_SHAPED, GROUPED, BEYOND_PHYSICS = 4, 4, 8, 9
+BASE_RMS_NM = (5.0, 15.0)
+
 # The default noise has the first, so it is seen in every trial; a refit leaves less than 10 nm of the second.
 _NOT_DEALT = {"line-roughness", "long-range-proximity"}
+# Drawn anew in every scan, or no change of a height map: no model of all scans can have them.
+_OF_SINGLE_SCANS = {
+    "quantisation",
+    "registration-residual",
+    "scan-line-stripes",
+    "scars-and-spikes",
+    "slow-drift",
+    "periodic-lines",
+}
+# The measured prints have these themselves, or may have: finding them would show nothing.
+_MEASURED_HAVE = {"slope-thinning", "elliptical-psf", "galvo-lag", "piezo-nonlinearity", "tip-dilation"}
+# Knobs that came after the first boards, which are drawn as they were.
+_LATER = ("stitching", "galvo-nonlinearity", "asymmetric-tip")
 # Base parameters within the Physics model and its bounds, other than the fab's own.
 _PRINTER_RANGES = {
     "threshold_dose": (0.2, 0.4),
@@ -31,16 +50,9 @@ _PRINTER_RANGES = {
     "base_um": (0.08, 0.2),
 }
 
-# The plan of boards up to seed 20266: shares of the trials; what rounding leaves over goes to single effects.
-EARLIER_RMS_NM = (4.0, 60.0)
-FEWEST_TRIALS = 4
-# Knobs that came after the boards that are published, which are drawn as they were.
-_LATER = ("stitching", "galvo-nonlinearity", "asymmetric-tip")
-_SHARES: dict[Kind, float] = {"two": 0.15, "none": 0.1, "off-catalogue": 0.15}
 
-
-def draw_board(seed: int) -> list[Draw]:
-    """The 48 trials of a board, in random order, each with a printer of its own.
+def draw_board(board: Board, seed: int) -> list[Draw]:
+    """The trials of a board, in random order, each with a printer of its own.
 
     Knobs and forms are dealt like cards: none comes twice before all have come once. In form come knobs that
     the base cannot imitate; as aliases those that it can, or that the scans' own terms absorb. Sizes are
@@ -49,66 +61,119 @@ def draw_board(seed: int) -> list[Draw]:
     Raises:
         InputError: a negative seed.
     """
-    rng = _rng(seed)
-    named = [one for one in KNOBS.values() if one.effect != OFF_CATALOGUE and one.name not in _LATER]
-    aliases = [knob.name for knob in named if knob.nuisance_span or knob.refit_absorbs]
-    in_form = [knob.name for knob in named if knob.name not in {*aliases, *_NOT_DEALT}]
+    if seed < 0:
+        raise InputError("seed", got=seed, wanted="0 or more")
+    return (_draw_singles if board == "singles" else _draw_mixtures)(np.random.default_rng(seed))
+
+
+def names_of(cause: str) -> tuple[str, ...]:
+    """Names that are right for a knob or a form."""
+    if cause in FORMS:
+        return FORMS[cause].names
+    effect = KNOBS[cause].effect
+    return () if effect == OFF_CATALOGUE else (effect,)
+
+
+def _in_form() -> list[str]:
+    return [
+        one.name
+        for one in KNOBS.values()
+        if one.effect != OFF_CATALOGUE
+        and not (one.nuisance_span or one.refit_absorbs)
+        and one.name not in {*_NOT_DEALT, *_LATER}
+    ]
+
+
+def _other_forms() -> list[str]:
+    return [form.name for form in FORMS.values() if form.deck == "both"]
+
+
+def _draw_singles(rng: np.random.Generator) -> list[Draw]:
+    aliases = [one.name for one in KNOBS.values() if one.nuisance_span or one.refit_absorbs]
     decks: dict[Kind, Iterator[str]] = {
-        "in-form": _deal(in_form, rng),
+        "in-form": _deal(_in_form(), rng),
         "alias": _deal(aliases, rng),
-        "other-form": _deal([*FORMS], rng),
+        "other-form": _deal(_other_forms(), rng),
         "empty": iter(()),
     }
-    kinds = [kind for kind, count in BOARD.items() for _ in range(count)]
+    kinds = [kind for kind, count in SINGLES.items() for _ in range(count)]
     trials = []
     for number, place in enumerate(rng.permutation(len(kinds))):
         kind = kinds[place]
-        printer = {name: round(rng.uniform(*limits), 3) for name, limits in _PRINTER_RANGES.items()}
-        knobs = [
-            KnobDraw(name=name, wanted_rms_nm=_size_nm(rng, BOARD_RMS_NM)) for name in islice(decks[kind], 1)
+        printer = _draw_printer(rng)
+        causes = [
+            CauseDraw(name=name, wanted_rms_nm=_size_nm(rng, SINGLES_RMS_NM))
+            for name in islice(decks[kind], 1)
         ]
-        trial_seed = int(rng.integers(2**31))
-        trials.append(Draw(number=number, kind=kind, seed=trial_seed, knobs=knobs, printer=printer))
+        trials.append(Draw(number=number, kind=kind, seed=_seed(rng), causes=causes, printer=printer))
     return trials
 
 
-def draw_earlier(count: int, seed: int) -> list[Draw]:
-    """The trials of a campaign as boards up to seed 20266 were drawn, in random order of their kinds.
+def _draw_mixtures(rng: np.random.Generator) -> list[Draw]:
+    """About as many causes in form as of another form; no two of a trial share a name that is right."""
+    in_form = _deal([name for name in _in_form() if name not in _OF_SINGLE_SCANS], rng)
+    other = _deal([name for name in _other_forms() if name not in _OF_SINGLE_SCANS], rng)
+    deck = chain.from_iterable(zip(in_form, other, strict=False))
+    first = ["linear-slope-loss"] * LINEAR + ["s-shaped-axis"] * S_SHAPED
+    kinds: list[Kind] = [kind for kind, count in MIXTURES.items() for _ in range(count)]
+    sizes = rng.permutation([2 + at % 3 for at in range(len(kinds))])
+    bases = [form.name for form in FORMS.values() if form.deck == "base"]
+    beyond = rng.permutation(MIXTURES["mixture"])[:BEYOND_PHYSICS].tolist()
+    drawn = []
+    for at, kind in enumerate(kinds):
+        base, causes = None, []
+        if at in beyond:
+            name = bases[beyond.index(at) % len(bases)]
+            base = CauseDraw(name=name, wanted_rms_nm=_size_nm(rng, BASE_RMS_NM))
+        if kind != "empty":
+            refused = {
+                *(names_of(base.name) if base else ()),
+                *(_MEASURED_HAVE if kind == "measured" else ()),
+            }
+            names = _without_overlap(first[at : at + 1], int(sizes[at]), deck, refused)
+            causes = [CauseDraw(name=name, wanted_rms_nm=_size_nm(rng, MIXTURES_RMS_NM)) for name in names]
+            causes[0] = _in_groups(causes[0], at, rng)
+        printer = _draw_printer(rng)
+        if base and base.name == "hill-response":
+            # It replaces the default response.
+            printer = {name: value for name, value in printer.items() if not name.startswith("threshold")}
+        drawn.append(Draw(number=0, kind=kind, seed=0, causes=causes, printer=printer, base=base))
+    return [
+        drawn[at].model_copy(update={"number": number, "seed": _seed(rng)})
+        for number, at in enumerate(rng.permutation(len(drawn)))
+    ]
 
-    Knobs are dealt like cards. Two effects at once come from the catalogue and differ in their identifier.
-    Sizes are log-uniform.
 
-    Raises:
-        InputError: too few trials for one of each kind, or a negative seed.
-    """
-    if count < FEWEST_TRIALS:
-        raise InputError("count", got=count, wanted=f"at least {FEWEST_TRIALS}, one of each kind")
-    rng = _rng(seed)
-    some: list[Kind] = [kind for kind, share in _SHARES.items() for _ in range(max(1, round(share * count)))]
-    singles: list[Kind] = ["single"] * (count - len(some))
-    kinds = [*some, *singles]
-    known = {name: knob.effect != OFF_CATALOGUE for name, knob in KNOBS.items() if name not in _LATER}
-    catalogue = _deal([name for name, inside in known.items() if inside], rng)
-    outside = _deal([name for name, inside in known.items() if not inside], rng)
-    trials = []
-    for number, place in enumerate(rng.permutation(count)):
-        kind = kinds[place]
-        names: list[str] = []
-        if kind == "off-catalogue":
-            names = [next(outside)]
-        elif kind == "single":
-            names = [next(catalogue)]
-        elif kind == "two":
-            names = _pair(catalogue)
-        knobs = [KnobDraw(name=name, wanted_rms_nm=_size_nm(rng, EARLIER_RMS_NM)) for name in names]
-        trials.append(Draw(number=number, kind=kind, seed=int(rng.integers(2**31)), knobs=knobs))
-    return trials
+def _in_groups(cause: CauseDraw, at: int, rng: np.random.Generator) -> CauseDraw:
+    """The first causes of a board of mixtures differ in strength by batch or by field."""
+    if at < LINEAR:
+        return _by_batch(cause, rng)
+    if at < LINEAR + S_SHAPED:
+        return _by_field(cause, rng, weak=0.0)
+    if at < LINEAR + S_SHAPED + GROUPED:
+        return (_by_batch if at % 2 else _by_field)(cause, rng)
+    return cause
 
 
-def _rng(seed: int) -> np.random.Generator:
-    if seed < 0:
-        raise InputError("seed", got=seed, wanted="0 or more")
-    return np.random.default_rng(seed)
+def _seed(rng: np.random.Generator) -> int:
+    return int(rng.integers(2**31))
+
+
+def _draw_printer(rng: np.random.Generator) -> dict[str, float]:
+    return {name: round(rng.uniform(*limits), 3) for name, limits in _PRINTER_RANGES.items()}
+
+
+def _by_batch(cause: CauseDraw, rng: np.random.Generator) -> CauseDraw:
+    """Weaker after a place in the middle of the order."""
+    place, weak = f"{rng.uniform(-0.2, 0.2):.3f}", round(rng.uniform(0.0, 0.6), 3)
+    return cause.model_copy(update={"by": "batch", "place": place, "weak": weak})
+
+
+def _by_field(cause: CauseDraw, rng: np.random.Generator, weak: float | None = None) -> CauseDraw:
+    """Weaker in two of the four fields of each print."""
+    place = "".join(sorted(rng.permutation(list("1234"))[:2]))
+    weak = round(rng.uniform(0.0, 0.6), 3) if weak is None else weak
+    return cause.model_copy(update={"by": "field", "place": place, "weak": weak})
 
 
 def _deal(names: Sequence[str], rng: np.random.Generator) -> Iterator[str]:
@@ -117,9 +182,15 @@ def _deal(names: Sequence[str], rng: np.random.Generator) -> Iterator[str]:
         yield from (names[i] for i in own.permutation(len(names)))
 
 
-def _pair(deck: Iterator[str]) -> list[str]:
-    first = next(deck)
-    return [first, next(name for name in deck if KNOBS[name].effect != KNOBS[first].effect)]
+def _without_overlap(started: Sequence[str], size: int, deck: Iterator[str], refused: set[str]) -> list[str]:
+    """The next of a deck until there are ``size``, none of whose names is refused or there already."""
+    names = list(started)
+    while len(names) < size:
+        name = next(deck)
+        taken = {right for one in names for right in names_of(one)} | refused
+        if name not in names and not taken & {*names_of(name)}:
+            names.append(name)
+    return names
 
 
 def _size_nm(rng: np.random.Generator, limits: tuple[float, float]) -> float:

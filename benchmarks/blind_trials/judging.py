@@ -9,157 +9,142 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from benchmarks.blind_trials.planting import cause_of
-from benchmarks.blind_trials.records import (
-    COUNTS_FROM_RMS_NM,
-    EMPTY,
-    OTHER_FORM,
-    Draw,
-    ErrorPair,
-    Judgement,
-    Kind,
-    Named,
-    Outcome,
-    Planted,
-)
+from benchmarks.blind_trials.planting import fab_of, plain_model, printer_of, share_of
+from benchmarks.blind_trials.records import Draw, Found, Outcome, Planted, Verdict
 from litho_data.register.resample import resample_to_layout
-from litho_data.store import Store
-from litho_data.virtual_fab import Fab, Job, Noise, Truth, scan_job
-from litho_data.virtual_fab.knobs import KnobBoard
-from litho_models.effects import CATALOGUE
-from litho_models.loop.prepared import prepare_scans
-from litho_models.loop.result.record import CloseLoop
-from litho_models.loop.study import DATUM_FREE, names_to_terms, score
+from litho_data.store import PrintedScan
+from litho_data.virtual_fab import Job, Noise, scan_job
+from litho_models.models.physics import Physics
+from litho_models.scan_terms.groups import label_of
+from litho_models.twin.record import CloseLoop
+from litho_models.twin.results import error_rows
 
-_CAUSES = ("explained", "confusable")
-# Offsets of lines are what single scans add: to accept these is to notice a cause that is made of them.
-_LINES = {"periodic-lines"}
-
-
-def scan_terms(result: CloseLoop) -> list[str]:
-    """Effects of single scans that the loop accepted: the nuisance span. Probes are no catalogue names."""
-    return [e.name for e in result.effects if e.name in _span()]
+# A form that is right under the name of a family only with this exponent.
+_EXPONENT = {"cubic-slope-loss": 3.0}
+_DISPLACED = "s-shaped-axis"
 
 
-def named_outside_span(result: CloseLoop, exported: Sequence[str] = ()) -> list[Named]:
-    """What the loop reports beyond the nuisance span, which the default noise has in every scan anyway.
-
-    Datum, gain, tilt and bow, offsets of lines, line-shaped roughness and warp of single scans are in it.
-
-    Args:
-        exported: names of the process effects in the model that the loop hands to design: whatever it says
-            about them, they are used as causes.
-    """
-    span = _span()
-    added = [effect for effect in result.effects if effect.name not in span]
-    named = []
-    for effect in added:
-        used = effect.name in exported and effect.verdict not in _CAUSES
-        verdict = "explained" if used else effect.verdict
-        named.append(Named(names=[effect.name, *effect.confusable_with], verdict=verdict))
-    known = span.union(*(one.names for one in named))
-    # Some effects are seen without being added: rounding, scars.
-    for one in result.candidates:
-        if one.name not in known and one.verdict in ("explained", "partial"):
-            named.append(Named(names=[one.name], verdict=one.verdict))
-    return named
-
-
-def strangers(named: Sequence[Named], planted: Sequence[Planted]) -> list[str]:
-    """Causes that the loop named and that contain nothing of what was planted."""
-    true = {one.effect for one in planted}
-    return [" | ".join(n.names) for n in named if n.verdict in _CAUSES and not true & set(n.names)]
+def found_by(result: CloseLoop) -> list[Found]:
+    """What the loop reports: causes, laws and descriptions, and what it sees without a model."""
+    added = [
+        Found(names=[one.name, *one.confusable_with], knowledge=one.knowledge, by=one.by)
+        for one in result.effects
+    ]
+    known = {name for one in added for name in one.names}
+    seen = [one.name for one in result.candidates if one.verdict == "explained" and one.name not in known]
+    return added + [Found(names=[name], knowledge="cause", by="all") for name in seen]
 
 
 def judge(
-    kind: Kind, planted: Sequence[Planted], result: CloseLoop, exported: Sequence[str] = ()
+    draw: Draw,
+    planted: Sequence[Planted],
+    result: CloseLoop,
+    jobs: Sequence[Job],
+    scans: Sequence[PrintedScan],
 ) -> list[Outcome]:
-    """One outcome per planted cause; one for the trial where nothing was planted."""
-    named = named_outside_span(result, exported)
-    state = f"{result.verdict}; {result.residual.signature or result.residual.state}"
-    if kind in EMPTY:
-        judgement: Judgement = "false-positive" if named or _structured(result) else "clean"
-        return [Outcome(effect="none", rms_nm=0.0, judgement=judgement, loop_says=state)]
-    if kind in OTHER_FORM:
-        (one,) = planted
-        noticed = _judge_unnamed(one, named, result)
-        return [Outcome(effect=one.name, rms_nm=one.rms_nm, judgement=noticed, loop_says=state)]
+    """One outcome per planted cause, in order; one for the trial where nothing was planted.
+
+    What the loop reports counts for one cause at most, for the larger one first.
+    """
+    found = found_by(result)
+    left = bool(found) or result.verdict == "unexplained" or any(one.matters for one in result.explained[-1:])
+    if not draw.causes:
+        return [Outcome(name="none", verdict="false-positive" if left else "clean")]
+    verdicts: dict[str, Verdict] = {}
+    causes = sorted(_own(draw, planted), key=lambda one: -one.rms_nm)
+    pool = [one for one in found if one.knowledge == "cause"]
+    for one in causes:
+        name = one.draw.name
+        hit = next((named for named in pool if _is_right(one, named, result)), None)
+        if hit:
+            pool.remove(hit)
+            verdicts[name] = "right" if {*hit.names} <= {*one.names} else "set-contains-it"
+        elif name == _DISPLACED and _displacement_is_shared(one, result, jobs, scans):
+            verdicts[name] = "right"
+    laws = sum(one.knowledge == "law" for one in found)
+    for one in causes:
+        if one.draw.name not in verdicts:
+            absorbed = draw.kind == "alias" and not one.counts and _is_absorbed(one, result)
+            silent: Verdict = "absorbed" if absorbed else "noticed" if left else "missed"
+            verdicts[one.draw.name] = "lawful" if laws > 0 else silent
+            laws -= 1
+    return [Outcome(name=one.name, verdict=verdicts[one.name]) for one in draw.causes]
+
+
+def false_names(planted: Sequence[Planted], result: CloseLoop) -> list[str]:
+    """Sets of causes that the loop named and that have nothing of what was planted, base included."""
     return [
-        Outcome(
-            effect=one.effect,
-            rms_nm=one.rms_nm,
-            judgement=_judge_effect(one, named, planted, result),
-            loop_says=_verdict_on(one.effect, result),
-        )
-        for one in planted
+        " | ".join(named.names)
+        for named in found_by(result)
+        if named.knowledge == "cause" and not any(_is_right(one, named, result) for one in planted)
     ]
 
 
-def _span() -> set[str]:
-    return {name for name, effect in CATALOGUE.items() if effect.per_scan}
+def _own(draw: Draw, planted: Sequence[Planted]) -> list[Planted]:
+    """What was planted, the base's form aside."""
+    return [one for one in planted if one.draw in draw.causes]
 
 
-def _structured(result: CloseLoop) -> bool:
-    return "unexplained" in (result.verdict, result.residual.state)
+def _is_right(one: Planted, named: Found, result: CloseLoop) -> bool:
+    if not {*one.names} & {*named.names}:
+        return False
+    wanted = _EXPONENT.get(one.draw.name)
+    return wanted is None or any(
+        own.ci95 is not None and own.ci95[0] <= wanted <= own.ci95[1]
+        for effect in result.effects
+        if effect.name == named.names[0]
+        for own in effect.strengths.get("exponent", [])
+    )
 
 
-def _judge_unnamed(planted: Planted, named: Sequence[Named], result: CloseLoop) -> Judgement:
-    verdicts = {one.verdict for one in named}
-    if verdicts & {*_CAUSES}:
-        return "named-a-cause"
-    lines = planted.name in _LINES and "scan-line-stripes" in scan_terms(result)
-    if lines or "traced-to-covariate" in verdicts:
-        return "traced-to-covariate"
-    if "partial" in verdicts:
-        return "partial"
-    return "unexplained" if _structured(result) else "missed"
+def _displacement_is_shared(
+    one: Planted, result: CloseLoop, jobs: Sequence[Job], scans: Sequence[PrintedScan]
+) -> bool:
+    """Whether the measurement has a displacement along x by a grouping that parts the scans as planted."""
+    strong = {job.id: share_of(one.draw, job) == 1 for job in jobs}
+    for part in result.measurement.parts:
+        if part.what == "shift-x":
+            labels: dict[str, set[bool]] = {}
+            for scan in scans:
+                labels.setdefault(label_of(scan, part.by), set()).add(strong[scan.id])
+            if all(len(kinds) == 1 for kinds in labels.values()):
+                return True
+    return False
 
 
-def _judge_effect(
-    one: Planted, named: Sequence[Named], planted: Sequence[Planted], result: CloseLoop
-) -> Judgement:
-    # All effects count here: a planted one may lie in the nuisance span, or be seen without a model.
-    sets = [{e.name, *e.confusable_with} for e in result.effects if e.verdict in _CAUSES]
-    sets += [{c.name} for c in result.candidates if c.verdict == "explained"]
-    if {one.effect} in sets:
-        return "right"
-    if any(one.effect in members for members in sets):
-        return "set-contains-it"
-    if strangers(named, planted):
-        return "wrong"
-    if any(one.effect in n.names for n in named if n.verdict == "partial"):
-        return "partial"
-    absorbed = any(c.name == one.effect and c.verdict == "absorbed" for c in result.candidates)
-    # Right for an alias only: what a refit of the base leaves of it is small.
-    return "absorbed" if absorbed and one.rms_nm <= COUNTS_FROM_RMS_NM else "missed"
+def _is_absorbed(one: Planted, result: CloseLoop) -> bool:
+    return any(own.name in one.names and own.verdict == "absorbed" for own in result.candidates)
 
 
-def _verdict_on(effect: str, result: CloseLoop) -> str:
-    found = next((c for c in result.candidates if c.name == effect), None)
-    return f"{found.verdict}: {found.reason}" if found else "not a candidate"
-
-
-# What no model can predict: an offset drawn anew for every line is estimated from the other half of the
-# pixels, as the loop does it; rounding cannot be undone, and scars lie where chance put them. The few
-# values that other knobs draw per scan could be estimated almost exactly, so the true model knows them.
-_UNFORESEEABLE = {"scan-line-stripes", "quantisation", "scars-and-spikes"}
+# What no model of all scans can predict: values drawn anew in every scan (or line), rounding, and scars where
+# chance put them. A bend stays in: the store's own transform of the scan has it.
+_UNFORESEEABLE = {
+    "datum-offset",
+    "min-to-zero-datum",
+    "periodic-lines",
+    "quantisation",
+    "scan-line-stripes",
+    "scars-and-spikes",
+    "slow-drift",
+    "tilt-bow",
+    "z-gain",
+}
 
 
 def true_floor(
-    truth: Truth, draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job], store: Store, result: CloseLoop
-) -> ErrorPair:
-    """Held-out error of the noise-free scans with every effect in place, nm.
+    draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job], scans: Sequence[PrintedScan], seed: int
+) -> float:
+    """Mean absolute error of the noise-free scans with every cause in place, k = 1, nm.
 
     They are brought onto the layout by the transform (and bend) that the store has for each scan, and
-    scored as the loop scores its final model: development scans, same pixels, same terms per scan.
+    scored as the loop scores its models: same scans, same pixels, same terms per scan.
     """
-    fab = _without_noise(truth, draw, planted)
     by_id = {job.id: job for job in jobs}
-    locked = set(result.split.lock_box)
-    scans = [scan for scan in store.scans() if scan.id not in locked]
     predictions = []
     for scan in scans:
-        found = scan_job(fab, by_id[scan.id])
+        job = by_id[scan.id]
+        fab = fab_of(draw, planted, job, noise=Noise.off(), without=_UNFORESEEABLE)
+        found = scan_job(fab, job)
         height, valid = resample_to_layout(
             found.noiseless_um,
             scan.scan_to_layout,
@@ -169,19 +154,24 @@ def true_floor(
             bend_um=scan.bend_um,
         )
         predictions.append(np.where(valid, height, np.float32(np.nanmean(height))))
-    stripes = any(knob.name == "scan-line-stripes" for knob in truth.knobs)
-    terms = DATUM_FREE | names_to_terms(scan_terms(result) + ["scan-line-stripes"] * stripes)
-    errors = score(prepare_scans(scans), predictions, terms, result.nuisance.blocks)
-    return ErrorPair(mae_nm=errors.mean_mae_nm, rmse_nm=errors.rmse_nm)
-
-
-def _without_noise(truth: Truth, draw: Draw, planted: Sequence[Planted]) -> Fab:
-    knobs = [knob.setting for knob in truth.knobs if knob.name not in _UNFORESEEABLE]
-    return Fab(
-        printer=truth.printer,
-        microscope=truth.microscope,
-        noise=Noise.off(),
-        knobs=KnobBoard(knobs, truth.seed),
-        seed=truth.seed,
-        cause=cause_of(planted, draw.seed),
+    rows = error_rows(
+        scans, predictions, model="all", measurement="shared", held_out="scans", numbers=(0, 0), seed=seed
     )
+    return next(row.mae_nm for row in rows if row.policy == "offset")
+
+
+def bias_of(draw: Draw, result: CloseLoop) -> tuple[float, float] | None:
+    """Median of the relative errors of the base's values, as fitted alone and with all that was found.
+
+    None if printer or base is no Physics model.
+    """
+    if draw.base or draw.kind == "measured" or result.base_model != "physics":
+        return None
+    model = plain_model(printer_of(draw))
+    assert isinstance(model, Physics)
+    true = {name: float(value.detach()) for name, value in model.values.items()}
+
+    def error(values: dict[str, float]) -> float:
+        return float(np.median([abs(values[name] / own - 1) for name, own in true.items()]))
+
+    return error(result.base_values), error(result.corrected_values)

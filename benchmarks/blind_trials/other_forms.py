@@ -1,14 +1,13 @@
-"""Causes of another form than any that the loop has a name for: other laws, axes, reaches, scales.
+"""Causes of another form than the catalogue's: other laws, axes, reaches, scales; and bases beyond Physics.
 
 They are written against the virtual fab alone. Neither this module nor the drawing reads the loop's catalogue
-of effects, and none of these causes was used in development. What is drawn for a form (a direction, a
-distance, a place) follows from the seed of its trial.
+of effects. What is drawn for a form (a direction, a distance, a place) follows from the seed of its trial.
 """
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -17,11 +16,12 @@ import scipy.ndimage
 import scipy.signal
 import scipy.special
 
-from litho_data.virtual_fab import Cause, Job
+from litho_data.virtual_fab import Cause, Job, Printer
 from litho_data.virtual_fab.canvas import Canvas, apply_transfer, blur, frequencies_per_um
 from litho_data.virtual_fab.geometry import ScanFrame
 
 Stage = Literal["dose", "surface", "scan"]
+Deck = Literal["both", "mixtures", "base"]
 # (field, strength, canvas or frame of the scan, job) to the changed field.
 Law = Callable[..., np.ndarray]
 Draw = Callable[[np.random.Generator], Law]
@@ -38,6 +38,8 @@ class Form:
     Attributes:
         limit: largest strength, in ``unit``; at strength 0 a law changes nothing.
         meaning: what a strength of one unit does, and what is drawn.
+        deck: boards that deal it; ``base`` belongs to the printer of a mixture and is not dealt.
+        names: names in the catalogue that are right for it; most have none.
     """
 
     name: str
@@ -46,18 +48,22 @@ class Form:
     limit: float
     meaning: str
     draw: Draw
+    deck: Deck
+    names: tuple[str, ...]
 
 
 FORMS: dict[str, Form] = {}
 
 
 class FormCause(Cause):
-    """A form at a strength, as the fab applies it."""
+    """Forms at their strengths, as the fab applies them, one after the other at each stage."""
 
-    def __init__(self, name: str, strength: float, seed: int):
-        self.form = FORMS[name]
-        self.strength = strength
-        self._law = self.form.draw(np.random.default_rng([seed, zlib.crc32(name.encode())]))
+    def __init__(self, strengths: Mapping[str, float], seed: int):
+        self._laws = [
+            (FORMS[name].stage, strength, FORMS[name].draw(np.random.default_rng([seed, _number(name)])))
+            for name, strength in strengths.items()
+            if strength
+        ]
 
     def on_dose(self, dose: np.ndarray, canvas: Canvas, job: Job) -> np.ndarray:
         return np.maximum(self._at("dose", dose, canvas, job), 0.0)
@@ -69,16 +75,24 @@ class FormCause(Cause):
         return self._at("scan", height_um, frame, job)
 
     def _at(self, stage: Stage, field: np.ndarray, place: Canvas | ScanFrame, job: Job) -> np.ndarray:
-        if stage != self.form.stage or not self.strength:
-            return field
-        return self._law(field, self.strength, place, job)
+        for own, strength, law in self._laws:
+            if own == stage:
+                field = law(field, strength, place, job)
+        return field
 
 
-def _form(name: str, stage: Stage, unit: str, limit: float) -> Callable[[Draw], Draw]:
+def _number(name: str) -> int:
+    return zlib.crc32(name.encode())
+
+
+def _form(
+    name: str, stage: Stage, unit: str, limit: float, deck: Deck = "both", names: tuple[str, ...] = ()
+) -> Callable[[Draw], Draw]:
     """Enter a drawing function into the list; its docstring says what the form does."""
 
     def enter(draw: Draw) -> Draw:
-        FORMS[name] = Form(name, stage, unit, limit, " ".join((draw.__doc__ or "").split()), draw)
+        meaning = " ".join((draw.__doc__ or "").split())
+        FORMS[name] = Form(name, stage, unit, limit, meaning, draw, deck, names)
         return draw
 
     return enter
@@ -124,12 +138,9 @@ def _oriented_ringing(rng: np.random.Generator) -> Law:
 def _oriented_proximity(rng: np.random.Generator) -> Law:
     """Dose spread far along one direction only, 4–8 µm, relative to the focused dose."""
     reach_um, direction = rng.uniform(4, 8), rng.uniform(0, np.pi)
-
-    def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
-        along = _frequency_along(canvas, direction)
-        return _spread(dose, strength, np.exp(-2 * (np.pi * reach_um * along) ** 2))
-
-    return law
+    return lambda dose, strength, canvas, job: _spread(
+        dose, strength, np.exp(-2 * (np.pi * reach_um * _frequency_along(canvas, direction)) ** 2)
+    )
 
 
 @_form("halo-ring", "dose", "1", 3.0)
@@ -138,8 +149,7 @@ def _halo_ring(rng: np.random.Generator) -> Law:
     radius_um = rng.uniform(4, 9)
 
     def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
-        frequency_y, frequency_x = frequencies_per_um(dose.shape, canvas.pitch_um)
-        frequency = np.hypot(frequency_y, frequency_x)
+        frequency = np.hypot(*frequencies_per_um(dose.shape, canvas.pitch_um))
         return _spread(dose, strength, scipy.special.j0(2 * np.pi * radius_um * frequency))
 
     return law
@@ -161,11 +171,9 @@ def _fast_axis_memory(rng: np.random.Generator) -> Law:
 def _crowding(rng: np.random.Generator) -> Law:
     """Relative gain of the dose at full density, with its cube; density over 2.5–5 µm."""
     reach_um = rng.uniform(2.5, 5)
-
-    def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
-        return dose * (1 + strength * blur(dose, canvas.pitch_um, reach_um) ** 3)
-
-    return law
+    return lambda dose, strength, canvas, job: (
+        dose * (1 + strength * blur(dose, canvas.pitch_um, reach_um) ** 3)
+    )
 
 
 @_form("alternate-slices", "dose", "1", 2.0)
@@ -184,80 +192,65 @@ def _alternate_slices(rng: np.random.Generator) -> Law:
 def _focus_step(rng: np.random.Generator) -> Law:
     """Sd that the spot gains from one print on; the print is drawn in the middle of the order."""
     first = rng.uniform(-0.25, 0.25)
-
-    def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
-        return blur(dose, canvas.pitch_um, strength) if job.order > first else dose
-
-    return law
+    return lambda dose, strength, canvas, job: (
+        blur(dose, canvas.pitch_um, strength) if job.order > first else dose
+    )
 
 
 # Resist and development: other laws
 
 
-@_form("cubic-slope-loss", "surface", "µm", 8.0)
+@_form("cubic-slope-loss", "surface", "µm", 8.0, names=("slope-thinning",))
 def _cubic_slope_loss(rng: np.random.Generator) -> Law:
     """Height lost per cubed slope, whichever way it faces."""
-
-    def law(surface: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
-        return surface - strength * np.hypot(*np.gradient(surface, canvas.pitch_um)) ** 3
-
-    return law
+    return lambda surface, strength, canvas, job: (
+        surface - strength * np.hypot(*np.gradient(surface, canvas.pitch_um)) ** 3
+    )
 
 
 @_form("diagonal-slope-loss", "surface", "µm", 4.0)
 def _diagonal_slope_loss(rng: np.random.Generator) -> Law:
     """Height lost per squared slope along a direction at 30–60° to the axes."""
     direction = rng.uniform(np.pi / 6, np.pi / 3) + rng.integers(2) * np.pi / 2
-
-    def law(surface: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
-        return surface - strength * _slope_along(surface, canvas, direction) ** 2
-
-    return law
+    return lambda surface, strength, canvas, job: (
+        surface - strength * _slope_along(surface, canvas, direction) ** 2
+    )
 
 
 @_form("lee-side-loss", "surface", "µm", 2.0)
 def _lee_side_loss(rng: np.random.Generator) -> Law:
     """Height lost per slope on the flanks that fall in one direction; the others keep theirs."""
     direction = rng.uniform(0, 2 * np.pi)
-
-    def law(surface: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
-        return surface + strength * np.minimum(_slope_along(surface, canvas, direction), 0.0)
-
-    return law
+    return lambda surface, strength, canvas, job: (
+        surface + strength * np.minimum(_slope_along(surface, canvas, direction), 0.0)
+    )
 
 
 @_form("plateau", "surface", "1", 1.0)
 def _plateau(rng: np.random.Generator) -> Law:
     """Share lost of the height between two heights 0.15–0.25 µm apart; 1 makes them one plateau."""
     lower_um, width_um = rng.uniform(0.3, 0.5), rng.uniform(0.15, 0.25)
-
-    def law(surface: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
-        return surface - strength * np.clip(surface - lower_um, 0.0, width_um)
-
-    return law
+    return lambda surface, strength, canvas, job: (
+        surface - strength * np.clip(surface - lower_um, 0.0, width_um)
+    )
 
 
 @_form("fringes", "surface", "nm", 150.0)
 def _fringes(rng: np.random.Generator) -> Law:
     """Amplitude of an error that is periodic in the height, with a period of 0.12–0.3 µm."""
     period_um, phase = rng.uniform(0.12, 0.3), rng.uniform(0, 2 * np.pi)
-
-    def law(surface: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
-        wave = np.sin(2 * np.pi * surface / period_um + phase)
-        return surface + 1e-3 * strength * wave
-
-    return law
+    return lambda surface, strength, canvas, job: (
+        surface + 1e-3 * strength * np.sin(2 * np.pi * surface / period_um + phase)
+    )
 
 
 @_form("overshoot", "surface", "1", 2.0)
 def _overshoot(rng: np.random.Generator) -> Law:
     """Gain of all that is finer than 0.6–1.2 µm: edges stand out on both sides."""
     reach_um = rng.uniform(0.6, 1.2)
-
-    def law(surface: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
-        return surface + strength * (surface - blur(surface, canvas.pitch_um, reach_um))
-
-    return law
+    return lambda surface, strength, canvas, job: (
+        surface + strength * (surface - blur(surface, canvas.pitch_um, reach_um))
+    )
 
 
 @_form("blur-with-height", "surface", "1/µm", 2.0)
@@ -292,22 +285,14 @@ def _blur_across_field(rng: np.random.Generator) -> Law:
 def _seam_in_gain(rng: np.random.Generator) -> Law:
     """Share of the height lost on one side of a seam in the middle of the field."""
     side, place = int(rng.integers(4)), rng.uniform(0.35, 0.65)
-
-    def law(surface: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
-        return surface * (1 - strength * _beyond(canvas, side, place))
-
-    return law
+    return lambda surface, strength, canvas, job: surface * (1 - strength * _beyond(canvas, side, place))
 
 
 @_form("seam-in-height", "surface", "nm", 300.0)
 def _seam_in_height(rng: np.random.Generator) -> Law:
     """Step of the height at a seam in the middle of the field."""
     side, place = int(rng.integers(4)), rng.uniform(0.35, 0.65)
-
-    def law(surface: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
-        return surface + 1e-3 * strength * _beyond(canvas, side, place)
-
-    return law
+    return lambda surface, strength, canvas, job: surface + 1e-3 * strength * _beyond(canvas, side, place)
 
 
 @_form("seam-in-place", "surface", "µm", 1.5)
@@ -350,6 +335,72 @@ def _periodic_lines(rng: np.random.Generator) -> Law:
         return height + 1e-3 * strength * np.sin(2 * np.pi * line / period + phases[job.index % _MOST_SCANS])
 
     return law
+
+
+# As on the measured prints: in every board of mixtures
+
+
+@_form("linear-slope-loss", "surface", "µm", 1.0, "mixtures", ("slope-thinning", "line-shortening"))
+def _linear_slope_loss(rng: np.random.Generator) -> Law:
+    """Height lost per slope along the hatch lines, whichever way it faces."""
+    return lambda surface, strength, canvas, job: (
+        surface - strength * np.abs(_slope_along(surface, canvas, direction=0.0))
+    )
+
+
+@_form("s-shaped-axis", "scan", "µm", 1.5, "mixtures", ("piezo-nonlinearity",))
+def _s_shaped_axis(rng: np.random.Generator) -> Law:
+    """Displacement along x of the scan, quadratic and cubic in x; the seed draws their shares."""
+    share = rng.uniform(np.pi / 6, np.pi / 3)
+
+    def law(height: np.ndarray, strength: float, frame: ScanFrame, job: Job) -> np.ndarray:
+        x = frame.unit_axes[1]
+        moved_um = np.cos(share) * (1.5 * x**2 - 0.5) + np.sin(share) * (2.5 * x**3 - 1.5 * x)
+        rows, columns = np.indices(height.shape, dtype=float)
+        at = [rows, columns + strength / frame.pitch_um * moved_um]
+        return scipy.ndimage.map_coordinates(height, at, order=3, mode="nearest")
+
+    return law
+
+
+# Printers that the Physics model cannot be
+
+
+@_form("two-part-spot", "dose", "1", 0.5, "base", ("long-range-proximity",))
+def _two_part_spot(rng: np.random.Generator) -> Law:
+    """Share of the spot in a second part, 0.5–0.9 µm wide (sd)."""
+    width_um = rng.uniform(0.5, 0.9)
+    return lambda dose, strength, canvas, job: (
+        (1 - strength) * dose + strength * blur(dose, canvas.pitch_um, width_um)
+    )
+
+
+@_form(
+    "hill-response", "dose", "1", 1.0, "base", ("dose-exponent", "threshold-softness", "height-saturation")
+)
+def _hill_response(rng: np.random.Generator) -> Law:
+    """Share of a Hill curve (exponent 1.5–2.5, half at 0.4–0.7) in the response, the rest the logistic."""
+    exponent, half = rng.uniform(1.5, 2.5), rng.uniform(0.4, 0.7)
+
+    def law(dose: np.ndarray, strength: float, canvas: Canvas, job: Job) -> np.ndarray:
+        # What the default printer's logistic converts as the Hill curve does the dose.
+        threshold, steepness = Printer().threshold_dose, Printer().threshold_steepness
+        low, high = (scipy.special.expit(steepness * (at - threshold)) for at in (0.0, 1.0))
+        hill = dose**exponent * (1 + half**exponent) / (dose**exponent + half**exponent)
+        # The curve may pass full conversion where doses add up, and a logistic never reaches its end.
+        response = np.minimum(low + (high - low) * hill, 0.99)
+        return (1 - strength) * dose + strength * (threshold + scipy.special.logit(response) / steepness)
+
+    return law
+
+
+@_form("elliptical-blur", "dose", "µm", 0.6, "base", ("elliptical-psf",))
+def _elliptical_blur(rng: np.random.Generator) -> Law:
+    """Sd that the spot gains along one direction."""
+    direction = rng.uniform(0, np.pi)
+    return lambda dose, strength, canvas, job: apply_transfer(
+        dose, np.exp(-2 * (np.pi * strength * _frequency_along(canvas, direction)) ** 2)
+    )
 
 
 def _spread(dose: np.ndarray, strength: float, transfer: np.ndarray) -> np.ndarray:

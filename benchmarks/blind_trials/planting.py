@@ -7,28 +7,28 @@ of its registration. The rms of what is left is the size of the cause.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
+from benchmarks.blind_trials.draws import names_of
 from benchmarks.blind_trials.other_forms import FORMS, FormCause
-from benchmarks.blind_trials.records import Draw, KnobDraw, Planted
+from benchmarks.blind_trials.records import CauseDraw, Draw, Planted
+from litho_data.layouts.card_text import CardText, write_layout
+from litho_data.readers.text_matrix import write_text_matrix
 from litho_data.store import PrintedScan
-from litho_data.virtual_fab import KNOBS, Job, KnobSetting, Printer, knob_rms_nm, strength_for_rms
-from litho_data.virtual_fab.fab import Fab, scan_job
+from litho_data.virtual_fab import KNOBS, Fab, Job, KnobSetting, Microscope, Noise, Printer, scan_job
 from litho_data.virtual_fab.jobs import Plan, random_jobs
-from litho_data.virtual_fab.knobs import OFF_CATALOGUE, KnobBoard
-from litho_data.virtual_fab.settings import Microscope, Noise
-from litho_data.virtual_fab.strength import NOISE_KNOB, search_strength
+from litho_data.virtual_fab.knobs import KnobBoard
+from litho_data.virtual_fab.strength import knob_rms_nm, search_strength
 from litho_models.fitting.least_squares import Linearised, Rules, fit_least_squares, gram, orthonormal
 from litho_models.fitting.small_models import ModelProblem
 from litho_models.models import build_model
 from litho_models.scan_terms import POLICIES
 from litho_models.simulator import Simulator
 
-# strength_for_rms refuses a knob that leaves less than this under the policy.
-_TRACE_NM = 1e-3
 _SCAN_TERMS = POLICIES["full"] | {"warp"}
 _RULES = Rules("squares", relative_gain=5e-3)
 # A strength is sought on four scans (both cut-offs, all of the order) and measured on all.
@@ -46,30 +46,86 @@ def trial_jobs(draw: Draw, n_scans: int, size_px: int) -> tuple[Job, ...]:
     return tuple(random_jobs(Plan(n_scans, (size_px, size_px)), printer_of(draw), draw.seed))
 
 
+def share_of(cause: CauseDraw, job: Job) -> float:
+    """Share of its strength that a cause has in a scan."""
+    if cause.by == "all":
+        return 1.0
+    strong = job.id[-1] in cause.place if cause.by == "field" else job.order <= float(cause.place)
+    return 1.0 if strong else cause.weak
+
+
+def fab_of(
+    draw: Draw,
+    planted: Sequence[Planted],
+    job: Job,
+    *,
+    noise: Noise | None = None,
+    microscope: Microscope | None = None,
+    without: Collection[str] = (),
+) -> Fab:
+    """The fab as it prints and scans one field, with everything that was planted at the field's strength.
+
+    Args:
+        draw: of the trial.
+        planted: base and causes, as `plant` returns them.
+        noise, microscope: other than the defaults.
+        without: causes that are left out.
+    """
+    strength = {one.draw.name: one.strength * share_of(one.draw, job) for one in planted}
+    strength = {name: own for name, own in strength.items() if name not in without}
+    return Fab(
+        printer=printer_of(draw),
+        microscope=microscope or Microscope(),
+        noise=noise or Noise(),
+        knobs=KnobBoard(
+            [KnobSetting(n, own, draw.seed) for n, own in strength.items() if n in KNOBS], draw.seed
+        ),
+        seed=draw.seed,
+        cause=FormCause({n: own for n, own in strength.items() if n in FORMS}, draw.seed),
+    )
+
+
 def plant(draw: Draw, jobs: Sequence[Job]) -> list[Planted]:
-    """Strengths that give the drawn sizes on these fields, each cause by itself.
+    """Strengths that give the drawn sizes on these fields, each cause by itself; the base's form comes first.
 
     Where the range of a strength ends before, the largest value is used and the size that it reached is
-    recorded: nothing is drawn anew. Boards up to seed 20266 sized without a refit. So is an alias, most of
-    which a refit takes up by definition; what is left of it is then measured.
+    recorded: nothing is drawn anew. An alias is set by how much it changes the scans before a refit, which
+    takes most of it up.
     """
-    if draw.kind in ("in-form", "other-form"):
-        return [_sized_by_refit(knob, jobs, draw) for knob in draw.knobs]
-    planted = [_sized_by_scan_terms(knob, jobs, draw) for knob in draw.knobs]
-    if draw.kind == "alias":
-        return [one.model_copy(update={"rms_nm": _refitted(one, jobs, draw)}) for one in planted]
-    return planted
+    drawn = [*([draw.base] if draw.base else []), *draw.causes]
+    return [(_as_alias if draw.kind == "alias" else _sized)(one, jobs, draw) for one in drawn]
 
 
-def knob_settings(planted: Sequence[Planted], seed: int) -> list[KnobSetting]:
-    """Settings of the knobs among what was planted."""
-    return [KnobSetting(one.name, one.strength, seed) for one in planted if one.name in KNOBS]
+def write_raw(draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job], folder: Path) -> Path:
+    """Print and scan all fields into raw files; returns their card, which says no more than it must."""
+    (folder / "scans").mkdir(parents=True)
+    for job in jobs:
+        scan = scan_job(fab_of(draw, planted, job), job)
+        write_layout(folder, job.id, job.level)
+        write_text_matrix(folder / "scans" / f"{job.id}.txt", scan.height_um)
+    printer = printer_of(draw)
+    CardText(
+        name="virtual-fab",
+        title="Simulated two-photon prints with simulated AFM scans",
+        pitch_um=printer.pitch_um,
+        level_height_um=printer.level_height_um,
+        levels=printer.levels,
+        scan_size_um=scan.frame.size_um,
+        table=False,
+    ).write(folder)
+    return folder / "card.toml"
 
 
-def cause_of(planted: Sequence[Planted], seed: int) -> FormCause | None:
-    """The cause of another form, if one was planted."""
-    forms = [FormCause(one.name, one.strength, seed) for one in planted if one.name in FORMS]
-    return forms[0] if forms else None
+def noise_free_um(draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job]) -> list[np.ndarray]:
+    """Scans (y, x) without noise and on the layout's grid, µm."""
+    found = []
+    for job in jobs:
+        fab = fab_of(draw, planted, job, noise=Noise.off(), microscope=Microscope.aligned())
+        height = scan_job(fab, job).noiseless_um
+        # Scan and layout share their middle.
+        margin = (height.shape[0] - job.level.shape[0]) // 2
+        found.append(height[margin : len(height) - margin, margin : len(height) - margin])
+    return found
 
 
 def refitted_rms_nm(heights_um: Sequence[np.ndarray], jobs: Sequence[Job], printer: Printer) -> float:
@@ -128,32 +184,17 @@ def _as_scan(job: Job, height_um: np.ndarray, printer: Printer) -> PrintedScan:
     )
 
 
-def _noise_free(name: str, strength: float, jobs: Sequence[Job], draw: Draw) -> list[np.ndarray]:
-    """Scans with one cause, without noise and on the layout's grid, µm."""
-    knobs = [KnobSetting(name, strength, draw.seed)] if name in KNOBS else []
-    cause = None if name in KNOBS else FormCause(name, strength, draw.seed)
-    board = KnobBoard(knobs, draw.seed)
-    fab = Fab(printer_of(draw), Microscope.aligned(), Noise.off(), board, draw.seed, cause)
-    scans = [scan_job(fab, job).noiseless_um for job in jobs]
-    # Scan and layout share their middle.
-    margins = [(scan.shape[0] - job.level.shape[0]) // 2 for scan, job in zip(scans, jobs, strict=True)]
-    return [scan[m : len(scan) - m, m : len(scan) - m] for scan, m in zip(scans, margins, strict=True)]
-
-
-def _refitted(one: Planted, jobs: Sequence[Job], draw: Draw) -> float:
-    return refitted_rms_nm(_noise_free(one.name, one.strength, jobs, draw), jobs, printer_of(draw))
-
-
-def _sized_by_refit(drawn: KnobDraw, jobs: Sequence[Job], draw: Draw) -> Planted:
-    wanted = drawn.wanted_rms_nm
+def _sized(drawn: CauseDraw, jobs: Sequence[Job], draw: Draw) -> Planted:
+    wanted, limit = drawn.wanted_rms_nm, _limit(drawn.name)
     few = [jobs[i] for i in np.linspace(0, len(jobs) - 1, min(_SOUGHT_ON, len(jobs))).round().astype(int)]
 
     def on(fields: Sequence[Job]) -> Callable[[float], float]:
-        return lambda strength: refitted_rms_nm(
-            _noise_free(drawn.name, strength, fields, draw), fields, printer_of(draw)
-        )
+        def left_nm(strength: float) -> float:
+            heights = noise_free_um(draw, [_planted(drawn, strength, 0.0)], fields)
+            return refitted_rms_nm(heights, fields, printer_of(draw))
 
-    limit = _limit(drawn.name)
+        return left_nm
+
     strength, at_limit = limit, on(few)(limit)
     if at_limit > wanted:
         strength, _ = search_strength(
@@ -162,31 +203,30 @@ def _sized_by_refit(drawn: KnobDraw, jobs: Sequence[Job], draw: Draw) -> Planted
     return _planted(drawn, strength, on(jobs)(strength))
 
 
-def _sized_by_scan_terms(drawn: KnobDraw, jobs: Sequence[Job], draw: Draw) -> Planted:
-    """The size of the noise-free scans with minus without the knob, freed of the scans' own terms only."""
-    wanted, printer = drawn.wanted_rms_nm, printer_of(draw)
-    highest = KnobSetting(drawn.name, _limit(drawn.name), draw.seed)
-    if drawn.name != NOISE_KNOB:
-        reached = knob_rms_nm(highest, jobs, printer=printer)
-        if reached <= max(wanted, _TRACE_NM):
-            return _planted(drawn, highest.strength, reached)
-    found = strength_for_rms(drawn.name, wanted, jobs=jobs, seed=draw.seed, printer=printer)
-    return _planted(drawn, found.setting.strength, found.rms_nm)
+def _as_alias(drawn: CauseDraw, jobs: Sequence[Job], draw: Draw) -> Planted:
+    """Sized by the noise-free scans with minus without it, freed of the scans' own terms only."""
+    wanted, printer, limit = drawn.wanted_rms_nm, printer_of(draw), _limit(drawn.name)
+
+    def change_nm(strength: float) -> float:
+        return knob_rms_nm(KnobSetting(drawn.name, strength, draw.seed), jobs, printer=printer)
+
+    strength, at_limit = limit, change_nm(limit)
+    if at_limit > wanted:
+        strength, _ = search_strength(change_nm, wanted, highest=limit, at_highest=at_limit)
+    heights = noise_free_um(draw, [_planted(drawn, strength, 0.0)], jobs)
+    return _planted(drawn, strength, refitted_rms_nm(heights, jobs, printer))
 
 
 def _limit(name: str) -> float:
     return KNOBS[name].limit if name in KNOBS else FORMS[name].limit
 
 
-def _planted(drawn: KnobDraw, strength: float, rms_nm: float) -> Planted:
-    knob = KNOBS.get(drawn.name)
+def _planted(drawn: CauseDraw, strength: float, rms_nm: float) -> Planted:
     return Planted(
-        name=drawn.name,
-        effect=knob.effect if knob else OFF_CATALOGUE,
+        draw=drawn,
+        names=[*names_of(drawn.name)],
         strength=strength,
-        unit=knob.unit if knob else FORMS[drawn.name].unit,
+        unit=(KNOBS if drawn.name in KNOBS else FORMS)[drawn.name].unit,
         at_limit=strength == _limit(drawn.name),
-        wanted_rms_nm=drawn.wanted_rms_nm,
         rms_nm=rms_nm,
-        nuisance_span=bool(knob and knob.nuisance_span),
     )

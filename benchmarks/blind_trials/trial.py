@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import resource
 import shutil
-import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
 
-from benchmarks.blind_trials.judging import judge, named_outside_span, scan_terms, strangers, true_floor
-from benchmarks.blind_trials.planting import cause_of, knob_settings, plant, printer_of, trial_jobs
-from benchmarks.blind_trials.records import Cost, Draw, ErrorPair, Outcome, Planted, Trial, TrialErrors
+from benchmarks.blind_trials.judging import bias_of, false_names, found_by, judge, true_floor
+from benchmarks.blind_trials.measured import inject, measured_jobs, middle
+from benchmarks.blind_trials.planting import plant, trial_jobs, write_raw
+from benchmarks.blind_trials.records import Draw, Draws, Outcome, Planted, Trial, TrialErrors
 from litho_data.build.build import build_dataset
+from litho_data.foundation.errors import InputError
 from litho_data.store import open_store
-from litho_data.virtual_fab import Truth, simulate
-from litho_models.frozen.card import ModelCard
-from litho_models.loop.result.record import CloseLoop, TermsError
-from litho_models.loop.run import MODEL_FOLDER, close_loop_on_store
+from litho_models.twin.run import close_store
 
 
 def trial_folder(out: Path, number: int) -> Path:
@@ -27,119 +25,88 @@ def trial_folder(out: Path, number: int) -> Path:
 
 def run_trial(
     draw: Draw,
+    draws: Draws,
     out: Path,
     *,
-    n_scans: int,
-    size_px: int,
+    measured: Path | None = None,
     keep_data: bool = False,
     report: Callable[[str], None] = lambda message: None,
 ) -> Trial:
     """Run and judge one trial; writes ``trials/NN/trial.json`` and the loop's own results beside it.
 
-    The truth lies in another branch, ``truth/NN``, that only the judge opens. An error becomes the
-    trial's result and is not raised.
+    The loop is given the store alone. An error becomes the trial's result and is not raised.
 
     Args:
-        draw: what to plant.
-        out: folder of the campaign; n_scans, size_px: scans of a trial and side of their layouts.
-        keep_data: keep raw files and store, which the truth file's settings make again.
+        draw: what to plant; ``draws``: the board that it belongs to.
+        out: folder of the board.
+        measured: store of measured prints, for trials on those.
+        keep_data: keep raw files and store, which the draw makes again.
         report: told what happens, a sentence at a time.
     """
-    folder, hidden = trial_folder(out, draw.number), out / "truth" / f"{draw.number:02d}"
-    for stale in (folder, hidden):
-        shutil.rmtree(stale, ignore_errors=True)
+    folder = trial_folder(out, draw.number)
+    shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     planted: list[Planted] = []
     try:
-        jobs = trial_jobs(draw, n_scans, size_px)
-        report("setting the knobs")
-        planted = plant(draw, jobs)
-        fab = folder / "fab"
-        card = simulate(
-            fab,
-            jobs=jobs,
-            seed=draw.seed,
-            knobs=knob_settings(planted, draw.seed),
-            cause=cause_of(planted, draw.seed),
-            printer=printer_of(draw),
-            metadata="files-only",
-        )
-        hidden.parent.mkdir(parents=True, exist_ok=True)
-        shutil.move(fab / "truth", hidden)
-        store, clock, used_s = folder / "store.zarr", time.perf_counter(), _cpu_s()
-        report("building the store")
-        built = build_dataset(card, store)
-        build_s, clock = time.perf_counter() - clock, time.perf_counter()
-        result = close_loop_on_store(store, folder / "loop", base="physics", report=report)
-        loop_s, dataset_cpu_s = time.perf_counter() - clock, _cpu_s() - used_s
-        exported = [*ModelCard.read(folder / "loop" / MODEL_FOLDER).process_effects]
+        report("setting the strengths")
+        store = folder / "store.zarr"
+        if draw.kind == "measured":
+            if measured is None:
+                raise InputError("store of measured prints", got="none", wanted="--measured STORE")
+            opened = open_store(measured)
+            jobs = measured_jobs(opened)
+            planted = plant(draw, middle(jobs, draws.size_px))
+            started_s = _cpu_s()
+            inject(opened, store, draw, planted, jobs)
+        else:
+            jobs = trial_jobs(draw, draws.n_scans, draws.size_px)
+            planted = plant(draw, jobs)
+            card = write_raw(draw, planted, jobs, folder / "raw")
+            started_s = _cpu_s()
+            build_dataset(card, store)
+        result = close_store(store, folder / "loop", base=draws.base, report=report)
+        used_s = _cpu_s() - started_s
         report("judging")
-        floor = true_floor(Truth.read(hidden), draw, planted, jobs, open_store(store), result)
-        cost = Cost(build_s=build_s, loop_s=loop_s, cpu_s=_cpu_s(), dataset_cpu_s=dataset_cpu_s)
-        trial = _judged(draw, planted, result, exported, floor, cost)
-        skipped = [f"{one.id}: {one.reason}" for one in built.skipped]
-        trial = trial.model_copy(update={"dropped": skipped + trial.dropped})
+        locked = set(result.split.lock_box)
+        scans = [scan for scan in open_store(store).scans() if scan.id not in locked]
+        before, after = result.error("base"), result.error("all")
+        assert before is not None
+        assert after is not None
+        floor = (
+            None if draw.kind == "measured" else true_floor(draw, planted, jobs, scans, result.run.seeds[0])
+        )
+        trial = Trial(
+            draw=draw,
+            planted=planted,
+            outcomes=judge(draw, planted, result, jobs, scans),
+            false_names=false_names(planted, result),
+            found=found_by(result),
+            verdict=result.verdict,
+            base_model=result.base_model,
+            errors=TrialErrors(before_nm=before.mae_nm, after_nm=after.mae_nm, floor_nm=floor),
+            bias=bias_of(draw, result),
+            dataset_cpu_s=used_s,
+        )
     except Exception as error:
         traceback.print_exc()
         # Results are published: where they were made must not show.
-        trial = failed(draw, planted, f"{type(error).__name__}: {error}".replace(str(out), "OUT"))
+        trial = failed(draw, f"{type(error).__name__}: {error}".replace(str(out), "OUT"), planted)
     if not keep_data:
-        made = (folder / "fab", folder / "store.zarr", folder / "store-report")
-        for data in (*made, hidden / "prints", hidden / "surfaces"):
-            shutil.rmtree(data, ignore_errors=True)
+        for data in ("raw", "store.zarr", "store-report"):
+            shutil.rmtree(folder / data, ignore_errors=True)
     trial.write(folder)
     return trial
 
 
-def failed(draw: Draw, planted: list[Planted], reason: str) -> Trial:
+def failed(draw: Draw, reason: str, planted: list[Planted] | None = None) -> Trial:
     """The result of a trial that did not come to an end."""
-    effects = [(one.effect, one.rms_nm) for one in planted] or [(k.name, k.wanted_rms_nm) for k in draw.knobs]
+    names = [one.name for one in draw.causes] or ["none"]
     return Trial(
         draw=draw,
-        planted=planted,
-        outcomes=[
-            Outcome(effect=effect, rms_nm=rms_nm, judgement="failed", loop_says="")
-            for effect, rms_nm in effects or [("none", 0.0)]
-        ],
-        also_named=[],
-        named=[],
-        scan_terms=[],
-        verdict="",
-        dropped=[],
-        errors=None,
-        cost=None,
+        planted=planted or [],
+        outcomes=[Outcome(name=name, verdict="failed") for name in names],
         failure=" ".join(reason.split()),
     )
-
-
-def _judged(
-    draw: Draw,
-    planted: list[Planted],
-    result: CloseLoop,
-    exported: list[str],
-    floor: ErrorPair,
-    cost: Cost,
-) -> Trial:
-    named = named_outside_span(result, exported)
-    # The floor has the terms that the loop accepted, and so have the errors beside it.
-    accepted = next(row for row in result.equal_terms or [] if row.terms == "accepted")
-    return Trial(
-        draw=draw,
-        planted=planted,
-        outcomes=judge(draw.kind, planted, result, exported),
-        also_named=strangers(named, planted),
-        named=named,
-        scan_terms=scan_terms(result),
-        verdict=result.verdict,
-        dropped=result.run.dropped,
-        errors=TrialErrors(before=_pair(accepted.before), after=_pair(accepted.after), floor=floor),
-        cost=cost,
-        failure="",
-    )
-
-
-def _pair(errors: TermsError) -> ErrorPair:
-    return ErrorPair(mae_nm=errors.mae_nm, rmse_nm=errors.rmse_nm)
 
 
 def _cpu_s() -> float:

@@ -1,226 +1,260 @@
-"""The blind trials: draws, sizes, judging, how a campaign survives, and trials end to end."""
+"""The blind trials: draws, sizes, judging, how a campaign survives, and a trial end to end."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
+from scipy.optimize import curve_fit
 
 from benchmarks.blind_trials import campaign
-from benchmarks.blind_trials.__main__ import PAGE, REPORTED_SEED, results_of
-from benchmarks.blind_trials.draws import BOARD, BOARD_RMS_NM, EARLIER_RMS_NM, draw_board, draw_earlier
-from benchmarks.blind_trials.judging import judge, named_outside_span, scan_terms, strangers
+from benchmarks.blind_trials.__main__ import PAGE, RESULTS, main
+from benchmarks.blind_trials.draws import (
+    BASE_RMS_NM,
+    GROUPED,
+    LINEAR,
+    MIXTURES,
+    MIXTURES_RMS_NM,
+    S_SHAPED,
+    SINGLES,
+    SINGLES_RMS_NM,
+    draw_board,
+    names_of,
+)
+from benchmarks.blind_trials.judging import bias_of, false_names, judge, true_floor
+from benchmarks.blind_trials.measured import inject, measured_jobs, middle
 from benchmarks.blind_trials.other_forms import FORMS, FormCause
 from benchmarks.blind_trials.planting import (
-    knob_settings,
+    fab_of,
+    noise_free_um,
     plant,
     printer_of,
     refitted_rms_nm,
+    share_of,
     trial_jobs,
+    write_raw,
 )
 from benchmarks.blind_trials.records import (
-    Cost,
+    CauseDraw,
     Draw,
     Draws,
-    ErrorPair,
     Kind,
-    KnobDraw,
-    Named,
     Outcome,
     Planted,
     Scoreboard,
     Trial,
     TrialErrors,
 )
-from benchmarks.blind_trials.report import write_report
 from benchmarks.blind_trials.scoreboard import (
     as_markdown,
+    figures_of,
     make_scoreboard,
     publish,
     published,
-    summarise,
+    share,
+    trial_table,
 )
-from benchmarks.blind_trials.trial import run_trial, trial_folder
+from benchmarks.blind_trials.trial import failed, run_trial, trial_folder
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.workers import Workers
-from litho_data.virtual_fab import KNOBS, Fab, Microscope, Noise, Printer, Truth, scan_job
+from litho_data.store import PrintedScan, open_store
+from litho_data.virtual_fab import KNOBS, Fab, KnobSetting, Microscope, Noise, Printer, scan_job, simulate
 from litho_data.virtual_fab.knobs import KnobBoard
-from litho_models.effects import CATALOGUE
-from litho_models.loop.result.record import AddedEffect, Candidate, CloseLoop, Residual
 from litho_models.scan_terms import POLICIES, TermPixels, least_squares, term_maps
+from litho_models.scan_terms.measurement import MeasurementModel, SharedPart
+from litho_models.twin.record import Candidate, CloseLoop, Explained, FoundEffect, Strength
+from tests.litho_models.prints import make_scans, write_store
 
-DEVELOPMENT_SEED = 0
+EARLIER = pd.read_csv(RESULTS / "earlier.csv", keep_default_na=False)
 
 
 # Draws
 
 
-def test_a_board_follows_from_its_seed_and_has_what_was_promised():
-    draws = draw_board(5)
-    assert draws == draw_board(5)
-    assert draws != draw_board(6)
-    assert [draw.number for draw in draws] == list(range(48))
-    assert Counter(draw.kind for draw in draws) == BOARD
-    assert all(len(draw.knobs) == (draw.kind != "empty") for draw in draws)
-    rms_nm = np.array([knob.wanted_rms_nm for draw in draws for knob in draw.knobs])
+def test_singles_follow_from_their_seed_and_have_what_was_promised():
+    draws = draw_board("singles", 5)
+    assert draws == draw_board("singles", 5) != draw_board("singles", 6)
+    assert Counter(draw.kind for draw in draws) == SINGLES
+    assert all(len(draw.causes) == (draw.kind != "empty") for draw in draws)
+    rms_nm = np.array([cause.wanted_rms_nm for draw in draws for cause in draw.causes])
     # All that is drawn is to count: above 8 nm with room for what the search on four scans is off by.
-    assert BOARD_RMS_NM[0] <= rms_nm.min() <= rms_nm.max() <= BOARD_RMS_NM[1]
-    assert 0.87 * BOARD_RMS_NM[0] > 8
+    assert SINGLES_RMS_NM[0] <= rms_nm.min() <= rms_nm.max() <= SINGLES_RMS_NM[1]
+    assert 0.87 * SINGLES_RMS_NM[0] > 8
     assert len({tuple(draw.printer.items()) for draw in draws}) == 48
+    names = {kind: [c.name for d in draws if d.kind == kind for c in d.causes] for kind in SINGLES}
+    assert all(len(set(dealt)) == len(dealt) for dealt in names.values())
+    assert all(FORMS[name].deck == "both" for name in names["other-form"])
+    assert all(names_of(name) for name in names["in-form"] + names["alias"])
+    assert {KNOBS[name].refit_absorbs or KNOBS[name].nuisance_span for name in names["alias"]} == {True}
 
 
-def test_causes_of_a_board_are_dealt_once_and_come_from_their_class():
-    for seed in range(5):
-        names = {
-            kind: [k.name for d in draw_board(seed) if d.kind == kind for k in d.knobs] for kind in BOARD
-        }
-        assert all(len(set(dealt)) == len(dealt) for dealt in names.values())
-        assert not set(names["other-form"]) & KNOBS.keys()
-        assert set(names["other-form"]) <= FORMS.keys()
-        assert all(KNOBS[name].effect != "off-catalogue" for name in names["in-form"] + names["alias"])
-        assert not any(KNOBS[name].refit_absorbs or KNOBS[name].nuisance_span for name in names["in-form"])
-        assert all(KNOBS[name].refit_absorbs or KNOBS[name].nuisance_span for name in names["alias"])
+@pytest.mark.parametrize("seed", range(20267, 20271))
+def test_the_published_boards_are_drawn_as_they_were(seed):
+    """The board of single causes is the earlier one, made again."""
+    was = EARLIER[EARLIER.board == seed]
+    drawn = draw_board("singles", seed)
+    assert [draw.seed for draw in drawn] == was.seed.tolist()
+    assert [draw.causes[0].name if draw.causes else "" for draw in drawn] == was.cause.tolist()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_mixtures_have_what_was_promised(seed):
+    draws = draw_board("mixtures", seed)
+    assert draws == draw_board("mixtures", seed) != draw_board("mixtures", seed + 1)
+    assert Counter(draw.kind for draw in draws) == MIXTURES
+    # A fifth is empty.
+    assert len(draws) >= 40
+    assert 0.18 < MIXTURES["empty"] / len(draws) < 0.22
+    causes = [cause for draw in draws for cause in draw.causes]
+    assert {len(draw.causes) for draw in draws} == {0, 2, 3, 4}
+    assert {one.wanted_rms_nm >= MIXTURES_RMS_NM[0] for one in causes} == {True}
+    assert max(one.wanted_rms_nm for one in causes) <= MIXTURES_RMS_NM[1]
+    assert 0.4 < sum(one.name in FORMS for one in causes) / len(causes) < 0.65
+    linear = [one for one in causes if one.name == "linear-slope-loss"]
+    s_shaped = [one for one in causes if one.name == "s-shaped-axis"]
+    assert [one.by for one in linear] == ["batch"] * LINEAR
+    assert [(one.by, len(one.place), one.weak) for one in s_shaped] == [("field", 2, 0.0)] * S_SHAPED
+    assert sum(one.by != "all" for one in causes) == LINEAR + S_SHAPED + GROUPED
+    bases = [draw.base for draw in draws if draw.base]
+    assert Counter(one.name for one in bases) == {n: 3 for n in FORMS if FORMS[n].deck == "base"}
+    assert all(BASE_RMS_NM[0] <= one.wanted_rms_nm <= BASE_RMS_NM[1] for one in bases)
+    for draw in draws:
+        # Two causes of one name could not be told apart by the judge.
+        names = [
+            name for one in [*draw.causes, *([draw.base] if draw.base else [])] for name in names_of(one.name)
+        ]
+        assert len(set(names)) == len(names)
 
 
 def test_the_page_lists_all_forms():
-    rows = [
-        f"| `{form.name}` | {form.stage} | 0…{form.limit:g} {form.unit} | {form.meaning} |".replace(
-            " 1 |", " |"
-        )
-        for form in FORMS.values()
-    ]
+    rows = [f"| `{form.name}` | {form.meaning} |" for form in FORMS.values()]
     table = PAGE.read_text(encoding="utf-8").split("<!-- forms -->")[1].split("<!-- end of forms -->")[0]
     assert [line for line in table.splitlines() if line.startswith("| `")] == rows
 
 
 def test_the_drawing_reads_no_catalogue():
     """In a fresh interpreter: what draws and sizes a board loads neither the effects nor the loop."""
+    rooms = ("litho_models.effects", "litho_models.loop", "litho_models.twin")
     code = (
         "import sys, benchmarks.blind_trials.draws, benchmarks.blind_trials.planting\n"
-        "print(*(m for m in sys.modules if m.startswith(('litho_models.effects', 'litho_models.loop'))))"
+        f"print(*(m for m in sys.modules if m.startswith({rooms})))"
     )
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert not loaded.split()
 
 
-def same_draws(draws: Sequence[Draw], committed: Scoreboard) -> None:
-    """The draws of a committed board, sizes to a few roundings: a processor has its own exponential."""
-    for drawn, trial in zip(draws, committed.trials, strict=True):
-        was = trial.draw
-        assert drawn.model_copy(update={"knobs": []}) == was.model_copy(update={"knobs": []})
-        assert [knob.name for knob in drawn.knobs] == [knob.name for knob in was.knobs]
-        sizes, were = ([knob.wanted_rms_nm for knob in one.knobs] for one in (drawn, was))
-        assert sizes == pytest.approx(were, rel=8 * np.finfo(float).eps)
-
-
-def test_an_earlier_board_is_drawn_as_it_was():
-    draws = draw_earlier(40, 5)
-    assert draws == draw_earlier(40, 5)
-    assert draws != draw_earlier(40, 6)
-    assert {draw.kind for draw in draws} == {"single", "two", "none", "off-catalogue"}
-    rms_nm = np.array([knob.wanted_rms_nm for draw in draws for knob in draw.knobs])
-    assert EARLIER_RMS_NM[0] <= rms_nm.min() <= rms_nm.max() <= EARLIER_RMS_NM[1]
-    pairs = [draw.knobs for draw in draws if draw.kind == "two"]
-    assert all(KNOBS[a.name].effect != KNOBS[b.name].effect for a, b in pairs)
-    committed = Scoreboard.read(results_of(20266))
-    same_draws(draw_earlier(len(committed.trials), committed.seed), committed)
-
-
-def test_too_few_trials_are_refused():
-    with pytest.raises(InputError, match="one of each kind"):
-        draw_earlier(3, 0)
-
-
 # Sizes
 
 
-def drawn(knobs: Mapping[str, float], kind: Kind = "single", seed: int = 4) -> Draw:
-    wanted = [KnobDraw(name=name, wanted_rms_nm=size) for name, size in knobs.items()]
-    return Draw(number=0, kind=kind, seed=seed, knobs=wanted)
+def drawn(*causes: CauseDraw, kind: Kind = "mixture", **settings: object) -> Draw:
+    return Draw(number=0, kind=kind, seed=4, causes=list(causes), **settings)
 
 
-def test_a_knob_reaches_the_drawn_rms_after_the_projection_of_policy_full():
-    draw = drawn({"galvo-lag": 12.0})
-    jobs = trial_jobs(draw, 3, 96)
-    (planted,) = plant(draw, jobs)
-    squares = []
-    for job in jobs:
-        with_knob, without = (
-            scan_job(
-                Fab(Printer(), Microscope.aligned(), Noise.off(), KnobBoard(knobs, draw.seed), draw.seed), job
-            ).noiseless_um
-            for knobs in (knob_settings([planted], draw.seed), [])
-        )
-        basis = term_maps(TermPixels(without), POLICIES["full"])
-        change = (with_knob - without).ravel()
-        squares.append(np.mean((change - least_squares(basis, change) @ basis) ** 2))
-    rms_nm = 1e3 * np.sqrt(np.mean(squares))
-    # The same projection written twice, in float64.
-    assert planted.rms_nm == pytest.approx(rms_nm, rel=1e-6)
-    # The search stops within 1 %.
-    assert rms_nm == pytest.approx(12.0, rel=0.011)
-    assert not planted.at_limit
+def cause(name: str, rms_nm: float = 12.0, **groups: object) -> CauseDraw:
+    return CauseDraw(name=name, wanted_rms_nm=rms_nm, **groups)
 
 
-def test_a_knob_that_cannot_reach_the_size_stands_at_its_limit_and_says_what_it_reached():
-    draw = drawn({"datum-offset": 20.0, "vignetting": 1e4}, "two")
-    datum, vignetting = plant(draw, trial_jobs(draw, 2, 64))
-    assert datum.strength == KNOBS["datum-offset"].limit
-    assert vignetting.strength == KNOBS["vignetting"].limit
-    assert datum.at_limit
-    assert vignetting.at_limit
-    # An offset is removed by the projection; what is left is rounding of a 0.3 µm constant.
-    assert datum.rms_nm < 1e-6
-    assert 1 < vignetting.rms_nm < 1e4
+def set_to(one: CauseDraw, strength: float = 1.0, rms_nm: float | None = None) -> Planted:
+    return Planted(
+        draw=one,
+        names=[*names_of(one.name)],
+        strength=strength,
+        unit="1",
+        at_limit=False,
+        rms_nm=one.wanted_rms_nm if rms_nm is None else rms_nm,
+    )
 
 
-def noise_free(cause: FormCause | None, jobs, printer: Printer) -> list[np.ndarray]:
-    fab = Fab(printer, Microscope.aligned(), Noise.off(), KnobBoard((), 0), 0, cause)
-    scans = [scan_job(fab, job).noiseless_um for job in jobs]
-    margin = (len(scans[0]) - len(jobs[0].level)) // 2
-    return [scan[margin:-margin, margin:-margin] for scan in scans]
+def test_raw_files_are_those_that_the_fab_writes(tmp_path):
+    draw = drawn(cause("galvo-lag"))
+    jobs, planted = trial_jobs(draw, 2, 64), [set_to(draw.causes[0], 0.4)]
+    card = write_raw(draw, planted, jobs, tmp_path / "own")
+    by_fab = simulate(
+        tmp_path / "fab",
+        jobs=jobs,
+        seed=draw.seed,
+        knobs=[KnobSetting("galvo-lag", 0.4, draw.seed)],
+        metadata="files-only",
+    )
+    for file in by_fab.parent.rglob("*"):
+        if file.is_file():
+            assert (card.parent / file.relative_to(by_fab.parent)).read_bytes() == file.read_bytes()
+
+
+def test_a_strength_by_batch_or_field_is_the_cause_alone_at_that_strength():
+    by_batch, by_field = (
+        cause("galvo-lag", by="batch", place="0.0", weak=0.5),
+        cause("s-shaped-axis", by="field", place="24", weak=0.0),
+    )
+    draw = drawn(by_batch, by_field)
+    jobs = trial_jobs(draw, 4, 64)
+    assert [share_of(by_batch, job) for job in jobs] == [1.0, 1.0, 0.5, 0.5]
+    assert [share_of(by_field, job) for job in jobs] == [0.0, 1.0, 0.0, 1.0]
+    together = noise_free_um(draw, [set_to(by_batch, 0.4), set_to(by_field, 0.5)], jobs)
+    for at, lag, axis in ((0, 0.4, 0.0), (1, 0.4, 0.5), (2, 0.2, 0.0), (3, 0.2, 0.5)):
+        alone = [set_to(cause("galvo-lag"), lag), set_to(cause("s-shaped-axis"), axis)]
+        np.testing.assert_array_equal(together[at], noise_free_um(draw, alone, [jobs[at]])[0])
 
 
 @pytest.mark.parametrize("name", sorted(FORMS))
 def test_a_form_does_nothing_at_strength_zero_and_the_same_twice(name):
-    draw = drawn({name: 10.0}, "other-form")
+    draw = drawn(cause(name))
     jobs = trial_jobs(draw, 2, 64)
-    plain = noise_free(None, jobs, Printer())
+    plain = noise_free_um(draw, [], jobs)
     for strength, differs in ((0.0, False), (0.3 * FORMS[name].limit, True)):
-        once, again = (noise_free(FormCause(name, strength, 3), jobs, Printer()) for _ in range(2))
+        once, again = (noise_free_um(draw, [set_to(cause(name), strength)], jobs) for _ in range(2))
         np.testing.assert_array_equal(once, again)
         # The last field in the order of printing has every step behind it.
         assert np.array_equal(once[-1], plain[-1]) != differs
+
+
+def test_a_full_hill_response_replaces_the_logistic():
+    """Without shrinkage and base layer the print is a Hill curve of the dose."""
+    draw = drawn(printer={"loose_retention": 1.0, "base_um": 0.0})
+    (job,) = trial_jobs(draw, 1, 64)
+    fab = fab_of(draw, [], job, noise=Noise.off(), microscope=Microscope.aligned())
+    # At steepness 1e-4 the logistic is straight to 1e-5: the print shows the dose.
+    straight = replace(fab, printer=replace(fab.printer, threshold_steepness=1e-4))
+    dose = scan_job(straight, job).clean_um / fab.printer.full_height_um
+    hill = scan_job(replace(fab, cause=FormCause({"hill-response": 1.0}, 9)), job)
+    conversion = hill.clean_um / fab.printer.full_height_um
+    inner = (dose > 0.1) & (dose < 0.9)
+
+    def curve(at: np.ndarray, exponent: float, half: float) -> np.ndarray:
+        return at**exponent * (1 + half**exponent) / (at**exponent + half**exponent)
+
+    found, _ = curve_fit(curve, dose[inner], conversion[inner], [2.0, 0.5])
+    np.testing.assert_allclose(conversion[inner], curve(dose[inner], *found), atol=1e-4)
+    assert 1.5 < found[0] < 2.5
+    assert 0.4 < found[1] < 0.7
 
 
 @pytest.mark.parametrize(
     "name",
     [
         "periodic-lines",
-        *(
-            pytest.param(name, marks=pytest.mark.long)
-            for name in ("alternate-slices", "cubic-slope-loss", "fringes", "seam-in-height")
-        ),
+        *(pytest.param(n, marks=pytest.mark.long) for n in ("cubic-slope-loss", "fringes", "seam-in-height")),
     ],
 )
 def test_a_planted_form_has_the_size_that_it_claims(name):
     """It counts, and it is no more than what the plain fab and the scans' own terms leave."""
     # A network of short reach, for speed.
-    draw = drawn({name: 9.0}, "other-form").model_copy(update={"printer": {"network_reach_um": 0.3}})
+    draw = drawn(cause(name, 9.0), printer={"network_reach_um": 0.3})
     jobs = trial_jobs(draw, 2, 96)
     (planted,) = plant(draw, jobs)
     # Sought to 3 % on these same two fields.
     assert planted.at_limit or planted.rms_nm == pytest.approx(9.0, rel=0.031)
-    printer = printer_of(draw)
-    heights = noise_free(FormCause(name, planted.strength, draw.seed), jobs, printer)
+    pairs = zip(noise_free_um(draw, [planted], jobs), noise_free_um(draw, [], jobs), strict=True)
     squares = []
-    for height, plain in zip(heights, noise_free(None, jobs, printer), strict=True):
+    for height, plain in pairs:
         basis = term_maps(TermPixels(plain), POLICIES["full"] | {"warp"})
         change = (height - plain).ravel()
         squares.append(np.mean((change - least_squares(basis, change) @ basis) ** 2))
@@ -231,18 +265,18 @@ def test_a_planted_form_has_the_size_that_it_claims(name):
 @pytest.mark.long
 def test_what_the_base_can_imitate_does_not_count():
     """The plain fab at other parameters is the Physics model: nothing is left, wherever a fit starts."""
-    draw = drawn({}, "empty")
+    other = {"threshold_steepness": 2.2, "loose_retention": 0.45, "network_reach_um": 1.6}
+    draw = drawn(printer=other)
     jobs = trial_jobs(draw, 4, 96)
-    other = replace(Printer(), threshold_steepness=2.2, loose_retention=0.45, network_reach_um=1.6)
-    heights = [1.02 * height + 0.03 for height in noise_free(None, jobs, other)]
+    heights = [1.02 * height + 0.03 for height in noise_free_um(draw, [], jobs)]
     # Kernels cut at 4 σ leave 0.001 nm of a change of more than 25 nm.
     assert refitted_rms_nm(heights, jobs, Printer()) < 0.01
-    assert refitted_rms_nm(heights, jobs, other) < 0.01
+    assert refitted_rms_nm(heights, jobs, printer_of(draw)) < 0.01
 
 
 @pytest.mark.long
 def test_an_alias_is_planted_at_the_drawn_size_and_hardly_any_of_it_counts():
-    draw = drawn({"dose-exponent": 12.0}, "alias")
+    draw = drawn(cause("dose-exponent"), kind="alias")
     (planted,) = plant(draw, trial_jobs(draw, 4, 96))
     assert not planted.at_limit
     # docs/virtual_fab.md: a refit leaves 6 % of it.
@@ -250,294 +284,329 @@ def test_an_alias_is_planted_at_the_drawn_size_and_hardly_any_of_it_counts():
 
 
 def test_a_cause_acts_on_the_print_and_on_the_scan_at_its_own_stage():
-    draw = drawn({})
-    (job,) = trial_jobs(draw, 1, 64)
+    (job,) = trial_jobs(drawn(), 1, 64)
+    fab = Fab(Printer(), Microscope.aligned(), Noise.off(), KnobBoard((), 0), 0)
+    plain = scan_job(fab, job)
     for name, on_print in (("far-copy", True), ("cubic-slope-loss", True), ("periodic-lines", False)):
-        fab = Fab(Printer(), Microscope.aligned(), Noise.off(), KnobBoard((), 0), 0)
-        plain = scan_job(fab, job)
-        found = scan_job(replace(fab, cause=FormCause(name, 0.5 * FORMS[name].limit, 1)), job)
+        found = scan_job(replace(fab, cause=FormCause({name: 0.5 * FORMS[name].limit}, 1)), job)
         assert np.array_equal(found.clean_um, plain.clean_um) != on_print
         assert not np.array_equal(found.noiseless_um, plain.noiseless_um)
+
+
+LEVELS = {name: getattr(Printer, name) for name in ("levels", "level_height_um", "pitch_um")}
+
+
+def test_what_is_injected_into_a_store_is_what_the_fab_makes_of_its_layouts(tmp_path):
+    store = open_store(write_store(tmp_path / "made.zarr", [replace(s, **LEVELS) for s in make_scans(2)]))
+    draw = drawn(cause("seam-in-height"), kind="measured")
+    planted, jobs = [set_to(draw.causes[0], 50.0)], measured_jobs(store)
+    inject(store, tmp_path / "injected.zarr", draw, planted, jobs)
+    changed = open_store(tmp_path / "injected.zarr")
+    for job in jobs:
+        step_nm = 1e3 * (changed.scan(job.id).height_um - store.scan(job.id).height_um)
+        # Either nothing or the whole step; float32 of a height of some µm.
+        sides = np.unique(np.round(step_nm[np.isfinite(step_nm)], 2))
+        np.testing.assert_allclose(sides, [0.0, 50.0], atol=0.02)
+    assert [job.level.shape for job in middle(jobs, 32)] == [(32, 32)] * 2
 
 
 # Judging
 
 
-def loop_result(
-    *sets: tuple[str, ...], verdict: str = "traced", rest: str = "undecided", **said: str
-) -> CloseLoop:
-    """What the loop would write had it added these effects, each with those that look the same.
+def found(
+    name: str,
+    *others: str,
+    knowledge: str = "cause",
+    by: str = "all",
+    exponent: tuple[float, float] | None = None,
+) -> FoundEffect:
+    strengths = {}
+    if exponent:
+        strengths = {"exponent": [Strength(label="", value=np.mean(exponent), unit="1", ci95=exponent)]}
+    return FoundEffect.model_construct(
+        name=name, knowledge=knowledge, by=by, strengths=strengths, confusable_with=list(others)
+    )
 
-    A set may begin with its verdict; ``said`` are the verdicts of candidates (with _ for -).
-    """
-    verdicts = {name.replace("_", "-"): value for name, value in said.items()}
+
+def said(
+    *effects: FoundEffect,
+    verdict: str = "traced",
+    matters: bool = False,
+    parts: Sequence[SharedPart] = (),
+    **more: str,
+) -> CloseLoop:
+    """What the loop would write; ``more`` are verdicts of candidates (with _ for -)."""
     return CloseLoop.model_construct(
-        effects=[added(*names) for names in sets],
+        effects=list(effects),
         candidates=[
-            Candidate.model_construct(
-                name=name,
-                verdict=verdicts.get(name, "below-noise"),
-                reason="none",
-                p_screen=None,
-                gain_nm=None,
-            )
-            for name in CATALOGUE | {"quantisation": None}
+            Candidate.model_construct(name=name.replace("_", "-"), verdict=own) for name, own in more.items()
         ],
-        residual=Residual.model_construct(state=rest, signature=""),
+        explained=[
+            Explained(stage="base", squared_error_nm2=300, explained_nm2=90, matters=True),
+            Explained(stage="all", squared_error_nm2=200, explained_nm2=9, matters=matters),
+        ],
+        measurement=MeasurementModel(levelling="none", parts=list(parts), field_um=(9, 9), scans=4),
         verdict=verdict,
     )
 
 
-def added(name: str, *others: str) -> AddedEffect:
-    if name == "partial":
-        return AddedEffect.model_construct(name=others[0], verdict="partial", confusable_with=[])
-    probe = name not in CATALOGUE
-    verdict = "traced-to-covariate" if probe else "confusable" if others else "explained"
-    return AddedEffect.model_construct(name=name, verdict=verdict, confusable_with=list(others))
-
-
-def planted_effect(effect: str, rms_nm: float = 20.0, name: str = "") -> Planted:
-    return Planted(
-        name=name or effect,
-        effect=effect,
-        strength=1.0,
-        unit="1",
-        at_limit=False,
-        wanted_rms_nm=rms_nm,
-        rms_nm=rms_nm,
-        nuisance_span=False,
-    )
+SHARED, THINNING = ["noticed", "set-contains-it"], ["slope-thinning"]
+LAW, TABLE = found("height-power-2", knowledge="law"), found("level-table", knowledge="description")
 
 
 @pytest.mark.parametrize(
-    ("kind", "planted", "sets", "wanted"),
+    ("names", "result", "wanted", "false"),
     [
-        ("in-form", ["vignetting"], [("datum-offset",), ("vignetting",)], ["right"]),
-        ("in-form", ["vignetting"], [("trench-residue", "vignetting")], ["set-contains-it"]),
-        ("in-form", ["vignetting"], [("trench-residue",)], ["wrong"]),
-        ("in-form", ["vignetting"], [("datum-offset",), ("tilt-bow",)], ["missed"]),
-        ("in-form", ["vignetting"], [("missing-kernel",)], ["missed"]),
-        ("in-form", ["vignetting"], [("partial", "vignetting")], ["partial"]),
-        ("in-form", ["vignetting"], [("partial", "trench-residue")], ["missed"]),
-        ("single", ["scan-line-stripes"], [("scan-line-stripes",)], ["right"]),
-        ("two", ["vignetting", "galvo-lag"], [("vignetting",), ("galvo-lag",)], ["right", "right"]),
-        ("two", ["vignetting", "galvo-lag"], [("vignetting",)], ["right", "missed"]),
-        ("two", ["vignetting", "galvo-lag"], [("vignetting",), ("trench-residue",)], ["right", "wrong"]),
-        ("empty", [], [("datum-offset",), ("registration-residual",)], ["clean"]),
-        ("empty", [], [("vignetting",)], ["false-positive"]),
-        ("empty", [], [("missing-kernel",)], ["false-positive"]),
-        ("none", [], [("partial", "vignetting")], ["false-positive"]),
-        ("other-form", ["off-catalogue"], [("missing-kernel",)], ["traced-to-covariate"]),
-        ("other-form", ["off-catalogue"], [("missing-kernel",), ("vignetting",)], ["named-a-cause"]),
-        ("off-catalogue", ["off-catalogue"], [("vignetting", "trench-residue")], ["named-a-cause"]),
-        ("other-form", ["off-catalogue"], [("partial", "vignetting")], ["partial"]),
-        ("other-form", ["off-catalogue"], [("datum-offset",)], ["missed"]),
+        (["vignetting"], said(found("vignetting")), ["right"], []),
+        (["vignetting"], said(found("galvo-lag", "vignetting")), ["set-contains-it"], []),
+        (["vignetting"], said(found("galvo-lag", "feedback-lag")), ["noticed"], ["galvo-lag | feedback-lag"]),
+        (["vignetting"], said(verdict="nothing-missing"), ["missed"], []),
+        (["vignetting"], said(verdict="unexplained"), ["noticed"], []),
+        (["vignetting"], said(verdict="nothing-missing", matters=True), ["noticed"], []),
+        (["quantisation"], said(quantisation="explained"), ["right"], []),
+        (["far-copy"], said(TABLE), ["noticed"], []),
+        # The larger cause first: a law, or a set, counts once.
+        (["vignetting", "far-copy"], said(LAW), ["noticed", "lawful"], []),
+        (["vignetting", "far-copy"], said(found("vignetting"), LAW), ["right", "lawful"], []),
+        (["galvo-lag", "tip-dilation"], said(found("galvo-lag", "tip-dilation")), SHARED, []),
+        (["linear-slope-loss"], said(found("line-shortening")), ["right"], []),
+        (["linear-slope-loss"], said(found("slope-thinning", exponent=(1.1, 1.3))), ["right"], []),
+        (["cubic-slope-loss"], said(found("slope-thinning", exponent=(2.8, 3.1))), ["right"], []),
+        (["cubic-slope-loss"], said(found("slope-thinning", exponent=(1.9, 2.1))), ["noticed"], THINNING),
+        (["cubic-slope-loss"], said(found("slope-thinning")), ["noticed"], THINNING),
+        ([], said(verdict="nothing-missing"), ["clean"], []),
+        ([], said(TABLE), ["false-positive"], []),
+        ([], said(verdict="nothing-missing", matters=True), ["false-positive"], []),
+        ([], said(found("vignetting")), ["false-positive"], ["vignetting"]),
+    ],
+)  # fmt: skip
+def test_judgements(names, result, wanted, false):
+    draw = drawn(*(cause(name, 10.0 + at) for at, name in enumerate(names)))
+    planted = [set_to(one) for one in draw.causes]
+    assert [one.verdict for one in judge(draw, planted, result, [], [])] == wanted
+    assert false_names(planted, result) == false
+
+
+def test_the_form_of_a_base_is_not_to_be_found_and_its_names_are_not_false():
+    base = cause("two-part-spot")
+    draw, planted = drawn(base=base), [set_to(base)]
+    result = said(found("long-range-proximity", "diffusion-blur"), found("vignetting"))
+    assert false_names(planted, result) == ["vignetting"]
+    assert [one.name for one in judge(draw, planted, result, [], [])] == ["none"]
+
+
+def test_absorbed_is_right_for_an_alias_that_a_refit_takes_up():
+    draw = drawn(cause("dose-exponent"), kind="alias")
+    for rms_nm, wanted in ((2.0, "absorbed"), (9.0, "missed")):
+        planted = [set_to(draw.causes[0], rms_nm=rms_nm)]
+        (outcome,) = judge(draw, planted, said(verdict="nothing-missing", dose_exponent="absorbed"), [], [])
+        assert outcome.verdict == wanted
+
+
+@pytest.mark.parametrize(
+    ("what", "by", "wanted"),
+    [
+        ("shift-x", "character 4", "right"),
+        ("shift-x", "character 2", "missed"),
+        ("shift-x", "all", "missed"),
+        ("shift-y", "character 4", "missed"),
     ],
 )
-def test_judgements(kind, planted, sets, wanted):
-    outcomes = judge(kind, [planted_effect(effect) for effect in planted], loop_result(*sets))
-    assert [outcome.judgement for outcome in outcomes] == wanted
-
-
-def test_structure_left_is_noticed_where_there_is_a_cause_and_invented_where_there_is_none():
-    for verdict, rest, structured in (
-        ("nothing-missing", "undecided", False),
-        ("nothing-missing", "nothing-missing", False),
-        ("too-few-scans", "too-few-scans", False),
-        ("unexplained", "unexplained", True),
-        ("nothing-missing", "unexplained", True),
-    ):
-        found = loop_result(verdict=verdict, rest=rest)
-        (other,) = judge("other-form", [planted_effect("off-catalogue")], found)
-        (empty,) = judge("empty", [], found)
-        assert (other.judgement, empty.judgement) == (
-            ("unexplained", "false-positive") if structured else ("missed", "clean")
-        )
-
-
-def test_absorbed_is_right_for_what_a_refit_takes_up_only():
-    found = loop_result(dose_exponent="absorbed")
-    for rms_nm, wanted in ((2.0, "absorbed"), (9.0, "missed")):
-        (outcome,) = judge("alias", [planted_effect("dose-exponent", rms_nm)], found)
-        assert outcome.judgement == wanted
-
-
-def test_what_is_seen_without_a_model_or_handed_to_design_is_named_too():
-    found = loop_result(
-        quantisation="explained", line_roughness="explained", registration_residual="explained"
-    )
-    # The default noise is line-shaped, and a scan may be bent.
-    assert [one.names for one in named_outside_span(found)] == [["quantisation"]]
-    assert judge("empty", [], found)[0].judgement == "false-positive"
-    assert judge("in-form", [planted_effect("quantisation")], found)[0].judgement == "right"
-    partial = loop_result(("partial", "vignetting"))
-    for exported, wanted in (([], "partial"), (["vignetting"], "named-a-cause")):
-        (outcome,) = judge("other-form", [planted_effect("off-catalogue")], partial, exported)
-        assert outcome.judgement == wanted
-
-
-def test_periodic_lines_are_noticed_by_accepting_offsets_of_lines():
-    found = loop_result(("scan-line-stripes",), verdict="nothing-missing")
-    for name, wanted in (("periodic-lines", "traced-to-covariate"), ("far-copy", "missed")):
-        (outcome,) = judge("other-form", [planted_effect("off-catalogue", name=name)], found)
-        assert outcome.judgement == wanted
-
-
-def test_terms_of_single_scans_are_those_of_the_catalogue():
-    result = loop_result(("datum-offset",), ("position-gain-map",), ("vignetting",), ("scan-line-stripes",))
-    assert scan_terms(result) == ["datum-offset", "scan-line-stripes"]
-
-
-def test_a_false_name_beside_a_right_one_is_a_stranger():
-    named = [
-        Named(names=["vignetting"], verdict="explained"),
-        Named(names=["galvo-lag", "feedback-lag"], verdict="confusable"),
-        Named(names=["level-table"], verdict="traced-to-covariate"),
+def test_a_shared_displacement_is_right_if_its_groups_are_those_of_the_axis(what, by, wanted):
+    one = cause("s-shaped-axis", by="field", place="24", weak=0.0)
+    draw = drawn(one)
+    jobs = trial_jobs(draw, 8, 64)
+    scans = [
+        PrintedScan(j.id, "", j.index, j.level, j.level, j.level > 0, 0.1, 0.1, 13, np.eye(3)) for j in jobs
     ]
-    assert strangers(named, [planted_effect("vignetting")]) == ["galvo-lag | feedback-lag"]
-    assert strangers(named, [planted_effect("vignetting"), planted_effect("feedback-lag")]) == []
+    part = SharedPart(what=what, by=by, degree=3, shrinking=1.0, coefficients={"2": [0.1]})
+    result = said(verdict="nothing-missing", parts=[part])
+    assert judge(draw, [set_to(one)], result, jobs, scans)[0].verdict == wanted
+
+
+def test_the_true_models_leave_the_noise_and_nothing_else():
+    draw = drawn(cause("galvo-lag", by="field", place="13", weak=0.5))
+    jobs, planted = trial_jobs(draw, 2, 96), [set_to(draw.causes[0], 0.4)]
+    heights = []
+    for job in jobs:
+        fab = fab_of(draw, planted, job, noise=Noise(roughness_nm=0, line_nm=0, pixel_nm=5, datum_nm=30))
+        made = scan_job(fab, job)
+        heights.append((job, made))
+    scans = []
+    for job, made in heights:
+        shape, pitch_um = made.height_um.shape, made.frame.pitch_um
+        scans.append(
+            SimpleNamespace(
+                id=job.id, shape=shape, scan_to_layout=np.eye(3), pitch_um=pitch_um, bend_um=None,
+                height_um=made.height_um.astype(np.float32), usable=np.ones(shape, bool),
+            )
+        )  # fmt: skip
+    # Mean absolute value of a normal of sd 5 nm, from 2 × 10⁴ pixels: 0.6 % for one standard error.
+    assert true_floor(draw, planted, jobs, scans, 0) == pytest.approx(5 * np.sqrt(2 / np.pi), rel=0.02)
+    # A cause in the wrong scans is seen.
+    swapped = [set_to(cause("galvo-lag", by="field", place="24", weak=0.5), 0.4)]
+    assert true_floor(draw, swapped, jobs, scans, 0) > 6
+
+
+def test_the_bias_is_that_of_the_base_and_only_where_it_can_be_right():
+    draw = drawn(cause("vignetting"), printer={"threshold_dose": 0.25})
+    own = {"eta": 0.25, "kappa_min": 0.35, "sigma_diffusion_um": 2.0, "bias_um": 0.14}
+    # A logistic of steepness 1.6 is a tanh of 0.8; the fab has no gain.
+    true = {"alpha": 0.8, "gain": 1.0, **own}
+    result = CloseLoop.model_construct(
+        base_model="physics",
+        base_values={name: 1.3 * own for name, own in true.items()},
+        corrected_values={name: 0.9 * own for name, own in true.items()},
+    )
+    # float32 of the model's values.
+    assert bias_of(draw, result) == pytest.approx((0.3, 0.1), rel=1e-5)
+    assert bias_of(draw.model_copy(update={"base": cause("hill-response")}), result) is None
+    assert bias_of(draw, result.model_copy(update={"base_model": "affine-mtf"})) is None
 
 
 # Scoreboard
 
 
-def finished_trial(draw: Draw, judgements: list[str], rms_nm: float = 20.0, after_nm: float = 12.0) -> Trial:
-    planted = [
-        planted_effect(knob.name, rms_nm).model_copy(update={"name": knob.name}) for knob in draw.knobs
-    ]
-    effects = [one.effect for one in planted] or ["none"]
+def finished_trial(draw: Draw, *verdicts: str, after_nm: float = 12.0, **more: object) -> Trial:
+    names = [one.name for one in draw.causes] or ["none"]
     return Trial(
-        schema=Trial.SCHEMA,
         draw=draw,
-        planted=planted,
-        outcomes=[
-            Outcome(effect=effect, rms_nm=rms_nm if planted else 0.0, judgement=judgement, loop_says="…")
-            for effect, judgement in zip(effects, judgements, strict=True)
-        ],
-        also_named=[],
-        named=[],
-        scan_terms=[],
-        verdict="traced",
-        dropped=[],
-        errors=TrialErrors(
-            before=ErrorPair(mae_nm=20, rmse_nm=25),
-            after=ErrorPair(mae_nm=after_nm, rmse_nm=15),
-            floor=ErrorPair(mae_nm=12, rmse_nm=15),
-        ),
-        cost=Cost(build_s=1, loop_s=2, cpu_s=3),
-        failure="",
+        planted=[set_to(one) for one in draw.causes],
+        outcomes=[Outcome(name=n, verdict=v) for n, v in zip(names, verdicts, strict=True)],
+        errors=TrialErrors(before_nm=20, after_nm=after_nm, floor_nm=12),
+        **more,
     )
 
 
-def campaign_of_seven() -> tuple[Draws, list[Trial]]:
+def board_of_mixtures() -> tuple[Draws, list[Trial]]:
+    linear = cause("linear-slope-loss", by="batch", place="0.0", weak=0.5)
     draws = [
-        drawn({"vignetting": 20}, "in-form"),
-        drawn({"galvo-lag": 20}, "in-form"),
-        drawn({"galvo-lag": 20, "vignetting": 20}, "two"),
-        drawn({}, "empty"),
-        drawn({"far-copy": 20}, "other-form"),
-        drawn({"fringes": 5}, "other-form"),
-        drawn({"rim": 20}, "other-form"),
+        drawn(cause("vignetting"), cause("far-copy")),
+        drawn(linear, cause("galvo-lag", 7.0)),
+        drawn(cause("tip-dilation"), cause("fringes")),
+        drawn(kind="empty"),
+        drawn(cause("crowding"), kind="measured"),
     ]
     draws = [draw.model_copy(update={"number": number}) for number, draw in enumerate(draws)]
-    with_false_name = finished_trial(draws[2], ["missed", "set-contains-it"], after_nm=12 * 1.06)
     trials = [
-        finished_trial(draws[0], ["right"], after_nm=12 * 1.04),
-        campaign.failed(draws[1], [], "boom | and\nmore"),
-        with_false_name.model_copy(update={"also_named": ["tip-dilation"]}),
-        finished_trial(draws[3], ["clean"]),
-        finished_trial(draws[4], ["unexplained"], after_nm=12 * 1.29),
-        finished_trial(draws[5], ["named-a-cause"], rms_nm=5),
-        campaign.failed(draws[6], [], "boom"),
-    ]
-    return Draws(schema=Draws.SCHEMA, seed=0, n_scans=12, size_px=256, trials=draws), trials
+        finished_trial(draws[0], "right", "lawful", after_nm=12 * 1.14, bias=(0.3, 0.1)),
+        finished_trial(
+            draws[1], "set-contains-it", "missed", after_nm=12 * 1.16, false_names=["z"], bias=(0.2, 0.1)
+        ),
+        failed(draws[2], "boom | and\nmore"),
+        finished_trial(draws[3], "clean"),
+        finished_trial(draws[4], "noticed", false_names=["theirs"]),
+    ]  # fmt: skip
+    board = {"board": "mixtures", "seed": 0, "n_scans": 12, "size_px": 256, "base": "auto"}
+    return Draws(**board, trials=draws), trials
 
 
 def test_the_figures_count_failures_as_not_found_and_leave_out_small_causes():
-    _, trials = campaign_of_seven()
-    figures = summarise(trials)
-    got = {name: (tally.count, tally.total) for name, tally in figures if hasattr(tally, "total")}
-    assert got == {
-        "in_form": (2, 4),
-        "false_beside": (1, 2),
-        "in_form_with_false_name": (1, 3),
-        "named": (0, 2),
-        "noticed": (1, 2),
-        "unnoticed": (1, 2),
-        "clean": (1, 1),
-        # 1.04 and the empty one, of 1.04, a failure, 1.06 and the empty one.
-        "at_floor_in_form": (2, 4),
-        "at_floor_other": (2, 3),
-    }
-    assert figures.failed == 2
+    draws, trials = board_of_mixtures()
+    values = [figure.value for figure in figures_of(make_scoreboard(draws, trials, ""))]
+    assert [value.split(" (")[0] for value in values] == [
+        "1 of 2",  # of the catalogue: vignetting; not tip-dilation, and galvo-lag is too small
+        "2 of 3",  # of another form: far-copy by a law and linear-slope-loss, not fringes
+        "3 of 5",
+        "3 of 5",
+        "1 of 1",
+        "none of 0",
+        "1 of 4",  # false names, the measured prints aside
+        "1 of 3",
+        "0 of 1",
+        "1 of 1",
+        "1",
+        # Ratios 1/3 and 1/2.
+        "25.0 %, 10.0 %; 0.42",
+    ]
+
+
+def test_intervals_are_exact():
+    # Clopper and Pearson at 0 of n: 1 − 0.025^(1/n).
+    assert share([False] * 8) == f"0 of 8 (0–{100 * (1 - 0.025 ** (1 / 8)):.0f} %)"
+    assert share([True] * 21) == f"21 of 21 ({100 * 0.025 ** (1 / 21):.0f}–100 %)"
 
 
 def test_the_scoreboard_survives_its_file_and_its_page_says_what_it_says(tmp_path):
-    draws, trials = campaign_of_seven()
+    draws, trials = board_of_mixtures()
     scoreboard = make_scoreboard(draws, trials, "make it again")
     scoreboard.write(tmp_path)
     assert Scoreboard.read(tmp_path) == scoreboard
+    other = scoreboard.model_copy(update={"seed": 7})
     page = tmp_path / "page.md"
-    page.write_text(page_of(scoreboard.seed, "old") + page_of(7, "another board"), encoding="utf-8")
+    page.write_text(page_of(scoreboard, "old") + page_of(other, "another board"), encoding="utf-8")
     publish(page, scoreboard)
-    assert published(page, scoreboard.seed) == as_markdown(scoreboard)
-    assert published(page, 7) == "another board"
+    assert published(page, scoreboard) == as_markdown(scoreboard)
+    assert published(page, other) == "another board"
     assert page.read_text(encoding="utf-8").startswith("top\n")
     assert page.read_text(encoding="utf-8").endswith("\nbottom\n")
-    table = [line for line in published(page, scoreboard.seed).splitlines() if line.startswith("|")]
-    # 12 figures and 8 planted causes, with two lines of head each.
-    assert len(table) == 12 + 2 + 8 + 2
-    assert "| … both together | 4 of 7 (57 %) | at least 90 % |" in table
-    report = write_report(scoreboard, tmp_path).read_text(encoding="utf-8")
-    assert report.count("<img") == 2
-    assert (tmp_path / "scoreboard.csv").read_text(encoding="utf-8").count("\n") >= 9
-
-
-def page_of(seed: int, text: str) -> str:
-    marks = (f"<!-- scoreboard of seed {seed}: written by the command -->", "<!-- end of scoreboard -->")
-    return f"top\n{marks[0]}\n{text}\n{marks[1]}\nbottom\n"
-
-
-def test_an_unfinished_campaign_is_not_published(tmp_path):
-    draws, trials = campaign_of_seven()
-    page = tmp_path / "page.md"
-    page.write_text(page_of(0, ""), encoding="utf-8")
+    table = trial_table(scoreboard)
+    assert table.name.tolist()[:4] == ["vignetting", "far-copy", "linear-slope-loss", "galvo-lag"]
+    assert len(table) == 8
     with pytest.raises(InputError, match="pending"):
         publish(page, make_scoreboard(draws, trials[:-1], ""))
 
 
-@pytest.mark.parametrize("seed", range(20266, REPORTED_SEED + 1))
-def test_the_published_table_is_the_committed_scoreboard(seed):
-    scoreboard = Scoreboard.read(results_of(seed))
-    assert published(PAGE, seed) == as_markdown(scoreboard)
-    assert scoreboard.seed == seed
-    assert scoreboard.summary in (None, summarise(scoreboard.trials))
-    if seed >= 20267:
-        same_draws(draw_board(seed), scoreboard)
+def page_of(scoreboard: Scoreboard, text: str) -> str:
+    start = f"<!-- board of {scoreboard.board} {scoreboard.seed}: written by the command -->"
+    return f"top\n{start}\n{text}\n<!-- end of scoreboard -->\nbottom\n"
+
+
+def test_the_published_table_is_the_committed_scoreboard():
+    for file in RESULTS.glob("*/scoreboard.json"):
+        scoreboard = Scoreboard.read(file)
+        assert published(PAGE, scoreboard) == as_markdown(scoreboard)
+        assert scoreboard.trials
+    text = PAGE.read_text(encoding="utf-8")
+    table = text.split("<!-- earlier boards -->")[1].split("<!-- end of earlier boards -->")[0].strip()
+    assert table.splitlines()[2:] == [earlier_row(seed, own) for seed, own in EARLIER.groupby("board")]
+    assert len(text.encode()) <= 10_000
+
+
+def earlier_row(seed: int, rows: pd.DataFrame) -> str:
+    """By the words and rules of their day: error after at most 1.05 × the floor, another form 1.3 ×."""
+    other, empty = ("other-form", "off-catalogue"), ("empty", "none")
+    large = rows[pd.to_numeric(rows.rms_nm, errors="coerce") > 8]
+    in_form, unnamed = large[~large.kind.isin(other)], large[large.kind.isin(other)]
+    trials = rows.drop_duplicates("trial")
+    ratio = trials.after_nm.astype(float) / trials.floor_nm.astype(float)
+    cells = [
+        in_form.outcome.isin(["right", "set-contains-it"]),
+        unnamed.outcome == "named-a-cause",
+        unnamed.outcome.isin(["traced-to-covariate", "partial", "unexplained"]),
+        rows[rows.kind.isin(empty)].outcome == "clean",
+        ratio <= np.where(trials.kind.isin(other), 1.3, 1.05),
+    ]
+    return f"| {seed} | {' | '.join(share(cell.tolist()) for cell in cells)} |"
 
 
 # Campaign
 
 
+def small_board(**changes: object) -> Draws:
+    settings = {"board": "singles", "seed": 0, "n_scans": 12, "size_px": 64, "base": "physics"}
+    return campaign.make_draws(**(settings | changes))
+
+
 def test_a_campaign_records_a_dying_trial_and_does_not_repeat_a_finished_one(tmp_path, monkeypatch, capsys):
-    draws = campaign.make_draws(count=4, seed=0, n_scans=12, size_px=64)
+    draws = small_board()
     campaign.open_campaign(tmp_path, draws)
     started: list[int] = []
 
     def process(command: list[str], **_: object) -> subprocess.CompletedProcess[bytes]:
         number = int(command[command.index("--run-one") + 1])
+        assert command[-1] == "--keep-data"
         started.append(number)
         if number == 1:
             return subprocess.CompletedProcess(command, -9)
         if number == 2:
             raise subprocess.TimeoutExpired(command, 7)
         draw = draws.trials[number]
-        judgements = ["missed"] * max(1, len(draw.knobs))
-        finished_trial(draw, judgements).write(trial_folder(tmp_path, number))
+        finished_trial(draw, *["missed"] * max(1, len(draw.causes))).write(trial_folder(tmp_path, number))
         return subprocess.CompletedProcess(command, 0)
 
     monkeypatch.setattr(campaign.subprocess, "run", process)
-    options = {"workers": Workers(2), "timeout_s": 7.0, "keep_data": False}
+    options = {"workers": Workers(2), "timeout_s": 7.0, "options": ["--keep-data"]}
     campaign.run_campaign(tmp_path, draws, numbers=[0, 1], **options)
     campaign.run_campaign(tmp_path, draws, numbers=[0, 1, 2, 3], **options)
     assert sorted(started) == [0, 1, 2, 3]
@@ -547,80 +616,54 @@ def test_a_campaign_records_a_dying_trial_and_does_not_repeat_a_finished_one(tmp
 
 
 def test_a_folder_with_other_draws_is_refused(tmp_path):
-    board, other = (campaign.make_draws(count=None, seed=s, n_scans=12, size_px=64) for s in (0, 1))
-    campaign.open_campaign(tmp_path, board)
-    campaign.open_campaign(tmp_path, board)
+    campaign.open_campaign(tmp_path, small_board())
+    campaign.open_campaign(tmp_path, small_board())
     with pytest.raises(InputError, match="other settings"):
-        campaign.open_campaign(tmp_path, other)
+        campaign.open_campaign(tmp_path, small_board(seed=1))
 
 
 def test_fields_that_cannot_be_printed_are_refused_before_the_first_trial():
     with pytest.raises(InputError, match="at least 32"):
-        campaign.make_draws(count=4, seed=0, n_scans=12, size_px=8)
+        small_board(size_px=8)
 
 
-@pytest.mark.long
-def test_a_plan_says_what_counts_and_runs_nothing():
-    draws = campaign.make_draws(count=None, seed=1, n_scans=2, size_px=64)
-    few = {draw.kind: draw.number for draw in draws.trials if draw.kind in ("empty", "other-form")}
-    *trials, counted = campaign.plan_lines(draws, [*few.values()])
-    assert {line.split(": ")[1].rstrip(":") for line in trials} == few.keys()
-    assert counted.startswith("counted: empty 0 of 1, other-form ")
+def test_measured_prints_that_are_not_given_are_asked_for_before_the_first_trial(
+    tmp_path, monkeypatch, capsys
+):
+    command = ["trials", "--out", str(tmp_path), "--board", "mixtures", "--seed", "1"]
+    monkeypatch.setattr(sys, "argv", command)
+    with pytest.raises(SystemExit, match="2"):
+        main()
+    assert "--measured STORE" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
 
 
 def test_an_error_inside_a_trial_is_its_result(tmp_path, capfd):
     # 8 px cannot be printed.
-    trial = run_trial(drawn({"vignetting": 20}), tmp_path, n_scans=2, size_px=8)
+    draw = drawn(cause("vignetting"))
+    trial = run_trial(draw, small_board().model_copy(update={"size_px": 8}), tmp_path)
     assert trial == Trial.read(trial_folder(tmp_path, 0))
     assert "at least 32" in trial.failure
-    assert [(o.effect, o.judgement) for o in trial.outcomes] == [("vignetting", "failed")]
+    assert [(one.name, one.verdict) for one in trial.outcomes] == [("vignetting", "failed")]
     assert "Traceback" in capfd.readouterr().err
 
 
-# Three trials from the raw folder
-
-
-def development_draw(kind: Kind) -> Draw:
-    """The first draw of a kind from the development seed that can be expected to be found."""
-
-    def findable(knob: KnobDraw) -> bool:
-        known = KNOBS[knob.name]
-        return knob.wanted_rms_nm > 8 and not known.nuisance_span and not known.refit_absorbs
-
-    draws = draw_earlier(24, DEVELOPMENT_SEED)
-    return next(draw for draw in draws if draw.kind == kind and all(map(findable, draw.knobs)))
-
-
-def run_small(kind: Kind, out: Path) -> Trial:
-    return run_trial(development_draw(kind), out, n_scans=12, size_px=192)
+# Two trials from the raw folder
 
 
 @pytest.mark.long
-def test_one_effect_is_found_or_in_the_set(tmp_path):
-    trial = run_small("single", tmp_path)
+def test_one_cause_is_found_or_in_the_set(tmp_path: Path):
+    trial = run_trial(drawn(cause("vignetting", 14.0), kind="in-form"), small_board(size_px=192), tmp_path)
     assert not trial.failure
-    assert trial.outcomes[0].judgement in ("right", "set-contains-it"), trial.outcomes
+    assert trial.outcomes[0].verdict in ("right", "set-contains-it"), trial.outcomes
     assert trial.errors is not None
-    assert trial.errors.mae_to_floor <= 1.15
+    assert trial.errors.ratio is not None
+    assert trial.errors.ratio <= 1.15
 
 
 @pytest.mark.long
-def test_nothing_is_reported_where_there_is_nothing(tmp_path):
-    trial = run_small("none", tmp_path)
+def test_nothing_is_reported_where_there_is_nothing(tmp_path: Path):
+    trial = run_trial(drawn(kind="empty"), small_board(size_px=192), tmp_path)
     assert not trial.failure
-    assert trial.named == []
-    assert trial.errors is not None
-    assert trial.errors.mae_to_floor <= 1.15
-    truth = Truth.read(tmp_path / "truth" / f"{trial.draw.number:02d}")
-    floor_nm = np.sqrt(np.mean([scan.floor_rmse_nm**2 for scan in truth.scans]))
-    # The truth's own figure is in the frame of the scans and over all of them: resampling smooths away
-    # 1 %, and the roughness of 10 of 12 scans of (192 px)² has some 10⁴ independent places.
-    assert trial.errors.floor.rmse_nm == pytest.approx(floor_nm, rel=0.04)
-
-
-@pytest.mark.long
-def test_an_effect_outside_the_catalogue_is_never_given_a_name(tmp_path):
-    trial = run_small("off-catalogue", tmp_path)
-    assert not trial.failure
-    assert trial.outcomes[0].judgement != "named-a-cause", trial.named
-    assert not [one for one in trial.named if one.verdict != "traced-to-covariate"]
+    assert trial.found == []
+    assert trial.outcomes[0].verdict == "clean"

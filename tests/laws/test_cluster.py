@@ -245,24 +245,24 @@ def test_nested_selections_are_the_same_to_the_bit(address: str, tmp_path: Path)
 @pytest.mark.long
 def test_blind_trials_are_the_same_to_the_bit(address: str, tmp_path: Path) -> None:
     # Smaller fields cannot be registered.
-    draws = campaign.make_draws(count=4, seed=0, n_scans=12, size_px=128)
+    draws = campaign.make_draws(board="singles", seed=0, n_scans=12, size_px=128, base="physics")
     records = []
     for name, dask in (("a", None), ("b", address)):
         (tmp_path / name).mkdir()
         campaign.open_campaign(tmp_path / name, draws)
-        settings = {"workers": Workers(dask=dask), "timeout_s": 3600.0, "keep_data": False}
+        settings = {"workers": Workers(dask=dask), "timeout_s": 3600.0}
         campaign.run_campaign(tmp_path / name, draws, numbers=[0, 1], **settings)
         trials = campaign.finished(tmp_path / name, draws)
         assert not any(trial.failure for trial in trials)
         # Seconds are the machine's; everything else is the trial's.
-        records.append([trial.model_dump(exclude={"cost"}) for trial in trials])
+        records.append([trial.model_dump(exclude={"dataset_cpu_s"}) for trial in trials])
     assert records[0] == records[1]
 
 
 def test_a_trial_runs_in_a_process_of_its_own_on_a_worker(address: str, tmp_path: Path) -> None:
-    draws = campaign.make_draws(count=4, seed=0, n_scans=12, size_px=64)
+    draws = campaign.make_draws(board="singles", seed=0, n_scans=12, size_px=64, base="physics")
     campaign.open_campaign(tmp_path, draws)
     # Long enough for a process to start, too short for a trial.
-    settings = {"workers": Workers(dask=address), "timeout_s": 0.3, "keep_data": False}
+    settings = {"workers": Workers(dask=address), "timeout_s": 0.3}
     campaign.run_campaign(tmp_path, draws, numbers=[0, 1], **settings)
     assert [trial.failure for trial in campaign.finished(tmp_path, draws)] == ["not finished after 0.3 s"] * 2

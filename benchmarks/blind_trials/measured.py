@@ -1,0 +1,62 @@
+"""Causes in measured prints: what the virtual fab makes of the layouts with them, minus without, is added."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.blind_trials.planting import noise_free_um
+from benchmarks.blind_trials.records import Draw, Planted
+from litho_data.foundation.errors import InputError
+from litho_data.store import Store
+from litho_data.virtual_fab import Job, Printer
+
+
+def measured_jobs(store: Store) -> list[Job]:
+    """The layouts of a store, as the fab would print them.
+
+    Raises:
+        InputError: layouts of another pitch, level height or number of levels than the fab's.
+    """
+    got = (store.pitch_um, store.level_height_um, store.levels)
+    wanted = (Printer.pitch_um, Printer.level_height_um, Printer.levels)
+    if got != wanted:
+        raise InputError(f"pitch, level height and levels of {store.path}", got=got, wanted=wanted)
+    scans = sorted(store.scans(), key=lambda scan: scan.order)
+    last = max(len(scans) - 1, 1)
+    return [
+        Job(id=scan.id, level=scan.mask_level, index=at, order=at / last - 0.5)
+        for at, scan in enumerate(scans)
+    ]
+
+
+def middle(jobs: Sequence[Job], size_px: int) -> list[Job]:
+    """The fields' middle parts: sizes are measured on them, for speed."""
+    corners = [[(side - size_px) // 2 for side in job.level.shape] for job in jobs]
+    return [
+        replace(job, level=job.level[max(y, 0) : size_px + max(y, 0), max(x, 0) : size_px + max(x, 0)])
+        for job, (y, x) in zip(jobs, corners, strict=True)
+    ]
+
+
+def inject(store: Store, out: Path, draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job]) -> None:
+    """Copy a store and change its heights by what was planted; everything else stays, its hash included.
+
+    Raises:
+        InputError: a store in a single file.
+    """
+    import zarr
+
+    if not store.path.is_dir():
+        raise InputError("store of measured prints", got=store.path.name, wanted="a folder")
+    shutil.copytree(store.path, out)
+    heights = zarr.open_array(out / "height_um", mode="r+")
+    for job in jobs:
+        (with_um,), (without_um,) = (noise_free_um(draw, one, [job]) for one in (planted, []))
+        row, (ny, nx) = store.ids.index(job.id), job.level.shape
+        changed_um = store.sample("height_um", row) + (with_um - without_um)
+        heights[row, :ny, :nx] = changed_um.astype(np.float32)
