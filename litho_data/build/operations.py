@@ -5,7 +5,6 @@ A build runs them, ``replay`` runs them again from the record; nothing else make
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -121,17 +120,14 @@ def _locate(params: Params, _: Files, arrays: Inputs) -> Made:
 
 @_operation("level", "level")
 def _level(params: Params, _: Files, arrays: Inputs) -> Made:
-    from litho_data.level import LevellingWarning, Recipe
+    from litho_data.level import Recipe
 
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always", LevellingWarning)
-        levelled = Recipe.from_dict(params["recipe"]).apply(
-            arrays["raw_height_um"].astype(np.float64) * _z_scale(arrays)[0],
-            pitch_um=tuple(params["scan_pitch_um"]),
-            mask=arrays.get("vendor_mask"),
-            layout_level=arrays.get("layout_in_scan"),
-        )
-    notes = [str(one.message) for one in said if issubclass(one.category, LevellingWarning)]
+    levelled, notes = Recipe.from_dict(params["recipe"]).apply_noting(
+        arrays["raw_height_um"].astype(np.float64) * _z_scale(arrays)[0],
+        pitch_um=tuple(params["scan_pitch_um"]),
+        mask=arrays.get("vendor_mask"),
+        layout_level=arrays.get("layout_in_scan"),
+    )
     named = {"levelled_height_um": levelled.height, "removed_um": levelled.removed}
     return {name: array.astype(np.float32) for name, array in named.items()}, {
         "notes": notes

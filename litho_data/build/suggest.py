@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-import warnings
+import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +17,7 @@ from litho_data.build.operations import OPERATIONS, load_recipe
 from litho_data.cards.listing import list_fields
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
+from litho_data.level.recipe import Recipe
 
 if TYPE_CHECKING:
     from litho_data.foundation.report import Page
@@ -92,12 +93,16 @@ def suggest_recipe(
     """
     listing = list_fields(card_path, data_dir)
     jobs = [job for job in field_jobs(listing, load_recipe(None)) if job.field.use == "dataset"]
-    places = np.unique(np.linspace(0, len(jobs) - 1, min(_SCANS, len(jobs))).astype(int))
+    # Three apart; others where one of them cannot be used.
+    places = np.unique(np.linspace(0, len(jobs) - 1, min(_SCANS, len(jobs))).astype(int)).tolist()
+    places += [place for place in range(len(jobs)) if place not in places]
     left: dict[str, dict[str, float]] = {name: {} for name in RECIPES}
     warned: dict[str, str] = {}
     pictures: dict[str, list[np.ndarray]] = {}
     refusal = ""
     for job in (jobs[place] for place in places):
+        if len(pictures) == _SCANS:
+            break
         try:
             raw_um, layout, pitch_um = _located(job)
         except InputError as error:
@@ -111,9 +116,12 @@ def suggest_recipe(
             warned |= {name: note} if note else {}
     if not pictures:
         raise InputError("scans to compare recipes on", got=refusal, wanted="one that registers")
-    best = _best(
-        {name: float(np.median(list(of.values()))) for name, of in left.items() if name not in warned}
-    )
+    usual = {name: float(np.median(list(of.values()))) for name, of in left.items() if name not in warned}
+    if not usual:
+        raise InputError(
+            "recipes to compare", got="; ".join(warned.values()), wanted="one that can be applied"
+        )
+    best = _best(usual)
     card = _write_card(Path(card_path), best)
     suggestion = Suggestion(best, left, warned, card)
     _write_page(suggestion, pictures, Path(out))
@@ -141,16 +149,14 @@ def _located(job: FieldJob) -> tuple[np.ndarray, np.ndarray, Sequence[float]]:
 def _levelled(
     recipe: str, raw_um: np.ndarray, layout: np.ndarray, pitch_um: Sequence[float]
 ) -> tuple[np.ndarray, str]:
-    import tomllib
-
-    from litho_data.level import LevellingWarning, Recipe
-
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always", LevellingWarning)
-        pitch = (float(pitch_um[0]), float(pitch_um[1]))
+    """The heights, and what speaks against the recipe; one that cannot be applied leaves them as they are."""
+    pitch = (float(pitch_um[0]), float(pitch_um[1]))
+    try:
         steps = Recipe.from_dict(tomllib.loads(recipe))
-        levelled = steps.apply(raw_um, pitch_um=pitch, layout_level=layout)
-    return levelled.height, "; ".join(str(one.message) for one in said)
+        levelled, notes = steps.apply_noting(raw_um, pitch_um=pitch, layout_level=layout)
+    except InputError as error:
+        return raw_um, str(error)
+    return levelled.height, "; ".join(notes)
 
 
 def left_by_layout(height_um: np.ndarray, layout: np.ndarray) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+import warnings
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -12,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import read_text
 from litho_data.foundation.results import first_error
-from litho_data.level.recipe_steps import AnyStep, State
+from litho_data.level.recipe_steps import AnyStep, LevellingWarning, State
 from litho_data.level.selection import Levelled, as_height
 from litho_data.scan import Scan
 
@@ -92,3 +93,10 @@ class Recipe(BaseModel):
             except InputError as error:
                 raise InputError(f"recipe step {number} ({step.op}): {error}") from error
         return Levelled(state.height_um, start - state.height_um)
+
+    def apply_noting(self, scan: Scan | np.ndarray, **arguments: Any) -> tuple[Levelled, list[str]]:
+        """The result of ``apply``, and in words what its steps warn of instead of warnings."""
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always", LevellingWarning)
+            levelled = self.apply(scan, **arguments)
+        return levelled, [str(one.message) for one in said if issubclass(one.category, LevellingWarning)]

@@ -129,13 +129,17 @@ def text_of_two_channels(path: Path, one: MapFile, rng: np.random.Generator) -> 
 
 def axes(path: Path, one: MapFile, rng: np.random.Generator) -> None:
     """A matrix below a row and beside a column of coordinates in µm, as spreadsheets have it."""
-    rows = one.rows(",")
+    separator, decimal = [(",", "."), (";", ","), ("\t", ".")][rng.integers(3)]
+    rows = one.rows(separator, decimal)
     nx = one.height_um.shape[1]
     corner = ["0", "", "nan"][rng.integers(3)]
-    head = ",".join([corner, *(f"{k * one.pitch_um:.6f}" for k in range(nx))])
-    path.write_text(
-        "\n".join([head, *(f"{k * one.pitch_um:.6f},{row}" for k, row in enumerate(rows))]) + "\n"
-    )
+
+    def at(place: int) -> str:
+        return f"{place * one.pitch_um:.6f}".replace(".", decimal)
+
+    head = separator.join([corner, *(at(k) for k in range(nx))])
+    lines = [head, *(f"{at(k)}{separator}{row}" for k, row in enumerate(rows))]
+    path.write_text("\n".join(lines) + "\n")
     one.needs(unit=one.unit)
     one.needs_mark()
     one.says_size = one.unit == "um"
