@@ -1,7 +1,7 @@
 """Small faults, put into a copy of the project one at a time: each has to be caught by the law beside it.
 
-``python -m tests.faults [WORDS]`` tries those whose name holds one of the words, all by default, and ends with
-1 if one is not caught. It takes minutes, so it is no test itself.
+``python -m tests.faults [WORDS]`` tries those whose name holds one of the words, all by default, and ends
+with 1 if one is not caught. It takes minutes, so it is no test itself.
 """
 
 from __future__ import annotations
