@@ -99,7 +99,7 @@ def whole_folder(
     require_replaceable_folder(out, *holds)
     if record:
         _require_same(Path(out), read_record(Path(out) / record), facts or {})
-    with atomic_folder(out) as folder:
+    with atomic_folder(out, wait=False) as folder:
         yield folder
 
 

@@ -44,15 +44,18 @@ def atomic_file(path: str | Path) -> Iterator[Path]:
 
 
 @contextmanager
-def atomic_folder(path: str | Path) -> Iterator[Path]:
+def atomic_folder(path: str | Path, *, wait: bool = True) -> Iterator[Path]:
     """Yield an empty folder; it replaces ``path`` only on success, and an older folder stays until then.
 
     If a user chose the path, use ``litho_data.foundation.begun.whole_folder``.
 
+    Args:
+        wait: for another process that is writing it, or else refuse.
+
     Raises:
         InputError: ``path`` cannot be written, or another process is writing it.
     """
-    with unfinished(path) as work:
+    with unfinished(path, wait=wait) as work:
         new = work / "new"
         shutil.rmtree(new, ignore_errors=True)
         try:
@@ -65,7 +68,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
 
 
 @contextmanager
-def unfinished(path: str | Path) -> Iterator[Path]:
+def unfinished(path: str | Path, *, wait: bool = False) -> Iterator[Path]:
     """Yield the folder ``.<name>.partial`` beside ``path``, with what a stopped process left in it.
 
     Raises:
@@ -73,9 +76,15 @@ def unfinished(path: str | Path) -> Iterator[Path]:
     """
     target = Path(path)
     work = _work(target)
-    with writable(target):
-        work.mkdir(parents=True, exist_ok=True)
-        lock = locked(work / "lock", target)
+    while True:
+        with writable(target):
+            work.mkdir(parents=True, exist_ok=True)
+            # Who held the lock before removes its file.
+            with contextlib.suppress(FileNotFoundError):
+                lock = locked(work / "lock", target, wait)
+                if os.path.samestat(os.fstat(lock.fileno()), (work / "lock").stat()):
+                    break
+                lock.close()
     with lock:
         _put_back(work, target)
         yield work
@@ -114,29 +123,28 @@ def _put_back(work: Path, target: Path) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
-def locked(file: Path, target: Path) -> IO[str]:
+def locked(file: Path, target: Path, wait: bool = False) -> IO[str]:
     """The file, open to add to, with an advisory lock that ends with it or with the process.
 
     Raises:
         InputError: another process holds it, as the one that writes ``target``.
     """
     stream = open(file, "a", encoding="utf-8")  # noqa: SIM115
-    if not _lock(stream):
+    if not _lock(stream, wait):
         stream.close()
         raise InputError(f"{target} is being written by another process", hint="wait for it, or stop it")
     return stream
 
 
-def _lock(stream: IO[str]) -> bool:
+def _lock(stream: IO[str], wait: bool = False) -> bool:
     """Whether the lock could be had; a system without such locks does without."""
-    try:
+    with contextlib.suppress(ImportError, OSError):
         import fcntl
-    except ImportError:
-        return True
-    try:
-        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
+
+        try:
+            fcntl.flock(stream, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError:
+            return False
     return True
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -92,6 +93,22 @@ def test_an_older_folder_that_a_killed_process_had_put_aside_comes_back(older: P
     assert not older.exists()
     with unfinished(older):
         assert contents(older) == OLDER
+
+
+def test_writers_of_one_folder_take_turns(tmp_path: Path) -> None:
+    """Two commands that share a cache keep the same fit there, one after the other."""
+
+    def write(number: int) -> None:
+        for turn in range(20):
+            with atomic_folder(tmp_path / "fit") as folder:
+                (folder / "a.txt").write_text(f"{number} {turn}")
+                (folder / "b.txt").write_text(f"{number} {turn}")
+
+    with ThreadPoolExecutor(4) as writers:
+        list(writers.map(write, range(4)))
+    kept = contents(tmp_path / "fit")
+    assert kept["a.txt"] == kept["b.txt"]
+    assert [path.name for path in tmp_path.iterdir()] == ["fit"]
 
 
 def test_an_error_on_the_way_leaves_the_older_file(tmp_path: Path) -> None:

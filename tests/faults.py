@@ -1,0 +1,131 @@
+"""Small faults, put into a copy of the project one at a time: each has to be caught by the law beside it.
+
+``python -m tests.faults [WORDS]`` tries those whose name holds one of the words, all by default, and ends
+with 1 if one is not caught. It takes minutes, so it is no test itself.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).parents[1]
+PARTS = ("litho_data", "litho_models", "litho_design", "tests", "benchmarks", "datasets", "pyproject.toml")
+
+
+class Fault(NamedTuple):
+    """What is changed where, and the tests that have to notice."""
+
+    name: str
+    file: str
+    right: str
+    wrong: str
+    tests: str
+
+
+AXES, WHOLE = "tests/litho_data/test_axes.py", "tests/litho_data/test_whole_store.py"
+BEGUN, OPTICS = "tests/litho_data/test_begun.py", "tests/litho_design/test_propagation_laws.py"
+CHECK = "tests/litho_models/test_check.py -k small"
+FAULTS = [
+    # Axes and half pixels.
+    Fault("a canvas half a pixel off", "litho_data/virtual_fab/canvas.py",
+          "shape[1]) - GUARD_PX + 0.5)", "shape[1]) - GUARD_PX)", AXES),
+    Fault("a canvas of another width", "litho_data/virtual_fab/canvas.py",
+          "self.x_um - width_um / 2", "self.x_um - height_um / 2", AXES),
+    Fault("pitch of a bent scan transposed", "litho_data/register/scan.py",
+          "nx * self.scan_pitch_um[1], ny * self.scan_pitch_um[0]",
+          "nx * self.scan_pitch_um[0], ny * self.scan_pitch_um[1]", AXES),
+    Fault("frame of a stored bend transposed", "litho_data/register/bend.py",
+          "scan_shape[1] * scan_pitch_um[1], scan_shape[0] * scan_pitch_um[0]",
+          "scan_shape[1] * scan_pitch_um[0], scan_shape[0] * scan_pitch_um[1]", AXES),
+    Fault("band of a target of another size", "litho_design/optics/angular_spectrum.py",
+          "(there - here) * pitch / 2", "(here - there) * pitch / 2", f"{OPTICS} -k band"),
+    Fault("room of a target of another size", "litho_design/optics/angular_spectrum.py",
+          "(length - (here + there) / 2)", "(length - here)", f"{OPTICS} -k band"),
+    Fault("separations of a target of another size", "litho_design/optics/angular_spectrum.py",
+          "torch.where(index < there, index, index - shortest)",
+          "torch.where(index < here, index, index - shortest)", f"{OPTICS} -k part"),
+    Fault("a decimetre", "litho_data/foundation/units.py", '"dm": 1e5', '"dm": 1e4', AXES),
+    # Keys.
+    Fault("own layouts by their shape", "litho_data/virtual_fab/simulate.py",
+          'array_sha256(job.level, "level", ("y", "x"))', "list(job.level.shape)",
+          "tests/litho_data/test_scan_key.py"),
+    Fault("pairs of any pitch", "litho_data/exchange/pairs.py",
+          "self.order, card, operation", "self.order, operation", "tests/litho_data/test_pairs.py -k begun"),
+    Fault("a scan by its arrays alone", "litho_data/store/printed_scan.py",
+          "return {one.name: _hashed(getattr(value, one.name)) for one in fields(value)}",
+          "return [_hashed(value.mask_level), _hashed(value.height_um), _hashed(value.valid)]",
+          "tests/litho_data/test_scan_key.py"),
+    # Gates.
+    Fault("an error that the fit has made small is judged", "litho_models/monitoring/check.py",
+          'if figure.name != "error"]', "if figure.name]", CHECK),
+    Fault("a path that leaves by a/../../b", "litho_data/cards/card.py",
+          '".." in parts', 'parts[0] == ".."', "tests/litho_data/test_card.py"),
+    Fault("a scan without its order", "litho_data/cards/listing.py",
+          'any("order" in row for row in table.values()):\n        return', "False:\n        return",
+          "tests/litho_data/test_listing.py"),
+    Fault("a store's name is a path", "litho_data/store/contract.py",
+          'require_plain_name(f"name of {path}", name)', "name", "tests/litho_data/test_release.py"),
+    Fault("a level above the highest", "litho_data/store/contract.py",
+          "if highest >= levels", "if highest > levels", WHOLE),
+    Fault("the hash that is written in the store", "litho_data/store/read.py",
+          "return self.computed_sha256()\n\n    @property",
+          'return str(self.root.attrs["dataset_sha256"])\n\n    @property', f"{WHOLE} -k hash"),
+    Fault("chunks of zeros without a file", "litho_data/store/write.py",
+          '"write_empty_chunks": True', '"write_empty_chunks": False', f"{WHOLE} -k every_chunk"),
+    # What is begun.
+    Fault("begun is not said first", "litho_data/foundation/begun.py",
+          "mark = Path(out), Path(out) / BEGUN", 'mark = Path(out), Path(out) / "other"', BEGUN),
+    Fault("an older folder is not put back", "litho_data/foundation/files.py",
+          "        old.replace(target)\n    shutil", "        pass\n    shutil",
+          f"{BEGUN} tests/litho_data/test_files.py"),
+    Fault("leftovers stay", "litho_data/foundation/begun.py", "clear_leftovers(folder)", "pass", BEGUN),
+    Fault("a dead worker takes all jobs with it", "litho_data/foundation/workers.py",
+          "_TRIES = 3", "_TRIES = 1", "tests/litho_data/test_workers.py -k dies"),
+]  # fmt: skip
+
+
+def caught(fault: Fault, copy: Path) -> bool:
+    """Whether the tests of a fault fail with it."""
+    file = copy / fault.file
+    text = file.read_text(encoding="utf-8")
+    assert text.count(fault.right) == 1, f"{fault.name}: {fault.file} no longer holds {fault.right!r} once"
+    file.write_text(text.replace(fault.right, fault.wrong), encoding="utf-8")
+    words, _, chosen = fault.tests.partition(" -k ")
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-x",
+        *words.split(),
+        *(["-k", chosen] if chosen else []),
+    ]
+    done = subprocess.run(command, cwd=copy, env={**os.environ, "PYTHONPATH": str(copy)}, capture_output=True)
+    file.write_text(text, encoding="utf-8")
+    # 1: tests failed; anything else is no answer.
+    return done.returncode == 1
+
+
+def main(words: list[str]) -> int:
+    """Try the faults; returns how many were not caught."""
+    missed = 0
+    with tempfile.TemporaryDirectory() as folder:
+        for part in PARTS:
+            copy = shutil.copytree if (ROOT / part).is_dir() else shutil.copy
+            copy(ROOT / part, Path(folder) / part)
+        for fault in FAULTS:
+            if not words or any(word in fault.name for word in words):
+                noticed = caught(fault, Path(folder))
+                print(f"{'caught' if noticed else 'MISSED'}  {fault.name}", flush=True)
+                missed += not noticed
+    return missed
+
+
+if __name__ == "__main__":
+    raise SystemExit(1 if main(sys.argv[1:]) else 0)
