@@ -59,7 +59,7 @@ def growing_folder(out: str | Path, record: str, facts: Mapping[str, Any] | None
             is writing, or one that cannot be written: all before the block begins.
     """
     folder, mark = Path(out), Path(out) / BEGUN
-    _require_own(folder, record, facts or {})
+    begun = _require_own(folder, record, facts or {})
     finished = (folder / record).exists() and not mark.exists()
     made = not folder.exists()
     with writable(folder):
@@ -68,9 +68,10 @@ def growing_folder(out: str | Path, record: str, facts: Mapping[str, Any] | None
     with stream:
         with writable(folder):
             clear_leftovers(folder)
-            stream.truncate(0)
-            json.dump({"record": record, **(facts or {})}, stream, indent=1)
-            stream.flush()
+            if not begun:
+                stream.truncate(0)
+                json.dump({"record": record, **(facts or {})}, stream, indent=1)
+                stream.flush()
         try:
             yield Begun(folder, finished)
         except BaseException:
@@ -103,13 +104,15 @@ def whole_folder(
         yield folder
 
 
-def _require_own(folder: Path, record: str, facts: Mapping[str, Any]) -> None:
+def _require_own(folder: Path, record: str, facts: Mapping[str, Any]) -> bool:
+    """Whether the same result is begun there already."""
     begun = read_record(folder / BEGUN)
     own = isinstance(begun, dict) and begun.get("record") == record
     # A process that was stopped before it had said what it begins has begun nothing.
     nothing = begun is None and [one.name for one in folder.glob("*")] == [BEGUN]
     require_own_folder(folder, record, *[BEGUN] * (own or nothing))
-    _require_same(folder, read_record(folder / (BEGUN if own else record)), facts)
+    _require_same(folder, begun if own else read_record(folder / record), facts)
+    return own
 
 
 def _require_same(folder: Path, held: Any, facts: Mapping[str, Any]) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -85,6 +86,16 @@ def test_a_begun_folder_is_continued_by_the_same_command_only(tmp_path: Path) ->
             growing_folder(tmp_path, "sums.json", FACTS),
         ):
             pass
+
+
+def test_what_is_continued_is_not_said_anew(tmp_path: Path) -> None:
+    """A process stopped while it writes the mark again would leave parts that nobody has begun."""
+    assert stopped_after(5, lambda: grow(tmp_path), tmp_path)
+    os.utime(tmp_path / BEGUN, (0, 0))
+    with growing_folder(tmp_path, "sums.json", FACTS) as begun:
+        assert not begun.finished
+        assert (tmp_path / BEGUN).stat().st_mtime == 0
+        assert json.loads((tmp_path / BEGUN).read_text()) == {"record": "sums.json", **FACTS}
 
 
 def test_what_had_begun_nothing_leaves_nothing(tmp_path: Path) -> None:
