@@ -30,6 +30,8 @@ from litho_models.twin.search import Cause, Found, search, untestable
 # formulas of true causes leave less than 1 % (layer-stacking 10 %), of causes that only resemble one 20 % and
 # more.
 FORM_SHARE = 0.15
+# Of what is left to be explained: less is the little that any columns take of causes that are still missing.
+LEFT_SHARE = 0.3
 # A cause that gains this little beside another may be an error of the other's formula: it is, if the other's
 # change in another shape would take half of what it takes.
 SMALL_SHARE, REPEATED_SHARE = 0.1, 0.5
@@ -43,11 +45,13 @@ class Checked:
 
     Attributes:
         cause: what was added; ``reshaped_nm2``: what its change in other shapes would take beside it.
+        left_nm2: what all features of layout and place still explain beside everything named.
         corrects: a much larger cause whose formula it may only correct; empty if none.
     """
 
     cause: Cause
     reshaped_nm2: float
+    left_nm2: float = 0.0
     corrects: str = ""
 
     @property
@@ -69,7 +73,7 @@ class Checked:
         """Why the name does not stand; empty if it does."""
         if self.corrects:
             return f"may only correct the formula of {self.corrects}"
-        if self.reshaped_share > FORM_SHARE:
+        if self.reshaped_share > FORM_SHARE and self.reshaped_nm2 > LEFT_SHARE * self.left_nm2:
             share = 100 * self.reshaped_share
             return (
                 f"only resembles the cause: its change in another shape takes {share:.0f} % of its gain more"
@@ -117,6 +121,8 @@ def close(
     fold_of: np.ndarray,
     base: nn.Module,
     study: Study,
+    *,
+    describe: bool = True,
 ) -> Closed:
     """Find what a base lacks on these scans.
 
@@ -124,6 +130,7 @@ def close(
         scans: development scans; ``fold_of``: (scans,) fold that holds each out.
         base: simulator with few parameters, which is refitted, or one that is taken as it is.
         study: settings: seed, workers, report.
+        describe: also say where the rest lies, which changes no model.
     """
     original = prepare_scans(scans)
     plain = replace(study, scans=original, fold_of=fold_of)
@@ -138,8 +145,10 @@ def close(
     named, checked = _named(start, at_work, causes)
     study.report("looking for a law in what is left")
     lawful = search(named.state, at_work, list(LAWS.values()), MOST_LAWS)
-    study.report("describing what is left")
-    described = search(lawful.state, at_work, list(DESCRIPTIONS.values()), MOST_DESCRIPTIONS)
+    described = Found(lawful.state)
+    if describe:
+        study.report("describing what is left")
+        described = search(lawful.state, at_work, list(DESCRIPTIONS.values()), MOST_DESCRIPTIONS)
     stages = {"base": start, "causes": named.state, "laws": lawful.state, "all": described.state}
     return Closed(
         study=at_work,
@@ -150,7 +159,7 @@ def close(
         checked=checked,
         lawful=lawful,
         described=described,
-        rests=_rests(stages, at_work),
+        rests=_rests(stages, at_work) if describe else {},
         untestable=excluded,
     )
 
@@ -159,7 +168,9 @@ def _named(start: State, study: Study, candidates: Sequence[Effect]) -> tuple[Fo
     """The causes, each with the check of its formula; those that fail are taken out, one after the other."""
     found = search(start, study, candidates)
     failed: list[Checked] = []
+    learner = Learner(study, held_out_maps(start, study, study.scans)) if found.causes else None
     while True:
+        left = learner.rest(held_out_maps(found.state, study, study.scans)).mean_nm2 if learner else 0.0
         without = {
             cause.name: fit_state(found.state.twin.without(cause.name), study) for cause in found.causes
         }
@@ -171,6 +182,7 @@ def _named(start: State, study: Study, candidates: Sequence[Effect]) -> tuple[Fo
             Checked(
                 cause,
                 reshaped_gain(without[cause.name], found.state, study),
+                left,
                 _larger(cause, found, without, study),
             )
             for cause in found.causes

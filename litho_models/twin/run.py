@@ -33,7 +33,7 @@ from litho_models.twin.record import CloseLoop, ErrorRow, Stage
 from litho_models.twin.report import write_report
 from litho_models.twin.results import error_rows, record
 
-MODEL_FOLDER = "model"
+MODEL_FOLDER, LAWS_FILE = "model", "laws.py"
 AUTO = "auto"
 # Bases that compete where none is asked for, the first one the form of the paper's physics.
 BASES = ("physics", "affine-mtf", "blur-table")
@@ -69,7 +69,7 @@ def close_store(
     Raises:
         InputError: no store, an unknown base, or too few usable scans.
     """
-    require_replaceable_folder(out, CloseLoop.FILE_NAME, "report.html", "*.csv", MODEL_FOLDER)
+    require_replaceable_folder(out, CloseLoop.FILE_NAME, "report.html", "*.csv", MODEL_FOLDER, LAWS_FILE)
     opened = open_store(store)
     scans = [scan for scan in opened.scans() if np.count_nonzero(scan.usable) >= _FEWEST_PIXELS]
     kept = {scan.id for scan in scans}
@@ -111,6 +111,8 @@ def close_store(
         result.write(folder)
         write_report(result, loop.shown(), folder)
         _save_model(loop.closed, result, opened, folder / MODEL_FOLDER)
+        if loop.closed.lawful.causes:
+            (folder / LAWS_FILE).write_text(laws_file(result), encoding="utf-8")
     return result
 
 
@@ -129,9 +131,12 @@ class _Loop:
     scans: Sequence[PrintedScan]
     base: nn.Module
     settings: Study
+    describe: bool = True
 
     def __post_init__(self) -> None:
-        self.closed = close(self.scans, self.settings.fold_of, self.base, self.settings)
+        self.closed = close(
+            self.scans, self.settings.fold_of, self.base, self.settings, describe=self.describe
+        )
         self._fitted: dict[int, list[tuple[Twin, MeasurementModel]]] = {}
 
     @property
@@ -316,7 +321,7 @@ def _nested(
         study.report(f"choosing without {', '.join(out)} ({number} of {len(parts)})")
         rest = [scan for scan in scans if scan.id not in out]
         inner = replace(study, fold_of=dealt(rest, len(study.folds), study.seed), report=lambda message: None)
-        loop = _Loop(rest, base, inner)
+        loop = _Loop(rest, base, inner, describe=False)
         for name in loop.closed.final.twin.names:
             often[name] = often.get(name, 0) + 1
         rows += loop.errors_of([scan for scan in scans if scan.id in out], f"nested {held_out}")
@@ -348,6 +353,27 @@ def _joined(rows: Sequence[ErrorRow]) -> list[ErrorRow]:
             )
         )
     return joined
+
+
+def laws_file(result: CloseLoop) -> str:
+    """A module that registers the laws that were found as effects, at the strengths that they have here."""
+    lines = [
+        f'"""Laws found on {result.dataset.name}: import this to screen, fit and apply them by name."""',
+        "",
+        "from dataclasses import replace",
+        "",
+        "from litho_models.effects import register_effect",
+        "from litho_models.effects.laws import LAWS",
+    ]
+    for one in result.effects:
+        if one.knowledge == "law":
+            sizes = ", ".join(f"{own.value:.4g} {own.unit}" for own in one.strengths["strength"])
+            lines += [
+                "",
+                f"# {one.title}; strength {sizes}",
+                f"register_effect(replace(LAWS[{one.name!r}], name='law-{one.name}', knowledge='cause'))",
+            ]
+    return "\n".join(lines) + "\n"
 
 
 def _save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) -> None:

@@ -1,0 +1,149 @@
+"""What the measured prints lack: the loop's record, its tables and its picture on the page about it.
+
+litho-models close-loop runs/neural-lithography/store.zarr --base auto --nested prints --out runs/causes
+python -m benchmarks.measured_causes runs/causes
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from benchmarks.markdown_table import markdown_table, with_interval
+from benchmarks.record import publish
+from litho_data.foundation.commands import run_script
+from litho_data.foundation.report_pictures import new_figure
+from litho_models.twin.record import CloseLoop, ErrorRow, FoundEffect
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+ROOT = Path(__file__).parents[1]
+PAGE = ROOT / "docs" / "measured_prints.md"
+FOLDER = ROOT / "docs" / "results" / "neural-lithography" / "causes"
+PICTURE = "errors.png"
+_MODELS = {"base": "the base", "causes": "with the causes", "all": "with causes and laws"}
+_MEASURED = {
+    "print alone": "nothing",
+    "published": "the smooth background that all scans share (published protocol)",
+    "shared": "the measurement model",
+}
+_HELD_OUT = {
+    "scans": "five folds of scans",
+    "nested prints": "whole prints, everything chosen without them",
+    "nested folds": "five folds of scans, everything chosen without them",
+}
+
+
+def texts(result: CloseLoop) -> dict[str, str]:
+    """The text of each mark on the page."""
+    return {"errors": errors_table(result), "causes": causes_table(result)}
+
+
+def errors_table(result: CloseLoop) -> str:
+    """Errors side by side, each row with its terms."""
+    keys = dict.fromkeys((row.model, row.measurement, row.held_out) for row in result.errors)
+    rows = []
+    for model, measurement, held_out in keys:
+        one = {
+            policy: result.error(model, policy, measurement, held_out)  # type: ignore[arg-type]
+            for policy in ("offset", "full")
+        }
+        first = one["offset"]
+        assert first is not None
+        assert one["full"] is not None
+        rows.append(
+            [
+                _MODELS[model],
+                _MEASURED[measurement],
+                _HELD_OUT[held_out],
+                f"{first.printer_numbers} + {first.measurement_numbers}",
+                with_interval(first.mae_nm, first.mae_ci95_nm),
+                f"{one['full'].mae_nm:.2f} nm",
+            ]
+        )
+    return markdown_table(
+        ["model", "what is added to the print", "held out", "numbers", "k = 1", "k = 7"],
+        rows,
+        f"Mean absolute error over all valid pixels of {len(result.errors[0].by_scan_nm)} scans; nothing but "
+        "k terms is fitted to a scored scan, on other pixels. Numbers: of the printer + of the measurement. "
+        "Intervals: 95 %, bootstrap over scans.",
+    )
+
+
+def causes_table(result: CloseLoop) -> str:
+    """What was added, with sizes."""
+    return markdown_table(
+        ["added", "by", "size (95 % over prints)", "error without it", "scans better", "or", "also on"],
+        [
+            [
+                f"`{one.name}`",
+                one.by,
+                "<br>".join(_sizes(one)),
+                "–" if one.left_out_nm is None else f"{one.left_out_nm:+.2f} nm",
+                "{} of {}".format(*one.scans_improved),
+                ", ".join(one.confusable_with) or "–",
+                ", ".join(one.survives_on) or "–",
+            ]
+            for one in result.effects
+            if one.knowledge != "description"
+        ],
+    )
+
+
+def _sizes(one: FoundEffect) -> list[str]:
+    found = []
+    for name, strengths in one.strengths.items():
+        for own in strengths:
+            unit = "" if own.unit == "1" else f" {own.unit}"
+            label = f" ({own.label})" if own.label else ""
+            ends = "" if own.ci95 is None else f" ({own.ci95[0]:.3f} … {own.ci95[1]:.3f})"
+            found.append(f"{name}{label}: {own.value:.3f}{unit}{ends}")
+    return found
+
+
+def picture(result: CloseLoop) -> Figure:
+    """Error of each scan, before and after."""
+    rows: list[tuple[str, ErrorRow | None]] = [
+        ("base, published protocol", result.error("base", "offset", "published")),
+        ("base with the measurement model", result.error("base")),
+        ("with what was found", result.error("all")),
+        ("the same, whole prints left out", result.error("all", held_out="nested prints")),
+    ]
+    shown = [(label, row) for label, row in rows if row is not None]
+    figure = new_figure(9, 0.7 * len(shown) + 1)
+    axes = figure.subplots()
+    for at, (_, row) in enumerate(shown):
+        values = [*row.by_scan_nm.values()]
+        axes.plot(values, np.full(len(values), at), "o", ms=5, alpha=0.45, color="#2f7fd0")
+        axes.plot(row.mae_nm, at, "|", ms=26, mew=3, color="#12344d")
+        axes.annotate(f"{row.mae_nm:.2f}", (row.mae_nm, at), (0, 14), textcoords="offset points", ha="center")
+    axes.set_yticks(range(len(shown)), [label for label, _ in shown])
+    axes.invert_yaxis()
+    axes.margins(y=0.25)
+    axes.set_xlabel("mean absolute error of each held-out scan, its zero free (nm)")
+    axes.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def main() -> None:
+    """Copy the record, draw, publish."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("run", type=Path, help="folder of the closed loop")
+    run = parser.parse_args().run
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(run / CloseLoop.FILE_NAME, FOLDER / CloseLoop.FILE_NAME)
+    result = CloseLoop.read(FOLDER)
+    picture(result).savefig(FOLDER / PICTURE, dpi=110)
+    for name, text in texts(result).items():
+        publish(PAGE, name, text)
+
+
+if __name__ == "__main__":
+    run_script(main)
