@@ -168,7 +168,7 @@ def _named(start: State, study: Study, candidates: Sequence[Effect]) -> tuple[Fo
     """The causes, each with the check of its formula; those that fail are taken out, one after the other."""
     found = search(start, study, candidates)
     failed: list[Checked] = []
-    learner = Learner(study, held_out_maps(start, study, study.scans)) if found.causes else None
+    learner = Learner(study, held_out_maps(start, study, study.scans)) if found.causes else None  # type: ignore[arg-type]
     while True:
         left = learner.rest(held_out_maps(found.state, study, study.scans)).mean_nm2 if learner else 0.0
         without = {
