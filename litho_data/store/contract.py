@@ -133,9 +133,9 @@ def _by_xarray(attributes: Mapping[str, Any]) -> bool:
 def checked_attributes(root: zarr.Group, path: Path) -> dict[str, Any]:
     """Name, pitch, level height, number of levels and write table of a store; InputError if one is wrong."""
     attributes = dict(root.attrs)
-    name = require_plain_name(f"name of {path}", str(attributes.get("name", path.name.partition(".")[0])))
+    name = str(attributes.get("name", path.name.partition(".")[0]))
     write = {key.removeprefix(WRITE): value for key, value in attributes.items() if key.startswith(WRITE)}
-    checked: dict[str, Any] = {"name": name, "write": write or None}
+    checked: dict[str, Any] = {"name": require_plain_name(f"name of {path}", name), "write": write or None}
     for key, limits in (("pitch_um", PITCH_UM), ("level_height_um", LEVEL_HEIGHT_UM), ("levels", LEVELS)):
         value = attributes.get(key)
         whole = key == "levels"
