@@ -171,7 +171,10 @@ def bias_of(draw: Draw, result: CloseLoop) -> tuple[float, float] | None:
     assert isinstance(model, Physics)
     true = {name: float(value.detach()) for name, value in model.values.items()}
 
+    # The sd of the squared spot, where the base has it free.
+    true["spot_um"] = printer_of(draw).spot_sigma_um / 2**0.5
+
     def error(values: dict[str, float]) -> float:
-        return float(np.median([abs(values[name] / own - 1) for name, own in true.items()]))
+        return float(np.median([abs(values[name] / own - 1) for name, own in true.items() if name in values]))
 
     return error(result.base_values), error(result.corrected_values)

@@ -16,7 +16,7 @@ from litho_data.store import Store
 from litho_data.virtual_fab import Job, Printer
 
 
-def measured_jobs(store: Store) -> list[Job]:
+def measured_jobs(store: Store) -> tuple[Job, ...]:
     """The layouts of a store, as the fab would print them.
 
     Raises:
@@ -28,10 +28,10 @@ def measured_jobs(store: Store) -> list[Job]:
         raise InputError(f"pitch, level height and levels of {store.path}", got=got, wanted=wanted)
     scans = sorted(store.scans(), key=lambda scan: scan.order)
     last = max(len(scans) - 1, 1)
-    return [
+    return tuple(
         Job(id=scan.id, level=scan.mask_level, index=at, order=at / last - 0.5)
         for at, scan in enumerate(scans)
-    ]
+    )
 
 
 def middle(jobs: Sequence[Job], size_px: int) -> list[Job]:

@@ -450,7 +450,7 @@ def test_the_true_models_leave_the_noise_and_nothing_else():
 
 def test_the_bias_is_that_of_the_base_and_only_where_it_can_be_right():
     draw = drawn(cause("vignetting"), printer={"threshold_dose": 0.25})
-    own = {"eta": 0.25, "kappa_min": 0.35, "sigma_diffusion_um": 2.0, "bias_um": 0.14}
+    own = {"eta": 0.25, "kappa_min": 0.35, "sigma_diffusion_um": 2.0, "bias_um": 0.14, "spot_um": 0.2}
     # A logistic of steepness 1.6 is a tanh of 0.8; the fab has no gain.
     true = {"alpha": 0.8, "gain": 1.0, **own}
     result = CloseLoop.model_construct(
