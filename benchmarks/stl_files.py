@@ -28,7 +28,6 @@ from litho_design.exports.stl import write_stl
 from litho_design.holograms.settings import HologramSettings
 from litho_design.holograms.task import HologramTask
 from litho_design.images.targets import load_target
-from litho_design.optimisation.parameters import make_parametrisation
 from litho_design.optimisation.search import search_layout
 from litho_design.printers.printer import Printer
 
@@ -86,9 +85,7 @@ def designed(settings: HologramSettings, printer: Printer, seed: int) -> np.ndar
     target = load_target((blots > blots.std()).astype(np.float32), size)
     search = settings.search.model_copy(update={"seed": seed})
     task = HologramTask(settings.model_copy(update={"search": search}), printer, target)
-    parameters = make_parametrisation(settings.layout, search)
-    task.start(parameters, printer.level_heights_um())
-    found = search_layout(parameters, task.objective, search).best_levels
+    found = search_layout(task.free_parameters(), task.objective, search).best_levels
     assert found is not None
     return found.numpy().astype(np.uint8)
 

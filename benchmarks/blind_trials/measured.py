@@ -44,7 +44,7 @@ def middle(jobs: Sequence[Job], size_px: int) -> list[Job]:
 
 
 def inject(store: Store, out: Path, draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job]) -> None:
-    """Copy a store and change its heights by what was planted; everything else stays, its hash included.
+    """Copy a store and change its heights by what was planted; everything else stays.
 
     Raises:
         InputError: a store in a single file.
