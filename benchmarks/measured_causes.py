@@ -34,6 +34,7 @@ _MEASURED = {
 }
 _HELD_OUT = {
     "scans": "five folds of scans",
+    "prints": "whole prints, chosen with them",
     "nested prints": "whole prints, everything chosen without them",
     "nested folds": "five folds of scans, everything chosen without them",
 }
@@ -112,7 +113,7 @@ def picture(result: CloseLoop) -> Figure:
         ("base, published protocol", result.error("base", "offset", "published")),
         ("base with the measurement model", result.error("base")),
         ("with what was found", result.error("all")),
-        ("the same, whole prints left out", result.error("all", held_out="nested prints")),
+        ("the same, whole prints left out", result.error("all", held_out="prints")),
     ]
     shown = [(label, row) for label, row in rows if row is not None]
     figure = new_figure(9, 0.7 * len(shown) + 1)

@@ -39,7 +39,7 @@ class ErrorRow(Record):
         measurement: what is added to the print: nothing, the smooth background that training scans share (the
             published protocol), or the whole measurement model.
         policy: terms of each scan, ``k`` of them, fitted on pixels that are not scored.
-        held_out: folds of scans; or whole folds or prints, without which everything was chosen anew.
+        held_out: folds of scans, or whole prints; nested where everything was chosen anew without them.
         printer_numbers: fitted numbers of the model; ``measurement_numbers``: of the measurement, the largest
             of any fold.
     """
@@ -48,7 +48,7 @@ class ErrorRow(Record):
     measurement: MeasuredBy
     policy: Policy
     k: float
-    held_out: Literal["scans", "nested folds", "nested prints", "locked"]
+    held_out: Literal["scans", "prints", "nested folds", "nested prints", "locked"]
     printer_numbers: int
     measurement_numbers: int
     mae_nm: float

@@ -84,7 +84,7 @@ def close_store(
         study = Study((), dealt(development, folds, seed), seed, places, report)
         name, chosen, others = _bases(base, development, study)
         loop = _Loop(development, chosen, study)
-        errors = loop.errors()
+        errors = loop.errors() + loop.errors_by_print()
         left_out = loop.left_out_nm()
         survives = _survives(loop, others)
         often: dict[str, int] = {}
@@ -206,6 +206,41 @@ class _Loop:
             for i in np.flatnonzero(fold_of == fold):
                 found[i] = Prediction.beside(learned, maps[i]).map_um
         return found
+
+    def errors_by_print(self) -> list[ErrorRow]:
+        """Errors of the scans of each print by fits without it; what is fitted was chosen with it."""
+        prints = [scan.print_id for scan in self.scans]
+        if not 1 < len(set(prints)) < len(prints):
+            return []
+        rows = []
+        stages: tuple[tuple[Stage, State], ...] = (("base", self.closed.base), ("all", self.closed.final))
+        for name, state in stages:
+            self.settings.report(f"leaving out whole prints: {name}")
+            jobs = [
+                (
+                    number,
+                    state.twin,
+                    [one for one in self.closed.original if one.stored.print_id != out],
+                    self.settings.seed,
+                )
+                for number, out in enumerate(sorted(set(prints)))
+            ]
+            fitted = {
+                job[0]: done
+                for job, done in run_jobs(
+                    _fit_fold, jobs, self.settings.workers, name=lambda job: f"print {job[0]}"
+                )
+            }
+            maps = []
+            for scan, prepared in zip(self.scans, self.closed.original, strict=True):
+                twin, learned = fitted[sorted(set(prints)).index(scan.print_id)]
+                maps.append(learned.expected_um(scan, twin.placed().height(prepared)))
+            shared = max(learned.numbers for _, learned in fitted.values())
+            rows += error_rows(
+                self.scans, maps, model=name, measurement="shared", held_out="prints",
+                numbers=(len(state.twin.vector), shared), seed=self.settings.seed,
+            )  # fmt: skip
+        return rows
 
     def left_out_nm(self) -> dict[str, float]:
         """By how much the error grows (k = 1) without each cause or law, the rest fitted again."""
