@@ -27,7 +27,7 @@ ROOMS = {
         "virtual_fab", "build", "provenance", "exchange", "cli",
     ),
     "litho_models": (
-        "layers", "simulator", "prediction", "fast", "models", "splits", "scan_terms", "effects",
+        "layers", "simulator", "prediction", "fast", "models", "scan_terms", "effects", "splits",
         "frozen", "scoring", "fitting", "evaluation", "noise", "monitoring", "loop", "planning", "twin",
         "cli",
     ),
