@@ -20,10 +20,10 @@ from scipy.ndimage import map_coordinates
 
 from litho_data.foundation.results import Record
 from litho_data.store import PrintedScan
+from litho_data.store.lock_box import drawing_key
 from litho_models.scan_terms.grouped import Block, Products
 from litho_models.scan_terms.groups import ALL, groupings, label_of
 from litho_models.scan_terms.term import FloatMap
-from litho_models.splits.folds import grouped_folds
 
 Shared = Literal["background", "shift-x", "shift-y", "gain"]
 Levelling = Literal["none", "plane", "twist", "bow"]
@@ -329,9 +329,9 @@ def _thinned(usable: np.ndarray) -> np.ndarray:
 
 
 def _deal(ids: Sequence[str], seed: int) -> np.ndarray:
-    folds = grouped_folds(ids, min(_INNER_FOLDS, len(ids)), seed)
-    fold = {one: number for number, members in enumerate(folds) for one in members}
-    return np.array([fold[one] for one in ids])
+    """Number of the inner fold of each scan, dealt by a hash of its id."""
+    shuffled = sorted(ids, key=lambda scan_id: drawing_key(scan_id, seed))
+    return np.array([shuffled.index(one) % min(_INNER_FOLDS, len(ids)) for one in ids])
 
 
 def _field_um(scan: PrintedScan) -> tuple[float, float]:
