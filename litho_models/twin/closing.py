@@ -225,12 +225,12 @@ def freed_scans(scans: Sequence[PrintedScan], state: State, study: Study) -> lis
     maps = held_out_maps(state, study, study.scans)
     freed = list(scans)
     for fold in study.folds:
-        own = np.flatnonzero(study.fold_of != fold)
+        own = np.flatnonzero(study.fold_of != fold).tolist()
         if len(own) < 2:
             continue
         learned = learn_measurement([scans[i] for i in own], [maps[i] for i in own], seed=study.seed)
         differences = learned.between_groups()
-        for i in np.flatnonzero(study.fold_of == fold):
+        for i in np.flatnonzero(study.fold_of == fold).tolist():
             extra = differences.expected_um(scans[i], maps[i]) - maps[i]
             freed[i] = replace(scans[i], height_um=(scans[i].height_um - extra).astype(np.float32))
     return freed
@@ -264,7 +264,8 @@ def fit_with_measurement(
 
 
 def _rests(stages: dict[str, State], study: Study) -> dict[str, Rest]:
-    learner, rests, seen = None, {}, []
+    learner, rests = None, {}
+    seen: list[State] = []
     for name, state in stages.items():
         if any(state is other for other in seen):
             continue

@@ -175,7 +175,7 @@ class _Loop:
                 (
                     int(fold),
                     state.twin.at(state.per_fold[fold]),
-                    [self.closed.original[i] for i in np.flatnonzero(self.settings.fold_of != fold)],
+                    [self.closed.original[i] for i in np.flatnonzero(self.settings.fold_of != fold).tolist()],
                     self.settings.seed,
                 )
                 for fold in self.closed.study.folds
@@ -198,12 +198,12 @@ class _Loop:
         found, fold_of = list(maps), self.settings.fold_of
         for fold in self.closed.study.folds:
             placed = state.twin.at(state.per_fold[fold]).placed()
-            own = np.flatnonzero(fold_of != fold)
+            own = np.flatnonzero(fold_of != fold).tolist()
             learned = learn_background(
                 [self.scans[i] for i in own],
                 [placed.height(self.closed.original[i], int(fold)) for i in own],
             )
-            for i in np.flatnonzero(fold_of == fold):
+            for i in np.flatnonzero(fold_of == fold).tolist():
                 found[i] = Prediction.beside(learned, maps[i]).map_um
         return found
 
@@ -346,7 +346,7 @@ def _nested(
     """All chosen anew without each fold, or print, and judged there; how often each effect was chosen."""
     ids = [scan.id for scan in scans]
     parts = (
-        [[ids[i] for i in np.flatnonzero(study.fold_of == fold)] for fold in study.folds]
+        [[ids[i] for i in np.flatnonzero(study.fold_of == fold).tolist()] for fold in study.folds]
         if held_out == "folds"
         else leave_one_print_out(ids, [scan.print_id for scan in scans])
     )
