@@ -27,7 +27,9 @@ def test_a_mistake_is_answered_in_one_line(did, mistake, files, page):
     *skipped, last = said.strip().splitlines()
     assert code == (2 if mistake.startswith("litho-") else "InputError"), said
     # What has begun says so, and a build names the scans that it skips as it goes.
-    assert [line for line in skipped if not line.startswith(("skipped ", "building ", "training ", "checking "))] == []
+    assert [
+        line for line in skipped if not line.startswith(("skipped ", "building ", "training ", "checking "))
+    ] == []
     # What was found and wanted, or what to do: never Python's own words.
     assert any(word in last for word in ("wanted", ";", ": no ")), last
     assert not any(word in last for word in ("Errno", "PosixPath", "Traceback", "codec")), last
