@@ -49,7 +49,7 @@ def export_ro_crate(store_path: str | Path, out: str | Path) -> Path:
         InputError: no store, a packed one, one without manifest, or a folder with something else in it.
     """
     store = open_store(store_path)
-    if not store.manifest:
+    if "card" not in store.manifest:
         raise InputError(f"{store_path} carries no manifest", wanted="a store made by litho-data build")
     with whole_folder(out, "*.zarr.zip", "quality.csv", _CRATE_FILE) as folder:
         packed = export_zip(store_path, folder / f"{store.name}.zarr.zip")

@@ -70,7 +70,7 @@ def verify(store_path: str | Path, data_dir: str | Path | None = None) -> Verifi
         store = Store(open_root(path), path)
         history = read_steps(store)
         manifest = store.manifest
-        if not manifest:
+        if "card" not in manifest:
             raise InputError(f"manifest of {path}", got="none", wanted="that of its build")
         folder = raw_folder(store, data_dir)
     except InputError as error:

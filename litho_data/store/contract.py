@@ -243,17 +243,19 @@ def require_possible(samples: Mapping[str, np.ndarray], levels: int, what: str) 
 
 
 def require_manifest(manifest: Mapping[str, Any], path: Path) -> None:
-    """Refuse a manifest without what its readers take from it.
+    """Refuse a manifest without what its readers take from it; one that is a table alone is of no build.
 
     Raises:
         InputError: with the first thing that is missing or of another kind.
     """
     with damaged(f"manifest of {path}"):
-        card, build = dict(manifest["card"]), dict(manifest["build"])
-        dict(build["software"]["versions"])
-        texts = [card["name"], build["data_dir"], build["started"]]
+        texts: list[Any] = []
+        if built := set(manifest) > {"files"}:
+            card, build = dict(manifest["card"]), dict(manifest["build"])
+            dict(build["software"]["versions"])
+            texts = [card["name"], build["data_dir"], build["started"]]
         for row in manifest["files"]:
-            texts += [row[name] for name in ("path", "scan", "status", "sha256", "read")]
+            texts += [row[name] for name in ("path", "scan", "sha256", "read", *["status"] * built)]
             pitch = dict(json.loads(row["read"] or "{}")).get("pitch_um")
             if pitch is not None:
                 PITCH_UM.require("pitch_um", [pitch[0], pitch[1]])

@@ -111,4 +111,7 @@ def _hashed(value: Any) -> Any:
         return {one.name: _hashed(getattr(value, one.name)) for one in fields(value)}
     if isinstance(value, Mapping):
         return {name: _hashed(inner) for name, inner in value.items()}
-    return value
+    if isinstance(value, np.generic):
+        value = value.item()
+    # JSON has no NaN.
+    return repr(value) if isinstance(value, float) else value
