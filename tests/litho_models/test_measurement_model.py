@@ -139,7 +139,7 @@ def test_a_displacement_in_one_field_is_found(axis: str) -> None:
 
     scans = measured(seen)
     learned = learn_measurement(scans, PRINTS)
-    # Half of it may be taken for what all scans have, and the rest for the difference: the sum is what counts.
+    # Half of it may be taken for what all scans have, the rest for the difference: the sum is what counts.
     parts = [part for part in learned.parts if part.what == f"shift-{axis}"]
     assert "field" in {part.by for part in parts}
     kept = min(COUNT / 2 / (COUNT / 2 + part.shrinking) for part in parts)
