@@ -51,7 +51,7 @@ def errors_table(result: CloseLoop) -> str:
     rows = []
     for model, measurement, held_out in keys:
         one = {
-            policy: result.error(model, policy, measurement, held_out)  # type: ignore[arg-type]
+            policy: result.error(model, policy, measurement, held_out)
             for policy in ("offset", "full")
         }
         first = one["offset"]
