@@ -50,10 +50,7 @@ def errors_table(result: CloseLoop) -> str:
     keys = dict.fromkeys((row.model, row.measurement, row.held_out) for row in result.errors)
     rows = []
     for model, measurement, held_out in keys:
-        one = {
-            policy: result.error(model, policy, measurement, held_out)
-            for policy in ("offset", "full")
-        }
+        one = {policy: result.error(model, policy, measurement, held_out) for policy in ("offset", "full")}
         first = one["offset"]
         assert first is not None
         assert one["full"] is not None

@@ -1,0 +1,28 @@
+"""The page on what the measured prints lack quotes the committed record, figure by figure."""
+
+from __future__ import annotations
+
+from benchmarks.measured_causes import FOLDER, PAGE, texts
+from benchmarks.record import published
+from litho_models.loop.result.record import CloseLoop as EarlierLoop
+from litho_models.twin.record import CloseLoop
+
+
+def test_the_page_quotes_the_committed_record():
+    for name, text in texts(CloseLoop.read(FOLDER)).items():
+        assert published(PAGE, name) == text
+
+
+def test_the_record_is_of_the_measured_prints_and_its_rows_are_made_alike():
+    result = CloseLoop.read(FOLDER)
+    assert result.dataset.sha256 == EarlierLoop.read(FOLDER.parent).dataset.sha256
+    scans = {frozenset(row.by_scan_nm) for row in result.errors if row.held_out != "locked"}
+    (development,) = scans
+    assert not development & set(result.split.lock_box)
+    # One with nothing free has no terms, one with its zero free has one: the same for every model.
+    assert {row.k for row in result.errors if row.policy == "none"} == {0.0}
+    assert {row.k for row in result.errors if row.policy == "offset"} == {1.0}
+
+
+def test_the_page_is_short():
+    assert len(PAGE.read_bytes()) <= 8192
