@@ -112,6 +112,7 @@ def write_raw(draw: Draw, planted: Sequence[Planted], jobs: Sequence[Job], folde
         levels=printer.levels,
         scan_size_um=scan.frame.size_um,
         table=False,
+        levelled=True,
     ).write(folder)
     return folder / "card.toml"
 
