@@ -78,7 +78,13 @@ def unfinished(path: str | Path, *, wait: bool = False) -> Iterator[Path]:
     work = _work(target)
     while True:
         with writable(target):
-            work.mkdir(parents=True, exist_ok=True)
+            try:
+                work.mkdir(parents=True, exist_ok=True)
+            except FileExistsError:
+                # Who held the lock before may have removed the folder between the two looks at it.
+                if work.exists() and not work.is_dir():
+                    raise
+                continue
             # Who held the lock before removes its file.
             with contextlib.suppress(FileNotFoundError):
                 lock = locked(work / "lock", target, wait)

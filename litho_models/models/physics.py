@@ -118,10 +118,10 @@ class Physics(Simulator):
         keys = {"given": (), "round": ("raw_spot_um",), "elliptical": ("raw_spot_y_um", "raw_spot_x_um")}
         return keys[self.config.spot]
 
-    def _spot_um(self, values: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
-        """Standard deviation of the spot along y and along x, µm."""
+    def _spot_um(self, values: Mapping[str, Tensor]) -> tuple[float | Tensor, float | Tensor]:
+        """Standard deviation of the spot along y and along x, µm; a given one is a plain number."""
         keys = self._spot_keys or ("",)
-        given = self.bias_um.new_tensor(self.config.sigma_optical_um)
+        given = self.config.sigma_optical_um
         widths = [values.get(key.removeprefix("raw_"), given) for key in keys]
         return widths[0], widths[-1]
 
@@ -144,7 +144,9 @@ class Physics(Simulator):
     def interior(self, layout_um: Tensor) -> Tensor:
         values = self.values
         optical, diffusion = self._radii_px(values)
-        along_y, along_x = (sigma / self.pitch_um for sigma in self._spot_um(values))
+        along_y, along_x = (
+            torch.as_tensor(sigma / self.pitch_um, device=layout_um.device) for sigma in self._spot_um(values)
+        )
         aerial = blur_interior(layout_um / self._reference_um, (along_y, along_x), optical)
         initial = self._project(aerial, values)
         dose = blur_interior(initial, values["sigma_diffusion_um"] / self.pitch_um, diffusion)
@@ -167,7 +169,9 @@ class Physics(Simulator):
 
     def _radii_px(self, values: Mapping[str, Tensor]) -> tuple[int, int]:
         config, diffusion = self.config, float(values["sigma_diffusion_um"].detach())
-        spot = max(float(sigma.detach()) for sigma in self._spot_um(values))
+        # In float32 a width is never quite itself: its last digits must not move the edge of the kernel.
+        widths = (torch.as_tensor(sigma).detach() for sigma in self._spot_um(values))
+        spot = max(round(float(width), 6) for width in widths)
         optical, diffused = (
             supported_radius_px(sigma / self.pitch_um, config.kernel_support, config.kernel_cap_px)
             for sigma in (spot, diffusion)

@@ -144,7 +144,7 @@ def test_another_set_of_objects_is_another_design(tmp_path, folder, settings, ma
         cut.setattr(LensTask, "arrays", stop)
         with pytest.raises(KeyboardInterrupt):
             design("cut", [folder])
-    with pytest.raises(InputError, match="checkpoint"):
+    with pytest.raises(InputError, match="other settings"):
         design("cut", one_less)
     # The same name with other pixels is another object too.
     cv2.imwrite(str(folder / "a.png"), np.eye(24, dtype=np.uint8))

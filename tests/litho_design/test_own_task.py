@@ -114,7 +114,7 @@ def test_search_improves_an_own_loss_and_resumes_only_the_same_task(tmp_path):
     assert judged.figures == pytest.approx(made.predicted, rel=1e-5)
     assert design(Corner, "none", tmp_path, settings=settings, announce=False) == made
     other = {"inputs": {"another": np.zeros(3)}}
-    with pytest.raises(InputError, match="another target"):
+    with pytest.raises(InputError, match="other settings"):
         design(Corner, "none", tmp_path, settings=settings, announce=False, **other)
 
 

@@ -118,7 +118,7 @@ def options_of(command):
     return {option for param in get_command(app).commands[command].params for option in param.opts}
 
 
-@pytest.mark.parametrize("page", ["docs/optics.md", "README.md"])
+@pytest.mark.parametrize("page", ["docs/optics.md", "docs/README.md"])
 def test_the_options_that_pages_name_are_there(page):
     text = (ROOT / page).read_text("utf-8")
     lines = [line for line in text.splitlines() if line.startswith("litho-design ")]

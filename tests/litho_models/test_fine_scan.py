@@ -111,5 +111,5 @@ def test_the_pixels_of_a_scan_go_from_the_table_to_the_loop(tmp_path: Path) -> N
 def test_pixels_without_a_size_are_refused(tmp_path: Path) -> None:
     table = tmp_path / "scans.csv"
     table.write_text("id,pixel_size\na,0\n", encoding="utf-8")
-    with pytest.raises(InputError, match=r"pixel_size, got '0', wanted above 0"):
+    with pytest.raises(InputError, match=r"pixel_size, got '0', wanted a number from 0\.001 to 1000"):
         read_table(table)

@@ -103,8 +103,8 @@ def test_what_the_form_of_a_named_effect_leaves_over_is_no_further_effect(left_o
 def test_sizes_of_one_direction_are_alternatives_and_directions_are_fitted_together() -> None:
     blocks = blocks_of([get_effect("elliptical-psf"), get_effect("slope-thinning")])
     sizes = [len(block.trials) for block in blocks]
-    # Three sizes of (stretch, shear); one block of slopes along x, along y, and along both.
-    assert sizes == [2, 2, 2, 3]
+    # Three sizes of (stretch, shear); for each power of the slope one block along x, along y, and along both.
+    assert sizes == [2, 2, 2, 3, 3]
     columns = [column for block in blocks for column in block.columns]
     assert columns == list(range(len(columns)))
 

@@ -255,7 +255,8 @@ def test_a_difference_that_rests_on_numbers_known_badly_is_no_sure_one(limits: L
     def powers(sd_um: float) -> list[float]:
         question = slope_question()
         covariance = np.zeros((len(question.rivals[0].vector),) * 2)
-        covariance[-1, -1] = sd_um**2
+        # The loss along y; the power of the slope comes last.
+        covariance[-2, -2] = sd_um**2
         rivals = [
             rival(name, nearly_equal, frame).model_copy(update={"covariance": covariance.tolist()})
             for name, frame in (("slope-thinning", []), ("slope-thinning" + IN_SCAN, ["slope-thinning"]))
