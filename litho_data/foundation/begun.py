@@ -44,7 +44,9 @@ class Begun:
 
 
 @contextmanager
-def growing_folder(out: str | Path, record: str, facts: Mapping[str, Any] | None = None) -> Iterator[Begun]:
+def growing_folder(
+    out: str | Path, record: str, facts: Mapping[str, Any] | None = None, *, holds: str = ""
+) -> Iterator[Begun]:
     """A folder whose files appear as they are finished, so that a stopped run goes on from them.
 
     What else lies in a folder of its own is left alone. One process at a time writes it.
@@ -53,13 +55,14 @@ def growing_folder(out: str | Path, record: str, facts: Mapping[str, Any] | None
         out: the folder; made if need be.
         record: the file that a finished result holds, such as ``run.json``. The block writes it last.
         facts: fields of the record that decide the result; a folder with others is refused.
+        holds: what may lie there before it is begun, such as designs made one by one.
 
     Raises:
         InputError: a file, a folder with something else in it, one of other facts, one that another process
             is writing, or one that cannot be written: all before the block begins.
     """
     folder, mark = Path(out), Path(out) / BEGUN
-    begun = _require_own(folder, record, facts or {})
+    begun = _require_own(folder, record, facts or {}, holds)
     finished = (folder / record).exists() and not mark.exists()
     made = not folder.exists()
     with writable(folder):
@@ -104,13 +107,13 @@ def whole_folder(
         yield folder
 
 
-def _require_own(folder: Path, record: str, facts: Mapping[str, Any]) -> bool:
+def _require_own(folder: Path, record: str, facts: Mapping[str, Any], holds: str) -> bool:
     """Whether the same result is begun there already."""
     begun = read_record(folder / BEGUN)
     own = isinstance(begun, dict) and begun.get("record") == record
     # A process that was stopped before it had said what it begins has begun nothing.
     nothing = begun is None and [one.name for one in folder.glob("*")] == [BEGUN]
-    require_own_folder(folder, record, *[BEGUN] * (own or nothing))
+    require_own_folder(folder, record, *[BEGUN] * (own or nothing), *[holds] * bool(holds))
     _require_same(folder, begun if own else read_record(folder / record), facts)
     return own
 

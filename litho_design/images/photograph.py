@@ -23,7 +23,7 @@ _SMALLEST_CORRELATION = 0.45
 # Of pixels at the end of their range: more of them change the likeness of an image.
 _LARGEST_SATURATED = 0.01
 # Prints close to the expected one look as if the exponent of counts over light were 0.9 to 1.1.
-_LARGEST_GAMMA_OFF, _OPEN_GAMMA_OFF = 0.12, 0.1
+_LARGEST_GAMMA_OFF, _OPEN_GAMMA_OFF = 0.2, 0.1
 _SMALLEST_COVERAGE = 0.9
 # Loss of light in the corners that an objective may have.
 _VIGNETTING_SD = 0.1

@@ -36,7 +36,7 @@ from litho_design.printers.printer import Printer
 from litho_design.printers.source import Device, load_printers
 from litho_design.reports.design import write_design_report
 from litho_design.reports.gap import write_gap_report
-from litho_design.tasks.design import Design
+from litho_design.tasks.design import DESIGNS, Design
 from litho_design.tasks.run import run_design
 from litho_design.tasks.task import Task, registered_task
 
@@ -119,7 +119,7 @@ def compare(
         search = settings.search.model_copy(update={"seed": seed})
         own = settings.model_copy(update={"search": search})
         jobs.append((make, own, printer, design_folder(folder, arm, seed), announce))
-    with growing_folder(folder, GapResult.FILE_NAME):
+    with growing_folder(folder, GapResult.FILE_NAME, holds=DESIGNS):
         done = run_jobs(_design, jobs, Workers(workers, dask, known), name=lambda job: str(job[3]))
         designs = [design for _, design in progress(done, "designs", len(jobs))]
         entries = [

@@ -158,7 +158,7 @@ def test_an_object_of_the_design_is_known_by_name(tmp_path, lens):
     assert list(verdict.pictures) == ["object text", "photograph", "deconvolved, design PSF"]
     assert score.mae_design < score.mae_direct
     # It is this object that was photographed: another one does not match, or is further off.
-    with pytest.raises(InputError, match="correlation|proportional to the light"):
+    with pytest.raises(InputError, match=r"correlation|proportional to the light"):
         score_lens_photo(loaded, replace(photo, imaged="spots"))
 
 

@@ -124,7 +124,7 @@ def test_a_photograph_is_cleaned_registered_and_scored(tmp_path, printed_design)
     cv2.imwrite(str(tmp_path / "photo.png"), counts.astype(np.uint16))
     source = PhotoSource(tmp_path / "photo.png", 0.2)
     score = score_design(printed_design, tmp_path / "score", judges=[], camera=source).scores[0]
-    assert abs(score.judge.dark_level - 300) < 2 * score.judge.dark_level_sd < 150
+    assert abs(score.judge.dark_level - 300) < 2 * score.judge.dark_level_sd < 200
     assert score.judge.replaced_pixels == 3
     assert score.judge.correlation > 0.97
     # photograph = matrix^-1 window / 2: the linear part found must undo what was done.
@@ -191,7 +191,7 @@ def test_a_photograph_is_within_a_third_of_a_decibel_of_its_light_or_refused(tmp
     for camera, why in (
         ({"noise": 0.25}, "above the noise"),
         ({"gamma": 1 / 2.2}, "proportional"),
-        ({"exposure": 4.0}, "shorter exposure"),
+        ({"exposure": 4.0}, "end of their range"),
     ):
         with pytest.raises(InputError, match=why):
             scored(**camera)

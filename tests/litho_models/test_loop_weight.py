@@ -70,7 +70,7 @@ def test_a_small_effect_beside_a_large_cause_of_another_form_is_only_a_part(also
 
 @pytest.mark.parametrize(("power", "holds"), [(2, True), (3, True), (5, False)])
 def test_a_name_holds_where_its_law_leaves_nothing_to_be_learned(power: int, holds: bool) -> None:
-    """The catalogue has a loss with a power of the slope up to the third; a fifth is described nearly as well."""
+    """The catalogue has a loss with a power of the slope up to 3; the fifth it describes nearly as well."""
     scans = [
         replace(f.stored, height_um=thinned_um(f, power))
         for f in prepare_scans(printed_scans(count=10, size_px=64, noise_um=0.003, seed=4))
