@@ -91,7 +91,7 @@ def headline_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
         free = with_interval(score["mae_datum_free_nm"], score["mae_datum_free_ci95_nm"])
         rows.append((name, f"{parameters[name]:,}", free, f"{full:.2f} nm"))
     no_model = floor_row(noise["noise_floor"], None, "offset", "full")
-    rows.append(("noise that no model can predict, at most", *no_model[1:]))
+    rows.append(("what the layout cannot tell, at most", *no_model[1:]))
     rows.append(("PBL in the paper: other split, levelling and zero", "–", "24.35 nm, not comparable", "–"))
     split = benchmark["split"]
     return markdown_table(
@@ -100,10 +100,10 @@ def headline_table(benchmark: dict[str, Any], noise: dict[str, Any]) -> str:
         f"Mean absolute error over all valid pixels of {len(split['scored_ids'])} scans in {split['folds']} "
         "folds: each scan is predicted by models that were not trained on it, with the smooth background "
         "that their training scans share. k counts the terms fitted to each scan, on other pixels than those "
-        "scored. Intervals: 95 %, bootstrap over scans, for the noise over the 6 prints. Scans of a print "
-        "are not independent: with 6 prints no sign-flip test goes below p = 0.031. The noise is an upper "
-        "estimate, from what the best model leaves: a better model could win at least what an error has "
-        "above it.",
+        "scored. Intervals: 95 %, bootstrap over scans, in the last row but one over the 6 prints. Scans of "
+        "a print are not independent: with 6 prints no sign-flip test goes below p = 0.031. The last row but "
+        "one is an upper estimate for models of the layout alone; it counts what place, field and print "
+        "share as noise.",
     )
 
 
