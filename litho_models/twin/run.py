@@ -137,7 +137,8 @@ class _Loop:
         self.closed = close(
             self.scans, self.settings.fold_of, self.base, self.settings, describe=self.describe
         )
-        self._fitted: dict[int, list[tuple[Twin, MeasurementModel]]] = {}
+        # With its state, which must outlive its entry: the number of one that is gone may come again.
+        self._fitted: dict[int, tuple[State, list[tuple[Twin, MeasurementModel]]]] = {}
 
     @property
     def stages(self) -> dict[Stage, State]:
@@ -182,8 +183,8 @@ class _Loop:
             ]
             done = run_jobs(_fit_fold, jobs, self.settings.workers, name=lambda job: f"fold {job[0]}")
             by_fold = {job[0]: fitted for job, fitted in done}
-            self._fitted[id(state)] = [by_fold[job[0]] for job in jobs]
-        return self._fitted[id(state)]
+            self._fitted[id(state)] = state, [by_fold[job[0]] for job in jobs]
+        return self._fitted[id(state)][1]
 
     def measured(self, state: State) -> list[np.ndarray]:
         """The maps that the scans should show, print and measurement learned without their fold."""
