@@ -17,7 +17,7 @@ from litho_data.virtual_fab import Job, Noise, scan_job
 from litho_models.models.physics import Physics
 from litho_models.scan_terms.groups import label_of
 from litho_models.twin.record import CloseLoop
-from litho_models.twin.results import error_rows
+from litho_models.twin.errors import error_rows
 
 # A form that is right under the name of a family only with this exponent.
 _EXPONENT = {"cubic-slope-loss": 3.0}

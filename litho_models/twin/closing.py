@@ -17,13 +17,13 @@ from litho_data.store import PrintedScan
 from litho_models.effects import Effect, screened_effects
 from litho_models.effects.laws import DESCRIPTIONS, LAWS
 from litho_models.fitting.least_squares import fit_least_squares
-from litho_models.loop.explainable import Learner, Rest
-from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.scan_terms.measurement import MeasurementModel, learn_measurement
 from litho_models.twin.adequacy import reshaped_gain
 from litho_models.twin.fits import RULES, State, Study, TwinProblem, fit_state, prepared_among
 from litho_models.twin.judging import judge
+from litho_models.twin.learner import Learner, Rest
 from litho_models.twin.model import Twin
+from litho_models.twin.prepared import PreparedScan, prepare_scans
 from litho_models.twin.search import Cause, Found, search, untestable
 
 # Of a cause's gain: what its change in other shapes may take beside it. On trials of the virtual fab the
@@ -168,7 +168,7 @@ def _named(start: State, study: Study, candidates: Sequence[Effect]) -> tuple[Fo
     """The causes, each with the check of its formula; those that fail are taken out, one after the other."""
     found = search(start, study, candidates)
     failed: list[Checked] = []
-    learner = Learner(study, held_out_maps(start, study, study.scans)) if found.causes else None  # type: ignore[arg-type]
+    learner = Learner(study, held_out_maps(start, study, study.scans)) if found.causes else None
     while True:
         left = learner.rest(held_out_maps(found.state, study, study.scans)).mean_nm2 if learner else 0.0
         without = {
@@ -237,16 +237,17 @@ def freed_scans(scans: Sequence[PrintedScan], state: State, study: Study) -> lis
 
 
 def fit_with_measurement(
-    twin: Twin, scans: Sequence[PreparedScan], seed: int = 0
+    twin: Twin, scans: Sequence[PreparedScan], seed: int = 0, fold: int | None = None
 ) -> tuple[Twin, MeasurementModel]:
     """Printer and measurement fitted to the same scans, one after the other and once more.
 
     Args:
         twin: where the fit of the printer begins; ``scans``: as they are, freed of nothing.
+        fold: that a base which was trained without each fold must not have seen.
     """
     stored = [scan.stored for scan in scans]
     placed = twin.placed()
-    maps = [placed.height(scan) for scan in scans]
+    maps = [placed.height(scan, fold) for scan in scans]
     learned = learn_measurement(stored, maps, seed=seed)
     freed = [
         replace(
@@ -257,9 +258,9 @@ def fit_with_measurement(
     ]
     if len(twin.vector):
         windows = [scan.window for scan in prepared_among(freed, scans)]
-        twin = twin.at(fit_least_squares(TwinProblem(twin, windows), twin.vector, RULES).vector)
+        twin = twin.at(fit_least_squares(TwinProblem(twin, windows, fold), twin.vector, RULES).vector)
         placed = twin.placed()
-        learned = learn_measurement(stored, [placed.height(scan) for scan in scans], seed=seed)
+        learned = learn_measurement(stored, [placed.height(scan, fold) for scan in scans], seed=seed)
     return twin, learned
 
 
@@ -271,6 +272,6 @@ def _rests(stages: dict[str, State], study: Study) -> dict[str, Rest]:
             continue
         seen.append(state)
         maps = held_out_maps(state, study, study.scans)
-        learner = learner or Learner(study, maps)  # type: ignore[arg-type]
+        learner = learner or Learner(study, maps)
         rests[name] = learner.rest(maps)
     return rests

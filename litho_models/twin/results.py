@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from litho_data.foundation.run_facts import run_info
-from litho_data.foundation.units import NM_PER_UM
-from litho_data.store import PrintedScan
 from litho_data.store.schema import DatasetId
 from litho_models.effects import CATALOGUE, UNTESTABLE, get_effect
 from litho_models.fitting.least_squares import eliminated
-from litho_models.scan_terms import POLICIES, Blocks, Policy, cross_fit
 from litho_models.scan_terms.groups import ALL
 from litho_models.scoring.pairs import over_prints, over_scans
-from litho_models.scoring.statistics import interval
 from litho_models.simulator import Simulator
 from litho_models.splits.folds import Split
 from litho_models.twin.closing import Closed
@@ -31,53 +27,17 @@ from litho_models.twin.record import (
     ErrorRow,
     Explained,
     FoundEffect,
-    MeasuredBy,
-    Stage,
+    Planted,
+    ScanFinding,
     Strength,
     Verdict,
 )
 from litho_models.twin.screening import SMALLEST_RETAINED
 from litho_models.twin.search import Cause, separating
 
-REPORTED: tuple[Policy, ...] = ("none", "offset", "full")
 _BASE_ABSORBS = 1e-2
-
-
-def error_rows(
-    scans: Sequence[PrintedScan],
-    maps_um: Sequence[np.ndarray],
-    *,
-    model: Stage,
-    measurement: MeasuredBy,
-    held_out: Any,
-    numbers: tuple[int, int],
-    seed: int = 0,
-) -> list[ErrorRow]:
-    """Errors of maps (y, x) µm under each reported policy."""
-    rows = []
-    for policy in REPORTED:
-        fits = [
-            cross_fit(scan.height_um, own, scan.usable, POLICIES[policy], Blocks(seed=seed))
-            for scan, own in zip(scans, maps_um, strict=True)
-        ]
-        mae = [NM_PER_UM * float(np.nanmean(np.abs(fit.residual_um))) for fit in fits]
-        mse = [NM_PER_UM**2 * float(np.nanmean(fit.residual_um**2)) for fit in fits]
-        rows.append(
-            ErrorRow(
-                model=model,
-                measurement=measurement,
-                policy=policy,
-                k=float(np.mean([fit.degrees_of_freedom for fit in fits])),
-                held_out=held_out,
-                printer_numbers=numbers[0],
-                measurement_numbers=numbers[1],
-                mae_nm=float(np.mean(mae)),
-                mae_ci95_nm=interval(mae),
-                rmse_nm=float(np.sqrt(np.mean(mse))),
-                by_scan_nm={scan.id: own for scan, own in zip(scans, mae, strict=True)},
-            )
-        )
-    return rows
+# Numbers whose estimates move together this much are known together only.
+_CONFOUNDED = 0.95
 
 
 def record(
@@ -85,6 +45,8 @@ def record(
     errors: list[ErrorRow],
     measurement: Any,
     *,
+    single_scans: list[ScanFinding],
+    planted: list[Planted],
     dataset: DatasetId,
     base_name: str,
     settings: dict[str, Any],
@@ -130,7 +92,10 @@ def record(
         over_scans=over_scans(gains, study.seed),
         over_prints=over_prints(gains, prints, study.seed),
         effects=effects,
-        candidates=_candidates(closed, {one.name: one for one in effects}),
+        candidates=_candidates(closed, effects, {one.name for one in single_scans}),
+        single_scans=single_scans,
+        planted=planted,
+        confounded=_confounded(closed.final),
         measurement=measurement,
         explained=[
             Explained(
@@ -251,18 +216,34 @@ def clustered_covariance(state: State, units: Sequence[str]) -> np.ndarray:
     return inverse @ (scores.T @ scores) @ inverse * len(names) / max(len(names) - 1, 1)
 
 
-def _candidates(closed: Closed, added: Mapping[str, FoundEffect]) -> list[Candidate]:
-    sets = {other: one.name for one in added.values() for other in one.confusable_with}
+def _confounded(state: State) -> list[tuple[str, str, float]]:
+    """Pairs of fitted numbers that these scans determine together only, with their correlation."""
+    twin = state.twin
+    normal = np.sum([eliminated(part, RULES.term_weight)[0] for part in state.linear], axis=0)
+    free = np.flatnonzero(np.diag(normal) > 0)
+    covariance = np.linalg.pinv(normal[np.ix_(free, free)], rcond=1e-10, hermitian=True)
+    sd = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    correlation = covariance / np.outer(sd, sd)
+    own = [*_values(twin)] if len(_values(twin)) == twin.own else [f"base {i}" for i in range(twin.own)]
+    names = [*own, *(" ".join(filter(None, (s.effect, s.parameter, s.label))) for s in twin.slots)]
+    pairs = zip(*np.nonzero(np.triu(np.abs(correlation), 1) >= _CONFOUNDED), strict=True)
+    return [(names[free[i]], names[free[j]], float(correlation[i, j])) for i, j in pairs]
+
+
+def _candidates(closed: Closed, added: Sequence[FoundEffect], seen: Collection[str]) -> list[Candidate]:
+    """Why each other effect was not added; ``seen``: those of single scans, which are told apart."""
+    sets = {other: one.name for one in added for other in one.confusable_with}
+    done = {*seen, *(one.name for one in added)}
     untestable = {**UNTESTABLE, **closed.untestable}
     found = [
         Candidate(name=name, verdict="not-testable", reason=reason)
         for name, reason in untestable.items()
-        if name not in added
+        if name not in done
     ]
     found += [
         _candidate(closed, name, sets)
         for name, effect in CATALOGUE.items()
-        if name not in {*added, *untestable} and not effect.per_scan
+        if name not in {*done, *untestable} and not effect.per_scan
     ]
     return found
 

@@ -35,7 +35,7 @@ from litho_models.loop.decision_error import Z_DECIDED, surely_better
 from litho_models.loop.fold_fits import RULES, ChainProblem
 from litho_models.loop.open_questions import _frames, _screened
 from litho_models.loop.parameters import chain_at, get_vector
-from litho_models.loop.prepared import prepare_scans
+from litho_models.twin.prepared import prepare_scans
 from litho_models.loop.residual_spectrum import NoiseSpectrum, residual_spectrum
 from litho_models.loop.result.exporting import part_of
 from litho_models.loop.result.questions import IN_PRINT, IN_SCAN, OpenQuestions, Question, Rival
