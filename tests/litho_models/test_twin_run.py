@@ -20,9 +20,9 @@ from litho_models.frozen.files import load_frozen
 from litho_models.scan_terms.groups import ALL
 from litho_models.twin import bases, closing
 from litho_models.twin.closing import freed_scans
+from litho_models.twin.errors import REPORTED, error_rows
 from litho_models.twin.record import CloseLoop, Explained
 from litho_models.twin.report import effect_text, measurement_text, verdict_text
-from litho_models.twin.errors import REPORTED, error_rows
 from litho_models.twin.results import _verdict, clustered_covariance
 from litho_models.twin.run import close_loop, dealt
 from tests.litho_models.prints import make_scans, write_store
