@@ -40,7 +40,7 @@ def found_by(result: CloseLoop) -> list[Found]:
 
 
 def _beyond_noise(found: Sequence[Found]) -> list[Found]:
-    """Without what the fab's default noise has in every scan: datum, bow, offsets of lines, and their like."""
+    """Without what the fab's default noise has in every scan: datum, bow, offsets of lines, their like."""
     return [one for one in found if not (one.by == "scan" and one.names[0] in CATALOGUE)]
 
 
@@ -56,11 +56,8 @@ def judge(
     What the loop reports counts for one cause at most, for the larger one first.
     """
     found = found_by(result)
-    left = (
-        bool(_beyond_noise(found))
-        or result.verdict == "unexplained"
-        or any(one.matters for one in result.explained[-1:])
-    )
+    rest = result.verdict == "unexplained" or any(one.matters for one in result.explained[-1:])
+    left = rest or bool(_beyond_noise(found))
     if not draw.causes:
         return [Outcome(name="none", verdict="false-positive" if left else "clean")]
     verdicts: dict[str, Verdict] = {}
