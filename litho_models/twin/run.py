@@ -18,12 +18,12 @@ from litho_data.store import PrintedScan, Store, open_store
 from litho_models.splits.folds import GROUPED_FOLDS, Split, grouped_folds, leave_one_print_out
 from litho_models.twin.bases import AUTO, choose_base
 from litho_models.twin.closing import Closed, close, fit_with_measurement
-from litho_models.twin.errors import HeldOut, joined
+from litho_models.twin.errors import HeldOut, error_rows
 from litho_models.twin.fits import Study
 from litho_models.twin.marks import marks, rounding_step_um, with_marks
 from litho_models.twin.model import is_refitted
 from litho_models.twin.planting import parse_planted, plant
-from litho_models.twin.record import CloseLoop, ErrorRow
+from litho_models.twin.record import CloseLoop, ErrorRow, Stage
 from litho_models.twin.report import write_report
 from litho_models.twin.results import record
 from litho_models.twin.saving import LAWS_FILE, MODEL_FOLDER, save_laws, save_model
@@ -97,7 +97,11 @@ def close_loop(
             errors += rows
         locked = [scan for scan in usable if scan.id in opened.locked_ids]
         if open_lock_box and locked:
-            errors += held_out.errors_of(locked, "locked")
+            for stage, fit, maps in held_out.of_others(locked):
+                errors += error_rows(
+                    locked, maps, model=stage, measurement="shared", held_out="locked", numbers=fit.numbers,
+                    seed=seed,
+                )  # fmt: skip
     report("looking at what single scans add")
     maps = held_out.maps_um(closed.final)
     seen = marks(closed.original, maps, _rounding_um(opened, development))
@@ -159,16 +163,25 @@ def _nested(
         else leave_one_print_out(ids, [scan.print_id for scan in scans])
     )
     close_again = _again(base, study)
-    rows: list[ErrorRow] = []
+    maps: dict[Stage, dict[str, np.ndarray]] = {"base": {}, "all": {}}
+    numbers: dict[Stage, tuple[int, int]] = {}
     often: dict[str, int] = {}
     for number, out in enumerate(parts, 1):
         study.report(f"choosing without {', '.join(out)} ({number} of {len(parts)})")
         closed = close_again([scan for scan in scans if scan.id not in out])
         for name in closed.final.twin.names:
             often[name] = often.get(name, 0) + 1
-        held_out = HeldOut(closed, study)
-        rows += held_out.errors_of([scan for scan in scans if scan.id in out], f"nested {nested}")
-    return joined(rows), often
+        judged = [scan for scan in scans if scan.id in out]
+        for stage, fit, own in HeldOut(closed, study).of_others(judged):
+            maps[stage].update({scan.id: one for scan, one in zip(judged, own, strict=True)})
+            numbers[stage] = max(fit.numbers, numbers.get(stage, fit.numbers))
+    rows = []
+    for stage, known in maps.items():
+        rows += error_rows(
+            scans, [known[one] for one in ids], model=stage, measurement="shared",
+            held_out=f"nested {nested}", numbers=numbers[stage], seed=study.seed,
+        )  # fmt: skip
+    return rows, often
 
 
 def _rounding_um(store: Store, scans: Sequence[PrintedScan]) -> dict[str, float] | None:
