@@ -231,8 +231,7 @@ def freed_scans(scans: Sequence[PrintedScan], state: State, study: Study) -> lis
         learned = learn_measurement([scans[i] for i in own], [maps[i] for i in own], seed=study.seed)
         differences = learned.between_groups()
         for i in np.flatnonzero(study.fold_of == fold).tolist():
-            extra = differences.expected_um(scans[i], maps[i]) - maps[i]
-            freed[i] = replace(scans[i], height_um=(scans[i].height_um - extra).astype(np.float32))
+            freed[i] = differences.freed(scans[i], maps[i])
     return freed
 
 
@@ -249,13 +248,7 @@ def fit_with_measurement(
     placed = twin.placed()
     maps = [placed.height(scan, fold) for scan in scans]
     learned = learn_measurement(stored, maps, seed=seed)
-    freed = [
-        replace(
-            scan,
-            height_um=(scan.height_um - learned.expected_um(scan, own) + own).astype(np.float32),
-        )
-        for scan, own in zip(stored, maps, strict=True)
-    ]
+    freed = [learned.freed(scan, own) for scan, own in zip(stored, maps, strict=True)]
     if len(twin.vector):
         windows = [scan.window for scan in prepared_among(freed, scans)]
         twin = twin.at(fit_least_squares(TwinProblem(twin, windows, fold), twin.vector, RULES).vector)
