@@ -65,7 +65,7 @@ def record(
     study, scans = closed.study, closed.study.scans
     effects = [
         _found(closed, one, left_out_nm, survives)
-        for one in (*closed.causes, *closed.lawful.causes, *closed.described.causes)
+        for one in (*closed.causes, *closed.lawful.causes, *closed.described)
     ]
     before, after = (
         next(
@@ -157,9 +157,7 @@ def _found(
         stage=effect.stage,
         verdict=verdict,
         by=cause.by,
-        strengths=_strengths(
-            closed.final if cause.name in closed.final.twin.by else closed.described.state, closed, cause.name
-        ),
+        strengths=_strengths(closed, cause),
         confusable_with=list(cause.alike),
         separating_experiment=separating([cause.name, *cause.alike]),
         gain_nm2=cause.judgement.gain_nm2,
@@ -174,11 +172,20 @@ def _found(
     )
 
 
-def _strengths(state: State, closed: Closed, name: str) -> dict[str, list[Strength]]:
-    """Numbers of an effect with intervals from what each print (or scan) asks for."""
+def _strengths(closed: Closed, cause: Cause) -> dict[str, list[Strength]]:
+    """Numbers of an effect with intervals from what each print (or scan) asks for; of a description alone."""
     from scipy.stats import t
 
-    twin, effect = state.twin, get_effect(name)
+    state, effect, name = closed.final, get_effect(cause.name), cause.name
+    if cause.values:
+        return {
+            parameter: [
+                Strength(label=label, value=values[parameter], unit=facts.unit, ci95=None)
+                for label, values in cause.values.items()
+            ]
+            for parameter, facts in effect.parameters.items()
+        }
+    twin = state.twin
     prints = [scan.stored.print_id for scan in closed.study.scans]
     units = prints if 2 < len(set(prints)) < len(prints) else [scan.id for scan in closed.study.scans]
     sd = np.sqrt(np.maximum(np.diag(clustered_covariance(state, units)), 0.0))
