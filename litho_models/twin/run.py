@@ -13,6 +13,7 @@ from torch import nn
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_folder
 from litho_data.foundation.outputs import require_replaceable_folder
+from litho_data.foundation.run_facts import run_info
 from litho_data.foundation.workers import Workers, kept_open
 from litho_data.store import PrintedScan, Store, open_store
 from litho_models.splits.folds import GROUPED_FOLDS, Split, grouped_folds, leave_one_print_out
@@ -72,13 +73,7 @@ def close_loop(
     for text in inject:
         parse_planted(text)
     opened = open_store(store)
-    scans = opened.scans()
-    usable = [scan for scan in scans if np.count_nonzero(scan.usable) >= _FEWEST_PIXELS]
-    kept = {scan.id for scan in usable}
-    development = [scan for scan in usable if scan.id not in opened.locked_ids]
-    if len(development) < 2:
-        got = f"{len(development)} usable and not locked"
-        raise InputError("scans to close the loop on", got=got, wanted="at least 2")
+    development, locked, dropped = _usable_scans(opened)
     with kept_open(Workers(workers, dask)) as places:
         study = Study((), dealt(development, folds, seed), seed, places, report)
         chosen = choose_base(base, development, study, steps=steps, cache=Path(cache or f"{out}-cache"))
@@ -95,7 +90,6 @@ def close_loop(
         if nested:
             rows, often = _nested(development, chosen.model, study, nested)
             errors += rows
-        locked = [scan for scan in usable if scan.id in opened.locked_ids]
         if open_lock_box and locked:
             for stage, fit, maps in held_out.of_others(locked):
                 errors += error_rows(
@@ -108,21 +102,19 @@ def close_loop(
     result = record(
         closed,
         errors,
-        fit_with_measurement(closed.final.twin, closed.original, seed)[1],
         single_scans=with_marks(SingleScans(study, closed.original, maps).findings(), seen),
-        planted=planted,
+        left_out_nm=left_out_nm,
+        survives_on=survives_on,
+        run=run_info([seed], len(development), dropped),
         dataset=opened.dataset_id,
-        base_name=chosen.name,
+        base_model=chosen.name,
+        measurement=fit_with_measurement(closed.final.twin, closed.original, seed)[1],
+        planted=planted,
         settings={
             "base": base, "folds": folds, "nested": nested, "inject": list(inject), "steps": steps,
             "open_lock_box": open_lock_box,
         },
         split=Split(kind="grouped", folds=len(closed.study.folds), lock_box=opened.locked_ids),
-        dropped=[
-            f"{one.id}: fewer than {_FEWEST_PIXELS} measured pixels" for one in scans if one.id not in kept
-        ],
-        left_out_nm=left_out_nm,
-        survives=survives_on,
         chosen=often,
     )  # fmt: skip
     with atomic_folder(out) as folder:
@@ -131,6 +123,24 @@ def close_loop(
         save_model(closed, result, opened, folder / MODEL_FOLDER)
         save_laws(result, folder)
     return result
+
+
+def _usable_scans(store: Store) -> tuple[list[PrintedScan], list[PrintedScan], list[str]]:
+    """Scans to develop on, locked ones, and those left out with the reason.
+
+    Raises:
+        InputError: fewer than two to develop on.
+    """
+    scans = store.scans()
+    usable = [scan for scan in scans if np.count_nonzero(scan.usable) >= _FEWEST_PIXELS]
+    kept = {scan.id for scan in usable}
+    dropped = [one.id for one in scans if one.id not in kept]
+    locked = [scan for scan in usable if scan.id in store.locked_ids]
+    development = [scan for scan in usable if scan.id not in store.locked_ids]
+    if len(development) < 2:
+        got = f"{len(development)} usable and not locked"
+        raise InputError("scans to close the loop on", got=got, wanted="at least 2")
+    return development, locked, [f"{one}: fewer than {_FEWEST_PIXELS} measured pixels" for one in dropped]
 
 
 def dealt(scans: Sequence[PrintedScan], folds: int, seed: int) -> np.ndarray:

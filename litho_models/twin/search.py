@@ -115,10 +115,9 @@ def _add_one(found: Found, study: Study, candidates: Sequence[Effect]) -> bool:
             alike = _alike(one, fitted, found.state, screening, study)
             found.causes.append(Cause(one.name, one.by, alike, judgement, screening.family_p(one), group_p))
             found.state = fitted[one.name]
-            study.report(
-                f"adding {one.name}{'' if one.by == ALL else ' by ' + one.by}: {judgement.gain_nm2:.0f} nm² of "
-                f"{judgement.before_nm2:.0f} nm² on held-out scans"
-            )
+            found.refused.pop(one.name, None)
+            gained = f"{judgement.gain_nm2:.0f} nm² of {judgement.before_nm2:.0f} nm² on held-out scans"
+            study.report(f"adding {one.name}{'' if one.by == ALL else ' by ' + one.by}: {gained}")
             return True
     return False
 
