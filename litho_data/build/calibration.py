@@ -14,6 +14,7 @@ import numpy as np
 from litho_data.cards.card import Grating
 from litho_data.cards.listing import Listing, leads_out, list_fields
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
 from litho_data.readers import read_scan
 from litho_data.roughness import Scale, axis_scales, find_step, find_wave
 
@@ -98,7 +99,7 @@ def standards_of(listing: Listing) -> Standards:
     return Standards(tuple(standards), files)
 
 
-def measure_scales(standards: Sequence[Mapping[str, Any]], files: Sequence[Path]) -> np.ndarray:
+def measure_scales(standards: Sequence[Mapping[str, Any]], files: Sequence[Path]) -> Array:
     """Factors and standard uncertainties, (3, 2) in the order of ``SCALES``; 1 and 0 of what has no standard.
 
     Raises:
@@ -110,7 +111,7 @@ def measure_scales(standards: Sequence[Mapping[str, Any]], files: Sequence[Path]
 
 
 @lru_cache(maxsize=4)
-def _measured(standards: str, files: tuple[Path, ...], times: tuple[int, ...]) -> np.ndarray:
+def _measured(standards: str, files: tuple[Path, ...], times: tuple[int, ...]) -> Array:
     found = np.array([[1.0, 0.0]] * len(SCALES))
     waves, axes = [], []
     z = None

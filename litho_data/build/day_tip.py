@@ -6,8 +6,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from litho_data.build.jobs import FieldJob, scaled_pitch_um
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.workers import Workers, run_jobs
@@ -46,5 +44,5 @@ def tip_of(job: FieldJob) -> PeakRadius | None:
         return None
     scales = {} if calibrated is None else calibrated.facts
     pitch_y_um, pitch_x_um = scaled_pitch_um(read.facts["pitch_um"], scales)
-    height_um = read.arrays["raw_height_um"].astype(np.float64) * scales.get("scale_z", 1.0)
+    height_um = read.arrays["raw_height_um"].astype(float) * scales.get("scale_z", 1.0)
     return peak_radius(height_um, (pitch_y_um, pitch_x_um))

@@ -10,8 +10,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import numpy as np
-
 from litho_data.build.calibration import NO_STANDARDS, Standards, standards_of
 from litho_data.build.operations import OPERATIONS
 from litho_data.build.quality import levelling_figures, noise_figures
@@ -20,6 +18,7 @@ from litho_data.cards.card import Card
 from litho_data.cards.listing import Listing, PrintedField
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256, record_sha256
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.run_facts import software_record
 from litho_data.store.partial import PartialStore, Piece
 
@@ -100,7 +99,7 @@ class FieldJob:
         code = {name: [operation.version, operation.code_sha256] for name, operation in OPERATIONS.items()}
         return record_sha256([*plan, files, code])
 
-    def layout(self) -> np.ndarray | None:
+    def layout(self) -> Array | None:
         """Levels of its layout; None if there is none that can be read."""
         try:
             done = self._read_layout()
@@ -157,13 +156,13 @@ class FieldJob:
 
     def _steps(self) -> Iterator[Done]:
         """The operations in order; each sees the arrays of those before it."""
-        layout: dict[str, np.ndarray] = {}
+        layout: dict[str, Array] = {}
         if (done := self._read_layout()) is not None:
             layout = done.arrays
             yield done
         read = self.read()
         yield read
-        calibration: dict[str, np.ndarray] = {}
+        calibration: dict[str, Array] = {}
         pitch_um = read.facts["pitch_um"]
         if (done := self.calibrate()) is not None:
             yield done

@@ -14,6 +14,7 @@ import numpy as np
 
 from litho_data.build.step import Facts, Files, Function, Inputs, Made, Operation, Params
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
 
 if TYPE_CHECKING:
     from litho_data.register import Registration
@@ -95,7 +96,7 @@ def _calibrate(params: Params, files: Files, _: Inputs) -> Made:
     return {"calibration": found}, facts
 
 
-def _z_scale(arrays: Mapping[str, np.ndarray]) -> tuple[float, float]:
+def _z_scale(arrays: Mapping[str, Array]) -> tuple[float, float]:
     """Factor of the heights and its relative uncertainty; 1 and 0 without a calibration."""
     if "calibration" not in arrays:
         return 1.0, 0.0
@@ -111,7 +112,7 @@ def _locate(params: Params, _: Files, arrays: Inputs) -> Made:
     raw, layout = arrays["raw_height_um"], arrays["mask_level"]
     found = _registration(raw, layout, params)
     _require_found(found, params, " before levelling")
-    shape, pitch_um = (raw.shape[0], raw.shape[1]), tuple(params["scan_pitch_um"])
+    shape, pitch_um = raw.shape, tuple(params["scan_pitch_um"])
     level = layout_in_scan_frame(
         layout, found.scan_to_layout, shape, pitch_um, params["layout_pitch_um"], found.bend_um
     )
@@ -123,7 +124,7 @@ def _level(params: Params, _: Files, arrays: Inputs) -> Made:
     from litho_data.level import Recipe
 
     levelled, notes = Recipe.from_dict(params["recipe"]).apply_noting(
-        arrays["raw_height_um"].astype(np.float64) * _z_scale(arrays)[0],
+        arrays["raw_height_um"].astype(float) * _z_scale(arrays)[0],
         pitch_um=tuple(params["scan_pitch_um"]),
         mask=arrays.get("vendor_mask"),
         layout_level=arrays.get("layout_in_scan"),
@@ -155,11 +156,11 @@ def _require_found(found: Registration, params: Params, when: str = "") -> None:
         raise InputError(f"{UNREGISTERED}{when}: {found.quality.reason}", hint=pixels if oblong else "")
 
 
-def _registration(height_um: np.ndarray, layout_level: np.ndarray, params: Mapping[str, Any]) -> Registration:
+def _registration(height_um: Array, layout_level: Array, params: Mapping[str, Any]) -> Registration:
     from litho_data.register import register_scan
 
     return register_scan(
-        height_um.astype(np.float64),
+        height_um.astype(float),
         layout_level,
         scan_pitch_um=tuple(params["scan_pitch_um"]),
         layout_pitch_um=params["layout_pitch_um"],
@@ -173,7 +174,7 @@ def _registration(height_um: np.ndarray, layout_level: np.ndarray, params: Mappi
 def _tip(params: Params, _: Files, arrays: Inputs) -> Made:
     from litho_data.tip import lateral_resolution_um, tip_certain
 
-    height, pitch_um = arrays["levelled_height_um"].astype(np.float64), tuple(params["scan_pitch_um"])
+    height, pitch_um = arrays["levelled_height_um"].astype(float), tuple(params["scan_pitch_um"])
     radius_um = params["radius_um"]
     certain = tip_certain(height, pitch_um, radius_um)
     facts = {
@@ -191,9 +192,9 @@ def _resample(params: Params, _: Files, arrays: Inputs) -> Made:
     levelled, pitch_um = arrays["levelled_height_um"], tuple(params["scan_pitch_um"])
     bend = Bend.of_scan(arrays["bend_um"], levelled.shape, pitch_um) if "bend_um" in arrays else None
 
-    def on_layout(scan_map: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def on_layout(scan_map: Array) -> tuple[Array, Array]:
         return resample_to_layout(
-            scan_map.astype(np.float64),
+            scan_map.astype(float),
             arrays["scan_to_layout"],
             tuple(params["layout_shape"]),
             scan_pitch_um=pitch_um,

@@ -11,6 +11,7 @@ import numpy as np
 from litho_data.build.gratings import GratingScan, grating_scans
 from litho_data.build.verdict import verdict_of
 from litho_data.foundation.files import atomic_file
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.report import Page
 from litho_data.foundation.report_pictures import colour_bar_png, coloured_png
 from litho_data.store.read import PrintedScan, Store, open_store
@@ -206,7 +207,7 @@ def _shown_ids(store: Store) -> list[str]:
     return [str(scan_id) for scan_id in worst]
 
 
-def _stages(store: Store, scan_id: str) -> list[np.ndarray]:
+def _stages(store: Store, scan_id: str) -> list[Array]:
     """Thumbnails of a scan, in the order of ``_STAGES``."""
     scan = store.scan(scan_id)
     raw = store.scan_frame(scan_id, "raw_height_um")
@@ -214,23 +215,23 @@ def _stages(store: Store, scan_id: str) -> list[np.ndarray]:
     return [_thumbnail(image) for image in images]
 
 
-def _residual_nm(scan: PrintedScan) -> np.ndarray:
+def _residual_nm(scan: PrintedScan) -> Array:
     from litho_data.register import predicted_topography
 
     layout = predicted_topography(scan.mask_level, _BLUR_PX)
-    x, z = layout[scan.valid].astype(np.float64), scan.height_um[scan.valid].astype(np.float64)
+    x, z = layout[scan.valid].astype(float), scan.height_um[scan.valid].astype(float)
     x_mean, z_mean = (float(values.mean()) if values.size else 0.0 for values in (x, z))
     variance = float(((x - x_mean) ** 2).sum())
     gain = float(((x - x_mean) * (z - z_mean)).sum()) / variance if variance > 0 else 0.0
     return (scan.height_um - (z_mean + gain * (layout - x_mean))) * 1e3
 
 
-def _range(images: Sequence[np.ndarray], symmetric: bool) -> tuple[float, float]:
+def _range(images: Sequence[Array], symmetric: bool) -> tuple[float, float]:
     values = np.concatenate([image.ravel() for image in images])
     low, high = (float(value) for value in np.nanpercentile(values, [0.5, 99.5]))
     return (-max(-low, high), max(-low, high)) if symmetric else (low, high)
 
 
-def _thumbnail(image: np.ndarray) -> np.ndarray:
+def _thumbnail(image: Array) -> Array:
     step = max(1, -(-max(image.shape) // _THUMBNAIL_PX))
     return image[::step, ::step]

@@ -9,19 +9,18 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import array_sha256, file_sha256, record_sha256, source_sha256
+from litho_data.foundation.kinds import Array
 from litho_data.store.schema import VARIABLES
 
 PACKAGE = Path(__file__).parents[1]
-Arrays = dict[str, np.ndarray]
+Arrays = dict[str, Array]
 Facts = dict[str, Any]
 # An operation: (parameters, raw files, input arrays by name) to arrays and facts.
 Params = Mapping[str, Any]
 Files = Sequence[Path]
-Inputs = Mapping[str, np.ndarray]
+Inputs = Mapping[str, Array]
 Made = tuple[Arrays, Facts]
 Function = Callable[[Params, Files, Inputs], Made]
 
@@ -89,9 +88,7 @@ class Operation:
         """Hash of the source that the result depends on."""
         return _code_sha256(self.code)
 
-    def run(
-        self, params: Mapping[str, Any], files: Mapping[str, Path], arrays: Mapping[str, np.ndarray]
-    ) -> Done:
+    def run(self, params: Mapping[str, Any], files: Mapping[str, Path], arrays: Mapping[str, Array]) -> Done:
         """Run the operation and record it.
 
         Args:
@@ -138,7 +135,7 @@ def _one_thread() -> Iterator[None]:
         cv2.setNumThreads(threads)
 
 
-def _described(name: str, array: np.ndarray) -> dict[str, Any]:
+def _described(name: str, array: Array) -> dict[str, Any]:
     variable = VARIABLES[name]
     dims, unit = variable.sample_dims, variable.unit
     sha256 = array_sha256(array, unit, dims)

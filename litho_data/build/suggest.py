@@ -17,6 +17,7 @@ from litho_data.build.operations import OPERATIONS, load_recipe
 from litho_data.cards.listing import list_fields
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_file
+from litho_data.foundation.kinds import Array
 from litho_data.level.recipe import Recipe
 
 if TYPE_CHECKING:
@@ -98,7 +99,7 @@ def suggest_recipe(
     places += [place for place in range(len(jobs)) if place not in places]
     left: dict[str, dict[str, float]] = {name: {} for name in RECIPES}
     warned: dict[str, str] = {}
-    pictures: dict[str, list[np.ndarray]] = {}
+    pictures: dict[str, list[Array]] = {}
     refusal = ""
     for job in (jobs[place] for place in places):
         if len(pictures) == _SCANS:
@@ -134,7 +135,7 @@ def _best(left_nm: Mapping[str, float]) -> str:
     return next(name for name, left in left_nm.items() if left * _BETTER <= least)
 
 
-def _located(job: FieldJob) -> tuple[np.ndarray, np.ndarray, Sequence[float]]:
+def _located(job: FieldJob) -> tuple[Array, Array, Sequence[float]]:
     """Raw heights (ny, nx) µm, the layout in the scan's frame, NaN outside it, and the pitch (y, x)."""
     read, layout, calibrated = job.read(), job.layout(), job.calibrate()
     if layout is None:
@@ -143,12 +144,10 @@ def _located(job: FieldJob) -> tuple[np.ndarray, np.ndarray, Sequence[float]]:
     raw = read.arrays["raw_height_um"]
     params = job.register_params(pitch_um, read.facts["fast_axis"])
     found = OPERATIONS["locate"].run(params, {}, {"mask_level": layout, "raw_height_um": raw})
-    return raw.astype(np.float64), found.arrays["layout_in_scan"], pitch_um
+    return raw.astype(float), found.arrays["layout_in_scan"], pitch_um
 
 
-def _levelled(
-    recipe: str, raw_um: np.ndarray, layout: np.ndarray, pitch_um: Sequence[float]
-) -> tuple[np.ndarray, str]:
+def _levelled(recipe: str, raw_um: Array, layout: Array, pitch_um: Sequence[float]) -> tuple[Array, str]:
     """The heights, and what speaks against the recipe; one that cannot be applied leaves them as they are."""
     pitch = (float(pitch_um[0]), float(pitch_um[1]))
     try:
@@ -159,7 +158,7 @@ def _levelled(
     return levelled.height, "; ".join(notes)
 
 
-def left_by_layout(height_um: np.ndarray, layout: np.ndarray) -> float:
+def left_by_layout(height_um: Array, layout: Array) -> float:
     """Root mean square of what a free response to the layout leaves in blocks outside its fit, µm.
 
     Args:
@@ -193,7 +192,7 @@ def _write_card(card: Path, best: str) -> Path:
     return target
 
 
-def _write_page(found: Suggestion, pictures: Mapping[str, Sequence[np.ndarray]], folder: Path) -> None:
+def _write_page(found: Suggestion, pictures: Mapping[str, Sequence[Array]], folder: Path) -> None:
     import pandas as pd
 
     from litho_data.foundation.report import Page
@@ -213,7 +212,7 @@ def _write_page(found: Suggestion, pictures: Mapping[str, Sequence[np.ndarray]],
     page.write(folder)
 
 
-def _show(page: Page, pictures: Mapping[str, Sequence[np.ndarray]]) -> None:
+def _show(page: Page, pictures: Mapping[str, Sequence[Array]]) -> None:
     from litho_data.foundation.report_pictures import colour_bar_png, coloured_png
 
     rows, bar = [], colour_bar_png("cividis")

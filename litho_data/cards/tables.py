@@ -12,6 +12,7 @@ from typing import get_args
 
 from litho_data.cards.card import Use
 from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.kinds import YX
 from litho_data.foundation.quantities import ORDER
 from litho_data.foundation.units import is_length
 from litho_data.readers.registry import formats
@@ -92,7 +93,7 @@ def _check_row(row: Mapping[str, str], what: str, overfull: bool, needs_order: b
         raise InputError(f"{what}: pixel_size", got=repr(row["pixel_size"]), wanted="above 0: 0.5 is half")
 
 
-def size_of(text: str) -> tuple[float, float] | None:
+def size_of(text: str) -> YX | None:
     """(y, x) of a cell with one side or with both, apart by ``x``; None if it is none."""
     sides = [one.strip() for one in re.split("[x×]", text)]
     if len(sides) > 2 or not all(_is_finite(one) and float(one) > 0 for one in sides):

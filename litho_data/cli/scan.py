@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import YX
 from litho_data.readers.registry import formats
 from litho_data.readers.text_blocks import NUMBER, number
 
@@ -21,7 +22,7 @@ ScanPath = Annotated[Path, typer.Argument(help="a scan in any supported format")
 Format = Annotated[str, typer.Option(help=f"auto (by the content of the file), {', '.join(formats())}")]
 Unit = Annotated[str | None, typer.Option(help="unit of the heights if the file states none, e.g. m, nm")]
 Size = Annotated[
-    tuple[float, float] | None,
+    YX | None,
     typer.Option("--size-um", metavar="Y X", help="field size in µm (y, x) if the file states none"),
 ]
 ChannelName = Annotated[str | None, typer.Option(help="name of the height channel, if there are several")]

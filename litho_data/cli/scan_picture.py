@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from litho_data.foundation.files import atomic_file
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.report_pictures import new_figure
 from litho_data.scan import Scan
 
@@ -73,11 +74,11 @@ def terminal_preview(scan: Scan) -> Text:
     return text
 
 
-def _limits(height: np.ndarray) -> tuple[float, float]:
+def _limits(height: Array) -> tuple[float, float]:
     """Limits that do not depend on a few outliers."""
     low, high = np.nanpercentile(height, _PERCENTILES)
     return float(low), float(high)
 
 
-def _middles(n: int, count: int) -> np.ndarray:
+def _middles(n: int, count: int) -> Array:
     return ((np.arange(count) + 0.5) * n / count).astype(int)

@@ -26,6 +26,7 @@ from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.hashes import file_sha256, record_sha256
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.run_facts import software_record
 from litho_data.foundation.workers import Workers
 from litho_data.readers.pairs import GREY_MAX, quadrant_slices
@@ -225,11 +226,11 @@ def export_pairs(store_path: str | Path, out: str | Path) -> list[str]:
     return notes
 
 
-def _cut(image: np.ndarray, quadrant: int) -> np.ndarray:
+def _cut(image: Array, quadrant: int) -> Array:
     return image[quadrant_slices(quadrant, image.shape)]
 
 
-def _write_tiff(path: Path, image: np.ndarray) -> None:
+def _write_tiff(path: Path, image: Array) -> None:
     import tifffile
 
     photometric = "rgb" if image.ndim == 3 else "minisblack"

@@ -27,7 +27,7 @@ class Range:
         if isinstance(values, bool):
             return False
         try:
-            numbers = np.asarray(values, dtype=np.float64)
+            numbers = np.asarray(values, dtype=float)
         except (TypeError, ValueError, OverflowError):
             return False
         return bool(np.all((numbers >= self.low) & (numbers <= self.high)))

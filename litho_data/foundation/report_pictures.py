@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from litho_data.foundation.kinds import Array
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
@@ -183,7 +185,7 @@ def _entries(legend: Legend) -> dict[str, Any]:
     return {"handles": legend.legend_handles, "labels": labels, "title": title, "fontsize": 8}
 
 
-def coloured_png(image: np.ndarray, colours: str, low: float, high: float) -> str:
+def coloured_png(image: Array, colours: str, low: float, high: float) -> str:
     """Data address of an image in one of matplotlib's colour maps, transparent where it is NaN.
 
     Args:
@@ -209,7 +211,7 @@ def colour_bar_png(colours: str) -> str:
     return coloured_png(np.linspace(0, 1, _COLOURS)[None, :], colours, 0.0, 1.0)
 
 
-def shown_html(line: str, **images: np.ndarray) -> str:
+def shown_html(line: str, **images: Array) -> str:
     """What a notebook shows of an object with maps: the line of its ``repr``, and each map with its range.
 
     Args:

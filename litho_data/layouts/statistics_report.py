@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.report import Page
 from litho_data.foundation.report_pictures import new_figure
 from litho_data.layouts.statistics import LayoutStatistics
@@ -60,7 +61,7 @@ def statistics_page(statistics: LayoutStatistics, files: Sequence[Path]) -> Page
     return page
 
 
-def layouts_figure(levels: Mapping[str, np.ndarray], between: tuple[int, int]) -> Figure:
+def layouts_figure(levels: Mapping[str, Array], between: tuple[int, int]) -> Figure:
     """Layouts (ny, nx) side by side, by title, their levels on one scale."""
     figure = new_figure(11, 3)
     for place, (title, level) in enumerate(levels.items(), start=1):

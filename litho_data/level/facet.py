@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import YX, Array
 from litho_data.level.plane import subtract_tilt
 from litho_data.level.selection import Levelled, Masking, as_height, select
 
@@ -16,10 +17,10 @@ _FEWEST_CELLS = 4
 
 
 def level_facet(
-    height_um: np.ndarray,
+    height_um: Array,
     *,
-    pitch_um: tuple[float, float],
-    mask: np.ndarray | None = None,
+    pitch_um: YX,
+    mask: Array | None = None,
     masking: Masking = "exclude",
 ) -> Levelled:
     """Subtract the tilt of the prevailing facet; the height at the pivot (nx/2, ny/2) stays.
@@ -53,9 +54,7 @@ def level_facet(
     return subtract_tilt(z, (total_x * pitch_um[1], total_y * pitch_um[0]))
 
 
-def _cell_slopes(
-    z: np.ndarray, chosen: np.ndarray | None, pitch_um: tuple[float, float]
-) -> tuple[np.ndarray, np.ndarray]:
+def _cell_slopes(z: Array, chosen: Array | None, pitch_um: YX) -> tuple[Array, Array]:
     diagonal = z[1:, 1:] - z[:-1, :-1]
     other = z[:-1, 1:] - z[1:, :-1]
     slope_x = (diagonal + other) * (0.5 / pitch_um[1])
@@ -66,7 +65,7 @@ def _cell_slopes(
     return slope_x[whole], slope_y[whole]
 
 
-def facet_pass(slope_x: np.ndarray, slope_y: np.ndarray) -> tuple[float, float]:
+def facet_pass(slope_x: Array, slope_y: Array) -> tuple[float, float]:
     """One pass: subtract the prevailing slope from the slopes, in place, and return it."""
     weights = slope_x * slope_x
     weights += slope_y * slope_y

@@ -8,6 +8,7 @@ import numpy as np
 from scipy import ndimage
 
 from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.kinds import Array
 from litho_data.level.polynomial import evaluate, fit_terms, polynomial_terms
 from litho_data.level.robust import noise_sigma, robust_surface
 from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
@@ -22,18 +23,18 @@ class MaskedLevelling(NamedTuple):
     """Result of ``mask_and_relevel``: the levelled map and the features left out."""
 
     levelled: Levelled
-    mask: np.ndarray
+    mask: Array
 
 
 def mark_features(
-    height: np.ndarray,
+    height: Array,
     *,
     threshold: float = 3.0,
     side: Side = "both",
     grow_px: int = 0,
-    mask: np.ndarray | None = None,
+    mask: Array | None = None,
     masking: Masking = "exclude",
-) -> np.ndarray:
+) -> Array:
     """Mark the pixels that lie off the main surface by more than ``threshold`` noise sigmas.
 
     Main surface and noise are the median and 1.4826 · MAD of the selected pixels, so features must be a
@@ -61,7 +62,7 @@ def mark_features(
 
 
 def mask_and_relevel(
-    height: np.ndarray,
+    height: Array,
     *,
     x_degree: int = 1,
     y_degree: int = 1,
@@ -69,7 +70,7 @@ def mask_and_relevel(
     threshold: float = 3.0,
     side: Side = "both",
     grow_px: int = 2,
-    mask: np.ndarray | None = None,
+    mask: Array | None = None,
     masking: Masking = "exclude",
 ) -> MaskedLevelling:
     """Level, mark the features, level again without them, until the marks no longer change.
@@ -95,7 +96,7 @@ def mask_and_relevel(
         background = usable & ~features
         if np.count_nonzero(background) < _LEAST_BACKGROUND * np.count_nonzero(usable):
             raise InputError("mask-and-relevel finds no main surface", wanted="a higher threshold or a mask")
-        surface = evaluate(fit_terms(z, background.astype(np.float64), terms), z.shape)
+        surface = evaluate(fit_terms(z, background.astype(float), terms), z.shape)
         key = np.packbits(features).tobytes()
         if key in seen:
             break
@@ -111,9 +112,7 @@ def _check(threshold: float, side: str, grow_px: int) -> None:
         raise InputError("grow_px", got=grow_px, wanted="0 or more pixels")
 
 
-def _off_surface(
-    residual: np.ndarray, usable: np.ndarray, limit: float, side: Side, grow_px: int
-) -> np.ndarray:
+def _off_surface(residual: Array, usable: Array, limit: float, side: Side, grow_px: int) -> Array:
     with np.errstate(invalid="ignore"):
         above, below = residual > limit, residual < -limit
     marked = usable & (above if side == "above" else below if side == "below" else above | below)

@@ -7,15 +7,14 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import YX, Array, Shape
 from litho_data.level.polynomial import Terms, fit_terms
 from litho_data.level.selection import Levelled, Masking, as_height, select, subtract, subtract_product
 
 PLANE: Terms = ((0, 0), (1, 0), (0, 1))
 
 
-def level_plane(
-    height: np.ndarray, *, mask: np.ndarray | None = None, masking: Masking = "exclude"
-) -> Levelled:
+def level_plane(height: Array, *, mask: Array | None = None, masking: Masking = "exclude") -> Levelled:
     """Subtract the tilt of the least-squares plane; the height at the pivot (nx/2, ny/2) stays.
 
     Gwyddion's definition: the fitted constant is replaced by -(bx nx + by ny) / 2, slopes in height per
@@ -26,17 +25,17 @@ def level_plane(
     """
     z = as_height(height)
     chosen = select(z, mask, masking)
-    weights = None if chosen is None else chosen.astype(np.float64)
+    weights = None if chosen is None else chosen.astype(float)
     return subtract_tilt(z, slopes_per_px(fit_terms(z, weights, PLANE), z.shape))
 
 
 def level_three_point(
-    height: np.ndarray,
+    height: Array,
     *,
-    points_px: Sequence[tuple[float, float]],
+    points_px: Sequence[YX],
     radius_px: float = 0.0,
     set_zero: bool = False,
-    mask: np.ndarray | None = None,
+    mask: Array | None = None,
     masking: Masking = "exclude",
 ) -> Levelled:
     """Subtract the plane through three points, each the mean over a disc.
@@ -67,12 +66,12 @@ def level_three_point(
     return subtract_tilt(z, (slope_x, slope_y), at_pivot if set_zero else 0.0)
 
 
-def slopes_per_px(coefficients: np.ndarray, shape: tuple[int, ...]) -> tuple[float, float]:
+def slopes_per_px(coefficients: Array, shape: Shape) -> tuple[float, float]:
     """(along x, along y) slope in height per pixel of ``fit_terms``'s linear terms."""
     return 2 * coefficients[0, 1] / (shape[1] - 1), 2 * coefficients[1, 0] / (shape[0] - 1)
 
 
-def subtract_tilt(z: np.ndarray, slopes: tuple[float, float], at_pivot: float = 0.0) -> Levelled:
+def subtract_tilt(z: Array, slopes: tuple[float, float], at_pivot: float = 0.0) -> Levelled:
     """The map minus the plane with these slopes (x, y) per pixel and this height at column nx/2, row ny/2."""
     ny, nx = z.shape
     along_y = slopes[1] * (np.arange(ny) - ny / 2) + at_pivot
@@ -80,7 +79,7 @@ def subtract_tilt(z: np.ndarray, slopes: tuple[float, float], at_pivot: float = 
     return subtract_product(z, np.stack([along_y, np.ones(ny)], axis=1), np.stack([np.ones(nx), along_x]))
 
 
-def _disc_mean(z: np.ndarray, chosen: np.ndarray | None, point: tuple[float, float], radius: float) -> float:
+def _disc_mean(z: Array, chosen: Array | None, point: YX, radius: float) -> float:
     y, x = (np.arange(n) - centre for n, centre in zip(z.shape, point, strict=True))
     distance2 = np.add.outer(y**2, x**2)
     disc = distance2 <= max(radius**2, distance2.min())
@@ -94,10 +93,10 @@ def _disc_mean(z: np.ndarray, chosen: np.ndarray | None, point: tuple[float, flo
 
 
 def level_rotate(
-    height_um: np.ndarray,
+    height_um: Array,
     *,
-    pitch_um: tuple[float, float],
-    mask: np.ndarray | None = None,
+    pitch_um: YX,
+    mask: Array | None = None,
     masking: Masking = "exclude",
 ) -> Levelled:
     """Rotate by the angles of the least-squares plane, first every row, then every column.
@@ -117,14 +116,14 @@ def level_rotate(
     if not np.isfinite(z).all():
         raise InputError("rotation of a scan with missing pixels", wanted="every pixel measured")
     chosen = select(z, mask, masking)
-    weights = None if chosen is None else chosen.astype(np.float64)
+    weights = None if chosen is None else chosen.astype(float)
     slope_x, slope_y = slopes_per_px(fit_terms(z, weights, PLANE), z.shape)
     turned = _rotate_rows(z, slope_x / pitch_um[1], pitch_um[1])
     turned = _rotate_rows(turned.T, slope_y / pitch_um[0], pitch_um[0]).T
     return Levelled(np.ascontiguousarray(turned), z - turned)
 
 
-def _rotate_rows(z: np.ndarray, slope: float, pitch_um: float) -> np.ndarray:
+def _rotate_rows(z: Array, slope: float, pitch_um: float) -> Array:
     angle = -np.arctan(slope)
     position = (np.arange(z.shape[1]) - (z.shape[1] - 1) / 2) * pitch_um
     # Rotating about the profile's own middle keeps the height there, whatever the datum.
@@ -139,25 +138,23 @@ def _rotate_rows(z: np.ndarray, slope: float, pitch_um: float) -> np.ndarray:
     return np.stack([np.interp(position, x, row) for x, row in zip(moved_x, moved_z, strict=True)])
 
 
-def fix_zero(height: np.ndarray, *, mask: np.ndarray | None = None, masking: Masking = "exclude") -> Levelled:
+def fix_zero(height: Array, *, mask: Array | None = None, masking: Masking = "exclude") -> Levelled:
     """Move the lowest selected pixel to zero. This is the height of one pixel, not a physical datum."""
     return _shift(height, np.min, mask, masking)
 
 
-def zero_mean(
-    height: np.ndarray, *, mask: np.ndarray | None = None, masking: Masking = "exclude"
-) -> Levelled:
+def zero_mean(height: Array, *, mask: Array | None = None, masking: Masking = "exclude") -> Levelled:
     """Move the mean of the selected pixels to zero."""
     return _shift(height, np.mean, mask, masking)
 
 
-def zero_max(height: np.ndarray, *, mask: np.ndarray | None = None, masking: Masking = "exclude") -> Levelled:
+def zero_max(height: Array, *, mask: Array | None = None, masking: Masking = "exclude") -> Levelled:
     """Move the highest selected pixel to zero."""
     return _shift(height, np.max, mask, masking)
 
 
 def _shift(
-    height: np.ndarray, statistic: Callable[[np.ndarray], float], mask: np.ndarray | None, masking: Masking
+    height: Array, statistic: Callable[[Array], float], mask: Array | None, masking: Masking
 ) -> Levelled:
     z = as_height(height)
     chosen = select(z, mask, masking)

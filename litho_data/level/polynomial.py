@@ -8,6 +8,7 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array, Shape
 from litho_data.level.selection import Levelled, Masking, as_height, select, subtract_product
 
 MAX_DEGREE = 11
@@ -19,12 +20,12 @@ _WELL_CONDITIONED = 1e3
 
 
 def level_polynomial(
-    height: np.ndarray,
+    height: Array,
     *,
     x_degree: int = 3,
     y_degree: int = 3,
     total_degree: int | None = None,
-    mask: np.ndarray | None = None,
+    mask: Array | None = None,
     masking: Masking = "exclude",
 ) -> Levelled:
     """Subtract the least-squares polynomial, its constant included.
@@ -43,7 +44,7 @@ def level_polynomial(
     z = as_height(height)
     terms = polynomial_terms(x_degree, y_degree, total_degree)
     chosen = select(z, mask, masking)
-    weights = None if chosen is None else chosen.astype(np.float64)
+    weights = None if chosen is None else chosen.astype(float)
     return subtract_product(z, *surface_factors(fit_terms(z, weights, terms), z.shape))
 
 
@@ -60,7 +61,7 @@ def polynomial_terms(x_degree: int, y_degree: int, total_degree: int | None = No
     )
 
 
-def fit_terms(z: np.ndarray, weights: np.ndarray | None, terms: Terms) -> np.ndarray:
+def fit_terms(z: Array, weights: Array | None, terms: Terms) -> Array:
     """Weighted least-squares coefficients c[q, p] of P_q(y) P_p(x), P the Legendre polynomials.
 
     x = 2 j / (nx - 1) - 1 and y alike. Any set of terms that contains all lower ones spans the
@@ -95,13 +96,13 @@ def fit_terms(z: np.ndarray, weights: np.ndarray | None, terms: Terms) -> np.nda
     return coefficients
 
 
-def evaluate(coefficients: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def evaluate(coefficients: Array, shape: Shape) -> Array:
     """The surface of ``fit_terms``'s coefficients on (ny, nx) pixels."""
     along_y, along_x = surface_factors(coefficients, shape)
     return along_y @ along_x
 
 
-def surface_factors(coefficients: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+def surface_factors(coefficients: Array, shape: Shape) -> tuple[Array, Array]:
     """(ny, k) and (k, nx): the surface of ``fit_terms``'s coefficients is their product."""
     basis_y = _basis(shape[0], coefficients.shape[0] - 1)
     basis_x = _basis(shape[1], coefficients.shape[1] - 1)
@@ -109,19 +110,19 @@ def surface_factors(coefficients: np.ndarray, shape: tuple[int, ...]) -> tuple[n
 
 
 @lru_cache(maxsize=64)
-def _basis(n: int, degree: int) -> np.ndarray:
+def _basis(n: int, degree: int) -> Array:
     basis = legendre.legvander(np.linspace(-1.0, 1.0, n), degree)
     basis.flags.writeable = False
     return basis
 
 
 def _normal_matrix(
-    weights: np.ndarray | None,
-    basis_x: np.ndarray,
-    basis_y: np.ndarray,
+    weights: Array | None,
+    basis_x: Array,
+    basis_y: Array,
     powers_x: list[int],
     powers_y: list[int],
-) -> np.ndarray:
+) -> Array:
     if weights is None:
         gram_x, gram_y = basis_x.T @ basis_x, basis_y.T @ basis_y
         return gram_x[np.ix_(powers_x, powers_x)] * gram_y[np.ix_(powers_y, powers_y)]
@@ -132,12 +133,12 @@ def _normal_matrix(
     return moments[q[:, None], q[None, :], p[:, None], p[None, :]]
 
 
-def _pairs(basis: np.ndarray) -> np.ndarray:
+def _pairs(basis: Array) -> Array:
     """(n, d^2): products of any two columns."""
     return (basis[:, :, None] * basis[:, None, :]).reshape(len(basis), -1)
 
 
-def _eigen_factors(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _eigen_factors(normal: Array) -> tuple[Array, Array]:
     scales, directions = np.linalg.eigh(normal)
     if scales[0] <= _SINGULAR * scales[-1]:
         raise InputError(
@@ -148,6 +149,6 @@ def _eigen_factors(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return scales, directions
 
 
-def _solve(factors: tuple[np.ndarray, np.ndarray], right: np.ndarray) -> np.ndarray:
+def _solve(factors: tuple[Array, Array], right: Array) -> Array:
     scales, directions = factors
     return directions @ ((directions.T @ right) / scales)

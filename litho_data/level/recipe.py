@@ -7,11 +7,11 @@ import warnings
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import read_text
+from litho_data.foundation.kinds import YX, Array
 from litho_data.foundation.results import first_error
 from litho_data.level.recipe_steps import AnyStep, LevellingWarning, State
 from litho_data.level.selection import Levelled, as_height
@@ -62,11 +62,11 @@ class Recipe(BaseModel):
 
     def apply(
         self,
-        scan: Scan | np.ndarray,
+        scan: Scan | Array,
         *,
-        pitch_um: tuple[float, float] | None = None,
-        mask: np.ndarray | None = None,
-        layout_level: np.ndarray | None = None,
+        pitch_um: YX | None = None,
+        mask: Array | None = None,
+        layout_level: Array | None = None,
     ) -> Levelled:
         """Level a scan; ``height + removed`` is the input, both NaN where nothing was measured.
 
@@ -94,7 +94,7 @@ class Recipe(BaseModel):
                 raise InputError(f"recipe step {number} ({step.op}): {error}") from error
         return Levelled(state.height_um, start - state.height_um)
 
-    def apply_noting(self, scan: Scan | np.ndarray, **arguments: Any) -> tuple[Levelled, list[str]]:
+    def apply_noting(self, scan: Scan | Array, **arguments: Any) -> tuple[Levelled, list[str]]:
         """The result of ``apply``, and in words what its steps warn of instead of warnings."""
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always", LevellingWarning)

@@ -7,10 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Annotated, Any, ClassVar, Literal
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import YX, Array
 from litho_data.level.facet import level_facet
 from litho_data.level.features import Side, mark_features, mask_and_relevel
 from litho_data.level.layout_aware import level_layout_aware
@@ -31,10 +31,10 @@ class LevellingWarning(UserWarning):
 class State:
     """What passes from step to step: heights (µm), the current mask, pitch and layout."""
 
-    height_um: np.ndarray
-    mask: np.ndarray | None
-    pitch_um: tuple[float, float] | None
-    layout_level: np.ndarray | None
+    height_um: Array
+    mask: Array | None
+    pitch_um: YX | None
+    layout_level: Array | None
 
     def need(self, name: str) -> Any:
         """The pitch or the layout; raises InputError where it is unknown."""

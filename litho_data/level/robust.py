@@ -7,6 +7,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from litho_data.foundation.errors import require_known
+from litho_data.foundation.kinds import Array
 from litho_data.level.polynomial import Terms, evaluate, fit_terms, polynomial_terms
 from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
 
@@ -21,13 +22,13 @@ _SETTLED = 1e-7
 
 
 def level_robust(
-    height: np.ndarray,
+    height: Array,
     *,
     x_degree: int = 1,
     y_degree: int = 1,
     total_degree: int | None = 1,
     loss: Loss = "tukey",
-    mask: np.ndarray | None = None,
+    mask: Array | None = None,
     masking: Masking = "exclude",
 ) -> Levelled:
     """Subtract the robust polynomial with its constant: the main surface then lies at zero.
@@ -48,25 +49,21 @@ def level_robust(
     return subtract(z, robust_surface(z, select(z, mask, masking), terms, loss))
 
 
-def robust_surface(
-    z: np.ndarray, chosen: np.ndarray | None, terms: Terms, loss: Loss = "tukey"
-) -> np.ndarray:
+def robust_surface(z: Array, chosen: Array | None, terms: Terms, loss: Loss = "tukey") -> Array:
     """The robust polynomial on all pixels, fitted to the chosen ones."""
     usable = np.isfinite(z) if chosen is None else chosen
-    base = usable.astype(np.float64)
+    base = usable.astype(float)
     surface = evaluate(fit_terms(z, base, terms), z.shape)
     surface = _reweight(z, base, usable, terms, "huber", surface)
     return surface if loss == "huber" else _reweight(z, base, usable, terms, "tukey", surface)
 
 
-def noise_sigma(residual: np.ndarray) -> float:
+def noise_sigma(residual: Array) -> float:
     """1.4826 times the median absolute value: the sigma of Gaussian noise, unaffected by rare outliers."""
     return _MAD_TO_SIGMA * float(np.median(np.abs(residual)))
 
 
-def _reweight(
-    z: np.ndarray, base: np.ndarray, usable: np.ndarray, terms: Terms, loss: Loss, surface: np.ndarray
-) -> np.ndarray:
+def _reweight(z: Array, base: Array, usable: Array, terms: Terms, loss: Loss, surface: Array) -> Array:
     for _ in range(_MAX_ROUNDS):
         residual = np.where(usable, z - surface, 0.0)
         sigma = noise_sigma(residual[usable])
@@ -79,7 +76,7 @@ def _reweight(
     return surface
 
 
-def _weights(scaled: np.ndarray, loss: Loss) -> np.ndarray:
+def _weights(scaled: Array, loss: Loss) -> Array:
     width = _WIDTH[loss]
     if loss == "huber":
         return width / np.maximum(np.abs(scaled), width)

@@ -9,22 +9,23 @@ from scipy import ndimage, sparse
 from scipy.sparse import linalg
 
 from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.kinds import Array
 from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
 
 ScarSign = Literal["both", "positive", "negative"]
 
 
 def mark_scars(
-    height: np.ndarray,
+    height: Array,
     *,
     high: float = 0.666,
     low: float = 0.25,
     min_length_px: int = 16,
     max_width_px: int = 4,
     sign: ScarSign = "both",
-    mask: np.ndarray | None = None,
+    mask: Array | None = None,
     masking: Masking = "exclude",
-) -> np.ndarray:
+) -> Array:
     """Mark strokes along the rows that stand out from the rows above and below them.
 
     A stroke of up to ``max_width_px`` rows stands out by the difference between its lowest pixel
@@ -60,7 +61,7 @@ def mark_scars(
     return scars if chosen is None else scars & chosen
 
 
-def remove_scars(height: np.ndarray, *, scars: np.ndarray) -> Levelled:
+def remove_scars(height: Array, *, scars: Array) -> Levelled:
     """Replace the marked pixels by the harmonic surface through their surroundings.
 
     Solves Laplace's equation inside the marks; the border of the image counts as insulated. All
@@ -79,7 +80,7 @@ def remove_scars(height: np.ndarray, *, scars: np.ndarray) -> Levelled:
     return subtract(z, removed)
 
 
-def _prominence(z: np.ndarray, max_width_px: int) -> np.ndarray:
+def _prominence(z: Array, max_width_px: int) -> Array:
     """By how much each pixel stands out as part of a ridge at most ``max_width_px`` rows wide."""
     ny = z.shape[0]
     prominence = np.zeros_like(z)
@@ -93,7 +94,7 @@ def _prominence(z: np.ndarray, max_width_px: int) -> np.ndarray:
     return prominence
 
 
-def _long_runs(prominence: np.ndarray, low: float, high: float, min_length_px: int) -> np.ndarray:
+def _long_runs(prominence: Array, low: float, high: float, min_length_px: int) -> Array:
     along_row = np.array([[0, 0, 0], [1, 1, 1], [0, 0, 0]])
     labels, count = ndimage.label(prominence >= low, structure=along_row)
     lengths = np.bincount(labels.ravel(), minlength=count + 1)
@@ -104,7 +105,7 @@ def _long_runs(prominence: np.ndarray, low: float, high: float, min_length_px: i
     return kept[labels]
 
 
-def _harmonic(z: np.ndarray, unknown: np.ndarray) -> np.ndarray:
+def _harmonic(z: Array, unknown: Array) -> Array:
     """Values of the unknown pixels, in the order of ``z[unknown]``."""
     n = int(np.count_nonzero(unknown))
     index = np.full(z.shape, -1)

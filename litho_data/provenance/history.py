@@ -6,11 +6,10 @@ import json
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-
 from litho_data.build.step import Step
 from litho_data.cards.fetch import known_folders
 from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.kinds import Array
 from litho_data.store.access import group_of, read_table
 from litho_data.store.read import Store, open_store
 from litho_data.store.schema import SCAN_VARIABLES
@@ -105,7 +104,7 @@ def require_folder(data_dir: str | Path) -> Path:
     return Path(data_dir)
 
 
-def stored_array(store: Store, scan_id: str, name: str) -> np.ndarray | None:
+def stored_array(store: Store, scan_id: str, name: str) -> Array | None:
     """A scan's array by name, from the arrays over all scans or from its own group.
 
     None for the layout of a reference scan, which is not kept.

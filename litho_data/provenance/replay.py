@@ -13,6 +13,7 @@ from litho_data.build.step import Step
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.hashes import file_sha256
+from litho_data.foundation.kinds import Array
 from litho_data.provenance.history import raw_folder, read_steps, steps_of, stored_array
 from litho_data.store.read import open_store
 from litho_data.store.schema import VARIABLES
@@ -74,9 +75,9 @@ def replay(
     return pd.DataFrame(rows)
 
 
-def _recomputed(steps: Sequence[Step], folder: Path) -> Iterator[tuple[str, np.ndarray]]:
+def _recomputed(steps: Sequence[Step], folder: Path) -> Iterator[tuple[str, Array]]:
     """Arrays in the order in which they are made, each step from the outputs of the steps before it."""
-    made: dict[str, np.ndarray] = {}
+    made: dict[str, Array] = {}
     for step in steps:
         if step.op not in OPERATIONS:
             raise InputError("operation", got=repr(step.op), wanted=f"one of {', '.join(OPERATIONS)}")
@@ -99,10 +100,10 @@ def _require_same(path: Path, sha256: str) -> None:
         )
 
 
-def _largest_difference(stored: np.ndarray, made: np.ndarray) -> float:
+def _largest_difference(stored: Array, made: Array) -> float:
     if stored.shape != made.shape:
         return float("inf")
-    a, b = (array.astype(np.float64) for array in (stored, made))
+    a, b = (array.astype(float) for array in (stored, made))
     if not np.array_equal(np.isnan(a), np.isnan(b)):
         return float("inf")
     return float(np.nanmax(np.abs(a - b), initial=0.0))

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array, Shape
 from litho_data.readers.confined import confined
 from litho_data.readers.reader import (
     Channel,
@@ -68,7 +69,7 @@ def _channel(path: Path, container: Any, key: str, title: str) -> Channel:
     )
 
 
-def _load(path: Path, key: str, shape: tuple[int, int]) -> Loaded:
+def _load(path: Path, key: str, shape: Shape) -> Loaded:
     import gwyfile
 
     with foreign_parser(path, "GWY"):
@@ -81,8 +82,8 @@ def _load(path: Path, key: str, shape: tuple[int, int]) -> Loaded:
         )
 
 
-def _pixels(path: Path, key: str, field: Any, shape: tuple[int, int]) -> np.ndarray:
-    data = np.asarray(field["data"], dtype=np.float64)
+def _pixels(path: Path, key: str, field: Any, shape: Shape) -> Array:
+    data = np.asarray(field["data"], dtype=float)
     if data.size != shape[0] * shape[1]:
         raise InputError(f"{path} {key}: values", got=data.size, wanted=f"{shape[0]} x {shape[1]}")
     return data.reshape(shape)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Shape
 from litho_data.readers import vendor
 from litho_data.readers.arrays import read_hdf5
 from litho_data.readers.confined import confined
@@ -150,13 +151,13 @@ def _first(attributes: Any, names: tuple[str, ...]) -> Any:
     return next((attributes[name] for name in names if name in attributes), None)
 
 
-def _load_nanosurf(path: Path, name: str, shape: tuple[int, int], range_: tuple[float, float]) -> Loaded:
+def _load_nanosurf(path: Path, name: str, shape: Shape, range_: tuple[float, float]) -> Loaded:
     import h5py
 
     with foreign_parser(path, "NHF"), h5py.File(path) as file:
         counts, fill = file[name][()].reshape(shape), file[name].fillvalue
     info = np.iinfo(counts.dtype)
-    values = (counts.astype(np.float64) - info.min) / (float(info.max) - info.min) * (range_[1] - range_[0])
+    values = (counts.astype(float) - info.min) / (float(info.max) - info.min) * (range_[1] - range_[0])
     return np.where(counts == fill, np.nan, values + range_[0]) if fill else values + range_[0], None
 
 
@@ -178,7 +179,7 @@ def _load_plain(path: Path, name: str) -> Loaded:
     import h5py
 
     with foreign_parser(path, "HDF5"), h5py.File(path) as file:
-        return np.asarray(file[name][()], dtype=np.float64), None
+        return np.asarray(file[name][()], dtype=float), None
 
 
 def _text(value: Any) -> str:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array, Shape
 from litho_data.readers.reader import (
     MOST_BYTES_PER_PACKED_BYTE,
     Channel,
@@ -66,10 +67,10 @@ def _load_member(path: Path, name: str) -> Loaded:
         return archive[name], None
 
 
-def _channel(name: str, shape: tuple[int, ...], dtype: np.dtype, load: Callable[[], Loaded]) -> Channel:
+def _channel(name: str, shape: Shape, dtype: np.dtype, load: Callable[[], Loaded]) -> Channel:
     return Channel(
         name=name,
-        shape=(shape[0], shape[1]),
+        shape=shape,
         unit=None,
         size_um=None,
         load=load,
@@ -78,7 +79,7 @@ def _channel(name: str, shape: tuple[int, ...], dtype: np.dtype, load: Callable[
     )
 
 
-def load_array(path: Path) -> np.ndarray:
+def load_array(path: Path) -> Array:
     """The array of a ``.npy`` file, mapped and not yet read.
 
     Raises:
@@ -86,7 +87,7 @@ def load_array(path: Path) -> np.ndarray:
     """
     with foreign_parser(path, "NPY"):
         array = np.load(path, mmap_mode="r", allow_pickle=False)
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "uif":
+    if not isinstance(array, Array) or array.dtype.kind not in "uif":
         raise InputError(
             f"{path}: type of the values",
             got=getattr(array, "dtype", type(array).__name__),

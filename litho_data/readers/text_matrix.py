@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array, Shape
 from litho_data.readers.reader import Channel, Reader, in_memory, one_by_one
 from litho_data.readers.text_blocks import Block, blocks_of, cells_of, is_row, read_text
 from litho_data.readers.text_grid import Map, map_of_points, without_axes
@@ -52,7 +53,7 @@ def _channel(path: Path, name: str, block: Block) -> Channel:
     values = found.values
     for number in block.missing:
         values = np.where(np.isclose(values, number, rtol=1e-6, atol=0), np.nan, values)
-    shape = (values.shape[0], values.shape[1])
+    shape = values.shape
     words = dict(table.words)
     if table.corner is not None and not found.corner:
         words[table.corner] = block.first_line
@@ -77,11 +78,11 @@ def _map_of(block: Block, table: Table) -> Map:
     return without_axes(table.values, block.words)
 
 
-def _may_be_points(shape: tuple[int, ...]) -> bool:
+def _may_be_points(shape: Shape) -> bool:
     return shape[1] <= _POINT_COLUMNS and shape[0] >= _POINT_ROWS_PER_COLUMN * shape[1]
 
 
-def write_text_matrix(path: str | Path, height_um: np.ndarray) -> None:
+def write_text_matrix(path: str | Path, height_um: Array) -> None:
     """Write heights with five significant digits, one line per row.
 
     Args:

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import Array
 from litho_data.readers.confined import confined
 from litho_data.readers.reader import (
     DAMAGED,
@@ -194,7 +195,7 @@ def _load(path: Path, kind: str, index: int, without_size: bool) -> Loaded:
     arguments = {"physical_sizes": (1.0, 1.0)} if without_size else {}
     with foreign_parser(path, kind), _open(path, kind) as reader:
         heights = reader.topography(channel_index=index, **arguments).heights()
-        values = np.ma.filled(np.ma.asarray(heights, dtype=np.float64), np.nan)
+        values: Array = np.ma.filled(np.ma.asarray(heights, dtype=float), np.nan)
     return np.ascontiguousarray(values.T), None
 
 

@@ -8,6 +8,7 @@ from typing import get_args
 import numpy as np
 
 from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.kinds import Array
 from litho_data.scan import Axis
 
 
@@ -21,11 +22,11 @@ class Spectrum:
             nm²·µm² for a radial mean of the two-dimensional density (``∫ 2πf·density df`` is Sq²).
     """
 
-    frequency_per_um: np.ndarray
-    density: np.ndarray
+    frequency_per_um: Array
+    density: Array
 
 
-def psd_along(height_um: np.ndarray, pitch_um: float, axis: Axis, *, window: bool = True) -> Spectrum:
+def psd_along(height_um: Array, pitch_um: float, axis: Axis, *, window: bool = True) -> Spectrum:
     """One-sided power spectral density along one axis, averaged over the lines.
 
     Each line loses its mean and slope, is weighted by a Hann window (divided out in power), and its
@@ -52,7 +53,7 @@ def psd_along(height_um: np.ndarray, pitch_um: float, axis: Axis, *, window: boo
     return Spectrum(np.fft.rfftfreq(size, pitch_um)[1:], density[1:])
 
 
-def psd_radial(height_um: np.ndarray, pitch_um: float, *, window: bool = True) -> Spectrum:
+def psd_radial(height_um: Array, pitch_um: float, *, window: bool = True) -> Spectrum:
     """Radial mean of the two-dimensional power spectral density, square pixels.
 
     Args:
@@ -64,7 +65,7 @@ def psd_radial(height_um: np.ndarray, pitch_um: float, *, window: bool = True) -
         InputError: NaN in the surface, or fewer than 8 pixels along an axis.
     """
     _lines(height_um, "x"), _lines(height_um, "y")
-    height_nm = 1e3 * height_um.astype(np.float64)
+    height_nm = 1e3 * height_um.astype(float)
     ny, nx = height_nm.shape
     weight = np.outer(np.hanning(ny + 2)[1:-1], np.hanning(nx + 2)[1:-1]) if window else np.ones((ny, nx))
     height_nm = height_nm - (height_nm * weight).sum() / weight.sum()
@@ -79,9 +80,9 @@ def psd_radial(height_um: np.ndarray, pitch_um: float, *, window: bool = True) -
     return Spectrum(np.arange(1, rings) * width, total[1:] / pixels[1:])
 
 
-def _lines(height_um: np.ndarray, axis: Axis) -> np.ndarray:
+def _lines(height_um: Array, axis: Axis) -> Array:
     require_known("axis", axis, get_args(Axis))
-    lines = 1e3 * (height_um if axis == "x" else height_um.T).astype(np.float64)
+    lines = 1e3 * (height_um if axis == "x" else height_um.T).astype(float)
     if not np.isfinite(lines).all():
         raise InputError(
             "surface", got="NaN", wanted="finite heights for a spectrum", hint="crop to valid pixels"
@@ -91,6 +92,6 @@ def _lines(height_um: np.ndarray, axis: Axis) -> np.ndarray:
     return lines - lines.mean(axis=1, keepdims=True)
 
 
-def _straight_line(lines: np.ndarray) -> np.ndarray:
+def _straight_line(lines: Array) -> Array:
     position = np.arange(lines.shape[1]) - (lines.shape[1] - 1) / 2
     return np.outer(lines @ position / (position @ position), position)

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from litho_data.foundation.hashes import array_sha256, record_sha256
+from litho_data.foundation.kinds import Array
 from litho_data.foundation.quantities import DOSE, ORDER, PLACE_UM, Range
 from litho_data.foundation.results import Record
 
@@ -32,7 +33,7 @@ class Variable:
         """The dimensions of one scan's slice."""
         return tuple(dim for dim in self.dims if dim != "scan")
 
-    def sample_sha256(self, sample: np.ndarray) -> str:
+    def sample_sha256(self, sample: Array) -> str:
         """Hash of one scan's slice in its true shape, so padding and chunking have no influence."""
         return array_sha256(np.asarray(sample, dtype=self.dtype), self.unit, self.sample_dims)
 

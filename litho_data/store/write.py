@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from litho_data.foundation.kinds import Array, Shape
 from litho_data.store.schema import (
     LAYOUT_VARIABLES,
     MIXED_UNITS,
@@ -38,7 +39,7 @@ _CF: dict[str, dict[str, Any]] = {
 
 
 def write_scan_group(
-    root: zarr.Group, scan_id: str, arrays: Mapping[str, np.ndarray], use: str, pitch_um: Sequence[float]
+    root: zarr.Group, scan_id: str, arrays: Mapping[str, Array], use: str, pitch_um: Sequence[float]
 ) -> None:
     """Group ``scans/<id>``: what one scan looked like in its own frame, an image of OME-Zarr as well.
 
@@ -69,7 +70,7 @@ def _ome(name: str, path: str, pitch_um: Sequence[float]) -> dict[str, Any]:
 def write_samples(
     root: zarr.Group,
     scans: Sequence[Mapping[str, Any]],
-    load: Callable[[str], Mapping[str, np.ndarray]],
+    load: Callable[[str], Mapping[str, Array]],
     pitch_um: float,
 ) -> None:
     """The arrays over all scans, streamed one scan at a time.
@@ -114,7 +115,7 @@ def write_samples(
             write_numbers(root, name, centres, axis, attributes={"units": "um", **described})
 
 
-def pixel_centres_um(count: int, pitch_um: float) -> np.ndarray:
+def pixel_centres_um(count: int, pitch_um: float) -> Array:
     """Coordinates of pixel centres along one axis, µm."""
     return (np.arange(count) + 0.5) * pitch_um
 
@@ -150,7 +151,7 @@ def write_strings(group: zarr.Group, name: str, values: Sequence[str], dim: str)
 def write_numbers(
     group: zarr.Group,
     name: str,
-    values: np.ndarray,
+    values: Array,
     dim: str,
     attributes: Mapping[str, Any] | None = None,
 ) -> None:
@@ -178,7 +179,7 @@ def consolidate(root: zarr.Group) -> None:
         zarr.consolidate_metadata(root.store)
 
 
-def _create(group: zarr.Group, name: str, shape: tuple[int, ...], **layout: Any) -> zarr.Array:
+def _create(group: zarr.Group, name: str, shape: Shape, **layout: Any) -> zarr.Array:
     variable = VARIABLES[name]
     unit = {"comment": MIXED_UNITS[name]} if name in MIXED_UNITS else {"units": variable.unit}
     attributes = {**unit, "long_name": variable.long_name, **_CF.get(name, {})}
@@ -207,7 +208,7 @@ def _compressors() -> list[Any]:
     return [BloscCodec(cname="zstd", clevel=5, shuffle="shuffle"), Crc32cCodec()]
 
 
-def _padded(name: str, sample: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def _padded(name: str, sample: Array, shape: Shape) -> Array:
     """A sample in the upper left corner of the common shape; ``PADDING`` elsewhere."""
     if sample.shape == shape:
         return sample

@@ -13,6 +13,7 @@ import numpy as np
 from litho_data.cards.card import Use, load_card
 from litho_data.cards.tables import read_table
 from litho_data.foundation.errors import InputError
+from litho_data.foundation.kinds import YX, Shape
 from litho_data.layouts.random_layout import random_layout
 from litho_data.readers import read_layout
 from litho_data.virtual_fab.printer import Job
@@ -39,7 +40,7 @@ class Plan:
     """
 
     count: int = 12
-    size_px: tuple[int, int] = (256, 256)
+    size_px: Shape = (256, 256)
     fields_per_print: int = 4
     cutoffs_per_um: tuple[float, ...] = (0.25, 0.5)
     write_field_um: float | None = None
@@ -88,7 +89,7 @@ def random_jobs(plan: Plan, printer: Printer, seed: int) -> Iterator[Job]:
         yield from _reference_jobs(plan, printer)
 
 
-def _field_position_um(plan: Plan, printer: Printer, field: int) -> tuple[float, float]:
+def _field_position_um(plan: Plan, printer: Printer, field: int) -> YX:
     """(y, x) centre of a field in the shared write field: a square block, row by row."""
     if plan.write_field_um is None:
         return 0.0, 0.0

@@ -14,6 +14,7 @@ from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.commands import progress
 from litho_data.foundation.errors import InputError, require_known
 from litho_data.foundation.hashes import array_sha256, record_sha256
+from litho_data.foundation.kinds import YX, Shape
 from litho_data.layouts.card_text import CardText, write_layout, write_table
 from litho_data.level.scan import write_heights
 from litho_data.readers.text_matrix import write_text_matrix
@@ -31,7 +32,7 @@ def simulate(
     out: str | Path,
     *,
     count: int = 12,
-    size_px: int | tuple[int, int] = 256,
+    size_px: int | Shape = 256,
     seed: int = 0,
     knobs: Iterable[KnobSetting | str] = (),
     cause: Cause | None = None,
@@ -186,7 +187,7 @@ def _write_card(
     raw: Path,
     fab: Fab,
     name: str,
-    size_um: tuple[float, float],
+    size_um: YX,
     rows: list[tuple[object, ...]],
     metadata: str,
     write_field_um: float | None,
