@@ -1,7 +1,5 @@
 """One height map as an instrument recorded it, with everything that the file says about it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Literal
 

@@ -1,7 +1,5 @@
 """The scales of a microscope from the card's scans of gratings and of a step."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

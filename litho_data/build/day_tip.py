@@ -1,7 +1,5 @@
 """The tip behind all scans of a card, found before they are built."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What scans of a grating of known size say about the microscope: its scales, its unevenness, its tip."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from litho_data.cards.card import KnownGrating

@@ -1,7 +1,5 @@
 """The standard uncertainty of every registered height, and what it is made of."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import numpy as np

@@ -3,8 +3,6 @@
 Jobs travel to other processes and machines, so they hold paths and plain parameters only.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

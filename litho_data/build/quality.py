@@ -3,8 +3,6 @@
 All contain topography, so as estimates of instrument noise they are upper bounds.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from litho_data.foundation.kinds import Array

@@ -4,8 +4,6 @@ A scan that registers may still show another layout like its own, a mirrored one
 another dose. One that does not register may show another layout of the set.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Is a dataset good, and if not what is to be done: every number of the card against the heights."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from enum import IntEnum
 from typing import Any

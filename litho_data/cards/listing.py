@@ -1,7 +1,5 @@
 """The printed fields of a card: files found, paired by id, and described by the card's table."""
 
-from __future__ import annotations
-
 import glob
 import json
 import re

@@ -1,7 +1,5 @@
 """The two files that a card may refer to: the table of the ids, and the full scales of images."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math

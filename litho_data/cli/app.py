@@ -1,7 +1,5 @@
 """``litho-data``: every command parses arguments and calls one public function."""
 
-from __future__ import annotations
-
 import sys
 from enum import StrEnum
 from pathlib import Path

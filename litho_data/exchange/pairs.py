@@ -4,8 +4,6 @@
 ``src_max_dict.txt``; q is 1 top left, 2 top right, 3 bottom left, 4 bottom right.
 """
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping, Sequence

@@ -13,8 +13,6 @@ other      anything else                            refused, and nothing is chan
 The law: a command that was stopped after any of its writes and is given again ends with the same result.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """SHA-256 of what determines a result: files, arrays, plain data, source code."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Sequence

@@ -5,8 +5,6 @@ subject (dataset, model, design) with the same settings the run resumes, or its 
 else is refused, and nothing is changed.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from fnmatch import fnmatch

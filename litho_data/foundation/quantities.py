@@ -1,7 +1,5 @@
 """What physical numbers can be, stated once: a type for records, and a check for everything else."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 

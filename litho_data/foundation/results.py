@@ -1,7 +1,5 @@
 """Result files: schema-versioned JSON, validated on writing and on reading."""
 
-from __future__ import annotations
-
 import json
 import reprlib
 from pathlib import Path

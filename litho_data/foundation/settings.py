@@ -3,8 +3,6 @@
 The command lines make their options from these fields, and every field can be changed by its dotted path.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import tomllib

@@ -1,7 +1,5 @@
 """A set of layouts on disk: one TIFF per layout, a table, and a dataset card to which scans can be added."""
 
-from __future__ import annotations
-
 import csv
 import json
 import tomllib

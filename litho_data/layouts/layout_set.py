@@ -1,7 +1,5 @@
 """Sets of layouts for the printer: random ones and calibration patterns, with card, table and report."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path

@@ -3,8 +3,6 @@
 All functions return uint8 levels of shape (ny, nx); lengths are rounded to whole pixels.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

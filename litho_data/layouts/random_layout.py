@@ -1,7 +1,5 @@
 """Random layouts by the paper's equation: arXiv:2309.17343, supplement, "Generate randomized … layout"."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from litho_data.foundation.errors import InputError, require_known

@@ -1,7 +1,5 @@
 """Levelling: every operation returns the levelled map and the surface that it removed."""
 
-from __future__ import annotations
-
 from litho_data.level.facet import level_facet
 from litho_data.level.features import MaskedLevelling, mark_features, mask_and_relevel
 from litho_data.level.layout_aware import layout_in_scan_frame, level_layout_aware

@@ -1,7 +1,5 @@
 """Facet levelling: make the most common facet orientation horizontal (Gwyddion's Facet Level)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from litho_data.foundation.errors import InputError

@@ -1,7 +1,5 @@
 """Features that levelling must not follow: marking them, and alternating between levelling and marking."""
 
-from __future__ import annotations
-
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np

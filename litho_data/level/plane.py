@@ -1,7 +1,5 @@
 """Datum and tilt: where zero lies, and planes by least squares, three points or rotation, as in Gwyddion."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

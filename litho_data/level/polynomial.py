@@ -1,7 +1,5 @@
 """Polynomial background, with the definition of Gwyddion's Polynomial Background."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

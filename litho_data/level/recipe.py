@@ -1,7 +1,5 @@
 """Levelling recipes: a list of steps, written in TOML or Python and stored with the data."""
 
-from __future__ import annotations
-
 import tomllib
 import warnings
 from pathlib import Path

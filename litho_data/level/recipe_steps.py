@@ -1,7 +1,5 @@
 """The steps that a recipe can hold: one frozen model per operation, with its defaults."""
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Robust background: a polynomial that follows the majority of the pixels, not their mean."""
 
-from __future__ import annotations
-
 from typing import Literal, get_args
 
 import numpy as np

@@ -3,8 +3,6 @@
 Each function takes (rows, n) values and the selection of the same shape, or None for all of it.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from litho_data.foundation.kinds import Array

@@ -1,7 +1,5 @@
 """Row alignment, with the definitions of Gwyddion's Align Rows."""
 
-from __future__ import annotations
-
 from typing import Literal, get_args
 
 import numpy as np

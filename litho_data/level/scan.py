@@ -1,7 +1,5 @@
 """Levelling one scan: levelled heights and removed surface, in memory or as files with a record."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar

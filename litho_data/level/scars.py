@@ -1,7 +1,5 @@
 """Scars: short strokes along the fast axis where the feedback lost the surface."""
 
-from __future__ import annotations
-
 from typing import Literal, get_args
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What all levelling operations share: the choice of pixels, and the result."""
 
-from __future__ import annotations
-
 import math
 from typing import Literal, NamedTuple
 

@@ -1,7 +1,5 @@
 """``history``: where the arrays of a scan come from, and the records in a store that say so."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """``verify``: is a store unchanged since its build, and are its raw files unchanged?"""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass

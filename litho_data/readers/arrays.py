@@ -1,7 +1,5 @@
 """Arrays that describe themselves: HDF5 of any program, NetCDF 3 and 4, MATLAB; scale, unit, axes applied."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Gwyddion Simple Field, read and written: a text header, NUL padding, little-endian float32 rows."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Gwyddion's own files: every data field is a channel, a mask stays a mask."""
 
-from __future__ import annotations
-
 import re
 import struct
 from functools import partial

@@ -1,7 +1,5 @@
 """HDF5 files that say whose they are: JPK's series, Nanosurf's NHF, TopoStats' results; then all others."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import Any

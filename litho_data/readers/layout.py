@@ -1,7 +1,5 @@
 """Layouts: what was sent to the printer, as integer levels, from files of levels or pictures of them."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Missing pixels that a file marks by a number or a word: named by the caller, or asked about."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

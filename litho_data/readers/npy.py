@@ -1,7 +1,5 @@
 """NumPy arrays in ``.npy`` and ``.npz`` files; pickled objects are refused."""
 
-from __future__ import annotations
-
 import zipfile
 from collections.abc import Callable
 from functools import partial

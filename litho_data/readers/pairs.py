@@ -4,8 +4,6 @@ A grey value means value / 255 · full scale. The format has no validity, no neg
 values, so it loses accuracy.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Reading one scan: format, channel, unit and size are decided here, in one place for all formats."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial

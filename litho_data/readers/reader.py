@@ -1,7 +1,5 @@
 """What a reader is: it recognises a file and describes its channels before they are loaded."""
 
-from __future__ import annotations
-
 import logging
 import re
 import struct

@@ -1,7 +1,5 @@
 """Golden Software's Surfer grids: DSAA (text), DSBB (Surfer 6) and DSRB (Surfer 7), y upwards."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

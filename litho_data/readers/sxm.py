@@ -1,7 +1,5 @@
 """Nanonis SXM: a text header in sections, then big-endian float32 images, two directions per channel."""
 
-from __future__ import annotations
-
 import re
 from functools import partial
 from pathlib import Path

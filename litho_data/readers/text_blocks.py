@@ -1,7 +1,5 @@
 """Text files cut into blocks of numbers, each with the lines of words above it."""
 
-from __future__ import annotations
-
 import codecs
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Coordinates in a table of numbers: axes in its first row and column, or points that make a whole grid."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Height maps as text: matrices, with axes, several in a file, points of a grid; read and written."""
 
-from __future__ import annotations
-
 import re
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Rows of text turned into numbers: separators, decimal commas, words in place of numbers, damage."""
 
-from __future__ import annotations
-
 import io
 import re
 from dataclasses import dataclass

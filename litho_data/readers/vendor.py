@@ -1,7 +1,5 @@
 """Instrument makers' formats (IBW, SPM, JPK, X3P, SUR, …) through SurfaceTopography."""
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Iterator, Mapping

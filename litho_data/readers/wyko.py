@@ -1,7 +1,5 @@
 """Wyko ASCII: a header of tabbed lines, then blocks of numbers, in waves or nm, ``Bad`` where missing."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The coarse fit, to within a few pixels: orientation, polarity and a robust affine, with fallbacks."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

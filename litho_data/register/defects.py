@@ -4,8 +4,6 @@ Such an area pulls a least-squares warp by pixels. Its heights differ from what 
 times the usual misfit over a connected area, whatever the response of the printer is.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How well a registration is known: held-out blocks, bootstrap, correlation, information."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Coarse registration without an assumption about position: matched points and a robust affine."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

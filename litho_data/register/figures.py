@@ -1,7 +1,5 @@
 """The figures of one registration, from the fit and the images it compared."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

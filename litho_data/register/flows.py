@@ -1,7 +1,5 @@
 """How a warp can change: the generators of every rung of the ladder, and the quadratic flows."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Literal
 

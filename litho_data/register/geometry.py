@@ -5,8 +5,6 @@ pixel centres 0, 1, 2 …; the micrometre frame of the same image has those cent
 ``(i + 0.5) * pitch_um``.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from litho_data.foundation.kinds import YX, Array, Shape

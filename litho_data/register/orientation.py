@@ -1,7 +1,5 @@
 """Orientation, sign and rough position, by masked normalised cross-correlation over all shifts."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache

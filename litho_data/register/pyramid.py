@@ -1,7 +1,5 @@
 """Refinement from coarse to fine, with the blur of the print matched on the way."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """What is recorded about one registration, and when it counts as passed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -155,6 +153,6 @@ def judge(
 
 def unregistered_quality(reason: str) -> RegistrationQuality:
     """The record of a scan for which nothing could be fitted: every figure is missing."""
-    empty = {"int": 0, "float": float("nan"), "str": "none", "bool": False}
-    figures = {field.name: empty[str(field.type)] for field in fields(RegistrationQuality)}
-    return RegistrationQuality(**{**figures, "reason": reason, "warning": ""})  # type: ignore[arg-type]
+    empty: dict[Any, Any] = {int: 0, float: float("nan"), str: "none", bool: False}
+    figures = {field.name: empty[field.type] for field in fields(RegistrationQuality)}
+    return RegistrationQuality(**{**figures, "reason": reason, "warning": ""})

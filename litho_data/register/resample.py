@@ -1,7 +1,5 @@
 """The single resampling between a scan and the dataset: float heights, gaps kept."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

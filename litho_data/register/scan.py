@@ -1,7 +1,5 @@
 """Registration of one scan onto the layout it was printed from."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Literal
 

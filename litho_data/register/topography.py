@@ -1,7 +1,5 @@
 """Images that can be compared: the topography that a layout predicts, and a scan without gaps and bow."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

@@ -4,8 +4,6 @@ Gain, quadratic surface and warp are fitted again without each block of the fiel
 spread of the fits contains what the topography does not explain, as far as blocks differ in it.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

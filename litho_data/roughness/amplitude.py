@@ -1,7 +1,5 @@
 """Amplitudes of a surface (ISO 25178-2 names), its autocorrelation, and the uncertainty of Sq."""
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.fft
 

@@ -1,7 +1,5 @@
 """Slopes, developed area and texture of a surface (ISO 25178-2), and the filters that come before them."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from litho_data.foundation.errors import InputError

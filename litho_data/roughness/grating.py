@@ -1,7 +1,5 @@
 """The period of a grating: where the spectrum peaks, then how its phase advances over the field."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ the expected variance ``σ² (1 − tr(Qᵀ C Q) / N)``. This is exact for any p
 any autocorrelation (compare arXiv:2001.00433, which treats the same bias for polynomials).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

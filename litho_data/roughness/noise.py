@@ -1,7 +1,5 @@
 """Separating line noise from pixel noise, and the print's roughness from the microscope's."""
 
-from __future__ import annotations
-
 from math import comb
 from typing import get_args
 

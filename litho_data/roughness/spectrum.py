@@ -1,7 +1,5 @@
 """Power spectral densities whose integral is the variance."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import get_args
 

@@ -1,7 +1,5 @@
 """Step heights in the windows of ISO 5436-1: off the edges, with one common slope, line by line."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import get_args
 

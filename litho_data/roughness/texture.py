@@ -1,7 +1,5 @@
 """Whether a surface has lines: in which direction, and whether they repeat."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """One printed field as everything in this project sees it, and the key of the whole of it."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, is_dataclass

@@ -1,7 +1,5 @@
 """The dataset store on one screen: arrays, dimensions, types, units, and the hash of a dataset."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal

@@ -7,8 +7,6 @@ the contacts that are possible there, until the opening of the image by the tip 
 noise.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -6,8 +6,6 @@ image says of it is one pixel: a valley with a curvature beyond that of the tip.
 those whose highest possible height is set by such a valley (Villarrubia 1997, section 5).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from litho_data.foundation.errors import InputError

@@ -1,7 +1,5 @@
 """Noise of a scan, and curvatures over small discs with their noise."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 

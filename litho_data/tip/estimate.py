@@ -1,7 +1,5 @@
 """The tip of one or more scans: its radius, or the most that it can be, and where it did not touch."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import ClassVar, Literal

@@ -5,8 +5,6 @@ highest surface pixel plus tip, ``erode`` the lowest image pixel minus tip; dila
 *opening*, eroding what was dilated the *closing*. A pixel that was not measured (NaN) takes no part.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

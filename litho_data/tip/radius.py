@@ -6,8 +6,6 @@ image end in an edge, which is clear where the tip sets it and a thin tail where
 are taken along the lines of the scan, where offsets of lines have no say.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

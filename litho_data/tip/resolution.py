@@ -1,7 +1,5 @@
 """The lateral resolution that a tip leaves to a scan."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from litho_data.foundation.kinds import YX, Array

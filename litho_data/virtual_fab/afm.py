@@ -1,7 +1,5 @@
 """The microscope: tip, feedback, drift, line offsets, tilt, bow, datum, quantisation."""
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.ndimage
 

@@ -1,7 +1,5 @@
 """The area simulated around one layout, and spectral blurs on it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Exposure: hatch lines, slices and two-photon dose; what beam, galvo and field do to it."""
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.ndimage
 import scipy.signal

@@ -1,7 +1,5 @@
 """The fab: a printer, a microscope, their knobs and their noise; one field in, one scan out."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Where the pixels of a scan lie on the print."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

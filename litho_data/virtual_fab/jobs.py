@@ -1,7 +1,5 @@
 """The fields of a run: random layouts in print blocks, and the reference scans of a noise analysis."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A plan of prints and scans, carried out in a fab that has printed before."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from litho_data.cards.card import load_card

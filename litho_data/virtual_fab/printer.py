@@ -1,7 +1,5 @@
 """One print from layout to dry surface."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Random shapes: Perlin curves, smooth maps, and roughness of a given spectrum."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from litho_data.foundation.kinds import Array, Shape

@@ -1,7 +1,5 @@
 """Resist and development: conversion, diffusion, shrinkage, and what is lost or left behind."""
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.ndimage
 

@@ -1,7 +1,5 @@
 """A whole run of the virtual fab: raw files as a laboratory would deliver them, and the truth apart."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """The size of an effect in the data, and the strength for a given size."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
