@@ -132,10 +132,7 @@ def _values(raw: Callable[[], Array], says: Mapping[str, Any], turned: bool) -> 
 
 def _channels(path: Path, kind: str, made: Iterator[tuple[str, Callable[[], Channel]]]) -> list[Channel]:
     with foreign_parser(path, kind):
-        channels = [one_by_one(path, kind, name, make) for name, make in made]
-    if not channels:
-        raise InputError(f"{path} ({kind}) holds no two-dimensional array of numbers")
-    return channels
+        return [one_by_one(path, kind, name, make) for name, make in made]
 
 
 def read_hdf5(path: Path, file: Any) -> list[Channel]:

@@ -18,7 +18,6 @@ from litho_data.readers.reader import (
     extent_um,
     foreign_parser,
     one_by_one,
-    with_unique_names,
 )
 
 _MAGIC = b"GWYP"
@@ -45,12 +44,10 @@ def read_channels(path: Path) -> list[Channel]:
             (key for key in container if _FIELD_KEY.fullmatch(key)), key=lambda key: int(key.split("/")[1])
         )
         titles = [str(container.get(f"{key}/title", f"channel {key.split('/')[1]}")) for key in keys]
-        return with_unique_names(
-            [
-                one_by_one(path, "GWY", title, partial(_channel, path, container, key, title))
-                for key, title in zip(keys, titles, strict=True)
-            ]
-        )
+        return [
+            one_by_one(path, "GWY", title, partial(_channel, path, container, key, title))
+            for key, title in zip(keys, titles, strict=True)
+        ]
 
 
 def _channel(path: Path, container: Any, key: str, title: str) -> Channel:

@@ -18,7 +18,6 @@ from litho_data.readers.reader import (
     extent_um,
     foreign_parser,
     one_by_one,
-    with_unique_names,
 )
 
 _MAGIC = b"\x89HDF\r\n\x1a\n"
@@ -57,9 +56,7 @@ def read_channels(path: Path) -> list[Channel]:
             return vendor.read_channels(path)
         else:
             return read_hdf5(path, file)
-    if not channels:
-        raise InputError(f"{path} (HDF5) holds no two-dimensional channel")
-    return with_unique_names(channels)
+    return channels
 
 
 def _jpk_channels(path: Path, measurement: Any) -> list[Channel]:

@@ -55,8 +55,6 @@ def read_archive(path: Path) -> list[Channel]:
             if len(shape) == 2 and min(shape) > 1 and dtype.kind in "uif":
                 name = member.filename.removesuffix(".npy")
                 channels.append(_channel(name, shape, dtype, partial(_load_member, path, name)))
-    if not channels:
-        raise InputError(f"{path} (NPZ) holds no two-dimensional array of numbers")
     return channels
 
 

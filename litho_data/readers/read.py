@@ -12,7 +12,14 @@ from litho_data.foundation.kinds import YX, Array
 from litho_data.foundation.units import um_per
 from litho_data.readers.missing import extreme_note, without_missing
 from litho_data.readers.packed import unpacked
-from litho_data.readers.reader import DAMAGED, MOST_BYTES_PER_PACKED_BYTE, Channel, Loaded, Reader
+from litho_data.readers.reader import (
+    DAMAGED,
+    MOST_BYTES_PER_PACKED_BYTE,
+    Channel,
+    Loaded,
+    Reader,
+    with_unique_names,
+)
 from litho_data.readers.registry import PICTURE, detect_format, reader_of, require_file
 from litho_data.scan import Axis, Scan
 
@@ -108,7 +115,9 @@ def _load_packed(path: Path, format: str, name: str) -> Loaded:
 
 
 def _read_channels(reader: Reader, file: Path) -> list[Channel]:
-    channels = reader.read_channels(file)
+    channels = with_unique_names(reader.read_channels(file))
+    if not channels:
+        raise InputError(f"{file} ({reader.name}) holds no two-dimensional map of numbers")
     size = file.stat().st_size
     for channel in channels:
         if channel.shape[0] * channel.shape[1] > MOST_BYTES_PER_PACKED_BYTE * size:

@@ -23,7 +23,6 @@ from litho_data.readers.reader import (
     foreign_parser,
     one_by_one,
     unknown_content,
-    with_unique_names,
 )
 from litho_data.readers.tiff import is_tiff, maker_of
 from litho_data.scan import Axis
@@ -86,12 +85,10 @@ def read_channels(path: Path) -> list[Channel]:
         channels = [
             one_by_one(path, kind, str(one.name), partial(_channel, path, kind, one, header)) for one in maps
         ]
-    if not channels:
-        raise InputError(f"{path} ({kind}) holds no two-dimensional channel")
     names = _layer_names(path, kind)
     if len(names) == len(channels) == 1 and names[0]:
         channels = [replace(channels[0], name=names[0])]
-    return with_unique_names(channels)
+    return channels
 
 
 def _kinds(path: Path, head: bytes) -> tuple[str, ...]:
