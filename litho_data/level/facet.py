@@ -4,6 +4,7 @@ import numpy as np
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import YX, Array
+from litho_data.level.operation import operation
 from litho_data.level.plane import subtract_tilt
 from litho_data.level.selection import Levelled, Masking, as_height, select
 
@@ -14,6 +15,7 @@ _SHARPNESS = 1 / 20
 _FEWEST_CELLS = 4
 
 
+@operation("facet")
 def level_facet(
     height_um: Array,
     *,

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+from pydantic import Field
 from scipy import ndimage
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import YX, Array, Shape
-from litho_data.level.polynomial import Terms, evaluate, polynomial_terms
+from litho_data.level.operation import operation
+from litho_data.level.polynomial import Degree, Terms, evaluate, polynomial_terms
 from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
 
 if TYPE_CHECKING:
@@ -22,14 +24,15 @@ _BLURS_PX = (0.0, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0)
 _LEAST_INSIDE = 0.25
 
 
+@operation("layout-aware")
 def level_layout_aware(
     height: Array,
     *,
     layout_level: Array,
-    blur_px: float | None = None,
-    x_degree: int = 1,
-    y_degree: int = 1,
-    total_degree: int | None = 1,
+    blur_px: Annotated[float, Field(ge=0)] | None = None,
+    x_degree: Degree = 1,
+    y_degree: Degree = 1,
+    total_degree: Degree | None = 1,
     mask: Array | None = None,
     masking: Masking = "exclude",
 ) -> Levelled:
@@ -56,8 +59,6 @@ def level_layout_aware(
     z = as_height(height)
     if layout_level.shape != z.shape:
         raise InputError("layout in the scan's frame: shape", got=layout_level.shape, wanted=z.shape)
-    if blur_px is not None and blur_px < 0:
-        raise InputError("blur_px", got=blur_px, wanted="0 or more pixels")
     terms = tuple(term for term in polynomial_terms(x_degree, y_degree, total_degree) if term != (0, 0))
     if not terms:
         raise InputError("layout-aware background", got="degree 0", wanted="degree 1 or more")

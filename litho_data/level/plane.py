@@ -1,17 +1,21 @@
 """Datum and tilt: where zero lies, and planes by least squares, three points or rotation, as in Gwyddion."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import YX, Array, Shape
+from litho_data.level.operation import operation
 from litho_data.level.polynomial import Terms, fit_terms
 from litho_data.level.selection import Levelled, Masking, as_height, select, subtract, subtract_product
 
 PLANE: Terms = ((0, 0), (1, 0), (0, 1))
 
 
+@operation("plane")
 def level_plane(height: Array, *, mask: Array | None = None, masking: Masking = "exclude") -> Levelled:
     """Subtract the tilt of the least-squares plane; the height at the pivot (nx/2, ny/2) stays.
 
@@ -27,11 +31,12 @@ def level_plane(height: Array, *, mask: Array | None = None, masking: Masking = 
     return subtract_tilt(z, slopes_per_px(fit_terms(z, weights, PLANE), z.shape))
 
 
+@operation("three-point")
 def level_three_point(
     height: Array,
     *,
-    points_px: Sequence[YX],
-    radius_px: float = 0.0,
+    points_px: tuple[YX, YX, YX],
+    radius_px: Annotated[float, Field(ge=0)] = 0.0,
     set_zero: bool = False,
     mask: Array | None = None,
     masking: Masking = "exclude",
@@ -49,10 +54,6 @@ def level_three_point(
     """
     z = as_height(height)
     chosen = select(z, mask, masking)
-    if len(points_px) != 3:
-        raise InputError(
-            "three-point levelling", got=f"{len(points_px)} points", wanted="3 points (y, x) in pixels"
-        )
     heights = [_disc_mean(z, chosen, point, radius_px) for point in points_px]
     design = np.array([[1.0, x, y] for y, x in points_px])
     if abs(np.linalg.det(design)) < 1e-9 * z.size:
@@ -90,6 +91,7 @@ def _disc_mean(z: Array, chosen: Array | None, point: YX, radius: float) -> floa
     return float(z[disc].mean())
 
 
+@operation("rotate")
 def level_rotate(
     height_um: Array,
     *,
@@ -136,16 +138,19 @@ def _rotate_rows(z: Array, slope: float, pitch_um: float) -> Array:
     return np.stack([np.interp(position, x, row) for x, row in zip(moved_x, moved_z, strict=True)])
 
 
+@operation("fix-zero")
 def fix_zero(height: Array, *, mask: Array | None = None, masking: Masking = "exclude") -> Levelled:
     """Move the lowest selected pixel to zero. This is the height of one pixel, not a physical datum."""
     return _shift(height, np.min, mask, masking)
 
 
+@operation("zero-mean")
 def zero_mean(height: Array, *, mask: Array | None = None, masking: Masking = "exclude") -> Levelled:
     """Move the mean of the selected pixels to zero."""
     return _shift(height, np.mean, mask, masking)
 
 
+@operation("zero-max")
 def zero_max(height: Array, *, mask: Array | None = None, masking: Masking = "exclude") -> Levelled:
     """Move the highest selected pixel to zero."""
     return _shift(height, np.max, mask, masking)

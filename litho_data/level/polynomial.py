@@ -1,15 +1,18 @@
 """Polynomial background, with the definition of Gwyddion's Polynomial Background."""
 
 from functools import lru_cache
+from typing import Annotated
 
 import numpy as np
 from numpy.polynomial import legendre
+from pydantic import Field
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array, Shape
+from litho_data.level.operation import operation
 from litho_data.level.selection import Levelled, Masking, as_height, select, subtract_product
 
-MAX_DEGREE = 11
+Degree = Annotated[int, Field(ge=0, le=11)]
 Terms = tuple[tuple[int, int], ...]
 
 # Below it, the smallest direction of the normal matrix is rounding noise.
@@ -17,12 +20,13 @@ _SINGULAR = 1e-12
 _WELL_CONDITIONED = 1e3
 
 
+@operation("polynomial")
 def level_polynomial(
     height: Array,
     *,
-    x_degree: int = 3,
-    y_degree: int = 3,
-    total_degree: int | None = None,
+    x_degree: Degree = 3,
+    y_degree: Degree = 3,
+    total_degree: Degree | None = None,
     mask: Array | None = None,
     masking: Masking = "exclude",
 ) -> Levelled:
@@ -47,10 +51,8 @@ def level_polynomial(
 
 
 def polynomial_terms(x_degree: int, y_degree: int, total_degree: int | None = None) -> Terms:
-    """The exponents (p, q) of x^p y^q; raises InputError for a degree outside 0..11."""
+    """The exponents (p, q) of x^p y^q."""
     degrees = (x_degree, y_degree) if total_degree is None else (total_degree, total_degree)
-    if not all(0 <= degree <= MAX_DEGREE for degree in degrees):
-        raise InputError("degree of the background", got=degrees, wanted=f"0 to {MAX_DEGREE}")
     return tuple(
         (p, q)
         for q in range(degrees[1] + 1)

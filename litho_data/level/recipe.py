@@ -3,24 +3,38 @@
 import tomllib
 import warnings
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, Union
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+# Each adds its operations.
+import litho_data.level.facet
+import litho_data.level.features
+import litho_data.level.layout_aware
+import litho_data.level.plane
+import litho_data.level.polynomial
+import litho_data.level.robust
+import litho_data.level.rows
+import litho_data.level.scars  # noqa: F401
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import read_text
 from litho_data.foundation.kinds import YX, Array
 from litho_data.foundation.results import first_error
-from litho_data.level.recipe_steps import AnyStep, LevellingWarning, State
+from litho_data.level.operation import STEPS, State, Step
+from litho_data.level.rows import LevellingWarning
 from litho_data.level.selection import Levelled, as_height
 from litho_data.scan import Scan
+
+if TYPE_CHECKING:
+    AnyStep = Step
+else:
+    AnyStep = Annotated[Union[tuple(STEPS.values())], Field(discriminator="op")]  # noqa: UP007
 
 
 class Recipe(BaseModel):
     """Levelling steps in the order in which they are applied; an unknown key is an error.
 
-    In TOML each step is a table ``[[step]]`` with its operation as ``op``; in Python the steps are
-    the models of ``litho_data.level.recipe_steps``.
+    In TOML each step is a table ``[[step]]`` with its operation as ``op``, in Python one of ``STEPS``.
     """
 
     SCHEMA: ClassVar[str] = "litho-data/recipe/1"

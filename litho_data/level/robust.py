@@ -1,12 +1,12 @@
 """Robust background: a polynomial that follows the majority of the pixels, not their mean."""
 
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
-from litho_data.foundation.errors import require_known
 from litho_data.foundation.kinds import Array
-from litho_data.level.polynomial import Terms, evaluate, fit_terms, polynomial_terms
+from litho_data.level.operation import operation
+from litho_data.level.polynomial import Degree, Terms, evaluate, fit_terms, polynomial_terms
 from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
 
 Loss = Literal["huber", "tukey"]
@@ -19,12 +19,13 @@ _MAX_ROUNDS = 200
 _SETTLED = 1e-7
 
 
+@operation("robust")
 def level_robust(
     height: Array,
     *,
-    x_degree: int = 1,
-    y_degree: int = 1,
-    total_degree: int | None = 1,
+    x_degree: Degree = 1,
+    y_degree: Degree = 1,
+    total_degree: Degree | None = 1,
     loss: Loss = "tukey",
     mask: Array | None = None,
     masking: Masking = "exclude",
@@ -42,7 +43,6 @@ def level_robust(
         InputError: an unknown loss, or pixels that do not determine the polynomial.
     """
     z = as_height(height)
-    require_known("robust loss", loss, get_args(Loss))
     terms = polynomial_terms(x_degree, y_degree, total_degree)
     return subtract(z, robust_surface(z, select(z, mask, masking), terms, loss))
 

@@ -1,11 +1,14 @@
 """Row alignment, with the definitions of Gwyddion's Align Rows."""
 
-from typing import Literal, get_args
+import warnings
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field
 
-from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import YX, Array
+from litho_data.level.operation import State, Step, operation
 from litho_data.level.row_statistics import (
     MEDIAN_TRIM,
     METRE_PER_UM,
@@ -28,17 +31,33 @@ RowMethod = Literal[
     "facet-tilt",
 ]
 Direction = Literal["horizontal", "vertical"]
-MAX_ROW_DEGREE = 5
 _SIGMA_PER_MAD, _CLEAR_SIGMA, _STAYED = 1.4826, 6.0, 0.15
 
 
+class LevellingWarning(UserWarning):
+    """A step may have removed part of the print."""
+
+
+class _Aligned(Step):
+    direction: Direction = "horizontal"
+
+    def run(self, state: State) -> State:
+        """The state with the levelled map; warns where the print moves with the lines."""
+        levelled = super().run(state)
+        pair = (state.height_um, state.height_um - levelled.height_um)
+        if note := print_taken_for_offsets(*(one.T if self.direction == "vertical" else one for one in pair)):
+            warnings.warn(note, LevellingWarning, stacklevel=2)
+        return levelled
+
+
+@operation("align-rows", _Aligned)
 def align_rows(
     height_um: Array,
     *,
     method: RowMethod = "median",
     direction: Direction = "horizontal",
-    degree: int = 1,
-    trim: float = 0.05,
+    degree: Annotated[int, Field(ge=0, le=5)] = 1,
+    trim: Annotated[float, Field(ge=0, le=MEDIAN_TRIM)] = 0.05,
     pitch_um: YX | None = None,
     mask: Array | None = None,
     masking: Masking = "exclude",
@@ -62,7 +81,8 @@ def align_rows(
         InputError: an unknown method or direction, a degree or trim outside its range, a missing pitch.
     """
     z = as_height(height_um)
-    _check(method, direction, degree, trim, pitch_um)
+    if method == "facet-tilt" and pitch_um is None:
+        raise InputError("facet-tilt of rows needs the pixel pitch", wanted="pitch_um")
     chosen = select(z, mask, masking)
     if direction == "vertical":
         columns = None if chosen is None else np.ascontiguousarray(chosen.T)
@@ -89,20 +109,9 @@ def print_taken_for_offsets(z: Array, removed: Array) -> str:
     worst = int(stayed.argmax())
     if stayed[worst] < _STAYED:
         return ""
-    size = float(np.abs(shifts[stayed >= _STAYED]).max())
+    size = float(np.nanmax(np.abs(shifts[stayed >= _STAYED])))
     shifted = f"lines were shifted by up to {size:.3g} µm where {stayed[worst]:.0%} of the pixels of a line"
     return f"{shifted} did not move: part of the print may be removed"
-
-
-def _check(method: str, direction: str, degree: int, trim: float, pitch_um: YX | None) -> None:
-    require_known("row alignment method", method, get_args(RowMethod))
-    require_known("row alignment direction", direction, get_args(Direction))
-    if not 0 <= degree <= MAX_ROW_DEGREE:
-        raise InputError("row alignment degree", got=degree, wanted=f"0 to {MAX_ROW_DEGREE}")
-    if not 0 <= trim <= MEDIAN_TRIM:
-        raise InputError("row alignment trim", got=trim, wanted=f"0 to {MEDIAN_TRIM}")
-    if method == "facet-tilt" and pitch_um is None:
-        raise InputError("facet-tilt of rows needs the pixel pitch", wanted="pitch_um")
 
 
 def _removed(

@@ -1,25 +1,31 @@
 """Scars: short strokes along the fast axis where the feedback lost the surface."""
 
-from typing import Literal, get_args
+from functools import wraps
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import Field
 from scipy import ndimage, sparse
 from scipy.sparse import linalg
 
-from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
+from litho_data.level.operation import operation
 from litho_data.level.selection import Levelled, Masking, as_height, select, subtract
 
 ScarSign = Literal["both", "positive", "negative"]
+Threshold = Annotated[float, Field(gt=0)]
+Count = Annotated[int, Field(ge=1)]
 
 
+@operation("mark-scars")
 def mark_scars(
     height: Array,
     *,
-    high: float = 0.666,
-    low: float = 0.25,
-    min_length_px: int = 16,
-    max_width_px: int = 4,
+    high: Threshold = 0.666,
+    low: Threshold = 0.25,
+    min_length_px: Count = 16,
+    max_width_px: Count = 4,
     sign: ScarSign = "both",
     mask: Array | None = None,
     masking: Masking = "exclude",
@@ -39,13 +45,8 @@ def mark_scars(
         InputError: thresholds or sizes outside their range, or an unknown sign.
     """
     z = as_height(height)
-    if not 0 < low <= high or min_length_px < 1 or max_width_px < 1:
-        raise InputError(
-            "scar parameters",
-            got=f"low {low}, high {high}, min_length_px {min_length_px}, max_width_px {max_width_px}",
-            wanted="0 < low <= high and sizes of at least 1 px",
-        )
-    require_known("sign of the scars", sign, get_args(ScarSign))
+    if low > high:
+        raise InputError("scar parameters", got=f"low {low}, high {high}", wanted="low up to high")
     chosen = select(z, mask, masking)
     steps = np.diff(z, axis=0)
     rms = np.sqrt(float(np.nansum(steps**2)) / z.size)
@@ -76,6 +77,12 @@ def remove_scars(height: Array, *, scars: Array) -> Levelled:
     if unknown.any():
         removed[unknown] = z[unknown] - _harmonic(z, unknown)
     return subtract(z, removed)
+
+
+@operation("remove-scars")
+@wraps(mark_scars)
+def _fill_scars(height: Array, **how: Any) -> Levelled:
+    return remove_scars(height, scars=mark_scars(height, **how))
 
 
 def _prominence(z: Array, max_width_px: int) -> Array:

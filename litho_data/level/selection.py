@@ -5,11 +5,10 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 
 Masking = Literal["ignore", "exclude", "include"]
-MASKINGS: tuple[Masking, ...] = ("ignore", "exclude", "include")
 _ROWS_IN_CACHE = 32
 
 
@@ -22,6 +21,13 @@ class Levelled(NamedTuple):
 
     height: Array
     removed: Array
+
+
+class MaskedLevelling(NamedTuple):
+    """A levelled map, and the features that were left out."""
+
+    levelled: Levelled
+    mask: Array
 
 
 def as_height(height: Array) -> Array:
@@ -42,10 +48,8 @@ def select(z: Array, mask: Array | None, masking: Masking) -> Array | None:
     Pixels that were not measured (NaN) are never used.
 
     Raises:
-        InputError: a mask that is not boolean or has another shape, an unknown masking, or a
-            selection without any pixel.
+        InputError: a mask that is not boolean or has another shape, or a selection without any pixel.
     """
-    require_known("masking", masking, MASKINGS)
     chosen = None
     if mask is not None and masking != "ignore":
         if mask.dtype != np.bool_ or mask.shape != z.shape:
