@@ -85,8 +85,8 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
     file = Path(card_path)
     card = load_card(file)
     folder = _data_folder(card, file, data_dir)
-    layouts = _files_by_id(folder, card.layout.files)
-    scans = _files_by_id(folder, card.scan.files)
+    layouts = files_by_id(folder, card.layout.files)
+    scans = files_by_id(folder, card.scan.files)
     table = _table(card, folder, file.parent)
     scales = read_full_scales(folder / name) if (name := card.scan.full_scale_file) else None
 
@@ -150,7 +150,7 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
 def _data_folder(card: Card, card_path: Path, data_dir: str | Path | None) -> Path:
     folders = [Path(data_dir)] if data_dir is not None else [card_path.parent, *known_folders(card.name)]
     for folder in folders:
-        if all(_files_by_id(folder, files) for files in (card.layout.files, card.scan.files)):
+        if all(files_by_id(folder, files) for files in (card.layout.files, card.scan.files)):
             return folder.resolve()
     raise InputError(
         f"files of card {card_path}",
@@ -165,7 +165,7 @@ def patterns_of(files: str | Sequence[str]) -> tuple[str, ...]:
     return (files,) if isinstance(files, str) else tuple(files)
 
 
-def _files_by_id(folder: Path, files: str | Sequence[str]) -> dict[str, list[Path]]:
+def files_by_id(folder: Path, files: str | Sequence[str]) -> dict[str, list[Path]]:
     """The files of each id, by one pattern or several; ``*`` stands for any part of a name."""
     found: dict[str, list[Path]] = {}
     for pattern in patterns_of(files):

@@ -28,7 +28,7 @@ class InputError(ValueError):
 
 
 @contextmanager
-def damaged(what: str, hint: str = "") -> Iterator[None]:
+def damaged(what: str) -> Iterator[None]:
     """Read what a program wrote and somebody may have changed since.
 
     Raises:
@@ -39,9 +39,7 @@ def damaged(what: str, hint: str = "") -> Iterator[None]:
     except InputError:
         raise
     except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
-        raise InputError(
-            f"{what} is damaged", got=f"{type(error).__name__}: {said(error)}", hint=hint
-        ) from error
+        raise InputError(f"{what} is damaged", got=f"{type(error).__name__}: {said(error)}") from error
 
 
 def said(error: Exception) -> str:

@@ -16,14 +16,13 @@ def flat(shape: Shape, *, level: int) -> Array:
     return np.full(shape, level, np.uint8)
 
 
-def step_ladder(shape: Shape, *, highest: int, lowest: int = 0) -> Array:
-    """Stairs along x from ``lowest`` to ``highest``, steps of equal width: height against level."""
-    if not 0 <= lowest < highest:
-        raise InputError("levels of a step ladder", got=(lowest, highest), wanted="0 <= lowest < highest")
-    steps = highest - lowest + 1
+def step_ladder(shape: Shape, *, highest: int) -> Array:
+    """Stairs along x from level 0 to ``highest``, steps of equal width: height against level."""
+    _positive(highest, "highest level of a step ladder")
+    steps = highest + 1
     if shape[1] < steps:
         raise InputError("width of a step ladder", got=f"{shape[1]} px", wanted=f"at least {steps} px")
-    stairs = lowest + np.arange(shape[1]) * steps // shape[1]
+    stairs = np.arange(shape[1]) * steps // shape[1]
     return _rows(stairs, shape)
 
 
@@ -80,14 +79,14 @@ def line_space_sweep(
     return _rows(profile, shape) if along == "y" else _rows(profile, shape[::-1]).T.copy()
 
 
-def siemens_star(shape: Shape, *, spokes: int, high: int, low: int = 0) -> Array:
+def siemens_star(shape: Shape, *, spokes: int, high: int) -> Array:
     """``spokes`` wedges around the centre, as wide as the gaps: resolution against direction."""
     _positive(spokes, "spokes of a Siemens star")
     y, x = np.indices(shape)
     # A rotation by half a wedge keeps the axes of the grid off the edges of the wedges.
     angle = np.arctan2(y - (shape[0] - 1) / 2, x - (shape[1] - 1) / 2) * spokes / np.pi + 0.5
     inside = np.hypot(y - (shape[0] - 1) / 2, x - (shape[1] - 1) / 2) <= 0.48 * min(shape)
-    return np.where(inside & (np.floor(angle).astype(int) % 2 == 0), high, low).astype(np.uint8)
+    return np.where(inside & (np.floor(angle).astype(int) % 2 == 0), high, 0).astype(np.uint8)
 
 
 def isolated_features(shape: Shape, *, widths_px: Sequence[int], feature: int, ground: int) -> Array:
@@ -113,11 +112,11 @@ def isolated_features(shape: Shape, *, widths_px: Sequence[int], feature: int, g
     return layout
 
 
-def relative_doses(count: int, *, spread: float = 0.3) -> Array:
-    """Doses of a dose matrix, evenly from 1 − ``spread`` to 1 + ``spread``, shape (count,)."""
-    if count < 2 or not 0 < spread < 1:
-        raise InputError("dose matrix", got=(count, spread), wanted="at least 2 doses and a spread in (0, 1)")
-    return np.linspace(1 - spread, 1 + spread, count)
+def relative_doses(count: int) -> Array:
+    """Doses of a dose matrix, evenly from 0.7 to 1.3, shape (count,)."""
+    if count < 2:
+        raise InputError("dose matrix", got=count, wanted="at least 2 doses")
+    return np.linspace(0.7, 1.3, count)
 
 
 def _rows(profile: Array, shape: Shape) -> Array:
