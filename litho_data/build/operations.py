@@ -28,11 +28,13 @@ _OBLONG = 0.01
 OPERATIONS: dict[str, Operation] = {}
 
 
-def _operation(name: str, *code: str) -> Callable[[Function], Function]:
+def _operation(name: str, takes: str, *code: str) -> Callable[[Function], Function]:
     """Make a function the operation of that name; its result depends on ``code`` and this file."""
 
     def made(function: Function) -> Function:
-        OPERATIONS[name] = Operation(name, "1", function, (*code, "build/operations.py"))
+        OPERATIONS[name] = Operation(
+            name, "1", function, tuple(takes.split()), (*code, "build/operations.py")
+        )
         return function
 
     return made
@@ -52,7 +54,7 @@ def no_recipe() -> dict[str, Any]:
     return Recipe().canonical()
 
 
-@_operation("read-layout", "readers")
+@_operation("read-layout", "", "readers")
 def _read_layout(params: Params, files: Files, _: Inputs) -> Made:
     from litho_data.readers import read_layout
 
@@ -63,7 +65,7 @@ def _read_layout(params: Params, files: Files, _: Inputs) -> Made:
     return {"mask_level": level}, {}
 
 
-@_operation("read-scan", "readers", "scan.py", "foundation/units.py")
+@_operation("read-scan", "", "readers", "scan.py", "foundation/units.py")
 def _read_scan(params: Params, files: Files, _: Inputs) -> Made:
     from litho_data.readers import read_scan
 
@@ -84,7 +86,7 @@ def _read_scan(params: Params, files: Files, _: Inputs) -> Made:
     return arrays, facts
 
 
-@_operation("calibrate", "readers", "roughness", "build/calibration.py")
+@_operation("calibrate", "", "readers", "roughness", "build/calibration.py")
 def _calibrate(params: Params, files: Files, _: Inputs) -> Made:
     """Scales of the microscope, from scans of what has a known size."""
     from litho_data.build.calibration import SCALES, measure_scales
@@ -104,7 +106,7 @@ def _z_scale(arrays: Mapping[str, Array]) -> tuple[float, float]:
     return factor, uncertainty / factor
 
 
-@_operation("locate", "register", "level")
+@_operation("locate", "mask_level raw_height_um", "register", "level")
 def _locate(params: Params, _: Files, arrays: Inputs) -> Made:
     """Where the layout lies in the scan before levelling, for layout-aware levelling."""
     from litho_data.level import layout_in_scan_frame
@@ -119,7 +121,7 @@ def _locate(params: Params, _: Files, arrays: Inputs) -> Made:
     return {"layout_in_scan": level.astype(np.float32)}, {}
 
 
-@_operation("level", "level")
+@_operation("level", "raw_height_um vendor_mask calibration layout_in_scan", "level")
 def _level(params: Params, _: Files, arrays: Inputs) -> Made:
     from litho_data.level import Recipe
 
@@ -135,7 +137,7 @@ def _level(params: Params, _: Files, arrays: Inputs) -> Made:
     } if notes else {}
 
 
-@_operation("register", "register")
+@_operation("register", "mask_level levelled_height_um", "register")
 def _register(params: Params, _: Files, arrays: Inputs) -> Made:
     found = _registration(arrays["levelled_height_um"], arrays["mask_level"], params)
     _require_found(found, params)
@@ -170,7 +172,7 @@ def _registration(height_um: Array, layout_level: Array, params: Mapping[str, An
     )
 
 
-@_operation("tip", "tip", "register/topography.py")
+@_operation("tip", "levelled_height_um", "tip", "register/topography.py")
 def _tip(params: Params, _: Files, arrays: Inputs) -> Made:
     from litho_data.tip import lateral_resolution_um, tip_certain
 
@@ -185,7 +187,7 @@ def _tip(params: Params, _: Files, arrays: Inputs) -> Made:
     return {"tip_certain": certain}, facts
 
 
-@_operation("resample", "register")
+@_operation("resample", "levelled_height_um scan_to_layout bend_um defect tip_certain", "register")
 def _resample(params: Params, _: Files, arrays: Inputs) -> Made:
     from litho_data.register import Bend, resample_to_layout
 
@@ -210,7 +212,13 @@ def _resample(params: Params, _: Files, arrays: Inputs) -> Made:
     return {"height_um": np.where(valid, height, np.float32(np.nan)), "valid": valid}, {}
 
 
-@_operation("uncertainty", "register", "roughness", "build/height_sigma.py")
+@_operation(
+    "uncertainty",
+    "levelled_height_um height_um mask_level calibration",
+    "register",
+    "roughness",
+    "build/height_sigma.py",
+)
 def _uncertainty(params: Params, _: Files, arrays: Inputs) -> Made:
     from litho_data.build.height_sigma import height_sigma
 
@@ -229,7 +237,7 @@ def _uncertainty(params: Params, _: Files, arrays: Inputs) -> Made:
     return {"height_sigma_um": sigma_um}, dict(budget)
 
 
-@_operation("stitch-pairs", "readers")
+@_operation("stitch-pairs", "", "readers")
 def _stitch_pairs(params: Params, files: Files, _: Inputs) -> Made:
     from litho_data.readers.pairs import stitch_field
 

@@ -75,12 +75,15 @@ class Operation:
         name: as in the records.
         version: changed whenever the function may give other results.
         function: ``function(params, files, arrays) -> (arrays, facts)``.
+        takes: names of the arrays, in the order in which they are recorded; those that a scan lacks are
+            left out.
         code: files and folders of this package that the result depends on.
     """
 
     name: str
     version: str
     function: Function
+    takes: tuple[str, ...]
     code: tuple[str, ...]
 
     @property
@@ -94,11 +97,12 @@ class Operation:
         Args:
             params: explicit parameters, plain data.
             files: raw files by their recorded name, in the order that the operation expects.
-            arrays: input arrays by their name in the store.
+            arrays: by their name in the store; those that the operation takes are its inputs.
 
         Raises:
             InputError: anything wrong with the input, including a missing or unreadable file.
         """
+        arrays = {name: arrays[name] for name in self.takes if name in arrays}
         try:
             inputs = [{"name": name, "sha256": file_sha256(path)} for name, path in files.items()]
             inputs += [
