@@ -10,6 +10,7 @@ from typing import get_args
 
 from litho_data.cards.card import Use
 from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.files import parsed
 from litho_data.foundation.kinds import YX
 from litho_data.foundation.quantities import ORDER
 from litho_data.foundation.units import is_length
@@ -112,10 +113,7 @@ def read_full_scales(path: Path) -> dict[str, float]:
     Raises:
         InputError: no such file, no JSON object, or a value that is not a positive number.
     """
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"cannot read {path}", got=error, wanted="a JSON object, m per id") from error
+    content = parsed(path, json.loads, f"cannot read {path}", "a JSON object, m per id")
     if not isinstance(content, dict):
         raise InputError(f"content of {path}", got=type(content).__name__, wanted="a JSON object, m per id")
     for key, value in content.items():

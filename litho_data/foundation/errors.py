@@ -28,6 +28,15 @@ class InputError(ValueError):
 
 
 @contextmanager
+def about(what: str) -> Iterator[None]:
+    """Errors of a block say first what it is about."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{what}: {error}") from error
+
+
+@contextmanager
 def damaged(what: str) -> Iterator[None]:
     """Read what a program wrote and somebody may have changed since.
 

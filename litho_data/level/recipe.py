@@ -16,8 +16,8 @@ import litho_data.level.polynomial
 import litho_data.level.robust
 import litho_data.level.rows
 import litho_data.level.scars  # noqa: F401
-from litho_data.foundation.errors import InputError
-from litho_data.foundation.files import read_text
+from litho_data.foundation.errors import InputError, about
+from litho_data.foundation.files import parsed
 from litho_data.foundation.kinds import YX, Array
 from litho_data.foundation.results import first_error
 from litho_data.level.operation import STEPS, State, Step
@@ -51,10 +51,7 @@ class Recipe(BaseModel):
         Raises:
             InputError: no such file, no TOML, an unknown operation or key, a value out of range.
         """
-        try:
-            content = tomllib.loads(read_text(Path(path)))
-        except (OSError, ValueError, RecursionError) as error:
-            raise InputError(f"cannot read recipe {path}", got=error, wanted="a TOML file") from error
+        content = parsed(Path(path), tomllib.loads, f"cannot read recipe {path}", "a TOML file")
         return cls.from_dict(content, source=str(path))
 
     @classmethod
@@ -100,10 +97,8 @@ class Recipe(BaseModel):
         state = State(as_height(heights), mask, pitch_um, layout_level)
         start = state.height_um
         for number, step in enumerate(self.step, start=1):
-            try:
+            with about(f"recipe step {number} ({step.op})"):
                 state = step.run(state)
-            except InputError as error:
-                raise InputError(f"recipe step {number} ({step.op}): {error}") from error
         return Levelled(state.height_um, start - state.height_um)
 
     def apply_noting(self, scan: Scan | Array, **arguments: Any) -> tuple[Levelled, list[str]]:

@@ -13,6 +13,8 @@ from litho_data.store.read import Store, open_store
 from litho_data.store.schema import SCAN_VARIABLES
 
 _HASH_DIGITS = 12
+Recorded = dict[str, list[tuple[str, Step]]]
+"""Steps of every scan in order, each with its recorded id."""
 
 
 def history(store_path: str | Path, scan_id: str | None = None) -> str:
@@ -40,7 +42,7 @@ def history(store_path: str | Path, scan_id: str | None = None) -> str:
     return "\n".join(lines)
 
 
-def _overview(recorded: dict[str, list[tuple[str, Step]]]) -> Iterator[str]:
+def _overview(recorded: Recorded) -> Iterator[str]:
     for scan_id, steps in recorded.items():
         made: set[str] = set()
         raw = []
@@ -56,13 +58,13 @@ def _overview(recorded: dict[str, list[tuple[str, Step]]]) -> Iterator[str]:
         yield f"{scan_id}: {', '.join(raw)} -> {chain} -> {last['name']} {last['sha256'][:_HASH_DIGITS]}"
 
 
-def read_steps(store: Store) -> dict[str, list[tuple[str, Step]]]:
+def read_steps(store: Store) -> Recorded:
     """Recorded steps of every scan in order, each with its recorded id.
 
     Raises:
         InputError: a store without provenance, or a record that is no JSON.
     """
-    steps: dict[str, list[tuple[str, Step]]] = {}
+    steps: Recorded = {}
     for row in read_table(group_of(store.root, "provenance"), "scan").to_dict("records"):
         try:
             steps.setdefault(row["scan"], []).append(
@@ -73,7 +75,7 @@ def read_steps(store: Store) -> dict[str, list[tuple[str, Step]]]:
     return steps
 
 
-def steps_of(recorded: dict[str, list[tuple[str, Step]]], scan_id: str) -> list[tuple[str, Step]]:
+def steps_of(recorded: Recorded, scan_id: str) -> list[tuple[str, Step]]:
     """The recorded steps of one scan; InputError if there is no such scan."""
     require_known("scan", scan_id, recorded)
     return recorded[scan_id]

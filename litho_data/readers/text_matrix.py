@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError
+from litho_data.foundation.errors import InputError, about
 from litho_data.foundation.kinds import Array, Shape
 from litho_data.readers.reader import Channel, Reader, in_memory, one_by_one
 from litho_data.readers.text_blocks import Block, blocks_of, cells_of, is_row, read_text
@@ -44,10 +44,8 @@ def read_channels(path: Path) -> list[Channel]:
 
 def _channel(path: Path, name: str, block: Block) -> Channel:
     table = numbers_of(path, block)
-    try:
+    with about(str(path)):
         found, factor = _map_of(block, table), block.factor
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
     values = found.values
     for number in block.missing:
         values = np.where(np.isclose(values, number, rtol=1e-6, atol=0), np.nan, values)

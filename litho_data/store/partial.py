@@ -37,6 +37,11 @@ class Piece:
     arrays: Mapping[str, Array]
 
 
+def outputs_of(record: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """What the steps of a scan's record have made: name, hash, shape, …"""
+    return [output for step in record["steps"] for output in step["outputs"]]
+
+
 @contextmanager
 def partial_store(out: Path) -> Iterator[PartialStore]:
     """The unfinished store of ``out``; only one process at a time may use it.
@@ -122,7 +127,7 @@ class PartialStore:
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _intact(self, root: zarr.Group, record: Mapping[str, Any]) -> bool:
-        hashes = {output["name"]: output["sha256"] for step in record["steps"] for output in step["outputs"]}
+        hashes = {output["name"]: output["sha256"] for output in outputs_of(record)}
         try:
             arrays = self.samples(record["id"])
             group = group_of(root, f"scans/{record['id']}")
