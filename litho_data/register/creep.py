@@ -12,9 +12,9 @@ import numpy as np
 
 from litho_data.foundation.kinds import Array
 from litho_data.register.bend import CREEP_DEGREE, Bend, fit_bent_affine
-from litho_data.register.geometry import apply_transform, warped_grid
+from litho_data.register.geometry import apply_transform, lattice, warped_grid
 from litho_data.register.pyramid import FineFit, reduced_levels
-from litho_data.register.refine import BORDER_PX, refine
+from litho_data.register.refine import BORDER_PX, interior_of, refine
 from litho_data.register.topography import fill_gaps, quadratic_basis
 
 # Every second pixel of the layout in both directions places the print as well as all of them.
@@ -97,13 +97,12 @@ class _Images:
         topography = topography[::every, ::every]
         shape = topography.shape
         self._surface = [topography - topography.mean(), *quadratic_basis(shape)]
-        border = min(BORDER_PX // every, min(shape) // 16)
-        self.everywhere = np.pad(np.ones([n - 2 * border for n in shape], bool), border)
+        self.everywhere = interior_of(shape, BORDER_PX // every)
 
     def fit(self, matrix: Array, bend: Bend, slow: int | None, chosen: Array) -> tuple[Array, Bend] | None:
         """Affine and, with a slow axis, creep by Gauss-Newton steps; None if they do not settle."""
         y, x = (np.linspace(0, n - 1, 17) for n in self._measured.shape)
-        points = np.stack([one.ravel() for one in np.meshgrid(x, y)], axis=1)
+        points = lattice(y, x)
         for _ in range(_ITERATIONS):
             warped, (rows, columns), inside = self._warped(matrix, bend)
             inside &= chosen & self.everywhere

@@ -10,7 +10,7 @@ import numpy as np
 
 from litho_data.foundation.kinds import Array
 from litho_data.register.flows import Model
-from litho_data.register.geometry import apply_transform, corners, overlap_of, warped_grid
+from litho_data.register.geometry import apply_transform, corners, nearest, overlap_of, warped_grid
 from litho_data.register.pyramid import FineFit, refine_pyramid
 from litho_data.register.refine import BORDER_PX
 from litho_data.register.topography import fill_gaps, quadratic_basis
@@ -117,8 +117,7 @@ def without_defects(scan: Array, defects: Array, layout_to_scan: Array) -> Array
     rows, columns = warped_grid(np.linalg.inv(layout_to_scan), scan.shape)
     ny, nx = defects.shape
     inside = (rows > -0.5) & (rows < ny - 0.5) & (columns > -0.5) & (columns < nx - 0.5)
-    nearest = (np.clip(np.rint(k), 0, n - 1).astype(int) for k, n in ((rows, ny), (columns, nx)))
-    return np.where(inside & defects[tuple(nearest)], np.nan, scan)
+    return np.where(inside & nearest(defects, rows, columns), np.nan, scan)
 
 
 def _misfit(scan: Array, fine: FineFit) -> Array | None:

@@ -97,10 +97,18 @@ def overlap_of(
     rows, columns = warped_grid(layout_to_scan, layout_shape, bend)
     ny, nx = measured.shape
     inside = (rows >= 0) & (rows <= ny - 1) & (columns >= 0) & (columns <= nx - 1)
-    if measured.all():
-        return inside
-    nearest = (np.clip(np.rint(k), 0, n - 1).astype(int) for k, n in ((rows, ny), (columns, nx)))
-    return inside & measured[tuple(nearest)]
+    return inside if measured.all() else inside & nearest(measured, rows, columns)
+
+
+def nearest(image: Array, rows: Array, columns: Array) -> Array:
+    """The pixels of an image (ny, nx) that lie nearest to these places."""
+    clipped = (np.clip(np.rint(k), 0, n - 1) for k, n in zip((rows, columns), image.shape, strict=True))
+    return image[tuple(k.astype(int) for k in clipped)]
+
+
+def lattice(y: Array, x: Array) -> Array:
+    """The points (x, y) of a grid with these rows and columns, (n, 2), row by row."""
+    return np.stack([one.ravel() for one in np.meshgrid(x, y)], axis=1)
 
 
 def linear_part(matrix: Array, point: Array) -> Array:

@@ -15,7 +15,7 @@ import numpy as np
 from litho_data.foundation.kinds import Array, Shape
 from litho_data.register.bend import Bend, fit_bent_affine
 from litho_data.register.flows import BENT_COUNT, GENERATORS, LADDER, Model, flows, normalisation
-from litho_data.register.geometry import apply_transform, corners, warped_grid
+from litho_data.register.geometry import apply_transform, corners, lattice, warped_grid
 from litho_data.register.topography import fill_gaps, quadratic_basis
 
 NUISANCES = 7  # gain of the topography, then the six quadratic terms
@@ -93,7 +93,7 @@ def refine(
     normalise = normalisation(shape)
     denormalise = np.linalg.inv(normalise)
     regressors = _regressors(topography, LADDER[model] if bend is None else BENT_COUNT)
-    interior = _interior(shape)
+    interior = interior_of(shape)
     measured = np.isfinite(scan)
     complete = bool(measured.all())
     spline = spline_filter(fill_gaps(scan), 3, output=np.float32, mode="mirror")
@@ -142,7 +142,7 @@ def aligned_gram(aligned: Array, topography: Array, count: int, further: Sequenc
     stand behind these.
     """
     shape = topography.shape
-    inside = _interior(shape) & np.isfinite(aligned)
+    inside = interior_of(shape) & np.isfinite(aligned)
     regressors = np.concatenate([_regressors(topography, count), *(one[None] for one in further)])
     return _cell_grams(regressors, np.where(inside, aligned, 0.0).astype(np.float32), inside)
 
@@ -184,8 +184,9 @@ def corner_motion_px(coefficients: Array, shape: Shape, points: Array) -> Array:
     return np.einsum("...k,kdn->...nd", warp, flow) / normalise[0, 0]
 
 
-def _interior(shape: Shape) -> Array:
-    border = min(BORDER_PX, min(shape) // 16)
+def interior_of(shape: Shape, border_px: int = BORDER_PX) -> Array:
+    """Pixels (ny, nx) away from the border, bool."""
+    border = min(border_px, min(shape) // 16)
     return np.pad(np.ones([n - 2 * border for n in shape], bool), border)
 
 
@@ -196,7 +197,7 @@ def _moved_on(matrix: Array, bend: Bend, coefficients: Array, shape: Shape) -> t
         numpy.linalg.LinAlgError: the positions in and around the scan do not determine them.
     """
     y, x = (np.linspace(0, n - 1, 17) for n in shape)
-    layout = np.stack([one.ravel() for one in np.meshgrid(x, y)], axis=1)
+    layout = lattice(y, x)
     scan = np.stack(bend.undo(*apply_transform(matrix, layout).T), axis=1)
     reached = (np.abs(scan - bend.middle) < 2 * bend.half).all(axis=1)
     moved = layout + corner_motion_px(coefficients, shape, layout)

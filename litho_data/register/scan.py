@@ -14,7 +14,14 @@ from litho_data.register.defects import refine_around_defects, without_defects
 from litho_data.register.evidence import BlockShifts, height_correlation, mutual_information_bit
 from litho_data.register.figures import figures_of_evidence, figures_of_fit, figures_of_warp
 from litho_data.register.flows import Model
-from litho_data.register.geometry import apply_transform, index_to_um, orient, orientation_matrix, slow_axis
+from litho_data.register.geometry import (
+    apply_transform,
+    index_to_um,
+    lattice,
+    orient,
+    orientation_matrix,
+    slow_axis,
+)
 from litho_data.register.orientation import rival_alignment
 from litho_data.register.pyramid import FineFit, climb, refine_bent, refine_pyramid
 from litho_data.register.quality import RegistrationQuality, Thresholds, judge, unregistered_quality
@@ -194,8 +201,7 @@ class _Case:
             to_scan = np.linalg.inv(to_oriented)
             return frame @ to_scan @ found.layout_to_scan @ np.linalg.inv(frame), None
         # Turned by 90° a bend is again one: points and their images determine it.
-        u, v = (one.ravel() for one in np.meshgrid(*[np.linspace(0, 1, 9)] * 2))
-        points_um = np.stack([u, v], axis=1) * size_um
+        points_um = lattice(*[np.linspace(0, 1, 9)] * 2) * size_um
         oriented = apply_transform(to_oriented @ np.linalg.inv(frame), points_um)
         to_layout = frame @ np.linalg.inv(found.layout_to_scan)
         images_um = apply_transform(to_layout, found.bend.straighten(oriented))

@@ -1,14 +1,14 @@
 """Separating line noise from pixel noise, and the print's roughness from the microscope's."""
 
 from math import comb
-from typing import get_args
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
 from litho_data.roughness.amplitude import amplitude_parameters, sq_uncertainty_nm
+from litho_data.roughness.spectrum import lines_nm
 from litho_data.scan import Axis
 
 # Median absolute deviation of a Gaussian: 0.6745 sd.
@@ -58,12 +58,11 @@ def split_noise(height_um: Array, *, fast_axis: Axis = "x") -> NoiseSplit:
     Raises:
         InputError: NaN in the surface, or fewer than 8 pixels along an axis.
     """
-    require_known("fast_axis", fast_axis, get_args(Axis))
     if not np.isfinite(height_um).all() or min(height_um.shape) < 8:
         raise InputError(
             "surface", got=f"{height_um.shape} px", wanted="finite heights, at least 8 px each way"
         )
-    lines = 1e3 * (height_um if fast_axis == "x" else height_um.T).astype(float)
+    lines = lines_nm(height_um, fast_axis)
     pixel_nm = _robust_sd(np.diff(lines, 2, axis=1)) / 6**0.5
     return NoiseSplit(
         pixel_nm=pixel_nm,
@@ -87,7 +86,7 @@ def white_noise(height_um: Array, *, fast_axis: Axis = "x") -> tuple[float, floa
     Returns:
         sd of the pixels' and of the lines' noise; NaN for one that too few pixels determine.
     """
-    lines = 1e3 * (height_um if fast_axis == "x" else height_um.T).astype(float)
+    lines = lines_nm(height_um, fast_axis)
     pixel_nm = _fine_sd(_fine(_fine(lines, 0), 1))
     measured = np.isfinite(lines)
     count = measured.sum(axis=1)

@@ -1,13 +1,13 @@
 """Step heights in the windows of ISO 5436-1: off the edges, with one common slope, line by line."""
 
 from collections.abc import Sequence
-from typing import get_args
 
 import numpy as np
 
-from litho_data.foundation.errors import InputError, require_known
+from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 from litho_data.foundation.results import Record
+from litho_data.roughness.spectrum import lines_nm
 from litho_data.scan import Axis
 
 # Of a rough surface without step the largest change is 4 to 5 times the usual one.
@@ -96,8 +96,7 @@ def stair_steps(
 
 
 def _profiles(height_um: Array, pitch_um: float, axis: Axis) -> tuple[Array, Array]:
-    require_known("axis", axis, get_args(Axis))
-    lines = 1e3 * (height_um if axis == "x" else height_um.T).astype(float)
+    lines = lines_nm(height_um, axis)
     return lines, (np.arange(lines.shape[1]) + 0.5) * pitch_um
 
 

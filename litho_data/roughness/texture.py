@@ -8,6 +8,7 @@ from scipy.special import digamma, gammaincc, ndtri, polygamma
 
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
+from litho_data.roughness.spectrum import hann
 
 FEWEST_LINES = 64
 # A peak is compared with the frequencies around it, beyond its own width under a Hann window.
@@ -88,7 +89,7 @@ def _mean_vector(height_um: Array) -> tuple[complex, float]:
     finite = np.isfinite(height)
     height = np.where(finite, height - height[finite].mean(), 0.0)
     ny, nx = height.shape
-    weight = np.outer(np.hanning(ny + 2)[1:-1], np.hanning(nx + 2)[1:-1])
+    weight = hann(height.shape)
     power = np.abs(np.fft.fft2((height - (height * weight).sum() / weight.sum()) * weight)) ** 2
     fy, fx = np.meshgrid(np.fft.fftfreq(ny), np.fft.fftfreq(nx), indexing="ij")
     radius = np.hypot(fx, fy)
