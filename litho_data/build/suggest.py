@@ -7,7 +7,7 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy import ndimage
@@ -193,35 +193,32 @@ def _write_card(card: Path, best: str) -> Path:
 
 
 def _write_page(found: Suggestion, pictures: Mapping[str, Sequence[Array]], folder: Path) -> None:
-    import pandas as pd
-
     from litho_data.foundation.report import Page
 
     page = Page(
         "Which levelling", "Recipes compared on scans of the card, by what the layout does not explain."
     )
     page.verdict(f"Level by \u201c{found.recipe}\u201d: build {found.card.name}.")
-    rows: list[dict[str, Any]] = [
+    rows = [
         {"recipe": name, **of, "warning": found.warned.get(name, "")} for name, of in found.left_nm.items()
     ]
     caption = (
         "What the layout leaves of the levelled heights, in blocks outside its fit: root mean square, nm"
     )
-    page.table(pd.DataFrame(rows), caption, "recipes.csv", digits=1)
+    page.table(rows, caption, "recipes.csv", digits=1)
     _show(page, pictures)
     page.write(folder)
 
 
 def _show(page: Page, pictures: Mapping[str, Sequence[Array]]) -> None:
-    from litho_data.foundation.report_pictures import colour_bar_png, coloured_png
+    from litho_data.foundation.report_pictures import colour_bar_png, coloured_png, thumbnail
 
     rows, bar = [], colour_bar_png("cividis")
     for name, images in pictures.items():
         shown = []
         for image in images:
-            step = max(1, -(-max(image.shape) // 180))
             low, high = (float(one) for one in np.nanpercentile(image, [0.5, 99.5]))
-            shown.append(coloured_png(image[::step, ::step], "cividis", low, high))
+            shown.append(coloured_png(thumbnail(image), "cividis", low, high))
         rows.append((name, shown))
     columns = [(title, bar) for title in ("raw", *RECIPES)]
     page.gallery(columns, rows, "Heights before and after each recipe, every picture on a scale of its own.")

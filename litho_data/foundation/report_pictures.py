@@ -112,6 +112,12 @@ def coloured_png(image: Array, colours: str, low: float, high: float) -> str:
     return f"data:image/png;base64,{_base64(buffer.getvalue())}"
 
 
+def thumbnail(image: Array, side_px: int = 180) -> Array:
+    """Every so many pixels of an image (ny, nx), at most this many along a side."""
+    step = max(1, -(-max(image.shape) // side_px))
+    return image[::step, ::step]
+
+
 def colour_bar_png(colours: str) -> str:
     """The colours from low to high, one pixel high, to be stretched."""
     return coloured_png(np.linspace(0, 1, _COLOURS)[None, :], colours, 0.0, 1.0)
@@ -127,9 +133,8 @@ def shown_html(line: str, **images: Array) -> str:
     figures = []
     for name, values in images.items():
         image = np.where(np.isfinite(values), values, np.nan)
-        step = max(1, -(-max(image.shape) // _NOTEBOOK_PX))
         low, high = float(np.nanmin(image)), float(np.nanmax(image))
-        png = coloured_png(image[::step, ::step], "viridis", low, high)
+        png = coloured_png(thumbnail(image, _NOTEBOOK_PX), "viridis", low, high)
         caption = f"{name.replace('_um', ', µm').replace('_', ' ')}: {low:.3g} … {high:.3g}"
         figures.append(
             f'<figure style="display:inline-block;margin:.3em"><img src="{png}" alt="{name}" '

@@ -9,8 +9,14 @@ from scipy import ndimage
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import Array
 from litho_data.level.operation import operation
-from litho_data.level.polynomial import Degree, evaluate, fit_terms, polynomial_terms
-from litho_data.level.robust import noise_sigma, robust_surface
+from litho_data.level.polynomial import (
+    Degree,
+    evaluate,
+    fit_terms,
+    noise_sigma,
+    polynomial_terms,
+    robust_surface,
+)
 from litho_data.level.selection import MaskedLevelling, Masking, as_height, select, subtract
 
 Side = Literal["above", "below", "both"]

@@ -7,14 +7,12 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, Union
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-# Each adds its operations.
-import litho_data.level.facet
 import litho_data.level.features
 import litho_data.level.layout_aware
+
+# Each adds its operations.
 import litho_data.level.plane
 import litho_data.level.polynomial
-import litho_data.level.robust
-import litho_data.level.rows
 import litho_data.level.scars  # noqa: F401
 from litho_data.foundation.errors import InputError, about
 from litho_data.foundation.files import parsed
