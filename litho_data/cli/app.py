@@ -177,7 +177,7 @@ def replay(
 
     Example: litho-data replay prints.zarr P11 --array height_um
     """
-    from litho_data.provenance.replay import replay as replay_store
+    from litho_data.provenance.history import replay as replay_store
 
     table = replay_store(store, scan, arrays=array, data_dir=data_dir)
     typer.echo(table.to_string(index=False))
