@@ -97,16 +97,14 @@ def list_fields(card_path: str | Path, data_dir: str | Path | None = None) -> Li
     for scan_id in ids:
         row = table.get(scan_id, {})
         use = cast(Use, row.get("use", "dataset"))
-        files = tuple(found[scan_id] for found in (layouts, scans) if scan_id in found)
+        files = [found[scan_id] for found in (layouts, scans) if scan_id in found]
+        every = tuple(one for found in files for one in found)
         if scan_id not in scans or (scan_id not in layouts and use == "dataset"):
             wanted = patterns_of(card.scan.files if scan_id not in scans else card.layout.files)
             shown = " or ".join(pattern.replace("{id}", scan_id) for pattern in wanted)
-            aside.append(
-                LeftAside(scan_id, tuple(one for found in files for one in found), True, f"no file {shown}")
-            )
+            aside.append(LeftAside(scan_id, every, True, f"no file {shown}"))
             continue
         print_id = print_ids[scan_id]
-        every = tuple(one for found in files for one in found)
         scale = None if scales is None else scales.get(scan_id, scales.get(scans[scan_id][0].name))
         reason = _refusal(scan_id, print_id, use, table, card) or leads_out(every, folder)
         if not reason and (several := [found for found in files if len(found) > 1]):

@@ -19,6 +19,7 @@ from litho_data.build.operations import OPERATIONS
 from litho_data.build.quality import noise_figures
 from litho_data.build.result import BuildResult
 from litho_data.cards.card import Card, check_card
+from litho_data.cards.listing import prints_of
 from litho_data.cards.tables import SAFE_ID, read_full_scales
 from litho_data.foundation.begun import whole_folder
 from litho_data.foundation.commands import progress
@@ -74,13 +75,11 @@ def import_pairs(
     card = _card(
         name or re.sub(r"[^A-Za-z0-9._-]", "-", root.name), pitch_um, level_height_um, levels, list(fields)
     )
-    print_of = re.compile(card.ids.print) if card.ids.print else None
-    jobs = []
-    for order, (field_id, quadrants) in enumerate(sorted(fields.items())):
-        match = print_of.fullmatch(field_id) if print_of else None
-        jobs.append(
-            PairsJob(field_id, match["print"] if match else field_id, order, root, quadrants, scales, card)
-        )
+    ids = sorted(fields)
+    jobs = [
+        PairsJob(field_id, print_id or field_id, order, root, fields[field_id], scales, card)
+        for order, (field_id, print_id) in enumerate(zip(ids, prints_of(ids, card.ids.print), strict=True))
+    ]
     source = Source(
         card=card,
         jobs=jobs,

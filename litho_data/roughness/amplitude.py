@@ -83,22 +83,24 @@ def autocorrelation(height_um: Array) -> Array:
     return covariance / covariance[0, nx // 2 - 1]
 
 
-def correlation_length_um(
-    height_um: Array, pitch_um: float, axis: Axis, *, level: float = np.exp(-1)
-) -> float:
-    """Lag at which the autocorrelation along an axis first falls to ``level``, µm, linear between pixels.
+def correlation_length_um(height_um: Array, pitch_um: float, axis: Axis) -> float:
+    """Lag at which the autocorrelation along an axis first falls to 1/e, µm, linear between pixels.
 
-    Infinity if it stays above ``level`` over half the field.
+    Infinity if it stays above that over half the field.
     """
     correlation = autocorrelation(height_um)
     centre = correlation.shape[1] // 2
     profile = correlation[0, centre:] if axis == "x" else correlation[:, centre]
-    below = np.flatnonzero(profile <= level)
+    return pitch_um * first_fall(profile, np.exp(-1))
+
+
+def first_fall(values: Array, level: float) -> float:
+    """Index at which values first fall to a level, linear between them; infinity if they never do."""
+    below = np.flatnonzero(values <= level)
     if below.size == 0:
         return float("inf")
-    lag = int(below[0])
-    before, after = profile[lag - 1], profile[lag]
-    return float(pitch_um * (lag - 1 + (before - level) / (before - after)))
+    before, after = values[below[0] - 1 : below[0] + 1]
+    return float(below[0] - (level - after) / (before - after))
 
 
 def effective_samples(height_um: Array) -> float:

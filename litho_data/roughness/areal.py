@@ -5,7 +5,7 @@ import numpy as np
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.kinds import YX, Array
 from litho_data.foundation.results import Record
-from litho_data.roughness.amplitude import autocorrelation
+from litho_data.roughness.amplitude import autocorrelation, first_fall
 
 # ISO 16610-61: half of the amplitude passes at the cut-off.
 _ALPHA = float(np.sqrt(np.log(2) / np.pi))
@@ -111,7 +111,8 @@ def decay_lengths_um(correlation: Array, pitch_um: YX) -> tuple[float, float]:
 
     rows, middle = correlation.shape[0] - 1, correlation.shape[1] // 2
     largest_um = np.hypot(rows * pitch_um[0], middle * pitch_um[1])
-    distance_um = np.arange(0.0, largest_um, min(pitch_um) / 4)
+    step_um = min(pitch_um) / 4
+    distance_um = np.arange(0.0, largest_um, step_um)
     lengths = []
     for angle in np.pi * np.arange(_DIRECTIONS) / _DIRECTIONS:
         places = np.array(
@@ -119,13 +120,7 @@ def decay_lengths_um(correlation: Array, pitch_um: YX) -> tuple[float, float]:
         )
         within = (places[0] <= rows) & (places[1] >= 0) & (places[1] <= 2 * middle)
         values = map_coordinates(correlation, places[:, within], order=3, mode="mirror")
-        below = np.flatnonzero(values <= _DECAYED)
-        if below.size == 0:
-            lengths.append(float("inf"))
-            continue
-        k = below[0]
-        share = (values[k - 1] - _DECAYED) / (values[k - 1] - values[k])
-        lengths.append(float(distance_um[k - 1] + share * (distance_um[k] - distance_um[k - 1])))
+        lengths.append(step_um * first_fall(values, _DECAYED))
     return min(lengths), max(lengths)
 
 
