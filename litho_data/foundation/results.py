@@ -85,7 +85,7 @@ class Result(Record):
         file = file / cls.FILE_NAME if file.is_dir() else file
         kind = "/".join(cls.SCHEMA.split("/")[:2])
         parse = partial(json.loads, parse_constant=_refuse)
-        content = parsed(file, parse, f"cannot read {file} as JSON", f"a result {kind}")
+        content = parsed(file, parse, f"cannot read {file}", f"a result {kind}")
         schema = content.get("schema") if isinstance(content, dict) else None
         if schema not in (cls.SCHEMA, *cls.OLDER):
             raise InputError(f"schema of {file}", got=repr(schema), wanted=repr(cls.SCHEMA))
