@@ -29,7 +29,7 @@ from litho_data.level import (
     mask_and_relevel,
     remove_scars,
 )
-from litho_data.level.facet import facet_pass
+from litho_data.level.plane import facet_pass
 from litho_data.level.rows import RowMethod
 from litho_data.readers import read_scan
 

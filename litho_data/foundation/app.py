@@ -1,7 +1,5 @@
 """What the three command lines share: their settings, exit codes, and errors of one line."""
 
-from __future__ import annotations
-
 import errno
 import functools
 import inspect

@@ -19,7 +19,7 @@ from benchmarks.registration import (
     rms_error_px,
 )
 from litho_data.build.build import build_dataset
-from litho_data.provenance.replay import replay
+from litho_data.provenance.history import replay
 from litho_data.provenance.verify import verify
 from litho_data.register import apply_transform
 from litho_data.register.bend import CREEP_DEGREE, Bend, fit_bent_affine
