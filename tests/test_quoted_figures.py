@@ -200,3 +200,42 @@ def test_a_page_quotes_its_record(file):
     assert [
         one for one in said(json.loads((DOCS / "results" / file).read_text("utf-8"))) if one not in text
     ] == []
+
+
+def test_the_results_page_quotes_the_draws_of_the_papers_split_and_the_seeds():
+    folder = DOCS / "results" / "neural-lithography"
+    text = " ".join((folder / "README.md").read_text("utf-8").split())
+
+    def errors_nm(file: str) -> dict[str, float]:
+        scores = json.loads((folder / file).read_text("utf-8"))["scores"]
+        return {score["model"]: score["mae_datum_free_nm"] for score in scores}
+
+    draws = [errors_nm(f"benchmark_paper_{draw}.json") for draw in range(4)]
+    low, high = ({name: end(draw[name] for draw in draws) for name in draws[0]} for end in (min, max))
+    assert (
+        f"FNO has {low['fno']:.2f} to {high['fno']:.2f} nm, PBL {low['pbl']:.2f} to {high['pbl']:.2f}" in text
+    )
+    assert f"Physics {low['physics']:.2f} to {high['physics']:.2f} nm" in text
+    ahead = [draw["pbl"] - draw["fno"] for draw in draws]
+    assert f"ahead of PBL by {min(ahead):.2f} to {max(ahead):.2f} nm in all four draws" in text
+    prints = errors_nm("benchmark_prints.json") | errors_nm("benchmark_prints_pbl.json")
+    shown = {"PBL": "pbl", "`features`": "features", "`linear`": "linear", "Physics": "physics"}
+    for name, model in shown.items():
+        assert f"{name} {prints[model]:.2f}" in text
+
+
+def test_the_page_on_training_quotes_the_recipes():
+    text = " ".join((DOCS / "evaluation.md").read_text("utf-8").split())
+    folder = DOCS / "results" / "recipes"
+
+    def error_nm(file: Path, model: str) -> float:
+        scores = json.loads(file.read_text("utf-8"))["scores"]
+        return next(score["mae_datum_free_nm"] for score in scores if score["model"] == model)
+
+    pbl, fno, physics = (
+        error_nm(folder / f"paper-{one}" / "benchmark.json", one) for one in ("pbl", "fno", "physics")
+    )
+    assert f"PBL {pbl:.2f} nm, FNO {fno:.2f} nm and Physics {physics:.2f} nm" in text
+    fast = DOCS / "results" / "neural-lithography" / "benchmark_paper_0.json"
+    pbl, fno, physics = (error_nm(fast, one) for one in ("pbl", "fno", "physics"))
+    assert f"{pbl:.2f}, {fno:.2f} and {physics:.2f} nm" in text
