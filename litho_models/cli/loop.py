@@ -88,13 +88,13 @@ def close_loop(
     """
     if base == "auto":
         others = {
-            "further stores": stores[1:], "--prior": prior, "--inject": inject, "--steps": steps,
+            "--prior": prior, "--inject": inject, "--steps": steps,
             "--cache": cache, "--loss": loss != "squares", "--weights": weights != "uniform",
             "--background": background != "none",
         }  # fmt: skip
         if given := [name for name, value in others.items() if value]:
             raise InputError(f"--base auto with {given[0]}", wanted="a named base, or none of it")
-        _close_together(stores[0], out, folds, nested, open_lock_box, seed, workers, dask)
+        _close_together(stores, out, folds, nested, open_lock_box, seed, workers, dask)
         return
     from litho_models.loop import LoopConfig, parse_priors
     from litho_models.loop.report.wording import error_lines, verdict_text
@@ -136,7 +136,7 @@ def close_loop(
 
 
 def _close_together(
-    store: Path,
+    stores: list[Path],
     out: Path,
     folds: int,
     nested: Literal["folds", "prints"] | None,
@@ -146,12 +146,13 @@ def _close_together(
     dask: str | None,
 ) -> None:
     """Causes and laws sought together, with strengths by group."""
-    from litho_models.twin.report import effect_text, verdict_text
-    from litho_models.twin.run import close_store
+    from litho_models.planning.rounds import close_loop as close_with_questions
+    from litho_models.twin.report import decision_text, effect_text, verdict_text
 
-    result = close_store(
-        store,
+    result = close_with_questions(
+        stores[0],
         out,
+        new_prints=stores[1:],
         folds=folds,
         nested=nested,
         open_lock_box=open_lock_box,
@@ -163,4 +164,6 @@ def _close_together(
     typer.echo(verdict_text(result))
     for one in result.effects:
         typer.echo(f"  {effect_text(one)}")
+    for decision in result.decisions:
+        typer.echo(f"  {decision_text(decision)}")
     typer.echo(f"report: {out / 'report.html'}")

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from litho_models.loop.result.questions import OpenQuestions, Question
 from litho_models.planning import power
+from litho_models.planning.questions import OpenQuestions, Question
 from litho_models.planning.record import PlannedPair, PlannedQuestion, Status
 from litho_models.planning.rivalry import PlannedPrint, Rivalry
 
@@ -72,7 +72,9 @@ def _pairs(rivalry: Rivalry, prints: Sequence[PlannedPrint]) -> list[PlannedPair
     drawn = [rivalry.drawn(random) for _ in range(DRAWS)]
     contrasts = [one.contrasts(prints, one.refitted(prints, first=first)) for one in drawn]
     directed = {}
-    for pair, fitted, *others in zip(rivalry.pairs, rivalry.contrasts(prints), *contrasts, strict=True):
+    for pair, fitted, *others in zip(
+        rivalry.pairs, rivalry.contrasts(prints, rivalry.refitted(prints, rounds=2)), *contrasts, strict=True
+    ):
         powers = [[power.of_contrast(one, rivalry.question, n) for n in _COUNTS] for one in others]
         directed[pair] = fitted, np.mean(powers, axis=0).tolist()
     found = []
@@ -95,22 +97,8 @@ def of_others(
     question: Question, open_: OpenQuestions, prints: int, scans: int, size_px: int
 ) -> PlannedQuestion:
     """A question whose answer lies in how prints are scanned, not in what is printed."""
-    difference = noise = None
-    if question.kind == "generic" and question.turning is not None:
-        turning = question.turning
-        difference, noise = turning.rms_nm, turning.noise_nm
-        # Only the first print is scanned once more at the end.
-        shown = [n if turning.by == "turned scan" else 1 for n in _COUNTS]
-        powers = [power.of_generic(question, n) for n in shown]
-        why = f"{turning.by}: as the printer's and as the microscope's it differs by {difference:.1f} nm rms"
-        why += _of_form(difference, question.form_nm, _status(powers, prints))
-        if difference < 0.1:
-            why += "; turning a print does not show it: a second tip and a step standard do"
-        outcomes = [
-            "the term stays where it was on the print: the printer's, or the resist's",
-            "it goes with the scan: the microscope's, and no design may use it",
-        ]
-    elif question.kind == "lines":
+    difference = None
+    if question.kind == "lines":
         sd_um = next(iter(question.sizes.values()), 0.0)
         difference = 1e3 * sd_um
         powers = [power.of_lines(sd_um, open_.noise, size_px, n) for n in _COUNTS]
@@ -143,7 +131,7 @@ def of_others(
         pairs=[],
         difference_nm=difference,
         random_difference_nm=difference,
-        noise_nm=noise,
+        noise_nm=None,
         form_nm=question.form_nm,
         power=powers,
         random_power=powers,

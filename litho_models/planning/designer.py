@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -16,10 +15,9 @@ from litho_data.layouts.random_layout import random_layout
 from litho_data.register.coarse import SEARCH_BLUR_PX
 from litho_data.register.orientation import rival_alignment
 from litho_data.register.topography import predicted_topography
-from litho_models.loop.result.questions import OpenQuestions, Question
-from litho_models.planning.answers import DRAWS
-from litho_models.planning.layouts import NEAREST, TILE_PX, Limits, climb, score, starts
-from litho_models.planning.rivalry import Place, PlannedPrint, Rivalry, Way
+from litho_models.planning.layouts import TILE_PX, Limits, climb, score, starts
+from litho_models.planning.questions import OpenQuestions, Question
+from litho_models.planning.rivalry import Place, Rivalry, Way
 
 TURNED = Way(turned_deg=90)
 _EXTRAS = (TURNED, Way(backward=True), Way(new_tip=True), Way(fine=True))
@@ -91,12 +89,8 @@ def choose(rivalry: Rivalry, level: np.ndarray, can_move: bool) -> Chosen:
 
 def ways_without_rivals(questions: Sequence[Question]) -> tuple[Way, ...]:
     """Scans asked for by questions whose answer depends on no layout."""
-    turned = any(
-        q.kind == "lines" or (q.turning is not None and q.turning.by == "turned scan") for q in questions
-    )
-    repeated = any(q.kind == "per-scan" for q in questions)
     # A scan turned by 90 degrees is a repeat as well: the print was taken out and put back.
-    return (TURNED,) if turned or repeated else ()
+    return (TURNED,) if any(q.kind in ("lines", "per-scan") for q in questions) else ()
 
 
 _TILES = 4
@@ -159,7 +153,8 @@ class Designer:
         )[:16]
         kept = self.cache / key
         kept.mkdir(parents=True, exist_ok=True)
-        self._announce(count, sum((kept / f"{n}.npy").is_file() for n in range(count)))
+        done = sum((kept / f"{number}.npy").is_file() for number in range(count))
+        self.report(f"{done} of {count} tiles are kept from an earlier run")
         ranked = [self._ranked(rivalry) for rivalry in self.rivalries]
         tiles = []
         for number in range(count):
@@ -204,26 +199,6 @@ class Designer:
         ]
         scores = {name: score(rivalry, level, self.ways) for name, level in found}
         return sorted(found, key=lambda one: -scores[one[0]])
-
-    def _announce(self, count: int, done: int) -> None:
-        """Say before the work begins how long it will take, from one step of it."""
-        rivalry = max(self.rivalries, key=lambda one: len(one.pairs))
-        level = random_level(self.limits, self.tile_px, self.seed)
-        clock = time.perf_counter()
-        refitted = rivalry.refitted([PlannedPrint(as_tensor(level), self.ways)])
-        refit_s, clock = time.perf_counter() - clock, time.perf_counter()
-        soft = as_tensor(level).requires_grad_()
-        nearest = range(min(NEAREST, len(rivalry.pairs)))
-        rivalry.separations([PlannedPrint(soft, self.ways)], refitted, nearest).sum().backward()
-        step_s = time.perf_counter() - clock
-        tile_s = self.steps * step_s + (1 + self.steps / 10) * refit_s
-        area = (self.size_px / self.tile_px) ** 2
-        # Two prints and two random ones are judged: a refit each and two rounds, and all draws.
-        judged = 12 + 4 * DRAWS
-        rest_s = len(self.rivalries) * (13 * refit_s + judged * area * refit_s)
-        total_s = (count - done) * tile_s + rest_s
-        kept = f", {done} of {count} tiles are kept from an earlier run" if done else ""
-        self.report(f"this takes about {max(1, round(total_s / 60))} min on one core{kept}")
 
 
 def _repeats(level: np.ndarray) -> float:

@@ -17,7 +17,7 @@ from torch import Tensor
 from litho_data.layouts.patterns import checkerboard, isolated_features, line_space_sweep
 from litho_data.layouts.random_layout import quantise, random_layout
 from litho_models.effects.chain import EffectChain
-from litho_models.loop.result.questions import OpenQuestions
+from litho_models.planning.questions import OpenQuestions
 from litho_models.planning.rivalry import Place, PlannedPrint, Rivalry, Way
 
 TILE_PX = 256
@@ -28,7 +28,6 @@ _STEP_LEVELS = 0.3
 NEAREST = 4
 # Levels rarer than this in the prints so far are not known to the models.
 _RARE = 1e-3
-_POWER_KNOWN = 0.95
 # Mean distance of sorted levels from those of the prints so far, in levels, that costs nothing.
 _FREE_LEVELS = 1.5
 _PRICE = 2.0
@@ -47,14 +46,12 @@ class Limits:
 
     @classmethod
     def of(cls, open_: OpenQuestions, pitch_um: float) -> Limits:
-        """Levels with a share of a thousandth, and frequencies up to where 95 % of the power lies."""
+        """Levels with a share of a thousandth, and structure no finer than in the prints so far."""
         share = np.array(open_.level_share)
         levels = np.flatnonzero(share >= _RARE)
-        cumulative = np.cumsum(open_.power_share) / max(sum(open_.power_share), 1e-12)
-        cutoff = float(np.array(open_.frequency_per_um)[np.searchsorted(cumulative, _POWER_KNOWN)])
         quantiles = (np.arange(4096) + 0.5) / 4096
         known = np.searchsorted(np.cumsum(share) / share.sum(), quantiles).astype(np.float32)
-        return cls(int(levels[0]), int(levels[-1]), cutoff, pitch_um, known)
+        return cls(int(levels[0]), int(levels[-1]), open_.cutoff_per_um, pitch_um, known)
 
     def soft(self, free: Tensor) -> Tensor:
         """Printable soft levels (y, x) nearest to free ones."""
@@ -134,8 +131,17 @@ def score(
     soft = torch.from_numpy(level.astype(np.float32))
     prints = [PlannedPrint(soft, ways, place, dose=dose) for dose in doses]
     refitted = rivalry.refitted(prints)
-    with torch.no_grad():
-        return float(rivalry.separations(prints, refitted).min())
+    return float(_separations(rivalry, prints, refitted).min())
+
+
+def _separations(
+    rivalry: Rivalry,
+    prints: Sequence[PlannedPrint],
+    refitted: Sequence[EffectChain],
+    only: Sequence[int] | None = None,
+) -> Tensor:
+    contrasts = rivalry.contrasts(prints, refitted, only)
+    return torch.stack([one.separation(rivalry.question.spread) for one in contrasts])
 
 
 def climb(
@@ -158,8 +164,7 @@ def climb(
         if step % _REFIT_EVERY == 0 or step == steps:
             here = [PlannedPrint(soft.detach(), ways, place)]
             refitted = rivalry.refitted(here)
-            with torch.no_grad():
-                apart = rivalry.separations(here, refitted)
+            apart = _separations(rivalry, here, refitted)
             nearest = torch.argsort(apart)[:NEAREST].tolist()
             # Only where the partners are those of this very layout is the height true.
             if float(apart.min()) > highest:
@@ -167,7 +172,7 @@ def climb(
         if step == steps:
             break
         # The nearest pair, softly: with the hard minimum two pairs would take turns.
-        apart = rivalry.separations([PlannedPrint(soft, ways, place)], refitted, nearest)
+        apart = _separations(rivalry, [PlannedPrint(soft, ways, place)], refitted, nearest)
         height = -torch.logsumexp(-apart, 0)
         climber.zero_grad()
         (limits.price(soft) - height).backward()

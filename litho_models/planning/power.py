@@ -10,11 +10,12 @@ from scipy.stats import f as f_distribution
 from scipy.stats import norm
 
 from litho_data.foundation.units import NM_PER_UM
-from litho_models.loop.decision_error import Z_DECIDED, surely_better
-from litho_models.loop.residual_spectrum import NoiseSpectrum
-from litho_models.loop.result.questions import Question
-from litho_models.loop.selection.confirming import BINOMIAL_P
+from litho_models.planning.deciding import PRINT_SHARE
+from litho_models.planning.decision_error import Z_DECIDED, surely_better
+from litho_models.planning.noise import NoiseSpectrum
+from litho_models.planning.questions import Question
 from litho_models.planning.rivalry import Contrast
+from litho_models.twin.judging import CONFIRM_P
 
 ENOUGH = 0.95
 # Beside this power no allowed experiment separates the rivals.
@@ -29,47 +30,26 @@ def of_contrast(contrast: Contrast, question: Question, prints: int) -> float:
     noise along the distance, and that of the distance itself, which varies between prints by the question's
     ``spread``. What its ``form_nm`` may have made of it does not count, as in the decision.
     """
-    squares, pixels = float(contrast.squares_um2.mean()), float(contrast.pixels.mean())
-    noise = float((contrast.sd_um2**2).mean())
-    return _power(squares, noise, pixels, question, prints, NM_PER_UM)
+    squares = prints * float(contrast.squares_um2.mean())
+    noise = prints * float((contrast.sd_um2**2).mean())
+    form = prints * float(contrast.pixels.mean()) * ((question.form_nm or 0.0) / NM_PER_UM) ** 2
+    sd = math.sqrt(noise + (question.spread * squares) ** 2 / prints)
+    return float(norm.cdf(surely_better(squares, squares, sd, form) - Z_DECIDED))
 
 
-def of_generic(question: Question, prints: int) -> float:
-    """Power to tell a term that goes with the print from one that goes with the scan."""
-    turning = question.turning
-    assert turning is not None
-    squares = turning.pixels * turning.rms_nm**2
-    noise = 2 * math.sqrt(turning.pixels) * turning.rms_nm * turning.noise_nm
-    return _power(squares, noise**2, turning.pixels, question, prints, 1.0) if squares else 0.0
-
-
-def _power(
-    squares: float, variance: float, pixels: float, question: Question, prints: int, nm_per_unit: float
-) -> float:
-    """Of prints with so large a squared distance and variance of its evidence by noise, each."""
-    form = pixels * ((question.form_nm or 0.0) / nm_per_unit) ** 2
-    sd = math.sqrt(prints * (variance + (question.spread * squares) ** 2))
-    expected = surely_better(prints * squares, prints * squares, sd, prints * form)
-    return float(norm.cdf(expected - Z_DECIDED))
-
-
-def of_repeats(prints: int, scans: int, share: float = 0.9) -> float:
+def of_repeats(prints: int, scans: int) -> float:
     """Power of prints that are taken out and scanned again, to say whose a term of single scans is.
 
     With the F of an analysis of variance: the printer's if scans of one print agree as they never would by
     chance (p <= 0.005), the microscope's if they agree as little as they never would (p <= 0.005) were it the
     printer's. The power is the smaller one of both answers.
-
-    Args:
-        prints: each with as many ``scans``.
-        share: of the variance that belongs to the print, if the printer is the cause.
     """
     if prints < 2 or scans < 2:
         return 0.0
     between, within = prints - 1, prints * (scans - 1)
-    ratio = 1 + scans * share / (1 - share)
-    printer = f_distribution.sf(f_distribution.isf(BINOMIAL_P, between, within) / ratio, between, within)
-    scanned = f_distribution.cdf(ratio * f_distribution.ppf(BINOMIAL_P, between, within), between, within)
+    ratio = 1 + scans * PRINT_SHARE / (1 - PRINT_SHARE)
+    printer = f_distribution.sf(f_distribution.isf(CONFIRM_P, between, within) / ratio, between, within)
+    scanned = f_distribution.cdf(ratio * f_distribution.ppf(CONFIRM_P, between, within), between, within)
     return float(min(printer, scanned))
 
 

@@ -14,8 +14,6 @@ from litho_data.foundation.report import Page, capitalised
 from litho_data.foundation.report_pictures import new_figure
 from litho_data.foundation.units import NM_PER_UM
 from litho_data.layouts.statistics_report import layouts_figure
-from litho_models.effects import CATALOGUE
-from litho_models.loop.result.questions import effect_of
 from litho_models.planning.power import ENOUGH
 from litho_models.planning.record import NextPrint, PlannedQuestion
 from litho_models.planning.rivalry import PlannedPrint, Rivalry
@@ -83,19 +81,8 @@ def write_report(
     return page.write(folder)
 
 
-def _asked(question: PlannedQuestion) -> str:
-    """The question in words; an effect of which it is open whose it is stands twice among the rivals."""
-    names = dict.fromkeys(effect_of(rival) for rival in question.rivals) or [question.name]
-    first, *others = [CATALOGUE[name].title if name in CATALOGUE else name for name in names]
-    if others:
-        return f"which is at work, {', '.join([first, *others[:-1]])} or {others[-1]}"
-    if question.kind == "fact":
-        return f"{first}: {question.text}"
-    return f"{first}: the printer's or the microscope's"
-
-
 def _verdict(plan: NextPrint) -> str:
-    decided = [_asked(q) for q in plan.questions if q.status == "decides"]
+    decided = [q.text for q in plan.questions if q.status == "decides"]
     asked = sum(question.kind != "fact" for question in plan.questions)
     if not asked:
         names = " and ".join(question.name for question in plan.questions)
@@ -134,7 +121,7 @@ def _table(plan: NextPrint) -> list[dict[str, Any]]:
             "difference_nm": np.nan if q.difference_nm is None else q.difference_nm,
             "noise_nm": np.nan if q.noise_nm is None else q.noise_nm,
             "form_nm": np.nan if q.form_nm is None else q.form_nm,
-            "asked": _asked(q),
+            "asked": q.text,
         }
         for q in plan.questions
     ]

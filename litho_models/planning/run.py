@@ -17,15 +17,15 @@ from litho_data.foundation.run_facts import run_info
 from litho_data.layouts.patterns import flat, framed_ladder
 from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import load_simulator
-from litho_models.loop.result.questions import OpenQuestions
-from litho_models.loop.run import MODEL_FOLDER
 from litho_models.planning import answers
 from litho_models.planning.designer import WORDS, Designer, as_tensor, random_level, ways_without_rivals
 from litho_models.planning.folder import HOLDS, write_plan
 from litho_models.planning.layouts import STEPS, Limits, assemble
+from litho_models.planning.questions import OpenQuestions
 from litho_models.planning.record import NextPrint, PlannedQuestion, PlannedScan
 from litho_models.planning.report import write_report
 from litho_models.planning.rivalry import PlannedPrint, Printing, Rivalry, Way
+from litho_models.twin.run import MODEL_FOLDER
 
 # Prints on which the rivals are compared at last; the others are made of the same tiles.
 _JUDGED = 2
@@ -112,7 +112,7 @@ def next_print(
     ]
     count = _fewest(answered, prints)
     planned, levels = planned[:count], levels[:count]
-    scans, maps = schedule(planned, levels, answered, limits, printing, seed)
+    scans, maps = schedule(planned, levels, limits, printing, seed)
     plan = NextPrint(
         run=run_info([seed], len(scans)),
         dataset=open_.dataset,
@@ -161,7 +161,6 @@ _LADDER_PX = 5 * _TREAD_PX
 def schedule(
     planned: Sequence[PlannedPrint],
     levels: Sequence[np.ndarray],
-    questions: Sequence[PlannedQuestion],
     limits: Limits,
     printing: Printing,
     seed: int,
@@ -191,9 +190,6 @@ def schedule(
             if one.dose != 1:
                 why += f"; the print has {one.dose:g} of the dose"
             rows.append((f"N{number}F{at}", str(number), "dataset", way, reach_um, one.dose, why, level))
-    if any(q.kind == "generic" and "early print" in q.why for q in questions):
-        why = "the first print once more at the end: what changed in between is the microscope's"
-        rows.append((f"N1F{len(planned[0].ways) + 1}", "1", "dataset", Way(), 0.0, 1.0, why, levels[0]))
     scans = [
         PlannedScan(
             id=scan_id,

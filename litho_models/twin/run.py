@@ -13,8 +13,10 @@ from torch import nn
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_folder
 from litho_data.foundation.outputs import require_replaceable_folder
+from litho_data.foundation.results import Result
 from litho_data.foundation.workers import Workers, kept_open, run_jobs
 from litho_data.store import PrintedScan, Store, open_store
+from litho_models.effects import get_effect
 from litho_models.fitting.runs import level_share, step_share
 from litho_models.frozen.files import save_frozen
 from litho_models.loop.prepared import PreparedScan, prepare_scans
@@ -33,12 +35,14 @@ from litho_models.twin.record import CloseLoop, ErrorRow, Stage
 from litho_models.twin.report import write_report
 from litho_models.twin.results import error_rows, record
 
-MODEL_FOLDER, LAWS_FILE = "model", "laws.py"
+MODEL_FOLDER, LAWS_FILE, QUESTIONS_FILE = "model", "laws.py", "open_questions.json"
 AUTO = "auto"
 # Bases that compete where none is asked for, the first one the form of the paper's physics.
 BASES = ("physics", "affine-mtf", "blur-table")
 _FEWEST_PIXELS = 1024
 HeldOut = Literal["folds", "prints"]
+# What is made of a closed loop before it is written: its record, and records to be written beside it.
+Further = Callable[[Closed, CloseLoop], tuple[CloseLoop, Sequence[Result]]]
 
 
 def close_store(
@@ -52,6 +56,7 @@ def close_store(
     seed: int = 0,
     workers: int = 1,
     dask: str | None = None,
+    further: Further | None = None,
     report: Callable[[str], None] = lambda message: None,
 ) -> CloseLoop:
     """Close the loop on a dataset store and write everything to ``out``, which appears when complete.
@@ -64,12 +69,15 @@ def close_store(
         open_lock_box: also score the locked scans.
         seed: of folds, calibration blocks and permutations.
         workers: local processes; ``dask``: address of a Dask scheduler instead.
+        further: called before anything is written.
         report: told what happens, a sentence at a time.
 
     Raises:
         InputError: no store, an unknown base, or too few usable scans.
     """
-    require_replaceable_folder(out, CloseLoop.FILE_NAME, "report.html", "*.csv", MODEL_FOLDER, LAWS_FILE)
+    require_replaceable_folder(
+        out, CloseLoop.FILE_NAME, QUESTIONS_FILE, "report.html", "*.csv", MODEL_FOLDER, LAWS_FILE
+    )
     opened = open_store(store)
     scans = [scan for scan in opened.scans() if np.count_nonzero(scan.usable) >= _FEWEST_PIXELS]
     kept = {scan.id for scan in scans}
@@ -107,8 +115,10 @@ def close_store(
         survives=survives,
         chosen=often,
     )
+    result, others_of_it = further(loop.closed, result) if further else (result, ())
     with atomic_folder(out) as folder:
-        result.write(folder)
+        for written in (result, *others_of_it):
+            written.write(folder)
         write_report(result, loop.shown(), folder)
         _save_model(loop.closed, result, opened, folder / MODEL_FOLDER)
         if loop.closed.lawful.causes:
@@ -419,6 +429,7 @@ def _save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) -
     assert isinstance(base, Simulator)
     latest: PreparedScan = max(closed.study.scans, key=lambda scan: scan.stored.order)
     values = twin.values(twin.labels(latest))
+    sides = {"process": "printer", "measurement": "microscope"}
     role = {one.name: one.role for one in result.effects}
     error = result.error("all")
     assert error is not None
@@ -432,6 +443,11 @@ def _save_model(closed: Closed, result: CloseLoop, store: Store, folder: Path) -
             name: own for name, own in values.items() if role[name] not in ("process", "measurement")
         },
         dataset=result.dataset.model_dump(mode="json"),
+        attributed={
+            one.name: sides[one.role]
+            for one in result.effects
+            if one.role in sides and get_effect(one.name).role != one.role
+        },
         command=result.run.command,
         split={
             **result.split.model_dump(mode="json"),

@@ -1,0 +1,240 @@
+"""What a closed loop leaves open, with everything that an experiment needs to be planned from it.
+
+A set that the prints cannot tell apart is kept as rivals: the corrected model with each member in turn,
+fitted again to all scans. What may be the printer's or the microscope's is kept as two: it goes with the
+print, or with the scan.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from litho_data.layouts.statistics import layout_statistics
+from litho_data.store import PrintedScan
+from litho_data.store.schema import DatasetId
+from litho_models.effects import CATALOGUE, get_effect
+from litho_models.effects.registry import TIP
+from litho_models.fitting.least_squares import eliminated_sum
+from litho_models.fitting.runs import level_share
+from litho_models.loop.explainable import Learner
+from litho_models.planning.noise import NoiseSpectrum, left_nm, noise_spectrum
+from litho_models.planning.questions import OpenQuestions, Owner, Question, Rival
+from litho_models.planning.rival_fits import fit_rivals
+from litho_models.scan_terms.groups import ALL
+from litho_models.twin.closing import Closed, held_out_maps
+from litho_models.twin.fits import RULES
+from litho_models.twin.model import Twin
+from litho_models.twin.results import clustered_covariance, independent
+from litho_models.twin.search import WORTH_FITTING, separating
+
+# Members of a set, or suspects: every pair of rivals is compared on every layout.
+_MOST_MEMBERS = 3
+# Of a layout whose spectrum can be told.
+_SMALLEST_PX, _POWER_KNOWN = 64, 0.95
+_LINES = ("line-roughness", "scan-line-stripes")
+_OF_PLACE = ("vignetting", "field-curvature")
+
+
+class SingleTerm(NamedTuple):
+    """A term of single scans whose owner is not known, with its sizes by name and unit."""
+
+    name: str
+    sizes: Mapping[str, float]
+
+
+def open_questions(
+    closed: Closed,
+    dataset: DatasetId,
+    single_terms: Sequence[SingleTerm] = (),
+    report: Callable[[str], None] = lambda message: None,
+) -> OpenQuestions:
+    """Everything that is open, the most valuable first, rivals fitted."""
+    scans = closed.study.scans
+    stored = [scan.stored for scan in scans]
+    maps = held_out_maps(closed.final, closed.study, scans)
+    noise = noise_spectrum([left_nm(*pair) for pair in zip(scans, maps, strict=True)])
+    asking = _Asking(closed, noise, report)
+    found = [asking.of_cause(one.name, one.alike) for one in (*closed.causes, *closed.lawful.causes)]
+    return OpenQuestions(
+        dataset=dataset,
+        noise=noise,
+        level_share=level_share(stored),
+        cutoff_per_um=_cutoff_per_um(stored),
+        write_field_um=(stored[0].write or {}).get("field_um"),
+        questions=[
+            *(one for one in (*found, asking.of_suspects()) if one is not None),
+            *map(_of_single_term, single_terms),
+            *_of_facts(closed),
+        ],
+    )
+
+
+def _cutoff_per_um(scans: Sequence[PrintedScan]) -> float:
+    """Up to where most of the power of the layouts lies, cycles/µm."""
+    first = scans[0]
+    if min(min(scan.shape) for scan in scans) < _SMALLEST_PX:
+        return 0.05 / first.pitch_um
+    known = layout_statistics(
+        [scan.mask_level for scan in scans], levels=first.levels, pitch_um=first.pitch_um
+    )
+    return known.frequency_per_um[int(np.searchsorted(np.cumsum(known.power_share), _POWER_KNOWN))]
+
+
+class _Asking:
+    """Questions with rivals, about one closed loop."""
+
+    def __init__(self, closed: Closed, noise: NoiseSpectrum, report: Callable[[str], None]):
+        self.closed, self.noise, self.report = closed, noise, report
+        self.twin = closed.final.twin.ungrouped()
+
+    def of_cause(self, name: str, alike: Sequence[str]) -> Question | None:
+        """The set of a cause or a law, or whose it is; None if nothing is open."""
+        members = [name, *alike][:_MOST_MEMBERS]
+        if len(members) == 1 and len(_owners(name, self.twin.values({})[name])) == 1:
+            return None
+        without = self.twin.without(name)
+        twins = [self.twin, *(without.with_effect(one, ALL, self._first(one)).ungrouped() for one in alike)]
+        grouped = self.closed.final.twin
+        rivals, fitted = self._rivals(members, [*twins[: len(members)], grouped.without(name)])
+        rests = self.closed.rests
+        stage = next((stage for stage in ("laws", "causes", "base") if stage in rests), None)
+        return Question(
+            name=name,
+            kind="set" if len(members) > 1 else "role",
+            text=_in_words(members),
+            experiment=separating(members),
+            rivals=rivals,
+            # What groups differ by is known: one more of them does not make its prints contradict each other.
+            spread=self._spread(fitted[-1], grouped),
+            form_nm=None if stage is None else rests[stage].most_nm,
+        )
+
+    def of_suspects(self) -> Question | None:
+        """What stood out and was not confirmed: which of these carries what is left, if any does."""
+        named = self.closed.named
+        least = WORTH_FITTING * 0.01 * named.state.mse_nm2
+        standing = [
+            one
+            for name in named.refused
+            if (one := named.last.get(name)) is not None
+            and one.allowed
+            and one.gain_nm2 >= least
+            and name not in self.twin.names
+        ]
+        names = [one.name for one in sorted(standing, key=lambda one: -one.gain_nm2)]
+        if len(names) < 2 and not any(get_effect(name).role == "undetermined" for name in names):
+            return None
+        names = names[:_MOST_MEMBERS]
+        twins = [self.twin.with_effect(name, ALL, named.last[name].start()).ungrouped() for name in names]
+        rivals, fitted = self._rivals(names, twins)
+        study = self.closed.study
+        # The loop knows the error of its form with none of them in, which is theirs as well.
+        learner = Learner(study, held_out_maps(self.closed.final, study, study.scans))  # type: ignore[arg-type]
+        rests = [learner.rest([twin.placed().height(scan) for scan in study.scans]) for twin in fitted]
+        return Question(
+            name=" or ".join(names),
+            kind="suspects",
+            text=f"each stands out and none was confirmed: {_in_words(names)}",
+            experiment=separating(names),
+            rivals=rivals,
+            form_nm=min(rest.most_nm for rest in rests),
+        )
+
+    def _rivals(self, members: Sequence[str], twins: Sequence[Twin]) -> tuple[list[Rival], list[Twin]]:
+        """The answers, and the fitted twins: one for each member, and any that only stand beside them."""
+        self.report(f"fitting the rivals {', '.join(members)}")
+        study = self.closed.study
+        windows, units = study.windows, independent(study.scans)
+        stands_for = sum(int(w.usable.sum()) for w in windows) / sum(len(w.sample) for w in windows)
+        rivals, fitted = [], []
+        for at, (twin, fit) in enumerate(zip(twins, fit_rivals(twins, windows), strict=True)):
+            fitted.append(twin.at(fit.vector))
+            if at >= len(members):
+                continue
+            free = fitted[-1].free()[:, None]
+            linear = [replace(part, jacobian=part.jacobian * free) for part in fit.linear]
+            values = fitted[-1].values({})
+            rivals += [
+                Rival(
+                    effect=members[at],
+                    owner=owner,
+                    effects=values,
+                    vector=fit.vector.tolist(),
+                    information=(stands_for * eliminated_sum(fit.linear, RULES.term_weight)[0]).tolist(),
+                    covariance=clustered_covariance(linear, units).tolist(),
+                )
+                for owner in _owners(members[at], values[members[at]])
+            ]
+        return rivals, fitted
+
+    def _first(self, name: str) -> dict[str, dict[str, float]]:
+        """Where a member starts in the place of another: as before any of them was found."""
+        found = self.closed.named.first.get(name) or self.closed.lawful.first[name]
+        return found.start()
+
+    def _spread(self, without: Twin, twin: Twin) -> float:
+        """How much the evidence for a change varies over scans, relative to its mean, beyond what noise does.
+
+        Each scan says by which multiple a it wants the change d; the difference of its squared errors is
+        |d|² (2 a - 1) beside the noise, so that it varies by twice the spread of a.
+        """
+        multiples, own = [], []
+        before, after = without.placed(), twin.placed()
+        for scan in self.closed.study.scans:
+            left, right = (left_nm(scan, one.height(scan)) for one in (before, after))
+            change = np.nan_to_num(left - right)
+            size = float((change**2).sum())
+            if size:
+                multiples.append(float((change * np.nan_to_num(left)).sum()) / size)
+                own.append(self.noise.along(change) ** 2 / size)
+        if len(multiples) < 2:
+            return 0.0
+        # Robust: a scan may have a defect.
+        spread = float(np.median(np.abs(np.array(multiples) - np.median(multiples)))) / 0.6745
+        return min(2 * float(np.sqrt(max(spread**2 - float(np.median(own)), 0.0))), 1.0)
+
+
+def _owners(name: str, values: Mapping[str, float]) -> list[Owner | None]:
+    """Whose an effect may be: that of the catalogue, or either's where one orientation cannot say.
+
+    A tip that is sharper along one axis looks as a print whose flanks stand proud along one.
+    """
+    uneven = name == TIP and values["along"] != values["across"]
+    return ["printer", "microscope"] if uneven or get_effect(name).role == "undetermined" else [None]
+
+
+def _in_words(names: Sequence[str]) -> str:
+    first, *others = [get_effect(name).title for name in names]
+    if others:
+        return f"which is at work, {', '.join([first, *others[:-1]])} or {others[-1]}"
+    return f"{first}: the printer's or the microscope's"
+
+
+def _of_single_term(term: SingleTerm) -> Question:
+    lines = term.name in _LINES
+    return Question(
+        name=term.name,
+        kind="lines" if lines else "per-scan",
+        text="offsets of lines: written or scanned" if lines else _in_words([term.name]),
+        experiment=separating([term.name]),
+        sizes=dict(term.sizes),
+    )
+
+
+def _of_facts(closed: Closed) -> list[Question]:
+    """Effects that could not be tested for want of a fact about the prints."""
+    reasons = dict(closed.untestable)
+    if "field_um" not in (closed.study.scans[0].stored.write or {}):
+        for name in _OF_PLACE:
+            reasons.setdefault(name, "the place of the prints in the write field is not known")
+    return [
+        Question(
+            name=name, kind="fact", text=f"{get_effect(name).title}: {why}", experiment=separating([name])
+        )
+        for name, why in reasons.items()
+        if name in CATALOGUE
+    ]
