@@ -31,7 +31,6 @@ _RARE = 1e-3
 # Mean distance of sorted levels from those of the prints so far, in levels, that costs nothing.
 _FREE_LEVELS = 1.5
 _PRICE = 2.0
-_FEWEST_TREADS = 3
 
 
 @dataclass(frozen=True)
@@ -76,6 +75,17 @@ class Limits:
         known = torch.from_numpy(self.known[8::16].copy())
         return _PRICE * torch.relu((quantiles - known).abs().mean() - _FREE_LEVELS) ** 2
 
+    def random(self, size_px: int, seed: int, finest: float = 1.0) -> np.ndarray:
+        """Random structure, (size, size) whole levels; ``finest``: share of the cut-off."""
+        level = random_layout(
+            (size_px, size_px),
+            levels=self.highest + 1,
+            cutoff_per_um=finest * self.cutoff_per_um,
+            pitch_um=self.pitch_um,
+            seed=seed,
+        )
+        return np.maximum(level, np.uint8(self.lowest))
+
 
 def starts(size_px: int, limits: Limits, seed: int) -> Iterator[tuple[str, np.ndarray]]:
     """Named layouts to start from, (size, size) levels.
@@ -83,40 +93,28 @@ def starts(size_px: int, limits: Limits, seed: int) -> Iterator[tuple[str, np.nd
     Patterns lie in a frame of random structure, a fifth of the side wide: a scan of what repeats itself
     cannot be registered.
     """
-    shape, high, low = (size_px, size_px), limits.highest, limits.lowest
+    for number, finest in enumerate((1.0, 0.5, 0.8)):
+        yield f"random-{number + 1}", limits.random(size_px, seed + number, finest)
+    high, low = limits.highest, limits.lowest
     feature = max(3, round(0.5 / limits.cutoff_per_um / limits.pitch_um))
-    levels = limits.highest + 1
-    for number in range(3):
-        cutoff = limits.cutoff_per_um * (1.0, 0.5, 0.8)[number]
-        level = random_layout(
-            shape, levels=levels, cutoff_per_um=cutoff, pitch_um=limits.pitch_um, seed=seed + number
-        )
-        yield f"random-{number + 1}", np.maximum(level, low)
-    frame = random_layout(
-        shape, levels=levels, cutoff_per_um=limits.cutoff_per_um, pitch_um=limits.pitch_um, seed=seed + 7
-    )
-    frame = np.maximum(frame, np.uint8(low))
     inset = size_px // 5
-    room, inner = (slice(inset, size_px - inset),) * 2, size_px - 2 * inset
+    shape = (size_px - 2 * inset,) * 2
+    treads = np.linspace(low, high, max(2, min(high + 1 - low, shape[0] // (2 * feature))))
+    stairs = np.rint(np.repeat(treads, -(-shape[0] // len(treads))))[: shape[0], None]
     patterns = {
-        "checkerboard": checkerboard((inner, inner), cell_px=2 * feature, high=high, low=low),
-        "lines": line_space_sweep((inner, inner), high=high, low=low, narrowest_px=feature),
-        "lines-along-x": line_space_sweep(
-            (inner, inner), high=high, low=low, narrowest_px=feature, along="x"
-        ),
+        "checkerboard": checkerboard(shape, cell_px=2 * feature, high=high, low=low),
+        "lines": line_space_sweep(shape, high=high, low=low, narrowest_px=feature),
+        "lines-along-x": line_space_sweep(shape, high=high, low=low, narrowest_px=feature, along="x"),
+        "stairs": stairs,
     }
-    if inner >= _FEWEST_TREADS * 2 * feature:
-        steps = min(levels - low, inner // (2 * feature))
-        stairs = np.rint(np.linspace(low, high, steps)).astype(np.uint8)
-        patterns["stairs"] = np.broadcast_to(stairs[np.arange(inner) * steps // inner], (inner, inner))
-    widths = [feature + 2 * i for i in range(9) if 3 * (feature + 2 * i) <= inner // 3]
+    widths = [feature + 2 * i for i in range(9) if 3 * (feature + 2 * i) <= shape[0] // 3]
     if widths:
-        middle = (high + low) // 2
-        for name, top in (("pillars", high), ("pits", low)):
-            patterns[name] = isolated_features((inner, inner), widths_px=widths, feature=top, ground=middle)
+        patterns["pillars"] = isolated_features(
+            shape, widths_px=widths, feature=high, ground=(high + low) // 2
+        )
     for name, pattern in patterns.items():
-        whole = frame.copy()
-        whole[room] = pattern
+        whole = limits.random(size_px, seed + 7)
+        whole[inset:-inset, inset:-inset] = pattern
         yield name, whole
 
 
@@ -128,8 +126,7 @@ def score(
     doses: Sequence[float] = (1.0,),
 ) -> float:
     """Separation of the nearest pair by a print of this layout at each of the doses, standard deviations."""
-    soft = torch.from_numpy(level.astype(np.float32))
-    prints = [PlannedPrint(soft, ways, place, dose=dose) for dose in doses]
+    prints = [PlannedPrint(as_tensor(level), ways, place, dose=dose) for dose in doses]
     refitted = rivalry.refitted(prints)
     return float(_separations(rivalry, prints, refitted).min())
 
@@ -154,7 +151,7 @@ def climb(
     steps: int = STEPS,
 ) -> np.ndarray:
     """Soft levels (y, x) at the top of the way up from ``start``."""
-    free = torch.from_numpy(start.astype(np.float32)).requires_grad_()
+    free = as_tensor(start).requires_grad_()
     climber = torch.optim.Adam([free], lr=_STEP_LEVELS)
     best, highest = start.astype(np.float32), -np.inf
     refitted: list[EffectChain] = []
@@ -183,10 +180,11 @@ def climb(
 def assemble(tiles: Sequence[np.ndarray], number: int, size_px: int, limits: Limits) -> np.ndarray:
     """Whole levels (size, size) of one print: the tiles side by side, in another order for each print."""
     side = -(-size_px // tiles[0].shape[0])
-    rows = []
-    for row in range(side):
-        places = [(row * side + column + number) % len(tiles) for column in range(side)]
-        rows.append(np.concatenate([tiles[place] for place in places], axis=1))
-    whole = np.concatenate(rows)[:size_px, :size_px]
-    smooth = limits.soft(torch.from_numpy(whole.astype(np.float32)))
-    return limits.whole(smooth.numpy())
+    order = [tiles[(place + number) % len(tiles)] for place in range(side**2)]
+    whole = np.block([order[row * side : (row + 1) * side] for row in range(side)])[:size_px, :size_px]
+    return limits.whole(limits.soft(as_tensor(whole)).numpy())
+
+
+def as_tensor(level: np.ndarray) -> Tensor:
+    """Levels for a planned print."""
+    return torch.from_numpy(level.astype(np.float32))

@@ -19,23 +19,17 @@ _TILE_PX = 64
 class NoiseSpectrum(Record):
     """Mean power of tiles of residuals, nm² per pixel of noise variance.
 
-    ``power_nm2``: (tile/2 + 1, tile/2 + 1) over the sizes of the frequencies along y and x, so that its mean
-    over the whole grid of frequencies is the variance of a pixel.
+    ``power_nm2``: (n, n) at the frequencies of ``np.fft.fft2`` of a tile; their mean is
+    the variance of a pixel.
     """
 
-    tile_px: int
     power_nm2: list[list[float]]
-
-    @property
-    def rms_nm(self) -> float:
-        """Standard deviation of a pixel."""
-        return float(np.sqrt(self.on_grid((self.tile_px, self.tile_px)).mean()))
 
     def on_grid(self, shape: tuple[int, ...]) -> np.ndarray:
         """Power at the frequencies of ``np.fft.fft2`` of a map of this shape, nm²."""
-        at = [np.abs(np.fft.fftfreq(n)) * self.tile_px for n in shape]
-        rows, columns = np.meshgrid(*at, indexing="ij")
-        return map_coordinates(np.array(self.power_nm2), [rows, columns], order=1, mode="nearest")
+        power = np.array(self.power_nm2)
+        at = np.meshgrid(*[np.fft.fftfreq(n) * len(power) for n in shape], indexing="ij")
+        return map_coordinates(power, at, order=1, mode="grid-wrap")
 
     def along(self, change: np.ndarray) -> float:
         """Standard deviation of the noise along a change (y, x) of the height, nm.
@@ -44,8 +38,7 @@ class NoiseSpectrum(Record):
         change.
         """
         spectrum = np.abs(np.fft.fft2(change)) ** 2
-        total = spectrum.sum()
-        return float(np.sqrt((spectrum * self.on_grid(change.shape)).sum() / total)) if total else self.rms_nm
+        return float(np.sqrt((spectrum * self.on_grid(change.shape)).sum() / spectrum.sum()))
 
 
 def left_nm(scan: PreparedScan, prediction_um: np.ndarray) -> np.ndarray:
@@ -62,7 +55,7 @@ def left_nm(scan: PreparedScan, prediction_um: np.ndarray) -> np.ndarray:
 
 def noise_spectrum(residuals_nm: Sequence[np.ndarray]) -> NoiseSpectrum:
     """Spectrum of maps of ``left_nm``, from tiles that are measured everywhere."""
-    size = min(_TILE_PX, *(min(one.shape) for one in residuals_nm)) // 2 * 2
+    size = min(_TILE_PX, *(min(one.shape) for one in residuals_nm))
     window = np.outer(np.hanning(size + 2)[1:-1], np.hanning(size + 2)[1:-1])
     window /= np.sqrt((window**2).mean())
     powers = []
@@ -75,10 +68,4 @@ def noise_spectrum(residuals_nm: Sequence[np.ndarray]) -> NoiseSpectrum:
                     powers.append(np.abs(np.fft.fft2((tile - tile.mean()) * window)) ** 2 / size**2)
     if not powers:
         powers = [np.full((size, size), float(np.mean([np.nanvar(one) for one in residuals_nm])))]
-    # The mean over both signs of both frequencies.
-    mirrored = -np.arange(size)
-    power = np.mean(powers, axis=0)
-    power = (power + power[mirrored]) / 2
-    power = (power + power[:, mirrored]) / 2
-    half = size // 2 + 1
-    return NoiseSpectrum(tile_px=size, power_nm2=np.round(power[:half, :half], 3).tolist())
+    return NoiseSpectrum(power_nm2=np.round(np.mean(powers, axis=0), 3).tolist())

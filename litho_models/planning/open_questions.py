@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -21,14 +21,15 @@ from litho_models.effects.registry import TIP
 from litho_models.fitting.least_squares import eliminated_sum
 from litho_models.fitting.runs import level_share
 from litho_models.loop.explainable import Learner
-from litho_models.planning.noise import NoiseSpectrum, left_nm, noise_spectrum
-from litho_models.planning.questions import OpenQuestions, Owner, Question, Rival
+from litho_models.planning.noise import left_nm, noise_spectrum
+from litho_models.planning.questions import Kind, OpenQuestions, Owner, Question, Rival
 from litho_models.planning.rival_fits import fit_rivals
 from litho_models.scan_terms.groups import ALL
 from litho_models.twin.closing import Closed, held_out_maps
 from litho_models.twin.fits import RULES
 from litho_models.twin.model import Twin
 from litho_models.twin.results import clustered_covariance, independent
+from litho_models.twin.screening import Candidate
 from litho_models.twin.search import WORTH_FITTING, separating
 
 # Members of a set, or suspects: every pair of rivals is compared on every layout.
@@ -39,36 +40,33 @@ _LINES = ("line-roughness", "scan-line-stripes")
 _OF_PLACE = ("vignetting", "field-curvature")
 
 
-class SingleTerm(NamedTuple):
-    """A term of single scans whose owner is not known, with its sizes by name and unit."""
-
-    name: str
-    sizes: Mapping[str, float]
-
-
 def open_questions(
     closed: Closed,
     dataset: DatasetId,
-    single_terms: Sequence[SingleTerm] = (),
+    single_terms: Mapping[str, Mapping[str, float]],
     report: Callable[[str], None] = lambda message: None,
 ) -> OpenQuestions:
-    """Everything that is open, the most valuable first, rivals fitted."""
-    scans = closed.study.scans
-    stored = [scan.stored for scan in scans]
-    maps = held_out_maps(closed.final, closed.study, scans)
-    noise = noise_spectrum([left_nm(*pair) for pair in zip(scans, maps, strict=True)])
-    asking = _Asking(closed, noise, report)
+    """Everything that is open, the most valuable first, rivals fitted.
+
+    Args:
+        single_terms: effects of single scans whose owner is not known, each with its sizes by name and unit.
+    """
+    asking = _Asking(closed, report)
     found = [asking.of_cause(one.name, one.alike) for one in (*closed.causes, *closed.lawful.causes)]
+    stored = [scan.stored for scan in closed.study.scans]
     return OpenQuestions(
         dataset=dataset,
-        noise=noise,
+        noise=asking.noise,
         level_share=level_share(stored),
         cutoff_per_um=_cutoff_per_um(stored),
         write_field_um=(stored[0].write or {}).get("field_um"),
         questions=[
             *(one for one in (*found, asking.of_suspects()) if one is not None),
-            *map(_of_single_term, single_terms),
-            *_of_facts(closed),
+            *(
+                _question("lines" if one in _LINES else "per-scan", [one], sizes=single_terms[one])
+                for one in single_terms
+            ),
+            *(_question("fact", [one], text=why) for one, why in _missing_facts(closed).items()),
         ],
     )
 
@@ -87,8 +85,11 @@ def _cutoff_per_um(scans: Sequence[PrintedScan]) -> float:
 class _Asking:
     """Questions with rivals, about one closed loop."""
 
-    def __init__(self, closed: Closed, noise: NoiseSpectrum, report: Callable[[str], None]):
-        self.closed, self.noise, self.report = closed, noise, report
+    def __init__(self, closed: Closed, report: Callable[[str], None]):
+        self.closed, self.report = closed, report
+        scans = closed.study.scans
+        self.maps = held_out_maps(closed.final, closed.study, scans)
+        self.noise = noise_spectrum([left_nm(*pair) for pair in zip(scans, self.maps, strict=True)])
         self.twin = closed.final.twin.ungrouped()
 
     def of_cause(self, name: str, alike: Sequence[str]) -> Question | None:
@@ -96,53 +97,43 @@ class _Asking:
         members = [name, *alike][:_MOST_MEMBERS]
         if len(members) == 1 and len(_owners(name, self.twin.values({})[name])) == 1:
             return None
-        without = self.twin.without(name)
-        twins = [self.twin, *(without.with_effect(one, ALL, self._first(one)).ungrouped() for one in alike)]
+        first = {**self.closed.lawful.first, **self.closed.named.first}
+        # In the place of another a member starts as before any of them was found.
+        others = [self._with(self.twin.without(name), first[one]) for one in members[1:]]
         grouped = self.closed.final.twin
-        rivals, fitted = self._rivals(members, [*twins[: len(members)], grouped.without(name)])
-        rests = self.closed.rests
-        stage = next((stage for stage in ("laws", "causes", "base") if stage in rests), None)
-        return Question(
-            name=name,
-            kind="set" if len(members) > 1 else "role",
-            text=_in_words(members),
-            experiment=separating(members),
+        rivals, fitted = self._rivals(members, [self.twin, *others, grouped.without(name)])
+        rests = [rest for stage, rest in self.closed.rests.items() if stage != "all"]
+        return _question(
+            "set" if alike else "role",
+            members,
             rivals=rivals,
             # What groups differ by is known: one more of them does not make its prints contradict each other.
             spread=self._spread(fitted[-1], grouped),
-            form_nm=None if stage is None else rests[stage].most_nm,
+            form_nm=rests[-1].most_nm if rests else None,
         )
 
     def of_suspects(self) -> Question | None:
         """What stood out and was not confirmed: which of these carries what is left, if any does."""
-        named = self.closed.named
+        named, study = self.closed.named, self.closed.study
         least = WORTH_FITTING * 0.01 * named.state.mse_nm2
         standing = [
             one
-            for name in named.refused
-            if (one := named.last.get(name)) is not None
-            and one.allowed
-            and one.gain_nm2 >= least
-            and name not in self.twin.names
+            for name, one in named.last.items()
+            if name in named.refused and name not in self.twin.names and one.allowed and one.gain_nm2 >= least
         ]
-        names = [one.name for one in sorted(standing, key=lambda one: -one.gain_nm2)]
+        standing = sorted(standing, key=lambda one: -one.gain_nm2)[:_MOST_MEMBERS]
+        names = [one.name for one in standing]
         if len(names) < 2 and not any(get_effect(name).role == "undetermined" for name in names):
             return None
-        names = names[:_MOST_MEMBERS]
-        twins = [self.twin.with_effect(name, ALL, named.last[name].start()).ungrouped() for name in names]
-        rivals, fitted = self._rivals(names, twins)
-        study = self.closed.study
+        rivals, fitted = self._rivals(names, [self._with(self.twin, one) for one in standing])
         # The loop knows the error of its form with none of them in, which is theirs as well.
-        learner = Learner(study, held_out_maps(self.closed.final, study, study.scans))  # type: ignore[arg-type]
+        learner = Learner(study, self.maps)  # type: ignore[arg-type]
         rests = [learner.rest([twin.placed().height(scan) for scan in study.scans]) for twin in fitted]
-        return Question(
-            name=" or ".join(names),
-            kind="suspects",
-            text=f"each stands out and none was confirmed: {_in_words(names)}",
-            experiment=separating(names),
-            rivals=rivals,
-            form_nm=min(rest.most_nm for rest in rests),
-        )
+        return _question("suspects", names, rivals=rivals, form_nm=min(rest.most_nm for rest in rests))
+
+    @staticmethod
+    def _with(twin: Twin, one: Candidate) -> Twin:
+        return twin.with_effect(one.name, ALL, one.start()).ungrouped()
 
     def _rivals(self, members: Sequence[str], twins: Sequence[Twin]) -> tuple[list[Rival], list[Twin]]:
         """The answers, and the fitted twins: one for each member, and any that only stand beside them."""
@@ -150,31 +141,26 @@ class _Asking:
         study = self.closed.study
         windows, units = study.windows, independent(study.scans)
         stands_for = sum(int(w.usable.sum()) for w in windows) / sum(len(w.sample) for w in windows)
-        rivals, fitted = [], []
-        for at, (twin, fit) in enumerate(zip(twins, fit_rivals(twins, windows), strict=True)):
-            fitted.append(twin.at(fit.vector))
-            if at >= len(members):
-                continue
-            free = fitted[-1].free()[:, None]
+        fits = fit_rivals(twins, windows)
+        fitted = [twin.at(fit.vector) for twin, fit in zip(twins, fits, strict=True)]
+        rivals = []
+        for member, twin, fit in zip(members, fitted, fits, strict=False):
+            free = twin.free()[:, None]
             linear = [replace(part, jacobian=part.jacobian * free) for part in fit.linear]
-            values = fitted[-1].values({})
+            information = stands_for * eliminated_sum(fit.linear, RULES.term_weight)[0]
+            effects = twin.values({})
             rivals += [
                 Rival(
-                    effect=members[at],
+                    effect=member,
                     owner=owner,
-                    effects=values,
+                    effects=effects,
                     vector=fit.vector.tolist(),
-                    information=(stands_for * eliminated_sum(fit.linear, RULES.term_weight)[0]).tolist(),
+                    information=information.tolist(),
                     covariance=clustered_covariance(linear, units).tolist(),
                 )
-                for owner in _owners(members[at], values[members[at]])
+                for owner in _owners(member, effects[member])
             ]
         return rivals, fitted
-
-    def _first(self, name: str) -> dict[str, dict[str, float]]:
-        """Where a member starts in the place of another: as before any of them was found."""
-        found = self.closed.named.first.get(name) or self.closed.lawful.first[name]
-        return found.start()
 
     def _spread(self, without: Twin, twin: Twin) -> float:
         """How much the evidence for a change varies over scans, relative to its mean, beyond what noise does.
@@ -207,34 +193,26 @@ def _owners(name: str, values: Mapping[str, float]) -> list[Owner | None]:
     return ["printer", "microscope"] if uneven or get_effect(name).role == "undetermined" else [None]
 
 
-def _in_words(names: Sequence[str]) -> str:
+def _question(kind: Kind, names: Sequence[str], text: str = "", **known: Any) -> Question:
+    """A question about effects, in words."""
     first, *others = [get_effect(name).title for name in names]
-    if others:
-        return f"which is at work, {', '.join([first, *others[:-1]])} or {others[-1]}"
-    return f"{first}: the printer's or the microscope's"
+    if kind == "lines":
+        text = "offsets of lines: written or scanned"
+    elif kind == "fact":
+        text = f"{first}: {text}"
+    elif others:
+        text = f"which is at work, {', '.join([first, *others[:-1]])} or {others[-1]}"
+    else:
+        text = f"{first}: the printer's or the microscope's"
+    name = " or ".join(names) if kind == "suspects" else names[0]
+    return Question(name=name, kind=kind, text=text, experiment=separating(names), **known)
 
 
-def _of_single_term(term: SingleTerm) -> Question:
-    lines = term.name in _LINES
-    return Question(
-        name=term.name,
-        kind="lines" if lines else "per-scan",
-        text="offsets of lines: written or scanned" if lines else _in_words([term.name]),
-        experiment=separating([term.name]),
-        sizes=dict(term.sizes),
-    )
-
-
-def _of_facts(closed: Closed) -> list[Question]:
-    """Effects that could not be tested for want of a fact about the prints."""
-    reasons = dict(closed.untestable)
+def _missing_facts(closed: Closed) -> dict[str, str]:
+    """Effects that could not be tested for want of a fact about the prints, with the reason."""
+    reasons = {name: why for name, why in closed.untestable.items() if name in CATALOGUE}
     if "field_um" not in (closed.study.scans[0].stored.write or {}):
-        for name in _OF_PLACE:
-            reasons.setdefault(name, "the place of the prints in the write field is not known")
-    return [
-        Question(
-            name=name, kind="fact", text=f"{get_effect(name).title}: {why}", experiment=separating([name])
+        reasons = (
+            dict.fromkeys(_OF_PLACE, "the place of the prints in the write field is not known") | reasons
         )
-        for name, why in reasons.items()
-        if name in CATALOGUE
-    ]
+    return reasons

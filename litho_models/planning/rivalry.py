@@ -39,22 +39,17 @@ _SMALLEST = 1e-12
 
 @dataclass(frozen=True)
 class Way:
-    """How one scan is made.
+    """How one scan is made, as the table of the plan says it.
 
-    ``turned_deg``: by how much the print lies turned under the microscope; ``backward``: lines recorded on
-    the way back; ``new_tip``: with another, sharp tip; ``fine``: with pixels of half the size, and as much
-    time for each.
+    ``turned_deg``: by how much the print lies turned under the microscope; ``direction``: -1 with lines
+    recorded on the way back; ``tip``: 2 with another, sharp one; ``pixel_size``: of those of the scans so
+    far, with as much time for each.
     """
 
     turned_deg: int = 0
-    backward: bool = False
-    new_tip: bool = False
-    fine: bool = False
-
-    @property
-    def pixel_size(self) -> float:
-        """Of the scan, relative to the scans so far."""
-        return 0.5 if self.fine else 1.0
+    direction: int = 1
+    tip: int = 1
+    pixel_size: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -86,11 +81,15 @@ class Printing:
         """Of the highest level."""
         return self.highest * self.level_height_um
 
+    def reach_um(self, printed: PlannedPrint) -> float:
+        """How far the centre of a print lies from that of the write field, along both axes."""
+        if printed.place == "centre" or self.write_field_um is None:
+            return 0.0
+        return (self.write_field_um - max(printed.level.shape) * self.pitch_um) / 2
+
     def context(self, layout_um: Tensor, printed: PlannedPrint, way: Way) -> FieldContext:
         """What effects know of a planned scan."""
-        reach_um = 0.0
-        if printed.place == "edge" and self.write_field_um is not None:
-            reach_um = (self.write_field_um - max(layout_um.shape) * self.pitch_um) / 2
+        reach_um = self.reach_um(printed)
         return FieldContext(
             layout_um=layout_um,
             pitch_um=self.pitch_um,
@@ -100,8 +99,8 @@ class Printing:
             field_radius_um=None if self.write_field_um is None else self.write_field_um / 2,
             order=printed.order,
             quarter_turns=way.turned_deg // 90,
-            backward=way.backward,
-            new_tip=way.new_tip,
+            backward=way.direction < 0,
+            new_tip=way.tip > 1,
             pixel_size=way.pixel_size,
             dose=printed.dose,
         )

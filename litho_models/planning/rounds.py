@@ -41,7 +41,7 @@ def close_loop(
     new = prepare_scans([scan for one in further for scan in new_scans(first, one)]) if further else []
 
     def asked(closed: Closed, result: CloseLoop) -> tuple[CloseLoop, list[Result]]:
-        open_ = open_questions(closed, result.dataset, report=report)
+        open_ = open_questions(closed, result.dataset, {}, report)
         result = result.model_copy(
             update={"settings": {**result.settings, "new_prints": [one.sha256 for one in further]}}
         )

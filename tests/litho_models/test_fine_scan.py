@@ -28,7 +28,7 @@ from litho_models.planning.rivalry import Printing, Rivalry, Way
 from tests.litho_models.test_next_print import first_layout, opened, rival, white
 from tests.litho_models.twin_scans import base_model, blank_scans
 
-FINE = Way(fine=True)
+FINE = Way(pixel_size=0.5)
 
 
 @pytest.mark.parametrize("pixel_size", [1.0, 0.5])

@@ -35,10 +35,9 @@ from litho_models.planning import power
 from litho_models.planning.answers import _pairs, of_rivals
 from litho_models.planning.deciding import NONE, Evidence, compared, said_by_gratings, with_decisions
 from litho_models.planning.decision_error import Z_DECIDED, surely_better
-from litho_models.planning.designer import as_tensor
-from litho_models.planning.layouts import Limits, climb, score, starts
+from litho_models.planning.layouts import Limits, as_tensor, climb, score, starts
 from litho_models.planning.noise import NoiseSpectrum, left_nm, noise_spectrum
-from litho_models.planning.open_questions import _in_words, _owners
+from litho_models.planning.open_questions import _owners, _question
 from litho_models.planning.questions import OpenQuestions, Owner, Question, Rival
 from litho_models.planning.record import NextPrint, PlannedQuestion
 from litho_models.planning.rival_fits import fit_rivals
@@ -92,8 +91,7 @@ def slope_question(**changes: object) -> Question:
 
 
 def white(tile_px: int = 16) -> NoiseSpectrum:
-    half = tile_px // 2 + 1
-    return NoiseSpectrum(tile_px=tile_px, power_nm2=np.full((half, half), NOISE_NM**2).tolist())
+    return NoiseSpectrum(power_nm2=np.full((tile_px, tile_px), NOISE_NM**2).tolist())
 
 
 def opened(questions: list[Question]) -> OpenQuestions:
@@ -204,7 +202,7 @@ def test_noise_along_a_change_is_what_draws_of_that_noise_show() -> None:
     scans = prepare_scans(with_heights(blank, heights))
     spectrum = noise_spectrum([left_nm(scan, scan.stored.layout_um) for scan in scans])
     # What a scan may add by itself takes some of the slow noise; four scans are few tiles.
-    assert spectrum.rms_nm == pytest.approx(10.0, rel=0.1)
+    assert np.sqrt(np.mean(spectrum.power_nm2)) == pytest.approx(10.0, rel=0.1)
     for sigma in ((0, 2), (2, 0)):
         change = gaussian_filter(random.normal(size=(80, 80)), sigma, mode="wrap")
         draws = [1e3 * scale * np.sum(change * rough()) for _ in range(400)]
@@ -543,7 +541,7 @@ def test_a_question_below_the_models_own_error_is_declared_before_printing(
     assert told.status == "no experiment separates"
     assert told.form_nm == plain.difference_nm == told.difference_nm
     said = f"own error is {told.form_nm:.1f} nm at most, the two differ by {told.form_nm:.1f} nm"
-    assert f"no experiment of this plan separates them: the model's {said}" in told.why
+    assert f"the model's {said}; no experiment of this plan separates them" in told.why
 
 
 def test_two_names_of_one_model_end_in_one_optimum() -> None:
@@ -619,8 +617,10 @@ def test_new_prints_have_to_be_of_this_printer_and_turned_as_they_say(tmp_path: 
 def test_a_question_is_put_in_words() -> None:
     names = ["diffusion-blur", "resampling-blur"]
     titles = [get_effect(name).title for name in names]
-    assert _in_words(names) == f"which is at work, {titles[0]} or {titles[1]}"
-    assert _in_words(["slope-thinning"]) == "height missing on slopes: the printer's or the microscope's"
+    assert _question("set", names).text == f"which is at work, {titles[0]} or {titles[1]}"
+    said = "height missing on slopes: the printer's or the microscope's"
+    assert _question("role", ["slope-thinning"]).text == said
+    assert _question("fact", ["vignetting"], text="no place").text.endswith(": no place")
 
 
 def test_a_plan_is_printed_by_the_same_machine_with_new_chance() -> None:
