@@ -35,7 +35,7 @@ from litho_models.frozen.files import save_frozen
 from litho_models.loop import LoopConfig, close_loop
 from litho_models.loop.findings import LoopFindings
 from litho_models.loop.open_questions import open_questions
-from litho_models.loop.prepared import prepare_scans
+from litho_models.twin.prepared import prepare_scans
 from litho_models.loop.result.questions import OpenQuestions
 from litho_models.loop.result.record import Decision
 from litho_models.loop.result.summary import summarise

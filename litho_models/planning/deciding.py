@@ -20,7 +20,6 @@ from scipy.stats import f_oneway
 from litho_data.build.gratings import GratingScan
 from litho_models.effects import get_effect
 from litho_models.effects.registry import TIP
-from litho_models.loop.prepared import PreparedScan
 from litho_models.planning.decision_error import Z_DECIDED, surely_better
 from litho_models.planning.noise import left_nm
 from litho_models.planning.questions import OpenQuestions, Question
@@ -36,6 +35,7 @@ from litho_models.scan_terms.lines import axis_along, shrunk_line_offsets
 from litho_models.scan_terms.term import row_index
 from litho_models.twin.judging import CONFIRM_P, SMALLEST_SHARE
 from litho_models.twin.model import Twin
+from litho_models.twin.prepared import PreparedScan
 from litho_models.twin.record import CloseLoop, Comparison, Decided, Decision, FoundEffect
 
 NONE: Decided = "none of them"

@@ -15,19 +15,20 @@ import numpy as np
 
 from litho_data.layouts.statistics import layout_statistics
 from litho_data.store import PrintedScan
-from litho_data.store.schema import DatasetId
 from litho_models.effects import CATALOGUE, get_effect
 from litho_models.effects.registry import TIP
 from litho_models.fitting.least_squares import eliminated_sum
 from litho_models.fitting.runs import level_share
-from litho_models.loop.explainable import Learner
 from litho_models.planning.noise import left_nm, noise_spectrum
 from litho_models.planning.questions import Kind, OpenQuestions, Owner, Question, Rival
 from litho_models.planning.rival_fits import fit_rivals
+from litho_models.scan_terms import line_terms, terms_of_effect
 from litho_models.scan_terms.groups import ALL
 from litho_models.twin.closing import Closed, held_out_maps
 from litho_models.twin.fits import RULES
+from litho_models.twin.learner import Learner
 from litho_models.twin.model import Twin
+from litho_models.twin.record import CloseLoop
 from litho_models.twin.results import clustered_covariance, independent
 from litho_models.twin.screening import Candidate
 from litho_models.twin.search import WORTH_FITTING, separating
@@ -36,36 +37,27 @@ from litho_models.twin.search import WORTH_FITTING, separating
 _MOST_MEMBERS = 3
 # Of a layout whose spectrum can be told.
 _SMALLEST_PX, _POWER_KNOWN = 64, 0.95
-_LINES = ("line-roughness", "scan-line-stripes")
 _OF_PLACE = ("vignetting", "field-curvature")
 
 
 def open_questions(
     closed: Closed,
-    dataset: DatasetId,
-    single_terms: Mapping[str, Mapping[str, float]],
+    result: CloseLoop,
     report: Callable[[str], None] = lambda message: None,
 ) -> OpenQuestions:
-    """Everything that is open, the most valuable first, rivals fitted.
-
-    Args:
-        single_terms: effects of single scans whose owner is not known, each with its sizes by name and unit.
-    """
+    """Everything that is open, the most valuable first, rivals fitted."""
     asking = _Asking(closed, report)
     found = [asking.of_cause(one.name, one.alike) for one in (*closed.causes, *closed.lawful.causes)]
     stored = [scan.stored for scan in closed.study.scans]
     return OpenQuestions(
-        dataset=dataset,
+        dataset=result.dataset,
         noise=asking.noise,
         level_share=level_share(stored),
         cutoff_per_um=_cutoff_per_um(stored),
         write_field_um=(stored[0].write or {}).get("field_um"),
         questions=[
             *(one for one in (*found, asking.of_suspects()) if one is not None),
-            *(
-                _question("lines" if one in _LINES else "per-scan", [one], sizes=single_terms[one])
-                for one in single_terms
-            ),
+            *_of_single_scans(result),
             *(_question("fact", [one], text=why) for one, why in _missing_facts(closed).items()),
         ],
     )
@@ -102,7 +94,7 @@ class _Asking:
         others = [self._with(self.twin.without(name), first[one]) for one in members[1:]]
         grouped = self.closed.final.twin
         rivals, fitted = self._rivals(members, [self.twin, *others, grouped.without(name)])
-        rests = [rest for stage, rest in self.closed.rests.items() if stage != "all"]
+        rests = list(self.closed.rests.values())
         return _question(
             "set" if alike else "role",
             members,
@@ -127,7 +119,7 @@ class _Asking:
             return None
         rivals, fitted = self._rivals(names, [self._with(self.twin, one) for one in standing])
         # The loop knows the error of its form with none of them in, which is theirs as well.
-        learner = Learner(study, self.maps)  # type: ignore[arg-type]
+        learner = Learner(study, self.maps)
         rests = [learner.rest([twin.placed().height(scan) for scan in study.scans]) for twin in fitted]
         return _question("suspects", names, rivals=rivals, form_nm=min(rest.most_nm for rest in rests))
 
@@ -191,6 +183,19 @@ def _owners(name: str, values: Mapping[str, float]) -> list[Owner | None]:
     """
     uneven = name == TIP and values["along"] != values["across"]
     return ["printer", "microscope"] if uneven or get_effect(name).role == "undetermined" else [None]
+
+
+def _of_single_scans(result: CloseLoop) -> list[Question]:
+    """Terms of single scans whose owner is not known, and offsets of lines."""
+    return [
+        _question(
+            "lines" if line_terms(terms_of_effect(one.name)) else "per-scan",
+            [one.name],
+            sizes={parameter: spread.value for parameter, spread in one.spread.items()},
+        )
+        for one in result.single_scans
+        if one.seen and (one.role == "undetermined" or one.confusable_with)
+    ]
 
 
 def _question(kind: Kind, names: Sequence[str], text: str = "", **known: Any) -> Question:

@@ -10,12 +10,12 @@ from litho_data.build.gratings import grating_scans
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Result
 from litho_data.store import PrintedScan, Store, open_store
-from litho_models.loop.prepared import prepare_scans
 from litho_models.planning.deciding import Evidence, with_decisions
 from litho_models.planning.open_questions import open_questions
+from litho_models.twin import run
 from litho_models.twin.closing import Closed
+from litho_models.twin.prepared import prepare_scans
 from litho_models.twin.record import CloseLoop
-from litho_models.twin.run import close_store
 
 
 def close_loop(
@@ -26,22 +26,22 @@ def close_loop(
     report: Callable[[str], None] = lambda message: None,
     **settings: Any,
 ) -> CloseLoop:
-    """Close the loop on a store, ``twin.run.close_store``, and write what it leaves open beside it.
+    """Close the loop on a store, ``twin.run.close_loop``, and write what it leaves open beside it.
 
     Args:
         new_prints: further stores of the same printer. What is found on the first store stays as it is; the
             new prints decide between the answers to what is open, see ``deciding``.
-        settings: of ``close_store``.
+        settings: of ``twin.run.close_loop``.
 
     Raises:
-        InputError: as ``close_store``; further stores of another printer, or with a turned scan whose card
+        InputError: as there; further stores of another printer, or with a turned scan whose card
             does not say so.
     """
     first, further = open_store(store), [open_store(path) for path in new_prints]
     new = prepare_scans([scan for one in further for scan in new_scans(first, one)]) if further else []
 
     def asked(closed: Closed, result: CloseLoop) -> tuple[CloseLoop, list[Result]]:
-        open_ = open_questions(closed, result.dataset, {}, report)
+        open_ = open_questions(closed, result, report)
         result = result.model_copy(
             update={"settings": {**result.settings, "new_prints": [one.sha256 for one in further]}}
         )
@@ -51,7 +51,7 @@ def close_loop(
             result = with_decisions(result, open_, evidence.decide(open_, report))
         return result, [open_]
 
-    return close_store(store, out, further=asked, report=report, **settings)
+    return run.close_loop(store, out, further=asked, report=report, **settings)
 
 
 def new_scans(first: Store, store: Store) -> list[PrintedScan]:

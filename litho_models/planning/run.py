@@ -25,7 +25,7 @@ from litho_models.planning.questions import OpenQuestions
 from litho_models.planning.record import NextPrint
 from litho_models.planning.report import write_report
 from litho_models.planning.rivalry import PlannedPrint, Printing, Rivalry
-from litho_models.twin.run import MODEL_FOLDER
+from litho_models.twin.saving import MODEL_FOLDER
 
 # Prints on which the rivals are compared at last; the others are made of the same tiles.
 _JUDGED = 2

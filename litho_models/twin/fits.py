@@ -23,10 +23,11 @@ from litho_models.fitting.least_squares import (
     orthonormal,
     solve_damped,
 )
-from litho_models.loop.prepared import PreparedScan, prepare_scans
 from litho_models.scan_terms import Terms
 from litho_models.scan_terms.groups import Labels, groupings
+from litho_models.twin.folded_base import FoldedBase
 from litho_models.twin.model import Placed, Twin, finished
+from litho_models.twin.prepared import PreparedScan, prepare_scans
 
 # What every scan may add in a fit: its gain is left to the process, which long-range effects act on.
 FREE_TERMS: Terms = frozenset({"offset", "bow", "warp"})
@@ -121,11 +122,17 @@ def prepared_among(scans: Sequence[PrintedScan], known: Sequence[PreparedScan]) 
 
 
 class TwinProblem:
-    """A twin on windows of scans; derivatives are one-sided differences."""
+    """A twin on windows of scans; derivatives are one-sided differences.
 
-    def __init__(self, twin: Twin, windows: Sequence[PreparedScan]):
+    Args:
+        fold: of a base that was trained without each fold, the one without this fold; None: for each window
+            the one that has not seen it.
+    """
+
+    def __init__(self, twin: Twin, windows: Sequence[PreparedScan], fold: int | None = None):
         self._twin = twin
         self._windows = windows
+        self._fold = fold
 
     def linearise(self, vector: np.ndarray) -> list[Linearised]:
         """Residuals, derivatives and free terms of all windows."""
@@ -141,7 +148,7 @@ class TwinProblem:
     ) -> Linearised:
         twin, own = placed.twin, placed.twin.own
         chain = placed.chain(window)
-        base = placed.base_height(chain, window)
+        base = placed.base_height(chain, window, self._fold)
         prediction = finished(chain, base, window)
         value = window.at_sample(prediction)
         rows = np.zeros((len(steps), len(window.sample)))
@@ -152,7 +159,7 @@ class TwinProblem:
             there = other.chain(window)
             # What acts on the height leaves the height of the base, most of the work, as it is.
             same = slot is not None and get_effect(slot.effect).acts_on == "height"
-            height = base if same else other.base_height(there, window)
+            height = base if same else other.base_height(there, window, self._fold)
             rows[i] = (window.at_sample(finished(there, height, window)) - value) / step
         basis = orthonormal(window.terms_at_sample(prediction, FREE_TERMS).T).T
         return Linearised(window.height - value, rows, basis)
@@ -160,7 +167,7 @@ class TwinProblem:
     def residuals(self, vector: np.ndarray) -> list[np.ndarray]:
         """Measured minus predicted of all windows, µm."""
         placed = self._twin.at(vector).placed()
-        return [w.height - w.at_sample(placed.height(w)) for w in self._windows]
+        return [w.height - w.at_sample(placed.height(w, self._fold)) for w in self._windows]
 
     def room(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Effects stay within their range, the base does not go too far at once."""
@@ -178,7 +185,7 @@ def fit_state(twin: Twin, study: Study) -> State:
     freed = np.empty(len(windows))
     for fold in study.folds:
         own = [i for i, of in enumerate(study.fold_of) if of != fold]
-        vector, squares = _without(common, [fitted.linear[i] for i in own], [windows[i] for i in own])
+        vector, squares = _without(common, [fitted.linear[i] for i in own], [windows[i] for i in own], fold)
         per_fold.append(vector)
         training.append(squares)
         placed = common.at(vector).placed()
@@ -213,20 +220,24 @@ def without_terms(
 
 
 def _without(
-    common: Twin, linear: Sequence[Linearised], windows: Sequence[PreparedScan]
+    common: Twin, linear: Sequence[Linearised], windows: Sequence[PreparedScan], fold: int
 ) -> tuple[np.ndarray, float]:
     """Numbers fitted to some of the windows with the derivatives of the common fit; weighted squares, µm².
 
     The common fit, which has seen all windows, is where it starts: nothing may be left there.
     """
-    normal, right, total = eliminated_sum(linear, RULES.term_weight)
     vector = common.vector
     if not len(vector):
-        return vector, total
+        return vector, eliminated_sum(linear, RULES.term_weight)[2]
+    if isinstance(common.base, FoldedBase):
+        # At the common fit each window was predicted by a model that has seen the fold.
+        left = TwinProblem(common, windows, fold).residuals(vector)
+        linear = [replace(part, residual=own) for part, own in zip(linear, left, strict=True)]
+    normal, right, total = eliminated_sum(linear, RULES.term_weight)
     for _ in range(_FOLD_STEPS):
         here = common.at(vector)
         trial = vector + solve_damped(normal, right, _FOLD_DAMPING, here.room())
-        left = TwinProblem(common, windows).residuals(trial)
+        left = TwinProblem(common, windows, fold).residuals(trial)
         moved = [replace(part, residual=own) for part, own in zip(linear, left, strict=True)]
         _, right, squares = eliminated_sum(moved, RULES.term_weight)
         if squares > total:

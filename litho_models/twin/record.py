@@ -9,7 +9,7 @@ from pydantic import Field
 from litho_data.foundation.results import Record, Result
 from litho_data.foundation.run_facts import RunInfo
 from litho_data.store.schema import DatasetId
-from litho_models.effects.effect import Knowledge
+from litho_models.effects.effect import Knowledge, Role
 from litho_models.scan_terms.measurement import MeasurementModel
 from litho_models.scan_terms.policies import Policy
 from litho_models.scoring.pairs import OverUnits
@@ -84,7 +84,7 @@ class FoundEffect(Record):
     name: str
     title: str
     knowledge: Knowledge
-    role: Literal["process", "measurement", "nuisance", "undetermined"]
+    role: Role
     stage: str
     verdict: EffectVerdict
     by: str
@@ -110,6 +110,40 @@ class Candidate(Record):
     reason: str
     p_screen: float | None = None
     gain_nm2: float | None = None
+
+
+class ScanFinding(Record):
+    """What single scans add, each its own, or what is seen in them directly; no model has it.
+
+    Attributes:
+        seen: whether it is there; ``evidence``: in a sentence; ``p``: of its test.
+        spread: parameter to its standard deviation over scans.
+        confusable_with: what these scans cannot tell from it.
+    """
+
+    name: str
+    title: str
+    role: Role
+    seen: bool
+    evidence: str
+    p: float | None
+    spread: dict[str, Strength] = Field(default_factory=dict)
+    confusable_with: list[str] = Field(default_factory=list)
+
+
+class Planted(Record):
+    """An effect that was planted in copies of the scans: its amount, what it changes, what was found.
+
+    ``rms_nm``: of the change, free of what single scans may add; ``named``: the set that it is in, empty if
+    it was not found; ``found``: its amount there.
+    """
+
+    name: str
+    amount: float
+    unit: str
+    rms_nm: float
+    named: list[str]
+    found: float | None
 
 
 class Explained(Record):
@@ -152,7 +186,8 @@ class CloseLoop(Result):
     """What the loop found.
 
     ``errors``: see ``ErrorRow``; ``gain``: base minus all, k = 1, with the shared measurement, over scans and
-    over prints. ``chosen``: in nested selections, how often each effect was chosen. ``decisions``: of further
+    over prints. ``chosen``: in nested selections, how often each effect was chosen. ``confounded``: fitted
+    numbers that these scans determine together only, with their correlation. ``decisions``: of further
     stores, about what was open on the first.
     """
 
@@ -174,6 +209,9 @@ class CloseLoop(Result):
     over_prints: OverUnits | None
     effects: list[FoundEffect]
     candidates: list[Candidate]
+    single_scans: list[ScanFinding] = Field(default_factory=list)
+    planted: list[Planted] = Field(default_factory=list)
+    confounded: list[tuple[str, str, float]] = Field(default_factory=list)
     measurement: MeasurementModel
     explained: list[Explained]
     chosen: dict[str, int] = Field(default_factory=dict)

@@ -29,7 +29,6 @@ from litho_models.effects.registry import TIP
 from litho_models.fitting.least_squares import fit_least_squares
 from litho_models.frozen.card import ModelCard
 from litho_models.frozen.files import save_frozen
-from litho_models.loop.prepared import prepare_scans
 from litho_models.models import build_model
 from litho_models.planning import power
 from litho_models.planning.answers import _pairs, of_rivals
@@ -45,10 +44,13 @@ from litho_models.planning.rivalry import Contrast, PlannedPrint, Printing, Riva
 from litho_models.planning.rounds import close_loop, new_scans
 from litho_models.planning.run import next_print
 from litho_models.scan_terms.groups import ALL
-from litho_models.twin import closing, run
+from litho_models.twin import bases, closing
+from litho_models.twin.errors import HeldOut
 from litho_models.twin.fits import RULES, TwinProblem
 from litho_models.twin.model import Twin
+from litho_models.twin.prepared import prepare_scans
 from litho_models.twin.record import CloseLoop, Decision, FoundEffect
+from litho_models.twin.single_scans import SingleScans
 from tests.litho_models.prints import write_store
 from tests.litho_models.twin_scans import base_model, blank_scans, planted, with_heights
 
@@ -398,9 +400,9 @@ def test_a_loop_asks_and_later_prints_answer(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr(closing, "screened_effects", lambda tip_radius_um: [get_effect("slope-thinning")])
     monkeypatch.setattr(closing, "LAWS", {})
     monkeypatch.setattr(closing, "DESCRIPTIONS", {})
-    monkeypatch.setattr(run, "build_model", lambda *name, **facts: base_model())
-    for slow, empty in (("errors_by_print", []), ("left_out_nm", {})):
-        monkeypatch.setattr(run._Loop, slow, lambda self, empty=empty: empty)
+    monkeypatch.setattr(bases, "build_model", lambda *name, **facts: base_model())
+    monkeypatch.setattr(HeldOut, "left_out_nm", lambda self: {})
+    monkeypatch.setattr(SingleScans, "findings", lambda self: [])
     early, late = (get_effect("slope-thinning").with_values({"along_x_um": own}) for own in (0.25, 0.15))
     effects = [("slope-thinning", "order 6", {"before": early, "from there on": late})]
     first = write_store(tmp_path / "first.zarr", planted(effects, count=12))

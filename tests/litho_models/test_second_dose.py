@@ -16,7 +16,7 @@ from litho_data.virtual_fab.knobs import KnobBoard, KnobSetting
 from litho_data.virtual_fab.printer import Job
 from litho_data.virtual_fab.settings import Microscope, Noise, Printer
 from litho_models.effects.chain import EffectChain
-from litho_models.loop.prepared import prepare_scans
+from litho_models.twin.prepared import prepare_scans
 from litho_models.planning import designer
 from litho_models.planning.designer import SECOND_DOSE
 from litho_models.planning.layouts import as_tensor

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from litho_data.foundation.errors import InputError
 from litho_data.store import PrintedScan
-from litho_data.store.again import StoredScans
 from litho_models.effects import FieldContext
 from litho_models.scan_terms import FloatMap, LineIndex, TermPixels, Terms, scan_line_index, term_maps
 
@@ -88,16 +87,6 @@ def prepare_scans(scans: Sequence[PrintedScan]) -> list[PreparedScan]:
         _with_quadrant(_prepare(s, float(order)), i)
         for i, (s, order) in enumerate(zip(scans, scaled, strict=True))
     ]
-
-
-def by_name(scans: Sequence[PreparedScan]) -> dict[str, PreparedScan | PrintedScan]:
-    """The scans, prepared and as they are stored, by names for other processes."""
-    return {scan.id: scan for scan in scans} | {f"{scan.id} as stored": scan.stored for scan in scans}
-
-
-def prepared_again(scans: StoredScans) -> dict[str, PreparedScan | PrintedScan]:
-    """The same in another process."""
-    return by_name(prepare_scans(scans.read()))
 
 
 def _prepare(scan: PrintedScan, order: float) -> PreparedScan:

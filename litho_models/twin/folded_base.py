@@ -10,7 +10,7 @@ from torch import nn
 from litho_data.foundation.commands import progress
 from litho_data.foundation.workers import HERE, Workers, run_jobs
 from litho_data.store import PrintedScan
-from litho_models.loop.prepared import PreparedScan
+from litho_models.twin.prepared import PreparedScan
 
 # Where other processes train, it is sent to them.
 Trainer = Callable[[Sequence[PrintedScan]], nn.Module]
@@ -60,8 +60,3 @@ def train_folds(
 def _train(job: tuple[int, Trainer, Sequence[PrintedScan]]) -> nn.Module:
     _, trainer, scans = job
     return trainer(scans)
-
-
-def same_for_all(model: nn.Module, scans: Sequence[PreparedScan]) -> FoldedBase:
-    """A model trained elsewhere, on scans that nobody here knows."""
-    return FoldedBase([model], {scan.id: 0 for scan in scans}, model)

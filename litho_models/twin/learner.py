@@ -12,30 +12,30 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import BSpline
 
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.fitting.least_squares import gram_inside, orthonormal
 from litho_models.fitting.ridge import feature_rows
-from litho_models.loop.linear import ALL_FREE
-from litho_models.loop.prepared import PreparedScan
-from litho_models.loop.probes.layout import richest_features
-from litho_models.loop.probes.linear import held_out_ridge
-from litho_models.loop.probes.places import map_columns_at
-from litho_models.loop.probes.tables import FEWEST_ORDERS, ORDER_STEPS
-from litho_models.loop.selection.confirming import SMALLEST_SHARE
-from litho_models.loop.study import Study
-from litho_models.models.features import Features
-from litho_models.scan_terms import Terms
+from litho_models.models.features import Features, FeaturesConfig, RandomFeaturesConfig
+from litho_models.scan_terms.grouped import Block, Products
+from litho_models.scan_terms.groups import ALL
 from litho_models.scoring.statistics import interval
+from litho_models.twin.fits import ALL_FREE, Study
+from litho_models.twin.judging import SMALLEST_SHARE
+from litho_models.twin.prepared import PreparedScan, sample_border_px
 
 # All rows of all scans; with more scans each is thinned.
 _KEPT_BYTES, _MOST_ROWS = 512 * 2**20, 360
 # Features whose strength may follow the place: height, ∂y and ∂x at 0.3 µm (a gain and a displacement); and
 # order or dose: height, |∂y| and |∂x|, surroundings of 1.6 µm.
 _PLACED, _VARYING = (18, 19, 20), (18, 21, 22, 7)
-
-# The stage of a loop at which all is in that follows one covariate, by name.
-GENERIC_TERMS = "generic terms"
+_ORDER_STEPS = (-0.25, 0.0, 0.25)
+_FEWEST_ORDERS = 3
+# Cubic splines along each axis of a scan.
+_SPLINES = 5
+# Scans' worth of evidence for nothing to learn: which of them is chosen inside the training folds.
+_SHRINKING = (1e-3, 1e-2, 1e-1, 1.0, 10.0, 100.0)
 
 
 @dataclass(frozen=True)
@@ -88,60 +88,55 @@ class Learner:
     def __init__(self, study: Study, predictions: Sequence[np.ndarray]):
         self._study = study
         self._predictions = list(predictions)
-        model = richest_features(study.scans[0])
+        model = _all_features(study.scans[0])
         pixels = sum(len(scan.sample) for scan in study.scans)
         self._every = -(-pixels * 4 * _MOST_ROWS // _KEPT_BYTES)
-        varied = [of for of in _VARIED if len({of(scan) for scan in study.scans}) >= FEWEST_ORDERS]
+        varied = [of for of in _VARIED if len({of(scan) for scan in study.scans}) >= _FEWEST_ORDERS]
         rows = [self._rows(model, scan, varied) for scan in study.scans]
         scale = np.sqrt(np.mean([one.var(axis=1) for one in rows], axis=0))[:, None]
         self._rows_of = [one / np.where(scale > 0, scale, np.float32(1)) for one in rows]
-        self._grams = [_gram(one) for one in self._rows_of]
-        self._freed: dict[Terms, tuple[list[np.ndarray], np.ndarray]] = {}
+        self._bases = [
+            orthonormal(scan.terms_at_sample(own, ALL_FREE)[:, :: self._every].T)
+            for scan, own in zip(study.scans, predictions, strict=True)
+        ]
+        self._grams = np.stack(
+            [
+                (_gram(own) - gram_inside(own.T, basis)) / len(basis)
+                for own, basis in zip(self._rows_of, self._bases, strict=True)
+            ]
+        )
 
-    def rest(self, predictions: Sequence[np.ndarray], terms: Terms = ALL_FREE) -> Rest:
+    def rest(self, predictions: Sequence[np.ndarray]) -> Rest:
         """What the features explain of measured minus predicted, each scan by a ridge that has not seen it.
 
         Args:
-            predictions: held-out predictions (y, x) µm, one per scan; ``terms``: what each scan may add.
+            predictions: held-out predictions (y, x) µm, one per scan.
         """
-        bases, grams = self._without(terms)
-        rights, squares = [], []
-        for scan, prediction, rows, basis in zip(
-            self._study.scans, predictions, self._rows_of, bases, strict=True
+        scans, count = self._study.scans, self._grams.shape[1]
+        grams = np.zeros((len(scans), 1 + count, 1 + count))
+        grams[:, 1:, 1:] = self._grams
+        for scan, own, rows, basis, gram in zip(
+            scans, predictions, self._rows_of, self._bases, grams, strict=True
         ):
-            residual = (scan.height - scan.at_sample(prediction))[:: self._every]
+            residual = (scan.height - scan.at_sample(own))[:: self._every]
             residual -= basis @ (basis.T @ residual)
-            rights.append(rows @ residual)
-            squares.append(np.mean(residual**2) * NM_PER_UM**2)
-        pixels = np.array([len(basis) for basis in bases])
-        found = held_out_ridge(grams, np.stack(rights), pixels, np.eye(grams.shape[1]), self._study.fold_of)
-        return Rest(found.gains_nm2, np.array(squares), bases[0].shape[1])
-
-    def _without(self, terms: Terms) -> tuple[list[np.ndarray], np.ndarray]:
-        """What each scan may add (n, k), orthonormal, and the features' inner products without it."""
-        if terms not in self._freed:
-            bases = [
-                orthonormal(scan.terms_at_sample(prediction, terms)[:, :: self._every].T)
-                for scan, prediction in zip(self._study.scans, self._predictions, strict=True)
-            ]
-            freed = [
-                gram - gram_inside(rows.T, basis)
-                for gram, rows, basis in zip(self._grams, self._rows_of, bases, strict=True)
-            ]
-            self._freed[terms] = bases, np.stack(freed)
-        return self._freed[terms]
+            gram[0, 0] = np.mean(residual**2)
+            gram[0, 1:] = gram[1:, 0] = rows @ residual / len(residual)
+        left = _held_out(grams, self._study.fold_of) * NM_PER_UM**2
+        squares = grams[:, 0, 0] * NM_PER_UM**2
+        return Rest(squares - left, squares, self._bases[0].shape[1])
 
     def _rows(
         self, model: Features, scan: PreparedScan, varied: Sequence[Callable[[PreparedScan], float]]
     ) -> NDArray[np.float32]:
         """Features of layout and place, and some times order and dose, (m, n)."""
         at = scan.sample[:: self._every]
-        of_layout, of_place = feature_rows(model, scan.stored, at), map_columns_at(scan, at)
+        of_layout, of_place = feature_rows(model, scan.stored, at), _place_columns(scan, at)
         varying = np.stack([*of_layout[list(_VARYING)], of_layout[_VARYING[0]] ** 2])
         columns = [of_layout, of_place, *(of_place * of_layout[one] for one in _PLACED)]
         for of in varied:
             value = of(scan)
-            columns += [value * varying, *((value > step) * varying for step in ORDER_STEPS)]
+            columns += [value * varying, *((value > step) * varying for step in _ORDER_STEPS)]
         return np.concatenate(columns).astype(np.float32)
 
 
@@ -160,3 +155,43 @@ _VARIED = (_order, _dose)
 def _gram(rows: np.ndarray) -> np.ndarray:
     exact = rows.astype(np.float64)
     return exact @ exact.T
+
+
+def _held_out(grams: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
+    """Mean squared residual (scans,) by ridges fitted, and their weight chosen, without each scan's fold."""
+    left = np.empty(len(grams))
+    columns = tuple(range(1, grams.shape[1]))
+    blocks = [Block(columns, ALL, shrinking) for shrinking in _SHRINKING]
+    products = Products(grams, {ALL: ("",) * len(grams)})
+    for fold in np.unique(fold_of):
+        own, rest = np.flatnonzero(fold_of == fold), np.flatnonzero(fold_of != fold)
+        inner = Products(grams[rest], {ALL: ("",) * len(rest)})
+        block = min(blocks, key=lambda one: float(inner.held_out([one], fold_of[rest]).sum()))
+        left[own] = products.squares([block], products.strengths([block], rest), own)
+    return left
+
+
+def _all_features(scan: PreparedScan) -> Features:
+    """All features of the zoo, without the random ones, for scans like this one; weights are not fitted."""
+    first = scan.stored
+    config = RandomFeaturesConfig.of_variant(
+        pitch_um=first.pitch_um, level_height_um=first.level_height_um, levels=first.levels
+    )
+    return Features(FeaturesConfig(**config.model_dump(include=set(FeaturesConfig.model_fields))))
+
+
+def _place_columns(scan: PreparedScan, at: np.ndarray) -> np.ndarray:
+    """Products of splines along y and x at flat indices of a scan, (25, n)."""
+    (ny, nx), (y, x) = scan.stored.shape, np.divmod(at, scan.stored.shape[1])
+    return (_splines(ny)[:, None, y] * _splines(nx)[None, :, x]).reshape(-1, len(at))
+
+
+def _splines(size: int) -> np.ndarray:
+    """Cubic splines (5, size) over the sampled part of an axis, constant beyond it; they add up to 1.
+
+    A spline that only pixels beyond it hold would be drawn there without having been measured.
+    """
+    first = sample_border_px(size)
+    position = np.interp(np.arange(size), [first, size - 1 - first], [-1.0, 1.0])
+    knots = np.concatenate([[-1.0] * 3, np.linspace(-1, 1, _SPLINES - 2), [1.0] * 3])
+    return BSpline.design_matrix(position, knots, 3).toarray().T
