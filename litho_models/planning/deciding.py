@@ -18,6 +18,7 @@ from scipy.stats import f as f_distribution
 from scipy.stats import f_oneway
 
 from litho_data.build.gratings import GratingScan
+from litho_data.store import PrintedScan
 from litho_models.effects import get_effect
 from litho_models.effects.registry import TIP
 from litho_models.planning.decision_error import Z_DECIDED, surely_better
@@ -33,9 +34,10 @@ from litho_models.scan_terms import (
 )
 from litho_models.scan_terms.lines import axis_along, shrunk_line_offsets
 from litho_models.scan_terms.term import row_index
+from litho_models.twin.closing import Closed
 from litho_models.twin.judging import CONFIRM_P, SMALLEST_SHARE
 from litho_models.twin.model import Twin
-from litho_models.twin.prepared import PreparedScan
+from litho_models.twin.prepared import PreparedScan, prepare_scans
 from litho_models.twin.record import CloseLoop, Comparison, Decided, Decision, FoundEffect
 
 NONE: Decided = "none of them"
@@ -47,8 +49,30 @@ _BLOCK_PX = 32
 PRINT_SHARE = 0.9
 
 
+def decide(
+    closed: Closed,
+    open_: OpenQuestions,
+    new: Sequence[PrintedScan],
+    gratings: Sequence[GratingScan] = (),
+    report: Callable[[str], None] = lambda message: None,
+) -> list[Decision]:
+    """Judge every declared question that scans can answer.
+
+    Args:
+        closed: the loop that asked; ``new``: scans that it has not seen; ``gratings``: scanned beside them.
+    """
+    judge = Judge(closed.final.twin.ungrouped(), closed.study.windows, prepare_scans(new), gratings)
+    kinds = {"lines": judge.of_lines, "per-scan": judge.of_single_scans}
+    decisions = []
+    for question in open_.questions:
+        if question.kind != "fact":
+            report(f"deciding on {question.name}")
+            decisions.append(kinds.get(question.kind, judge.among_rivals)(question))
+    return decisions
+
+
 @dataclass(frozen=True)
-class Evidence:
+class Judge:
     """New scans, beside those that a model is known from.
 
     Attributes:
@@ -61,19 +85,7 @@ class Evidence:
     new: Sequence[PreparedScan]
     gratings: Sequence[GratingScan] = ()
 
-    def decide(
-        self, open_: OpenQuestions, report: Callable[[str], None] = lambda message: None
-    ) -> list[Decision]:
-        """Judge every declared question that scans can answer."""
-        kinds = {"lines": self._of_lines, "per-scan": self._of_single_scans}
-        decisions = []
-        for question in open_.questions:
-            if question.kind != "fact":
-                report(f"deciding on {question.name}")
-                decisions.append(kinds.get(question.kind, self._among_rivals)(question))
-        return decisions
-
-    def _among_rivals(self, question: Question) -> Decision:
+    def among_rivals(self, question: Question) -> Decision:
         bare = Twin.of_base(self.twin.base, self.twin.full_height_um, self.twin.pitch_um)
         twins = [rival.twin(bare) for rival in question.rivals]
         without = twins[0]
@@ -90,7 +102,7 @@ class Evidence:
         said = said_by_gratings(question, self.gratings, scan.shape[1] * scan.pitch_um)
         return compared(question, self.new, left, said)
 
-    def _of_single_scans(self, question: Question) -> Decision:
+    def of_single_scans(self, question: Question) -> Decision:
         """Analysis of variance of a term of single scans: prints against repeats."""
         terms = terms_of_effect(question.name)
         placed, by_print = self.twin.placed(), dict[str, list[np.ndarray]]()
@@ -116,7 +128,7 @@ class Evidence:
             scanned=law.cdf(ratio / expected) <= CONFIRM_P,
         )
 
-    def _of_lines(self, question: Question) -> Decision:
+    def of_lines(self, question: Question) -> Decision:
         """Variance of line offsets along the layout's rows and along the scan lines of turned scans."""
         turned = [scan for scan in self.new if axis_along(scan.line) == 0]
         if not turned:

@@ -10,11 +10,10 @@ from litho_data.build.gratings import grating_scans
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Result
 from litho_data.store import PrintedScan, Store, open_store
-from litho_models.planning.deciding import Evidence, with_decisions
+from litho_models.planning.deciding import decide, with_decisions
 from litho_models.planning.open_questions import open_questions
 from litho_models.twin import run
 from litho_models.twin.closing import Closed
-from litho_models.twin.prepared import prepare_scans
 from litho_models.twin.record import CloseLoop
 
 
@@ -38,17 +37,15 @@ def close_loop(
             does not say so.
     """
     first, further = open_store(store), [open_store(path) for path in new_prints]
-    new = prepare_scans([scan for one in further for scan in new_scans(first, one)]) if further else []
+    new = [scan for one in further for scan in new_scans(first, one)]
+    gratings = [scan for one in further for scan in grating_scans(one)]
 
     def asked(closed: Closed, result: CloseLoop) -> tuple[CloseLoop, list[Result]]:
         open_ = open_questions(closed, result, report)
-        result = result.model_copy(
-            update={"settings": {**result.settings, "new_prints": [one.sha256 for one in further]}}
-        )
+        settings = {**result.settings, "new_prints": [one.sha256 for one in further]}
+        result = result.model_copy(update={"settings": settings})
         if new:
-            gratings = [scan for one in further for scan in grating_scans(one)]
-            evidence = Evidence(closed.final.twin.ungrouped(), closed.study.windows, new, gratings)
-            result = with_decisions(result, open_, evidence.decide(open_, report))
+            result = with_decisions(result, open_, decide(closed, open_, new, gratings, report))
         return result, [open_]
 
     return run.close_loop(store, out, further=asked, report=report, **settings)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -13,6 +14,9 @@ import torch
 from scipy.ndimage import gaussian_filter
 from scipy.stats import norm
 
+from benchmarks import measured_plan, two_rounds
+from benchmarks.record import published
+from benchmarks.two_rounds_figure import bins
 from litho_data.cards.card import load_card
 from litho_data.cards.tables import read_table
 from litho_data.foundation.errors import InputError
@@ -32,7 +36,7 @@ from litho_models.frozen.files import save_frozen
 from litho_models.models import build_model
 from litho_models.planning import power
 from litho_models.planning.answers import _pairs, of_rivals
-from litho_models.planning.deciding import NONE, Evidence, compared, said_by_gratings, with_decisions
+from litho_models.planning.deciding import NONE, Judge, compared, said_by_gratings, with_decisions
 from litho_models.planning.decision_error import Z_DECIDED, surely_better
 from litho_models.planning.layouts import Limits, as_tensor, climb, score, starts
 from litho_models.planning.noise import NoiseSpectrum, left_nm, noise_spectrum
@@ -57,6 +61,7 @@ from tests.litho_models.twin_scans import base_model, blank_scans, planted, with
 SLOPE = {"slope-thinning": {"along_x_um": 0.2, "along_y_um": 0.0, "exponent": 2.0}}
 AS_PRINTER, AS_MICROSCOPE = "slope-thinning as the printer's", "slope-thinning as the microscope's"
 NOISE_NM = 10.0
+DOCS = Path(__file__).parents[2] / "docs"
 TURNED = (Way(), Way(turned_deg=90))
 
 
@@ -364,6 +369,21 @@ def test_nothing_open_and_no_questions_kept_are_said(tmp_path: Path) -> None:
         next_print(loop, tmp_path / "plan")
 
 
+def test_the_page_quotes_the_plan_for_the_measured_prints() -> None:
+    plan = NextPrint.read(measured_plan.RESULTS)
+    for name, text in measured_plan.texts(plan).items():
+        assert published(measured_plan.PAGE, name) == text
+    assert plan.run.command in measured_plan.PAGE.read_text(encoding="utf-8")
+
+
+def test_the_plan_for_the_measured_prints_is_ready_and_of_the_published_loop() -> None:
+    plan = NextPrint.read(measured_plan.RESULTS)
+    loop = json.loads((DOCS / "results" / "neural-lithography" / "close_loop.json").read_text("utf-8"))
+    assert plan.dataset.model_dump(mode="json") == loop["dataset"]
+    jobs = jobs_of_card(measured_plan.RESULTS / "card.toml", first=0)
+    assert [job.id for job in jobs] == [scan.id for scan in plan.scans]
+
+
 # --- the second round
 
 
@@ -389,10 +409,10 @@ def second_round(
     return scans
 
 
-def evidence(effects: dict[str, dict[str, float]], new: Sequence[PrintedScan]) -> Evidence:
+def judge(effects: dict[str, dict[str, float]], new: Sequence[PrintedScan]) -> Judge:
     """Four scans of the first round with these effects, and new ones."""
     first = planted([(name, ALL, {"": own}) for name, own in effects.items()], count=4, size_px=64)
-    return Evidence(model(effects), [scan.window for scan in prepare_scans(first)], prepare_scans(new))
+    return Judge(model(effects), [scan.window for scan in prepare_scans(first)], prepare_scans(new))
 
 
 def test_a_loop_asks_and_later_prints_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -432,7 +452,7 @@ def test_a_loop_asks_and_later_prints_answer(tmp_path: Path, monkeypatch: pytest
 @pytest.mark.parametrize("owner", ["printer", "microscope"])
 def test_two_turned_prints_say_whose_a_loss_on_slopes_is(owner: Owner) -> None:
     new = second_round(5, SLOPE, owner)
-    [decision] = evidence(SLOPE, new).decide(opened([slope_question()]))
+    decision = judge(SLOPE, new).among_rivals(slope_question())
     assert decision.verdict == "decided"
     assert decision.left == [f"slope-thinning as the {owner}'s"]
 
@@ -445,8 +465,8 @@ def test_two_turned_prints_say_whether_an_asymmetric_tip_is_one(owner: Owner) ->
     assert _owners(TIP, effects[TIP]) == ["printer", "microscope"]
     assert _owners(TIP, {**effects[TIP], "across": 1.0}) == [None]
     rivals = [rival(TIP, effects, one) for one in ("printer", "microscope")]
-    open_ = opened([slope_question(name=TIP, rivals=rivals)])
-    [decision] = evidence(effects, second_round(5, effects, owner)).decide(open_)
+    question = slope_question(name=TIP, rivals=rivals)
+    decision = judge(effects, second_round(5, effects, owner)).among_rivals(question)
     assert decision.verdict == "decided"
     assert decision.left == [f"{TIP} as the {owner}'s"]
 
@@ -623,6 +643,49 @@ def test_a_question_is_put_in_words() -> None:
     said = "height missing on slopes: the printer's or the microscope's"
     assert _question("role", ["slope-thinning"]).text == said
     assert _question("fact", ["vignetting"], text="no place").text.endswith(": no place")
+
+
+def test_what_is_planted_is_drawn_before_anything_is_run_and_judged_by_its_owner() -> None:
+    drawn = two_rounds.draws(24, 1)
+    assert drawn == two_rounds.draws(24, 1)
+    assert drawn != two_rounds.draws(24, 2)
+    assert all(12 <= one["rms_nm"] <= 30 for one in drawn)
+    assert {one["knob"] for one in drawn} == set(two_rounds.DEALT)
+    assert [one["knob"] for one in two_rounds.draws(3, 1, ["galvo-lag", "tip-dilation"])][1:] == [
+        "tip-dilation",
+        "galvo-lag",
+    ]
+    answer = {
+        "question": "slope-thinning",
+        "kind": "role",
+        "declared": [AS_PRINTER, AS_MICROSCOPE],
+        "verdict": "decided",
+        "evidence": "",
+        "prints": 4,
+        "scans": 8,
+    }
+    planned = PlannedQuestion.model_construct(power=[1.0] * 12, status="decides")
+    for left, right in ((AS_PRINTER, True), (AS_MICROSCOPE, False)):
+        decision = Decision.model_validate({**answer, "left": [left]})
+        told = two_rounds.judged(decision, planned, "slope-thinning-x")
+        assert told["counts"]
+        assert told["right"] is right
+        assert told["wrong"] is not right
+    # A name that was not planted is wrong where names were asked for, and a role of it is nobody's.
+    other = Decision.model_validate({**answer, "declared": ["a", "b"], "left": ["a"]})
+    for kind, wrong in (("set", True), ("suspects", True), ("role", False)):
+        told = two_rounds.judged(other.model_copy(update={"kind": kind}), planned, "slope-thinning-x")
+        assert not told["counts"]
+        assert told["wrong"] is wrong
+
+
+def test_the_picture_of_promises_shows_what_the_table_counts() -> None:
+    trials = json.loads((two_rounds.RESULTS / "20273.json").read_text("utf-8"))["trials"]
+    kept = bins(trials, "optimised")[-1]
+    assert kept.promised > 0.95
+    assert f"| {kept.right} of {kept.asked} (" in two_rounds.summary(trials)
+    counted = sum(one["counts"] for trial in trials for one in trial["answers"].get("optimised", []))
+    assert sum(one.asked for one in bins(trials, "optimised")) == counted
 
 
 def test_a_plan_is_printed_by_the_same_machine_with_new_chance() -> None:
