@@ -25,7 +25,6 @@ from scipy.stats import binomtest
 from benchmarks.markdown_table import markdown_table
 from benchmarks.record import conclude, origin, write_record
 from litho_data.build.build import build_dataset
-from litho_data.build.gratings import grating_scans
 from litho_data.foundation.commands import run_script
 from litho_data.foundation.errors import InputError
 from litho_data.store import open_store
@@ -152,8 +151,7 @@ def run_trial(
         store = open_store(folder / f"{arm}.zarr")
         planned = {q.name: q for q in plan.questions}
         answers[arm] = [
-            judged(one, planned[one.question], draw["knob"])
-            for one in decide(*asked[0], store.scans(), grating_scans(store))
+            judged(one, planned[one.question], draw["knob"]) for one in decide(*asked[0], store.scans())
         ]
     return {
         **draw,

@@ -17,51 +17,43 @@ import numpy as np
 from scipy.stats import f as f_distribution
 from scipy.stats import f_oneway
 
-from litho_data.build.gratings import GratingScan
 from litho_data.store import PrintedScan
 from litho_models.effects import get_effect
-from litho_models.effects.registry import TIP
-from litho_models.planning.decision_error import Z_DECIDED, surely_better
+from litho_models.effects.effect import Role
 from litho_models.planning.noise import left_nm
-from litho_models.planning.questions import OpenQuestions, Question
+from litho_models.planning.power import PRINT_SHARE, Z_DECIDED, surely_better
+from litho_models.planning.questions import OpenQuestions, Owner, Question
 from litho_models.planning.rival_fits import fit_rivals
-from litho_models.scan_terms import (
-    TermPixels,
-    freed_um,
-    least_squares,
-    term_maps,
-    terms_of_effect,
-)
+from litho_models.scan_terms import freed_um, terms_of_effect
 from litho_models.scan_terms.lines import axis_along, shrunk_line_offsets
 from litho_models.scan_terms.term import row_index
 from litho_models.twin.closing import Closed
+from litho_models.twin.fits import Study
 from litho_models.twin.judging import CONFIRM_P, SMALLEST_SHARE
 from litho_models.twin.model import Twin
 from litho_models.twin.prepared import PreparedScan, prepare_scans
-from litho_models.twin.record import CloseLoop, Comparison, Decided, Decision, FoundEffect
+from litho_models.twin.record import CloseLoop, Comparison, Decided, Decision
+from litho_models.twin.single_scans import SingleScans
 
 NONE: Decided = "none of them"
 UNSEEN: Decided = "not shown by these prints"
 BOTH = PRINTER, MICROSCOPE = "the printer", "the microscope"
-SCANNER = "piezo-nonlinearity"
+_ROLES: dict[Owner | None, Role] = {"printer": "process", "microscope": "measurement"}
 _BLOCK_PX = 32
-# Of the variance of a term of single scans, that of the print if the printer is its cause.
-PRINT_SHARE = 0.9
 
 
 def decide(
     closed: Closed,
     open_: OpenQuestions,
     new: Sequence[PrintedScan],
-    gratings: Sequence[GratingScan] = (),
     report: Callable[[str], None] = lambda message: None,
 ) -> list[Decision]:
     """Judge every declared question that scans can answer.
 
     Args:
-        closed: the loop that asked; ``new``: scans that it has not seen; ``gratings``: scanned beside them.
+        closed: the loop that asked; ``new``: scans that it has not seen.
     """
-    judge = Judge(closed.final.twin.ungrouped(), closed.study.windows, prepare_scans(new), gratings)
+    judge = Judge(closed.final.twin.ungrouped(), closed.study, prepare_scans(new))
     kinds = {"lines": judge.of_lines, "per-scan": judge.of_single_scans}
     decisions = []
     for question in open_.questions:
@@ -76,56 +68,46 @@ class Judge:
     """New scans, beside those that a model is known from.
 
     Attributes:
-        twin: the corrected model, of one strength for all scans; ``windows``: what it was fitted to.
-        new: scans that were in no fit so far; ``gratings``: scanned beside them.
+        twin: the corrected model, of one strength for all scans; ``study``: what it was fitted to.
+        new: scans that were in no fit so far.
     """
 
     twin: Twin
-    windows: Sequence[PreparedScan]
+    study: Study
     new: Sequence[PreparedScan]
-    gratings: Sequence[GratingScan] = ()
 
     def among_rivals(self, question: Question) -> Decision:
-        bare = Twin.of_base(self.twin.base, self.twin.full_height_um, self.twin.pitch_um)
-        twins = [rival.twin(bare) for rival in question.rivals]
-        without = twins[0]
-        for name in {rival.effect for rival in question.rivals} & {*without.names}:
-            without = without.without(name)
+        """Rivals, and none of them, fitted to all scans and judged on the new ones."""
+        twins = [rival.twin(self.twin.alone()) for rival in question.rivals]
+        without = twins[0].without(question.rivals[0].effect)
         names = [*(rival.name for rival in question.rivals), NONE]
         twins.append(without)
         left = {}
-        windows = [*self.windows, *(scan.window for scan in self.new)]
+        windows = [*self.study.windows, *(scan.window for scan in self.new)]
         for name, twin, fit in zip(names, twins, fit_rivals(twins, windows), strict=True):
             placed = twin.at(fit.vector).placed()
             left[name] = [left_nm(scan, placed.height(scan)) for scan in self.new]
-        scan = self.new[0].stored
-        said = said_by_gratings(question, self.gratings, scan.shape[1] * scan.pitch_um)
-        return compared(question, self.new, left, said)
+        return compared(question, self.new, left)
 
     def of_single_scans(self, question: Question) -> Decision:
         """Analysis of variance of a term of single scans: prints against repeats."""
-        terms = terms_of_effect(question.name)
-        placed, by_print = self.twin.placed(), dict[str, list[np.ndarray]]()
-        for scan in self.new:
-            prediction = placed.height(scan)
-            pixels = TermPixels(prediction, scan.line, scan.sample)
-            own = term_maps(pixels, terms)
-            maps = np.concatenate([own, term_maps(pixels, {"offset", "gain", "bow"} - terms)])
-            found = least_squares(maps, scan.height - scan.at_sample(prediction))
-            by_print.setdefault(scan.stored.print_id, []).append(found[: len(own)])
-        repeated = [np.array(values) for values in by_print.values() if len(values) > 1]
-        count, scans = len(repeated), sum(map(len, repeated))
+        placed, own = self.twin.placed(), terms_of_effect(question.name)
+        scans = SingleScans(self.study, self.new, [placed.height(scan) for scan in self.new])
+        by_print: dict[str, list[np.ndarray]] = {}
+        for scan, values in zip(
+            self.new, scans.coefficients(own, own | {"offset", "gain", "bow"}), strict=True
+        ):
+            by_print.setdefault(scan.stored.print_id, []).append(values)
+        repeated = [np.array(one) for one in by_print.values() if len(one) > 1]
+        count, total = len(repeated), sum(map(len, repeated))
         if count < 2:
             return _decision(question, self.new, BOTH, "no print was scanned twice", UNSEEN)
         ratio = float(np.median(f_oneway(*repeated).statistic))
-        law = f_distribution(count - 1, scans - count)
-        expected = 1 + scans / count * PRINT_SHARE / (1 - PRINT_SHARE)
+        law = f_distribution(count - 1, total - count)
+        expected = 1 + total / count * PRINT_SHARE / (1 - PRINT_SHARE)
+        told = f"F({count - 1}, {total - count}) = {ratio:.2f} of prints against repeats"
         return _of_owner(
-            question,
-            self.new,
-            f"F({count - 1}, {scans - count}) = {ratio:.2f} of prints against repeats",
-            printer=law.sf(ratio) <= CONFIRM_P,
-            scanned=law.cdf(ratio / expected) <= CONFIRM_P,
+            question, self.new, told, law.sf(ratio) <= CONFIRM_P, law.cdf(ratio / expected) <= CONFIRM_P
         )
 
     def of_lines(self, question: Question) -> Decision:
@@ -146,41 +128,31 @@ class Judge:
             f"offsets vary by {written:.1f} nm² along the layout's rows and by {scanned:.1f} nm² along the "
             f"lines of the turned scans (z = {z:.1f})"
         )
-        return _of_owner(question, turned, told, printer=z >= Z_DECIDED, scanned=z <= -Z_DECIDED)
+        return _of_owner(question, turned, told, z >= Z_DECIDED, z <= -Z_DECIDED)
 
 
 def with_decisions(result: CloseLoop, open_: OpenQuestions, decisions: list[Decision]) -> CloseLoop:
     """The result with what was decided: an effect that is left alone is explained, and has an owner."""
     decided = {(one.question, *one.left) for one in decisions if one.verdict == "decided"}
-    owners = {
-        rival.effect: rival.owner
+    roles = {
+        rival.effect: _ROLES.get(rival.owner, get_effect(rival.effect).role)
         for question in open_.questions
         for rival in question.rivals
         if (question.name, rival.name) in decided
     }
-
-    def settled(effect: FoundEffect) -> FoundEffect:
-        if effect.name not in owners:
-            return effect
-        known = get_effect(effect.name).role
-        role = {"printer": "process", "microscope": "measurement"}.get(owners[effect.name] or "", known)
-        return effect.model_copy(update={"verdict": "explained", "confusable_with": [], "role": role})
-
-    effects = [settled(effect) for effect in result.effects]
+    effects = [
+        one.model_copy(update={"verdict": "explained", "confusable_with": [], "role": roles[one.name]})
+        if one.name in roles
+        else one
+        for one in result.effects
+    ]
     return result.model_copy(update={"decisions": decisions, "effects": effects})
 
 
 def compared(
-    question: Question,
-    new: Sequence[PreparedScan],
-    left_nm: Mapping[str, Sequence[np.ndarray]],
-    said: str = "",
+    question: Question, new: Sequence[PreparedScan], left_nm: Mapping[str, Sequence[np.ndarray]]
 ) -> Decision:
-    """Judge the answers to a question by what each leaves of the new scans, maps (y, x) in nm.
-
-    Args:
-        said: what else stands in the evidence.
-    """
+    """Judge the answers to a question by what each leaves of the new scans, maps (y, x) in nm."""
     comparisons = [_compare(pair, left_nm, new, question) for pair in combinations(left_nm, 2)]
     # As in the loop: a smaller difference may come from what no rival describes.
     least = {
@@ -201,8 +173,7 @@ def compared(
             f"differ by {nearest_nm:.1f} nm"
         )
     nothing = not left or (NONE not in excluded and len(left) == 1)
-    evidence = "; ".join([*told, said] if said else told)
-    decision = _decision(question, new, left, evidence, NONE if nothing else None)
+    decision = _decision(question, new, left, "; ".join(told), NONE if nothing else None)
     return decision.model_copy(update={"comparisons": comparisons})
 
 
@@ -235,15 +206,12 @@ def _compare(
 
 
 def _block_sums(gain: np.ndarray) -> np.ndarray:
-    blocks = [max(2, n // _BLOCK_PX) for n in gain.shape]
-    rows, columns = (np.arange(n) * count // n for n, count in zip(gain.shape, blocks, strict=True))
-    sums = np.zeros(blocks)
-    np.add.at(sums, (rows[:, None], columns[None, :]), np.nan_to_num(gain))
-    return sums
+    rows, columns = (np.arange(max(2, n // _BLOCK_PX)) * n // max(2, n // _BLOCK_PX) for n in gain.shape)
+    return np.add.reduceat(np.add.reduceat(np.nan_to_num(gain), rows, axis=0), columns, axis=1)
 
 
 def _of_owner(
-    question: Question, scans: Sequence[PreparedScan], evidence: str, *, printer: bool, scanned: bool
+    question: Question, scans: Sequence[PreparedScan], evidence: str, printer: bool, scanned: bool
 ) -> Decision:
     left = BOTH if printer == scanned else [PRINTER if printer else MICROSCOPE]
     return _decision(question, scans, left, evidence)
@@ -267,29 +235,3 @@ def _decision(
         prints=len({scan.stored.print_id for scan in scans}),
         scans=len(scans),
     )
-
-
-def said_by_gratings(question: Question, gratings: Sequence[GratingScan], line_um: float) -> str:
-    """What gratings say of a question about the scanner or the tip; empty if they say nothing of it.
-
-    A rival asks for what the first round fitted. What gratings say decides nothing.
-
-    Args:
-        question: with its rivals; ``line_um``: length of a line of the prints.
-    """
-    told = []
-    for name, asked in {rival.effect: rival.effects[rival.effect] for rival in question.rivals}.items():
-        for one in gratings:
-            shown = None
-            if name == TIP and one.tip_at_most_um is not None:
-                shown = f"a tip of {one.tip_at_most_um:.2f} µm at most", f"{asked['radius_um']:.2f} µm"
-            elif name == SCANNER and one.bow_um is not None and one.bow_sd_um is not None:
-                # A displacement that is quadratic grows with the square of the line.
-                bow, sd = (1e3 * (line_um / one.line_um) ** 2 * own for own in (one.bow_um, one.bow_sd_um))
-                shown = (
-                    f"the middle of a line {bow:.1f} ± {sd:.1f} nm off",
-                    f"{1e3 * asked['strength'] * line_um / 4:.0f} nm",
-                )
-            if shown is not None:
-                told.append(f"a grating shows {shown[0]}, {name} asks for {shown[1]}")
-    return "; ".join(told)

@@ -14,9 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from litho_data.layouts.patterns import checkerboard, isolated_features, line_space_sweep
+from litho_data.layouts.patterns import checkerboard, line_space_sweep
 from litho_data.layouts.random_layout import quantise, random_layout
-from litho_models.effects.chain import EffectChain
 from litho_models.planning.questions import OpenQuestions
 from litho_models.planning.rivalry import Place, PlannedPrint, Rivalry, Way
 
@@ -24,33 +23,32 @@ TILE_PX = 256
 STEPS = 40
 _REFIT_EVERY = 10
 _STEP_LEVELS = 0.3
-# Directed pairs that a layout climbs for until the next refit: the farther ones take care of themselves.
-NEAREST = 4
 # Levels rarer than this in the prints so far are not known to the models.
 _RARE = 1e-3
-# Mean distance of sorted levels from those of the prints so far, in levels, that costs nothing.
+# Distance of mean and spread of the levels from those of the prints so far that costs nothing.
 _FREE_LEVELS = 1.5
 _PRICE = 2.0
 
 
 @dataclass(frozen=True)
 class Limits:
-    """What may be printed: levels, cut-off (cycles/µm), and the levels of the prints so far, sorted."""
+    """What may be printed: levels, cut-off (cycles/µm), and mean and spread of the levels so far."""
 
     lowest: int
     highest: int
     cutoff_per_um: float
     pitch_um: float
-    known: np.ndarray
+    mean: float
+    sd: float
 
     @classmethod
     def of(cls, open_: OpenQuestions, pitch_um: float) -> Limits:
         """Levels with a share of a thousandth, and structure no finer than in the prints so far."""
         share = np.array(open_.level_share)
-        levels = np.flatnonzero(share >= _RARE)
-        quantiles = (np.arange(4096) + 0.5) / 4096
-        known = np.searchsorted(np.cumsum(share) / share.sum(), quantiles).astype(np.float32)
-        return cls(int(levels[0]), int(levels[-1]), open_.cutoff_per_um, pitch_um, known)
+        known, levels = np.flatnonzero(share >= _RARE), np.arange(len(share))
+        mean = float(share @ levels)
+        sd = float(np.sqrt(share @ (levels - mean) ** 2))
+        return cls(int(known[0]), int(known[-1]), open_.cutoff_per_um, pitch_um, mean, sd)
 
     def soft(self, free: Tensor) -> Tensor:
         """Printable soft levels (y, x) nearest to free ones."""
@@ -67,13 +65,9 @@ class Limits:
         return quantise((soft - self.lowest) / span, span + 1) + np.uint8(self.lowest)
 
     def price(self, soft: Tensor) -> Tensor:
-        """What levels far from those of the prints so far cost."""
-        quantiles = torch.quantile(
-            soft.reshape(-1)[:: max(1, soft.numel() // 16384)],
-            (torch.arange(256) + 0.5) / 256,
-        )
-        known = torch.from_numpy(self.known[8::16].copy())
-        return _PRICE * torch.relu((quantiles - known).abs().mean() - _FREE_LEVELS) ** 2
+        """What levels costs whose mean or spread is far from that of the prints so far."""
+        far = (soft.mean() - self.mean).abs() + (soft.std() - self.sd).abs()
+        return _PRICE * torch.relu(far - _FREE_LEVELS) ** 2
 
     def random(self, size_px: int, seed: int, finest: float = 1.0) -> np.ndarray:
         """Random structure, (size, size) whole levels; ``finest``: share of the cut-off."""
@@ -99,19 +93,11 @@ def starts(size_px: int, limits: Limits, seed: int) -> Iterator[tuple[str, np.nd
     feature = max(3, round(0.5 / limits.cutoff_per_um / limits.pitch_um))
     inset = size_px // 5
     shape = (size_px - 2 * inset,) * 2
-    treads = np.linspace(low, high, max(2, min(high + 1 - low, shape[0] // (2 * feature))))
-    stairs = np.rint(np.repeat(treads, -(-shape[0] // len(treads))))[: shape[0], None]
     patterns = {
         "checkerboard": checkerboard(shape, cell_px=2 * feature, high=high, low=low),
         "lines": line_space_sweep(shape, high=high, low=low, narrowest_px=feature),
         "lines-along-x": line_space_sweep(shape, high=high, low=low, narrowest_px=feature, along="x"),
-        "stairs": stairs,
     }
-    widths = [feature + 2 * i for i in range(9) if 3 * (feature + 2 * i) <= shape[0] // 3]
-    if widths:
-        patterns["pillars"] = isolated_features(
-            shape, widths_px=widths, feature=high, ground=(high + low) // 2
-        )
     for name, pattern in patterns.items():
         whole = limits.random(size_px, seed + 7)
         whole[inset:-inset, inset:-inset] = pattern
@@ -127,18 +113,7 @@ def score(
 ) -> float:
     """Separation of the nearest pair by a print of this layout at each of the doses, standard deviations."""
     prints = [PlannedPrint(as_tensor(level), ways, place, dose=dose) for dose in doses]
-    refitted = rivalry.refitted(prints)
-    return float(_separations(rivalry, prints, refitted).min())
-
-
-def _separations(
-    rivalry: Rivalry,
-    prints: Sequence[PlannedPrint],
-    refitted: Sequence[EffectChain],
-    only: Sequence[int] | None = None,
-) -> Tensor:
-    contrasts = rivalry.contrasts(prints, refitted, only)
-    return torch.stack([one.separation(rivalry.question.spread) for one in contrasts])
+    return float(rivalry.separations(prints, rivalry.refitted(prints)).min())
 
 
 def climb(
@@ -154,25 +129,18 @@ def climb(
     free = as_tensor(start).requires_grad_()
     climber = torch.optim.Adam([free], lr=_STEP_LEVELS)
     best, highest = start.astype(np.float32), -np.inf
-    refitted: list[EffectChain] = []
-    nearest: list[int] = []
     for step in range(steps + 1):
         soft = limits.soft(free)
-        if step % _REFIT_EVERY == 0 or step == steps:
-            here = [PlannedPrint(soft.detach(), ways, place)]
-            refitted = rivalry.refitted(here)
-            apart = _separations(rivalry, here, refitted)
-            nearest = torch.argsort(apart)[:NEAREST].tolist()
-            # Only where the partners are those of this very layout is the height true.
-            if float(apart.min()) > highest:
-                best, highest = soft.detach().numpy().copy(), float(apart.min())
-        if step == steps:
-            break
+        fresh = step % _REFIT_EVERY == 0 or step == steps
+        if fresh:
+            refitted = rivalry.refitted([PlannedPrint(soft.detach(), ways, place)])
+        apart = rivalry.separations([PlannedPrint(soft, ways, place)], refitted)
+        # Only where the partners are those of this very layout is the height true.
+        if fresh and apart.min().item() > highest:
+            best, highest = soft.detach().numpy().copy(), apart.min().item()
         # The nearest pair, softly: with the hard minimum two pairs would take turns.
-        apart = _separations(rivalry, [PlannedPrint(soft, ways, place)], refitted, nearest)
-        height = -torch.logsumexp(-apart, 0)
         climber.zero_grad()
-        (limits.price(soft) - height).backward()
+        (limits.price(soft) + torch.logsumexp(-apart, 0)).backward()
         climber.step()
     return best
 

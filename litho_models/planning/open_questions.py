@@ -31,7 +31,7 @@ from litho_models.twin.model import Twin
 from litho_models.twin.record import CloseLoop
 from litho_models.twin.results import clustered_covariance, independent
 from litho_models.twin.screening import Candidate
-from litho_models.twin.search import WORTH_FITTING, separating
+from litho_models.twin.search import WORTH_FITTING, Cause, separating
 
 # Members of a set, or suspects: every pair of rivals is compared on every layout.
 _MOST_MEMBERS = 3
@@ -47,7 +47,7 @@ def open_questions(
 ) -> OpenQuestions:
     """Everything that is open, the most valuable first, rivals fitted."""
     asking = _Asking(closed, report)
-    found = [asking.of_cause(one.name, one.alike) for one in (*closed.causes, *closed.lawful.causes)]
+    found = [asking.of_cause(one) for one in (*closed.causes, *closed.lawful.causes)]
     stored = [scan.stored for scan in closed.study.scans]
     return OpenQuestions(
         dataset=result.dataset,
@@ -65,12 +65,10 @@ def open_questions(
 
 def _cutoff_per_um(scans: Sequence[PrintedScan]) -> float:
     """Up to where most of the power of the layouts lies, cycles/µm."""
-    first = scans[0]
-    if min(min(scan.shape) for scan in scans) < _SMALLEST_PX:
+    first, layouts = scans[0], [scan.mask_level for scan in scans]
+    if min(first.shape) < _SMALLEST_PX:
         return 0.05 / first.pitch_um
-    known = layout_statistics(
-        [scan.mask_level for scan in scans], levels=first.levels, pitch_um=first.pitch_um
-    )
+    known = layout_statistics(layouts, levels=first.levels, pitch_um=first.pitch_um)
     return known.frequency_per_um[int(np.searchsorted(np.cumsum(known.power_share), _POWER_KNOWN))]
 
 
@@ -78,35 +76,33 @@ class _Asking:
     """Questions with rivals, about one closed loop."""
 
     def __init__(self, closed: Closed, report: Callable[[str], None]):
-        self.closed, self.report = closed, report
-        scans = closed.study.scans
-        self.maps = held_out_maps(closed.final, closed.study, scans)
-        self.noise = noise_spectrum([left_nm(*pair) for pair in zip(scans, self.maps, strict=True)])
+        self.closed, self.study, self.report = closed, closed.study, report
         self.twin = closed.final.twin.ungrouped()
+        self.maps = held_out_maps(closed.final, closed.study, closed.study.scans)
+        self.left_nm = self._left_by(self.maps)
+        self.noise = noise_spectrum(self.left_nm)
 
-    def of_cause(self, name: str, alike: Sequence[str]) -> Question | None:
+    def of_cause(self, cause: Cause) -> Question | None:
         """The set of a cause or a law, or whose it is; None if nothing is open."""
-        members = [name, *alike][:_MOST_MEMBERS]
-        if len(members) == 1 and len(_owners(name, self.twin.values({})[name])) == 1:
+        members = [cause.name, *cause.alike][:_MOST_MEMBERS]
+        if len(members) == 1 and len(_owners(cause.name, self.twin.values({})[cause.name])) == 1:
             return None
-        first = {**self.closed.lawful.first, **self.closed.named.first}
+        without = self.twin.without(cause.name)
         # In the place of another a member starts as before any of them was found.
-        others = [self._with(self.twin.without(name), first[one]) for one in members[1:]]
-        grouped = self.closed.final.twin
-        rivals, fitted = self._rivals(members, [self.twin, *others, grouped.without(name)])
+        first = {**self.closed.lawful.first, **self.closed.named.first}
+        twins = [self.twin, *(_with(without, first[one]) for one in members[1:])]
         rests = list(self.closed.rests.values())
         return _question(
-            "set" if alike else "role",
+            "set" if cause.alike else "role",
             members,
-            rivals=rivals,
-            # What groups differ by is known: one more of them does not make its prints contradict each other.
-            spread=self._spread(fitted[-1], grouped),
+            rivals=self._rivals(members, twins),
+            spread=self._spread(cause.name),
             form_nm=rests[-1].most_nm if rests else None,
         )
 
     def of_suspects(self) -> Question | None:
         """What stood out and was not confirmed: which of these carries what is left, if any does."""
-        named, study = self.closed.named, self.closed.study
+        named = self.closed.named
         least = WORTH_FITTING * 0.01 * named.state.mse_nm2
         standing = [
             one
@@ -117,30 +113,25 @@ class _Asking:
         names = [one.name for one in standing]
         if len(names) < 2 and not any(get_effect(name).role == "undetermined" for name in names):
             return None
-        rivals, fitted = self._rivals(names, [self._with(self.twin, one) for one in standing])
+        twins = [_with(self.twin, one) for one in standing]
+        rivals = self._rivals(names, twins)
         # The loop knows the error of its form with none of them in, which is theirs as well.
-        learner = Learner(study, self.maps)
-        rests = [learner.rest([twin.placed().height(scan) for scan in study.scans]) for twin in fitted]
+        learner = Learner(self.study, self.maps)
+        placed = [rival.twin(self.twin.alone()).placed() for rival in rivals]
+        rests = [learner.rest([one.height(scan) for scan in self.study.scans]) for one in placed]
         return _question("suspects", names, rivals=rivals, form_nm=min(rest.most_nm for rest in rests))
 
-    @staticmethod
-    def _with(twin: Twin, one: Candidate) -> Twin:
-        return twin.with_effect(one.name, ALL, one.start()).ungrouped()
-
-    def _rivals(self, members: Sequence[str], twins: Sequence[Twin]) -> tuple[list[Rival], list[Twin]]:
-        """The answers, and the fitted twins: one for each member, and any that only stand beside them."""
+    def _rivals(self, members: Sequence[str], twins: Sequence[Twin]) -> list[Rival]:
         self.report(f"fitting the rivals {', '.join(members)}")
-        study = self.closed.study
-        windows, units = study.windows, independent(study.scans)
+        windows, units = self.study.windows, independent(self.study.scans)
         stands_for = sum(int(w.usable.sum()) for w in windows) / sum(len(w.sample) for w in windows)
-        fits = fit_rivals(twins, windows)
-        fitted = [twin.at(fit.vector) for twin, fit in zip(twins, fits, strict=True)]
         rivals = []
-        for member, twin, fit in zip(members, fitted, fits, strict=False):
-            free = twin.free()[:, None]
+        for member, twin, fit in zip(members, twins, fit_rivals(twins, windows), strict=True):
+            fitted = twin.at(fit.vector)
+            free = fitted.free()[:, None]
             linear = [replace(part, jacobian=part.jacobian * free) for part in fit.linear]
             information = stands_for * eliminated_sum(fit.linear, RULES.term_weight)[0]
-            effects = twin.values({})
+            effects = fitted.values({})
             rivals += [
                 Rival(
                     effect=member,
@@ -152,28 +143,32 @@ class _Asking:
                 )
                 for owner in _owners(member, effects[member])
             ]
-        return rivals, fitted
+        return rivals
 
-    def _spread(self, without: Twin, twin: Twin) -> float:
-        """How much the evidence for a change varies over scans, relative to its mean, beyond what noise does.
+    def _left_by(self, maps_um: Sequence[np.ndarray]) -> list[np.ndarray]:
+        return [left_nm(*pair) for pair in zip(self.study.scans, maps_um, strict=True)]
+
+    def _spread(self, name: str) -> float:
+        """How much the evidence for an effect varies over scans, relative to its mean, beyond noise.
 
         Each scan says by which multiple a it wants the change d; the difference of its squared errors is
-        |d|² (2 a - 1) beside the noise, so that it varies by twice the spread of a.
+        |d|² (2 a - 1) beside the noise, so that it varies by twice the spread of a. What groups differ by is
+        in d: one more of them does not make its prints contradict each other.
         """
+        without = held_out_maps(self.closed.final.without(name, self.study), self.study, self.study.scans)
         multiples, own = [], []
-        before, after = without.placed(), twin.placed()
-        for scan in self.closed.study.scans:
-            left, right = (left_nm(scan, one.height(scan)) for one in (before, after))
-            change = np.nan_to_num(left - right)
+        for before, after in zip(self._left_by(without), self.left_nm, strict=True):
+            change = np.nan_to_num(before - after)
             size = float((change**2).sum())
-            if size:
-                multiples.append(float((change * np.nan_to_num(left)).sum()) / size)
-                own.append(self.noise.along(change) ** 2 / size)
-        if len(multiples) < 2:
-            return 0.0
+            multiples.append(float((change * np.nan_to_num(before)).sum()) / size)
+            own.append(self.noise.along(change) ** 2 / size)
         # Robust: a scan may have a defect.
         spread = float(np.median(np.abs(np.array(multiples) - np.median(multiples)))) / 0.6745
         return min(2 * float(np.sqrt(max(spread**2 - float(np.median(own)), 0.0))), 1.0)
+
+
+def _with(twin: Twin, one: Candidate) -> Twin:
+    return twin.with_effect(one.name, ALL, one.start()).ungrouped()
 
 
 def _owners(name: str, values: Mapping[str, float]) -> list[Owner | None]:

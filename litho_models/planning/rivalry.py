@@ -205,18 +205,18 @@ class Rivalry:
         """The models where a refit starts, whatever it is fitted to."""
         return [self._linearise(twin, prints) for twin in self.twins]
 
-    def contrasts(
-        self,
-        prints: Sequence[PlannedPrint],
-        refitted: Sequence[EffectChain],
-        only: Sequence[int] | None = None,
-    ) -> list[Contrast]:
-        """Every directed pair, or ``only`` of these, on these prints; differentiable in the levels."""
-        pairs = [(self.pairs[i][0], refitted[i]) for i in (range(len(self.pairs)) if only is None else only)]
-        true = {first: self._predict(self.true[first], prints) for first in {first for first, _ in pairs}}
+    def contrasts(self, prints: Sequence[PlannedPrint], refitted: Sequence[EffectChain]) -> list[Contrast]:
+        """Every directed pair on these prints; differentiable in the levels."""
+        true = [self._predict(chain, prints) for chain in self.true]
         return [
-            self._contrast(true[first], self._predict(partner, prints), prints) for first, partner in pairs
+            self._contrast(true[first], self._predict(partner, prints), prints)
+            for (first, _), partner in zip(self.pairs, refitted, strict=True)
         ]
+
+    def separations(self, prints: Sequence[PlannedPrint], refitted: Sequence[EffectChain]) -> Tensor:
+        """Distance of each directed pair (pairs,), in standard deviations; differentiable in the levels."""
+        contrasts = self.contrasts(prints, refitted)
+        return torch.stack([one.separation(self.question.spread) for one in contrasts])
 
     def _contrast(
         self, true: Sequence[Tensor], other: Sequence[Tensor], prints: Sequence[PlannedPrint]

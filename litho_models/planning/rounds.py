@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from litho_data.build.gratings import grating_scans
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.results import Result
 from litho_data.store import PrintedScan, Store, open_store
@@ -38,14 +37,13 @@ def close_loop(
     """
     first, further = open_store(store), [open_store(path) for path in new_prints]
     new = [scan for one in further for scan in new_scans(first, one)]
-    gratings = [scan for one in further for scan in grating_scans(one)]
 
     def asked(closed: Closed, result: CloseLoop) -> tuple[CloseLoop, list[Result]]:
         open_ = open_questions(closed, result, report)
         settings = {**result.settings, "new_prints": [one.sha256 for one in further]}
         result = result.model_copy(update={"settings": settings})
         if new:
-            result = with_decisions(result, open_, decide(closed, open_, new, gratings, report))
+            result = with_decisions(result, open_, decide(closed, open_, new, report))
         return result, [open_]
 
     return run.close_loop(store, out, further=asked, report=report, **settings)

@@ -117,9 +117,13 @@ class Twin:
             vector=np.concatenate([self.vector[: self.own], self.vector[self.own :][kept]]),
         )
 
+    def alone(self) -> Twin:
+        """The same without any effect."""
+        return replace(self, by={}, choices={}, slots=(), vector=self.vector[: self.own])
+
     def ungrouped(self) -> Twin:
         """The same with one strength for all scans, the groups' mean; numbers in the order of action."""
-        twin = replace(self, by={}, choices={}, slots=(), vector=self.vector[: self.own])
+        twin = self.alone()
         for name, values in self.values({}).items():
             twin = twin.with_effect(name, ALL, {"": values})
         return twin

@@ -36,11 +36,11 @@ from litho_models.frozen.files import save_frozen
 from litho_models.models import build_model
 from litho_models.planning import power
 from litho_models.planning.answers import _pairs, of_rivals
-from litho_models.planning.deciding import NONE, Judge, compared, said_by_gratings, with_decisions
-from litho_models.planning.decision_error import Z_DECIDED, surely_better
+from litho_models.planning.deciding import NONE, Judge, compared, with_decisions
 from litho_models.planning.layouts import Limits, as_tensor, climb, score, starts
 from litho_models.planning.noise import NoiseSpectrum, left_nm, noise_spectrum
 from litho_models.planning.open_questions import _owners, _question
+from litho_models.planning.power import Z_DECIDED, surely_better
 from litho_models.planning.questions import OpenQuestions, Owner, Question, Rival
 from litho_models.planning.record import NextPrint, PlannedQuestion
 from litho_models.planning.rival_fits import fit_rivals
@@ -56,7 +56,7 @@ from litho_models.twin.prepared import prepare_scans
 from litho_models.twin.record import CloseLoop, Decision, FoundEffect
 from litho_models.twin.single_scans import SingleScans
 from tests.litho_models.prints import write_store
-from tests.litho_models.twin_scans import base_model, blank_scans, planted, with_heights
+from tests.litho_models.twin_scans import base_model, blank_scans, planted, study_of, with_heights
 
 SLOPE = {"slope-thinning": {"along_x_um": 0.2, "along_y_um": 0.0, "exponent": 2.0}}
 AS_PRINTER, AS_MICROSCOPE = "slope-thinning as the printer's", "slope-thinning as the microscope's"
@@ -412,7 +412,7 @@ def second_round(
 def judge(effects: dict[str, dict[str, float]], new: Sequence[PrintedScan]) -> Judge:
     """Four scans of the first round with these effects, and new ones."""
     first = planted([(name, ALL, {"": own}) for name, own in effects.items()], count=4, size_px=64)
-    return Judge(model(effects), [scan.window for scan in prepare_scans(first)], prepare_scans(new))
+    return Judge(model(effects), study_of(first), prepare_scans(new))
 
 
 def test_a_loop_asks_and_later_prints_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -706,19 +706,3 @@ def test_a_plan_is_printed_by_the_same_machine_with_new_chance() -> None:
     assert abs(agreement(first.height_um, other.height_um)) < 0.6
     sharp = scan_job(fab, Job("N1F3", level, index=13, print_index=12, tip=2.0))
     assert not np.array_equal(again.height_um, sharp.height_um)
-
-
-def test_a_grating_is_a_second_answer_to_whose_a_distortion_is() -> None:
-    from litho_data.build.gratings import GratingScan
-
-    rivals = [
-        Rival(effect=name, effects={name: {"strength": 0.04}}, vector=[0.04], information=[[1.0]])
-        for name in ("galvo-nonlinearity", "piezo-nonlinearity")
-    ]
-    question = slope_question(rivals=rivals)
-    # A line twice as long is bent four times as much; 0.04 of 20 µm is 0.2 µm in the middle.
-    one = GratingScan(id="G", period_um=2.0, line_um=40.0, bow_um=0.8, bow_sd_um=0.04)
-    told = said_by_gratings(question, [one], 20.0)
-    assert "200.0 ± 10.0 nm off, piezo-nonlinearity asks for 200 nm" in told
-    assert said_by_gratings(slope_question(), [one], 20.0) == ""
-    assert said_by_gratings(question, [one.model_copy(update={"bow_um": None})], 20.0) == ""
