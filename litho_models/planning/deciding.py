@@ -118,7 +118,7 @@ class Judge:
         placed, rows, lines = self.twin.placed(), [], 0
         for scan in turned:
             used, index = scan.usable, row_index(scan.usable.shape)
-            residual = freed_um(scan.stored.height_um, placed.height(scan), used, {"offset"})
+            residual = freed_um(scan.stored.height_um, placed.height(scan), used, frozenset({"offset"}))
             offsets = (shrunk_line_offsets(residual, used, one, _BLOCK_PX)[2] for one in (index, scan.line))
             rows.append([*offsets, residual[used].var() / used.shape[1]])
             lines += len(used)

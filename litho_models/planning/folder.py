@@ -49,13 +49,13 @@ def schedule(
     planned: Sequence[PlannedPrint], limits: Limits, printing: Printing, seed: int
 ) -> tuple[list[PlannedScan], list[np.ndarray]]:
     """The rows of the table, and the layout of each."""
-    shape = tuple(planned[0].level.shape)
+    size_px = len(planned[0].level)
     # A stair alone looks the same wherever it is shifted; without room for a frame it is left to chance.
-    ladder = limits.random(shape[0], seed + 13)
-    if shape[0] >= _LADDER_PX:
+    ladder = limits.random(size_px, seed + 13)
+    if size_px >= _LADDER_PX:
         ladder = framed_ladder(ladder, highest=limits.highest, lowest=limits.lowest, tread_px=_TREAD_PX)
-    unprinted = flat(shape, level=0)
-    middle = flat(shape, level=(limits.lowest + limits.highest) // 2)
+    unprinted = flat((size_px, size_px), level=0)
+    middle = flat((size_px, size_px), level=(limits.lowest + limits.highest) // 2)
     scans: list[PlannedScan] = []
     levels: list[np.ndarray] = []
 

@@ -36,10 +36,10 @@ from litho_models.frozen.files import save_frozen
 from litho_models.models import build_model
 from litho_models.planning import power
 from litho_models.planning.answers import _pairs, of_rivals
-from litho_models.planning.deciding import NONE, Judge, compared, with_decisions
+from litho_models.planning.deciding import NONE, Judge, compared, decide, with_decisions
 from litho_models.planning.layouts import Limits, as_tensor, climb, score, starts
 from litho_models.planning.noise import NoiseSpectrum, left_nm, noise_spectrum
-from litho_models.planning.open_questions import _owners, _question
+from litho_models.planning.open_questions import _owners, _question, open_questions
 from litho_models.planning.power import Z_DECIDED, surely_better
 from litho_models.planning.questions import OpenQuestions, Owner, Question, Rival
 from litho_models.planning.record import NextPrint, PlannedQuestion
@@ -49,12 +49,11 @@ from litho_models.planning.rounds import close_loop, new_scans
 from litho_models.planning.run import next_print
 from litho_models.scan_terms.groups import ALL
 from litho_models.twin import bases, closing
-from litho_models.twin.errors import HeldOut
-from litho_models.twin.fits import RULES, TwinProblem
+from litho_models.twin.closing import close
+from litho_models.twin.fits import RULES, Study, TwinProblem
 from litho_models.twin.model import Twin
 from litho_models.twin.prepared import prepare_scans
 from litho_models.twin.record import CloseLoop, Decision, FoundEffect
-from litho_models.twin.single_scans import SingleScans
 from tests.litho_models.prints import write_store
 from tests.litho_models.twin_scans import base_model, blank_scans, planted, study_of, with_heights
 
@@ -415,30 +414,48 @@ def judge(effects: dict[str, dict[str, float]], new: Sequence[PrintedScan]) -> J
     return Judge(model(effects), study_of(first), prepare_scans(new))
 
 
-def test_a_loop_asks_and_later_prints_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A loss on slopes by one strength early and another late: named, planned for, printed, decided."""
+EARLY, LATE = (get_effect("slope-thinning").with_values({"along_x_um": size}) for size in (0.25, 0.15))
+
+
+def by_order() -> list[PrintedScan]:
+    """A loss on slopes by one strength early and another late."""
+    return planted([("slope-thinning", "order 6", {"before": EARLY, "from there on": LATE})], count=12)
+
+
+@pytest.fixture
+def one_cause(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(closing, "screened_effects", lambda tip_radius_um: [get_effect("slope-thinning")])
     monkeypatch.setattr(closing, "LAWS", {})
     monkeypatch.setattr(closing, "DESCRIPTIONS", {})
+
+
+def test_a_loop_asks_and_later_prints_answer(one_cause: None) -> None:
+    """What groups differ by is known: it does not make later prints contradict each other."""
+    scans = by_order()
+    study = Study((), np.arange(len(scans)) % 3)
+    closed = close(scans, study.fold_of, base_model(), study, describe=False)
+    result = CloseLoop.model_construct(dataset=opened([]).dataset, single_scans=[])
+    open_ = open_questions(closed, result)
+    question = next(one for one in open_.questions if one.name == "slope-thinning")
+    assert (question.kind, [one.name for one in question.rivals]) == ("role", [AS_PRINTER, AS_MICROSCOPE])
+    assert question.rivals[0].effects["slope-thinning"]["along_x_um"] == pytest.approx(0.2, abs=0.06)
+    # Some multiples of 0.75 and 1.25 would be a spread of half and more.
+    assert question.spread < 0.2
+    [decision] = decide(closed, open_, second_round(5, SLOPE, "microscope"))
+    assert decision.left == [AS_MICROSCOPE]
+
+
+@pytest.mark.slow
+def test_two_stores_become_a_result_a_model_and_a_plan(
+    one_cause: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(bases, "build_model", lambda *name, **facts: base_model())
-    monkeypatch.setattr(HeldOut, "left_out_nm", lambda self: {})
-    monkeypatch.setattr(SingleScans, "findings", lambda self: [])
-    early, late = (get_effect("slope-thinning").with_values({"along_x_um": own}) for own in (0.25, 0.15))
-    effects = [("slope-thinning", "order 6", {"before": early, "from there on": late})]
-    first = write_store(tmp_path / "first.zarr", planted(effects, count=12))
+    first = write_store(tmp_path / "first.zarr", by_order())
     second = write_store(tmp_path / "second.zarr", second_round(5, SLOPE, "microscope"))
     result = close_loop(first, tmp_path / "loop", new_prints=[second], base="affine-mtf", folds=3)
-    [found] = result.effects
-    assert found.name == "slope-thinning"
-    open_ = OpenQuestions.read(tmp_path / "loop")
-    question = next(one for one in open_.questions if one.name == "slope-thinning")
-    assert [one.name for one in question.rivals] == [AS_PRINTER, AS_MICROSCOPE]
-    values = question.rivals[0].effects["slope-thinning"]
-    assert values["along_x_um"] == pytest.approx(0.2, abs=0.06)
-    [decision] = result.decisions
-    assert decision.left == [AS_MICROSCOPE]
-    assert found.role == "measurement"
     assert CloseLoop.read(tmp_path / "loop") == result
+    assert [one.left for one in result.decisions] == [[AS_MICROSCOPE]]
+    assert [(one.name, one.role) for one in result.effects] == [("slope-thinning", "measurement")]
     card = ModelCard.read(tmp_path / "loop" / "model")
     assert list(card.measurement_effects) == ["slope-thinning"]
     assert card.attributed == {"slope-thinning": "microscope"}
