@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -21,7 +21,7 @@ from torch import Tensor
 from litho_data.foundation.units import NM_PER_UM
 from litho_models.effects import FieldContext
 from litho_models.effects.chain import EffectChain
-from litho_models.fitting.least_squares import gram, orthonormal, solve_damped
+from litho_models.fitting.least_squares import Linearised, eliminated_sum, orthonormal, solve_damped
 from litho_models.planning.noise import NoiseSpectrum
 from litho_models.planning.questions import Question
 from litho_models.scan_terms import TermPixels, term_maps
@@ -31,8 +31,6 @@ from litho_models.twin.model import Twin
 from litho_models.twin.prepared import sample_border_px
 
 Place = Literal["centre", "edge"]
-# Of each scan: prediction (y, x), derivatives (n, p) on the inner pixels, free basis (n, k).
-Linear = list[tuple[Tensor, np.ndarray, np.ndarray]]
 _DAMPING = 1e-6
 _SMALLEST = 1e-12
 
@@ -174,7 +172,11 @@ class Rivalry:
         return other
 
     def refitted(
-        self, prints: Sequence[PlannedPrint], *, rounds: int = 1, first: Sequence[Linear] | None = None
+        self,
+        prints: Sequence[PlannedPrint],
+        *,
+        rounds: int = 1,
+        first: Sequence[list[Linearised]] | None = None,
     ) -> list[EffectChain]:
         """For each directed pair the second model, fitted to what the first predicts.
 
@@ -190,18 +192,17 @@ class Rivalry:
             start = twin = self.twins[other]
             prior = np.array(self.question.rivals[other].information)
             for number in range(rounds):
-                linear = self._linearise(twin, prints) if number else first[other]
-                normal, right = prior.copy(), -prior @ (twin.vector - start.vector)
-                for (height, jacobian, basis), wanted in zip(linear, predicted[true], strict=True):
-                    # As in a fit of the loop: a little weight fixes what only the scans' own terms carry.
-                    stacked = np.column_stack([_flat(wanted - height), jacobian])
-                    products = gram(stacked, basis, RULES.term_weight)
-                    normal, right = normal + products[1:, 1:], right + products[1:, 0]
-                twin = twin.at(twin.vector + solve_damped(normal, right, _DAMPING, twin.room()))
+                pairs = zip(
+                    self._linearise(twin, prints) if number else first[other], predicted[true], strict=True
+                )
+                linear = [replace(part, residual=part.residual + _flat(wanted)) for part, wanted in pairs]
+                normal, right, _ = eliminated_sum(linear, RULES.term_weight)
+                right = right - prior @ (twin.vector - start.vector)
+                twin = twin.at(twin.vector + solve_damped(normal + prior, right, _DAMPING, twin.room()))
             found.append(_chain(twin))
         return found
 
-    def linearised(self, prints: Sequence[PlannedPrint]) -> list[Linear]:
+    def linearised(self, prints: Sequence[PlannedPrint]) -> list[list[Linearised]]:
         """The models where a refit starts, whatever it is fitted to."""
         return [self._linearise(twin, prints) for twin in self.twins]
 
@@ -228,7 +229,7 @@ class Rivalry:
             for _ in printed.ways:
                 right, refitted = next(scans)
                 # The refitted model's own maps: a gain of the true one would let the other fade to nothing.
-                basis = torch.from_numpy(_free_basis(refitted.detach().numpy())).to(right)
+                basis = torch.from_numpy(_free_basis(refitted.detach())).to(right)
                 inner = _inner(right - refitted)
                 flat = inner.reshape(-1)
                 freed = (flat - basis @ (basis.T @ flat)).reshape(inner.shape)
@@ -242,18 +243,17 @@ class Rivalry:
     def _predict(self, chain: EffectChain, prints: Sequence[PlannedPrint]) -> list[Tensor]:
         return [self.printing.predict(chain, one, way) for one in prints for way in one.ways]
 
-    def _linearise(self, twin: Twin, prints: Sequence[PlannedPrint]) -> Linear:
+    def _linearise(self, twin: Twin, prints: Sequence[PlannedPrint]) -> list[Linearised]:
+        """Each scan of the prints; its residual is that of a height of zero."""
         steps = twin.steps()
         here = self._predict(_chain(twin), prints)
         moved = [twin.at(twin.vector + one) for one in np.diag(steps)]
         aside = [self._predict(_chain(one), prints) for one in moved]
         return [
-            (
-                height,
-                np.column_stack(
-                    [_flat(own[at] - height) / step for own, step in zip(aside, steps, strict=True)]
-                ),
-                _free_basis(height.numpy()),
+            Linearised(
+                -_flat(height),
+                np.stack([_flat(own[at] - height) for own in aside]) / steps[:, None],
+                _free_basis(height).T,
             )
             for at, height in enumerate(here)
         ]
@@ -273,7 +273,6 @@ def _flat(field: Tensor) -> np.ndarray:
     return _inner(field).reshape(-1).numpy().astype(np.float64)
 
 
-def _free_basis(prediction_um: np.ndarray) -> np.ndarray:
+def _free_basis(prediction_um: Tensor) -> np.ndarray:
     """Orthonormal basis (n, k) of what a scan may add by itself, on the inner pixels."""
-    inner = _inner(torch.from_numpy(prediction_um)).numpy()
-    return orthonormal(term_maps(TermPixels(inner), ALL_FREE).T)
+    return orthonormal(term_maps(TermPixels(_inner(prediction_um).numpy()), ALL_FREE).T)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -36,7 +36,7 @@ from litho_models.frozen.files import save_frozen
 from litho_models.models import build_model
 from litho_models.planning import power
 from litho_models.planning.answers import _pairs, of_rivals
-from litho_models.planning.deciding import NONE, Judge, compared, decide, with_decisions
+from litho_models.planning.deciding import MICROSCOPE, NONE, PRINTER, Judge, compared, decide, with_decisions
 from litho_models.planning.layouts import Limits, as_tensor, climb, score, starts
 from litho_models.planning.noise import NoiseSpectrum, left_nm, noise_spectrum
 from litho_models.planning.open_questions import _owners, _question, open_questions
@@ -48,11 +48,12 @@ from litho_models.planning.rivalry import Contrast, PlannedPrint, Printing, Riva
 from litho_models.planning.rounds import close_loop, new_scans
 from litho_models.planning.run import next_print
 from litho_models.scan_terms.groups import ALL
+from litho_models.scan_terms.term import row_index
 from litho_models.twin import bases, closing
 from litho_models.twin.closing import close
 from litho_models.twin.fits import RULES, Study, TwinProblem
 from litho_models.twin.model import Twin
-from litho_models.twin.prepared import prepare_scans
+from litho_models.twin.prepared import PreparedScan, prepare_scans
 from litho_models.twin.record import CloseLoop, Decision, FoundEffect
 from tests.litho_models.prints import write_store
 from tests.litho_models.twin_scans import base_model, blank_scans, planted, study_of, with_heights
@@ -62,6 +63,8 @@ AS_PRINTER, AS_MICROSCOPE = "slope-thinning as the printer's", "slope-thinning a
 NOISE_NM = 10.0
 DOCS = Path(__file__).parents[2] / "docs"
 TURNED = (Way(), Way(turned_deg=90))
+# Of a print of 6.4 µm under the microscope.
+QUARTER = np.array([[0.0, -1.0, 6.4], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 def model(effects: dict[str, dict[str, float]]) -> Twin:
@@ -393,11 +396,10 @@ def second_round(
     random = np.random.default_rng(seed)
     [name] = effects
     chain = rival(name, effects, owner).twin(model({})).placed().of_labels({})
-    turned = np.array([[0.0, -1.0, 6.4], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     scans = []
     for number, blank in enumerate(blank_scans(12, 64)[-2:]):
         rough = gaussian_filter(random.normal(size=blank.shape), 1.0)
-        for at, placed in enumerate((np.eye(3), turned)):
+        for at, placed in enumerate((np.eye(3), QUARTER)):
             scan = replace(
                 blank, id=f"N{number}F{at}", print_id=str(number), scan_to_layout=placed, turned_deg=90.0 * at
             )
@@ -486,6 +488,43 @@ def test_two_turned_prints_say_whether_an_asymmetric_tip_is_one(owner: Owner) ->
     decision = judge(effects, second_round(5, effects, owner)).among_rivals(question)
     assert decision.verdict == "decided"
     assert decision.left == [f"{TIP} as the {owner}'s"]
+
+
+def single_scans(name: str, heights_um: Callable[[PreparedScan, int], np.ndarray]) -> Decision:
+    """What is decided of a term of single scans by six prints, each scanned at 0 and 90 degrees."""
+    base, random = model({}), np.random.default_rng(8)
+    scans = []
+    for number, blank in enumerate(blank_scans(12, 64)[::2]):
+        for at, placed in enumerate((np.eye(3), QUARTER)):
+            scan = replace(blank, id=f"N{number}F{at}", print_id=str(number), scan_to_layout=placed)
+            [one] = prepare_scans([scan])
+            noise = random.normal(0, 0.004, blank.shape)
+            scans += with_heights([scan], [base.placed().height(one) + noise + heights_um(one, number)])
+    judge_ = Judge(base, study_of(scans), prepare_scans(scans))
+    kind = "lines" if "line" in name else "per-scan"
+    question = slope_question(name=name, kind=kind, rivals=[])
+    return judge_.of_lines(question) if kind == "lines" else judge_.of_single_scans(question)
+
+
+@pytest.mark.parametrize("owner", [PRINTER, MICROSCOPE])
+def test_turned_scans_say_whether_lines_were_written_or_scanned(owner: str) -> None:
+    offsets = np.random.default_rng(9).normal(0, 0.004, 64)
+
+    def lines(scan: PreparedScan, number: int) -> np.ndarray:
+        return np.roll(offsets, number)[scan.line if owner == MICROSCOPE else row_index((64, 64))]
+
+    assert single_scans("line-roughness", lines).left == [owner]
+
+
+@pytest.mark.parametrize("owner", [PRINTER, MICROSCOPE])
+def test_repeats_say_whose_a_datum_is(owner: str) -> None:
+    random = np.random.default_rng(2)
+    of_print = random.normal(0, 0.05, 6)
+
+    def datum(scan: PreparedScan, number: int) -> np.ndarray:
+        return np.full((64, 64), of_print[number] if owner == PRINTER else random.normal(0, 0.05))
+
+    assert single_scans("datum-offset", datum).left == [owner]
 
 
 @pytest.mark.parametrize(("share", "verdict"), [(0.005, "still open"), (0.03, "decided")])
