@@ -58,7 +58,7 @@ def choose(rivalry: Rivalry, level: np.ndarray, can_move: bool) -> Chosen:
     for _ in range(_MOST_EXTRAS):
         scores = {way: score(rivalry, level, (*ways, way)) for way in WORDS if way not in ways}
         # What each does beside one plain scan; later ones only add to it.
-        tried = {f"a scan {WORDS[way]}": own for way, own in scores.items()} | tried
+        tried = tried | {f"a scan {WORDS[way]}": own for way, own in scores.items()} | tried
         best = max(scores, key=lambda way: scores[way])
         if not _worth(scores[best], reached):
             break
