@@ -65,7 +65,7 @@ class Limits:
         return quantise((soft - self.lowest) / span, span + 1) + np.uint8(self.lowest)
 
     def price(self, soft: Tensor) -> Tensor:
-        """What levels costs whose mean or spread is far from that of the prints so far."""
+        """The cost of levels whose mean or spread is far from that of the prints so far."""
         far = (soft.mean() - self.mean).abs() + (soft.std() - self.sd).abs()
         return _PRICE * torch.relu(far - _FREE_LEVELS) ** 2
 
@@ -74,7 +74,8 @@ class Limits:
         level = random_layout(
             (size_px, size_px),
             levels=self.highest + 1,
-            cutoff_per_um=finest * self.cutoff_per_um,
+            # A small print holds one period of something at least.
+            cutoff_per_um=max(finest * self.cutoff_per_um, 1.001 / (size_px * self.pitch_um)),
             pitch_um=self.pitch_um,
             seed=seed,
         )

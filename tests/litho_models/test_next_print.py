@@ -275,6 +275,11 @@ def test_a_difference_that_rests_on_numbers_known_badly_is_no_sure_one(limits: L
     assert unsure[0] > 0.1
 
 
+def test_a_small_print_can_start_from_layouts_as_coarse_as_the_prints_so_far() -> None:
+    coarse = replace(Limits.of(opened([]), 0.1), cutoff_per_um=0.25)
+    assert all(np.ptp(level) > 0 for _, level in starts(64, coarse, 0))
+
+
 def test_layouts_climb_and_stay_printable(rivalry: Rivalry, limits: Limits) -> None:
     start = first_layout(limits)
     soft = climb(rivalry, start, TURNED, limits, steps=10)
