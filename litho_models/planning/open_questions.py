@@ -160,8 +160,9 @@ class _Asking:
         for before, after in zip(self._left_by(without), self.left_nm, strict=True):
             change = np.nan_to_num(before - after)
             size = float((change**2).sum())
-            multiples.append(float((change * np.nan_to_num(before)).sum()) / size)
-            own.append(self.noise.along(change) ** 2 / size)
+            if size:
+                multiples.append(float((change * np.nan_to_num(before)).sum()) / size)
+                own.append(self.noise.along(change) ** 2 / size)
         # Robust: a scan may have a defect.
         spread = float(np.median(np.abs(np.array(multiples) - np.median(multiples)))) / 0.6745
         return min(2 * float(np.sqrt(max(spread**2 - float(np.median(own)), 0.0))), 1.0)
@@ -189,7 +190,7 @@ def _of_single_scans(result: CloseLoop) -> list[Question]:
             sizes={parameter: spread.value for parameter, spread in one.spread.items()},
         )
         for one in result.single_scans
-        if one.seen and (one.role == "undetermined" or one.confusable_with)
+        if one.seen and terms_of_effect(one.name) and (one.role == "undetermined" or one.confusable_with)
     ]
 
 

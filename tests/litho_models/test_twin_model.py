@@ -72,6 +72,14 @@ def test_a_group_behind_which_there_is_no_scan_has_the_mean_of_the_others(twin: 
     assert twin.known_from([]).values({"field": "1"})[THINNING]["along_x_um"] == 0.0
 
 
+def test_without_groups_every_scan_has_the_mean_strength(twin: Twin, study) -> None:
+    plain = twin.ungrouped()
+    assert plain.values({"field": "1"}) == plain.values({}) == twin.values({})
+    assert plain.values({})[THINNING]["along_x_um"] == pytest.approx(0.15)
+    assert plain.vector == pytest.approx(np.r_[twin.vector[: twin.own], 0.15, 0.0, 1.0])
+    np.testing.assert_array_equal(plain.alone().vector, twin.vector[: twin.own])
+
+
 def test_directions_are_chosen_and_never_fitted(study) -> None:
     lag = {"length_um": 0.2, "direction": -1.0}
     twin = Twin.bare(base_model(), study.scans[0]).with_effect("galvo-lag", ALL, {"": lag})
