@@ -165,8 +165,10 @@ def _held_out(grams: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
     products = Products(grams, {ALL: ("",) * len(grams)})
     for fold in np.unique(fold_of):
         own, rest = np.flatnonzero(fold_of == fold), np.flatnonzero(fold_of != fold)
-        inner = Products(grams[rest], {ALL: ("",) * len(rest)})
-        block = min(blocks, key=lambda one: float(inner.held_out([one], fold_of[rest]).sum()))
+        inner, inner_fold = Products(grams[rest], {ALL: ("",) * len(rest)}), fold_of[rest]
+        if len(set(inner_fold)) == 1:
+            inner_fold = np.arange(len(rest))
+        block = min(blocks, key=lambda one: float(inner.held_out([one], inner_fold).sum()))
         left[own] = products.squares([block], products.strengths([block], rest), own)
     return left
 
