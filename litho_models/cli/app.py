@@ -32,12 +32,14 @@ PolicyOption = Annotated[
     Literal["none", "offset", "offset-gain", "full", "full+rows"],
     typer.Option(help="terms fitted to each scan for its datum-free error"),
 ]
-BackgroundOption = Annotated[
-    Literal["training", "none"],
-    typer.Option(
-        help="training: add the smooth background that the training scans share to predictions of measured "
-        "maps; both errors are in the tables"
-    ),
+_BACKGROUND_HELP = (
+    "training: add the smooth background that the training scans share to predictions of measured maps; both "
+    "errors are in the tables"
+)
+BackgroundOption = Annotated[Literal["training", "none"], typer.Option(help=_BACKGROUND_HELP)]
+SharedOption = Annotated[
+    Literal["training", "shared", "none"],
+    typer.Option(help=f"{_BACKGROUND_HELP}; shared: all that the measurement model learns from them"),
 ]
 NoiseOption = Annotated[
     Path | None,
@@ -178,7 +180,7 @@ def benchmark(
         int | None, typer.Option(min=1, help="only so many of the folds, to compare seeds; all by default")
     ] = None,
     policy: PolicyOption = "offset",
-    background: BackgroundOption = "training",
+    background: SharedOption = "training",
     noise: NoiseOption = None,
     open_lock_box: Annotated[
         bool, typer.Option("--open-lock-box", help="also score the locked scans; once per release")

@@ -25,6 +25,7 @@ from litho_models.twin.learner import Learner, Rest
 from litho_models.twin.model import Twin
 from litho_models.twin.prepared import PreparedScan, prepare_scans
 from litho_models.twin.search import Cause, Found, search, untestable
+from litho_models.twin.search import describe as describe_rest
 
 # Of a cause's gain: what its change in other shapes may take beside it. On trials of the virtual fab the
 # formulas of true causes leave less than 1 % (layer-stacking 10 %), of causes that only resemble one 20 % and
@@ -89,7 +90,7 @@ class Closed:
         study: the scans, freed of what they share by group.
         plain: the base fitted to the scans as they are; ``base``: to the freed ones.
         named: the search among causes; ``checked``: each of its causes with the check of its formula.
-        lawful, described: the searches among laws and descriptions, each beside all before.
+        lawful: the search among laws, beside the causes; ``described``: where the rest lies, beside both.
         rests: what features of layout and place still explain, by stage.
         untestable: effects that could not be tested, with the reason.
     """
@@ -101,7 +102,7 @@ class Closed:
     named: Found
     checked: list[Checked]
     lawful: Found
-    described: Found
+    described: list[Cause]
     rests: dict[str, Rest]
     untestable: dict[str, str]
 
@@ -145,11 +146,11 @@ def close(
     named, checked = _named(start, at_work, causes)
     study.report("looking for a law in what is left")
     lawful = search(named.state, at_work, list(LAWS.values()), MOST_LAWS)
-    described = Found(lawful.state)
+    described: list[Cause] = []
     if describe:
         study.report("describing what is left")
-        described = search(lawful.state, at_work, list(DESCRIPTIONS.values()), MOST_DESCRIPTIONS)
-    stages = {"base": start, "causes": named.state, "laws": lawful.state, "all": described.state}
+        described = describe_rest(lawful.state, at_work, list(DESCRIPTIONS.values()), MOST_DESCRIPTIONS)
+    stages = {"base": start, "causes": named.state, "laws": lawful.state}
     return Closed(
         study=at_work,
         original=original,
@@ -231,8 +232,7 @@ def freed_scans(scans: Sequence[PrintedScan], state: State, study: Study) -> lis
         learned = learn_measurement([scans[i] for i in own], [maps[i] for i in own], seed=study.seed)
         differences = learned.between_groups()
         for i in np.flatnonzero(study.fold_of == fold).tolist():
-            extra = differences.expected_um(scans[i], maps[i]) - maps[i]
-            freed[i] = replace(scans[i], height_um=(scans[i].height_um - extra).astype(np.float32))
+            freed[i] = differences.freed(scans[i], maps[i])
     return freed
 
 
@@ -249,13 +249,7 @@ def fit_with_measurement(
     placed = twin.placed()
     maps = [placed.height(scan, fold) for scan in scans]
     learned = learn_measurement(stored, maps, seed=seed)
-    freed = [
-        replace(
-            scan,
-            height_um=(scan.height_um - learned.expected_um(scan, own) + own).astype(np.float32),
-        )
-        for scan, own in zip(stored, maps, strict=True)
-    ]
+    freed = [learned.freed(scan, own) for scan, own in zip(stored, maps, strict=True)]
     if len(twin.vector):
         windows = [scan.window for scan in prepared_among(freed, scans)]
         twin = twin.at(fit_least_squares(TwinProblem(twin, windows, fold), twin.vector, RULES).vector)

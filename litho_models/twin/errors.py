@@ -25,7 +25,9 @@ from litho_models.twin.prepared import PreparedScan
 from litho_models.twin.record import ErrorRow, MeasuredBy, Stage
 
 REPORTED: tuple[Policy, ...] = ("none", "offset", "full")
-_OFFSET_NUMBERS = 5
+# Of the smooth background of the published protocol.
+_PUBLISHED_NUMBERS = 5
+Maps = list[np.ndarray]
 
 
 def error_rows(
@@ -71,6 +73,11 @@ class Fit(NamedTuple):
     twin: Twin
     measurement: MeasurementModel
 
+    @property
+    def numbers(self) -> tuple[int, int]:
+        """Fitted numbers of printer and measurement."""
+        return len(self.twin.vector), self.measurement.numbers
+
 
 class HeldOut:
     """The models that a loop has found, each fitted with its measurement to other scans than are scored.
@@ -83,7 +90,7 @@ class HeldOut:
         self.closed, self.settings = closed, settings
         self.scans = [one.stored for one in closed.original]
         # With its state, which must outlive its entry: the number of one that is gone may come again.
-        self._maps: dict[int, tuple[State, list[np.ndarray], int]] = {}
+        self._known: dict[int, tuple[State, tuple[Maps, tuple[int, int]]]] = {}
 
     @property
     def stages(self) -> dict[Stage, State]:
@@ -95,39 +102,34 @@ class HeldOut:
 
     def errors(self) -> list[ErrorRow]:
         """Of all models, scans predicted without their fold; of first and last also without their print."""
-        plain = self.closed.plain
-        maps = held_out_maps(plain, self.closed.study, self.closed.original)
-        rows = self._rows("base", "print alone", self.scans, maps, "scans", (plain, 0))
+        plain, study = self.closed.plain, self.closed.study
+        numbers = len(plain.twin.vector)
+        maps = held_out_maps(plain, study, self.closed.original)
+        rows = self._rows("base", "print alone", "scans", maps, (numbers, 0))
         published = self._published(plain, maps)
-        rows += self._rows("base", "published", self.scans, published, "scans", (plain, _OFFSET_NUMBERS))
+        rows += self._rows("base", "published", "scans", published, (numbers, _PUBLISHED_NUMBERS))
         for name, state in self.stages.items():
             self.settings.report("scoring the base" if name == "base" else f"scoring {name}")
-            rows += self._rows(
-                name, "shared", self.scans, self.maps_um(state), "scans", (state, self._maps[id(state)][2])
-            )
+            rows += self._rows(name, "shared", "scans", *self._by_fold(state))
         prints = [scan.print_id for scan in self.scans]
         if 1 < len(set(prints)) < len(prints) and is_refitted(self.closed.base.twin.base):
             for name, state in self._ends():
                 self.settings.report(f"leaving out whole prints: {name}")
-                maps, shared = self._without_parts(state, sorted(set(prints)), prints)
-                rows += self._rows(name, "shared", self.scans, maps, "prints", (state, shared))
+                jobs = dict.fromkeys(sorted(set(prints)), (state.twin, None))
+                rows += self._rows(name, "shared", "prints", *self._without_parts(jobs, prints))
         return rows
 
-    def errors_of(self, scans: Sequence[PrintedScan], held_out: Any) -> list[ErrorRow]:
-        """Errors of scans that took no part, by the fits to all that did."""
-        prepared, rows = prepared_among(scans, self.closed.original), []
+    def of_others(self, scans: Sequence[PrintedScan]) -> list[tuple[Stage, Fit, list[np.ndarray]]]:
+        """Base and corrected model fitted to all scans that took part, and the maps of scans that did not."""
+        prepared, found = prepared_among(scans, self.closed.original), []
         for name, state in self._ends():
-            twin, learned = fit_with_measurement(state.twin, self.closed.original, self.settings.seed)
-            maps = _expected(Fit(twin, learned), prepared, None)
-            rows += self._rows(name, "shared", scans, maps, held_out, (state, learned.numbers))
-        return rows
+            fit = Fit(*fit_with_measurement(state.twin, self.closed.original, self.settings.seed))
+            found.append((name, fit, _expected(fit, prepared, None)))
+        return found
 
     def maps_um(self, state: State) -> list[np.ndarray]:
         """The maps (y, x) that the scans should show, print and measurement learned without their fold."""
-        if id(state) not in self._maps:
-            maps, shared = self._without_parts(state, list(self.closed.study.folds), self.settings.fold_of)
-            self._maps[id(state)] = state, maps, shared
-        return self._maps[id(state)][1]
+        return self._by_fold(state)[0]
 
     def left_out_nm(self) -> dict[str, float]:
         """By how much the error grows (k = 1) without each cause or law, the rest fitted again."""
@@ -165,41 +167,42 @@ class HeldOut:
         return ("base", self.closed.base), ("all", self.closed.final)
 
     def _mae_nm(self, state: State) -> float:
-        rows = self._rows("all", "shared", self.scans, self.maps_um(state), "scans", (state, 0))
+        rows = self._rows("all", "shared", "scans", *self._by_fold(state))
         return next(row.mae_nm for row in rows if row.policy == "offset")
 
     def _rows(
-        self,
-        model: Stage,
-        measurement: MeasuredBy,
-        scans: Sequence[PrintedScan],
-        maps: Sequence[np.ndarray],
-        held_out: Any,
-        numbers: tuple[State, int],
+        self, model: Stage, measurement: MeasuredBy, held_out: Any, maps: Maps, numbers: tuple[int, int]
     ) -> list[ErrorRow]:
-        count = len(numbers[0].twin.vector), numbers[1]
         return error_rows(
-            scans, maps, model=model, measurement=measurement, held_out=held_out, numbers=count,
+            self.scans, maps, model=model, measurement=measurement, held_out=held_out, numbers=numbers,
             seed=self.settings.seed,
         )  # fmt: skip
 
+    def _by_fold(self, state: State) -> tuple[Maps, tuple[int, int]]:
+        if id(state) not in self._known:
+            jobs = {fold: (state.twin.at(own), fold) for fold, own in enumerate(state.per_fold)}
+            self._known[id(state)] = state, self._without_parts(jobs, self.settings.fold_of.tolist())
+        return self._known[id(state)][1]
+
     def _without_parts(
-        self, state: State, parts: Sequence[Any], part_of: Sequence[Any] | np.ndarray
-    ) -> tuple[list[np.ndarray], int]:
-        """Maps of all scans by fits without their part, and the most numbers that any measurement took."""
-        original, by_fold = self.closed.original, part_of is self.settings.fold_of
-        jobs = []
-        for part in parts:
-            twin = state.twin.at(state.per_fold[part]) if by_fold else state.twin
+        self, starts: Mapping[Any, tuple[Twin, int | None]], part_of: Sequence[Any]
+    ) -> tuple[Maps, tuple[int, int]]:
+        """Maps of all scans by fits without their part, and the most numbers that any of them took.
+
+        Args:
+            starts: part to where its fit begins, and the fold that the base must not have seen.
+        """
+        original, jobs = self.closed.original, []
+        for part, (twin, fold) in starts.items():
             rest = [scan for scan, own in zip(original, part_of, strict=True) if own != part]
-            jobs.append((part, twin, rest, self.settings.seed, part if by_fold else None))
+            jobs.append((part, twin, rest, self.settings.seed, fold))
         done = run_jobs(_fit_part, jobs, self.settings.workers, name=lambda job: f"part {job[0]}")
         fits = {job[0]: fit for job, fit in done}
         maps = [
-            _expected(fits[part], [scan], part if by_fold else None)[0]
+            _expected(fits[part], [scan], starts[part][1])[0]
             for scan, part in zip(original, part_of, strict=True)
         ]
-        return maps, max(fit.measurement.numbers for fit in fits.values())
+        return maps, max(fit.numbers for fit in fits.values())
 
     def _published(self, state: State, maps: Sequence[np.ndarray]) -> list[np.ndarray]:
         """The maps with the smooth background of the training scans: the published protocol."""
@@ -223,29 +226,4 @@ def _fit_part(job: tuple[Any, Twin, Sequence[PreparedScan], int, int | None]) ->
 
 def _expected(fit: Fit, scans: Sequence[PreparedScan], fold: int | None) -> list[np.ndarray]:
     placed = fit.twin.placed()
-    return [
-        fit.measurement.expected_um(scan.stored, placed.height(scan, None if fold is None else int(fold)))
-        for scan in scans
-    ]
-
-
-def joined(rows: Sequence[ErrorRow]) -> list[ErrorRow]:
-    """Rows of the same model and policy over different scans as one, every scan counting alike."""
-    by: dict[tuple[Any, ...], list[ErrorRow]] = {}
-    for row in rows:
-        by.setdefault((row.model, row.measurement, row.policy, row.held_out), []).append(row)
-    found = []
-    for own in by.values():
-        scans = {name: value for row in own for name, value in row.by_scan_nm.items()}
-        weights = [len(row.by_scan_nm) for row in own]
-        changes = {
-            "k": float(np.average([row.k for row in own], weights=weights)),
-            "printer_numbers": max(row.printer_numbers for row in own),
-            "measurement_numbers": max(row.measurement_numbers for row in own),
-            "mae_nm": float(np.mean([*scans.values()])),
-            "mae_ci95_nm": interval([*scans.values()]),
-            "rmse_nm": float(np.sqrt(np.average([row.rmse_nm**2 for row in own], weights=weights))),
-            "by_scan_nm": scans,
-        }
-        found.append(own[0].model_copy(update=changes))
-    return found
+    return [fit.measurement.expected_um(scan.stored, placed.height(scan, fold)) for scan in scans]

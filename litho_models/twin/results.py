@@ -7,14 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from litho_data.foundation.run_facts import run_info
-from litho_data.store.schema import DatasetId
 from litho_models.effects import CATALOGUE, UNTESTABLE, get_effect
 from litho_models.fitting.least_squares import eliminated
 from litho_models.scan_terms.groups import ALL
 from litho_models.scoring.pairs import over_prints, over_scans
 from litho_models.simulator import Simulator
-from litho_models.splits.folds import Split
 from litho_models.twin.closing import Closed
 from litho_models.twin.fits import RULES, State
 from litho_models.twin.judging import FAMILY_P, FEWEST_SCANS
@@ -27,7 +24,6 @@ from litho_models.twin.record import (
     ErrorRow,
     Explained,
     FoundEffect,
-    Planted,
     ScanFinding,
     Strength,
     Verdict,
@@ -43,29 +39,22 @@ _CONFOUNDED = 0.95
 def record(
     closed: Closed,
     errors: list[ErrorRow],
-    measurement: Any,
     *,
     single_scans: list[ScanFinding],
-    planted: list[Planted],
-    dataset: DatasetId,
-    base_name: str,
-    settings: dict[str, Any],
-    split: Split,
-    dropped: list[str],
     left_out_nm: Mapping[str, float],
-    survives: Mapping[str, list[str]],
-    chosen: Mapping[str, int],
+    survives_on: Mapping[str, list[str]],
+    **given: Any,
 ) -> CloseLoop:
     """The record of one run.
 
     Args:
-        closed: what was found; ``errors``: of ``error_rows``; ``measurement``: learned on all scans.
-        left_out_nm, survives: of each effect, see ``FoundEffect``; ``chosen``: by nested selections.
+        closed: what was found; ``errors``: of ``error_rows``; ``single_scans``: what those add.
+        left_out_nm, survives_on: of each effect, see ``FoundEffect``; ``given``: other fields as they are.
     """
     study, scans = closed.study, closed.study.scans
     effects = [
-        _found(closed, one, left_out_nm, survives)
-        for one in (*closed.causes, *closed.lawful.causes, *closed.described.causes)
+        _found(closed, one, left_out_nm, survives_on)
+        for one in (*closed.causes, *closed.lawful.causes, *closed.described)
     ]
     before, after = (
         next(
@@ -78,14 +67,10 @@ def record(
     gains = [before.by_scan_nm[scan.id] - after.by_scan_nm[scan.id] for scan in scans]
     prints = [scan.stored.print_id for scan in scans]
     return CloseLoop(
-        run=run_info([study.seed], len(scans), dropped),
-        dataset=dataset,
-        base_model=base_name,
+        **given,
         base_values=_values(closed.base.twin),
         corrected_values=_values(closed.final.twin),
-        settings=settings,
         at_bounds=closed.final.twin.at_bounds(),
-        split=split,
         groups={name: list(labels) for name, labels in study.groups.items() if name != ALL},
         errors=errors,
         gain_nm=float(np.mean(gains)),
@@ -94,9 +79,7 @@ def record(
         effects=effects,
         candidates=_candidates(closed, effects, {one.name for one in single_scans}),
         single_scans=single_scans,
-        planted=planted,
         confounded=_confounded(closed.final),
-        measurement=measurement,
         explained=[
             Explained(
                 stage=stage,
@@ -106,7 +89,6 @@ def record(
             )
             for stage, rest in closed.rests.items()
         ],
-        chosen=dict(chosen),
         verdict=_verdict(closed, effects),
         fewest_scans=FEWEST_SCANS,
     )
@@ -142,7 +124,7 @@ def _found(
     closed: Closed,
     cause: Cause,
     left_out_nm: Mapping[str, float],
-    survives: Mapping[str, list[str]],
+    survives_on: Mapping[str, list[str]],
 ) -> FoundEffect:
     effect = get_effect(cause.name)
     verdicts: dict[str, EffectVerdict] = {"law": "lawful", "description": "described"}
@@ -157,9 +139,7 @@ def _found(
         stage=effect.stage,
         verdict=verdict,
         by=cause.by,
-        strengths=_strengths(
-            closed.final if cause.name in closed.final.twin.by else closed.described.state, closed, cause.name
-        ),
+        strengths=_strengths(closed, cause),
         confusable_with=list(cause.alike),
         separating_experiment=separating([cause.name, *cause.alike]),
         gain_nm2=cause.judgement.gain_nm2,
@@ -170,15 +150,24 @@ def _found(
         group_p=cause.group_p,
         reshaped_share=reshaped,
         left_out_nm=left_out_nm.get(cause.name),
-        survives_on=survives.get(cause.name, []),
+        survives_on=survives_on.get(cause.name, []),
     )
 
 
-def _strengths(state: State, closed: Closed, name: str) -> dict[str, list[Strength]]:
-    """Numbers of an effect with intervals from what each print (or scan) asks for."""
+def _strengths(closed: Closed, cause: Cause) -> dict[str, list[Strength]]:
+    """Numbers of an effect with intervals from what each print (or scan) asks for; of a description alone."""
     from scipy.stats import t
 
-    twin, effect = state.twin, get_effect(name)
+    state, effect, name = closed.final, get_effect(cause.name), cause.name
+    if cause.values:
+        return {
+            parameter: [
+                Strength(label=label, value=values[parameter], unit=facts.unit, ci95=None)
+                for label, values in cause.values.items()
+            ]
+            for parameter, facts in effect.parameters.items()
+        }
+    twin = state.twin
     prints = [scan.stored.print_id for scan in closed.study.scans]
     units = prints if 2 < len(set(prints)) < len(prints) else [scan.id for scan in closed.study.scans]
     sd = np.sqrt(np.maximum(np.diag(clustered_covariance(state, units)), 0.0))

@@ -13,17 +13,18 @@ from torch import nn
 from litho_data.foundation.errors import InputError
 from litho_data.foundation.files import atomic_folder
 from litho_data.foundation.outputs import require_replaceable_folder
+from litho_data.foundation.run_facts import run_info
 from litho_data.foundation.workers import Workers, kept_open
 from litho_data.store import PrintedScan, Store, open_store
 from litho_models.splits.folds import GROUPED_FOLDS, Split, grouped_folds, leave_one_print_out
 from litho_models.twin.bases import AUTO, choose_base
 from litho_models.twin.closing import Closed, close, fit_with_measurement
-from litho_models.twin.errors import HeldOut, joined
+from litho_models.twin.errors import HeldOut, error_rows
 from litho_models.twin.fits import Study
 from litho_models.twin.marks import marks, rounding_step_um, with_marks
 from litho_models.twin.model import is_refitted
 from litho_models.twin.planting import parse_planted, plant
-from litho_models.twin.record import CloseLoop, ErrorRow
+from litho_models.twin.record import CloseLoop, ErrorRow, Stage
 from litho_models.twin.report import write_report
 from litho_models.twin.results import record
 from litho_models.twin.saving import LAWS_FILE, MODEL_FOLDER, save_laws, save_model
@@ -72,13 +73,7 @@ def close_loop(
     for text in inject:
         parse_planted(text)
     opened = open_store(store)
-    scans = opened.scans()
-    usable = [scan for scan in scans if np.count_nonzero(scan.usable) >= _FEWEST_PIXELS]
-    kept = {scan.id for scan in usable}
-    development = [scan for scan in usable if scan.id not in opened.locked_ids]
-    if len(development) < 2:
-        got = f"{len(development)} usable and not locked"
-        raise InputError("scans to close the loop on", got=got, wanted="at least 2")
+    development, locked, dropped = _usable_scans(opened)
     with kept_open(Workers(workers, dask)) as places:
         study = Study((), dealt(development, folds, seed), seed, places, report)
         chosen = choose_base(base, development, study, steps=steps, cache=Path(cache or f"{out}-cache"))
@@ -95,30 +90,31 @@ def close_loop(
         if nested:
             rows, often = _nested(development, chosen.model, study, nested)
             errors += rows
-        locked = [scan for scan in usable if scan.id in opened.locked_ids]
         if open_lock_box and locked:
-            errors += held_out.errors_of(locked, "locked")
+            for stage, fit, maps in held_out.of_others(locked):
+                errors += error_rows(
+                    locked, maps, model=stage, measurement="shared", held_out="locked", numbers=fit.numbers,
+                    seed=seed,
+                )  # fmt: skip
     report("looking at what single scans add")
     maps = held_out.maps_um(closed.final)
     seen = marks(closed.original, maps, _rounding_um(opened, development))
     result = record(
         closed,
         errors,
-        fit_with_measurement(closed.final.twin, closed.original, seed)[1],
         single_scans=with_marks(SingleScans(study, closed.original, maps).findings(), seen),
-        planted=planted,
+        left_out_nm=left_out_nm,
+        survives_on=survives_on,
+        run=run_info([seed], len(development), dropped),
         dataset=opened.dataset_id,
-        base_name=chosen.name,
+        base_model=chosen.name,
+        measurement=fit_with_measurement(closed.final.twin, closed.original, seed)[1],
+        planted=planted,
         settings={
             "base": base, "folds": folds, "nested": nested, "inject": list(inject), "steps": steps,
             "open_lock_box": open_lock_box,
         },
         split=Split(kind="grouped", folds=len(closed.study.folds), lock_box=opened.locked_ids),
-        dropped=[
-            f"{one.id}: fewer than {_FEWEST_PIXELS} measured pixels" for one in scans if one.id not in kept
-        ],
-        left_out_nm=left_out_nm,
-        survives=survives_on,
         chosen=often,
     )  # fmt: skip
     with atomic_folder(out) as folder:
@@ -127,6 +123,24 @@ def close_loop(
         save_model(closed, result, opened, folder / MODEL_FOLDER)
         save_laws(result, folder)
     return result
+
+
+def _usable_scans(store: Store) -> tuple[list[PrintedScan], list[PrintedScan], list[str]]:
+    """Scans to develop on, locked ones, and those left out with the reason.
+
+    Raises:
+        InputError: fewer than two to develop on.
+    """
+    scans = store.scans()
+    usable = [scan for scan in scans if np.count_nonzero(scan.usable) >= _FEWEST_PIXELS]
+    kept = {scan.id for scan in usable}
+    dropped = [one.id for one in scans if one.id not in kept]
+    locked = [scan for scan in usable if scan.id in store.locked_ids]
+    development = [scan for scan in usable if scan.id not in store.locked_ids]
+    if len(development) < 2:
+        got = f"{len(development)} usable and not locked"
+        raise InputError("scans to close the loop on", got=got, wanted="at least 2")
+    return development, locked, [f"{one}: fewer than {_FEWEST_PIXELS} measured pixels" for one in dropped]
 
 
 def dealt(scans: Sequence[PrintedScan], folds: int, seed: int) -> np.ndarray:
@@ -159,16 +173,25 @@ def _nested(
         else leave_one_print_out(ids, [scan.print_id for scan in scans])
     )
     close_again = _again(base, study)
-    rows: list[ErrorRow] = []
+    maps: dict[Stage, dict[str, np.ndarray]] = {"base": {}, "all": {}}
+    numbers: dict[Stage, tuple[int, int]] = {}
     often: dict[str, int] = {}
     for number, out in enumerate(parts, 1):
         study.report(f"choosing without {', '.join(out)} ({number} of {len(parts)})")
         closed = close_again([scan for scan in scans if scan.id not in out])
         for name in closed.final.twin.names:
             often[name] = often.get(name, 0) + 1
-        held_out = HeldOut(closed, study)
-        rows += held_out.errors_of([scan for scan in scans if scan.id in out], f"nested {nested}")
-    return joined(rows), often
+        judged = [scan for scan in scans if scan.id in out]
+        for stage, fit, own in HeldOut(closed, study).of_others(judged):
+            maps[stage].update({scan.id: one for scan, one in zip(judged, own, strict=True)})
+            numbers[stage] = max(fit.numbers, numbers.get(stage, fit.numbers))
+    rows = []
+    for stage, known in maps.items():
+        rows += error_rows(
+            scans, [known[one] for one in ids], model=stage, measurement="shared",
+            held_out=f"nested {nested}", numbers=numbers[stage], seed=study.seed,
+        )  # fmt: skip
+    return rows, often
 
 
 def _rounding_um(store: Store, scans: Sequence[PrintedScan]) -> dict[str, float] | None:
