@@ -166,7 +166,9 @@ def _held_out(grams: np.ndarray, fold_of: np.ndarray) -> np.ndarray:
     for fold in np.unique(fold_of):
         own, rest = np.flatnonzero(fold_of == fold), np.flatnonzero(fold_of != fold)
         inner = Products(grams[rest], {ALL: ("",) * len(rest)})
-        block = min(blocks, key=lambda one: float(inner.held_out([one], fold_of[rest]).sum()))
+        # Where one fold is left each of its scans is held out by itself.
+        inner_of = fold_of[rest] if len(set(fold_of[rest])) > 1 else rest
+        block = min(blocks, key=lambda one: float(inner.held_out([one], inner_of).sum()))
         left[own] = products.squares([block], products.strengths([block], rest), own)
     return left
 

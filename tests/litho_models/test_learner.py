@@ -91,6 +91,14 @@ def test_a_scan_is_judged_by_a_ridge_that_has_not_seen_it(scene) -> None:
     assert gains[0] < 0.05 * (before[0] - learner.rest(predictions).squares_nm2[0])
 
 
+def test_two_folds_are_enough(scene) -> None:
+    """The weight of the ridge is then chosen on single scans of the other fold."""
+    study, predictions, learner = scene
+    halves = Learner(replace(study, fold_of=np.arange(10) % 2), predictions)
+    lacking = changed(study, predictions, bead)
+    assert halves.rest(lacking).mean_nm2 == pytest.approx(learner.rest(lacking).mean_nm2, rel=0.1)
+
+
 def test_what_may_follow_the_order_are_height_slopes_and_surroundings(scene) -> None:
     """The learner takes them by their place in a default model's features."""
     scan = scene[0].scans[0]
