@@ -79,7 +79,7 @@ def record(
         effects=effects,
         candidates=_candidates(closed, effects, {one.name for one in single_scans}),
         single_scans=single_scans,
-        confounded=_confounded(closed.final),
+        confounded=confounded(closed.final),
         explained=[
             Explained(
                 stage=stage,
@@ -205,7 +205,7 @@ def clustered_covariance(state: State, units: Sequence[str]) -> np.ndarray:
     return inverse @ (scores.T @ scores) @ inverse * len(names) / max(len(names) - 1, 1)
 
 
-def _confounded(state: State) -> list[tuple[str, str, float]]:
+def confounded(state: State) -> list[tuple[str, str, float]]:
     """Pairs of fitted numbers that these scans determine together only, with their correlation."""
     twin = state.twin
     normal = np.sum([eliminated(part, RULES.term_weight)[0] for part in state.linear], axis=0)
