@@ -16,7 +16,6 @@ from scipy.stats import norm
 
 from benchmarks import measured_plan, two_rounds
 from benchmarks.record import published
-from benchmarks.two_rounds_figure import bins
 from litho_data.cards.card import load_card
 from litho_data.cards.tables import read_table
 from litho_data.foundation.errors import InputError
@@ -676,13 +675,9 @@ def test_what_is_planted_is_drawn_before_anything_is_run_and_judged_by_its_owner
         assert told["wrong"] is wrong
 
 
-def test_the_picture_of_promises_shows_what_the_table_counts() -> None:
-    trials = json.loads((two_rounds.RESULTS / "20273.json").read_text("utf-8"))["trials"]
-    kept = bins(trials, "optimised")[-1]
-    assert kept.promised > 0.95
-    assert f"| {kept.right} of {kept.asked} (" in two_rounds.summary(trials)
-    counted = sum(one["counts"] for trial in trials for one in trial["answers"].get("optimised", []))
-    assert sum(one.asked for one in bins(trials, "optimised")) == counted
+def test_the_page_quotes_a_board_of_two_rounds() -> None:
+    board = json.loads((two_rounds.RESULTS / "20273.json").read_text("utf-8"))
+    assert published(two_rounds.PAGE, "two-rounds-20273") == two_rounds.summary(board["trials"])
 
 
 def test_a_plan_is_printed_by_the_same_machine_with_new_chance() -> None:
